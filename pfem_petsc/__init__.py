@@ -14,8 +14,8 @@ from .version import __version__
 if TYPE_CHECKING:
     from .case.schema import Case
     from .errors import EarlyStop, InputError, NotConverged, PfemError, SimulationFailure
+    from .formats import write_mesh
     from .mesh.truss import Truss
-    from .mesh.writing import write_mesh
     from .output.result import open_result
     from .output.table import Table
     from .post.live import LivePlot
@@ -48,7 +48,7 @@ _HOMES = {
     "Table": ".output.table",
     "open_result": ".output.result",
     "sweep": ".studies.sweep",
-    "write_mesh": ".mesh.writing",
+    "write_mesh": ".formats",
 }
 
 

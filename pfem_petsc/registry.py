@@ -1,21 +1,71 @@
-"""Finds the classes that case files name: one class per module, with the name of the module."""
+"""Finds what case files and file names name: one module for each name, of the package, installed, or from a plugin.
+
+A module of one of the packages :data:`KINDS` has the name of its file. Other distributions add modules by entry points
+(``[project.entry-points."pfem_petsc.laws"]``: ``my_law = "my_package.my_law"``), users by files (:func:`add_plugin`).
+"""
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import difflib
 import importlib
 import pkgutil
+import sys
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
 from types import ModuleType
+from typing import Any, NamedTuple
 
 from .errors import InputError
+from .files import readable_whole
 
-__all__ = ["choices", "lookup", "nearest"]
+
+class Kind(NamedTuple):
+    """What the modules of a package are: their group of entry points, and what a module defines at its top level."""
+
+    group: str
+    defines: tuple[str, ...]
+
+
+KINDS = {
+    "pfem_petsc.integrators": Kind("pfem_petsc.integrators", ("Scheme",)),
+    "pfem_petsc.mechanics.materials": Kind("pfem_petsc.laws", ("LAW",)),
+    "pfem_petsc.contact.walls": Kind("pfem_petsc.walls", ("Wall",)),
+    "pfem_petsc.contact.constraints": Kind("pfem_petsc.constraints", ("Constraint",)),
+    "pfem_petsc.contact.treatments": Kind("pfem_petsc.treatments", ("Treatment",)),
+    "pfem_petsc.mesh.generators": Kind("pfem_petsc.generators", ("generate",)),
+    "pfem_petsc.mesh.readers": Kind("pfem_petsc.formats", ("SUFFIXES", "read")),
+    "pfem_petsc.mesh.writers": Kind("pfem_petsc.formats", ("SUFFIXES", "write")),
+    "pfem_petsc.statics.methods": Kind("pfem_petsc.static_methods", ("make_stepper",)),
+}
+
+_plugins: dict[str, dict[str, ModuleType]] = {package: {} for package in KINDS}
+_sources: dict[Path, bytes] = {}
+"""What the files of plugins had when they were run."""
+
+
+def _own(package: str) -> tuple[str, ...]:
+    """Names of the modules of a package, except ``base`` and private ones."""
+    path = importlib.import_module(package).__path__
+    return tuple(m.name for m in pkgutil.iter_modules(path) if not m.name.startswith("_") and m.name != "base")
+
+
+@cache
+def _installed(package: str) -> dict[str, EntryPoint]:
+    """Entry points of other distributions by name."""
+    kind = KINDS.get(package)
+    found = {point.name: point for point in entry_points(group=kind.group)} if kind is not None else {}
+    if kind is None or len(kind.defines) == 1:
+        return found
+    return {name: point for name, point in found.items() if all(hasattr(point.load(), part) for part in kind.defines)}
 
 
 def choices(package: str) -> list[str]:
-    """Return the names of the modules of a package without importing them, except ``base`` and private ones."""
-    path = importlib.import_module(package).__path__
-    return sorted(m.name for m in pkgutil.iter_modules(path) if not m.name.startswith("_") and m.name != "base")
+    """Return the names that :func:`lookup` finds, without importing the modules of the package."""
+    return sorted({*_own(package), *_installed(package), *_plugins.get(package, ())})
 
 
 def nearest(name: str, known: list[str]) -> str:
@@ -27,15 +77,101 @@ def nearest(name: str, known: list[str]) -> str:
 
 
 def lookup(package: str, name: str, where: str) -> ModuleType:
-    """Import the module ``name`` of a package.
+    """Import the module ``name`` of a package, or of what others add to it.
 
     Raises
     ------
     InputError
         If there is no such module; the message names the key ``where`` and the nearest known name.
     """
+    if not isinstance(name, str):  # of a case that is not checked yet
+        raise InputError(f"{where}: unknown value {name!r}{nearest(name, choices(package))}")
+    if name in _own(package):
+        return importlib.import_module(f"{package}.{name}")
+    if name in _plugins.get(package, ()):
+        return _plugins[package][name]
+    if name in _installed(package):
+        try:
+            return _installed(package)[name].load()
+        except Exception as error:  # noqa: BLE001 - what is installed beside the program may raise anything
+            text = f"{_installed(package)[name].value} cannot be imported: {type(error).__name__}: {error}"
+            raise InputError(f"{where}: {text}") from error
     known = choices(package)
-    if name not in known:
-        hint = nearest(name, known) if known else "; none is built in, CONTRIBUTING.md says how to add one"
-        raise InputError(f"{where}: unknown value {name!r}{hint}")
-    return importlib.import_module(f"{package}.{name}")
+    hint = nearest(name, known) if known else "; none is built in, CONTRIBUTING.md says how to add one"
+    raise InputError(f"{where}: unknown value {name!r}{hint}")
+
+
+def modules(package: str) -> dict[str, ModuleType]:
+    """Return all modules by name that can be imported; a package of others may be broken."""
+    found = {}
+    for name in choices(package):
+        with contextlib.suppress(InputError):
+            found[name] = lookup(package, name, "")
+    return found
+
+
+def description(package: str, name: str) -> str:
+    """Return the first line of a module's docstring; one of the program is not imported, as some compile kernels."""
+    if name in _own(package):
+        text = ast.get_docstring(ast.parse(Path(find_spec(f"{package}.{name}").origin).read_text(encoding="utf-8")))
+    else:
+        text = getattr(modules(package).get(name), "__doc__", "cannot be imported")
+    return (text or "").strip().partition("\n")[0]
+
+
+def add_plugin(path: Path | str) -> None:
+    """Add the module of a file under the name of the file, as one of the package whose definitions it has.
+
+    Its relative imports are those of a module of that package.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or run, is no such module, or has the name of a module of the program.
+    """
+    path = Path(path).resolve()
+    try:
+        source = readable_whole(path).read_bytes()
+        if _sources.get(path) == source:
+            return
+        tree = ast.parse(source, str(path))
+    except (OSError, SyntaxError, ValueError) as error:
+        if path in _sources and not path.exists():
+            return
+        raise InputError(f"this plugin cannot be read: {error}") from error
+    defined = {name for node in tree.body for name in _names(node)}
+    packages = [package for package, kind in KINDS.items() if defined.issuperset(kind.defines)]
+    name = path.stem
+    if not packages or not name.isidentifier():
+        known = ", ".join(" and ".join(kind.defines) for kind in KINDS.values())
+        raise InputError(
+            f"this is no plugin: expected a file NAME.py that defines one of {known} (CONTRIBUTING.md has examples)"
+        )
+    for package in packages:
+        if name in _own(package):
+            raise InputError(f"{package} has a module {name} of its own: give the plugin another name")
+    module_name = f"{packages[0]}.{name}"
+    spec: Any = spec_from_file_location(module_name, path)
+    module = module_from_spec(spec)
+    sys.modules[module_name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # noqa: BLE001 - a plugin may raise anything
+        del sys.modules[module_name]
+        raise InputError(f"this plugin cannot be imported: {type(error).__name__}: {error}") from error
+    _sources[path] = source
+    for package in packages:
+        _plugins[package][name] = module
+
+
+def has_plugin(path: Path | str) -> bool:
+    """Return whether the module of a file was added."""
+    return Path(path).resolve() in _sources
+
+
+def _names(node: ast.stmt) -> list[str]:
+    """Names that a statement of a module defines."""
+    if isinstance(node, ast.ClassDef | ast.FunctionDef):
+        return [node.name]
+    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+    return [target.id for target in targets if isinstance(target, ast.Name)]

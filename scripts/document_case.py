@@ -11,61 +11,28 @@ import re
 import types
 import typing
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticUndefined
 
-from pfem_petsc.case import settings, stages, table_files, tables
-from pfem_petsc.case.base import ConstraintKeys, StrictModel
-from pfem_petsc.case.materials import LAWS
-from pfem_petsc.case.reading import CONSTRAINTS, GENERATORS, INTEGRATORS, KEYS, STATIC_METHODS, WALLS
-from pfem_petsc.contact.walls.base import WallKeys
-from pfem_petsc.mechanics.materials.base import MaterialKeys
+from pfem_petsc.case.base import StrictModel
+from pfem_petsc.case.files import TableFile
+from pfem_petsc.case.model import KEYS, STAGE_TABLES, CaseModel, Family, StageName, StageOutput, shape_of
 from pfem_petsc.registry import choices, lookup
 
-__all__ = ["TABLES", "Family", "page", "rows", "type_text"]
+
+def _tables() -> dict[str, tuple[type[StrictModel] | Family, ...]]:
+    """The tables of a case file by heading, with the models that have their keys."""
+    found: dict[str, tuple[type[StrictModel] | Family, ...]] = {}
+    for key, field in CaseModel.model_fields.items():
+        shape = shape_of(field)
+        heading = {list: f"[[{key}]]", dict: f"[{key}.NAME]"}.get(shape.many, f"[{key}]")
+        found[heading] = shape.models if shape.family is None else (*shape.models, shape.family)
+    found["[[stage]]"] = (StageName, StageOutput)
+    return {**{heading: models for heading, models in found.items() if models}, "Columns of files": (TableFile,)}
 
 
-class Family(NamedTuple):
-    """Models that a key chooses among, one in each module of a package: ``type = "plane"``."""
-
-    package: str
-    key: str
-    common: type[StrictModel] | None
-
-
-TABLES: dict[str, tuple[type[StrictModel] | Family, ...]] = {
-    "[mesh]": (tables.MeshKeys, Family(GENERATORS, "generator", None)),
-    "[node_set.NAME]": (tables.NodeSet,),
-    "[material.NAME]": (MaterialKeys, Family(LAWS, "law", MaterialKeys)),
-    "[section.NAME]": (tables.Section,),
-    "[initial], [[initial.on]]": (tables.Initial,),
-    "[[support]]": (tables.Support,),
-    "[[mass]]": (tables.NodalMass,),
-    "[[spring]]": (tables.Spring,),
-    "[[dashpot]]": (tables.Dashpot,),
-    "[[load]]": (tables.Load, tables.LoadFile),
-    "[gravity]": (tables.Gravity, tables.VaryingGravity),
-    "[wind]": (tables.Wind, tables.VaryingWind),
-    "[[temperature]]": (tables.Temperature,),
-    "[[wall]]": (WallKeys, Family(WALLS, "type", WallKeys)),
-    "[[contact_pair]]": (tables.ContactPair,),
-    "[[constraint]]": (
-        ConstraintKeys,
-        Family(CONSTRAINTS, "kind", None),
-    ),
-    "[[remove]]": (tables.Remove,),
-    "[contact]": (settings.ContactSettings,),
-    "[time]": (settings.TimeKeys, Family(INTEGRATORS, "integrator", None)),
-    "[static]": (settings.StaticKeys, Family(STATIC_METHODS, "method", None)),
-    "[[stage]]": (stages.StageOutput,),
-    "[modes]": (settings.Modes,),
-    "[output]": (settings.OutputKeys,),
-    "[[output.probe]]": (settings.Probe,),
-    "[solver]": (settings.Solver,),
-    "Columns of files": (table_files.TableFile,),
-}
+TABLES = _tables()
 """The tables of a case file in the order of the page, with the models that have their keys."""
 
 NOTES = {
@@ -75,7 +42,8 @@ NOTES = {
     "[[wall]]": "`name`: default `wall1`, `wall2` and so on.",
     "[[constraint]]": "Kinds are modules of `pfem_petsc.contact.constraints`; none is built in.",
     "[[stage]]": "A stage has a `name` (default `stage1`, `stage2` and so on), `[stage.time]` or `[stage.static]`, and "
-    "the tables that change: " + ", ".join(f"`{name}`" for name in stages.TABLES) + ". Of `[output]` it takes:",
+    "the tables that change: " + ", ".join(f"`{name}`" for name in STAGE_TABLES) + ". Of `[output]` it takes "
+    "`fields_every` and `history_every`.",
     "Columns of files": "What a key `..._file` takes instead of the name of a file: a table with these keys.",
 }
 UNIT = re.compile(r"\s*\[((?:-|1/\w+|degrees|min|(?:[NJ]|Pa|kg|m|s|K|rad)[\w/() ^-]*?)(?:, (?:-|[NJ\w/()^ -]+?))*)\]")
@@ -89,7 +57,9 @@ def page() -> str:
         "Generated from the models that validate case files; [the keys of a case file](../case_file.md) explains them, "
         "with examples. A key without default and not marked *required* may be left out. Whole numbers are accepted "
         "for numbers; rows are lists of lists.\n\n"
-        "The top level of a case file has `title` and the tables " + ", ".join(f"`{key}`" for key in KEYS[1:]) + ".\n"
+        "The top level of a case file has `title`, `plugins` (files with modules of your own) and the tables "
+        + ", ".join(f"`{key}`" for key in KEYS[2:])
+        + ".\n"
     )
     for heading, models in TABLES.items():
         text += f"\n## `{heading}`\n" if heading.startswith("[") else f"\n## {heading}\n"
@@ -105,7 +75,7 @@ def _family(family: Family) -> str:
         module = lookup(family.package, name, "")
         if not hasattr(module, "Parameters"):
             continue
-        without = family.common.model_fields if family.common is not None else ()
+        without = family.models[0].model_fields
         about = (module.__doc__ or "").strip().partition("\n\n")[0].replace("\n", " ").partition(". ")[0].rstrip(".:")
         own = [key for key in module.Parameters.model_fields if key not in without]
         text += f'\n### `{family.key} = "{name}"`\n\n{_plain(about)}.\n'
@@ -125,7 +95,7 @@ def rows(model: type[StrictModel], without: Any = ()) -> tuple[list[list[str]], 
     """Return the rows of a model's table, and the models of its keys that are tables themselves."""
     lines, inner = [], []
     for key, field in model.model_fields.items():
-        if key in without:
+        if key in without or key == getattr(model, "slot", None):
             continue
         unit, text = _unit(_plain(field.description or ""))
         lines.append([f"`{key}`", type_text(field.annotation, field.metadata), unit, _default(field), text])
@@ -148,9 +118,9 @@ def _plain(text: str) -> str:
 
 def _default(field: FieldInfo) -> str:
     value = field.default
-    if value is PydanticUndefined:
+    if field.is_required():
         return "*required*"
-    if value is None or value == ():
+    if value in (None, (), []):
         return ""
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"

@@ -20,8 +20,8 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Simulation
-from pfem_petsc.case.builtin import built_in_cases
 from pfem_petsc.case.schema import Case
+from pfem_petsc.case.toml import built_in_cases
 from pfem_petsc.cli import main as cli
 from pfem_petsc.errors import InputError
 

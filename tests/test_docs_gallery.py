@@ -8,8 +8,8 @@ from mpi4py import MPI
 from PIL import Image
 
 from pfem_petsc import Simulation
-from pfem_petsc.case.builtin import built_in_cases
 from pfem_petsc.case.schema import Case
+from pfem_petsc.case.toml import built_in_cases
 
 
 def test_every_case_is_an_entry():

@@ -19,8 +19,9 @@ import pytest
 from docutils.utils.math import MathError
 
 import pfem_petsc
-from pfem_petsc.case import settings, tables
-from pfem_petsc.case.base import StrictModel, WithParameters
+from pfem_petsc.case import tables
+from pfem_petsc.case.base import StrictModel
+from pfem_petsc.case.model import CaseModel, WithParameters
 
 ROOT = Path(__file__).parents[1]
 LOADS = {"src", "srcset", "poster", "data"}
@@ -151,7 +152,7 @@ def test_reference_lists_every_key():
     listed = {line.split("|")[1].strip() for line in text.splitlines() if line.startswith("| `")}
     assert len(listed) > 150
     # assembled from those that the page has; and a public class for each base
-    assembled = {WithParameters, settings.Time, settings.Static, settings.Output, tables.Mesh}
+    assembled = {CaseModel, *WithParameters.__subclasses__()}
     for model in models():
         if model not in assembled and model.__module__.startswith("pfem_petsc"):
             assert {f"`{key}`" for key in model.model_fields} <= listed, model
@@ -170,7 +171,7 @@ def test_types_of_keys():
     assert lines["`area`"][1:4] == ["number > 0", "m2", ""]
     assert lines["`shape`"][1] == '`"round"`, `"tube"`'
     assert lines["`material`"][3] == "*required*"
-    lines = {row[0]: row for row in document_case.rows(settings.TimeKeys)[0]}
+    lines = {row[0]: row for row in document_case.rows(tables.TimeKeys)[0]}
     assert lines["`safety`"][1:4] == ["number > 0, ≤ 1", "", "0.9"]
     assert lines["`damping_table`"][1:3] == ["rows of 2 numbers", "s, -"]
     lines = {row[0]: row for row in document_case.rows(tables.NodeSet)[0]}

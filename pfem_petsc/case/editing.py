@@ -1,4 +1,4 @@
-"""Changes of a case that was read: each is validated with the whole case, as a file is.
+"""Changes of a case, each validated with the whole case as a file is: by ``key=value``, and as tables of objects.
 
 The tables of a :class:`~pfem_petsc.case.schema.Case` know their place in it. A change is put into the nested tables
 that were given, without defaults; these are read again, and the objects of the case then take the values that were
@@ -7,30 +7,173 @@ read, so that references to tables stay valid. A rejected change has no effect.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from pydantic import BaseModel
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from ..errors import InputError
 from .base import StrictModel
-from .containers import KeyPath, Place, Rows, Tables
-from .overrides import put, split_key, take_out
-from .problems import key_text
-from .stages import ANALYSES, ONE_STAGE, StageOutput
+from .model import ANALYSES, LISTS, ONE_STAGE, CaseModel, StageOutput, shape_of
+from .toml import DEEPEST, KeyPath, key_text, plain, split_key
 
 if TYPE_CHECKING:
     from .schema import Case
 
-__all__ = ["attribute_of", "changed_data", "copied", "given_table", "key_path", "merge", "merged_stages", "settle"]
+V = TypeVar("V")
 
-_FLAT = ("scheme", "parameters")
-"""Tables whose keys stand among those of the table that has them."""
 
-_MODELS = ("gravity", "wind", "contact", "time", "static", "modes", "output", "solver")
-_LISTS = ("support", "mass", "spring", "dashpot", "load", "temperature", "wall", "contact_pair", "constraint", "remove")
-_NAMED = ("node_set", "material", "section")
+def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[KeyPath]:
+    """Apply ``key=value`` texts to the tables of a case, in place; missing tables are created.
+
+    Parameters
+    ----------
+    data : the case as nested tables
+    overrides : texts ``path=value``; the value is TOML, or else used as a plain string; without a value, the key is
+        removed if it exists
+
+    Returns
+    -------
+    The paths that were set.
+
+    Raises
+    ------
+    InputError
+        If a text has no ``=``, or its path passes through a value that is not a table, or beyond the end of a list.
+    """
+    paths = []
+    for text in overrides:
+        key, equals, value = text.partition("=")
+        parts = split_key(key.strip())
+        if parts is not None and len(parts) > DEEPEST:
+            raise InputError(f"--set {text[:40]} ...: a key of more than {DEEPEST} parts")
+        if not equals or parts is None:
+            raise InputError(f"--set {text}: expected KEY=VALUE, like time.step=1e-5 or wall.0.point=[1.0, 0.0, 0.0]")
+        if not value.strip():
+            take_out(data, parts)
+            continue
+        paths.append(put(data, parts, _value(value.strip()), f"--set {text}"))
+    return paths
+
+
+def _value(text: str) -> Any:
+    try:
+        read = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):  # a syntax error, too many digits, nested too deep
+        return text
+    return read["value"] if len(read) == 1 else text
+
+
+def take_out(data: dict[str, Any], parts: list[str]) -> None:
+    """Remove the value at the parts of a key, if it is there."""
+    here: Any = data
+    for k, part in enumerate(parts):
+        key = int(part) if isinstance(here, list) and _is_place(part) else part
+        if not (key in here if isinstance(here, dict) else isinstance(here, list) and key in range(len(here))):
+            return
+        if k == len(parts) - 1:
+            del here[key]
+        else:
+            here = here[key]
+
+
+def _is_place(part: str) -> bool:
+    return part.isascii() and part.isdigit() and len(part) <= 18
+
+
+def put(data: dict[str, Any], parts: Sequence[str], value: Any, where: str) -> KeyPath:
+    """Set the value at the parts of a key, and return its path; missing tables are created.
+
+    Raises
+    ------
+    InputError
+        Beginning with ``where``, if the key leads through a value, or beyond the end of a list.
+    """
+    path: KeyPath = ()
+    here: Any = data
+    for k, part in enumerate(parts):
+        last = k == len(parts) - 1
+        if isinstance(here, list):
+            if not _is_place(part) or int(part) > len(here):
+                raise InputError(
+                    f"{where}: {part!r} is not an index of this list: 0 to {len(here)}, where the last one "
+                    "appends an item"
+                )
+            key: str | int = int(part)
+            if key == len(here):
+                here.append({})
+        elif isinstance(here, dict):
+            key = part
+            names = tuple(p for p in (*path, part) if isinstance(p, str))
+            if key not in here:
+                here[key] = [] if names in LISTS else {}
+        else:
+            raise InputError(f"{where}: {'.'.join(map(str, path))} is a value, not a table")
+        path = (*path, key)
+        if last:
+            here[key] = value
+        else:
+            here = here[key]
+    return path
+
+
+class Place(NamedTuple):
+    """Where a table is: the case that is changed with it, and its key path there."""
+
+    case: Case
+    path: KeyPath
+
+    def change(self, key: str | int, value: Any) -> None:
+        """Set a key of the table; see :meth:`~pfem_petsc.case.schema.Case.update`."""
+        self.case.edit([((*self.path, key), value)])
+
+
+def _through_copy(*names: str) -> Callable[[type], type]:
+    """Decorate a list or dict whose methods ``names`` change a copy, with which the case is then validated."""
+
+    def decorate(cls: Any) -> Any:
+        plain = cls.__mro__[1]
+        for name in names:
+
+            def method(self: Any, *arguments: Any, name: str = name, **named: Any) -> Any:
+                changed = plain(self)
+                result = getattr(changed, name)(*arguments, **named)
+                self._place.case.edit(self._changes(changed))
+                if name == "setdefault":
+                    return self[arguments[0]]
+                return self if result is changed else result
+
+            method.__name__, method.__doc__ = name, getattr(plain, name).__doc__
+            setattr(cls, name, method)
+        cls.__reduce__ = lambda self: (plain, (plain(self),))
+        return cls
+
+    return decorate
+
+
+@_through_copy("__setitem__", "__delitem__", "__ior__", "pop", "popitem", "setdefault", "update", "clear")
+class Tables(dict[str, V]):
+    """Tables by name, such as the materials of a case; changes are validated at once."""
+
+    __slots__ = ("_place",)
+    _place: Place
+
+    def _changes(self, changed: Mapping[str, Any]) -> list[tuple[KeyPath, Any]]:
+        named = {**dict.fromkeys(self), **changed}
+        return [((*self._place.path, name), table) for name, table in named.items() if table is not self.get(name)]
+
+
+@_through_copy(
+    *("__setitem__", "__delitem__", "__iadd__", "__imul__", "append", "extend", "insert", "pop", "remove", "clear"),
+    *("reverse", "sort"),
+)
+class Rows(list[V]):
+    """A list of tables, such as the walls of a case; changes are validated at once."""
+
+    __slots__ = ("_place",)
+    _place: Place
+
+    def _changes(self, changed: list[Any]) -> list[tuple[KeyPath, Any]]:
+        return [(self._place.path, changed)]
 
 
 def attribute_of(key: str) -> str:
@@ -38,85 +181,51 @@ def attribute_of(key: str) -> str:
     return "point_mass" if key == "mass" else key
 
 
-def given_table(model: BaseModel | None) -> dict[str, Any]:
-    """Return the keys of a table that were given, those of its scheme or generator among them."""
-    if model is None:
-        return {}
-    data = model.model_dump(exclude_unset=True, exclude_none=True, exclude=set(_FLAT))
-    for key in _FLAT:
-        if key in model.__dict__ and model.__dict__[key] is not None:
-            data |= given_table(model.__dict__[key])
-    return {key: str(value) if isinstance(value, Path) else value for key, value in data.items()}
+TABLES = {key: attribute_of(key) for key, field in CaseModel.model_fields.items() if shape_of(field).models}
+"""Attributes of a case that are tables, by top-level key."""
 
 
-def given_tables(case: Case) -> dict[str, Any]:
-    """Return the nested tables of a case as they were given, with rows instead of files with tables over time."""
-    data = _tables(case)
-    if case.stage:
-        data["stage"] = [_stage(case, stage) for stage in case.stage]
-    return data
+def tables_of(case: Case, given: bool = False) -> dict[str, Any]:
+    """Return the nested tables of a case with all defaults, or as they were given; without absent tables.
 
-
-def _tables(case: Case) -> dict[str, Any]:
-    everywhere = {k: v for entry in case.initial if entry.node_set is None for k, v in given_table(entry).items()}
-    on = [given_table(entry) for entry in case.initial if entry.node_set is not None]
-    data: dict[str, Any] = {
-        "title": case.title,
-        "mesh": given_table(case.mesh),
-        "initial": {**everywhere, "on": on} if on else everywhere,
-    }
-    for key in _NAMED:
-        data[key] = {name: given_table(table) for name, table in case.__dict__[key].items()}
-    for key in _LISTS:
-        data[key] = [given_table(table) for table in case.__dict__[attribute_of(key)]]
-    for key in _MODELS:
-        data[key] = given_table(case.__dict__[key])
-    present = {key: case.__dict__[key] is not None for key in ("static", "modes", "time", "gravity", "wind")}
-    return {key: value for key, value in data.items() if value not in ({}, []) or present.get(key, False)}
-
-
-def _stage(case: Case, stage: Case) -> dict[str, Any]:
-    tables = _tables(stage)
-    analysis = "time" if stage.time is not None else "static"
-    row = {"name": stage.name, **{key: tables.get(key, _nothing(key)) for key in (*stage.given, analysis)}}
-    if "output" in row:
-        keys = StageOutput.model_fields
-        own = {key: value for key, value in given_table(stage.output).items() if key in keys}
-        row["output"] = {key: value for key, value in own.items() if value != getattr(case.output, key)}
-    if "section" in row:  # a stage gives the prestress alone
-        named = {name: stage.section[name].prestressed for name in _stressed(stage)}
-        row["section"] = {name: {key: getattr(stage.section[name], str(key))} for name, key in named.items()}
-    return row
-
-
-def _stressed(stage: Case) -> Sequence[str]:
-    """Names of the sections whose prestress a stage gives itself."""
-    return stage.__dict__.get("stressed", ())
-
-
-def _nothing(key: str) -> Any:
-    return [] if key in _LISTS else {}
-
-
-def changed_data(case: Case, changes: Iterable[tuple[KeyPath, Any]]) -> dict[str, Any]:
-    """Return the nested tables of a case with changes: values, tables or models at key paths; None removes a key.
-
-    Raises
-    ------
-    InputError
-        If a path leads through a value, or beyond the end of a list.
+    Tables over time from files have rows instead.
     """
-    data = given_tables(case)
-    for path, value in changes:
-        value = _plain_tables(value)
-        if path[-1:] == ("initial",) and isinstance(value, list):
-            value = _initial(value)
-        parts = [str(part) for part in path]
-        if value is None:
-            take_out(data, parts)
-        else:
-            put(data, parts, value, f"{case.source}: {key_text(path)}")
+    data = {"title": case.title, **({"plugins": list(case.plugins)} if case.plugins else {}), **_tables(case, given)}
+    if case.stage:
+        data["stage"] = [_stage(case, stage, given) for stage in case.stage]
     return data
+
+
+def _tables(case: Case, given: bool) -> dict[str, Any]:
+    data: dict[str, Any] = {}
+    for key, attribute in TABLES.items():
+        content = case.__dict__[attribute]
+        if isinstance(content, dict):
+            data[key] = {name: table.as_table(given) for name, table in content.items()}
+        elif isinstance(content, list):
+            data[key] = [table.as_table(given) for table in content]
+        elif content is not None:
+            data[key] = content.as_table(given)
+    data["initial"] = _initial(data["initial"])
+    if not data["output"].get("probe"):
+        data["output"].pop("probe", None)
+    optional = [key for key in data if CaseModel.model_fields[key].default is None]
+    return {key: value for key, value in data.items() if value or key in optional}
+
+
+def _stage(case: Case, stage: Case, given: bool) -> dict[str, Any]:
+    """Return name, analysis and given tables of a stage."""
+    tables = _tables(stage, given)
+    analysis = "time" if stage.time is not None else "static"
+    empty = {key: [] if (key,) in LISTS else {} for key in stage.given}
+    row = {"name": stage.name, **empty, **{key: tables[key] for key in (*stage.given, analysis) if key in tables}}
+    if "output" in row:
+        own = {key: row["output"][key] for key in StageOutput.model_fields if key in row["output"]}
+        row["output"] = {k: v for k, v in own.items() if not given or v != getattr(case.output, k)}
+    if "section" in row:  # a stage gives the prestress alone
+        named = {name: str(stage.section[name].prestressed) for name in stage.stressed}
+        row["section"] = {name: {key: getattr(stage.section[name], key)} for name, key in named.items()}
+    return row
 
 
 def _initial(entries: Sequence[Any]) -> dict[str, Any]:
@@ -128,15 +237,25 @@ def _initial(entries: Sequence[Any]) -> dict[str, Any]:
     return {**(everywhere[0] if everywhere else {}), **({"on": on} if on else {})}
 
 
-def _plain_tables(value: Any) -> Any:
-    """Replace models by the keys that they were given."""
-    if isinstance(value, StrictModel):
-        return given_table(value)
-    if isinstance(value, Mapping):
-        return {key: _plain_tables(item) for key, item in value.items()}
-    if isinstance(value, list | tuple) and any(isinstance(item, StrictModel | Mapping) for item in value):
-        return [_plain_tables(item) for item in value]
-    return value
+def changed_data(case: Case, changes: Iterable[tuple[KeyPath, Any]]) -> dict[str, Any]:
+    """Return the nested tables of a case with changes: values, tables or models at key paths; None removes a key.
+
+    Raises
+    ------
+    InputError
+        If a path leads through a value, or beyond the end of a list.
+    """
+    data = tables_of(case, given=True)
+    for path, value in changes:
+        value = plain(value)
+        if path[-1:] == ("initial",) and isinstance(value, list):
+            value = _initial(value)
+        parts = [str(part) for part in path]
+        if value is None:
+            take_out(data, parts)
+        else:
+            put(data, parts, value, f"{case.source}: {key_text(path)}")
+    return data
 
 
 def key_path(case: Case, key: str) -> KeyPath:
@@ -194,33 +313,12 @@ def merged_stages(old: tuple[Case, ...], new: tuple[Case, ...]) -> tuple[Case, .
     return old
 
 
-def copied(case: Case) -> Case:
-    """Return a case with tables of its own, without places."""
-    made = case.__new__(type(case))
-    made.__dict__.update({key: _copied(value) for key, value in case.__dict__.items() if key != "editor"})
-    made.__dict__["stage"] = tuple(copied(stage) for stage in case.stage)
-    return made
-
-
-def _copied(value: Any) -> Any:
-    if isinstance(value, StrictModel):
-        value = value.model_copy()
-        value.__dict__.update({key: _copied(item) for key, item in value.__dict__.items()})
-        return value
-    if isinstance(value, dict):
-        return {name: _copied(table) for name, table in value.items()}
-    if isinstance(value, list):
-        return [_copied(row) for row in value]
-    if isinstance(value, tuple) and value and isinstance(value[0], StrictModel):
-        return tuple(_copied(item) for item in value)
-    return value
-
-
 def settle(case: Case, attached: bool = True) -> None:
     """Give all tables of a case their places in it, or take these away."""
+    owner = case if attached else None
     for k, stage in enumerate(case.stage):
-        _settle(stage, case if attached else None, lambda key, k=k: _of_stage(case, k, key))
-    _settle(case, case if attached else None, lambda key: (key,))
+        _settle(stage, owner, lambda key, k=k: _of_stage(case, k, key))
+    _settle(case, owner, lambda key: (key,))
 
 
 def _of_stage(case: Case, k: int, key: str) -> KeyPath:
@@ -237,46 +335,34 @@ def _of_stage(case: Case, k: int, key: str) -> KeyPath:
 
 def _settle(case: Case, owner: Case | None, place: Callable[[str], KeyPath]) -> None:
     case.__dict__["editor"] = (case if owner is None else owner), place
-    for key in (*_NAMED, "initial", *_LISTS, *_MODELS, "mesh"):
-        attribute, path = attribute_of(key), place(key)
+    for key, attribute in TABLES.items():
         content = case.__dict__[attribute]
-        if isinstance(content, dict) and not isinstance(content, Tables):
-            content = case.__dict__[attribute] = Tables(content)
-        elif isinstance(content, list) and not isinstance(content, Rows):
-            content = case.__dict__[attribute] = Rows(content)
-        if isinstance(content, Tables | Rows):
-            content._place = None if owner is None else Place(owner, path)
-        for table, where in _inside(content, path, key):
-            _settle_model(table, owner, where)
+        if type(content) in (dict, list):
+            content = case.__dict__[attribute] = Tables(content) if isinstance(content, dict) else Rows(content)
+        for table, path in _placed(content, place(key)):
+            object.__setattr__(table, "_place", None if owner is None else Place(owner, path))
     for k in range(case.number, -1, -1) if owner is not None and owner is not case else ():
-        for name in _stressed(owner.stage[k]):
-            if case.section[name]._place.path[0] != "stage":
-                _settle_model(case.section[name], owner, ("stage", k, "section", name))
+        for name in owner.stage[k].stressed:
+            section = case.section[name]
+            if section._place.path[0] != "stage":
+                object.__setattr__(section, "_place", Place(owner, ("stage", k, "section", name)))
 
 
-def _inside(content: Any, path: KeyPath, key: str) -> Iterator[tuple[StrictModel, KeyPath]]:
-    if isinstance(content, StrictModel):
+def _placed(content: Any, path: KeyPath) -> Iterator[tuple[Any, KeyPath]]:
+    """Yield the tables of some content of a case, and what has them, with their places."""
+    if isinstance(content, Tables | Rows | StrictModel):
         yield content, path
+    inner: Iterable[tuple[Any, KeyPath]] = ()
+    if isinstance(content, StrictModel):
+        slot = getattr(type(content), "slot", "")
+        inner = ((item, path if key == slot else (*path, key)) for key, item in content.__dict__.items())
     elif isinstance(content, dict):
-        yield from ((table, (*path, name)) for name, table in content.items())
-    elif key == "initial":
-        on = 0
-        for entry in content:
-            yield entry, path if entry.node_set is None else (*path, "on", on)
-            on += entry.node_set is not None
-    elif isinstance(content, list):
-        yield from ((table, (*path, i)) for i, table in enumerate(content))
-
-
-def _settle_model(table: StrictModel, owner: Case | None, path: KeyPath) -> None:
-    object.__setattr__(table, "_place", None if owner is None else Place(owner, path))
-    for key, value in table.__dict__.items():
-        if isinstance(value, StrictModel):
-            _settle_model(value, owner, path if key in _FLAT else (*path, key))
-        elif isinstance(value, dict):
-            for name, item in value.items():
-                if isinstance(item, StrictModel):
-                    _settle_model(item, owner, (*path, key, name))
-        elif isinstance(value, tuple) and value and isinstance(value[0], StrictModel):
-            for i, item in enumerate(value):
-                _settle_model(item, owner, (*path, key, i))
+        inner = ((item, (*path, name)) for name, item in content.items())
+    elif isinstance(content, list | tuple) and content and isinstance(content[0], StrictModel):
+        everywhere = path[-1] == "initial" and content[0].node_set is None
+        first = (*path, "on") if path[-1] == "initial" else path
+        inner = ((item, (*first, i - everywhere)) for i, item in enumerate(content))
+        if everywhere:
+            inner = [(content[0], path), *list(inner)[1:]]
+    for item, where in inner:
+        yield from _placed(item, where)

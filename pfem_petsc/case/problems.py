@@ -1,43 +1,26 @@
-"""Collects all problems of a case and reports them in one message: file, key, value, what is expected."""
+"""The problems of a case in one message: file, key, value, what is expected. Errors of pydantic are translated here."""
 
 from __future__ import annotations
 
 import re
-import types
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from ..errors import InputError
 from ..registry import nearest
-from .base import StrictModel
-from .toml import value_text
-
-__all__ = ["Path", "Problems", "key_text", "table_list"]
-
-Path = tuple[str | int, ...]
-"""Path of a value in the case: keys of tables and indices of lists."""
-
-M = TypeVar("M", bound=StrictModel)
+from .base import StrictModel, WithFiles
+from .files import TableFile
+from .model import CaseModel, Chosen, Family, plain_type, shape_of
+from .toml import KeyPath, key_text, value_text
 
 MOST = 10
 """Maximum number of problems listed in a message; the others are counted."""
 
 SI_HINT = "expected a number in SI units, without quotes and unit"
-
-
-def key_text(path: Path) -> str:
-    """Return a key path as users write it: ``wall[0].normal``."""
-    text = ""
-    for part in path:
-        if isinstance(part, int):
-            text += f"[{part}]"
-        else:
-            text += ("." if text else "") + (part if re.fullmatch(r"[\w-]+", part) else value_text(part))
-    return text
 
 
 class Problems:
@@ -49,12 +32,12 @@ class Problems:
     overridden : key paths that were set on the command line, which the message states if one of them is wrong
     """
 
-    def __init__(self, source: str, overridden: Iterable[Path] = ()) -> None:
+    def __init__(self, source: str, overridden: Iterable[KeyPath] = ()) -> None:
         self.source = source
         self.overridden = list(overridden)
         self.lines: list[str] = []
 
-    def add(self, path: Path, message: str, value: Any = None) -> None:
+    def add(self, path: KeyPath, message: str, value: Any = None) -> None:
         """Add a problem; ``value`` is shown if given."""
         key = key_text(path)
         shown = f"{key} = {_short(value)}" if value is not None else key
@@ -62,14 +45,6 @@ class Problems:
         line = f"{self.source}: {shown}{origin}: {message}" if key else f"{self.source}: {message}"
         if line not in self.lines:
             self.lines.append(line)
-
-    def refer(self, path: Path, name: str, known: Sequence[str], what: str) -> None:
-        """Add a problem if ``name`` is not one of the ``known`` names of a ``what``."""
-        if name not in known:
-            hint = nearest(name, list(known)) if known else "; the case defines none"
-            if what == "node set":
-                hint += f'; a group of the mesh becomes one by node_set.NAME = {{ group = "{name}" }}'
-            self.add(path, f"there is no {what} of this name{hint}", name)
 
     def raise_if_any(self) -> None:
         """Raise one :class:`InputError` with every problem on its own line."""
@@ -80,85 +55,130 @@ class Problems:
             lines.append(f"{self.source}: ... and {len(self.lines) - MOST} more")
         raise InputError("\n".join(lines))
 
-    def read(
-        self,
-        model: type[M],
-        data: Any,
-        path: Path,
-        *,
-        known: Sequence[str] = (),
-        taker: str = "",
-        siblings: Callable[[], Mapping[str, Sequence[str]]] = dict,
-    ) -> M | None:
-        """Validate a table; if it is rejected, add the problems and return None.
+    def validated(
+        self, model: type[StrictModel], data: Any, context: Any, place: Callable[[KeyPath], KeyPath] = tuple
+    ) -> Any:
+        """Return a validated table; if it is rejected, add the problems and return None.
 
         Parameters
         ----------
         model : the model of the table
         data : the table as read
-        path : of the table
-        known : keys of the same table that do not belong to the model (for hints)
-        taker : name of the scheme, generator or wall with these keys, for messages about unknown keys
-        siblings : returns the alternatives by name with their keys, to identify the owner of a key
+        context : of the validation
+        place : path in the case of a path within the table
         """
-        if not isinstance(data, Mapping):
-            self.add(path, "expected a table", data)
-            return None
         try:
-            return model.model_validate(dict(data))
-        except InputError as error:
-            self.add(path, str(error))
+            return model.model_validate(data, context=context)
         except ValidationError as error:
             for item in error.errors(include_url=False):
-                self._describe(model, item, path, known, taker, siblings)
+                self._describe(_owner(model, item["loc"], data), item, place)
         return None
 
-    def _describe(
-        self,
-        model: type[StrictModel],
-        item: Any,
-        path: Path,
-        known: Sequence[str],
-        taker: str,
-        siblings: Callable[[], Mapping[str, Sequence[str]]],
-    ) -> None:
-        where: Path = (*path, *item["loc"])
+    def _describe(self, owner: Owner, item: Any, place: Callable[[KeyPath], KeyPath]) -> None:
+        where, field = place(owner.path), owner.field
         kind, value, context = item["type"], item["input"], item.get("ctx", {})
-        inner, field = _innermost(model, item["loc"])
         about = (
             f" ({' '.join(field.description.split()).rstrip('.')})" if field is not None and field.description else ""
         )
         if kind == "extra_forbidden":
-            key = str(item["loc"][-1])
-            owners = [name for name, keys in siblings().items() if key in keys] if inner is model else []
-            taker = taker if inner is model else ""
-            text = _unknown_key(key, list(inner.model_fields), known, taker, owners)
-            if taker and where not in self.overridden and any(p[:-1] == where[:-1] for p in self.overridden):
+            text = owner.unknown(str(where[-1]))
+            if owner.taker and where not in self.overridden and any(p[:-1] == where[:-1] for p in self.overridden):
                 text += f"; --set {key_text(where)}= removes it"
             self.add(where, text)
+        elif kind == "missing" and owner.model is CaseModel:
+            self.add((), f"the table [{key_text(where)}] is missing")
         elif kind == "missing" and isinstance(value, Mapping):
             self.add(where, f"this key is missing{about}")
         elif kind in ("missing", "too_long", "too_short") and isinstance(value, list | tuple):
             whole = where[:-1] if kind == "missing" else where
-            self.add(whole, f"expected {_shape(field)}, got {len(value)} value{'s' * (len(value) != 1)}{about}", value)
+            self.add(
+                whole, f"expected {_list_text(field)}, got {len(value)} value{'s' * (len(value) != 1)}{about}", value
+            )
+        elif kind == "refused":
+            self.add(where, context["text"], value)
         elif kind in ("value_error", "assertion_error"):
             self.add(where, str(context["error"]), None if isinstance(value, Mapping) else value)
         else:
-            self.add(where, _expected(kind, value, context, field) + about, value)
+            tables = _tables_text(kind, owner)
+            self.add(where, tables or _expected(kind, value, context, field) + about, value)
 
 
-def _innermost(model: type[StrictModel], path: Path) -> tuple[type[StrictModel], FieldInfo | None]:
-    """Return the model of the table that a path within a table leads to, and the last of its fields on the way."""
-    field = None
-    for part in path:
-        if isinstance(part, str) and part in model.model_fields:
-            field = model.model_fields[part]
-            annotation = _plain(field.annotation)
-            if typing.get_origin(annotation) is dict:  # tables by name
-                annotation = _plain(typing.get_args(annotation)[1])
-            if isinstance(annotation, type) and issubclass(annotation, StrictModel):
-                model = annotation
-    return model, field
+class Owner(NamedTuple):
+    """The table that has a key, or lacks it.
+
+    Attributes
+    ----------
+    model : of the table
+    field : the last of the fields on the way to the key
+    path : of the key in the case
+    taker : what has these keys, if they are those of a module found by name
+    family : to which the module belongs
+    """
+
+    model: type[StrictModel]
+    field: FieldInfo | None
+    path: KeyPath
+    taker: str = ""
+    family: Family | None = None
+
+    def unknown(self, key: str) -> str:
+        """Return the message for a key that the table does not have."""
+        own = list(self.model.model_fields)
+        if self.family is None:
+            return f"unknown key{nearest(key, own)}"
+        keys = ", ".join(own) if own else "no parameters"
+        owners = [name for name, known in self.family.keys().items() if key in known]
+        if owners:
+            return f"a key of {', '.join(owners)}, not of {self.taker}, which takes {keys}"
+        hint = nearest(key, [*own, *self.family.models[0].model_fields])
+        return f"unknown key; {self.taker} takes {keys}" + (hint if hint.startswith(", did") else "")
+
+
+def _owner(model: type[StrictModel], loc: KeyPath, data: Any) -> Owner:
+    """Follow the path of an error through the models and the data to the table that it is about."""
+    owner, rest = Owner(model, None, ()), list(loc)
+    while rest:
+        part = rest.pop(0)
+        field = owner.model.model_fields.get(str(part))
+        inner = field is not None and part == getattr(owner.model, "slot", None)  # its keys stand beside the others
+        owner = owner._replace(path=owner.path if inner else (*owner.path, part))
+        if field is None:  # an unknown key, or an index of numbers
+            continue
+        many, models, chosen = shape_of(field)
+        data = data if inner else _item(data, part)
+        owner = owner._replace(field=field)
+        if many is not None and models and rest:
+            data = _item(data, rest[0])
+            owner = owner._replace(path=(*owner.path, rest.pop(0)))
+        if not rest:
+            break
+        if issubclass(owner.model, WithFiles) and str(part).endswith("_file"):
+            owner = owner._replace(model=TableFile, family=None)
+        elif isinstance(chosen, Chosen) and isinstance(data, Mapping):
+            found, family = chosen.found(data), chosen if isinstance(chosen, Family) else None
+            owner = owner._replace(model=found or owner.model, family=family)
+            if found is not None and family is not None:
+                owner = owner._replace(taker=family.taker.format(family.name(data)))
+        elif models:
+            owner = owner._replace(model=models[0], family=None)
+    return owner
+
+
+def _tables_text(kind: str, owner: Owner) -> str:
+    """Describe lists of tables and tables by name, where there is something else."""
+    tables = owner.field is not None and shape_of(owner.field).models
+    if tables and kind in ("list_type", "tuple_type"):
+        return f"expected a list of tables, each under a heading [[{key_text(owner.path)}]]"
+    if tables and kind == "dict_type":
+        return f"expected tables, each under a heading [{key_text(owner.path)}.NAME]"
+    return ""
+
+
+def _item(data: Any, key: str | int) -> Any:
+    try:
+        return data[key]
+    except (LookupError, TypeError):
+        return None
 
 
 def _short(value: Any, most: int = 60) -> str:
@@ -166,34 +186,13 @@ def _short(value: Any, most: int = 60) -> str:
     return text if len(text) <= most else f"{text[: most - 4]} ..."
 
 
-def _unknown_key(key: str, own: list[str], shared: Sequence[str], taker: str, owners: Sequence[str]) -> str:
-    if not taker:
-        return f"unknown key{nearest(key, own)}"
-    keys = ", ".join(own) if own else "no parameters"
-    if owners:
-        return f"a key of {', '.join(owners)}, not of {taker}, which takes {keys}"
-    hint = nearest(key, [*own, *shared])
-    return f"unknown key; {taker} takes {keys}" + (hint if hint.startswith(", did") else "")
-
-
-def _plain(annotation: Any) -> Any:
-    """Return a type without ``Annotated`` and ``None``."""
-    while True:
-        if typing.get_origin(annotation) is typing.Annotated:
-            annotation = typing.get_args(annotation)[0]
-        elif typing.get_origin(annotation) in (typing.Union, types.UnionType):
-            annotation = next(a for a in typing.get_args(annotation) if a is not type(None))
-        else:
-            return annotation
-
-
-def _shape(field: FieldInfo | None) -> str:
+def _list_text(field: FieldInfo | None) -> str:
     """Describe the content of a list field by its type: ``a list of 3 numbers``."""
-    annotation = _plain(field.annotation) if field is not None else None
+    annotation = plain_type(field.annotation) if field is not None else None
     arguments = typing.get_args(annotation)
     if typing.get_origin(annotation) is not tuple or not arguments:
         return "a list"
-    words = {float: "numbers", int: "integers", str: "texts"}.get(_plain(arguments[0]), "lists")
+    words = {float: "numbers", int: "integers", str: "texts"}.get(plain_type(arguments[0]), "lists")
     return f"a list of {words}" if arguments[-1] is Ellipsis else f"a list of {len(arguments)} {words}"
 
 
@@ -225,15 +224,7 @@ def _expected(kind: str, value: Any, context: Mapping[str, Any], field: FieldInf
         hint = nearest(value, choices) if isinstance(value, str) else f"; known: {', '.join(choices)}"
         return "unknown value" + hint
     if kind in ("tuple_type", "list_type"):
-        return f"expected {_shape(field)}" + (", in SI units without quotes and unit" if isinstance(value, str) else "")
+        return f"expected {_list_text(field)}" + (
+            ", in SI units without quotes and unit" if isinstance(value, str) else ""
+        )
     return f"rejected ({kind.replace('_', ' ')})"
-
-
-def table_list(data: Any, path: Path, problems: Problems) -> Sequence[Any]:
-    """Return the items of an optional list of tables."""
-    if data is None:
-        return ()
-    if not isinstance(data, list | tuple):
-        problems.add(path, f"expected a list of tables, each under a heading [[{'.'.join(map(str, path))}]]", data)
-        return ()
-    return data

@@ -2,29 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import pickle
+import warnings
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Self
 
 from ..errors import InputError
-from .builtin import built_in_path, read_text
-from .checks import check_names
-from .containers import CaseTables
-from .editable import Editable
-from .editing import attribute_of, settle
-from .names import checked_name
-from .overrides import apply_overrides
-from .parsing import parse_toml
+from ..registry import add_plugin, has_plugin, nearest
+from .editing import (
+    TABLES,
+    apply_overrides,
+    attribute_of,
+    changed_data,
+    key_path,
+    merge,
+    merged_stages,
+    settle,
+    tables_of,
+)
+from .model import ANALYSES, KEYS, STAGE_TABLES, CaseModel, Reading
 from .problems import Problems
-from .reading import KEYS, read_tables
 from .stages import stages_of
-from .toml import plain, table_text
-from .writing import tables_of
+from .toml import KeyPath, built_in_path, parse_toml, plain, read_text, table_text
 
-__all__ = ["Case"]
+_ARGUMENTS = {
+    "name": "the name of a case is that of its file, or an argument: Case(..., name=...), case.copy(name=...)",
+    "source": "it is an argument of Case(...) and cannot be changed",
+    "folder": "it is an argument of Case(...) and cannot be changed",
+    "overrides": "it is an argument of Case(...) and cannot be changed; update and copy take changes by key",
+    "comment": "comments of TOML begin with #",
+}
+
+if TYPE_CHECKING:
+    _Tables = CaseModel  # for checkers of types: a case has the attributes of the model
+else:
+    _Tables = object
 
 
-class Case(Editable):
+class Case(_Tables):
     """A validated case. Created by :meth:`from_file` (or :meth:`load`), from its text, or from tables.
 
     ``Case(mesh=..., material={...}, section={...}, time={...})`` takes the tables of a case file, all at once as nested
@@ -43,19 +59,20 @@ class Case(Editable):
     source : file of the case as given, for messages
     folder : to which the case's relative file names refer
     overrides : texts ``KEY=VALUE`` that override its values
-    mesh : :class:`~pfem_petsc.case.tables.Mesh`: generator with parameters, or file
+    mesh : :class:`~pfem_petsc.case.model.Mesh`: generator with parameters, or file
     node_set, material, section : tables by name, in file order
     initial, support, load, temperature, wall, contact_pair, constraint, remove : lists of tables
     point_mass : list of tables ``[[mass]]``; spring, dashpot : lists of tables
     gravity, wind : :class:`~pfem_petsc.case.tables.Gravity`, :class:`~pfem_petsc.case.tables.Wind`, or None
-    contact, output, solver : tables of :mod:`~pfem_petsc.case.settings`
+    contact, output, solver : tables of :mod:`~pfem_petsc.case.tables`
     time, static, modes : what is computed, None for what is not; ``time`` and ``static`` exclude each other
     stage : the cases of its stages, empty for a case without them
     stages : the same, or the case itself
     number : of a stage among those of its case, from 0
     given : tables that a stage gives itself, and does not have from the stages before
     stressed : names of the sections whose prestress a stage gives itself
-    removes_bars : whether bars are removed, in this or another stage
+    fixed : whether it cannot be changed, as the case of a simulation
+    editor : the case that is changed with this one, which is another for those of stages; and the key path of a table
 
     Raises
     ------
@@ -76,7 +93,7 @@ class Case(Editable):
         source: str = "case",
         folder: str | Path = ".",
         overrides: Iterable[str] = (),
-        **named: Unpack[CaseTables],
+        **named: Any,
     ) -> None:
         given = {key: value for key, value in named.items() if value is not None}
         data = {} if tables is None else tables
@@ -90,15 +107,10 @@ class Case(Editable):
         settle(self)
 
     @classmethod
-    def _of(cls, attributes: Mapping[str, Any], *, name: str, source: str, folder: Path) -> Case:
-        """The case of tables that were read."""
+    def _of(cls, model: CaseModel, **attributes: Any) -> Case:
         case = cls.__new__(cls)
-        for key in KEYS:
-            case.__dict__[attribute_of(key)] = attributes.get(key, ()) if key == "stage" else attributes[key]
-        case.__dict__.update(
-            name=name, source=source, folder=Path(folder), overrides=(), number=0, given=(), stressed=()
-        )
-        case.__dict__.update(removes_bars=any(entry.bars is not None for entry in case.remove), fixed=False)
+        case.__dict__.update({attribute_of(key): value for key, value in model.__dict__.items()})
+        case.__dict__.update({"stage": (), "number": 0, "given": (), "stressed": (), "fixed": False, **attributes})
         return case
 
     def __eq__(self, other: object) -> bool:
@@ -123,6 +135,12 @@ class Case(Editable):
             named = {**{wall.name: wall for wall in stage.wall}, **named}
         return list(named.values())
 
+    @property
+    def removes_bars(self) -> bool:
+        """Whether bars are removed, in this or another stage."""
+        whole = self.editor[0]
+        return any(entry.bars is not None for each in (whole, *whole.stage) for entry in each.remove)
+
     def holds(self, table: str) -> bool:
         """Whether a table keeps its state at the end of the previous stage."""
         return self.number > 0 and table not in self.given
@@ -146,7 +164,9 @@ class Case(Editable):
         return (self.modes is not None and self.modes.mass) or "lumped"
 
     @classmethod
-    def load(cls, path_or_name: str | Path, overrides: Iterable[str] = (), *, mesh: Any = None) -> Case:
+    def load(
+        cls, path_or_name: str | Path, overrides: Iterable[str] = (), *, mesh: Any = None, plugins: Iterable[Any] = ()
+    ) -> Case:
         """Read a case file, or a built-in case by its name.
 
         Parameters
@@ -154,6 +174,7 @@ class Case(Editable):
         path_or_name : TOML file, or name of a built-in case
         overrides : strings such as ``"time.step=1e-5"`` that override values of the file
         mesh : Truss that replaces the mesh of the file
+        plugins : files with modules, in addition to those of the case; relative to the working directory
 
         Raises
         ------
@@ -161,8 +182,15 @@ class Case(Editable):
             Names all invalid keys.
         """
         path = built_in_path(str(path_or_name)) or Path(path_or_name)
+        data = parse_toml(read_text(path), str(path))
+        if plugins:
+            own = data.get("plugins", [])
+            data["plugins"] = [
+                *(own if isinstance(own, list) else [own]),
+                *(str(Path(each).resolve()) for each in plugins),
+            ]
         named: dict[str, Any] = {"name": path.stem, "source": str(path), "overrides": overrides, "mesh": mesh}
-        return cls.from_toml(read_text(path), path.parent, **named)
+        return cls.from_dict(data, folder=path.parent, **named)
 
     from_file = load
 
@@ -176,10 +204,14 @@ class Case(Editable):
         source: str = "case",
         overrides: Iterable[str] = (),
         mesh: Any = None,
+        lenient: bool = False,
     ) -> Case:
-        """Read the text of a case; see :meth:`load`. The path of its mesh file is relative to ``folder``."""
-        data = parse_toml(text, source)
-        return cls.from_dict(data, name=name, source=source, folder=folder, overrides=overrides, mesh=mesh)
+        """Read the text of a case; see :meth:`load`. The path of its mesh file is relative to ``folder``.
+
+        If ``lenient``, as for the case of a result, plugins are not run, and what is missing is a warning.
+        """
+        data, keys = parse_toml(text, source), {"overrides": overrides, "mesh": mesh, "lenient": lenient}
+        return cls.from_dict(data, name=name, source=source, folder=folder, **keys)
 
     @classmethod
     def from_dict(
@@ -191,6 +223,7 @@ class Case(Editable):
         folder: str | Path = ".",
         overrides: Iterable[str] = (),
         mesh: Any = None,
+        lenient: bool = False,
     ) -> Case:
         """Validate a case given as nested tables with the keys of the case file; see :meth:`load`.
 
@@ -203,35 +236,42 @@ class Case(Editable):
                 "Case.from_toml its text"
             )
         try:
-            overrides = tuple(overrides)
-            data = plain(dict(data), copied=bool(overrides))
+            data = plain(data)
             if mesh is not None:
                 data["mesh"] = _with_arrays(data.get("mesh"), plain(mesh))
         except RecursionError as error:
             raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
+        overrides, folder = tuple(overrides), Path(folder)
         problems = Problems(source, apply_overrides(data, overrides))
-        attributes = read_tables(data, Path(folder), problems)
-        check_names(attributes, data, problems)
-        stages = []
-        for stage in stages_of(data, problems) if "stage" in data else ():
-            tables = read_tables(stage.data, Path(folder), stage.problems)
-            check_names(tables, stage.data, stage.problems)
-            stages.append((stage, tables))
+        stages = stages_of(data, problems) if "stage" in data else []
+        if not lenient:
+            _add_plugins(data.get("plugins"), folder, problems)
+        reading = [Reading(tables, folder, lenient) for tables in (data, *(stage.data for stage in stages))]
+        model = _validated(data, reading[0], problems)
+        models = [
+            _validated(stage.data, each, problems, stage.place) for stage, each in zip(stages, reading[1:], strict=True)
+        ]
         problems.raise_if_any()
-        name = Path(source).stem if name is None else checked_name(name, source)
-        attributes["title"] = name if attributes["title"] is None else attributes["title"]
-        case = cls._of(attributes, name=name, source=source, folder=Path(folder))
-        case.__dict__["overrides"] = overrides
-        made = []
-        for k, (stage, tables) in enumerate(stages):
-            each = cls._of(tables, name=stage.name, source=f"{source}: stage[{k}]", folder=Path(folder))
-            made.append(each)
-            each.__dict__.update(title=attributes["title"], number=k, given=stage.given, overrides=overrides)
-            each.__dict__["stressed"] = stage.stressed
-        case.__dict__["stage"] = tuple(made)
-        removes = any(each.removes_bars for each in (case, *made))
-        for each in (case, *made):
-            each.__dict__["removes_bars"] = removes
+        missing = dict.fromkeys(text for each in reading for text in each.missing)
+        if missing:
+            text = f"{', '.join(missing)}: not there, as the plugin or package that has it; what needs it is left out"
+            warnings.warn(f"{source}: {text}", stacklevel=2)
+        name = Path(source).stem if name is None else _checked_name(name, source)
+        title = name if model.title is None else model.title
+        common = {"title": title, "folder": folder, "overrides": overrides}
+        case = cls._of(model, name=name, source=source, **common)
+        case.__dict__["stage"] = tuple(
+            cls._of(
+                tables,
+                name=stage.name,
+                source=f"{source}: stage[{k}]",
+                number=k,
+                given=stage.given,
+                stressed=stage.stressed,
+                **common,
+            )
+            for k, (stage, tables) in enumerate(zip(stages, models, strict=True))
+        )
         settle(case)
         return case
 
@@ -243,9 +283,151 @@ class Case(Editable):
         """Return the resolved case, with all defaults, as text from which :meth:`from_toml` reads an equal case."""
         return table_text(self.to_dict())
 
+    def __setattr__(self, key: str, value: Any) -> None:
+        if key == "name":
+            self.update({key: value})
+            return
+        known = [attribute_of(table) for table in KEYS]
+        if key not in known:
+            hint = "; nodal masses are point_mass" if key == "mass" else _hint(key, known)
+            raise InputError(f"{self.source}: {key}: a case has no table of this name{hint}")
+        self._edit({("mass" if key == "point_mass" else key,): value})
+
+    def __delattr__(self, key: str) -> None:
+        setattr(self, key, None)
+
+    def _edit(self, changes: Mapping[KeyPath, Any]) -> None:
+        """Make changes at key paths as of this case, which may be that of a stage: it is given whole tables itself."""
+        owner, place = self.editor
+        own = ("stage", self.number)
+        placed: list[tuple[KeyPath, Any]] = []
+        for path, value in changes.items():
+            given = owner is not self and len(path) == 1 and path[0] in STAGE_TABLES
+            placed.append(((*own, *path) if given else (*place(str(path[0])), *path[1:]), value))
+        owner.edit(placed)
+
+    def edit(self, changes: Iterable[tuple[KeyPath, Any]]) -> None:
+        """Make changes at key paths; :meth:`update` takes keys as strings.
+
+        Raises
+        ------
+        InputError
+            The case is unchanged.
+        """
+        self._check_not_fixed()
+        new = self._reread(changed_data(self, changes))
+        settle(self, attached=False)
+        for key in ("title", "plugins", *TABLES.values()):
+            self.__dict__[key] = merge(self.__dict__[key], new.__dict__[key])
+        self.__dict__["stage"] = merged_stages(self.stage, new.stage)
+        settle(self)
+
+    def _check_not_fixed(self) -> None:
+        if self.fixed:
+            raise InputError(
+                f"{self.source}: the case of a simulation cannot be changed; change the case that it was made from, "
+                "and make another simulation"
+            )
+
+    def update(self, changes: Mapping[str, Any] | None = None, /, **named: Any) -> None:
+        """Make several changes, and validate them together.
+
+        Parameters
+        ----------
+        changes : values by key, ``{"time.step": 1e-5, "wall[0].point": [0, 0, 1]}``; None removes a key
+        named : values of top-level keys, as for the constructor: ``name="stiff"``, ``wall=[]``
+
+        Raises
+        ------
+        InputError
+            The case is unchanged.
+        """
+        values = {**(changes or {}), **named}
+        of_stage = self.editor[0] is not self
+        name = None if of_stage or "name" not in values else _checked_name(values.pop("name"), self.source)
+        self._check_not_fixed()
+        if values:
+            self._edit({key_path(self, key): value for key, value in values.items()})
+        if name is not None:
+            self.__dict__["name"] = name
+
+    def copy(self, changes: Mapping[str, Any] | None = None, /, *, fixed: bool = False, **named: Any) -> Self:
+        """Return a copy, with changes as for :meth:`update`; if ``fixed``, the copy cannot be changed."""
+        made = self._reread(tables_of(self, given=True))
+        made.__dict__["overrides"] = self.overrides
+        made.update(changes, **named)
+        made.__dict__["fixed"] = fixed
+        return made
+
+    def _reread(self, tables: Mapping[str, Any]) -> Case:
+        return type(self).from_dict(tables, name=self.name, source=self.source, folder=self.folder)
+
+    def __copy__(self) -> Self:
+        return self.copy()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self.copy()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The plugins are added before what they have is read."""
+        state = {key: value for key, value in self.__dict__.items() if key != "editor"}
+        plugins = [path for path in self.plugins if has_plugin(path)]  # not those of a result, whose case is lenient
+        return _unpickled, (type(self), plugins, pickle.dumps(state))
+
 
 def _with_arrays(table: Any, mesh: Any) -> Any:
     """The table [mesh] with a truss instead of what it had; the truss must be that of its digest, if it has one."""
     if isinstance(table, Mapping) and "digest" in table and hasattr(mesh, "mesh_table"):
         return {**mesh.mesh_table, "digest": table["digest"]}
     return mesh
+
+
+def _unpickled(cls: type[Case], plugins: Iterable[str], state: bytes) -> Case:
+    for path in plugins:
+        add_plugin(path)
+    case = cls.__new__(cls)
+    case.__dict__.update(pickle.loads(state))
+    settle(case)
+    return case
+
+
+def _validated(
+    data: Mapping[str, Any], reading: Reading, problems: Problems, place: Callable[[KeyPath], KeyPath] = tuple
+) -> Any:
+    """Return the model of nested tables; if they are rejected, add the problems and return None."""
+    for key in [key for key in data if key not in KEYS]:
+        problems.add((key,), f"unknown key{_hint(key, KEYS)}")
+    for key in ("material", "section"):
+        if data.get(key, {}) == {}:
+            problems.add((), f"no [{key}.NAME] is given: a case needs at least one {key}")
+    if all(key in data for key in ANALYSES):
+        problems.add((), "[time] and [static] exclude each other: give one of them")
+    if not any(key in data for key in (*ANALYSES, "stage", "modes")):
+        problems.add((), "the table [time] is missing, or one of [static], [[stage]], [modes], which give the analysis")
+    # [[stage]] is checked by stages_of
+    known = {key: value for key, value in data.items() if key in KEYS and value is not None and key != "stage"}
+    return problems.validated(CaseModel, known, reading, place)
+
+
+def _add_plugins(given: Any, folder: Path, problems: Problems) -> None:
+    """Add the modules of the files ``plugins``; those that are no names are refused with the other keys."""
+    for i, name in enumerate(given if isinstance(given, list) else ()):
+        if isinstance(name, str) and name and "\0" not in name:
+            try:
+                add_plugin(folder / name)
+            except InputError as error:
+                problems.add(("plugins", i), str(error), name)
+
+
+def _hint(key: str, known: Iterable[str]) -> str:
+    """Return a hint about a top-level key that no case has."""
+    return f"; {_ARGUMENTS[key]}" if key in _ARGUMENTS else nearest(key, list(known))
+
+
+def _checked_name(name: Any, source: str) -> str:
+    """Return the name of a case, which is the default folder of its results below ``results``."""
+    if not isinstance(name, str) or not name.strip() or "\0" in name:
+        raise InputError(f"{source}: name = {name!r:.60}: expected a text, the default folder of the results")
+    if name.startswith("/") or ".." in name.split("/"):
+        raise InputError(f"{source}: name = {name!r:.60}: expected the name of a folder below results")
+    return name

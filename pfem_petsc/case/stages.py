@@ -12,47 +12,10 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from ..registry import nearest
-from .base import Name, NonNegativeInt, PositiveInt, StrictModel
-from .problems import Path, Problems
+from .model import ANALYSES, ONE_STAGE, STAGE_TABLES, StageName, StageOutput
+from .problems import Problems
 from .tables import PRESTRESSES
-
-__all__ = ["ANALYSES", "ONE_STAGE", "TABLES", "StageOutput", "StageTables", "stages_of"]
-
-ANALYSES = ("time", "static")
-"""Tables of which a stage has exactly one."""
-
-TABLES = (
-    "initial",
-    "support",
-    "load",
-    "gravity",
-    "wind",
-    "temperature",
-    "wall",
-    "remove",
-    "contact",
-    "output",
-    "solver",
-    "section",
-)
-"""Tables that a stage may give."""
-
-
-ONE_STAGE = ("initial", "remove")
-"""Tables that are in force in the stage alone that gives them."""
-
-
-class _Named(StrictModel):
-    name: Name
-
-
-class StageOutput(StrictModel):
-    """The keys of [stage.output]; what else is written is the same for all stages."""
-
-    fields_every: NonNegativeInt | None = None
-    """steps between field snapshots, counted from the start of the run; 0: none but the last of the stage"""
-    history_every: PositiveInt | None = None
-    """steps between rows of the history"""
+from .toml import KeyPath
 
 
 class StageTables(NamedTuple):
@@ -63,28 +26,18 @@ class StageTables(NamedTuple):
     name : of the stage
     data : the tables of the case that are in force
     given : the tables that the stage gives itself; stressed : names of the sections whose prestress it gives
-    problems : takes what is wrong with them
+    owner : the number of the stage that gave each table that is not the case's own
     """
 
     name: str
     data: dict[str, Any]
     given: tuple[str, ...]
     stressed: tuple[str, ...]
-    problems: Problems
+    owner: Mapping[str, int]
 
-
-class _Located(Problems):
-    """Problems of a stage's case, told where the table was given: ``stage[1].static.step``."""
-
-    def __init__(self, problems: Problems, owner: Mapping[str, int]) -> None:
-        super().__init__(problems.source)
-        self._problems, self._owner = problems, dict(owner)
-
-    def add(self, path: Path, message: str, value: Any = None) -> None:
-        """See :meth:`~pfem_petsc.case.problems.Problems.add`."""
-        if path and path[0] in self._owner:
-            path = ("stage", self._owner[path[0]], *path)
-        self._problems.add(path, message, value)
+    def place(self, path: KeyPath) -> KeyPath:
+        """Return the path in the case of a key of the tables in force: ``stage[1].static.step``."""
+        return ("stage", self.owner[str(path[0])], *path) if path and path[0] in self.owner else path
 
 
 def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
@@ -107,8 +60,10 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         name = _name(row, k, problems)
         if name in [stage.name for stage in found]:
             problems.add(("stage", k, "name"), "another stage has this name", name)
-        _refuse_unknown(row, k, problems)
-        given = tuple(key for key in TABLES if key in row)
+        known = ["name", *ANALYSES, *STAGE_TABLES]
+        for key in [key for key in row if key not in known]:
+            problems.add(("stage", k, key), f"unknown key of a stage{nearest(key, known)}")
+        given = tuple(key for key in STAGE_TABLES if key in row)
         tables = {key: row[key] for key in given}
         if "output" in tables:
             tables["output"] = _output(tables["output"], common.get("output", {}), k, problems)
@@ -128,21 +83,14 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         if k == last and "modes" in data:
             here["modes"] = data["modes"]
         stressed = tuple(row["section"]) if isinstance(row.get("section"), Mapping) else ()
-        found.append(StageTables(name, here, given, stressed, _Located(problems, owner)))
+        found.append(StageTables(name, here, given, stressed, dict(owner)))
     return found
 
 
 def _name(row: Mapping[str, Any], k: int, problems: Problems) -> str:
     name = row.get("name", f"stage{k + 1}")
-    read = problems.read(_Named, {"name": name}, ("stage", k))
+    read = problems.validated(StageName, {"name": name}, None, lambda path: ("stage", k, *path))
     return read.name if read is not None else f"stage{k + 1}"
-
-
-def _refuse_unknown(row: Mapping[str, Any], k: int, problems: Problems) -> None:
-    known = ["name", *ANALYSES, *TABLES]
-    for key in row:
-        if key not in known:
-            problems.add(("stage", k, key), f"unknown key of a stage{nearest(key, known)}")
 
 
 def _sections(given: Any, common: Any, k: int, problems: Problems) -> Any:
@@ -166,7 +114,7 @@ def _sections(given: Any, common: Any, k: int, problems: Problems) -> Any:
 
 def _output(given: Any, common: Any, k: int, problems: Problems) -> Any:
     """The output of a stage: its keys over those of the case."""
-    read = problems.read(StageOutput, given, ("stage", k, "output"))
+    read = problems.validated(StageOutput, given, None, lambda path: ("stage", k, "output", *path))
     if read is None or not isinstance(common, Mapping):
         return common
     return {**common, **read.model_dump(exclude_none=True)}

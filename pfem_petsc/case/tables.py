@@ -1,13 +1,16 @@
-"""The tables of a case file that define the model, each with its keys (SI units)."""
+"""The tables of a case file, each with its keys (SI units); :mod:`~pfem_petsc.case.model` puts them together."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, InstanceOf, ValidationInfo, field_validator, model_validator
+import numpy as np
+from pydantic import AfterValidator, Field, PlainSerializer, ValidationInfo, field_validator, model_validator
 
+from ..errors import InputError
 from .base import (
     FileName,
     Finite,
@@ -16,49 +19,64 @@ from .base import (
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
+    PositiveInt,
     StrictModel,
+    Table2,
+    Table4,
     Vector3,
-    WithParameters,
+    WithFiles,
+    increasing,
+    is_finite_number,
     listed,
     number_or_rows,
+    refers,
+    refusal,
 )
-from .load_tables import Gravity, Load, LoadFile, Temperature, VaryingGravity, VaryingWind, Wind
-from .point_tables import Dashpot, NodalMass, Spring
-from .rows import increasing
-from .support_tables import Support
-
-__all__ = [
-    "ARRAYS",
-    "ContactPair",
-    "Dashpot",
-    "Gravity",
-    "Initial",
-    "Load",
-    "LoadFile",
-    "Mesh",
-    "MeshKeys",
-    "NodalMass",
-    "NodeSet",
-    "PRESTRESSES",
-    "Remove",
-    "Section",
-    "Spring",
-    "Support",
-    "Temperature",
-    "VaryingGravity",
-    "VaryingWind",
-    "Wind",
-]
+from .files import digest_of
 
 Indices = Annotated[tuple[NonNegativeInt, ...], listed]
 
 
-ARRAYS = "arrays"
-"""The generator of meshes that are given as arrays, or in the case file itself."""
+def distinct(what: str) -> AfterValidator:
+    """Annotation of a list of tables whose names must differ, those of a ``what``."""
+
+    def check(entries: Sequence[Any]) -> Sequence[Any]:
+        names = [entry.name for entry in entries]
+        twice = [i for i, name in enumerate(names) if name is not None and name in names[:i]]
+        if twice:
+            raise refusal(*(((i, "name"), f"another {what} has this name", names[i]) for i in twice))
+        return entries
+
+    return AfterValidator(check)
 
 
 PRESTRESSES = ("pretension", "prestress", "rest_length")
 """Keys of a section that prescribe rest lengths."""
+
+
+def _has_direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(value):
+        raise ValueError("has zero length; give a direction")
+    if not 1e-100 < max(map(abs, value)) < 1e100:
+        raise ValueError("has components out of range (1e-100 to 1e100); give a vector of about length 1")
+    return value
+
+
+_PARALLEL = 1e-6  # sine of the angle between two vectors that give no frame
+
+Direction = Annotated[Vector3, AfterValidator(_has_direction)]
+"""A vector of any length, which gives a direction."""
+
+
+def check_frame(frame: tuple[tuple[float, float, float], tuple[float, float, float]]) -> None:
+    """Refuse two vectors that give no frame."""
+    first, second = (np.array(row) / np.linalg.norm(row) for row in frame)
+    if np.linalg.norm(np.cross(first, second)) < _PARALLEL:
+        raise ValueError("the two vectors of frame are parallel; the second must point to the side of the y axis")
+
+
+def _path_of(name: str, info: ValidationInfo) -> Path:
+    return Path(name) if info.context is None else Path(info.context.folder, name).resolve()
 
 
 class MeshKeys(StrictModel):
@@ -66,7 +84,7 @@ class MeshKeys(StrictModel):
 
     generator: Name | None = None
     """name of a mesh generator"""
-    file: FileName | None = None
+    file: Annotated[FileName, AfterValidator(_path_of), PlainSerializer(str)] | None = None
     """mesh file, relative to the case file"""
 
     @model_validator(mode="after")
@@ -75,19 +93,6 @@ class MeshKeys(StrictModel):
             hint = "" if self.file else " (a file is made from arrays by pfem_petsc.write_mesh)"
             raise ValueError(f"expected exactly one of the keys generator, file{hint}")
         return self
-
-
-class Mesh(WithParameters):
-    """Source of the mesh: a generator with its parameters, or a file."""
-
-    generator: str | None = None
-    file: Path | None = None
-    parameters: InstanceOf[StrictModel] | None = None
-
-    @property
-    def arranged(self) -> bool:
-        """Whether a generator computes the mesh, which is then free of mistakes."""
-        return self.generator not in (None, ARRAYS)
 
 
 class NodeSet(StrictModel):
@@ -131,6 +136,32 @@ class NodeSet(StrictModel):
         return self
 
 
+class Rupture(StrictModel):
+    """A bar breaks at the end of the step in which it first reaches one of the limits."""
+
+    stress: PositiveFloat | None = None
+    """tensile stress [Pa]"""
+    strain: PositiveFloat | None = None
+    """tensile strain, without the thermal strain, in the strain measure of the material"""
+    compressive_stress: PositiveFloat | None = None
+    """magnitude of the compressive stress [Pa]"""
+    compressive_strain: PositiveFloat | None = None
+    """magnitude of the compressive strain, without the thermal strain"""
+    plastic_strain: PositiveFloat | None = None
+    """accumulated plastic strain; the magnitude of the plastic strain for laws that do not accumulate it"""
+    damage: PositiveFloat | None = None
+    """damage variable of the law"""
+    steps: PositiveInt = 1
+    """steps over which the force of a broken bar is reduced to zero in equal parts"""
+
+    @model_validator(mode="after")
+    def _at_least_one(self) -> Rupture:
+        limits = [key for key in type(self).model_fields if key != "steps"]
+        if all(getattr(self, key) is None for key in limits):
+            raise ValueError(f"expected at least one limit: {', '.join(limits)}")
+        return self
+
+
 class Section(StrictModel):
     """Cross-section and material of bars."""
 
@@ -138,7 +169,7 @@ class Section(StrictModel):
     """cross-section area [m2]"""
     area_field: Annotated[str, Field(min_length=1)] | None = None
     """cell field of the mesh file with the area of each bar [m2], instead of ``area``"""
-    material: str
+    material: Annotated[str, refers("material", "material")]
     """name of a material"""
     bars: str | None = None
     """bar group of the mesh; default: all bars that no other section names"""
@@ -208,7 +239,7 @@ class Section(StrictModel):
 class Initial(StrictModel):
     """Initial velocity v + w x (X - c) of a node set, or of all nodes if ``node_set`` is None."""
 
-    node_set: str | None = None
+    node_set: NodeSetName | None = None
     """name of a node set"""
     velocity: Vector3 = (0.0, 0.0, 0.0)
     """velocity v [m/s]"""
@@ -224,6 +255,305 @@ class Initial(StrictModel):
         return self
 
 
+def _moves_along(normal: tuple, rows: tuple, velocity: tuple | None) -> None:
+    """Refuse a motion that is all across the one direction in which a support prescribes it."""
+    given = np.array([row[1:] for row in rows] + ([velocity] if velocity is not None else []))
+    unit = np.array(normal) / np.linalg.norm(normal)
+    if given.any() and np.abs(given @ unit).max() <= _PARALLEL * np.abs(given).max():
+        raise ValueError("the motion has no component along normal, so it would have no effect")
+
+
+class Support(WithFiles):
+    """Fixed or prescribed position components of a node set."""
+
+    alternatives: ClassVar[tuple[str, ...]] = ("velocity",)
+
+    name: Name | None = None
+    """name, by which [[remove]] refers to the support; unique"""
+    node_set: NodeSetName
+    """name of a node set"""
+    fix: str | None = None
+    """the fixed components: any of x, y, z"""
+    frame: Annotated[tuple[Direction, Direction], listed] | None = None
+    """axes of ``fix`` that are not those of the model: x along the first vector, y in the plane of both, on the side of
+    the second"""
+    normal: Direction | None = None
+    """instead of ``fix``: the one direction along which displacements are prescribed, such as the normal of the plane
+    on which a roller moves"""
+    motion: Table4 | None = None
+    """rows [t, dx, dy, dz]: displacement from the mesh [s, m], at rest before the first and after the last row"""
+    velocity: Vector3 | None = None
+    """constant velocity of the fixed components [m/s]"""
+    acceleration: Table4 | None = None
+    """rows [t, ax, ay, az] [s, m/s2]: linear between rows, zero outside; the fixed components start from rest"""
+    motion_file: FileName | None = None
+    """the rows of ``motion`` from the columns of a CSV or NPZ file: its name, or a table of :class:`TableFile`"""
+    acceleration_file: FileName | None = None
+    """the rows of ``acceleration`` from a file in the same way"""
+    interpolation: Literal["smooth", "linear"] = "smooth"
+    """interpolation of ``motion`` between its rows: a cubic spline, or straight lines with velocity jumps at rows"""
+
+    @field_validator("fix")
+    @classmethod
+    def _components(cls, fix: str | None) -> str | None:
+        if fix is None:
+            return None
+        if not fix or set(fix) - set("xyz") or len(set(fix)) < len(fix):
+            raise ValueError('expected any of the components x, y, z, each once, like "xz"')
+        return fix
+
+    @model_validator(mode="after")
+    def _moves_what_it_fixes(self) -> Support:
+        keys = [key for key in ("motion", "velocity", "acceleration") if getattr(self, key) is not None]
+        if len(keys) > 1:
+            raise ValueError(
+                f"expected at most one of the keys motion, velocity, acceleration, acceleration_file; got {keys}"
+            )
+        if self.interpolation == "linear" and self.motion is None:
+            raise ValueError('interpolation = "linear" requires motion; accelerations are always linear between rows')
+        if (self.fix is None) == (self.normal is None):
+            raise ValueError("expected exactly one of the keys fix, normal")
+        if self.frame is not None:
+            if self.fix is None:
+                raise ValueError("frame defines the axes of fix; expected the key fix")
+            check_frame(self.frame)
+        if self.normal is not None:
+            _moves_along(self.normal, self.motion or self.acceleration or (), self.velocity)
+        if self.fix is None or self.frame is not None:
+            return self
+        for k, axis in enumerate("xyz"):
+            rows = self.motion or self.acceleration or ()
+            moves = any(row[1 + k] != 0.0 for row in rows) or (self.velocity is not None and self.velocity[k] != 0.0)
+            if moves and axis not in self.fix:
+                raise ValueError(f'{axis} is given a motion, but fix = "{self.fix}" leaves it free')
+        return self
+
+
+class NodalMass(StrictModel):
+    """Mass of each node of a node set, in addition to that of its bars."""
+
+    node_set: NodeSetName
+    """name of a node set"""
+    value: NonNegativeFloat
+    """mass of each node of the set [kg]"""
+
+
+class _GroundOrNodes(StrictModel):
+    """From each node of a node set to the ground, or between the nodes of two node sets."""
+
+    node_set: NodeSetName | None = None
+    """name of a node set, whose nodes are connected with the ground"""
+    between: Annotated[tuple[NodeSetName, NodeSetName], listed] | None = None
+    """instead: names of two node sets; each node of the second is connected with the nearest of the first"""
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> _GroundOrNodes:
+        if (self.node_set is None) == (self.between is None):
+            raise ValueError("expected exactly one of the keys node_set, between")
+        return self
+
+
+class Spring(_GroundOrNodes):
+    """Spring without force at the positions in the mesh."""
+
+    stiffness: Any
+    """stiffness [kx, ky, kz] of each node of the set along the axes, or k along the line between two nodes [N/m]"""
+    frame: Annotated[tuple[Direction, Direction], listed] | None = None
+    """x axis of the three values, and a vector on the side of their y axis; default: the axes of the model"""
+
+    @field_validator("stiffness")
+    @classmethod
+    def _as_many_as_directions(cls, value: Any, info: ValidationInfo) -> Any:
+        if info.data.get("between") is not None:
+            if not is_finite_number(value) or not value > 0.0:
+                raise ValueError("expected one number > 0 [N/m] between nodes, along the line from one to the other")
+            return float(value)
+        if not isinstance(value, list | tuple) or len(value) != 3 or not all(map(is_finite_number, value)):
+            raise ValueError("expected three numbers [kx, ky, kz] [N/m] to the ground")
+        if min(value) < 0.0:
+            raise ValueError("expected values >= 0")
+        return tuple(map(float, value))
+
+    @model_validator(mode="after")
+    def _frame_of_three_values(self) -> Spring:
+        if self.frame is not None:
+            if self.between is not None:
+                raise ValueError(
+                    "frame defines the axes of springs to the ground; springs between nodes act along their line"
+                )
+            check_frame(self.frame)
+        return self
+
+
+class Dashpot(_GroundOrNodes):
+    """Dashpot to the ground, or between nodes."""
+
+    coefficient: NonNegativeFloat
+    """force over velocity [N s/m]: of each node of the set, in any direction, or along the line between two nodes"""
+
+    @field_validator("coefficient")
+    @classmethod
+    def _acts(cls, value: float, info: ValidationInfo) -> float:
+        if info.data.get("between") is not None and not value:
+            raise ValueError("expected a number > 0 between nodes")
+        return value
+
+
+class Load(WithFiles):
+    """Force on each node of a node set."""
+
+    node_set: NodeSetName
+    """name of a node set"""
+    force: Vector3
+    """force on each node of the set [N]"""
+    table: Table2 | None = None
+    """rows [t, factor] [s, -], constant outside; default: factor 1"""
+    table_file: FileName | None = None
+    """the rows of ``table`` from the columns of a CSV or NPZ file: its name, or a table of :class:`TableFile`"""
+    interpolation: Literal["linear", "smooth"] = "linear"
+    """interpolation of ``table`` between its rows: straight lines, or a cubic spline"""
+
+    @model_validator(mode="after")
+    def _interpolates(self) -> Load:
+        if self.interpolation == "smooth" and self.table is None:
+            raise ValueError('interpolation = "smooth" requires table')
+        return self
+
+
+class LoadFile(StrictModel):
+    """Forces over time on many nodes or node sets, from one file (:mod:`~pfem_petsc.case.files`)."""
+
+    node_set: ClassVar[None] = None
+
+    file: FileName
+    """CSV or NPZ file with forces over time of nodes or node sets, relative to the case file"""
+    scale: Finite = 1.0
+    """factor of the forces"""
+    time_scale: PositiveFloat = 1.0
+    """factor of the times"""
+    interpolation: Literal["linear", "smooth"] = "linear"
+    """interpolation between the rows: straight lines, or a cubic spline"""
+    digest: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """SHA-256 of the content of the file, which results and checkpoints keep; default: that of the file"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _alone(cls, data: Any) -> Any:
+        taken = [key for key in ("node_set", "force", "table", "table_file") if key in data]
+        if taken:
+            raise ValueError(f"file gives the forces of nodes or node sets over time, without {', '.join(taken)}")
+        return data
+
+    @model_validator(mode="after")
+    def _found(self, info: ValidationInfo) -> LoadFile:
+        if info.context is not None:
+            path = Path(info.context.folder, self.file).resolve()
+            try:
+                digest = digest_of(path) if self.digest is None else self.digest
+            except InputError as error:
+                raise refusal((("file",), str(error), self.file)) from error
+            self._take(file=str(path), digest=digest)
+        return self
+
+
+class _Varying(WithFiles):
+    """A vector over time; the rows of its file are added to a constant vector."""
+
+    interpolation: Literal["linear", "smooth"] = "linear"
+    """interpolation between the rows: straight lines, or a cubic spline"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _added(cls, data: Any, info: ValidationInfo) -> Any:
+        key = next(key for key in cls.COLUMNS if key in cls.model_fields)
+        given = data.get(key)
+        if given is None or has_rows(given) or f"{key}_file" not in data:
+            return data
+        constant = getattr(cls.constant.model_validate({key: given}), key)
+        rest = cls._rows_of_files({name: value for name, value in data.items() if name != key}, info)
+        return {**rest, key: [[t, *(a + b for a, b in zip(row, constant, strict=True))] for t, *row in rest[key]]}
+
+
+def has_rows(value: Any) -> bool:
+    """Whether a value of a key that takes a vector is given over time."""
+    return isinstance(value, list | tuple) and any(isinstance(row, list | tuple) for row in value)
+
+
+class Gravity(WithFiles):
+    """Uniform acceleration of every mass."""
+
+    acceleration: Vector3
+    """acceleration [m/s2]; or rows [t, ax, ay, az] [s, m/s2], constant outside"""
+    acceleration_file: FileName | None = None
+    """such rows from the columns of a CSV or NPZ file, added to a constant acceleration"""
+
+    @property
+    def mean(self) -> tuple[float, ...]:
+        """Mean acceleration (3,) [m/s2]."""
+        return self.acceleration
+
+
+class VaryingGravity(_Varying, Gravity):
+    """Uniform acceleration of every mass that varies over time."""
+
+    constant: ClassVar[type[WithFiles]] = Gravity
+
+    acceleration: Table4
+    """rows [t, ax, ay, az] [s, m/s2], constant outside"""
+
+    @property
+    def mean(self) -> tuple[float, ...]:
+        """Mean of the rows (3,) [m/s2]."""
+        return tuple(np.mean(np.array(self.acceleration)[:, 1:], axis=0).tolist())
+
+
+class Wind(WithFiles):
+    """Wind that drags the bars, the same everywhere."""
+
+    velocity: Vector3
+    """velocity [m/s]; or rows [t, vx, vy, vz] [s, m/s], constant outside"""
+    velocity_file: FileName | None = None
+    """such rows from the columns of a CSV or NPZ file, added to a constant velocity"""
+    density: PositiveFloat = 1.225
+    """density of the fluid [kg/m3]; default: air at 15 degrees Celsius"""
+    drag_coefficient: NonNegativeFloat = 1.2
+    """drag coefficient C_d of bars whose section has none"""
+
+
+class VaryingWind(_Varying, Wind):
+    """Wind over time."""
+
+    constant: ClassVar[type[WithFiles]] = Wind
+
+    velocity: Table4
+    """rows [t, vx, vy, vz] [s, m/s], constant outside"""
+
+
+class Temperature(WithFiles):
+    """Temperature above reference of bars."""
+
+    alternatives: ClassVar[tuple[str, ...]] = ("value",)
+
+    bars: str | None = None
+    """bar group of the mesh; default: all bars"""
+    value: Finite | None = None
+    """temperature above reference [K]"""
+    table: Table2 | None = None
+    """rows [t, temperature above reference] [s, K], constant outside"""
+    table_file: FileName | None = None
+    """the rows of ``table`` from the columns of a CSV or NPZ file: its name, or a table of :class:`TableFile`"""
+    interpolation: Literal["linear", "smooth"] = "linear"
+    """interpolation of ``table`` between its rows: straight lines, or a cubic spline"""
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> Temperature:
+        if (self.value is None) == (self.table is None):
+            raise ValueError("expected exactly one of the keys value, table, table_file")
+        if self.interpolation == "smooth" and self.table is None:
+            raise ValueError('interpolation = "smooth" requires table')
+        return self
+
+
 class ContactPair(StrictModel):
     """Nodes of two bodies that cannot pass each other along a direction, in pairs."""
 
@@ -233,19 +563,10 @@ class ContactPair(StrictModel):
     """name of a node set"""
     second: NodeSetName
     """name of a node set of equal size; each node is paired with the nearest of first, seen along the direction"""
-    direction: Vector3
+    direction: Direction
     """points from the first nodes to the second"""
     gap: Finite = 0.0
     """smallest distance of second from first along the direction [m]"""
-
-    @field_validator("direction")
-    @classmethod
-    def _has_length(cls, value: Vector3) -> Vector3:
-        if not any(value):
-            raise ValueError("has zero length; give the direction from first to second")
-        if not 1e-100 < max(map(abs, value)) < 1e100:
-            raise ValueError("has components out of range (1e-100 to 1e100); give a vector of about length 1")
-        return value
 
 
 class Remove(StrictModel):
@@ -253,7 +574,7 @@ class Remove(StrictModel):
 
     bars: str | None = None
     """bar group of the mesh"""
-    supports: str | None = None
+    supports: Annotated[str, refers("support", "support")] | None = None
     """name of a support"""
     time: NonNegativeFloat
     """time [s], or load factor, at which the removal begins"""
@@ -265,3 +586,124 @@ class Remove(StrictModel):
         if (self.bars is None) == (self.supports is None):
             raise ValueError("expected exactly one of the keys bars, supports")
         return self
+
+
+class ContactSettings(StrictModel):
+    """Treatment of contact."""
+
+    treatment: str = "scheme"
+    """treatment of impact: velocity and acceleration of nodes in contact"""
+
+
+class TimeKeys(StrictModel):
+    """The keys of [time] other than those of an integrator."""
+
+    integrator: str
+    """name of a time integration scheme"""
+    step: Any
+    """time step [s], or "auto" with an explicit scheme"""
+    end: PositiveFloat
+    """end time [s]"""
+    mass: Literal["lumped", "consistent"] = "lumped"
+    """mass matrix"""
+    safety: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
+    """factor on the critical step if step = "auto\""""
+    damping_table: Table2 | None = None
+    """rows [t, factor] [s, -] of the damping of all materials over time, constant outside; default: factor 1"""
+
+    @field_validator("damping_table")
+    @classmethod
+    def _factors(cls, table: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
+        if any(row[1] < 0.0 for row in table or ()):
+            raise ValueError("expected factors >= 0")
+        return table
+
+    @field_validator("step")
+    @classmethod
+    def _step(cls, step: Any) -> float | str:
+        if step == "auto":
+            return "auto"
+        if isinstance(step, bool) or not isinstance(step, int | float):
+            raise ValueError('expected a number of seconds in SI units without quotes and unit, or "auto"')
+        if not (step > 0 and is_finite_number(step)):
+            raise ValueError('expected a finite number of seconds > 0, or "auto"')
+        return _computable(float(step))
+
+    @field_validator("end")
+    @classmethod
+    def _end(cls, end: float) -> float:
+        return _computable(end)
+
+
+def _computable(seconds: float) -> float:
+    """Refuse times whose powers in the formulas of the schemes overflow double precision."""
+    if not 1e-50 <= seconds <= 1e50:
+        raise ValueError("overflows double precision in the formulas of the schemes; give seconds from 1e-50 to 1e50")
+    return seconds
+
+
+class StaticKeys(StrictModel):
+    """The keys of [static] that are not a method's own."""
+
+    method: str = "newton"
+    """name of a method that finds equilibria"""
+
+
+class Modes(StrictModel):
+    """Modes of the state at the end of the analysis, or of the initial state where the case has none."""
+
+    count: PositiveInt = 10
+    """number of modes"""
+    kind: Literal["vibration", "buckling"] = "vibration"
+    """natural frequencies, or linear buckling factors of the load"""
+    mass: Literal["lumped", "consistent"] | None = None
+    """mass matrix; default: that of [time], lumped without it"""
+    solver: Literal["auto", "dense", "scipy", "slepc"] = "auto"
+    """library that solves the eigenvalue problem"""
+
+
+class Probe(StrictModel):
+    """A node set whose motion and reaction are recorded in the history."""
+
+    name: Name
+    """name of the probe in the results"""
+    node_set: NodeSetName
+    """name of a node set"""
+
+
+class Output(StrictModel):
+    """Outputs and their intervals."""
+
+    fields_every: NonNegativeInt = 10
+    """steps between field snapshots; 0: only first and last"""
+    history_every: PositiveInt = 1
+    """steps between rows of the history"""
+    checkpoint_every: NonNegativeInt = 0
+    """steps between checkpoints; 0: none"""
+    checkpoint_minutes: NonNegativeFloat = 0.0
+    """wall-clock time between checkpoints [min]; 0: none"""
+    fields: Annotated[tuple[str, ...], listed] | None = None
+    """names of the fields to write; default: all"""
+    precision: Literal["float64", "float32"] = "float64"
+    """precision of the fields in the result file"""
+    compression: Literal["none", "gzip"] = "none"
+    """lossless, of positions and fields in the result file; "gzip" takes ten times as long to write"""
+    probe: Annotated[tuple[Probe, ...], listed, distinct("probe")] = ()
+    """node sets whose motion and reaction the history has"""
+
+
+class Solver(StrictModel):
+    """Solution of the nonlinear and linear systems."""
+
+    linear: Literal["auto", "cg", "multigrid", "gamg", "mumps"] = "auto"
+    """linear solver"""
+    operator: Literal["auto", "assembled", "matrix_free"] = "auto"
+    """form of the Hessian"""
+    rtol: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-9
+    """relative tolerance of the residual"""
+    atol: PositiveFloat | None = None
+    """absolute tolerance of the residual [N]; default: from the model's force scale"""
+    max_newton: PositiveInt = 50
+    """maximum number of Newton iterations in a step"""
+    guard: bool = True
+    """whether converged implicit steps that are unrelated to the previous state are rejected and bisected"""

@@ -1,83 +1,107 @@
-"""Reads and writes TOML: tables of numbers, strings, booleans, lists and tables, as in case files."""
+"""The text of case files: the built-in ones, TOML that is read and written, and dotted keys."""
 
 from __future__ import annotations
 
+import difflib
 import json
 import re
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Mapping, Sequence
 from itertools import chain
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
-import numpy as np
+from ..errors import InputError
+from ..files import readable_whole
 
-__all__ = ["cut_rows", "plain", "put_rows_back", "table_text", "value_text"]
+FOLDER = Path(__file__).parent.parent / "cases"
 
-_PLAIN = {float, int, str, bool}
+KeyPath = tuple[str | int, ...]
+"""Path of a value in a case: keys of tables and indices of lists."""
+
+DEEPEST = 100
+"""Largest number of parts of a dotted key; the parsing time grows with their square."""
 
 
-def plain(value: Any, copied: bool = True) -> Any:
-    """A copy of nested tables and lists in Python's own types, those of NumPy, tuples, ranges and paths resolved.
+def built_in_cases() -> list[str]:
+    """Return the names of the built-in cases."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
-    Unless ``copied``, rows of numbers are not copied, of which tables over time may have many.
+
+def built_in_path(name: str) -> Path | None:
+    """Return the file of a built-in case, or None if there is no such case."""
+    return FOLDER / f"{name}.toml" if name in built_in_cases() else None
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a case file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read; the nearest built-in case is named.
     """
+    try:
+        return readable_whole(path).read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise InputError(f"{path}: line {line}: this is not UTF-8 text; a case file is TOML in UTF-8") from error
+    except FileNotFoundError as error:
+        names = built_in_cases()
+        near = difflib.get_close_matches(str(path), names, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"the built-in cases are {', '.join(names)}"
+        raise InputError(f"{path}: there is no such case file or built-in case; {hint}") from error
+    except IsADirectoryError as error:
+        raise InputError(
+            f"{path}: this is a folder; name a case file or a built-in case, and the folder of its results by -o"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: this case file cannot be read: {error}") from error
+
+
+_LONG_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*)""" + f"{{{DEEPEST}}}")
+
+
+def parse_toml(text: str, source: str) -> dict[str, Any]:
+    """Parse TOML text to nested tables.
+
+    Raises
+    ------
+    InputError
+        On a syntax error; the message names line and column.
+    """
+    if (found := _LONG_KEY.search(text)) is not None:
+        line = text.count("\n", 0, found.start()) + 1
+        raise InputError(f"{source}: line {line}: this is not a case: a key of more than {DEEPEST} parts")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{source}: this is not valid TOML: {error}") from error
+    except ValueError as error:
+        # Python limits the number of digits of integers
+        raise InputError(f"{source}: this is not a case: it has an integer of more than 4,300 digits") from error
+    except RecursionError as error:
+        raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
+
+
+def plain(value: Any) -> Any:
+    """Return nested tables and lists in Python's own types; NumPy's, tuples, ranges, paths and tables are resolved."""
     if isinstance(value, Mapping):
-        return {key: plain(item, copied) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | range):
-        if _has_rows(value):
-            return list(map(list, value)) if copied else value
-        return [item if type(item) in _PLAIN else plain(item, copied) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
+        if _has_rows(value):  # of which tables over time may have many
+            return list(map(list, value))
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
         return value.tolist()
+    if hasattr(value, "as_table"):  # a table of a case
+        return plain(value.as_table(given=True))
     return str(value) if isinstance(value, PurePath) else value
 
 
-def _has_rows(value: Any) -> bool:
-    """Whether a value is a list of lists of plain values."""
-    return (
-        type(value) is list and set(map(type, value)) == {list} and set(map(type, chain.from_iterable(value))) <= _PLAIN
-    )
-
-
-_ROWS = re.compile(r"=\s*(\[\s*\[[-+0-9eE.,\s\[\]]{2000,}\])[ \t]*(?=[\r\n,}]|$)")
-
-
-def cut_rows(text: str) -> tuple[str, list[Any]]:
-    """Return TOML text with marks, which are texts, in the place of long lists of rows of numbers; and these lists.
-
-    Such a list is mostly valid JSON, whose reader is fifty times as fast as that of TOML. Others stay in the text.
-    """
-    rows: list[Any] = []
-
-    def cut(match: re.Match[str]) -> str:
-        try:
-            rows.append(json.loads(match[1]))
-        except (ValueError, RecursionError):  # no JSON, or nested too deep
-            return match[0]
-        return f'= "{_MARK}{len(rows) - 1}"'
-
-    return (text, []) if _MARK in text else (_ROWS.sub(cut, text), rows)
-
-
-_MARK = "rows cut out: "
-
-
-def put_rows_back(data: Any, rows: list[Any]) -> bool:
-    """Replace the marks in nested tables by their lists; return False if one is missing, or part of a text."""
-    found = 0
-    left = [data]
-    while left:
-        here = left.pop()
-        for key, item in here.items() if isinstance(here, dict) else enumerate(here):
-            if isinstance(item, dict | list):
-                left.append(item)
-            elif isinstance(item, str) and _MARK in item:
-                number = item.removeprefix(_MARK)
-                if not number.isdigit():
-                    return False
-                here[key] = rows[int(number)]
-                found += 1
-    return found == len(rows)
+def _has_rows(value: Sequence[Any]) -> bool:
+    """Whether a list has lists of plain values alone."""
+    return set(map(type, value)) == {list} and set(map(type, chain.from_iterable(value))) <= {float, int, str, bool}
 
 
 def value_text(value: Any) -> str:
@@ -121,3 +145,33 @@ def _is_nested(value: Any) -> bool:
 
 def _key(key: str) -> str:
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", str(key)) else value_text(key)
+
+
+def key_text(path: KeyPath) -> str:
+    """Return a key path as users write it: ``wall[0].normal``."""
+    text = ""
+    for part in path:
+        text += f"[{part}]" if isinstance(part, int) else ("." if text else "") + _key(part)
+    return text
+
+
+_PART = re.compile(r"""(?:"((?:[^"\\]|\\.)*)"|([^.\[\]"]+))|\[(\d+)\]""")
+
+
+def split_key(key: str) -> list[str] | None:
+    """Return the parts of a dotted path, including indices in brackets; None if it is malformed."""
+    parts, position = [], 0
+    while position < len(key):
+        match = _PART.match(key, position)
+        if match is None:
+            return None
+        quoted, bare, index = match.groups()
+        parts.append(next(p.strip() for p in (quoted, bare, index) if p is not None))
+        position = match.end()
+        if position < len(key) and key[position] == ".":
+            position += 1
+            if position == len(key):
+                return None
+        elif position < len(key) and key[position] != "[":
+            return None
+    return parts if parts and all(parts) else None

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import ast
-import importlib.util
 import tomllib
-from pathlib import Path
 
-from ..case.builtin import built_in_cases, built_in_path
-from ..registry import choices
+from ..case.toml import built_in_cases, built_in_path
+from ..registry import choices, description
 from .parser import PROGRAM
 
 RANKS = "one, without MPI"
@@ -21,8 +18,7 @@ example:
 KINDS = {
     "integrators": "pfem_petsc.integrators",
     "mesh generators": "pfem_petsc.mesh.generators",
-    "mesh formats that are read": "pfem_petsc.mesh.readers",
-    "mesh formats that are written": "pfem_petsc.mesh.writers",
+    "mesh formats": "pfem_petsc.formats",
     "material laws": "pfem_petsc.mechanics.materials",
     "walls": "pfem_petsc.contact.walls",
     "constraints": "pfem_petsc.contact.constraints",
@@ -39,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Print the lists."""
     sections = {"built-in cases": {name: _title(name) for name in built_in_cases()}}
     for kind, package in KINDS.items():
-        sections[kind] = {name: _first_line(f"{package}.{name}") for name in choices(package)}
+        sections[kind] = {name: description(package, name) for name in choices(package)}
     width = max(len(name) for lines in sections.values() for name in lines)
     for kind, lines in sections.items():
         print(f"{kind}:")
@@ -52,10 +48,3 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _title(name: str) -> str:
     return tomllib.loads(built_in_path(name).read_text(encoding="utf-8"))["title"]
-
-
-def _first_line(module: str) -> str:
-    """Return the first line of a module's docstring without importing it (some modules compile kernels)."""
-    spec = importlib.util.find_spec(module)
-    text = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or ""
-    return text.partition("\n")[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -106,38 +106,52 @@ def _distance(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Do what the subcommand says, and return the exit status."""
-    actions: dict[str, Callable[[argparse.Namespace], None]] = {
-        "generate": _generate,
-        "convert": _convert,
-        "refine": _refine,
-        "merge": _merge,
-        "clean": _clean,
-        "info": _info,
-        "picture": _picture,
-    }
-    actions[arguments.action](arguments)
+    from ..formats import writer_of
+    from ..mesh.tools import cleaned, merged, refined
+
+    def inputs() -> list[WholeMesh]:
+        paths = arguments.inputs if "inputs" in arguments else [arguments.input]
+        return [_read(path, arguments.scale) for path in paths]
+
+    match arguments.action:
+        case "generate":
+            writer_of(arguments.output)  # before a long computation
+            _write(arguments, _made(arguments.what, arguments.overrides))
+        case "convert":
+            _write(arguments, *inputs())
+        case "refine":
+            _write(arguments, refined(*inputs(), arguments.parts))
+        case "merge":
+            _write(arguments, *merged(inputs(), arguments.tolerance))
+        case "clean":
+            mesh, done = cleaned(*inputs(), arguments.tolerance, arguments.sum_areas)
+            _write(arguments, mesh, done or ["nothing to clean"])
+        case "info":
+            _info(arguments)
+        case "picture":
+            _picture(arguments)
     return 0
 
 
 def _read(path: Path, scale: float) -> WholeMesh:
     """Read a file, and print what its reader has to say."""
-    from ..mesh.readers import read_whole
+    from ..formats import read_whole
     from ..mesh.tools import scaled
 
     mesh = read_whole(path)
-    for text in mesh.warnings:
-        print(printable(f"warning: {text}"))
+    _tell(f"warning: {text}" for text in mesh.warnings)
     mesh.warnings = []
     return mesh if scale == 1.0 else scaled(mesh, scale)
 
 
-def _write(arguments: argparse.Namespace, mesh: WholeMesh) -> None:
-    """Write the mesh, and a case file if there is to be one; print what they are."""
+def _write(arguments: argparse.Namespace, mesh: WholeMesh, done: Sequence[str] = ()) -> None:
+    """Write the mesh, and a case file if there is to be one; print what was ``done`` to it, and what they are."""
     import numpy as np
 
+    from ..formats import write_whole
     from ..mesh.whole import skeleton
-    from ..mesh.writers import write_whole
 
+    _tell(done)
     if arguments.area is not None:
         mesh.bar_fields["area"] = np.full(len(mesh.bars), arguments.area)
         for keys in mesh.tables.get("section", {}).values():
@@ -146,21 +160,13 @@ def _write(arguments: argparse.Namespace, mesh: WholeMesh) -> None:
     if arguments.case is not None and arguments.case.exists():
         raise InputError(f"--case {arguments.case}: this file exists; remove it, or give another name")
     path = write_whole(arguments.output, mesh)
-    print(printable(f"{arguments.output}: {len(mesh.points):,} nodes, {len(mesh.bars):,} bars"))
+    _tell([f"{arguments.output}: {len(mesh.points):,} nodes, {len(mesh.bars):,} bars"])
     if arguments.case is not None:
         try:
             arguments.case.write_text(skeleton(mesh, path, arguments.case), encoding="utf-8")
         except OSError as error:
             raise InputError(f"--case {arguments.case}: cannot be written: {error.strerror}") from error
-        print(printable(f"{arguments.case}: a case for this mesh; see the comments at its top"))
-
-
-def _generate(arguments: argparse.Namespace) -> None:
-    """Generate the mesh of a case, or of a generator, with the areas and materials of the case."""
-    from ..mesh.writers import writer_name
-
-    writer_name(arguments.output)  # before a long computation
-    _write(arguments, _made(arguments.what, arguments.overrides))
+        _tell([f"{arguments.case}: a case for this mesh; see the comments at its top"])
 
 
 def _made(what: str, overrides: list[str]) -> WholeMesh:
@@ -187,7 +193,7 @@ def _made(what: str, overrides: list[str]) -> WholeMesh:
     keys = case.mesh.parameters
     names = dict(getattr(keys, "bar_fields", None) or getattr(getattr(keys, "truss", None), "bar_fields", None) or {})
     if case.mesh.file is not None:
-        from ..mesh.readers import read_whole
+        from ..formats import read_whole
 
         names = read_whole(case.mesh.file).bar_fields
     slab = load_slab(case.mesh, MPI.COMM_SELF, dict.fromkeys(names, "mesh.bar_fields"))
@@ -206,46 +212,19 @@ def _made(what: str, overrides: list[str]) -> WholeMesh:
     return mesh
 
 
-def _convert(arguments: argparse.Namespace) -> None:
-    _write(arguments, _read(arguments.input, arguments.scale))
-
-
-def _refine(arguments: argparse.Namespace) -> None:
-    from ..mesh.tools import refined
-
-    _write(arguments, refined(_read(arguments.input, arguments.scale), arguments.parts))
-
-
-def _merge(arguments: argparse.Namespace) -> None:
-    from ..mesh.tools import merged
-
-    mesh, done = merged([_read(path, arguments.scale) for path in arguments.inputs], arguments.tolerance)
-    _tell(done)
-    _write(arguments, mesh)
-
-
-def _clean(arguments: argparse.Namespace) -> None:
-    from ..mesh.tools import cleaned
-
-    mesh, done = cleaned(_read(arguments.input, arguments.scale), arguments.tolerance, arguments.sum_areas)
-    _tell(done or ["nothing to clean"])
-    _write(arguments, mesh)
-
-
-def _tell(lines: list[str]) -> None:
+def _tell(lines: Iterable[str]) -> None:
     for line in lines:
         print(printable(line))
 
 
 def _info(arguments: argparse.Namespace) -> None:
-    from ..mesh.summary import summary
+    from ..mesh.tools import summary
 
     for path in arguments.inputs:
         mesh = _read(path, arguments.scale)
         lines = summary(mesh, arguments.tolerance)
         width = max(len(label) for label, _ in lines)
-        print(printable(str(path)))
-        _tell([f"  {label:{width}}  {text}" for label, text in lines])
+        _tell([str(path), *(f"  {label:{width}}  {text}" for label, text in lines)])
 
 
 def _picture(arguments: argparse.Namespace) -> None:
@@ -261,4 +240,4 @@ def _picture(arguments: argparse.Namespace) -> None:
         output.write_bytes(data)
     except OSError as error:
         raise InputError(f"{output}: cannot be written: {error.strerror}") from error
-    print(printable(str(output)))
+    _tell([str(output)])

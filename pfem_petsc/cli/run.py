@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EarlyStop, SimulationFailure
-from .parser import PROGRAM, add_case, seconds
-from .petsc_options import start_petsc
+from .parser import PROGRAM, add_case, add_plugins, seconds, start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -32,6 +31,7 @@ exit status: 0 done, 2 invalid input, 3 the simulation failed, 4 stopped early w
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     add_case(parser)
+    add_plugins(parser)
     parser.add_argument(
         "-o", "--output", metavar="DIR", type=Path, help="output folder; default: results/NAME OF THE CASE"
     )
@@ -86,8 +86,8 @@ def load_case(arguments: argparse.Namespace, comm: MPI.Comm) -> Case:
 
 
 def _load(arguments: argparse.Namespace) -> Case:
-    from ..case.builtin import built_in_path
     from ..case.schema import Case
+    from ..case.toml import built_in_path
 
     overrides = arguments.overrides
     restart = getattr(arguments, "restart", None)
@@ -97,18 +97,17 @@ def _load(arguments: argparse.Namespace) -> Case:
         name = (built_in_path(arguments.case) or Path(arguments.case)).stem
         kept = kept_overrides(name, arguments.output or Path("results", name), restart)
         overrides = joined_overrides(kept, overrides)
-    return Case.load(arguments.case, overrides)
+    return Case.load(arguments.case, overrides, plugins=arguments.plugins)
 
 
 def _command(arguments: argparse.Namespace, case: Case, ranks: int) -> str:
     """Return the shell command that continues this run."""
-    launcher = []
-    if ranks > 1:
-        launcher = ["srun" if "SLURM_STEP_NUM_TASKS" in os.environ else "mpirun", "-n", str(ranks)]
-    words = [*launcher, *PROGRAM.split(), str(arguments.case)]
+    launcher = ["srun" if "SLURM_STEP_NUM_TASKS" in os.environ else "mpirun", "-n", str(ranks)]
+    words = [*(launcher if ranks > 1 else ()), *PROGRAM.split(), str(arguments.case)]
     words += ["-o", str(arguments.output)] if arguments.output is not None else []
     words += ["--quiet"] if arguments.quiet else []
     words += ["--wall-time", f"{arguments.wall_time:g}"] if arguments.wall_time is not None else []
+    words += ["--plugin", *arguments.plugins] if arguments.plugins else []
     words += ["--set", *case.overrides] if case.overrides else []
     words += ["--restart"]
     words += ["--", *arguments.petsc_options] if arguments.petsc_options else []

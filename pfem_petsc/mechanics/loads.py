@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ..case.load_files import Forces, read_forces
-from ..case.load_tables import VaryingWind
-from ..case.tables import LoadFile, VaryingGravity
+from ..case.files import Forces, read_forces
+from ..case.tables import LoadFile, VaryingGravity, VaryingWind
 from ..errors import InputError
 from ..parallel.agreement import on_root
 from ..registry import nearest

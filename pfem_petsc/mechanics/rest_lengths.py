@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..case.materials import law_of
 from ..errors import InputError
 from ..mesh.node_sets import group_hint
 from .bar_loops import COLLAPSED_STRETCH, no_variables
 from .conserving import MEASURES
+from .materials.base import law_of
 from .motion import Table
 from .rupture import intact
 

@@ -25,14 +25,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba.extending import register_jitable
 
-from ..energies import STORED
+from ..columns import STORED
 from .bar_loops import no_bar_data, no_variables
 from .compiled import inlined, kernel
 from .materials.base import Law
 from .rows import bar_value, blend, extend, keep_where, put, sum_where, sum_with, take
 
 if TYPE_CHECKING:
-    from ..case.rupture import Rupture
+    from ..case.tables import Rupture
 
 __all__ = ["LIMITS", "WHOLE", "breakable", "intact", "limit_values", "make_release", "variable_of"]
 
@@ -100,8 +100,8 @@ def make_release(law: Law, measure: Callable[..., Any]) -> Callable[..., Any]:
     """Make the loop that removes a share of bars, for a law that is not breakable itself; see :func:`breakable`.
 
     Its arguments are those of the loops in :mod:`~pfem_petsc.mechanics.bar_loops`; ``members``, the local bars; the
-    state -r that they are to have, if they have not left further; ``counted``, the end of the bars counted on this rank; and
-    ``moved``, to which the stored energies that are released [J] are added, one for each energy of the law.
+    state -r that they are to have, if they have not left further; ``counted``, the end of the bars counted on this
+    rank; and ``moved``, to which the stored energies that are released [J] are added, one for each energy of the law.
     """
     count, like = len(law.internal), no_variables(law)
     stored = np.array([name in STORED for name in law.energies])

@@ -17,8 +17,8 @@ from .supports import axes_of
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from ..solvers.matrix import BlockPattern
     from .bars import Bars
+    from .block_pattern import BlockPattern
 
 
 class Springs:

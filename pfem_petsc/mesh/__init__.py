@@ -53,7 +53,7 @@ def load_slab(
                 except MemoryError:
                     raise InputError(f"mesh: the {mesh.generator} does not fit in this machine's memory") from None
     else:
-        from .readers import read_slab
+        from ..formats import read_slab
 
         slab = read_slab(Path(mesh.file), comm, fields or {})
     slab.warnings = check_mesh(slab, comm)

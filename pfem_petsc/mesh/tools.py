@@ -1,8 +1,9 @@
-"""Operations on whole meshes: clean, merge, refine, scale. Each returns a new mesh, for one rank."""
+"""Operations on whole meshes, for one rank: clean, merge, refine and scale, which return a new mesh, and a summary."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,6 @@ import numpy as np
 
 from ..errors import InputError
 from .whole import WholeMesh
-
-__all__ = ["cleaned", "coincident", "components", "copies", "lengths", "merged", "refined", "scaled", "tolerance_of"]
 
 MERGED = 1e-6
 """Default of the distance up to which nodes are merged, over the mean length of the bars."""
@@ -135,15 +134,13 @@ def cleaned(mesh: WholeMesh, tolerance: float | None = None, sum_areas: bool = F
     new_bar = np.full(len(bars), -1)
     new_bar[kept] = np.arange(len(kept))
     new_bar = np.where(first >= 0, new_bar[first], -1)
-    return WholeMesh(
-        mesh.points[used],
-        new_node[bars[kept]],
-        _renumbered(mesh.node_groups, new_node),
-        _renumbered(mesh.bar_groups, new_bar),
-        fields,
-        mesh.tables,
-        mesh.warnings,
-        source=mesh.source,
+    return replace(
+        mesh,
+        points=mesh.points[used],
+        bars=new_node[bars[kept]],
+        node_groups=_renumbered(mesh.node_groups, new_node),
+        bar_groups=_renumbered(mesh.bar_groups, new_bar),
+        bar_fields=fields,
     ), done
 
 
@@ -210,15 +207,13 @@ def refined(mesh: WholeMesh, n: int) -> WholeMesh:
     groups = {
         name: (np.asarray(members)[:, None] * n + np.arange(n)).ravel() for name, members in mesh.bar_groups.items()
     }
-    return WholeMesh(
-        np.concatenate([mesh.points, inner]),
-        bars,
-        dict(mesh.node_groups),
-        groups,
-        {name: np.repeat(values, n) for name, values in mesh.bar_fields.items()},
-        mesh.tables,
-        mesh.warnings,
-        source=mesh.source,
+    return replace(
+        mesh,
+        points=np.concatenate([mesh.points, inner]),
+        bars=bars,
+        node_groups=dict(mesh.node_groups),
+        bar_groups=groups,
+        bar_fields={name: np.repeat(values, n) for name, values in mesh.bar_fields.items()},
     )
 
 
@@ -233,19 +228,10 @@ def scaled(mesh: WholeMesh, scale: float) -> WholeMesh:
     if scale == 1.0:
         return mesh
     fields = {name: values * scale**2 if name == "area" else values for name, values in mesh.bar_fields.items()}
-    tables: dict[str, dict[str, Any]] = {}
-    for table, rows in mesh.tables.items():
-        tables[table] = {name: _scaled_keys(keys, scale) for name, keys in rows.items()}
-    return WholeMesh(
-        mesh.points * scale,
-        mesh.bars,
-        mesh.node_groups,
-        mesh.bar_groups,
-        fields,
-        tables,
-        mesh.warnings,
-        source=mesh.source,
-    )
+    tables = {
+        table: {name: _scaled_keys(keys, scale) for name, keys in rows.items()} for table, rows in mesh.tables.items()
+    }
+    return replace(mesh, points=mesh.points * scale, bar_fields=fields, tables=tables)
 
 
 def _scaled_keys(keys: dict[str, Any], scale: float) -> dict[str, Any]:
@@ -261,3 +247,84 @@ def _scaled_keys(keys: dict[str, Any], scale: float) -> dict[str, Any]:
 def _converted(value: float) -> float:
     """Return a product with a unit as people write it, to 15 digits: 2e-4 and not 1.9999999999999998e-4."""
     return float(f"{value:.15g}")
+
+
+_SHOWN = 12
+"""Number of groups, and of numbers of bars at a node, that are listed."""
+
+
+def summary(mesh: WholeMesh, tolerance: float | None = None) -> list[tuple[str, str]]:
+    """Return labels and texts about a mesh, which need not be one that can be simulated.
+
+    Parameters
+    ----------
+    tolerance : distance [m] up to which nodes coincide; default: 1e-6 of the mean length of the bars
+    """
+    return [*_sizes(mesh), *_named(mesh), *_topology(mesh), *_problems(mesh, tolerance)]
+
+
+def _sizes(mesh: WholeMesh) -> Iterator[tuple[str, str]]:
+    yield "nodes", f"{len(mesh.points):,}"
+    yield "bars", f"{len(mesh.bars):,}"
+    if len(mesh.points):
+        low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+        yield "from", ", ".join(f"{x:.6g}" for x in low) + " m"
+        yield "to", ", ".join(f"{x:.6g}" for x in high) + " m"
+        yield "size", " x ".join(f"{x:.6g}" for x in high - low) + " m"
+    own = lengths(mesh)
+    if len(own):
+        yield "lengths", f"{own.min():.6g} to {own.max():.6g} m, mean {own.mean():.6g} m, total {own.sum():.6g} m"
+    area = mesh.bar_fields.get("area")
+    if area is not None and len(own):
+        yield "volume", f"{float(area @ own):.6g} m3"
+
+
+def _named(mesh: WholeMesh) -> Iterator[tuple[str, str]]:
+    for label, groups in (("node groups", mesh.node_groups), ("bar groups", mesh.bar_groups)):
+        texts = [f"{name} ({len(members):,})" for name, members in groups.items()]
+        if texts:
+            yield label, _listed(texts)
+    for name, values in mesh.bar_fields.items():
+        unit = " m2" if name == "area" else ""
+        yield f"field {name}", f"{values.min(initial=np.inf):.6g} to {values.max(initial=-np.inf):.6g}{unit}"
+    for table, rows in mesh.tables.items():
+        for name, keys in rows.items():
+            yield f"{table} {name}", ", ".join(f"{key} {_short(value)}" for key, value in keys.items()) or "no keys"
+
+
+def _short(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return f"of {len(value)} rows" if isinstance(value, list) else str(value)
+
+
+def _listed(texts: list[str]) -> str:
+    return ", ".join(texts[:_SHOWN]) + (f" and {len(texts) - _SHOWN} more" if len(texts) > _SHOWN else "")
+
+
+def _topology(mesh: WholeMesh) -> Iterator[tuple[str, str]]:
+    degree = np.bincount(mesh.bars.ravel(), minlength=len(mesh.points))
+    counts = np.bincount(degree)
+    texts = [f"{k} ({counts[k]:,} nodes)" for k in np.flatnonzero(counts).tolist()]
+    if texts:
+        yield "bars at a node", _listed(texts)
+    _, sizes = np.unique(components(len(mesh.points), mesh.bars)[mesh.bars[:, 0]], return_counts=True)
+    if len(sizes):
+        texts = [f"{n:,}" for n in np.sort(sizes)[::-1].tolist()]
+        yield "parts", f"{len(sizes):,} that no bar connects, of {_listed(texts)} bars" if len(sizes) > 1 else "1"
+
+
+def _problems(mesh: WholeMesh, tolerance: float | None) -> Iterator[tuple[str, str]]:
+    """Return what ``mesh clean`` removes."""
+    distance = tolerance_of(mesh) if tolerance is None else tolerance
+    place, same = coincident(mesh.points, distance), copies(mesh.bars)
+    for label, found, of in (
+        ("nodes at the place of another", np.flatnonzero(place != np.arange(len(place))), place),
+        ("bars between the nodes of another", np.flatnonzero(same != np.arange(len(same))), same),
+        ("bars without length", np.flatnonzero(place[mesh.bars[:, 0]] == place[mesh.bars[:, 1]]), None),
+        ("nodes without bars", np.setdiff1d(np.arange(len(mesh.points)), mesh.bars), None),
+    ):
+        if len(found):
+            some = [str(i) if of is None else f"{of[i]} and {i}" for i in found[:3].tolist()]
+            within = f" (within {distance:.3g} m)" if of is place else ""
+            yield label, f"{len(found):,}{within}: {', '.join(some)}" + (", ..." if len(found) > 3 else "")

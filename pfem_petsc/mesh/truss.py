@@ -126,7 +126,7 @@ class Truss:
         InputError
             As for the mesh file of a case.
         """
-        from .readers import read_whole
+        from ..formats import read_whole
 
         mesh = read_whole(Path(path), None if bar_fields is None else list(bar_fields))
         if clean is not None:
@@ -172,7 +172,7 @@ class Truss:
         InputError
             If there is no writer for the suffix, or the file cannot be written.
         """
-        from .writers import write_whole
+        from ..formats import write_whole
 
         return write_whole(path, self.to_mesh())
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,16 @@ def without_slashes(named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             own += "_"
         found[own] = values
     return found
+
+
+def missing_field(path: Path | str, fields: Mapping[str, str], known: Iterable[str]) -> str | None:
+    """Return the message about the first of ``fields`` that is not among the ``known`` cell fields of a file."""
+    known = sorted(known)
+    for name, key in fields.items():
+        if name not in known:
+            there = f"; it has {', '.join(known)}" if known else ""
+            return f"{key} = {name!r}: {path} has no cell field of this name with one number for each bar{there}"
+    return None
 
 
 def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Comm) -> MeshSlab:

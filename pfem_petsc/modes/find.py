@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -20,8 +20,8 @@ from ..registry import lookup
 from .pencil import Holds, Pencil, StateMatrices, buckling_bars, join
 
 if TYPE_CHECKING:
-    from ..case.settings import Modes
-    from ..case.settings import Modes as Settings
+    from ..case.tables import Modes
+    from ..case.tables import Modes as Settings
     from ..integrators.base import State
     from ..stepping.model import Model
 
@@ -268,6 +268,14 @@ class _Solver(Protocol):
     def destroy(self) -> None: ...
 
 
+class _Scale(NamedTuple):
+    """Eigenvalues of theta, the magnitude up to which they are zero, and that of theta over the largest."""
+
+    values: Callable[[np.ndarray], np.ndarray]
+    zero: float
+    nothing: float = 0.0
+
+
 def find_modes(model: Model, state: State, settings: Settings, consistent: bool) -> Found:
     """Compute the lowest modes of a state. Collective.
 
@@ -316,16 +324,14 @@ def _vibration(
         pencil.b.destroy()
     basis = _basis(model, state)
 
-    def values_of(theta: np.ndarray) -> np.ndarray:
-        return shift + 1.0 / theta
-
     try:
-        theta, shapes = _lowest(model, holds, pencil, solver, basis, count, values_of, zero)
+        scale = _Scale(lambda theta: shift + 1.0 / theta, zero)
+        theta, shapes = _lowest(model, holds, pencil, solver, basis, count, scale)
     finally:
         solver.destroy()
         pencil.destroy()
         stiffness.destroy()
-    values = values_of(theta)
+    values = scale.values(theta)
     values[np.abs(values) <= zero] = 0.0
     shapes /= np.sqrt(theta)[:, None, None]
     negative = int((values < 0.0).sum())
@@ -360,7 +366,8 @@ def _buckling(
                 "stiffness is singular, and no factor of the load is defined; brace and support it, or use "
                 'kind = "vibration", whose eigenvalues include the stresses of the state'
             )
-        theta, shapes = _lowest(model, holds, pencil, solver, _basis(model, state), count, np.reciprocal, 0.0, _NOTHING)
+        scale = _Scale(np.reciprocal, 0.0, _NOTHING)
+        theta, shapes = _lowest(model, holds, pencil, solver, _basis(model, state), count, scale)
     finally:
         solver.destroy()
         pencil.destroy()
@@ -386,9 +393,7 @@ def _lowest(
     solver: _Solver,
     basis: Basis,
     count: int,
-    values_of: Callable[[np.ndarray], np.ndarray],
-    zero: float,
-    nothing: float = 0.0,
+    scale: _Scale,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ``count`` largest positive theta (k,), and unique vectors (k, owned, 3), x^T B x = 1. Collective.
 
@@ -404,13 +409,13 @@ def _lowest(
             found = solver.largest(ask, _start(model, holds, search), known)
             found = np.where(holds.held.ravel(), 0.0, found[:ask])
             theta, known = _ritz(model.comm, pencil, np.concatenate([known, found]))
-            positive = theta > nothing * np.abs(theta).max(initial=0.0)
+            positive = theta > scale.nothing * np.abs(theta).max(initial=0.0)
             theta, known = theta[positive], known[positive]
         now = theta[:wanted]
         if not (solver.finds_all or (len(now) == len(before) and np.allclose(now, before, rtol=1e-9, atol=0.0))):
             continue
-        values = values_of(now)
-        cut = len(now) == wanted < pencil.free and same(values[-1], values[min(count, wanted) - 1], zero)
+        values = scale.values(now)
+        cut = len(now) == wanted < pencil.free and same(values[-1], values[min(count, wanted) - 1], scale.zero)
         if not cut or wanted > count + 8 * _MORE:
             break
         wanted = min(wanted + 2 * _MORE, pencil.free)
@@ -420,7 +425,7 @@ def _lowest(
             "fewer modes (modes.count)"
         )
     shapes = holds.to_axes(known[: len(now)].reshape(len(now), model.mesh.n_owned, 3))
-    shapes = basis.unique(values_of(now), shapes, zero)
+    shapes = basis.unique(scale.values(now), shapes, scale.zero)
     return now[:count].copy(), shapes[:count]
 
 

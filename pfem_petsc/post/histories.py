@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..energies import LOST, STORED, SUPPLIED
+from ..columns import LOST, STORED, SUPPLIED
 from ..output.units import engineering, unit_of
 from .chart import COLOURS, REFERENCE, Chart, Curve, legend_beside, thinned
 from .closed_forms import ClosedForm

@@ -277,6 +277,20 @@ class Elements(NamedTuple):
     node_starts: np.ndarray
 
 
+class Summands(NamedTuple):
+    """What the coarse matrix is summed of: bars with ends ``ends`` (b, 2) at positions ``x`` (local, 3) and with the
+    numbers ``stored`` (2, b) of a product; inertia ``nodal`` (owned,); and ``place`` (local,) of nodes among those with
+    matrices ``turned`` (k, 3, 3) and further stiffness ``extra`` (k, 3, 3), -1 for others."""
+
+    ends: np.ndarray
+    x: np.ndarray
+    stored: np.ndarray
+    nodal: np.ndarray
+    place: np.ndarray
+    turned: np.ndarray
+    extra: np.ndarray
+
+
 class BackgroundGrid:
     """The grid of one model and the numbering of its corners. Construction is collective.
 
@@ -453,13 +467,11 @@ def _flush(corners, element, m, dense, ptr, columns, blocks):
 
 
 @inlined
-def _turned_difference(difference, a, b, direction, place, turned, w, m, v):
-    """Write to ``v`` how a component of the end difference of a bar depends on the corners."""
-    for i in range(3 * m):
-        v[i] = 0.0
+def _turned_difference(difference, ends, direction, place, turned, w, v):
+    """Write to ``v`` (3 m,) how a component of the end difference of a bar depends on the corners."""
+    v[:] = 0.0
     for end in range(2):
-        node = b if end else a
-        at = place[node]
+        at = place[ends[end]]
         for q in range(3):
             part = 0.0
             for p in range(3):
@@ -467,7 +479,7 @@ def _turned_difference(difference, a, b, direction, place, turned, w, m, v):
                 part += along * (turned[at, p, q] if at >= 0 else (1.0 if p == q else 0.0))
             if end == 0:
                 part = -part
-            for i in range(m):
+            for i in range(len(v) // 3):
                 v[3 * i + q] += part * w[end, i]
 
 
@@ -488,15 +500,10 @@ def _add_turned_node(extra, nodal, turn, w, dense):
 
 
 @kernel
-def assemble(
-    t, base, boxes, corners, bar_order, bar_starts, ends, x, stored, node_order, node_starts, nodal, extra, place,
-    turned, ptr, columns, blocks
-):  # fmt: skip
-    """Add everything to ``blocks``.
-
-    ``place`` (local,): of nodes among those with matrices ``turned`` (k, 3, 3), -1 for others; ``nodal`` (owned,)
-    inertia; ``extra`` (k, 3, 3) further stiffness of these nodes.
-    """
+def assemble(t, base, elements, parts, pattern, blocks):
+    """Add the Summands ``parts`` of all Elements to ``blocks``; ``pattern``: pointers and columns of these."""
+    boxes, corners, bar_order, bar_starts = elements.boxes, elements.corners, elements.bars, elements.bar_starts
+    ends, x, stored, place, turned = parts.ends, parts.x, parts.stored, parts.place, parts.turned
     dense = np.zeros((48, 48))
     same = np.zeros((16, 16))
     d = np.zeros(16)
@@ -536,22 +543,22 @@ def assemble(
                 continue
             # in the three directions of space with g, and along the bar with c
             for direction in range(4):
-                _turned_difference(difference, a, b, direction, place, turned, w, m, v)
+                _turned_difference(difference, (a, b), direction, place, turned, w, v[: 3 * m])
                 _add_square(v, c if direction == 3 else g, 3 * m, dense)
-        for k in range(node_starts[element], node_starts[element + 1]):
-            node = node_order[k]
+        for k in range(elements.node_starts[element], elements.node_starts[element + 1]):
+            node = elements.nodes[k]
             w[:] = 0.0
             corner_weights(t, node, base, boxes[element, 0], w[0], 0)
             if place[node] < 0:
-                _add_square(w[0], nodal[node], m, same)
+                _add_square(w[0], parts.nodal[node], m, same)
                 continue
-            _add_turned_node(extra[place[node]], nodal[node], turned[place[node]], w[0], dense)
+            _add_turned_node(parts.extra[place[node]], parts.nodal[node], turned[place[node]], w[0], dense)
         for i in range(m):
             for j in range(m):
                 for p in range(3):
                     dense[3 * i + p, 3 * j + p] += same[i, j]
                 same[i, j] = 0.0
-        _flush(corners, element, m, dense, ptr, columns, blocks)
+        _flush(corners, element, m, dense, *pattern, blocks)
 
 
 @inlined

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -11,13 +10,11 @@ from petsc4py import PETSc
 
 from .linear import reproducible_products, set_preconditioner
 from .matrix import HessianMatrix
-from .matrix_free import MatrixFreeHessian, at_exit
+from .matrix_free import MatrixFreeHessian
 from .multigrid import GridMultigrid
 
 if TYPE_CHECKING:
-    from ..stepping.model import Model
-    from ..stepping.problem import StepProblem
-    from .newton import NewtonSolver
+    from .problem import Linearisable, Mechanics
 
 
 # Nodes a rank. Aggregates of fewer unknowns than rigid body modes make PETSc 3.18 fail on several ranks, and let solves
@@ -38,7 +35,7 @@ class AssembledPreconditioner:
 
     Parameters
     ----------
-    model : Model
+    model : Mechanics
     kind : ``gamg``, ``lu`` or ``mumps``
     symmetric : whether the Hessian, including friction, is symmetric
     definite : whether the Hessian without friction is symmetric, and thus has a definite part
@@ -46,7 +43,7 @@ class AssembledPreconditioner:
         saves a third of the time
     """
 
-    def __init__(self, model: Model, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
+    def __init__(self, model: Mechanics, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
         self.mesh, self.kind = model.mesh, kind
         # for symmetric schemes: the stiffness of the bars and its products
         self.product = MatrixFreeHessian(model) if definite else None
@@ -59,7 +56,7 @@ class AssembledPreconditioner:
         """Set the coordinates of links for steps with bounds. Collective."""
         self.matrix.couple(links)
 
-    def make(self, problem: StepProblem, held: np.ndarray) -> None:
+    def make(self, problem: Linearisable, held: np.ndarray) -> None:
         """Set up at the positions of a problem; ``held`` (local, 3): nonzero for active unknowns, ghosts not yet up to
         date. Collective."""
         matrix = self.matrix
@@ -100,7 +97,7 @@ class AssembledPreconditioner:
         entries = [solver.getOperators()[1].getInfo()["nz_used"] for solver in solvers]
         return sum(entries[:-1]) / max(entries[-1], 1.0)
 
-    def _set_up(self, matrix: PETSc.Mat, problem: StepProblem) -> None:
+    def _set_up(self, matrix: PETSc.Mat, problem: Linearisable) -> None:
         # from scratch: a reused hierarchy would differ from that after a restart
         self._new_inner(matrix)
         x = problem.x[: self.mesh.n_owned]
@@ -148,7 +145,7 @@ class LaggedPreconditioner:
 
     Parameters
     ----------
-    model : Model
+    model : Mechanics
     kind : of preconditioner: ``gamg``, ``lu``, ``mumps``; ``multigrid``
     symmetric, definite, matrix_free : see :class:`~pfem_petsc.solvers.lagged.AssembledPreconditioner`
 
@@ -163,7 +160,7 @@ class LaggedPreconditioner:
     carried : whether it was set up for an earlier problem
     """
 
-    def __init__(self, model: Model, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
+    def __init__(self, model: Mechanics, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
         mesh = model.mesh
         self.mesh = mesh
         self.kind = kind
@@ -194,12 +191,12 @@ class LaggedPreconditioner:
         self._problem = None
         self.place = self.place[:, :0]
 
-    def renew(self, problem: StepProblem, kept: np.ndarray | None) -> None:
+    def renew(self, problem: Linearisable, kept: np.ndarray | None) -> None:
         """Set the preconditioner up again if necessary; called at each Newton iteration. Collective.
 
         Parameters
         ----------
-        problem : StepProblem, at the positions at which the Hessian is required
+        problem : Linearisable, at the positions at which the Hessian is required
         kept : this rank's unknowns in the system, local and ascending; None for all
         """
         *coefficients, first, beyond, last = self.count
@@ -233,7 +230,7 @@ class LaggedPreconditioner:
         self._problem = problem
         self.count = [*wanted, first, beyond, 0.0]
 
-    def _make_again(self, problem: StepProblem) -> None:
+    def _make_again(self, problem: Linearisable) -> None:
         """Recreate the preconditioner after a restart, from the Hessian at its last set-up."""
         here, owned = problem.x.copy(), self.mesh.n_owned
         held = np.zeros((self.mesh.n_local, 3))
@@ -247,7 +244,7 @@ class LaggedPreconditioner:
         if self.remembers:
             self.bars.put_history(history)
 
-    def _make(self, problem: StepProblem, held: np.ndarray) -> None:
+    def _make(self, problem: Linearisable, held: np.ndarray) -> None:
         self.inner.make(problem, held)
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
@@ -275,32 +272,3 @@ class LaggedPreconditioner:
         self._problem = None
         for thing in (self.inner, self._right, self._left):
             thing.destroy()
-
-
-class Preconditioning:
-    """Python preconditioner of one nonlinear solver; all solvers share the lagged preconditioner."""
-
-    def __init__(self, shared: LaggedPreconditioner, solver: NewtonSolver, snes: PETSc.SNES, bounded: bool) -> None:
-        self.shared = shared
-        self.first = 3 * shared.mesh.first_node
-        # PETSc's solver owns this object
-        self.solver = weakref.ref(solver)
-        self.snes = weakref.ref(snes)
-        self.bounded = bounded
-        at_exit(_let_go, snes)
-
-    def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
-        """Handle a change of the operator; called by PETSc."""
-        kept = self.snes().getVIInactiveSet().getIndices() - self.first if self.bounded else None
-        self.shared.renew(self.solver().problem, kept)
-
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Compute y = P x; called by PETSc."""
-        self.shared.apply(x, y)
-
-
-def _let_go(reference: weakref.ref) -> None:
-    """Detach the preconditioner from a solver that still exists when Python exits; PETSc 3.18 would call it later."""
-    snes = reference()
-    if snes:
-        snes.getKSP().getPC().setType("none")

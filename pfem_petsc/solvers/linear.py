@@ -16,7 +16,7 @@ from ..errors import InputError, SimulationFailure
 from .matrix import HessianMatrix
 
 if TYPE_CHECKING:
-    from ..stepping.model import Model
+    from .problem import Mechanics
 
 
 DIRECT = ("lu", "mumps")
@@ -49,42 +49,44 @@ class LinearChoice:
         return self.preconditioner in ("gamg", "multigrid") or (self.matrix_free and self.preconditioner in DIRECT)
 
 
-def choose_linear(
-    request: str,
-    unknowns: int,
-    step_ratio: float,
-    symmetric: bool = True,
-    operator: str = "auto",
-    steps: int = _MULTIGRID_FROM,
-    impact: bool = False,
-    block: bool = False,
-) -> LinearChoice:
+@dataclass(frozen=True)
+class Demand:
+    """What the choice of a linear solver depends on besides the case's wishes.
+
+    Attributes
+    ----------
+    unknowns : of the whole model
+    step_ratio : time step relative to the critical step of central differences: stiffness relative to mass
+    symmetric : whether the matrix is symmetric; if not, GMRES and incomplete LU replace conjugate gradients and
+        Cholesky
+    steps : of the run
+    impact : whether there is contact or yielding, with which tangents change too fast for a lagged preconditioner
+    block : whether the truss fills a block, see :func:`~pfem_petsc.solvers.background_grid.fills_block`
+    """
+
+    unknowns: int
+    step_ratio: float
+    symmetric: bool = True
+    steps: int = _MULTIGRID_FROM
+    impact: bool = False
+    block: bool = False
+
+
+def choose_linear(request: str, operator: str, demand: Demand) -> LinearChoice:
     """Resolve ``solver.linear`` and ``solver.operator``.
 
     Parameters
     ----------
-    request : str
-        ``auto``, ``cg``, ``multigrid``, ``gamg`` or ``mumps``.
-    unknowns : int
-        Number of unknowns of the whole model.
-    step_ratio : float
-        Time step relative to the critical step of central differences, a measure of stiffness relative to mass.
-    symmetric : bool
-        Whether the matrix is symmetric; if not, GMRES and incomplete LU replace conjugate gradients and Cholesky.
-    operator : str
-        ``auto``, ``assembled`` or ``matrix_free``.
-    steps : int
-        Number of steps of the run.
-    impact : bool
-        Whether there is contact or yielding, with which tangents change too fast for a lagged preconditioner.
-    block : bool
-        Whether the truss fills a block, see :func:`~pfem_petsc.solvers.background_grid.fills_block`.
+    request : ``auto``, ``cg``, ``multigrid``, ``gamg`` or ``mumps``
+    operator : ``auto``, ``assembled`` or ``matrix_free``
+    demand : Demand
 
     Raises
     ------
     InputError
         If a matrix-free operator is requested together with a method that needs a matrix, or the reverse.
     """
+    unknowns, step_ratio, symmetric, impact = demand.unknowns, demand.step_ratio, demand.symmetric, demand.impact
     _check(request, operator, symmetric)
     free = operator != "assembled" and symmetric
     krylov, method = ("cg", "conjugate gradients") if symmetric else ("gmres", "GMRES")
@@ -102,12 +104,12 @@ def choose_linear(
         return LinearChoice(krylov, "gamg", f"{words} (asked for)", free)
     ratio = f"step is {step_ratio:.3g} x the explicit limit"
     if free:
-        if request == "auto" and block and not impact and step_ratio > _JACOBI_BLOCK_UP_TO:
+        if request == "auto" and demand.block and not impact and step_ratio > _JACOBI_BLOCK_UP_TO:
             return LinearChoice(krylov, "multigrid", f"{_MULTIGRID} ({ratio})", True)
         if request == "cg" or step_ratio <= _JACOBI_FREE_UP_TO:
             return LinearChoice(krylov, "jacobi", f"{method}, Jacobi, matrix-free ({ratio})", True)
-        if impact or steps < _MULTIGRID_FROM:
-            short = "contact or yielding" if impact else f"{steps} steps"
+        if impact or demand.steps < _MULTIGRID_FROM:
+            short = "contact or yielding" if impact else f"{demand.steps} steps"
             return LinearChoice(krylov, "jacobi", f"{method}, Jacobi, matrix-free ({ratio}, {short})", True)
         return LinearChoice(krylov, "gamg", f"{words} ({ratio})", True)
     if request == "cg" or step_ratio <= _JACOBI_UP_TO:
@@ -277,11 +279,11 @@ class MassSolver:
 
     Parameters
     ----------
-    model : Model
+    model : Mechanics
         With consistent mass.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Mechanics) -> None:
         self._supports = model.supports
         self._matrix = matrix = HessianMatrix(model.mesh, model.supports)
 

@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
+from ..mechanics.block_pattern import BlockPattern
 from ..mechanics.compiled import kernel
 
 if TYPE_CHECKING:
-    from ..contact.links import Transform
     from ..mechanics.supports import Directions, Supports
     from ..mesh.distribution import DistributedMesh
-    from ..stepping.problem import StepProblem
+    from .problem import Coordinates, Linearisable
 
 
 @kernel
 def turn_blocks(ptr, local_columns, place, left, right, values):
     """Multiply the rows of nodes by matrices ``left`` (m, 3, 3), and their columns by ``right``, from the right.
 
-    ``ptr``, ``local_columns``, ``values``: of a :class:`~pfem_petsc.solvers.matrix.BlockPattern`; ``place`` (local,):
-    of a node among the m, -1 for others.
+    ``ptr``, ``local_columns``, ``values``: of a :class:`~pfem_petsc.mechanics.block_pattern.BlockPattern`; ``place``
+    (local,): of a node among the m, -1 for others.
     """
     block = np.zeros((3, 3))
     for row in range(len(ptr) - 1):
@@ -74,65 +74,6 @@ class Projection:
     def project(self, ptr: np.ndarray, local_columns: np.ndarray, values: np.ndarray) -> None:
         """Project the values of a matrix, without its new diagonal blocks."""
         turn_blocks(ptr, local_columns, self._place, self._free, self._free, values)
-
-
-class BlockPattern:
-    """Block-compressed rows of the owned nodes, with one 3 x 3 block per node and per neighbour connected by a bar.
-
-    Attributes
-    ----------
-    ptr : (owned + 1,) int32, first block of each block row
-    columns : (blocks,) int64, PETSc node number of each block's column, ascending in a row
-    slots : (b, 4) int32, blocks (a, a), (a, b), (b, b), (b, a) of each bar, -1 if the row is not owned
-    diagonal : (owned,) int32, the diagonal block of each row
-    """
-
-    def __init__(self, mesh: DistributedMesh) -> None:
-        owned = mesh.n_owned
-        numbers = np.concatenate([mesh.first_node + np.arange(owned, dtype=np.int64), mesh.ghost_numbers])
-        a, b = mesh.bars[:, 0].astype(np.int64), mesh.bars[:, 1].astype(np.int64)
-        first, second = np.flatnonzero(a < owned), np.flatnonzero(b < owned)
-        n = max(mesh.n_nodes, 1)
-        keys = np.concatenate(
-            [
-                np.arange(owned, dtype=np.int64) * n + numbers[:owned],
-                a[first] * n + numbers[b[first]],
-                b[second] * n + numbers[a[second]],
-            ]
-        )
-        unique, place = np.unique(keys, return_inverse=True)
-        place = place.astype(np.int32)
-        rows = unique // n
-        self.columns = unique - rows * n
-        self.ptr = np.zeros(owned + 1, dtype=np.int32)
-        np.cumsum(np.bincount(rows, minlength=owned), out=self.ptr[1:])
-        self.diagonal = place[:owned].copy()
-        self.slots = np.full((len(a), 4), -1, dtype=np.int32)
-        self.slots[first, 0] = self.diagonal[a[first]]
-        self.slots[first, 1] = place[owned : owned + len(first)]
-        self.slots[second, 2] = self.diagonal[b[second]]
-        self.slots[second, 3] = place[owned + len(first) :]
-
-    def scalar_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return row pointers and PETSc column numbers of the pattern in scalar compressed rows (PETSc integers)."""
-        blocks = np.repeat(np.diff(self.ptr), 3)
-        pointers = np.zeros(len(blocks) + 1, dtype=PETSc.IntType)
-        np.cumsum(3 * blocks, out=pointers[1:])
-        columns = np.empty(pointers[-1], dtype=PETSc.IntType)
-        expand_columns(self.ptr, self.columns, columns)
-        return pointers, columns
-
-
-@kernel
-def expand_columns(ptr, columns, out):
-    """Write the columns of a matrix in scalar compressed rows; ``ptr``, ``columns``: of its blocks."""
-    for row in range(len(ptr) - 1):
-        width = 3 * (ptr[row + 1] - ptr[row])
-        for k in range(ptr[row], ptr[row + 1]):
-            at = 6 * ptr[row] + 3 * k
-            for i in range(3):
-                for j in range(3):
-                    out[at + i * width + j] = 3 * columns[k] + j
 
 
 @kernel
@@ -255,18 +196,18 @@ class HessianMatrix:
             self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
             self._chain.append((link, matrix, self.bounded))
 
-    def update(self, problem: StepProblem, w: np.ndarray) -> None:
+    def update(self, problem: Linearisable, w: np.ndarray) -> None:
         """Assemble the Hessian of a problem at ``w``. Collective."""
         self.fill(lambda values: problem.hessian(w, self, values))
         if problem.transform.bounded:
             self._change_coordinates(problem.transform)
 
-    def put(self, problem: StepProblem, bars: np.ndarray) -> None:
+    def put(self, problem: Linearisable, bars: np.ndarray) -> None:
         """Assemble at the predictor of a problem, with the stiffness (5, b) of ``Bars.linearise``. Collective."""
         problem.place(np.zeros_like(problem.u))
         self.fill(lambda values: problem.hessian_here(self, values, bars))
 
-    def _change_coordinates(self, transform: Transform) -> None:
+    def _change_coordinates(self, transform: Coordinates) -> None:
         """Compute ``bounded`` from ``mat``. Collective."""
         last = self.mat
         for link, matrix, product in self._chain:
@@ -279,7 +220,7 @@ class HessianMatrix:
             last = product
 
     def fill_held(
-        self, add: Callable[[np.ndarray], None], held: np.ndarray, scale: float, transform: Transform
+        self, add: Callable[[np.ndarray], None], held: np.ndarray, scale: float, transform: Coordinates
     ) -> PETSc.Mat:
         """Assemble in the coordinates of a transform; rows and columns of components (local nodes, 3) with nonzero
         ``held`` are replaced by ``scale`` on the diagonal. Collective."""

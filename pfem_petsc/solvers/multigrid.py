@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
+from ..mechanics.block_pattern import expand_columns
 from ..mechanics.compiled import kernel
 from ..mesh.exchange import Router
-from .background_grid import BackgroundGrid, arrange, assemble, interpolate, neighbours, restrict, stabilise
+from .background_grid import BackgroundGrid, Summands, arrange, assemble, interpolate, neighbours, restrict, stabilise
 from .linear import reproducible_products
-from .matrix import expand_columns
 from .matrix_free import MatrixFreeHessian, full_blocks
 
 if TYPE_CHECKING:
-    from ..stepping.model import Model
-    from ..stepping.problem import StepProblem
+    from .problem import Linearisable, Mechanics
 
 
 _SHIFT = 1e-8  # of the diagonal: corners that few nodes depend on may have functions that depend on each other
@@ -63,25 +62,11 @@ class CoarseMatrix:
         self._scalar_columns = np.empty(int(self._pointers[-1]), PETSc.IntType)
         expand_columns(self._block_ptr, block_columns, self._scalar_columns)
 
-    def make(
-        self,
-        ends: np.ndarray,
-        x: np.ndarray,
-        stored: np.ndarray,
-        nodal: np.ndarray,
-        place: np.ndarray,
-        turned: np.ndarray,
-        extra: np.ndarray,
-    ) -> PETSc.Mat:
-        """Return the matrix for bars at ``x`` (local, 3) with ``stored`` (2, b), nodal inertia (owned,), and matrices
-        of some local nodes, see :func:`~pfem_petsc.solvers.background_grid.assemble`. Collective."""
+    def make(self, parts: Summands) -> PETSc.Mat:
+        """Return the matrix of what it is summed of. Collective."""
         grid = self.grid
-        each = grid.elements
         blocks = np.zeros((len(self._columns), 3, 3))
-        assemble(
-            grid.t, grid.base, each.boxes, each.corners, each.bars, each.bar_starts, ends, x, stored,
-            each.nodes, each.node_starts, nodal, extra, place, turned, self._ptr, self._columns, blocks,
-        )  # fmt: skip
+        assemble(grid.t, grid.base, grid.elements, parts, (self._ptr, self._columns), blocks)
         arrived = self._router.send(blocks[self._n_own :].reshape(-1, 9)).reshape(-1, 3, 3)
         values = np.zeros(len(self._scalar_columns))
         own = self._n_own
@@ -152,7 +137,7 @@ class GridMultigrid:
     reduced : whether the last :meth:`make` was for such a solve
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Mechanics) -> None:
         self.model, self.mesh = model, model.mesh
         self.product = MatrixFreeHessian(model)
         self.grid = BackgroundGrid(model.mesh)
@@ -174,7 +159,7 @@ class GridMultigrid:
     def couple(self, links: object) -> None:
         """Do nothing: with coordinates of links the diagonal is the preconditioner."""
 
-    def make(self, problem: StepProblem, held: np.ndarray) -> None:
+    def make(self, problem: Linearisable, held: np.ndarray) -> None:
         """Set up at the positions of a problem; ``held`` (local, 3) nonzero for active unknowns, ghosts not yet up to
         date. Collective."""
         owned = self.mesh.n_owned
@@ -228,7 +213,7 @@ class GridMultigrid:
         nodes = np.flatnonzero(shared[:, 0])
         return nodes, np.ascontiguousarray(shared[nodes, 1:]).reshape(-1, 3, 3)
 
-    def _make_coarse(self, problem: StepProblem, nodes: np.ndarray, turned: np.ndarray) -> None:
+    def _make_coarse(self, problem: Linearisable, nodes: np.ndarray, turned: np.ndarray) -> None:
         mesh, product = self.mesh, self.product
         extra_nodes, extra = product.extra_blocks()
         every = np.union1d(nodes, extra_nodes)
@@ -238,13 +223,15 @@ class GridMultigrid:
         matrices[place[nodes]] = turned
         further = np.zeros((len(every), 3, 3))
         further[place[extra_nodes]] = extra
-        matrix = self.pattern.make(mesh.bars, product.x, product.stored, problem.nodal, place, matrices, further)
+        matrix = self.pattern.make(
+            Summands(mesh.bars, product.x, product.stored, problem.nodal, place, matrices, further)
+        )
         self._new_solver(matrix)
         self._solver.setCoordinates(self._positions(problem)[: self.grid.n_owned])
         with reproducible_products(mesh.comm):
             self._solver.setUp()
 
-    def _positions(self, problem: StepProblem) -> np.ndarray:
+    def _positions(self, problem: Linearisable) -> np.ndarray:
         """Return positions (local corners, 3) of the corners, moved by the affine map that fits the nodes best, with
         origin at the centre. Collective."""
         mesh, owned = self.mesh, self.mesh.n_owned

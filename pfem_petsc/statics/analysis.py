@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..analysis import Analysis
-from ..case.materials import law_name, law_of
 from ..errors import InputError
 from ..integrators.base import Scheme
+from ..mechanics.materials.base import law_name, law_of
 from ..output.units import LOAD_FACTOR, POINT, Axis
 from ..registry import lookup
 from ..solvers.background_grid import fills_block
-from ..solvers.linear import LinearChoice, choose_linear
+from ..solvers.linear import Demand, LinearChoice, choose_linear
 from ..tolerances import TIME
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def _linear(model: Model) -> LinearChoice:
         most = _DIRECT_UP_TO if smooth else _DIRECT_YIELDING_UP_TO
         multigrid = "multigrid" if solver.operator != "assembled" and fills_block(model.mesh) else "gamg"
         request = "mumps" if unknowns <= most and solver.operator != "matrix_free" else multigrid
-    choice = choose_linear(request, unknowns, np.inf, True, solver.operator)
+    choice = choose_linear(request, solver.operator, Demand(unknowns, np.inf))
     if solver.linear == "auto":
         choice = replace(choice, why=choice.why.removesuffix(" (asked for)"))
     return choice

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import h5py
 import numpy as np
@@ -17,10 +17,8 @@ import numpy as np
 from ..errors import NotConverged
 
 if TYPE_CHECKING:
-    from .path_points import Point
-    from .path_stepper import PathStepper
-
-__all__ = ["EVENTS", "KINDS", "Event", "find_critical"]
+    from ..integrators.base import State
+    from .path_points import Constraint, Direction, Metric, Point, PointSolver
 
 KINDS = {"limit": 0, "bifurcation": 1}
 EVENTS: dict[str, Any] = {
@@ -70,6 +68,27 @@ class Event:
         return f"{what} at load factor {self.load_factor:.9g}{where}, before point {self.step}"
 
 
+class Path(Protocol):
+    """What the search needs of a path, see :class:`~pfem_petsc.statics.path_stepper.PathStepper`."""
+
+    state: State
+    slope: float
+    negatives: int
+    number: int
+    bifurcations: int
+    metric: Metric
+    direction: Direction | None
+    points: PointSolver
+
+    def constraint(self, size: float) -> Constraint: ...
+
+    def measure(self, point: Point) -> float: ...
+
+    def rate(self, point: Point) -> float: ...
+
+    def turns_at(self, number: int, point: Point, multiplicity: int) -> bool: ...
+
+
 class _End(NamedTuple):
     """An end of an interval: length, slope, and number of negative eigenvalues."""
 
@@ -94,21 +113,21 @@ class _Interval(NamedTuple):
         return self.second.negatives - self.first.negatives if known else 0
 
 
-def find_critical(stepper: PathStepper, last: Point) -> tuple[list[Event], Point | None]:
-    """Return the critical points up to a point, in order, and the one at which the path branches off. Collective.
+class CriticalPoints:
+    """The critical points between the state of a path and a point, in order. Construction is collective.
+
+    Attributes
+    ----------
+    events : what was found
+    turn : the point at which the path branches off, None if it does not
 
     Raises
     ------
     NotConverged
         On all ranks, if one cannot be located between state and point: the point may lie on another path.
     """
-    return _Search(stepper, last).run()
 
-
-class _Search:
-    """The search between the state and a point."""
-
-    def __init__(self, stepper: PathStepper, last: Point) -> None:
+    def __init__(self, stepper: Path, last: Point) -> None:
         self.stepper, self.last = stepper, last
         self.size = stepper.measure(last)
         tangent, slope = stepper.state.memory["tangent"], stepper.slope
@@ -116,13 +135,8 @@ class _Search:
         self._start = replace(last, u=np.zeros_like(last.u), load_factor=here, tangent=tangent, slope=slope)
         self.events: list[Event] = []
         self.turn: Point | None = None
-
-    def run(self) -> tuple[list[Event], Point | None]:
-        """See :func:`find_critical`."""
-        stepper, last = self.stepper, self.last
-        start = _End(0.0, stepper.slope, stepper.negatives)
+        start = _End(0.0, slope, stepper.negatives)
         self._look(_Interval(start, _End(self.size, last.slope, last.negatives)), 0)
-        return self.events, self.turn
 
     def _look(self, interval: _Interval, depth: int) -> None:
         """Find the critical points of an interval, starting from its first end."""
@@ -214,7 +228,7 @@ class _Search:
         """
         stepper = self.stepper
         u, load_factor, _, _ = self._cubic(self._start, 0.0, self.last, self.size, size)
-        return stepper.points.find(stepper.control.constraint(size), u, load_factor)
+        return stepper.points.find(stepper.constraint(size), u, load_factor)
 
     def _cubic(
         self, first: Point, low: float, second: Point, high: float, size: float

@@ -1,6 +1,4 @@
-"""Points of a path: Newton's method with a constraint that is an arc length or a displacement, and the stiffness at
-points.
-"""
+"""Points of a path: Newton's method with a constraint, an arc length or linear, and the spectrum of the stiffness."""
 
 from __future__ import annotations
 
@@ -103,6 +101,10 @@ class Direction:
         """Return the mean of displacements (owned, 3) along the direction. Collective."""
         return dot(self.comm, self.weights, u)
 
+    def constraint(self, target: float, scale: float) -> Linear:
+        """Return the constraint of the point at a displacement [m] along the direction, over a scale [m]."""
+        return Linear(self.comm, self.weights, target, abs(target) / scale, scale)
+
     def at(self, position: np.ndarray) -> float:
         """Return that of positions (owned, 3) relative to the mesh or to the start of the stage. Collective."""
         model = self._model
@@ -111,51 +113,30 @@ class Direction:
         return self.of(position - start)
 
 
-class Component:
-    """The point with a displacement along a direction: (d.u - target)/scale = 0."""
+@dataclass
+class Linear:
+    """The point at which (weights.u + by_load change - target)/scale = 0.
 
-    def __init__(self, direction: Direction, target: float, scale: float) -> None:
-        self.direction, self.target, self.scale = direction, target, scale
-        self.size = abs(target) / scale
+    Attributes
+    ----------
+    comm : MPI.Comm
+    weights : (owned, 3) of displacements, zero where the load factor alone counts
+    target, scale : in the unit of weights.u
+    size : length with which the value is compared
+    by_load : 1 where the load factor is prescribed
+    """
 
-    def terms(self, u: np.ndarray, change: float) -> Terms:
-        """See :class:`Constraint`."""
-        value = (self.direction.of(u) - self.target) / self.scale
-        return Terms(value, self.direction.weights / self.scale, 0.0)
-
-
-class LoadFactor:
-    """The point at a load factor."""
-
-    def __init__(self, change: float, size: float) -> None:
-        self.change, self.size = change, size
-
-    def terms(self, u: np.ndarray, change: float) -> Terms:
-        """See :class:`Constraint`."""
-        return Terms(change - self.change, np.zeros_like(u), 1.0)
-
-
-class Along:
-    """The point at a distance along a mode (owned, 3) of length one: (mode, u) - s = 0."""
-
-    def __init__(self, metric: Metric, mode: np.ndarray, size: float) -> None:
-        self.metric, self.mode, self.size = metric, mode, size
+    comm: MPI.Comm
+    weights: np.ndarray
+    target: float
+    size: float
+    scale: float = 1.0
+    by_load: float = 0.0
 
     def terms(self, u: np.ndarray, change: float) -> Terms:
         """See :class:`Constraint`."""
-        gradient = self.metric.weight * self.mode
-        return Terms(dot(self.metric.comm, gradient, u) - self.size, gradient, 0.0)
-
-
-class Still:
-    """The point at an unchanged displacement: gradient.u = 0 with a gradient (owned, 3) [1/m]."""
-
-    def __init__(self, comm: MPI.Comm, gradient: np.ndarray, size: float) -> None:
-        self.comm, self.gradient, self.size = comm, gradient, size
-
-    def terms(self, u: np.ndarray, change: float) -> Terms:
-        """See :class:`Constraint`."""
-        return Terms(dot(self.comm, self.gradient, u), self.gradient, 0.0)
+        value = (dot(self.comm, self.weights, u) + self.by_load * change - self.target) / self.scale
+        return Terms(value, self.weights / self.scale, self.by_load)
 
 
 _MOST = 20  # Newton iterations of a point: more are no sign of a path
@@ -318,95 +299,3 @@ class PointSolver:
             (found[i] + sign * found[j]) for i in range(count) for j in range(i + 1, count) for sign in (1.0, -1.0)
         ]
         return found + [pair / self.metric.length(pair, 0.0) for pair in pairs]
-
-
-_LEAST = 1e-9  # displacement along the direction per length of the path, below which it decreases
-
-
-class Control(Protocol):
-    """A measure of points; displacements (owned, 3) [m] and changes of the load factor are those from the last one."""
-
-    scale: float
-    """Scale of displacements along the direction [m]; zero before the first point, or if there is no direction."""
-
-    def constraint(self, size: float) -> Constraint:
-        """Return the constraint of the point at a measure."""
-
-    def measure(self, u: np.ndarray, change: float) -> float:
-        """Return the measure of a point. Collective."""
-
-    def rate(self, u: np.ndarray, change: float, tangent: np.ndarray, slope: float) -> float:
-        """Return the derivative of the measure along the tangent at a point. Collective."""
-
-    def advance(self, tangent: np.ndarray, size: float) -> float:
-        """Return the length along the tangent at the last point that reaches a measure. Collective."""
-
-    def still(self, tangent: np.ndarray) -> np.ndarray:
-        """Return the gradient (owned, 3) [1/m] of the displacement that is held where bars have broken."""
-
-
-class ByArc:
-    """Points at a distance from the last one in a metric: the chord of the arc."""
-
-    scale = 0.0
-
-    def __init__(self, metric: Metric) -> None:
-        self._metric = metric
-
-    def constraint(self, size: float) -> Constraint:
-        """See :class:`Control`."""
-        return Arc(self._metric, size)
-
-    def measure(self, u: np.ndarray, change: float) -> float:
-        """See :class:`Control`."""
-        return self._metric.length(u, change)
-
-    def rate(self, u: np.ndarray, change: float, tangent: np.ndarray, slope: float) -> float:
-        """See :class:`Control`."""
-        length = self._metric.length(u, change)
-        return self._metric.product(u, change, tangent, slope) / length if length else 1.0
-
-    def advance(self, tangent: np.ndarray, size: float) -> float:
-        """See :class:`Control`."""
-        return size
-
-    def still(self, tangent: np.ndarray) -> np.ndarray:
-        """See :class:`Control`: that along the path."""
-        return self._metric.weight * tangent
-
-
-class ByComponent:
-    """Points at a displacement along a direction, relative to that of the first response to a unit of load."""
-
-    def __init__(self, direction: Direction) -> None:
-        self._direction = direction
-        self.scale = 0.0
-
-    def constraint(self, size: float) -> Constraint:
-        """See :class:`Control`."""
-        return Component(self._direction, size * self.scale, self.scale)
-
-    def measure(self, u: np.ndarray, change: float) -> float:
-        """See :class:`Control`."""
-        return self._direction.of(u) / self.scale
-
-    def rate(self, u: np.ndarray, change: float, tangent: np.ndarray, slope: float) -> float:
-        """See :class:`Control`."""
-        return self._direction.of(tangent) / self.scale
-
-    def advance(self, tangent: np.ndarray, size: float) -> float:
-        """See :class:`Control`.
-
-        Raises
-        ------
-        NotConverged
-            On all ranks, if the displacement does not increase along the path.
-        """
-        along = self._direction.of(tangent) / self.scale
-        if not along > _LEAST:
-            raise NotConverged("the displacement along static.direction does not increase any more along the path")
-        return size / along
-
-    def still(self, tangent: np.ndarray) -> np.ndarray:
-        """See :class:`Control`."""
-        return self._direction.weights / self.scale

@@ -14,284 +14,33 @@ from ..solvers.linear import LinearChoice
 from ..stepping.stepper import Solution
 from ..tolerances import TIME
 from .bordered import BorderedSystem, free_motions
-from .critical import EVENTS, Event, find_critical
-from .path_points import (
-    Along,
-    ByArc,
-    ByComponent,
-    Component,
-    Constraint,
-    Control,
-    Direction,
-    LoadFactor,
-    Metric,
-    Point,
-    PointSolver,
-    Still,
-    dot,
-)
+from .critical import EVENTS, CriticalPoints, Event
+from .path_points import Arc, Constraint, Direction, Linear, Metric, Point, PointSolver, dot
 from .scheme import PathEquilibrium
-from .stepper import StaticStepper, hold_detached
+from .stepper import StaticStepper
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
-    from .path_keys import PathKeys
-
-
-def end_at_limit(stepper: PathStepper, point: Point) -> tuple[Point, str]:
-    """Return a point and an empty text, or the point at the first limit before it and that limit. Collective.
-
-    Raises
-    ------
-    NotConverged
-        On all ranks, if there is no point at the limit.
-    """
-    limits = _exceeded(stepper, point)
-    if not limits:
-        return point, ""
-    time = stepper.state.time
-    share, constraint, reached = min(limits, key=lambda limit: limit[0])
-    change = share * (point.load_factor - time)
-    return stepper.points.find(constraint, share * point.u, time + change), reached
-
-
-def _exceeded(stepper: PathStepper, point: Point) -> list[tuple[float, Constraint, str]]:
-    """Return the limits that a point exceeds: share of the step at which they are, constraint, and text. Collective."""
-    state, keys, direction = stepper.state, stepper.keys, stepper.direction
-    limits: list[tuple[float, Constraint, str]] = []
-    change = point.load_factor - state.time
-    if keys.end is not None and point.load_factor >= keys.end * (1.0 - TIME):
-        left = keys.end - state.time
-        limits.append((left / change, LoadFactor(left, abs(change)), f"static.end = {keys.end:g}"))
-    if keys.displacement is not None:
-        start, way = direction.at(state.position), direction.of(point.u)
-        if start + way >= keys.displacement * (1.0 - TIME):
-            left = keys.displacement - start
-            constraint = Component(direction, left, stepper.control.scale or abs(way))
-            limits.append((left / way, constraint, f"static.displacement = {keys.displacement:g} m"))
-    return limits
+    from .keys import PathKeys
 
 
 _UNRESOLVED = 2.0**-6  # of the first length, down to which a step is halved if a critical point is not located
 _TURN = 0.5  # cosine between tangents of successive points, below which the step is halved if possible
-
-
-def next_point(stepper: PathStepper, size: float) -> tuple[Point, list[Event], str]:
-    """Return the point at a length or at a limit before it, the critical points on the way, and the limit reached.
-
-    Raises
-    ------
-    NotConverged
-        On all ranks.
-    """
-    state = stepper.state
-    if stepper.turning:
-        mode = stepper.turning * stepper.mode
-        guess, load_factor = size * mode, state.time
-        point = stepper.points.find(Along(stepper.metric, mode, size), guess, load_factor)
-    else:
-        tangent = state.memory["tangent"]
-        length = stepper.control.advance(tangent, size)
-        guess, load_factor = length * tangent, state.time + length * stepper.slope
-        point = stepper.points.find(stepper.control.constraint(size), guess, load_factor)
-    _suspect(stepper, point, guess)
-    if not stepper.turning:
-        _refuse_turn(stepper, point, size)
-    point, reached = end_at_limit(stepper, point)
-    if stepper.turning or stepper.points.stability is None:
-        return point, [], reached
-    try:
-        events, turn = find_critical(stepper, point)
-    except NotConverged as failure:
-        # close to an imperfect bifurcation the point may lie on a path that does not pass through it
-        if size > _UNRESOLVED * stepper.arc and 0.5 * size >= stepper.keys.smallest:
-            raise
-        stepper.message(f"a critical point was not located: {failure}")
-        events, turn = [], None
-    if turn is not None:
-        point, reached = turn, ""
-    return point, events, reached
-
-
-def _refuse_turn(stepper: PathStepper, point: Point, size: float) -> None:
-    """Refuse a tangent that has turned too far: it belongs to another path, or the step has cut a corner.
-
-    Raises
-    ------
-    NotConverged
-        On all ranks.
-    """
-    cosine = stepper.metric.product(point.tangent, point.slope, stepper.state.memory["tangent"], stepper.slope)
-    if cosine < _TURN and 0.5 * size >= stepper.keys.smallest:
-        raise NotConverged(
-            f"{stepper.points.place}: the path turns by {np.degrees(np.arccos(max(cosine, -1.0))):.3g} degrees"
-        )
-    if stepper.control.scale and cosine < 0.0:
-        raise NotConverged(
-            f"{stepper.points.place}: the displacement along static.direction turns back; static.method = "
-            '"arc_length" follows the path'
-        )
-
-
-def _suspect(stepper: PathStepper, point: Point, guess: np.ndarray) -> None:
-    """Refuse a point that is unrelated to the last one.
-
-    Raises
-    ------
-    NotConverged
-        On all ranks.
-    """
-    if stepper.guard is None:
-        return
-    state = stepper.state
-    after = stepper.with_ghosts(state.position + point.u)
-    forces = np.maximum(np.abs(stepper.system.external(point.load_factor)), np.abs(stepper.system.external(state.time)))
-    energy = 0.5 * float(((forces + np.abs(state.support)) * np.abs(point.u)).sum())
-    reason = stepper.guard.check(state.x, after, state.position + guess, energy)
-    if reason is not None:
-        raise NotConverged(f"{stepper.points.place}: {reason}; {stepper.remedy}", reason.partition(":")[0])
-
-
-PARTED = "no remaining bar carries the load"
-
-
-def settle_broken(stepper: PathStepper) -> tuple[bool, str]:
-    """Find equilibria at the same displacement until no further bar breaks. Collective.
-
-    Returns whether bars broke, and why the path ends there: an empty text if it goes on.
-
-    Raises
-    ------
-    SimulationFailure
-        On all ranks, if the rest of the truss finds no equilibrium.
-    """
-    broke, ended = False, ""
-    if not stepper.model.bars.can_break:
-        return broke, ended
-    while stepper.model.comm.allreduce(stepper.energy.changed > 0, op=MPI.LOR):
-        broke = True
-        hold_detached(stepper)
-        try:
-            point, ended = _again(stepper)
-            stepper.commit(point)
-        except NotConverged as failure:
-            raise SimulationFailure(
-                f"{stepper.arrived()}: the rest of the truss finds no equilibrium at this displacement after bars "
-                "broke: a part of it is a mechanism, or the next equilibrium is distant; [time] follows the motion. "
-                f"The last attempt: {failure}{free_motions(stepper.model, stepper.state)}"
-            ) from failure
-        stepper.keep(point)
-    return broke, ended
-
-
-def _again(stepper: PathStepper) -> tuple[Point, str]:
-    """Return the point of the bars that are left; without a load on them, that at load factor zero, and why."""
-    state, system, points, comm = stepper.state, stepper.system, stepper.points, stepper.model.comm
-    system.begin(state)
-    zero = np.zeros_like(state.position)
-    system.linearise(zero)
-    gradient = stepper.control.still(state.memory["tangent"])
-    response = system.response(zero, state.time)
-    size = float(np.sqrt(dot(comm, gradient, gradient) * dot(comm, response, response)))
-    along = dot(comm, gradient, response)
-    if not abs(along) > 1e-12 * size:
-        u, load_factor, newton = points.newton(LoadFactor(-state.time, stepper.arc), zero, state.time)
-        return Point(u, load_factor, state.memory["tangent"], stepper.slope, *points.spectrum(u), newton), PARTED
-    point = points.find(Still(comm, gradient, stepper.arc), zero, state.time)
-    sign = np.sign(dot(comm, gradient, point.tangent))
-    return replace(point, tangent=sign * point.tangent, slope=float(sign * point.slope)), ""
-
-
-def check_path(model: Model, keys: PathKeys) -> None:
-    """Refuse what path following does not support.
-
-    Raises
-    ------
-    InputError
-        On all ranks.
-    """
-    case = model.case
-    if case.remove:
-        raise InputError(
-            f'{case.source}: static.method = "{case.static.method}" can pass a load factor several times or never, '
-            'so that [[remove]] has no defined time; remove bars and supports with static.method = "newton"'
-        )
-    if model.can_touch:
-        raise InputError(
-            f'{case.source}: static.method = "{case.static.method}" follows paths without contact; remove walls, '
-            'contact pairs and constraints, or use static.method = "newton", with static.stabilise beyond limit points'
-        )
-    if not (model.external.active or model.supports.moves or model.bars_vary):
-        raise InputError(f"{case.source}: static: nothing depends on the load factor; give a [[load]] or a table")
-    free = 3 * model.mesh.n_nodes - model.comm.allreduce(model.supports.number)
-    unknown = [turn for turn in keys.branch_at if abs(turn) > free]
-    if unknown:
-        raise InputError(
-            f"{case.source}: static.branch_at = {unknown}: bifurcations are numbered from 1 along the path, and a "
-            f"truss with {free} free components has no more than {free} eigenvalues that can change their sign on it; "
-            "run the case without branch_at, which reports the bifurcations and their numbers"
-        )
-    if keys.node_set is not None and not model.comm.allreduce(len(model.nodes[keys.node_set])):
-        raise InputError(f"{case.source}: static.node_set = {keys.node_set!r} has no nodes")
-
-
-def first_point(stepper: PathStepper) -> tuple[Point, bool]:
-    """Return the first point with its tangent, and whether it differs from the state; set the metric. Collective.
-
-    It differs if the state is not an equilibrium at its load factor.
-
-    Raises
-    ------
-    NotConverged, SimulationFailure
-        On all ranks, if there is no equilibrium, or if the load factor moves no node.
-    """
-    state, system, points, u = stepper.state, stepper.system, stepper.points, np.zeros_like(stepper.zero)
-    comm, newton, g = stepper.model.comm, 0, np.empty_like(u)
-    system.residual(u, state.time, g)
-    norm, tolerance = float(np.sqrt(dot(comm, g, g))), points.tolerance(u, state.time, 0.0)
-    moved = not (norm <= tolerance.residual or tolerance.rounded(norm, g, 1.0, comm))
-    if moved:
-        u, _, newton = points.newton(LoadFactor(0.0, stepper.keys.step), u, state.time)
-    system.linearise(u)
-    response = system.response(u, state.time)
-    size = float(np.sqrt(dot(comm, response, response)))
-    if not size > 0.0 or not np.isfinite(size):
-        raise SimulationFailure(
-            f"{stepper.model.case.source}: static: the load factor moves no node at the start of the path: loads act "
-            "on supports only, or tables are constant there"
-        )
-    stepper.weight = stepper.metric.weight = 1.0 / size**2
-    sign = _scale_component(stepper, response, size) if stepper.by_component else 1.0
-    length = stepper.metric.length(response, 1.0)
-    tangent, slope = sign * response / length, sign / length
-    negatives, nearest = points.spectrum(u)
-    return Point(u, state.time, tangent, slope, negatives, nearest, newton), moved
-
-
-def _scale_component(stepper: PathStepper, response: np.ndarray, size: float) -> float:
-    """Set the scale of the prescribed displacement; return the sign of load factors that increase it. Collective."""
-    along = stepper.direction.of(response)
-    if not abs(along) > 1e-12 * size:
-        raise SimulationFailure(
-            "static.direction: the load does not move the nodes of static.node_set along it at the start of "
-            'the path; use another direction, or static.method = "arc_length"'
-        )
-    stepper.scale = abs(along)
-    return float(np.sign(along))
-
-
 _FACTORS = 0.5, 1.5  # of the length from point to point
+_LEAST = 1e-9  # displacement along the direction per length of the path, below which it decreases
+PARTED = "no remaining bar carries the load"
 
 
 class PathStepper(StaticStepper):
     """Advances from point to point by a predictor along the tangent and Newton's method with a constraint.
+
+    The measure of a point is its distance from the last one in a metric, the chord of the arc.
 
     Parameters
     ----------
     model : Model
     choice : LinearChoice
     keys : of the method
-    component : whether points are defined by a displacement instead of an arc length
 
     Attributes
     ----------
@@ -300,6 +49,7 @@ class PathStepper(StaticStepper):
     negatives : number of negative eigenvalues at the state, -1 if unknown
     events : found with the last point and not recorded yet
     outcome : why the path ended; empty before
+    scale : of a prescribed displacement [m]; zero with arc lengths, and before the first point
     """
 
     kept_numbers = (
@@ -317,8 +67,8 @@ class PathStepper(StaticStepper):
     event_columns = EVENTS
     remedy = "reduce static.max_step or static.step; if such jumps are intended, set solver.guard = false"
 
-    def __init__(self, model: Model, choice: LinearChoice, keys: PathKeys, component: bool) -> None:
-        check_path(model, keys)
+    def __init__(self, model: Model, choice: LinearChoice, keys: PathKeys) -> None:
+        _check_path(model, keys)
         super().__init__(model, choice, keys)
         self.keys = keys
         self.scheme = PathEquilibrium()
@@ -327,8 +77,7 @@ class PathStepper(StaticStepper):
         self.direction = None
         if keys.node_set is not None:
             self.direction = Direction(model, keys.node_set, keys.direction)
-        self.by_component = component
-        self.control: Control = ByComponent(self.direction) if component else ByArc(self.metric)
+        self.scale = 0.0
         self._choice = choice
         self._make_system()
         self.arc, self.slope, self.negatives = keys.step, 0.0, -1
@@ -360,23 +109,32 @@ class PathStepper(StaticStepper):
         """Number of the point, as the load factor need not increase."""
         return float(self.state.step)
 
-    @property
-    def scale(self) -> float:
-        """Scale of the prescribed displacement [m]; zero with arc lengths."""
-        return self.control.scale
-
-    @scale.setter
-    def scale(self, value: float) -> None:
-        if value:
-            self.control.scale = value
+    def constraint(self, size: float) -> Constraint:
+        """Return the constraint of the point at a measure."""
+        return Arc(self.metric, size)
 
     def measure(self, point: Point) -> float:
         """Return the measure of a point. Collective."""
-        return self.control.measure(point.u, point.load_factor - self.state.time)
+        return self.metric.length(point.u, point.load_factor - self.state.time)
 
     def rate(self, point: Point) -> float:
         """Return the derivative of the measure along the tangent at a point. Collective."""
-        return self.control.rate(point.u, point.load_factor - self.state.time, point.tangent, point.slope)
+        change = point.load_factor - self.state.time
+        length = self.metric.length(point.u, change)
+        return self.metric.product(point.u, change, point.tangent, point.slope) / length if length else 1.0
+
+    def _length(self, size: float) -> float:
+        """Return the length along the tangent at the state that reaches a measure. Collective."""
+        return size
+
+    def _held_gradient(self) -> np.ndarray:
+        """Return the gradient (owned, 3) [1/m] of the displacement that is held where bars have broken."""
+        return self.metric.weight * self.state.memory["tangent"]
+
+    def _orient(self, response: np.ndarray, size: float) -> float:
+        """Return the sign of load factors that increase the measure, from the first response (owned, 3) [m] and its
+        2-norm. Collective."""
+        return 1.0
 
     @property
     def done(self) -> bool:
@@ -428,7 +186,7 @@ class PathStepper(StaticStepper):
         while True:
             self.smallest = size
             try:
-                point, events, reached = next_point(self, size)
+                point, events, reached = self._next_point(size)
                 break
             except NotConverged as failure:
                 self.name_obstacle(failure)
@@ -474,7 +232,7 @@ class PathStepper(StaticStepper):
     def _begin_path(self) -> bool:
         """Take the first point; return whether a step was made, because the start was not in equilibrium."""
         try:
-            point, moved = first_point(self)
+            point, moved = self._first_point()
         except NotConverged as failure:
             self.name_obstacle(failure)
             raise self._no_path(failure) from failure
@@ -490,7 +248,7 @@ class PathStepper(StaticStepper):
         self.part = self.smallest = size
         self.commit(point)
         self.keep(point)
-        broke, parted = settle_broken(self)
+        broke, parted = self._settle_broken()
         self.state.step += 1
         return broke, parted
 
@@ -528,9 +286,263 @@ class PathStepper(StaticStepper):
     def _no_path(self, failure: NotConverged) -> SimulationFailure:
         """Return the message about a path that cannot be continued."""
         hint = ""
-        if self.control.scale:
+        if self.scale:
             hint = '; if the displacement along static.direction turns back, static.method = "arc_length" continues'
         return SimulationFailure(
             f"the path cannot be followed beyond point {self.state.step} at load factor {self.state.time:.6g} with "
             f"steps down to {self.keys.smallest:.3g}: {failure}{hint}{free_motions(self.model, self.state)}"
         )
+
+    def _first_point(self) -> tuple[Point, bool]:
+        """Return the first point with its tangent, and whether it differs from the state; set the metric. Collective.
+
+        It differs if the state is not an equilibrium at its load factor.
+
+        Raises
+        ------
+        NotConverged, SimulationFailure
+            On all ranks, if there is no equilibrium, or if the load factor moves no node.
+        """
+        state, system, points, u = self.state, self.system, self.points, np.zeros_like(self.zero)
+        comm, newton, g = self.model.comm, 0, np.empty_like(u)
+        system.residual(u, state.time, g)
+        norm, tolerance = float(np.sqrt(dot(comm, g, g))), points.tolerance(u, state.time, 0.0)
+        moved = not (norm <= tolerance.residual or tolerance.rounded(norm, g, 1.0, comm))
+        if moved:
+            u, _, newton = points.newton(self._load_factor(0.0, self.keys.step), u, state.time)
+        system.linearise(u)
+        response = system.response(u, state.time)
+        size = float(np.sqrt(dot(comm, response, response)))
+        if not size > 0.0 or not np.isfinite(size):
+            raise SimulationFailure(
+                f"{self.model.case.source}: static: the load factor moves no node at the start of the path: loads act "
+                "on supports only, or tables are constant there"
+            )
+        self.weight = self.metric.weight = 1.0 / size**2
+        sign = self._orient(response, size)
+        length = self.metric.length(response, 1.0)
+        tangent, slope = sign * response / length, sign / length
+        negatives, nearest = points.spectrum(u)
+        return Point(u, state.time, tangent, slope, negatives, nearest, newton), moved
+
+    def _next_point(self, size: float) -> tuple[Point, list[Event], str]:
+        """Return the point at a length or at a limit before it, the critical points on the way, and the limit reached.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks.
+        """
+        state = self.state
+        if self.turning:
+            mode = self.turning * self.mode
+            guess, load_factor = size * mode, state.time
+            along = Linear(self.metric.comm, self.metric.weight * mode, size, size)
+            point = self.points.find(along, guess, load_factor)
+        else:
+            tangent = state.memory["tangent"]
+            length = self._length(size)
+            guess, load_factor = length * tangent, state.time + length * self.slope
+            point = self.points.find(self.constraint(size), guess, load_factor)
+        self._suspect(point, guess)
+        if not self.turning:
+            self._refuse_turn(point, size)
+        point, reached = self._end_at_limit(point)
+        if self.turning or self.points.stability is None:
+            return point, [], reached
+        try:
+            critical = CriticalPoints(self, point)
+            events, turn = critical.events, critical.turn
+        except NotConverged as failure:
+            # close to an imperfect bifurcation the point may lie on a path that does not pass through it
+            if size > _UNRESOLVED * self.arc and 0.5 * size >= self.keys.smallest:
+                raise
+            self.message(f"a critical point was not located: {failure}")
+            events, turn = [], None
+        if turn is not None:
+            point, reached = turn, ""
+        return point, events, reached
+
+    def _refuse_turn(self, point: Point, size: float) -> None:
+        """Refuse a tangent that has turned too far: it belongs to another path, or the step has cut a corner.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks.
+        """
+        cosine = self.metric.product(point.tangent, point.slope, self.state.memory["tangent"], self.slope)
+        if cosine < _TURN and 0.5 * size >= self.keys.smallest:
+            raise NotConverged(
+                f"{self.points.place}: the path turns by {np.degrees(np.arccos(max(cosine, -1.0))):.3g} degrees"
+            )
+        if self.scale and cosine < 0.0:
+            raise NotConverged(
+                f"{self.points.place}: the displacement along static.direction turns back; static.method = "
+                '"arc_length" follows the path'
+            )
+
+    def _suspect(self, point: Point, guess: np.ndarray) -> None:
+        """Refuse a point that is unrelated to the last one.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks.
+        """
+        if self.guard is None:
+            return
+        state = self.state
+        after = self.with_ghosts(state.position + point.u)
+        forces = np.maximum(np.abs(self.system.external(point.load_factor)), np.abs(self.system.external(state.time)))
+        energy = 0.5 * float(((forces + np.abs(state.support)) * np.abs(point.u)).sum())
+        reason = self.guard.check(state.x, after, state.position + guess, energy)
+        if reason is not None:
+            raise NotConverged(f"{self.points.place}: {reason}; {self.remedy}", reason.partition(":")[0])
+
+    def _end_at_limit(self, point: Point) -> tuple[Point, str]:
+        """Return a point and an empty text, or the point at the first limit before it and that limit. Collective.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks, if there is no point at the limit.
+        """
+        limits = self._exceeded(point)
+        if not limits:
+            return point, ""
+        time = self.state.time
+        share, constraint, reached = min(limits, key=lambda limit: limit[0])
+        change = share * (point.load_factor - time)
+        return self.points.find(constraint, share * point.u, time + change), reached
+
+    def _load_factor(self, change: float, size: float) -> Constraint:
+        """Return the constraint of the point at a change of the load factor."""
+        return Linear(self.metric.comm, self.zero, change, size, by_load=1.0)
+
+    def _exceeded(self, point: Point) -> list[tuple[float, Constraint, str]]:
+        """Return the limits that a point exceeds: share of the step up to them, constraint, and text. Collective."""
+        state, keys, direction = self.state, self.keys, self.direction
+        limits: list[tuple[float, Constraint, str]] = []
+        change = point.load_factor - state.time
+        if keys.end is not None and point.load_factor >= keys.end * (1.0 - TIME):
+            left = keys.end - state.time
+            limits.append((left / change, self._load_factor(left, abs(change)), f"static.end = {keys.end:g}"))
+        if keys.displacement is not None:
+            start, way = direction.at(state.position), direction.of(point.u)
+            if start + way >= keys.displacement * (1.0 - TIME):
+                left = keys.displacement - start
+                constraint = direction.constraint(left, self.scale or abs(way))
+                limits.append((left / way, constraint, f"static.displacement = {keys.displacement:g} m"))
+        return limits
+
+    def _settle_broken(self) -> tuple[bool, str]:
+        """Find equilibria at the same displacement until no further bar breaks. Collective.
+
+        Returns whether bars broke, and why the path ends there: an empty text if it goes on.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, if the rest of the truss finds no equilibrium.
+        """
+        broke, ended = False, ""
+        if not self.model.bars.can_break:
+            return broke, ended
+        while self.model.comm.allreduce(self.energy.changed > 0, op=MPI.LOR):
+            broke = True
+            self.hold_detached()
+            try:
+                point, ended = self._without_broken()
+                self.commit(point)
+            except NotConverged as failure:
+                raise SimulationFailure(
+                    f"{self.arrived()}: the rest of the truss finds no equilibrium at this displacement after bars "
+                    "broke: a part of it is a mechanism, or the next equilibrium is distant; [time] follows the "
+                    f"motion. The last attempt: {failure}{free_motions(self.model, self.state)}"
+                ) from failure
+            self.keep(point)
+        return broke, ended
+
+    def _without_broken(self) -> tuple[Point, str]:
+        """Return the point of the bars that are left; without a load on them, that at load factor zero, and why."""
+        state, system, points, comm = self.state, self.system, self.points, self.model.comm
+        system.begin(state)
+        zero = np.zeros_like(state.position)
+        system.linearise(zero)
+        gradient = self._held_gradient()
+        response = system.response(zero, state.time)
+        size = float(np.sqrt(dot(comm, gradient, gradient) * dot(comm, response, response)))
+        along = dot(comm, gradient, response)
+        if not abs(along) > 1e-12 * size:
+            u, load_factor, newton = points.newton(self._load_factor(-state.time, self.arc), zero, state.time)
+            return Point(u, load_factor, state.memory["tangent"], self.slope, *points.spectrum(u), newton), PARTED
+        point = points.find(Linear(comm, gradient, 0.0, self.arc), zero, state.time)
+        sign = np.sign(dot(comm, gradient, point.tangent))
+        return replace(point, tangent=sign * point.tangent, slope=float(sign * point.slope)), ""
+
+
+class ComponentStepper(PathStepper):
+    """The same with points at displacements along a direction, relative to that of the first response to a unit of
+    load."""
+
+    def constraint(self, size: float) -> Constraint:
+        return self.direction.constraint(size * self.scale, self.scale)
+
+    def measure(self, point: Point) -> float:
+        return self.direction.of(point.u) / self.scale
+
+    def rate(self, point: Point) -> float:
+        return self.direction.of(point.tangent) / self.scale
+
+    def _length(self, size: float) -> float:
+        along = self.direction.of(self.state.memory["tangent"]) / self.scale
+        if not along > _LEAST:
+            raise NotConverged("the displacement along static.direction does not increase any more along the path")
+        return size / along
+
+    def _held_gradient(self) -> np.ndarray:
+        return self.direction.weights / self.scale
+
+    def _orient(self, response: np.ndarray, size: float) -> float:
+        along = self.direction.of(response)
+        if not abs(along) > 1e-12 * size:
+            raise SimulationFailure(
+                "static.direction: the load does not move the nodes of static.node_set along it at the start of "
+                'the path; use another direction, or static.method = "arc_length"'
+            )
+        self.scale = abs(along)
+        return float(np.sign(along))
+
+
+def _check_path(model: Model, keys: PathKeys) -> None:
+    """Refuse what path following does not support.
+
+    Raises
+    ------
+    InputError
+        On all ranks.
+    """
+    case = model.case
+    if case.remove:
+        raise InputError(
+            f'{case.source}: static.method = "{case.static.method}" can pass a load factor several times or never, '
+            'so that [[remove]] has no defined time; remove bars and supports with static.method = "newton"'
+        )
+    if model.can_touch:
+        raise InputError(
+            f'{case.source}: static.method = "{case.static.method}" follows paths without contact; remove walls, '
+            'contact pairs and constraints, or use static.method = "newton", with static.stabilise beyond limit points'
+        )
+    if not (model.external.active or model.supports.moves or model.bars_vary):
+        raise InputError(f"{case.source}: static: nothing depends on the load factor; give a [[load]] or a table")
+    free = 3 * model.mesh.n_nodes - model.comm.allreduce(model.supports.number)
+    unknown = [turn for turn in keys.branch_at if abs(turn) > free]
+    if unknown:
+        raise InputError(
+            f"{case.source}: static.branch_at = {unknown}: bifurcations are numbered from 1 along the path, and a "
+            f"truss with {free} free components has no more than {free} eigenvalues that can change their sign on it; "
+            "run the case without branch_at, which reports the bifurcations and their numbers"
+        )
+    if keys.node_set is not None and not model.comm.allreduce(len(model.nodes[keys.node_set])):
+        raise InputError(f"{case.source}: static.node_set = {keys.node_set!r} has no nodes")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..integrators.base import State
     from ..solvers.linear import LinearChoice
     from ..stepping.model import Model
-    from .methods.relaxation import Parameters
+    from .keys import RelaxationKeys
 
 
 RESIDUAL, WEIGHTED, POWER, KINETIC, SUPPORTS, WALLS, BARS, FAILED, WIDTH = range(9)
@@ -61,8 +61,10 @@ def add_up(r, v, mass, sums):
 
 
 @kernel
-def move_freely(r, mass, keep, push, step, reach, v, u):
-    """v = keep v + push r/m, and u = step v, both (owned, 3); a node's u is at most ``reach`` (owned,) [m]."""
+def move_freely(r, mass, factors, reach, v, u):
+    """v = keep v + push r/m, and u = step v, both (owned, 3), with these three ``factors``; a node's u is at most
+    ``reach`` (owned,) [m]."""
+    keep, push, step = factors
     for i in range(len(r)):
         share = push / mass[i]
         square = 0.0
@@ -304,7 +306,7 @@ class PseudoMotion:
         """Compute v = keep v + push residual/m, x = x + step v, both with the constraints of walls."""
         owned = self.model.mesh.n_owned
         u = self._u
-        move_freely(self.residual, self.mass, keep, push, step, self._reach, self.v, u)
+        move_freely(self.residual, self.mass, (keep, push, step), self._reach, self.v, u)
         if self.model.contact.any:
             self._project(u)
             np.divide(u, step, out=self.v)
@@ -419,7 +421,7 @@ class RelaxationStepper(StaticStepper):
     kept_numbers = (*StaticStepper.kept_numbers, "pseudo_steps", "residual")
     columns = (*StaticStepper.columns, "pseudo_steps", "residual")
 
-    def __init__(self, model: Model, choice: LinearChoice, parameters: Parameters) -> None:
+    def __init__(self, model: Model, choice: LinearChoice, parameters: RelaxationKeys) -> None:
         _check(model)
         super().__init__(model, choice, parameters)
         self.parameters = parameters
@@ -436,7 +438,7 @@ class RelaxationStepper(StaticStepper):
         SimulationFailure
             On all ranks, if relaxation does not converge in ``max_iterations`` pseudo-steps.
         """
-        state, end = self.state, min(self.end, self.removals.ends())
+        state, end = self.state, min(self.end, self.removals.ends(self.state.time))
         left = end - state.time
         last = left <= self.limits.step * (1.0 + TIME)
         size = left if last else self.limits.step

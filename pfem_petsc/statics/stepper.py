@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -23,52 +23,7 @@ from .stability import LARGEST, LARGEST_WITH_MUMPS, MinimumCheck, held_nodes, is
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
-
-
-def redistribute(stepper: StaticStepper) -> None:
-    """Remove what is due at the load factor, and find equilibria there until no further bar breaks. Collective.
-
-    Raises
-    ------
-    SimulationFailure
-        On all ranks, if the rest of the truss finds no equilibrium.
-    """
-    changed = stepper.removals.apply()
-    if not stepper.model.bars.can_break and not changed:
-        return
-    while stepper.model.comm.allreduce(changed or stepper.energy.changed > 0, op=MPI.LOR):
-        changed = False
-        hold_detached(stepper)
-        _solve_again(stepper)
-
-
-def hold_detached(stepper: StaticStepper) -> None:
-    """Hold nodes that no bar holds any more where they are. Collective."""
-    model, owned = stepper.model, stepper.model.mesh.n_owned
-    left = np.zeros(model.mesh.n_local, dtype=bool)
-    left[model.mesh.bars[np.abs(model.bars.rupture()) < 1.0].ravel()] = True
-    loose = np.flatnonzero(~left[:owned] & ~model.supports.held_nodes())
-    if not model.links and model.comm.allreduce(len(loose)):
-        model.supports.hold_nodes(loose, stepper.state.position)
-        stepper.supports_changed()
-
-
-def _solve_again(stepper: StaticStepper) -> None:
-    """Find the equilibrium at the present load factor with the bars that are left. Collective.
-
-    The guard is not used: what moves when bars go has nothing to do with the increments before.
-    """
-    guard, stepper.guard, stepper.scheme.releases = stepper.guard, None, True
-    try:
-        stepper._make_part(stepper.state.time)
-    except NotConverged as failure:
-        raise SimulationFailure(
-            f"{stepper.arrived()}: the rest of the truss finds no equilibrium after bars or supports went: it "
-            f'collapses, or a part of it is a mechanism; static.method = "relaxation" finds distant equilibria, '
-            f"[time] follows the motion. The last attempt: {failure}{free_motions(stepper.model, stepper.state)}"
-        ) from failure
-    finally:
-        stepper.guard, stepper.scheme.releases = guard, False
+    from .keys import Increments
 
 
 _FEW = 5  # maximum number of Newton iterations after which the next increment is larger
@@ -85,15 +40,6 @@ _EXCEEDED = (
     "nodes moved far without load, as in a snap-through, and forces from there on contain the viscous force; compare "
     "with a smaller static.stabilise, or use a dynamic stage"
 )
-
-
-class Increments(Protocol):
-    """First, smallest and largest increment of the load factor, and the last load factor."""
-
-    step: float
-    smallest: float
-    largest: float
-    end: float
 
 
 class StaticStepper(ImplicitStepper):
@@ -159,7 +105,7 @@ class StaticStepper(ImplicitStepper):
         state, model = self.state, self.model
         model.bars.step = 0.0
         if model.bars.can_break:
-            hold_detached(self)
+            self.hold_detached()
         self.start_without_motion()
         model.bars.step = np.inf
         # the force that the state lacks to equilibrium (heat, a stage before) does work in the first increment, which
@@ -182,7 +128,7 @@ class StaticStepper(ImplicitStepper):
         NotConverged
             On all ranks, if the smallest increment does not converge.
         """
-        state, reached = self.state, min(self.end, self.removals.ends())
+        state, reached = self.state, min(self.end, self.removals.ends(self.state.time))
         self._external = state.external
         left = reached - state.time
         size = first = self.increment if self.increment < left * (1.0 - TIME) else left
@@ -219,10 +165,53 @@ class StaticStepper(ImplicitStepper):
         state.step += 1
 
     def leave(self) -> None:
-        """See :func:`~pfem_petsc.statics.stepper.redistribute`. Collective."""
-        redistribute(self)
+        """Remove what is due, and redistribute the forces of bars that break. Collective."""
+        self._redistribute()
         if self.done:
             self.negatives = self._falling()
+
+    def _redistribute(self) -> None:
+        """Remove what is due at the load factor, and find equilibria there until no further bar breaks. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, if the rest of the truss finds no equilibrium.
+        """
+        changed = self.remove_due()
+        if not self.model.bars.can_break and not changed:
+            return
+        while self.model.comm.allreduce(changed or self.energy.changed > 0, op=MPI.LOR):
+            changed = False
+            self.hold_detached()
+            self._solve_again()
+
+    def hold_detached(self) -> None:
+        """Hold nodes that no bar holds any more where they are. Collective."""
+        model, owned = self.model, self.model.mesh.n_owned
+        left = np.zeros(model.mesh.n_local, dtype=bool)
+        left[model.mesh.bars[np.abs(model.bars.rupture()) < 1.0].ravel()] = True
+        loose = np.flatnonzero(~left[:owned] & ~model.supports.held_nodes())
+        if not model.links and model.comm.allreduce(len(loose)):
+            model.supports.hold_nodes(loose, self.state.position)
+            self.supports_changed()
+
+    def _solve_again(self) -> None:
+        """Find the equilibrium at the present load factor with the bars that are left. Collective.
+
+        The guard is not used: what moves when bars go has nothing to do with the increments before.
+        """
+        guard, self.guard, self.scheme.releases = self.guard, None, True
+        try:
+            self._make_part(self.state.time)
+        except NotConverged as failure:
+            raise SimulationFailure(
+                f"{self.arrived()}: the rest of the truss finds no equilibrium after bars or supports went: it "
+                f'collapses, or a part of it is a mechanism; static.method = "relaxation" finds distant equilibria, '
+                f"[time] follows the motion. The last attempt: {failure}{free_motions(self.model, self.state)}"
+            ) from failure
+        finally:
+            self.guard, self.scheme.releases = guard, False
 
     def _falling(self) -> int:
         """Return the number of directions in which the potential falls at the state, see :attr:`negatives`. Collective.
@@ -323,7 +312,7 @@ class StaticStepper(ImplicitStepper):
         super().resume()
         if self.model.bars.can_break:
             kept = self.lagged_count, self.lagged_place, self.lagged_history
-            hold_detached(self)
+            self.hold_detached()
             self.lagged_count, self.lagged_place, self.lagged_history = kept
 
     def _resist(self, viscosity: float) -> None:

@@ -9,6 +9,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
+from ..columns import HEAD
 from ..contact.explicit import find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows, solve_rows
 from ..contact.impact import join_nodes, plane_gaps, stop_nodes, unpressed
@@ -16,7 +17,6 @@ from ..integrators._leapfrog import advance, advance_loaded, centre, kick, move
 from ..mechanics.columns import join_planes, split_planes
 from ..mechanics.compiled import borrowing, kernel
 from ..mesh.ordering import NODE_BLOCK
-from ..output.sums import HEAD
 from .explicit import accelerations, explicit_increments, hold_still
 from .impulses import WALLS, fill_impulses
 from .ledger_loops import (
@@ -24,6 +24,7 @@ from .ledger_loops import (
     INTERNAL,
     LANES,
     REACTIONS,
+    NodeValues,
     add_drags,
     add_loads,
     add_powers,
@@ -409,17 +410,10 @@ def complete(n, f, half, nodes, alpha, eta, alone, held, stiffness, u, a, v):
             continue
         first = NODE_BLOCK * block
         last = min(first + NODE_BLOCK, n)
+        loads = nodes.external[first:last] if loaded else nothing
+        inertia = nodes.mass[first:last], nodes.damping
         explicit_increments(
-            nodes.external[first:last] if loaded else nothing,
-            f[first:last],
-            nodes.mass[first:last],
-            nodes.damping,
-            alpha,
-            eta,
-            nothing,
-            nothing,
-            stiffness[first:last],
-            u[first:last],
+            (loads, f[first:last]), inertia, (alpha, eta), (nothing, nothing), stiffness[first:last], u[first:last]
         )
         for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
             u[nodes.support_nodes[k], nodes.support_components[k]] = held[k]
@@ -443,7 +437,6 @@ def fill_row(
     link_sums,
     touching,
     powers,
-    lanes,
     room,
     totals,
     ends,
@@ -454,28 +447,18 @@ def fill_row(
 
     ``push_u``: see :func:`push_particles`; ``wall_sums``: forces, moments, contacts and releases of the walls;
     ``link_sums``: forces of the tables of links; ``touching``: number of nodes with contact forces; ``powers``: of the
-    balances before; ``lanes``, ``room``, ``ends`` are workspace.
+    balances before; ``room`` and ``ends`` are workspace.
     """
     n, energies = len(state.v), state.energies
     stored = 0.0
     for k in range(len(energies)):
         stored += energies[k]
-    pushed = state.contact if touching > 0 else np.empty((0, 3))
-    kinetic = book_row(
-        x[:n],
-        nodes.mass,
-        state.v,
-        state.a,
-        state.f[:n],
-        nodes.external,
-        nodes.damping,
-        pushed,
-        h,
-        lanes,
-        room,
-        totals,
-        ends,
-    )
+    none = np.empty((0, 3))
+    pushed = state.contact if touching > 0 else none
+    reaction = state.support if len(nodes.support_nodes) > 0 else none
+    forces = state.f[:n]
+    values = NodeValues(x[:n], state.v, state.a, forces, nodes.external, reaction, pushed, nodes.mass, nodes.damping)
+    kinetic = book_row(values, h, room, totals, ends)
     fill_works(ledger, powers, ends, stored)
     add_totals(ledger, totals)
     centre(push_u.reshape(-1), eta, impulses.half.reshape(-1), impulses.v.reshape(-1))
@@ -495,8 +478,10 @@ def fill_row(
     if len(force) > 0:
         at = fill_walls(row, _HEAD + 1, force, moment, impulses.v, contacts, releases)
     at = fill_links(row, at, link_sums, impulses.v, WALLS + len(force))
-    reaction = state.support if len(nodes.support_nodes) > 0 else np.empty((0, 3))
-    fill_probes(row, at, probes.nodes, probes.places, probes.counts, x, state.v, state.a, state.contact, reaction)
+    values = NodeValues(
+        x[:n], state.v, state.a, forces, nodes.external, reaction, state.contact, nodes.mass, nodes.damping
+    )
+    fill_probes(row, at, probes, values)
     return kinetic
 
 

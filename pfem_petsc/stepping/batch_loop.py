@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..columns import HEAD
 from ..contact.forces import compare_contacts
 from ..integrators._leapfrog import centre
 from ..mechanics.bar_loops import first_inverted
@@ -15,7 +16,6 @@ from ..mechanics.columns import Columns, Sweep, gather_history, slide_planes, sp
 from ..mechanics.compiled import borrowing, kernel
 from ..mechanics.rows import CHUNK, new_rows
 from ..mesh.ordering import NODE_BLOCK
-from ..output.sums import HEAD
 from .batch_blocks import (
     advance_block,
     complete,
@@ -41,11 +41,12 @@ from .ledger_loops import (
     CONTACT,
     INTERNAL,
     WORKS,
+    Acting,
     add_sparse_powers,
     clear_forces,
     clear_sums,
     fill_walls,
-    new_lanes,
+    new_row_room,
     new_sums,
     start_of_step,
     sum_balance,
@@ -114,7 +115,7 @@ class BlockArrays(NamedTuple):
     ``inverses`` (n,) of the stiffness; ``factors``, ``speeds`` and ``drag``
     (3 NODE_BLOCK,) buffers of a block, the last one empty without damping; for prescribed components the increments
     ``held`` (k,) [m] and ``load`` (k,), the forces that would move them [N]; reactions ``support`` (n, 3) [N]; and
-    ``lanes``, the sums of the balance, see :mod:`~pfem_petsc.stepping.balance_loops`."""
+    ``lanes``, the sums of the balance, see :mod:`~pfem_petsc.stepping.ledger_loops`."""
 
     h: float
     alpha: float
@@ -140,7 +141,7 @@ class ImpulseArrays(NamedTuple):
 
 
 class ProbeArrays(NamedTuple):
-    """Nodes of all probes, see :meth:`~pfem_petsc.recording.recorder.Recorder.probed`."""
+    """Nodes of all probes, see :meth:`~pfem_petsc.run.recorder.Recorder.probed`."""
 
     nodes: np.ndarray
     places: np.ndarray
@@ -255,8 +256,8 @@ def make_fused_loop(
         stiffness = np.empty(n)
         load, held = np.empty(len(nodes.support_nodes)), np.empty(len(nodes.support_nodes))
         speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
-        ends, totals, lanes, room = np.empty(len(WORKS)), np.zeros((6, 3)), new_sums(), new_lanes()
-        row_lanes, after = new_sums(), np.empty(len(WORKS))
+        ends, totals, lanes, room = np.empty(len(WORKS)), np.zeros((6, 3)), new_sums(), new_row_room()
+        after = np.empty(len(WORKS))
         numbers, buffers = (h, alpha, eta), (factors, speeds, drag)
         shared = BlockArrays(*numbers, x, half, inverses, *buffers, held, load, support, lanes)
         work, columns_work = np.empty(work_rows * CHUNK), new_rows(column_rows)
@@ -297,7 +298,7 @@ def make_fused_loop(
                 continue
             for i in near:
                 contact[i] = 0.0
-            clear_forces(lanes, n, supported, loaded, damped)
+            clear_forces(lanes, n, Acting(supported, loaded, False, damped))
             changed = 0
             changes = 0
             moved = 0
@@ -422,7 +423,7 @@ def make_fused_loop(
             sum_rows(rows, pressing)
             touching = len(near) + 2 * pressing
             after[:] = powers
-            sum_balance(lanes, n, h, supported, loaded, touching > 0, damped, totals, after)
+            sum_balance(lanes, n, h, Acting(supported, loaded, touching > 0, damped), totals, after)
             push_particles(totals, pressed.force, rows.totals, alpha, h, impulses, push_u)
             ledger[_IMPACT] += impact
             if n_walls > 0:
@@ -463,7 +464,6 @@ def make_fused_loop(
                     rows.totals,
                     touching,
                     powers,
-                    row_lanes,
                     room,
                     totals,
                     ends,

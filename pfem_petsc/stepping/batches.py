@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
+from ..columns import ENERGIES, HEAD, WALL
 from ..contact.forces import WallForces
-from ..energies import ENERGIES
 from ..errors import SimulationFailure
 from ..mechanics.bar_loops import fused_parts
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.columns import Columns, make_columns, new_planes, no_columns
 from ..mesh.ordering import NODE_BLOCK
-from ..output.sums import HEAD, WALL
 from ..parallel.heap import return_freed_memory
 from ..tolerances import PROJECTED
 from .batch_loop import BarArrays, ImpulseArrays, NodeArrays, ProbeArrays, StateArrays, WallArrays, make_fused_loop
@@ -22,8 +21,6 @@ from .ledger import LeapfrogLedger
 from .stepper import Solution
 
 if TYPE_CHECKING:
-    from ..recording.observers import History
-    from ..recording.recorder import Recorder
     from .ledger import Ledger
     from .stepper import Stepper
     from .time_stepping import TimeStepping
@@ -45,10 +42,10 @@ class Batch:
 
     Attributes
     ----------
-    sums : (:data:`MOST`, width) for each step, the sums that :meth:`~pfem_petsc.recording.recorder.Recorder.row` uses
+    sums : (:data:`MOST`, width) for each step, the sums that :meth:`~pfem_petsc.run.recorder.Recorder.row` uses
     """
 
-    def __init__(self, stepper: Stepper, ledger: LeapfrogLedger, recorder: Recorder) -> None:
+    def __init__(self, stepper: Stepper, ledger: LeapfrogLedger, recorder: Any) -> None:
         self.stepper, self.ledger = stepper, ledger
         model = stepper.model
         self.model = model
@@ -204,7 +201,7 @@ class Batch:
         state.step, state.time = begin + done - 1, (begin + done) * stepper.h
         stepper.balance = scheme.balance(state, stepper.h)
         if changed:
-            stepper.ruptures.note()
+            stepper.ruptures.note(state.x, stepper.number + 1, stepper.arrived())
             self.sums[done - 1, _BROKEN] = stepper.ruptures.count
         if known is not None:  # of earlier steps; the ranks have not synchronised since
             self.sums[: len(due), _ALARM] = 1.0
@@ -240,7 +237,7 @@ class Batches:
         """The same for the next stage."""
         return Batches(self._min_steps)
 
-    def advance(self, analysis: TimeStepping, history: History, left: int) -> bool:
+    def advance(self, analysis: TimeStepping, history: Any, left: int) -> bool:
         """Make fused steps that need only rows of the history.
 
         Parameters
@@ -257,7 +254,7 @@ class Batches:
         """
         stepper, state, end = analysis.stepper, analysis.state, analysis.last_step
         begin = state.step
-        count = min(left, end - begin, MOST + 1, stepper.removals.steps_left()) - 1
+        count = min(left, end - begin, MOST + 1, stepper.removals.steps_left(state.time, stepper.h)) - 1
         if self._refused or count < _FEWEST or end < self._min_steps or not history.ledger.begun:
             return True
         if self._changes != stepper.support_changes:

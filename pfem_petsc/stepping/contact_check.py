@@ -15,8 +15,8 @@ from ..integrators.base import Balance, Scheme, State
 from ..registry import lookup
 
 if TYPE_CHECKING:
+    from ..case.model import Time
     from ..case.schema import Case
-    from ..case.settings import Time
 
 
 KNOWN = ("scheme", "stick", "conserving", "mass_redistribution")

@@ -20,12 +20,17 @@ if TYPE_CHECKING:
 
 
 @kernel
-def explicit_increments(external, f, mass, damping, alpha, eta, a_hat, v_hat, stiffness, u):
+def explicit_increments(forces, inertia, factors, known, stiffness, u):
     """Solve (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat for every node.
 
-    ``external``, ``a_hat``, ``v_hat`` are (owned, 3), or (0, 3) for zero; ``stiffness`` (owned,) and ``u`` (owned, 3)
-    are written.
+    ``forces``: f_ext and f_int; ``inertia``: m and c (owned,); ``factors``: alpha and eta; ``known``: a_hat and v_hat.
+    The first, a_hat and v_hat are (owned, 3), or (0, 3) for zero; ``stiffness`` (owned,) and ``u`` (owned, 3) are
+    written.
     """
+    external, f = forces
+    mass, damping = inertia
+    alpha, eta = factors
+    a_hat, v_hat = known
     loaded = len(external) > 0
     carried = len(a_hat) > 0
     damped = len(v_hat) > 0
@@ -66,11 +71,12 @@ def accelerations(u, alpha, a):
 
 
 @kernel
-def hold(begin, end, origin, nodes, components, positions, predictor, stiffness, u, load):
-    """Set the prescribed components [begin, end) of ``u`` to their values; ``load`` (k,) output: force that would move
-    them [N]. ``origin``: the node in the first row of ``predictor``, ``stiffness`` and ``u``."""
-    for k in range(begin, end):
-        i, c = nodes[k] - origin, components[k]
+def hold(supports, predictor, stiffness, u, load):
+    """Set prescribed components of ``u`` (owned, 3) to their values; ``load`` (k,) output: force that would move them
+    [N]. ``supports``: nodes, components and positions (k,)."""
+    nodes, components, positions = supports
+    for k in range(len(nodes)):
+        i, c = nodes[k], components[k]
         load[k] = stiffness[i] * u[i, c]
         u[i, c] = positions[k] - predictor[i, c]
 
@@ -98,11 +104,12 @@ def hold_still(
 
 
 @kernel
-def react(begin, end, origin, nodes, components, load, contact, stiffness, u, support):
-    """Write support forces [begin, end) into ``support`` (owned, 3) [N], from the loads that :func:`hold` computed."""
-    for k in range(begin, end):
+def react(supports, load, contact, stiffness, u, support):
+    """Write support forces into ``support`` (owned, 3) [N], from the loads that :func:`hold` computed."""
+    nodes, components, _ = supports
+    for k in range(len(nodes)):
         i, c = nodes[k], components[k]
-        support[i, c] = stiffness[i - origin] * u[i - origin, c] - load[k] - contact[i, c]
+        support[i, c] = stiffness[i] * u[i, c] - load[k] - contact[i, c]
 
 
 class ExplicitStepper(Stepper):
@@ -156,18 +163,13 @@ class ExplicitStepper(Stepper):
         model, state = self.model, self.state
         inertia = model.inertia
         u, stiffness = np.empty_like(state.v), self._stiffness_for(balance)
-        explicit_increments(
-            state.external if model.external.active else self._none,
-            state.f,
-            inertia.mass,
-            inertia.damping,
-            balance.alpha,
-            balance.eta,
+        forces = state.external if model.external.active else self._none, state.f
+        known = (
             balance.a_hat if balance.a_hat is not None else self._none,
             balance.v_hat if inertia.damped else self._none,
-            stiffness,
-            u,
         )
+        factors = balance.alpha, balance.eta
+        explicit_increments(forces, (inertia.mass, inertia.damping), factors, known, stiffness, u)
         supports = model.supports
         state.contact = self.zero
         if supports.any:
@@ -175,7 +177,8 @@ class ExplicitStepper(Stepper):
             if supports.inclined is not None:
                 others = self._hold(balance, stiffness, u)
             positions = supports.positions(balance.time)[: len(supports.nodes)]
-            hold(0, len(load), 0, supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
+            held_at = supports.nodes, supports.components, positions
+            hold(held_at, balance.predictor, stiffness, u, load)
         walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.size
         with self._faults(balance):
             state.contact = model.links.explicit(balance, state, u, stiffness, self.zero, tolerance)
@@ -191,9 +194,7 @@ class ExplicitStepper(Stepper):
                 held = nodes
         if supports.any:
             state.support = np.zeros_like(u)
-            react(
-                0, len(load), 0, supports.nodes, supports.components, load, state.contact, stiffness, u, state.support
-            )
+            react(held_at, load, state.contact, stiffness, u, state.support)
             if supports.inclined is not None:
                 state.support[supports.inclined.nodes] = others - supports.inclined.part(state.contact)
         return Solution(u, state.f, walls, contacts=model.links.count_held(held, len(u)))

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
+from ..columns import ENERGIES, HEAD
 from ..contact.impact import Impacts
-from ..energies import ENERGIES
 from ..mechanics.bars import StrainEnergy, state_before_rupture
 from ..mechanics.conserving import MEASURES
 from ..mechanics.materials.base import SMALL
-from ..output.sums import HEAD
 from .impulses import Impulses, NoImpulses, wall_shares
 from .ledger_loops import (
     DAMPING,
@@ -21,14 +20,15 @@ from .ledger_loops import (
     INERTIAL,
     TOTALS,
     WORKS,
+    NodeValues,
+    StepWorks,
     add_totals,
     add_works,
     book_balance,
     book_nodes,
     book_row,
     fill_works,
-    new_lanes,
-    new_sums,
+    new_row_room,
 )
 
 if TYPE_CHECKING:
@@ -227,10 +227,15 @@ class BarChanges:
         return float((block.counted_area * (rest * mean * (whole - moved) + density * (rest1 - rest0))).sum())
 
 
-_NOTHING = np.empty((0, 3))
+_NO_FORCES = np.empty((0, 3))
 _AT = {energy.name: HEAD.first(energy.name) for energy in ENERGIES if energy.source != "derived"}
 _SUPPORT = TOTALS.index("support")
 _TOTALS = slice(HEAD.first("momentum"), HEAD["support_force"].stop)
+
+
+def _loads(moment: Moment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the forces (owned, 3) that may be zero, in the order of :class:`NodeValues`."""
+    return moment.external, moment.support, moment.contact
 
 
 class Ledger:
@@ -238,7 +243,7 @@ class Ledger:
 
     Attributes
     ----------
-    sums : of a row, in the layout of :data:`~pfem_petsc.output.sums.HEAD`: works and dissipations since the start [J],
+    sums : of a row, in the layout of :data:`~pfem_petsc.columns.HEAD`: works and dissipations since the start [J],
         and totals of this rank's nodes at the present state; valid after :meth:`complete`
     impulses : Impulses
     impacts : Impacts
@@ -307,7 +312,9 @@ class Ledger:
             of, by = WORKS.index("inertial"), WORKS.index("damping")
             self._works[of] = self._works[of] + self._works[by] - damping
             self._works[by] = damping
-        add_works(self.sums, self._works, stored, heating, impact, friction, work, given, weight, lost, jumped)
+        add_works(
+            self.sums, self._works, StepWorks(stored, heating, impact, friction, work, given, weight, lost, jumped)
+        )
         self.sums[_AT["prestress_work"]] += stressing
         self.sums[_AT["numerical_dissipation"]] += stressing
 
@@ -411,36 +418,22 @@ class Ledger:
     def _book(self, present: Moment, first: Moment, second: Moment, start: np.ndarray) -> None:
         """Add kinetic energy and totals at the present state, and the works from positions ``start`` (owned, 3)."""
         state, inertia = self.stepper.state, self.model.inertia
-        present.kinetic = book_nodes(
-            start,
-            state.position,
-            inertia.mass,
-            self._mass,
-            state.v,
-            present.momentum,
-            state.support,
-            self._damping,
-            first.a,
-            second.a,
-            first.v,
-            second.v,
-            first.internal,
-            second.internal,
-            *self._pair(first.external, second.external),
-            *self._pair(first.support, second.support),
-            *self._pair(first.contact, second.contact),
-            self._totals,
-            self._works,
-        )
+        zero, x, mass = self.stepper.zero, state.position, inertia.mass
+
+        def values(moment: Moment) -> NodeValues:
+            forces = (
+                _NO_FORCES if one is zero and other is zero else own
+                for one, other, own in zip(_loads(first), _loads(second), _loads(moment), strict=True)
+            )
+            return NodeValues(x, moment.v, moment.a, moment.internal, *forces, mass, self._damping)
+
+        here = NodeValues(x, state.v, state.a, state.f, zero, state.support, zero, mass, self._damping)
+        momenta = self._mass, present.momentum
+        present.kinetic = book_nodes(start, here, momenta, values(first), values(second), self._totals, self._works)
         self.sums[_AT["kinetic_energy"]] = present.kinetic
         if self.model.bars.springs is not None:  # reactions of the ground: the forces of bars cancel in the sum
             self._totals[_SUPPORT] -= second.internal.sum(axis=0)
         add_totals(self.sums, self._totals)
-
-    def _pair(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return two arrays, or the placeholder for two arrays of zeros."""
-        zero = self.stepper.zero
-        return (_NOTHING, _NOTHING) if first is zero and second is zero else (first, second)
 
     def _before_jump(self, after: Moment) -> tuple[Moment, float]:
         """Return the end of the step before velocity jumps, and the energy of the jumps [J], a work of contact."""
@@ -485,7 +478,6 @@ class Ledger:
 _EXTERNAL, _DAMPING = HEAD.first("external_work"), HEAD.first("damping_dissipation")
 _IMPACT, _NUMERICAL = HEAD.first("impact_dissipation"), HEAD.first("numerical_dissipation")
 _KINETIC = HEAD.first("kinetic_energy")
-_NO_FORCES = np.empty((0, 3))
 
 
 def make_ledger(stepper: Stepper) -> Ledger:
@@ -509,7 +501,7 @@ class LeapfrogLedger(Ledger):
         self.begun = False
         super().__init__(stepper)
         self._ends = np.zeros(len(WORKS))
-        self._lanes, self._room = new_sums(), new_lanes()
+        self._room = new_row_room()
         self._complete = True
         # bars that are removed after a step change the forces of its end
         self._at_once = bool(stepper.model.case.remove)
@@ -545,21 +537,18 @@ class LeapfrogLedger(Ledger):
 
     def _sum_row(self, present: Moment) -> float:
         """Return the kinetic energy [J]; compute totals and the works of half a step."""
-        state, model = self.stepper.state, self.model
-        external, contact = self._one(present.external), self._one(present.contact)
-        loads = (present.internal, external, self._damping, contact)
-        room = (self._lanes, self._room, self._totals, self._ends)
-        return book_row(state.position, model.inertia.mass, state.v, state.a, *loads, self.stepper.h, *room)
+        return book_row(self._values(present), self.stepper.h, self._room, self._totals, self._ends)
 
     def _sum_balance(self, present: Moment) -> None:
         """Add the works of the present balance."""
-        external, support, contact = (self._one(of) for of in (present.external, present.support, present.contact))
-        loads = (present.internal, external, self._damping, support, contact)
-        book_balance(*loads, self.stepper.state.v, self.stepper.h, self._totals, self.powers)
+        book_balance(self._values(present), self.stepper.h, self._totals, self.powers)
 
-    def _one(self, array: np.ndarray) -> np.ndarray:
-        """Return an array, or the placeholder for an array of zeros."""
-        return _NO_FORCES if array is self.stepper.zero else array
+    def _values(self, present: Moment) -> NodeValues:
+        """Return the values at the state, with placeholders for arrays of zeros."""
+        state, zero = self.stepper.state, self.stepper.zero
+        loads = (_NO_FORCES if force is zero else force for force in _loads(present))
+        mass = self.model.inertia.mass
+        return NodeValues(state.position, state.v, state.a, present.internal, *loads, mass, self._damping)
 
     def _begin(self) -> None:
         """Continue the works of the steps before."""

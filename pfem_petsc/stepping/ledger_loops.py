@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from ..energies import BAR_ENERGIES
+from ..columns import BAR_ENERGIES, HEAD, PAIR, WALL
 from ..mechanics.compiled import inlined, kernel
-from ..output.sums import HEAD, PAIR, WALL
 from .impulses import WALLS
 
 WORKS = ("external", "contact", "damping", "inertial", "internal")
@@ -29,6 +30,49 @@ _BY_EXTERNAL = WORKS.index("external")
 _MASSES, _PULSES, _WAYS = (WIDE * k for k in range(14, 17))
 
 
+class NodeValues(NamedTuple):
+    """Values at owned nodes at an instant, (owned, 3); ``external``, ``support``, ``contact`` may be (0, 3) for zero,
+    ``mass`` is (owned,), and ``damping`` (owned,), or (0,) for none."""
+
+    x: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    internal: np.ndarray
+    external: np.ndarray
+    support: np.ndarray
+    contact: np.ndarray
+    mass: np.ndarray
+    damping: np.ndarray
+
+
+class Acting(NamedTuple):
+    """Whether supports, loads, contact and damping act in a balance."""
+
+    supports: bool
+    loads: bool
+    contact: bool
+    damping: bool
+
+
+class StepWorks(NamedTuple):
+    """Works and dissipations of a step besides those at nodes [J].
+
+    ``stored``: change of the energies of nodes and bars; ``heating``: work of changing temperatures; ``impact``,
+    ``friction``: dissipations; ``walls``, ``bodies``, ``weight``, ``lost``: work on the truss of walls that move as
+    prescribed and of those with mass, work of the weight of these, and their numerical dissipation; ``jumped``: energy
+    that a treatment of impact gave to nodes."""
+
+    stored: float
+    heating: float
+    impact: float
+    friction: float
+    walls: float
+    bodies: float
+    weight: float
+    lost: float
+    jumped: float
+
+
 @kernel
 def new_lanes():
     """Return the sums of all lanes, zero, and workspace."""
@@ -36,30 +80,13 @@ def new_lanes():
 
 
 @kernel
-def _book_part(
-    x0,
-    x1,
-    mass,
-    factor,
-    v,
-    p,
-    support,
-    damping,
-    a0,
-    a1,
-    v0,
-    v1,
-    f0,
-    f1,
-    e0,
-    e1,
-    s0,
-    s1,
-    r0,
-    r1,
-    lanes,
-):
+def _book_part(start, present, momenta, first, second, lanes):
     """Add all nodes to the sums of the lanes; arguments as those of :func:`book_nodes`."""
+    factor, p = momenta
+    x1, mass, v, support, damping = present.x, present.mass, present.v, present.support, present.damping
+    a0, a1, v0, v1, f0, f1 = first.a, second.a, first.v, second.v, first.internal, second.internal
+    e0, e1, s0, s1 = first.external, second.external, first.support, second.support
+    r0, r1 = first.contact, second.contact
     # Each loop reads few arrays: with more the compiler does not check that they do not overlap. Loops begin at zero,
     # which spares them a check for negative indices.
     masses, ways = lanes[_MASSES : _MASSES + WIDE], lanes[_WAYS : _WAYS + WIDE]
@@ -67,43 +94,43 @@ def _book_part(
     inertial = lanes[_WORK_INERTIAL : _WORK_INERTIAL + WIDE]
     internal = lanes[_WORK_INTERNAL : _WORK_INTERNAL + WIDE]
     external = lanes[_WORK_EXTERNAL : _WORK_EXTERNAL + WIDE]
-    for first in range(0, len(x0), LANES):
-        last = min(first + LANES, len(x0))
-        wide = 3 * (last - first)
-        z0, z1 = x0[first:last].reshape(-1), x1[first:last].reshape(-1)
-        speeds, pulses = v[first:last].reshape(-1), p[first:last].reshape(-1)
-        _add_totals(mass[first:last], factor[first:last], z1, pulses, lanes)
-        spread(factor[first:last], masses)
+    for at in range(0, len(start), LANES):
+        last = min(at + LANES, len(start))
+        wide = 3 * (last - at)
+        z0, z1 = start[at:last].reshape(-1), x1[at:last].reshape(-1)
+        speeds, pulses = v[at:last].reshape(-1), p[at:last].reshape(-1)
+        _add_totals(mass[at:last], factor[at:last], z1, pulses, lanes)
+        spread(factor[at:last], masses)
         for j in range(wide):
             kinetic[j] += masses[j] * pulses[j] * speeds[j]
-        one, other = a0[first:last].reshape(-1), a1[first:last].reshape(-1)
+        one, other = a0[at:last].reshape(-1), a1[at:last].reshape(-1)
         for j in range(wide):
             way = 0.5 * (z1[j] - z0[j])
             ways[j] = way
             inertial[j] += masses[j] * (way * (one[j] + other[j]))
-        one, other = f0[first:last].reshape(-1), f1[first:last].reshape(-1)
+        one, other = f0[at:last].reshape(-1), f1[at:last].reshape(-1)
         for j in range(wide):
             internal[j] += ways[j] * (one[j] + other[j])
         if len(e0) > 0:
-            one, other = e0[first:last].reshape(-1), e1[first:last].reshape(-1)
+            one, other = e0[at:last].reshape(-1), e1[at:last].reshape(-1)
             loads = lanes[_EXTERNAL : _EXTERNAL + WIDE]
             for j in range(wide):
                 external[j] += ways[j] * (one[j] + other[j])
                 loads[j] += other[j]
         if len(s0) > 0:
-            one, other, held = s0[first:last].reshape(-1), s1[first:last].reshape(-1), support[first:last].reshape(-1)
+            one, other, held = s0[at:last].reshape(-1), s1[at:last].reshape(-1), support[at:last].reshape(-1)
             reactions, work = lanes[_SUPPORT : _SUPPORT + WIDE], lanes[_WORK_SUPPORT : _WORK_SUPPORT + WIDE]
             for j in range(wide):
                 work[j] += ways[j] * (one[j] + other[j])
                 reactions[j] += held[j]
         if len(r0) > 0:
-            one, other = r0[first:last].reshape(-1), r1[first:last].reshape(-1)
+            one, other = r0[at:last].reshape(-1), r1[at:last].reshape(-1)
             contact = lanes[_WORK_CONTACT : _WORK_CONTACT + WIDE]
             for j in range(wide):
                 contact[j] += ways[j] * (one[j] + other[j])
         if len(damping) > 0:
-            spread(damping[first:last], masses)
-            one, other = v0[first:last].reshape(-1), v1[first:last].reshape(-1)
+            spread(damping[at:last], masses)
+            one, other = v0[at:last].reshape(-1), v1[at:last].reshape(-1)
             work, drags = lanes[_WORK_DAMPING : _WORK_DAMPING + WIDE], lanes[_DAMPING : _DAMPING + WIDE]
             for j in range(wide):
                 work[j] += masses[j] * (ways[j] * (one[j] + other[j]))
@@ -186,26 +213,23 @@ def sum_lane(lanes, wide):
 
 
 @kernel
-def book_nodes(
-    x0, x1, mass, factor, v, p, support, damping, a0, a1, v0, v1, f0, f1, e0, e1, s0, s1, r0, r1, totals, works
-):
-    """Return the kinetic energy [J] at the end of a step; sum over nodes there, and works over dx = x1 - x0 by the mean
-    of two sets of forces.
+def book_nodes(start, present, momenta, first, second, totals, works):
+    """Return the kinetic energy [J] at the end of a step; sum over nodes there, and works over its displacements by the
+    mean of two sets of forces.
 
     Parameters
     ----------
-    x0, x1 : (owned, 3) positions at start and end
-    mass : (owned,); the momentum of a node is ``factor`` (owned,) times ``p``: m v, or M v with factor one
-    v, p, support : (owned, 3) at the end
-    damping : (owned,), (0,) for none; like ``factor`` it multiplies ``v0`` and ``v1``
-    a0, a1, v0, v1, f0, f1, e0, e1, s0, s1, r0, r1 : acceleration, velocity, internal, external, support and contact
-        force at start and end of the works' rule (owned, 3); the last six may be (0, 3) for zero, in pairs
+    start : (owned, 3) positions at the start
+    present : NodeValues at the end, whose ``damping`` multiplies the velocities of the sets of forces
+    momenta : ``factor`` (owned,) and ``p`` (owned, 3), whose product is the momentum: m v, or M v with factor one
+    first, second : NodeValues at start and end of the works' rule; external, support and contact forces are (0, 3) in
+        both, or in none
     totals : (6, 3) output, see :data:`TOTALS`; external and damping force are those at the end of the works' rule
     works : (5,) output [J], see :data:`WORKS`
     """
     lanes = new_lanes()
-    _book_part(x0, x1, mass, factor, v, p, support, damping, a0, a1, v0, v1, f0, f1, e0, e1, s0, s1, r0, r1, lanes)
-    wide = min(3 * len(x0), WIDE)
+    _book_part(start, present, momenta, first, second, lanes)
+    wide = min(3 * len(start), WIDE)
     _sum_totals(lanes, wide, len(totals), totals)
     for k in range(len(works)):
         x, y, z = sum_lane(lanes[_WORK_EXTERNAL + WIDE * k :], wide)
@@ -230,28 +254,26 @@ _BY_LOADS, _BY_CONTACT, _BY_DAMPING, _BY_INERTIA, _BY_BARS = range(len(WORKS))
 
 
 @kernel
-def add_works(sums, works, stored, heating, impact, friction, work, given, weight, lost, jumped) -> None:
+def add_works(sums, works, step) -> None:
     """Add the works and dissipations of a step to the sums of a row [J].
 
     Parameters
     ----------
-    sums : (HEAD.width,) in the layout of :data:`~pfem_petsc.output.sums.HEAD`
-    works : (5,) see :data:`~pfem_petsc.stepping.book_loops.WORKS`
-    stored : change of the energies of nodes and bars; heating : work of changing temperatures
-    impact, friction : dissipations
-    work, given, weight, lost : of walls: work on the truss of those that move as prescribed and of those with mass, of
-        the weight of these, and their numerical dissipation
-    jumped : energy that a treatment of impact gave to nodes
+    sums : (HEAD.width,) in the layout of :data:`~pfem_petsc.columns.HEAD`
+    works : (5,) see :data:`WORKS`
+    step : StepWorks
     """
-    sums[_EXTERNAL_WORK] += works[_BY_LOADS] + weight
-    sums[_CONTACT_WORK] += work
+    sums[_EXTERNAL_WORK] += works[_BY_LOADS] + step.weight
+    sums[_CONTACT_WORK] += step.walls
     sums[_DAMPING_DISSIPATION] += works[_BY_DAMPING]
-    sums[_THERMAL] += heating
-    sums[_FRICTION] += friction
-    sums[_IMPACT] += impact
+    sums[_THERMAL] += step.heating
+    sums[_FRICTION] += step.friction
+    sums[_IMPACT] += step.impact
     # the work of contact on nodes in excess of the work of walls and the losses by friction and impact
-    left = works[_BY_CONTACT] + jumped - work - given + friction
-    sums[_NUMERICAL] += works[_BY_INERTIA] + works[_BY_BARS] + heating - stored - left - impact + lost
+    left = works[_BY_CONTACT] + step.jumped - step.walls - step.bodies + step.friction
+    sums[_NUMERICAL] += (
+        works[_BY_INERTIA] + works[_BY_BARS] + step.heating - step.stored - left - step.impact + step.lost
+    )
 
 
 @kernel
@@ -262,7 +284,7 @@ def fill_works(sums, powers, ends, held) -> None:
     ----------
     sums : (HEAD.width,) of a row; those of impact are complete
     powers : (5,) of the balances before, see :class:`~pfem_petsc.stepping.leapfrog_ledger.LeapfrogLedger`
-    ends : (5,) of the last balance, see :func:`~pfem_petsc.stepping.balance_loops.book_row`
+    ends : (5,) of the last balance, see :func:`~pfem_petsc.stepping.ledger_loops.book_row`
     held : energies of the bars
     """
     sums[_EXTERNAL_WORK] = powers[_BY_LOADS] + ends[_BY_LOADS]
@@ -312,21 +334,20 @@ def fill_links(row, at, force, v, first) -> int:
 
 
 @kernel
-def fill_probes(row, at, nodes, places, counts, x, v, a, contact, support) -> None:
+def fill_probes(row, at, probes, values) -> None:
     """Write positions, velocities, accelerations and reactions of this rank's probed nodes, from index ``at`` of a row.
 
-    ``nodes`` (m,); ``places`` (m,) of the positions among the sums of all probes; ``counts`` (m,) numbers of nodes of
-    the probes on all ranks; ``support`` (0, 3) if there are no supports.
+    ``probes``: see :class:`~pfem_petsc.stepping.batch_loop.ProbeArrays`; ``values``: NodeValues.
     """
-    supported = len(support) > 0
-    for j in range(len(nodes)):
-        i = nodes[j]
-        first, size = at + places[j], 3 * counts[j]
+    supported = len(values.support) > 0
+    for j in range(len(probes.nodes)):
+        i = probes.nodes[j]
+        first, size = at + probes.places[j], 3 * probes.counts[j]
         for c in range(3):
-            row[first + c] = x[i, c]
-            row[first + size + c] = v[i, c]
-            row[first + 2 * size + c] = a[i, c]
-            row[first + 3 * size + c] = contact[i, c] + (support[i, c] if supported else 0.0)
+            row[first + c] = values.x[i, c]
+            row[first + size + c] = values.v[i, c]
+            row[first + 2 * size + c] = values.a[i, c]
+            row[first + 3 * size + c] = values.contact[i, c] + (values.support[i, c] if supported else 0.0)
 
 
 # rows of lanes: one for each work, in the order of WORKS, with that of inertia unused; then sums of forces
@@ -349,15 +370,15 @@ def clear_sums(sums, n):
 
 
 @kernel
-def clear_forces(lanes, n, supported, loaded, damped):
+def clear_forces(lanes, n, acting):
     """Set the sums of a balance to zero, as far as there are supports, loads and damping; not those of contact."""
     clear_sums(lanes[INTERNAL], n)
-    if supported:
+    if acting.supports:
         clear_sums(lanes[REACTIONS], n)
-    if loaded:
+    if acting.loads:
         clear_sums(lanes[EXTERNAL], n)
         clear_sums(lanes[_PUSHES], n)
-    if damped:
+    if acting.damping:
         clear_sums(lanes[DAMPING], n)
         clear_sums(lanes[_DRAGS], n)
 
@@ -425,7 +446,7 @@ def add_loads(external, v, lanes):
 
 
 @kernel
-def sum_balance(lanes, n, h, supported, loaded, pressed, damped, totals, powers):
+def sum_balance(lanes, n, h, acting, totals, powers):
     """Add ``h`` times the powers of a balance to ``powers`` (5,) [J], and write the sums of forces into ``totals``;
     those of supports, loads, contact and damping as far as there are any."""
     wide = min(3 * n, WIDE)
@@ -433,14 +454,14 @@ def sum_balance(lanes, n, h, supported, loaded, pressed, damped, totals, powers)
         for c in range(3):
             totals[k, c] = 0.0
     _sum_power(lanes, INTERNAL, wide, h, powers)
-    if supported:
+    if acting.supports:
         totals[3] = sum_lane(lanes[REACTIONS], wide)
-    if loaded:
+    if acting.loads:
         _sum_power(lanes, EXTERNAL, wide, h, powers)
         totals[4] = sum_lane(lanes[_PUSHES], wide)
-    if pressed:
+    if acting.contact:
         _sum_power(lanes, CONTACT, wide, h, powers)
-    if damped:
+    if acting.damping:
         _sum_power(lanes, DAMPING, wide, h, powers)
         x, y, z = sum_lane(lanes[_DRAGS], wide)
         totals[5] = -x, -y, -z
@@ -453,40 +474,65 @@ def _sum_power(lanes, row, wide, h, powers):
 
 
 @kernel
-def book_balance(f, external, damping, support, contact, v, h, totals, powers):
+def book_balance(values, h, totals, powers):
     """Add the works of a balance, ``h`` times force times velocity, to ``powers`` (5,) [J], in the order of ``WORKS``;
-    write the sums of support, external and damping forces into ``totals`` (6, 3) [N].
-
-    ``f``, ``v`` (owned, 3); ``support``, ``external`` and ``contact`` (owned, 3), or (0, 3) for none; ``damping``
-    (owned,), or (0,) for none.
-    """
+    write the sums of support, external and damping forces into ``totals`` (6, 3) [N]. ``values``: NodeValues."""
+    v, external, support, contact, damping = (
+        values.v,
+        values.external,
+        values.support,
+        values.contact,
+        values.damping,
+    )
     n = len(v)
+    acting = Acting(len(support) > 0, len(external) > 0, len(contact) > 0, len(damping) > 0)
     lanes = new_sums()
     drag = np.empty(WIDE)
     for first in range(0, n, LANES):  # velocities are read once from memory
         last = min(first + LANES, n)
         speeds = v[first:last].reshape(-1)
-        add_powers(f[first:last].reshape(-1), speeds, lanes[INTERNAL])
-        if len(support) > 0:
+        add_powers(values.internal[first:last].reshape(-1), speeds, lanes[INTERNAL])
+        if acting.supports:
             add_forces(support[first:last].reshape(-1), lanes[REACTIONS])
-        if len(external) > 0:
+        if acting.loads:
             add_loads(external[first:last].reshape(-1), speeds, lanes)
-        if len(contact) > 0:
+        if acting.contact:
             add_powers(contact[first:last].reshape(-1), speeds, lanes[CONTACT])
-        if len(damping) > 0:
+        if acting.damping:
             add_drags(damping[first:last], speeds, drag, lanes)
-    sum_balance(lanes, n, h, len(support) > 0, len(external) > 0, len(contact) > 0, len(damping) > 0, totals, powers)
+    sum_balance(lanes, n, h, acting, totals, powers)
+
+
+class RowRoom(NamedTuple):
+    """Workspace of :func:`book_row`: lanes of sums, and those of totals."""
+
+    sums: np.ndarray
+    totals: np.ndarray
 
 
 @kernel
-def book_row(x, mass, v, a, f, external, damping, contact, h, lanes, room, totals, ends):
+def new_row_room():
+    """Return workspace for rows."""
+    return RowRoom(new_sums(), new_lanes())
+
+
+@kernel
+def book_row(values, h, room, totals, ends):
     """Return the kinetic energy [J]; write momentum, angular momentum and mass times position into ``totals`` (6, 3),
     and into ``ends`` (5,) [J], in the order of ``WORKS``, half the works over the last step of the forces at its end.
 
-    The step was h v - h^2 a/2. At the place of inertia is h^2/8 times the sum of m a . a. Arrays as in
-    :func:`book_balance`; ``lanes`` and ``room``, from :func:`~pfem_petsc.stepping.book_loops.new_lanes`, are workspace.
+    The step was h v - h^2 a/2. At the place of inertia is h^2/8 times the sum of m a . a. ``values``: NodeValues;
+    ``room``: RowRoom.
     """
-    n = len(v)
+    v, a, mass, external, contact, damping = (
+        values.v,
+        values.a,
+        values.mass,
+        values.external,
+        values.contact,
+        values.damping,
+    )
+    n, lanes = len(v), room.sums
     wide = min(3 * n, WIDE)
     half, eighth = 0.5 * h, 0.125 * h * h
     loaded, pressed, damped = len(external) > 0, len(contact) > 0, len(damping) > 0
@@ -504,7 +550,7 @@ def book_row(x, mass, v, a, f, external, damping, contact, h, lanes, room, total
         for j in range(len(speeds)):
             ways[j] = half * (speeds[j] - half * pulls[j])
         here = ways[: len(speeds)]
-        add_powers(f[first:last].reshape(-1), here, lanes[INTERNAL])
+        add_powers(values.internal[first:last].reshape(-1), here, lanes[INTERNAL])
         if loaded:
             add_powers(external[first:last].reshape(-1), here, lanes[EXTERNAL])
         if pressed:
@@ -518,5 +564,5 @@ def book_row(x, mass, v, a, f, external, damping, contact, h, lanes, room, total
         ends[k] = 0.0
         _sum_power(lanes, k, wide, eighth if k == INERTIAL else 1.0, ends)
     one, two, three = sum_lane(kinetic, wide)
-    book_totals(x, mass, v, room, totals)
+    book_totals(values.x, mass, v, room.totals, totals)
     return 0.5 * (one + two + three)

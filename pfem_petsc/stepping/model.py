@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -30,7 +31,53 @@ from ..parallel.agreement import agreed
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from .stage import StageStart
+
+
+@dataclass
+class StageStart:
+    """Where a stage starts from.
+
+    Attributes
+    ----------
+    step : number of the last step before
+    time : on the axis of the results
+    position : (owned, 3) of the nodes [m]
+    force : (owned, 3) of the loads [N]
+    gravity : (3,) acceleration [m/s2]
+    wind : (3,) velocity [m/s]
+    walls : (w, 3) displacements of the walls of the stage before [m]
+    """
+
+    step: int
+    time: float
+    position: np.ndarray
+    force: np.ndarray
+    gravity: np.ndarray
+    wind: np.ndarray
+    walls: np.ndarray
+
+    ARRAYS = ("position", "force")
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Rows of owned nodes, for a checkpoint."""
+        return {name: getattr(self, name) for name in self.ARRAYS}
+
+    def scalars(self) -> dict[str, Any]:
+        """The rest of it."""
+        return {
+            "step": self.step,
+            "time": self.time,
+            "gravity": self.gravity.tolist(),
+            "wind": self.wind.tolist(),
+            "walls": self.walls.tolist(),
+        }
+
+    @classmethod
+    def restored(cls, scalars: dict[str, Any], arrays: dict[str, np.ndarray]) -> StageStart:
+        """What :meth:`scalars` and :meth:`arrays` gave."""
+        vectors = {name: np.array(scalars[name]) for name in ("gravity", "wind")}
+        walls = np.array(scalars["walls"]).reshape(-1, 3)
+        return cls(int(scalars["step"]), float(scalars["time"]), **arrays, **vectors, walls=walls)
 
 
 def make_links(

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from ..case.materials import law_name, law_of
 from ..errors import InputError
 from ..integrators.base import Scheme
+from ..mechanics.materials.base import law_name, law_of
 from ..mechanics.springs import viscous_rate
 from ..output.units import TIME as AXIS
 from ..output.units import Axis, engineering
 from ..registry import lookup
 from ..solvers.background_grid import fills_block
-from ..solvers.linear import LinearChoice, choose_linear
+from ..solvers.linear import Demand, LinearChoice, choose_linear
 from ..tolerances import TIME
 
 if TYPE_CHECKING:
@@ -294,7 +294,8 @@ def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoi
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
     try:
         block = solver.linear == "auto" and fills_block(model.mesh)
-        choice = choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact, block)
+        demand = Demand(unknowns, over, scheme.symmetric, steps, impact, block)
+        choice = choose_linear(solver.linear, solver.operator, demand)
     except InputError as error:
         raise InputError(f"{case.source}: {error}") from error
     if choice.preconditioner == "multigrid" and (model.links or not model.contact.symmetric):

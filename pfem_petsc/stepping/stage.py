@@ -8,63 +8,14 @@ wall go over; the scheme starts again from them, as at the start of a run.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .model import Model, StageStart
+
 if TYPE_CHECKING:
-    from .model import Model
     from .stepper import Stepper
-
-__all__ = ["StageStart", "end_of_stage", "hand_over"]
-
-
-@dataclass
-class StageStart:
-    """Where a stage starts from.
-
-    Attributes
-    ----------
-    step : number of the last step before
-    time : on the axis of the results
-    position : (owned, 3) of the nodes [m]
-    force : (owned, 3) of the loads [N]
-    gravity : (3,) acceleration [m/s2]
-    wind : (3,) velocity [m/s]
-    walls : (w, 3) displacements of the walls of the stage before [m]
-    """
-
-    step: int
-    time: float
-    position: np.ndarray
-    force: np.ndarray
-    gravity: np.ndarray
-    wind: np.ndarray
-    walls: np.ndarray
-
-    ARRAYS = ("position", "force")
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Rows of owned nodes, for a checkpoint."""
-        return {name: getattr(self, name) for name in self.ARRAYS}
-
-    def scalars(self) -> dict[str, Any]:
-        """The rest of it."""
-        return {
-            "step": self.step,
-            "time": self.time,
-            "gravity": self.gravity.tolist(),
-            "wind": self.wind.tolist(),
-            "walls": self.walls.tolist(),
-        }
-
-    @classmethod
-    def restored(cls, scalars: dict[str, Any], arrays: dict[str, np.ndarray]) -> StageStart:
-        """What :meth:`scalars` and :meth:`arrays` gave."""
-        vectors = {name: np.array(scalars[name]) for name in ("gravity", "wind")}
-        walls = np.array(scalars["walls"]).reshape(-1, 3)
-        return cls(int(scalars["step"]), float(scalars["time"]), **arrays, **vectors, walls=walls)
 
 
 def end_of_stage(stepper: Stepper) -> StageStart:
@@ -92,7 +43,7 @@ def hand_over(old: Stepper, new: Stepper) -> None:
         state.support, state.contact = old.recorded()[1].copy(), before.contact.copy()
     new.model.bars.put_history(old.model.bars.history())
     new.model.bars.forget_rates()
-    new.removals.follow(old.removals)
+    new.follow_removals(old.removals)
     new.ruptures.begin()
     new.model.temperatures.hold(old.model.bars.heat)
     new.model.rest_lengths.hold(old.model.bars.rest)

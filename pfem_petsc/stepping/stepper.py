@@ -7,7 +7,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,171 +17,13 @@ from ..contact.initial_equilibrium import start_at_rest
 from ..contact.monitoring import CarriedNodes
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
-from ..mechanics.bars import StrainEnergy
+from ..mechanics.bars import StrainEnergy, release
 from ..mechanics.materials.base import EXTRAPOLATED
 from ..tolerances import BEYOND, ON_BOUND, ROUNDING, TIME
-from .bar_events import Removals, Ruptures, tell_collapse
+from .bar_events import Collapse, Removals, Ruptures, collapse_message
 
 if TYPE_CHECKING:
     from .model import Model
-
-
-def load_of(stepper: Stepper, balance: Balance) -> np.ndarray:
-    """Return the external force (owned, 3) [N] of a balance that is not solved yet. Collective."""
-    external = stepper.model.external
-    if not external.active:
-        return stepper.zero
-    if len(balance.loads) == 1 and balance.loads[0][0] == 1.0:
-        total = external.constant()
-        if total is not None:
-            return total
-    total = None
-    for weight, time in balance.loads:
-        if external.state_forces:
-            external.follow(*_expected(stepper, balance, time))
-        part = external.at(time, np.empty_like(stepper.state.v))
-        if weight != 1.0:
-            part *= weight
-        total = part if total is None else np.add(total, part, out=total)
-    if external.failure is not None:
-        _fail(stepper, stepper.when(balance))
-    return total
-
-
-def load_now(stepper: Stepper, time: float) -> np.ndarray:
-    """Return the external force (owned, 3) [N] at a time [s] and the present positions and velocities. Collective."""
-    external = stepper.model.external
-    if external.state_forces:
-        external.follow(stepper.state.position, stepper.state.v)
-    force = external.at(time, np.empty_like(stepper.state.v))
-    if external.failure is not None:
-        _fail(stepper, stepper.arrived())
-    return force
-
-
-def _fail(stepper: Stepper, where: str) -> None:
-    if stepper.fault is None:
-        stepper.fault = SimulationFailure(f"{where}: external_force: the function {stepper.model.external.failure}")
-
-
-def _expected(stepper: Stepper, balance: Balance, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities (owned, 3) at a time [s] of a balance that is not solved yet.
-
-    The acceleration is that of the state; nodes in contact, whose acceleration may jump, are predicted without it.
-    """
-    state = stepper.state
-    a = np.where((state.contact != 0.0).any(axis=1)[:, None], 0.0, state.a)
-    if stepper.scheme.solves_next_position:  # the velocity of the state is that of the step before
-        known = 0.0 if balance.a_hat is None else balance.a_hat
-        return state.position, balance.v_hat + (balance.eta / balance.alpha) * (a - known)
-    ahead = time - state.time
-    return state.position + ahead * (state.v + (0.5 * ahead) * a), state.v + ahead * a
-
-
-def begin(stepper: Stepper, end: float) -> None:
-    """Keep what later phases compare with the start of the part."""
-    state = stepper.state
-    if stepper.model.bars_vary:
-        stepper.model.bars.keep_start()
-    stepper.carried.start(state.position, state.time)
-    if stepper.treatment is not None:
-        stepper.treatment.before()
-
-
-def move(stepper: Stepper, end: float) -> None:
-    """Move to the positions that the last balance was solved for, supports to their exact ones."""
-    stepper.before[:] = stepper.state.x
-    stepper.scheme.advance(stepper.state, stepper.part)
-    stepper.prescribed.place(end)
-
-
-def evaluate(stepper: Stepper, end: float) -> None:
-    """Evaluate forces and energies at the positions reached, and keep the internal variables. Collective."""
-    model = stepper.model
-    if stepper.scheme.inertial:  # static steps are infinitely long for material laws
-        model.bars.step = stepper.part
-    stepper.state.time = end
-    if model.bars_vary:
-        model.change_bars(end)
-    stepper.evaluate(commit=True)
-
-
-def balance(stepper: Stepper, end: float) -> None:
-    """Set up the balance of the part, with the loads, supports, dampers and walls of its times. Collective."""
-    state, model = stepper.state, stepper.model
-    stepper.balance = stepper.scheme.balance(state, stepper.part)
-    if stepper.prescribed.moving:
-        stepper.prescribed.prescribe(stepper.balance)
-    model.inertia.change(sum(weight * time for weight, time in stepper.balance.loads))
-    model.contact.motion.begin(state.time, stepper.part)
-    state.external = load_of(stepper, stepper.balance)
-    if stepper.scheme.inertial:
-        model.bars.step = stepper.balance.time - state.time
-
-
-def solve(stepper: Stepper, end: float) -> None:
-    """Solve the balance with contact and supports. Collective if the solve is."""
-    stepper.solution = stepper.solve(stepper.balance)
-
-
-def finish(stepper: Stepper, end: float) -> None:
-    """Update velocities, accelerations, walls and the contact log from the solution."""
-    state, scheme, contact, found = stepper.state, stepper.scheme, stepper.model.contact, stepper.balance
-    fresh = contact.record(stepper.solution.walls, found.time, stepper.part)
-    if not scheme.solves_next_position:
-        stepper.before[:] = state.x
-    scheme.finish(state, found, stepper.solution.u, stepper.part)
-    if scheme.solves_next_position and stepper.prescribed.moving:
-        stepper.prescribed.take_rates(state.time)
-    contact.motion.finish(stepper.part, end)
-    if scheme.turns_held and stepper.treatment is None:
-        contact.calm(fresh, state.v, found.time, stepper.part)
-
-
-def place(stepper: Stepper, end: float) -> None:
-    """Give supports that move their exact positions and rates."""
-    if stepper.prescribed.moving:
-        stepper.prescribed.place(end)
-        stepper.prescribed.take_rates(end)
-
-
-def treat(stepper: Stepper, end: float) -> None:
-    """Apply the treatment of impact."""
-    if stepper.treatment is not None:
-        stepper.treatment.after()
-
-
-def book(stepper: Stepper, end: float) -> None:
-    """Update the ledger."""
-    stepper.booking()
-
-
-def check(stepper: Stepper, end: float) -> None:
-    """Find nodes that supports have carried through a rectangle."""
-    if stepper.carried.of and stepper.fault is None:
-        crossing = stepper.carried.crossing(stepper.state.position, end, stepper.at(stepper.state.step + 1, end))
-        stepper.fault = SimulationFailure(crossing) if crossing else None
-
-
-Phase = Callable[["Stepper", float], None]
-
-MOVES_FIRST: tuple[Phase, ...] = begin, move, evaluate, balance, solve, finish, treat, book, check
-"""For schemes that solve for the next position, as central differences."""
-
-SOLVES_FIRST: tuple[Phase, ...] = begin, balance, solve, finish, place, evaluate, treat, book, check
-"""For all others."""
-
-
-def phases_of(scheme: Scheme) -> tuple[Phase, ...]:
-    """Return the phases of a scheme's steps in their order."""
-    return MOVES_FIRST if scheme.solves_next_position else SOLVES_FIRST
-
-
-def solve_and_finish(stepper: Stepper, end: float) -> None:
-    """Make the phases of the balance alone, up to a time [s]: at the start, where the positions stay. Collective if the
-    solve is."""
-    for phase in (balance, solve, finish):
-        phase(stepper, end)
 
 
 class PrescribedMotion:
@@ -271,83 +112,6 @@ class NoRates(PrescribedMotion):
     def __init__(self, stepper: Stepper) -> None:
         super().__init__(stepper)
         self.moving = False
-
-
-def start_in_motion(stepper: Stepper) -> None:
-    """Initialise velocity, internal force and acceleration of the state. Collective."""
-    state, model = stepper.state, stepper.model
-    velocity = model.initial_velocity()
-    state.v = velocity if model.start is None else state.v + velocity
-    supports = model.supports
-    if supports.any:
-        supports.place(state.position, supports.positions(0.0))
-        supports.put(state.v, supports.rates(0.0, 0.0)[0])
-    if model.external.state_forces:
-        model.external.follow(state.position, state.v)
-    if stepper.massless is not None and stepper.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.size:
-        stepper.fault = SimulationFailure(
-            "step 0, t = 0 s: contact nodes without mass found no equilibrium; use another contact.treatment"
-        )
-    stepper.evaluate(commit=True)
-    if model.external.active:
-        state.external = load_now(stepper, 0.0)
-    load = state.external - state.f[: model.mesh.n_owned]
-    if model.inertia.damped:
-        load -= model.inertia.damping_times(state.v, np.zeros_like(load))
-    state.a = _acceleration(stepper, load)
-    if model.can_touch and model.inertia.redistribution is None:
-        walls = start_at_rest(model, state, partial(_acceleration, stepper), load)
-        if walls is not None:
-            held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)], len(state.v))
-            stepper.solution.walls, stepper.solution.contacts = walls, held
-    if stepper.massless is not None:
-        state.contact, stepper.solution.walls = stepper.massless.press(state.position, load, 0.0)
-        stepper.solution.contacts = int(stepper.solution.walls.touching.sum())
-    if supports.any:
-        inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))
-        state.support = supports.part(inertial - load - state.contact)
-    stepper.totals_at_start = stepper.totals()
-    stepper.walls_at_start = stepper.solution.walls.force
-    stepper.links_at_start = model.links.totals()
-    stepper.scheme.start(state, stepper.h)
-    if model.bars.viscous and stepper.scheme.solves_next_position:  # the rate half a step before, to extrapolate from
-        half = stepper.on_all(state.memory["half_velocity"])
-        model.bars.set_rates(state.x, state.x - (0.5 * stepper.h) * half, (1.0 - EXTRAPOLATED) * half, 0.0)
-    motion = model.contact.motion
-    motion.start(stepper.h)
-    if stepper.scheme.solves_next_position:
-        v, speeds = state.v, motion.speeds
-        solve_and_finish(stepper, state.time)
-        stepper.totals_solved = stepper.totals()
-        if model.inertia.damped:
-            stepper.velocity_solved = state.v
-        # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
-        state.v = v
-        motion.set_speeds(speeds)
-
-
-def start_at_zero(stepper: Stepper) -> None:
-    """Initialise positions, internal forces and loads at time zero, where nothing moves. Collective."""
-    state, model = stepper.state, stepper.model
-    state.v = np.zeros_like(stepper.zero)
-    state.a = np.zeros_like(stepper.zero)
-    if model.supports.any:
-        model.supports.place(state.position, model.supports.positions(0.0))
-    stepper.evaluate(commit=True)
-    if model.external.active:
-        state.external = model.external.at(0.0, np.empty_like(state.v))
-
-
-def _acceleration(stepper: Stepper, load: np.ndarray) -> np.ndarray:
-    """Return the acceleration (owned, 3) with M a = load [N], prescribed values included. Collective."""
-    supports = stepper.model.supports
-    if not supports.moving:
-        return stepper.accelerate(load)
-    carried = np.zeros_like(load)
-    supports.put(carried, supports.rates(stepper.state.time, 0.0)[1])
-    a = stepper.accelerate(load - stepper.model.inertia.mass_times(carried, np.empty_like(load)))
-    supports.put(a, supports.get(carried))
-    return a
 
 
 _ITERATIONS = 200
@@ -554,8 +318,8 @@ class Stepper(ABC):
         self.closed = np.zeros_like(self.touching)
         self.step_changed = False
         self.prescribed = PrescribedMotion(self)
-        self.ruptures = Ruptures(self)
-        self.removals = Removals(self)
+        self.ruptures = Ruptures(model.bars, mesh)
+        self.removals = Removals(model)
         self.support_changes = 0
         self.carried = CarriedNodes(model.contact)
         self.totals_at_start: np.ndarray | None = None
@@ -576,11 +340,78 @@ class Stepper(ABC):
 
     def start(self) -> None:
         """Initialise velocity, internal force and acceleration of the state. Collective."""
-        start_in_motion(self)
+        state, model = self.state, self.model
+        velocity = model.initial_velocity()
+        state.v = velocity if model.start is None else state.v + velocity
+        supports = model.supports
+        if supports.any:
+            supports.place(state.position, supports.positions(0.0))
+            supports.put(state.v, supports.rates(0.0, 0.0)[0])
+        if model.external.state_forces:
+            model.external.follow(state.position, state.v)
+        if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.size:
+            self.fault = SimulationFailure(
+                "step 0, t = 0 s: contact nodes without mass found no equilibrium; use another contact.treatment"
+            )
+        self.evaluate(commit=True)
+        if model.external.active:
+            state.external = self.load_now(0.0)
+        load = state.external - state.f[: model.mesh.n_owned]
+        if model.inertia.damped:
+            load -= model.inertia.damping_times(state.v, np.zeros_like(load))
+        state.a = self._acceleration_for(load)
+        if model.can_touch and model.inertia.redistribution is None:
+            walls = start_at_rest(model, state, self._acceleration_for, load)
+            if walls is not None:
+                held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)], len(state.v))
+                self.solution.walls, self.solution.contacts = walls, held
+        if self.massless is not None:
+            state.contact, self.solution.walls = self.massless.press(state.position, load, 0.0)
+            self.solution.contacts = int(self.solution.walls.touching.sum())
+        if supports.any:
+            inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))
+            state.support = supports.part(inertial - load - state.contact)
+        self.totals_at_start = self.totals()
+        self.walls_at_start = self.solution.walls.force
+        self.links_at_start = model.links.totals()
+        self.scheme.start(state, self.h)
+        if model.bars.viscous and self.scheme.solves_next_position:  # the rate half a step before, to extrapolate from
+            half = self.on_all(state.memory["half_velocity"])
+            model.bars.set_rates(state.x, state.x - (0.5 * self.h) * half, (1.0 - EXTRAPOLATED) * half, 0.0)
+        motion = model.contact.motion
+        motion.start(self.h)
+        if self.scheme.solves_next_position:
+            v, speeds = state.v, motion.speeds
+            for phase in (self._set_balance, self._solve_balance, self._finish):
+                phase(state.time)
+            self.totals_solved = self.totals()
+            if model.inertia.damped:
+                self.velocity_solved = state.v
+            # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
+            state.v = v
+            motion.set_speeds(speeds)
 
     def start_without_motion(self) -> None:
         """Initialise positions, internal forces and loads at time zero, where nothing moves. Collective."""
-        start_at_zero(self)
+        state, model = self.state, self.model
+        state.v = np.zeros_like(self.zero)
+        state.a = np.zeros_like(self.zero)
+        if model.supports.any:
+            model.supports.place(state.position, model.supports.positions(0.0))
+        self.evaluate(commit=True)
+        if model.external.active:
+            state.external = model.external.at(0.0, np.empty_like(state.v))
+
+    def _acceleration_for(self, load: np.ndarray) -> np.ndarray:
+        """Return the acceleration (owned, 3) with M a = load [N], prescribed values included. Collective."""
+        supports = self.model.supports
+        if not supports.moving:
+            return self.accelerate(load)
+        carried = np.zeros_like(load)
+        supports.put(carried, supports.rates(self.state.time, 0.0)[1])
+        a = self.accelerate(load - self.model.inertia.mass_times(carried, np.empty_like(load)))
+        supports.put(a, supports.get(carried))
+        return a
 
     def acceleration(self) -> np.ndarray:
         """Acceleration (owned, 3) to record [m/s2], see :meth:`recorded`. Collective."""
@@ -598,7 +429,7 @@ class Stepper(ABC):
             return state.a, state.support
         load = -state.f[: len(state.a)]
         if model.external.active:
-            load += load_now(self, state.time)
+            load += self.load_now(state.time)
         model.inertia.change(state.time)
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.empty_like(load))
@@ -660,7 +491,38 @@ class Stepper(ABC):
 
     def leave(self) -> None:
         """Remove the bars and supports that are to go at the time reached. Collective."""
-        self.removals.apply()
+        self.remove_due()
+
+    def remove_due(self) -> bool:
+        """Remove what is due at the state's time; return whether any bar or support of this rank's part changed.
+
+        Supports change on all ranks or on none.
+        """
+        changed = False
+        for entry, share, begins in self.removals.due(self.state.time, self.h):
+            changed = True
+            if entry.bars is not None:
+                self._remove_bars(self.removals.members[entry.bars], share)
+            elif begins:
+                self.removals.release(entry, self.recorded()[1], self.state.time)
+                self.supports_changed()
+        return changed
+
+    def follow_removals(self, before: Removals) -> None:
+        """Begin a stage after that of other removals: removals remain, and bars are removed entirely."""
+        for members in before.begun_bars():
+            self._remove_bars(members, 1.0)
+        if self.model.case.holds("support") and before.gone:
+            self.removals.gone = list(before.gone)
+            self.model.supports.release(before.gone)
+            self.supports_changed()
+
+    def _remove_bars(self, members: np.ndarray, share: float) -> None:
+        """Remove a share of local bars, with their energy."""
+        change = release(self.model.bars, self.state.x, members, share)
+        energies = np.array(self.energy.energies) + change
+        self.energy = self.energy._replace(energies=tuple(energies.tolist()))
+        self.bars_removed()
 
     def supports_changed(self) -> None:
         """Take account of components that are no longer prescribed, or now are. Collective."""
@@ -670,7 +532,9 @@ class Stepper(ABC):
         """Continue from a state that was restored from a checkpoint. Collective."""
         self.model.inertia.change(self.state.time)
         self.ruptures.begin()
-        self.removals.resume()
+        self.removals.resume(self.state.time)
+        if self.removals.gone:
+            self.supports_changed()
 
     @property
     def removal_times(self) -> list[float]:
@@ -701,8 +565,139 @@ class Stepper(ABC):
 
     def _make_part(self, end: float) -> None:
         """Advance by ``part`` to the time ``end`` [s]."""
-        for phase in phases_of(self.scheme):
-            phase(self, end)
+        for phase in self._phases():
+            phase(end)
+
+    def _phases(self) -> tuple[Callable[[float], None], ...]:
+        """Return the phases of a step, methods of the time [s] at which its part ends, in their order."""
+        solve = self._set_balance, self._solve_balance, self._finish
+        last = self._treat, self._account, self._check
+        if self.scheme.solves_next_position:
+            return self._begin, self._move, self._evaluate_end, *solve, *last
+        return self._begin, *solve, self._place_supports, self._evaluate_end, *last
+
+    def _begin(self, end: float) -> None:
+        """Keep what later phases compare with the start of the part."""
+        state = self.state
+        if self.model.bars_vary:
+            self.model.bars.keep_start()
+        self.carried.start(state.position, state.time)
+        if self.treatment is not None:
+            self.treatment.before()
+
+    def _move(self, end: float) -> None:
+        """Move to the positions that the last balance was solved for, supports to their exact ones."""
+        self.before[:] = self.state.x
+        self.scheme.advance(self.state, self.part)
+        self.prescribed.place(end)
+
+    def _evaluate_end(self, end: float) -> None:
+        """Evaluate forces and energies at the positions reached, and keep the internal variables. Collective."""
+        model = self.model
+        if self.scheme.inertial:  # static steps are infinitely long for material laws
+            model.bars.step = self.part
+        self.state.time = end
+        if model.bars_vary:
+            model.change_bars(end)
+        self.evaluate(commit=True)
+
+    def _set_balance(self, end: float) -> None:
+        """Set up the balance of the part, with the loads, supports, dampers and walls of its times. Collective."""
+        state, model = self.state, self.model
+        self.balance = self.scheme.balance(state, self.part)
+        if self.prescribed.moving:
+            self.prescribed.prescribe(self.balance)
+        model.inertia.change(sum(weight * time for weight, time in self.balance.loads))
+        model.contact.motion.begin(state.time, self.part)
+        state.external = self.load_of(self.balance)
+        if self.scheme.inertial:
+            model.bars.step = self.balance.time - state.time
+
+    def _solve_balance(self, end: float) -> None:
+        """Solve the balance with contact and supports. Collective if the solve is."""
+        self.solution = self.solve(self.balance)
+
+    def _finish(self, end: float) -> None:
+        """Update velocities, accelerations, walls and the contact log from the solution."""
+        state, scheme, contact, found = self.state, self.scheme, self.model.contact, self.balance
+        fresh = contact.record(self.solution.walls, found.time, self.part)
+        if not scheme.solves_next_position:
+            self.before[:] = state.x
+        scheme.finish(state, found, self.solution.u, self.part)
+        if scheme.solves_next_position and self.prescribed.moving:
+            self.prescribed.take_rates(state.time)
+        contact.motion.finish(self.part, end)
+        if scheme.turns_held and self.treatment is None:
+            contact.calm(fresh, state.v, found.time, self.part)
+
+    def _place_supports(self, end: float) -> None:
+        """Give supports that move their exact positions and rates."""
+        if self.prescribed.moving:
+            self.prescribed.place(end)
+            self.prescribed.take_rates(end)
+
+    def _treat(self, end: float) -> None:
+        """Apply the treatment of impact."""
+        if self.treatment is not None:
+            self.treatment.after()
+
+    def _account(self, end: float) -> None:
+        """Update the ledger."""
+        self.booking()
+
+    def _check(self, end: float) -> None:
+        """Find nodes that supports have carried through a rectangle."""
+        if self.carried.of and self.fault is None:
+            crossing = self.carried.crossing(self.state.position, end, self.at(self.state.step + 1, end))
+            self.fault = SimulationFailure(crossing) if crossing else None
+
+    def load_of(self, balance: Balance) -> np.ndarray:
+        """Return the external force (owned, 3) [N] of a balance that is not solved yet. Collective."""
+        external = self.model.external
+        if not external.active:
+            return self.zero
+        if len(balance.loads) == 1 and balance.loads[0][0] == 1.0:
+            total = external.constant()
+            if total is not None:
+                return total
+        total = None
+        for weight, time in balance.loads:
+            if external.state_forces:
+                external.follow(*self._expected(balance, time))
+            part = external.at(time, np.empty_like(self.state.v))
+            if weight != 1.0:
+                part *= weight
+            total = part if total is None else np.add(total, part, out=total)
+        if external.failure is not None:
+            self._fail_load(self.when(balance))
+        return total
+
+    def load_now(self, time: float) -> np.ndarray:
+        """Return the external force (owned, 3) [N] at a time [s] and the present state. Collective."""
+        external = self.model.external
+        if external.state_forces:
+            external.follow(self.state.position, self.state.v)
+        force = external.at(time, np.empty_like(self.state.v))
+        if external.failure is not None:
+            self._fail_load(self.arrived())
+        return force
+
+    def _fail_load(self, where: str) -> None:
+        if self.fault is None:
+            self.fault = SimulationFailure(f"{where}: external_force: the function {self.model.external.failure}")
+
+    def _expected(self, balance: Balance, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and velocities (owned, 3) at a time [s] of a balance that is not solved yet.
+
+        The acceleration is that of the state; nodes in contact, whose acceleration may jump, are predicted without it.
+        """
+        state = self.state
+        a = np.where((state.contact != 0.0).any(axis=1)[:, None], 0.0, state.a)
+        if self.scheme.solves_next_position:  # the velocity of the state is that of the step before
+            known = 0.0 if balance.a_hat is None else balance.a_hat
+            return state.position, balance.v_hat + (balance.eta / balance.alpha) * (a - known)
+        ahead = time - state.time
+        return state.position + ahead * (state.v + (0.5 * ahead) * a), state.v + ahead * a
 
     def remarks(self) -> list[str]:
         """What users should know at the end of a run."""
@@ -733,7 +728,7 @@ class Stepper(ABC):
             bars.set_rates(self.before, state.x, self.on_all(state.v), 0.0)
         self.energy = bars.forces(state.x, state.f, commit)
         if commit and self.energy.changed:
-            self.ruptures.note()
+            self.ruptures.note(state.x, self.number + 1, self.arrived())
         failed = self.energy.failed
         if failed < 0 and self.energy.shortened:
             failed = bars.first_inverted(state.x, self.before)
@@ -749,7 +744,9 @@ class Stepper(ABC):
 
     def collapse(self, bar: int) -> str:
         """Return the message about a bar (local index) that failed in the current step."""
-        return tell_collapse(self, bar)
+        found = Collapse(bar, self.state.x, self.before, self.part, bar == self.energy.failed)
+        implicit = not self.scheme.explicit and self.scheme.inertial
+        return collapse_message(self.model, found, self.arrived(), (self.remedy, implicit))
 
     @abstractmethod
     def accelerate(self, load: np.ndarray) -> np.ndarray:

@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pfem_petsc.case.builtin import built_in_cases
-from pfem_petsc.case.overrides import apply_overrides
+from pfem_petsc.case.editing import apply_overrides
 from pfem_petsc.case.schema import Case
-from pfem_petsc.case.toml import table_text
+from pfem_petsc.case.toml import built_in_cases, table_text
 from pfem_petsc.errors import InputError
 
 
@@ -122,55 +121,6 @@ def test_tables_read_back_equal(table):
     assert repr(read) == repr(tomllib.loads(table_text(read)))
 
 
-POSITIVE = st.floats(min_value=0.0, exclude_min=True, allow_infinity=False)
-SECONDS = st.floats(1e-50, 1e50)
-FINITE = st.floats(allow_nan=False, allow_infinity=False)
-VECTORS = st.lists(FINITE, min_size=3, max_size=3)
-KEYS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=8)
-TIMES = st.lists(FINITE, min_size=1, max_size=5, unique=True).map(sorted)
-
-
-@st.composite
-def cases(draw):
-    node_sets = draw(st.dictionaries(KEYS, st.fixed_dictionaries({"nearest": VECTORS}), min_size=1, max_size=3))
-    materials = draw(
-        st.dictionaries(
-            KEYS,
-            st.fixed_dictionaries(
-                {"young_modulus": POSITIVE, "density": POSITIVE},
-                optional={"thermal_expansion": FINITE, "yield_stress": POSITIVE},
-            ),
-            min_size=1,
-            max_size=3,
-        )
-    )
-    names = st.sampled_from(list(node_sets))
-    load = st.fixed_dictionaries(
-        {"node_set": names, "force": VECTORS}, optional={"table": TIMES.map(lambda ts: [[t, 1.0] for t in ts])}
-    )
-    start = st.fixed_dictionaries({"node_set": names, "velocity": VECTORS})
-    return {
-        "title": draw(NAMES),
-        "mesh": {"generator": "rod", "length": draw(POSITIVE), "elements": draw(st.integers(1, 2**63 - 1))},
-        "node_set": node_sets,
-        "material": materials,
-        "section": {"s": {"area": draw(POSITIVE), "material": draw(st.sampled_from(list(materials)))}},
-        "initial": {"velocity": draw(VECTORS), "on": draw(st.lists(start, max_size=2))},
-        "load": draw(st.lists(load, max_size=2)),
-        "time": {"integrator": "newmark", "step": draw(SECONDS), "end": draw(SECONDS)},
-        "output": draw(st.fixed_dictionaries({}, optional={"fields": st.just([]) | st.just(["strain", "velocity"])})),
-    }
-
-
-@pytest.mark.slow
-@given(cases())
-def test_any_case_reads_back_equal(data):
-    case = Case.from_dict(data)
-    again = Case.from_toml(case.to_toml())
-    assert again == case
-    assert again.to_toml() == case.to_toml()
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -239,35 +189,3 @@ def test_default_title_is_the_name():
     case = Case.load("rod_impact")
     assert case.title == "Elastic rod against a rigid wall"
     assert case.folder.samefile(Path(case.source).parent)
-
-
-@pytest.mark.parametrize("separator", [",", ", ", ";", "\t", " "])
-def test_acceleration_record(case_text, tmp_path, separator):
-    """A record is read relative to the case file, and the resolved case has its rows."""
-    lines = ["# station 7", separator.join(["t", "ax", "ay", "az"]), ""]
-    rows = ((0.0, 0.5, 0.0, -1e-3), (0.02, 1.0, 2.0, 3.0))
-    lines += [separator.join(map(str, row)) for row in rows]
-    (tmp_path / "record.csv").write_text("\n".join(lines))
-    override = 'support=[{node_set="tip", fix="xyz", acceleration_file="record.csv"}]'
-    case = Case.from_toml(case_text, tmp_path, overrides=[override])
-    assert case.support[0].acceleration == rows
-    assert Case.from_toml(case.to_toml(), "/nowhere") == case
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("0,1,2\n", "line 1: expected four finite numbers"),
-        ("t,ax,ay,az\n0,1,2,3\n1,nan,0,0\n", "line 3: expected four finite numbers"),
-        ("0,1,2,3\nt,ax,ay,az\n", "line 2: expected numbers"),
-        ("t,ax,ay,az\nt,ax,ay,az\n", "line 2: expected numbers"),
-        ("0,1,2,3\n0,1,2,3\n", "line 2: times must increase"),
-        ("t,ax,ay,az\n", "this file has no rows"),
-        (b"\xff\xfe\x00", "this is not a text file"),
-    ],
-)
-def test_damaged_acceleration_records(case_text, tmp_path, text, told):
-    (tmp_path / "record.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
-    override = 'support=[{node_set="tip", fix="xyz", acceleration_file="record.csv"}]'
-    with pytest.raises(InputError, match=r'support\[0\].acceleration_file = "record.csv".*: ' + told):
-        Case.from_toml(case_text, tmp_path, overrides=[override])

@@ -10,8 +10,8 @@ import pytest
 from pydantic import ValidationError
 
 from pfem_petsc import Case, InputError
-from pfem_petsc.case.builtin import built_in_cases
-from pfem_petsc.case.editing import given_tables
+from pfem_petsc.case.editing import tables_of
+from pfem_petsc.case.toml import built_in_cases
 
 STAGED = """
 [mesh]
@@ -188,6 +188,9 @@ def test_case_of_tables_by_name(case, case_file):
     tables = case.to_dict()
     assert Case(tables) == Case(**tables) == case
     assert Case(tables, title="other", name="n").title == "other"
+    assert Case({**tables, "wall": list(case.wall), "time": case.time}) == case
+    arrays = {"generator": "arrays", "points": np.eye(2, 3), "bars": np.array([[0, 1]])}
+    assert Case(tables, mesh=arrays).mesh.parameters.truss.n_nodes == 2
     with pytest.raises(InputError, match="unknown key, did you mean 'material'"):
         Case(tables, meterial={})
     with pytest.raises(InputError, match="expected nested tables, got 3"):
@@ -221,7 +224,7 @@ def test_stages_change_where_their_tables_are():
 @pytest.mark.parametrize("name", built_in_cases())
 def test_given_tables_make_the_same_case(name):
     case = Case.load(name)
-    assert Case.from_dict(given_tables(case), name=name, folder=case.folder) == case
+    assert Case.from_dict(tables_of(case, given=True), name=name, folder=case.folder) == case
 
 
 def test_rows_of_files_stay_when_the_file_is_gone(case, case_file):
@@ -243,7 +246,7 @@ def test_tables_show_what_they_have(case):
 
 def test_prestress_of_a_stage_is_changed_in_the_stage():
     case = Case.from_toml(STAGED + "section = { all = { pretension = 1e3 } }\n")
-    assert Case.from_dict(given_tables(case)) == case
+    assert Case.from_dict(tables_of(case, given=True)) == case
     case.stage[1].section["all"].pretension = 2e3
     case.stage[0].section["all"].area = 2e-4  # of the case
     assert [each.section["all"].area for each in (case, *case.stages)] == [2e-4] * 3

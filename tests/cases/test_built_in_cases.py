@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.case.builtin import built_in_cases
+from pfem_petsc.case.toml import built_in_cases
 from pfem_petsc.output.result import open_result
 
 pytestmark = pytest.mark.parallel

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from pfem_petsc import __version__
-from pfem_petsc.case.builtin import built_in_cases
+from pfem_petsc.case.toml import built_in_cases
 from pfem_petsc.cli.list import KINDS
 from pfem_petsc.cli.main import VERBS, main
 from pfem_petsc.cli.parser import seconds
@@ -71,7 +71,7 @@ def test_list_names_everything_on_offer(capsys):
     lines = capsys.readouterr().out.splitlines()
     shown = {line.split()[0]: line.split(maxsplit=1)[1:] for line in lines if line.startswith("  ")}
     kinds = ("integrators", "mesh.generators", "contact.walls", "contact.constraints", "contact.treatments")
-    kinds += ("mechanics.materials", "mesh.readers", "mesh.writers", "statics.methods")
+    kinds += ("mechanics.materials", "formats", "statics.methods")
     expected = {*built_in_cases(), *(name for kind in kinds for name in choices(f"pfem_petsc.{kind}"))}
     assert set(shown) - {"none"} == expected
     for kind in KINDS:  # also where nothing is built in

@@ -9,8 +9,8 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.cli.main import main
+from pfem_petsc.formats import read_whole
 from pfem_petsc.mesh import load_slab
-from pfem_petsc.mesh.readers import read_whole
 
 MESHES = Path(__file__).parents[2] / "meshes"
 

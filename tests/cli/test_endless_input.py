@@ -10,8 +10,8 @@ from pfem_petsc import Case, Simulation, Truss
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.files import memory_of_machine
+from pfem_petsc.formats import read_whole
 from pfem_petsc.mesh.lattices.expressions import Expression
-from pfem_petsc.mesh.readers import read_whole
 
 ROD = {
     "mesh": {"generator": "rod", "length": 1.0, "elements": 2},

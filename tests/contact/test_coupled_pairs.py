@@ -7,7 +7,7 @@ import pytest
 from helpers.bodies import two_lattices
 from helpers.lattices import box, planes, simulation
 
-from pfem_petsc.contact.pairs import complementary
+from pfem_petsc.contact.projection import complementary
 from pfem_petsc.errors import InputError, SimulationFailure
 
 

@@ -42,7 +42,7 @@ class Distances(Constraint):
 @pytest.fixture
 def model(comm, monkeypatch):
     module = type("module", (), {"Parameters": Parameters, "Constraint": Distances})
-    for place in ("case.reading", "contact.constraint_link"):
+    for place in ("case.model", "contact.constraint_link"):
         found = importlib.import_module(f"pfem_petsc.{place}")
         lookup = found.lookup
         monkeypatch.setattr(

@@ -56,7 +56,7 @@ class Ropes(Constraint):
 @pytest.fixture
 def ropes(monkeypatch):
     module = type("module", (), {"Parameters": Parameters, "Constraint": Ropes})
-    for place in ("case.reading", "contact.constraint_link"):
+    for place in ("case.model", "contact.constraint_link"):
         found = importlib.import_module(f"pfem_petsc.{place}")
         own = found.lookup
         monkeypatch.setattr(

@@ -1,36 +1,43 @@
-"""The package with the examples of CONTRIBUTING.md in its folders."""
+"""The examples of CONTRIBUTING.md as plugins: nothing is put into the package."""
 
 from __future__ import annotations
 
-import importlib
 import shutil
 import sys
 
 import pytest
-from helpers.contributed import EXAMPLES, PACKAGES
+from helpers.contributed import EXAMPLES
 
-from pfem_petsc.case import builtin
+from pfem_petsc import registry
+from pfem_petsc.case import toml
 
 
 @pytest.fixture
-def examples(monkeypatch, comm, shared_tmp_path):
-    """The package with the examples' files in its folders."""
-    root = shared_tmp_path / "added"
+def plugin_files(comm, shared_tmp_path):
+    """A folder with the examples' files."""
+    folder = shared_tmp_path / "added"
     if comm.rank == 0:
-        shutil.copytree(builtin.FOLDER, root / "cases")
+        folder.mkdir()
         for path, code in EXAMPLES.items():
-            (root / path).parent.mkdir(parents=True, exist_ok=True)
-            (root / path).write_text(code)
+            (folder / path.rpartition("/")[2]).write_text(code)
     comm.Barrier()
-    importlib.invalidate_caches()
-    for name in PACKAGES:
-        package = importlib.import_module(f"pfem_petsc.{name}")
-        monkeypatch.setattr(package, "__path__", [*package.__path__, str(root / name.replace(".", "/"))])
-    monkeypatch.setattr(builtin, "FOLDER", root / "cases")
+    return folder
+
+
+@pytest.fixture
+def examples(monkeypatch, comm, plugin_files):
+    """The examples' modules and their case, found by name."""
+    cases = plugin_files / "cases"
+    if comm.rank == 0:
+        shutil.copytree(toml.FOLDER, cases)
+        shutil.copy(plugin_files / "polygon_spin.toml", cases)
+    comm.Barrier()
+    monkeypatch.setattr(toml, "FOLDER", cases)
+    monkeypatch.setattr(registry, "_plugins", {package: {} for package in registry.KINDS})
+    monkeypatch.setattr(registry, "_sources", {})
+    for path in sorted(plugin_files.glob("*.py")):
+        registry.add_plugin(path)
     yield
-    for path in EXAMPLES:
-        module = "pfem_petsc." + path.removesuffix(".py").replace("/", ".")
-        if module in sys.modules:
-            del sys.modules[module]
-            parent, _, name = module.rpartition(".")
-            delattr(sys.modules[parent], name)
+    for package, modules in registry._plugins.items():
+        for name in modules:
+            sys.modules.pop(f"{package}.{name}", None)

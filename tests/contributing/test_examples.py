@@ -99,10 +99,10 @@ def test_field_is_one_entry(comm, shared_tmp_path):
 @pytest.mark.slow
 def test_energy_term_is_one_line(tmp_path):
     """In a copy of the package: the columns of a row are laid out when it is imported."""
-    line = re.search(r"^```python\n(Energy\(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1]
+    line = re.search(r"^```python\n(energy\(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1]
     package = Path(fields.__file__).parent
     shutil.copytree(package, tmp_path / package.name)
-    path = tmp_path / package.name / "energies.py"
+    path = tmp_path / package.name / "columns.py"
     text = path.read_text()
     path.write_text(text.replace("ENERGIES = (\n", f"ENERGIES = (\n    {line.strip()},\n", 1))
     command = [sys.executable, "-m", "pfem_petsc", "run", "pendulum", "--set", "initial.velocity=[0.0, 2.0, 0.0]"]
@@ -195,7 +195,7 @@ def test_treatment_states_what_it_goes_with(examples, comm, tmp_path):
 
 
 def test_reader_of_a_mesh_format(examples, tmp_path):
-    from pfem_petsc.mesh.readers import read_whole
+    from pfem_petsc.formats import read_whole
 
     text = "# a square\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\no frame\nl 1 2 3 4 1\no brace\nl -4/1 -2/1\nf 1 2 3\n"
     (tmp_path / "square.obj").write_text(text)

@@ -10,7 +10,7 @@ from pfem_petsc import Simulation
 TEXT = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text()
 PACKAGES = (
     *("integrators", "contact.walls", "contact.constraints", "mesh.generators", "mechanics.materials"),
-    *("contact.treatments", "mesh.readers", "statics.methods"),
+    *("contact.treatments", "formats", "statics.methods"),
 )
 EXAMPLES = {
     path: code

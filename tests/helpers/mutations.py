@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pfem_petsc
 from pfem_petsc import Truss
-from pfem_petsc.case.builtin import built_in_cases
+from pfem_petsc.case.toml import built_in_cases
 from pfem_petsc.cli.main import main
 
 from .samples import BARS, GMSH, LEGS, POINTS, TOP, write_hdf5, write_vtk

@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.case.materials import LAWS
 from pfem_petsc.mechanics import strips
 from pfem_petsc.mechanics.bar_loops import fused_parts, make_kernels
 from pfem_petsc.mechanics.compiled import Compilation, _variant, code_digest
 from pfem_petsc.mechanics.conserving import MEASURES, engineering
 from pfem_petsc.mechanics.materials import elastic, elastoplastic
-from pfem_petsc.mechanics.materials.base import damped, softened
+from pfem_petsc.mechanics.materials.base import LAWS, damped, softened
 from pfem_petsc.mechanics.rupture import breakable
 from pfem_petsc.registry import choices, lookup
 from pfem_petsc.stepping.batch_loop import make_fused_loop

@@ -6,7 +6,7 @@ from helpers.abaqus import FLAT, MESHES, written
 
 from pfem_petsc import Truss
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.readers import read_whole
+from pfem_petsc.formats import read_whole
 
 
 def members(groups):

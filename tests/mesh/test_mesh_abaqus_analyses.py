@@ -6,7 +6,7 @@ from helpers.abaqus import FLAT, MESHES, written
 
 from pfem_petsc import Case, Truss
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.readers import read_whole
+from pfem_petsc.formats import read_whole
 from pfem_petsc.mesh.whole import skeleton
 
 SECTIONS = {
@@ -77,6 +77,7 @@ LEGS, P1, 1.
         "line 59: *CLOAD: 'Top, 4, 1.' is left out: only forces along x, y and z are read",
         "line 63: *DLOAD: 'LEGS, GRAV, 1., 1., 0., 0.' is left out: the gravity of a case acts on all bars",
         "line 64: *DLOAD: 'LEGS, P1, 1.' is left out: only GRAV is read of distributed loads",
+        "line 68: *STEP: left out with all that follows: only the first step is read",
     ]
     case = Case(Truss.read(tmp_path / "a.inp").tables, mesh=Truss.read(tmp_path / "a.inp"), static={"step": 1.0})
     assert [support.fix for support in case.support] == ["xyz", "xyz", "y"]
@@ -161,5 +162,5 @@ def test_keywords_that_are_left_out_are_named(tmp_path):
     assert told == [
         "line 50: *CLOAD: AMPLITUDE=ramp is left out: give the table over time in the case",
         "left out *AMPLITUDE, *INITIAL CONDITIONS: keywords that are not read",
-        "left out the steps after the first one: *FREQUENCY, *DYNAMIC",
+        "line 54: *STEP: left out with all that follows: only the first step is read",
     ]

@@ -5,7 +5,7 @@ import pytest
 
 from pfem_petsc import Case, Simulation, Truss
 from pfem_petsc.cli.main import main
-from pfem_petsc.mesh.readers import read_whole
+from pfem_petsc.formats import read_whole
 
 
 @pytest.mark.slow

@@ -9,11 +9,8 @@ from helpers.gathered import whole
 
 from pfem_petsc import Truss, write_mesh
 from pfem_petsc.errors import InputError
+from pfem_petsc.formats import read_whole, suffixes, write_whole
 from pfem_petsc.mesh import load_slab
-from pfem_petsc.mesh.readers import read_whole
-from pfem_petsc.mesh.readers import suffixes as read_suffixes
-from pfem_petsc.mesh.writers import suffixes as written_suffixes
-from pfem_petsc.mesh.writers import write_whole
 
 NAMES = ["t.h5", "t.vtu", "t.vtkhdf", "t.msh", "t.inp", "t.3mf", "t_bars.csv"]
 EXACT = ("t.h5", "t.vtu", "t.vtkhdf", "t.msh", "t_bars.csv")
@@ -104,8 +101,9 @@ def test_sections_and_materials_of_abaqus_come_back(tmp_path):
 
 
 def test_every_format_that_is_written_is_read():
-    assert set(written_suffixes()) <= set(read_suffixes())
-    assert {".inp", ".msh", ".vtu", ".vtkhdf", ".3mf", ".csv", ".h5", ".stl"} == set(read_suffixes())
+    read = set(suffixes("read", "read_on"))
+    assert set(suffixes("write")) == read - {".stl"}
+    assert {".inp", ".msh", ".vtu", ".vtkhdf", ".3mf", ".csv", ".h5", ".stl"} == read
 
 
 def test_gmsh_and_vtk_as_meshio_reads_them(tmp_path):
@@ -241,17 +239,6 @@ def test_names_with_slashes(tmp_path, name):
     for file in ("s.msh", name):
         truss = Truss.read(tmp_path / file)
         assert {key: members.tolist() for key, members in truss.bar_groups.items()} == {"a_b_": [1], "a_b": [2]}
-
-
-@pytest.mark.parametrize("suffix", ["inp", "stl", "3mf"])
-@pytest.mark.parametrize("content", [b"", b"\0" * 1000, b"$", b"*", b"<VTKFile", b"PK\3\4" + b"\xff" * 500])
-def test_garbage_is_refused(tmp_path, capfd, suffix, content):
-    path = tmp_path / f"garbage.{suffix}"
-    path.write_bytes(content)
-    with pytest.raises(InputError) as caught:
-        Truss.read(path)
-    assert str(path) in str(caught.value)
-    assert capfd.readouterr().err == ""
 
 
 def test_what_cannot_be_written_leaves_the_earlier_file(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 
 from pfem_petsc import Truss
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.readers import read_whole
+from pfem_petsc.formats import read_whole
 
 STL = """solid tetra
  facet normal 0 0 0

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.readers import read_whole
+from pfem_petsc.formats import read_whole, write_whole
 from pfem_petsc.mesh.whole import WholeMesh
-from pfem_petsc.mesh.writers import write_whole
 
 
 def test_tables_as_spreadsheets_save_them(tmp_path):

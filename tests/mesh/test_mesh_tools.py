@@ -6,8 +6,7 @@ import pytest
 from pfem_petsc import Truss
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.summary import summary
-from pfem_petsc.mesh.tools import cleaned, coincident, components, lengths, merged, refined, scaled
+from pfem_petsc.mesh.tools import cleaned, coincident, components, lengths, merged, refined, scaled, summary
 from pfem_petsc.mesh.whole import WholeMesh
 
 
@@ -126,7 +125,7 @@ def test_summary_of_a_lattice():
 
 
 def test_python_reads_and_cleans(tmp_path):
-    from pfem_petsc.mesh.writers import write_whole
+    from pfem_petsc.formats import write_whole
 
     mesh = square(bar_fields={"area": np.ones(5), "w": np.zeros(5)})
     mesh.points = np.concatenate([mesh.points, [[5.0, 5.0, 5.0]]])

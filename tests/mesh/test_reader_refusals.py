@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from helpers.mutations import mutated_bytes, sound_meshes
 from helpers.samples import BARS, GMSH, POINTS, write_hdf5, write_vtk
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.readers import read_slab
+from pfem_petsc.formats import read_slab
 from pfem_petsc.mesh.whole import check_mesh
 
 ALONE = MPI.COMM_SELF
@@ -134,8 +134,11 @@ def test_hdf5_that_declares_more_than_it_holds(tmp_path):
         assert "/bars declares (10000000000000, 2) values but holds 0 bytes" in refusal(path)
 
 
-@pytest.mark.parametrize("suffix", ["msh", "vtu", "vtkhdf", "h5"])
-@pytest.mark.parametrize("content", [b"", b"\0" * 1000, b"$", b"<VTKFile", b"\x89HDF\r\n\x1a\n" + b"\xff" * 500])
+GARBAGE = [b"", b"\0" * 1000, b"$", b"*", b"<VTKFile", b"\x89HDF\r\n\x1a\n" + b"\xff" * 500, b"PK\3\4" + b"\xff" * 500]
+
+
+@pytest.mark.parametrize("suffix", ["msh", "vtu", "vtkhdf", "h5", "inp", "stl", "3mf"])
+@pytest.mark.parametrize("content", GARBAGE)
 def test_garbage_is_refused_without_a_word_on_stderr(tmp_path, capfd, suffix, content):
     path = tmp_path / f"garbage.{suffix}"
     path.write_bytes(content)
@@ -174,26 +177,6 @@ def test_vtk_with_other_cells(tmp_path):
     assert "FILE" in refusal(path)
 
 
-changes = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=4)
-
-
-@pytest.mark.parametrize("kind", GMSH)
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(changes=changes, cut=st.floats(0, 1))
-@example(changes=[], cut=0.5)
-def test_changed_gmsh_files_are_read_or_refused(tmp_path, kind, changes, cut):
-    mutate_and_read(tmp_path / "changed.msh", GMSH[kind], changes, cut)
-
-
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(changes=changes, cut=st.floats(0, 1))
-def test_changed_hdf5_files_are_read_or_refused(tmp_path, changes, cut):
-    path = tmp_path / "original.h5"
-    if not path.exists():
-        write_hdf5(path)
-    mutate_and_read(tmp_path / "changed.h5", path.read_bytes(), changes, cut)
-
-
 @settings(max_examples=200)
 @given(st.data())
 def test_changed_words_of_gmsh_text_are_read_or_refused(tmp_path_factory, data):
@@ -202,39 +185,32 @@ def test_changed_words_of_gmsh_text_are_read_or_refused(tmp_path_factory, data):
     for _ in range(data.draw(st.integers(1, 3))):
         words[data.draw(st.integers(0, len(words) - 1))] = data.draw(new)
     path = tmp_path_factory.getbasetemp() / "words.msh"
-    mutate_and_read(path, " ".join(words).encode(), [], 1.0)
+    path.write_text(" ".join(words))
+    read_or_refused(path)
 
 
-def mutate_and_read(path, content, changes, cut):
-    content = bytearray(content)
-    for place, byte in changes:
-        content[min(int(place * len(content)), len(content) - 1)] = byte
-    if cut < 0.5:
-        content = content[: int(2 * cut * len(content))]
-    path.write_bytes(content)
+def read_or_refused(path):
     try:
         slab = read_slab(path, ALONE)
         check_mesh(slab, ALONE)
     except InputError as error:
-        assert str(path) in str(error)
+        assert str(path.parent) in str(error)
     else:
-        assert len(slab.points) == slab.n_nodes
+        assert len(slab.points) == slab.n_nodes > 0
         assert len(slab.bars) == slab.n_bars
 
 
-@pytest.mark.parametrize("name", ["mesh.inp", "parts.inp", "mesh.3mf", "mesh_bars.csv", "mesh_nodes.csv", "mesh.stl"])
-def test_changed_files_of_other_programs_are_read_or_refused(tmp_path, name):
+NAMES = [f"{kind.replace(' ', '-')}.msh" for kind in GMSH]
+NAMES += ["mesh.h5", "mesh.inp", "parts.inp", "mesh.3mf", "mesh_bars.csv", "mesh_nodes.csv", "mesh.stl"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_changed_files_are_read_or_refused(tmp_path, name):
     sound_meshes(tmp_path)
     content = (tmp_path / name).read_bytes()
     for seed in range(150):
         (tmp_path / name).write_bytes(mutated_bytes(content, random.Random(seed)))
-        try:
-            slab = read_slab(tmp_path / name, ALONE)
-            check_mesh(slab, ALONE)
-        except InputError as error:
-            assert str(tmp_path) in str(error)
-        else:
-            assert len(slab.points) == slab.n_nodes > 0
+        read_or_refused(tmp_path / name)
 
 
 @pytest.mark.parallel

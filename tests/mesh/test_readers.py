@@ -7,9 +7,9 @@ from helpers.gathered import stiffness_modes, whole
 from helpers.samples import BARS, GMSH, LEGS, POINTS, TOP, write_hdf5, write_vtk
 
 from pfem_petsc.errors import InputError
+from pfem_petsc.formats import read_slab
 from pfem_petsc.mesh import load_slab
-from pfem_petsc.mesh.generators import lattice, ring
-from pfem_petsc.mesh.readers import hdf5, read_slab
+from pfem_petsc.mesh.generators import ring
 from pfem_petsc.mesh.slab import slab_range
 
 pytestmark = pytest.mark.parallel
@@ -47,16 +47,12 @@ def test_gmsh(comm, shared_tmp_path, kind):
     assert warning.endswith("left out 1 elements that are neither lines nor points")
 
 
-def test_gmsh_with_windows_line_ends_and_other_sections(comm, shared_tmp_path):
-    content = GMSH["2.2 ascii"].replace(b"$Nodes", b"$Comments\n5 $ x\n$EndComments\n$Nodes").replace(b"\n", b"\r\n")
-    check_sample(whole(read(written(comm, shared_tmp_path, "truss.msh", content), comm), comm))
-
-
 @pytest.mark.parametrize("kind", ["2.2 ascii", "4.1 ascii"])
-def test_gmsh_with_a_byte_order_mark(comm, shared_tmp_path, kind):
-    """As editors of Windows save it."""
-    content = GMSH[kind].decode().encode("utf-8-sig")
-    check_sample(whole(read(written(comm, shared_tmp_path, "truss.msh", content), comm), comm))
+def test_gmsh_as_editors_of_windows_save_it(comm, shared_tmp_path, kind):
+    """With a byte order mark, other line ends, and sections of other programs."""
+    text = GMSH[kind].decode().replace("$Nodes", "$Comments\n5 $ x\n$EndComments\n$Nodes").replace("\n", "\r\n")
+    path = written(comm, shared_tmp_path, "truss.msh", text.encode("utf-8-sig"))
+    check_sample(whole(read(path, comm), comm))
 
 
 @pytest.mark.parametrize("version", ["gmsh22", "gmsh"])
@@ -121,24 +117,6 @@ def test_vtk_with_lines_of_several_points(comm, shared_tmp_path):
 
 def test_hdf5_of_another_writer(comm, shared_tmp_path):
     check_sample(whole(read(written(comm, shared_tmp_path, "truss.h5", write_hdf5), comm), comm))
-
-
-def test_hdf5_gives_back_what_was_written(comm, shared_tmp_path):
-    keys = lattice.Parameters(kind="octet", cells=[3, 4, 2], pitch=0.37)
-    slab = lattice.generate(keys, comm.rank, comm.size)
-    slab.bar_groups["every_third"] = np.arange(slab.first_bar, slab.first_bar + len(slab.bars), 3)
-    path = shared_tmp_path / "lattice.h5"
-    hdf5.write_hdf5(path, slab, comm)
-    again = read(path, comm)
-    for name in ("n_nodes", "n_bars", "first_node", "first_bar"):
-        assert getattr(again, name) == getattr(slab, name)
-    np.testing.assert_array_equal(again.points, slab.points)
-    np.testing.assert_array_equal(again.bars, slab.bars)
-    for kind in ("node_groups", "bar_groups"):
-        groups, original = getattr(again, kind), getattr(slab, kind)
-        assert sorted(groups) == sorted(original)
-        for name in groups:
-            np.testing.assert_array_equal(groups[name], np.sort(original[name]))
 
 
 def test_the_ring_in_the_repository_is_the_generators(comm):

@@ -9,31 +9,53 @@ from helpers.gathered import whole
 from helpers.samples import GMSH
 
 from pfem_petsc.errors import InputError
+from pfem_petsc.formats import gmsh, hdf5, read_slab, read_whole, vtk, write_whole
 from pfem_petsc.mesh import load_slab
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.readers import _gmsh_stream, _shares, gmsh, read_whole, vtk
 from pfem_petsc.mesh.slab import slab_range
 from pfem_petsc.mesh.whole import WholeMesh
-from pfem_petsc.mesh.writers import write_whole
 
 pytestmark = pytest.mark.parallel
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def small_pieces(monkeypatch):
-    """Several pieces a rank."""
-    monkeypatch.setattr(_shares, "PIECE", 7)
+    """Several pieces of rows and of text a rank."""
+    monkeypatch.setattr(hdf5, "PIECE", 7)
+    monkeypatch.setattr(gmsh, "PIECE", 5)
+    monkeypatch.setattr(gmsh, "BYTES", 61)
 
 
-def lattice_file(comm, path, fields=True):
+@pytest.fixture
+def reads(monkeypatch):
+    """Numbers of rows that are read from datasets at a time."""
+    rows = []
+    read = h5py.Dataset.__getitem__
+
+    def counted(dataset, key, *more):
+        found = read(dataset, key, *more)
+        rows.append(len(found))
+        return found
+
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", counted)
+    return rows
+
+
+def on_rank_0(comm, path, write):
+    """Write a file on rank 0; return its name."""
+    if comm.rank == 0:
+        write(path) if callable(write) else path.write_bytes(write)
+    comm.Barrier()
+    return path
+
+
+def lattice_file(comm, path):
     """Write a lattice with groups that overlap and a field, on rank 0; return it."""
     slab = lattice.generate(lattice.Parameters(kind="octet", cells=[2, 2, 3], pitch=0.37), 0, 1)
     groups = {"third": np.arange(0, slab.n_bars, 3), "none": np.empty(0, np.int64), **slab.bar_groups}
-    fields = {"area": 1e-6 * (1.0 + np.arange(slab.n_bars))} if fields else {}
+    fields = {"area": 1e-6 * (1.0 + np.arange(slab.n_bars))}
     mesh = WholeMesh(slab.points, slab.bars.astype(np.int64), slab.node_groups, groups, fields)
-    if comm.rank == 0:
-        write_whole(path, mesh)
-    comm.Barrier()
+    on_rank_0(comm, path, lambda path: write_whole(path, mesh))
     return mesh
 
 
@@ -48,29 +70,20 @@ def check(slab, mesh, comm):
             assert one[name].tolist() == np.sort(other[name]).tolist()
 
 
-@pytest.mark.parametrize("suffix", ["vtkhdf", "h5"])
-def test_every_rank_reads_its_share(comm, shared_tmp_path, monkeypatch, small_pieces, suffix):
+@pytest.mark.parametrize("suffix", ["vtkhdf", "h5", "msh"])
+def test_every_rank_reads_its_share(comm, shared_tmp_path, monkeypatch, reads, suffix):
     path = shared_tmp_path / f"lattice.{suffix}"
     mesh = lattice_file(comm, path)
     monkeypatch.setattr(vtk, "read", None)
-    rows = []
-    read = h5py.Dataset.__getitem__
-
-    def counted(dataset, key, *more):
-        found = read(dataset, key, *more)
-        rows.append(len(found))
-        return found
-
-    monkeypatch.setattr(h5py.Dataset, "__getitem__", counted)
     slab = load_slab(SimpleNamespace(generator=None, file=path), comm, {"area": "area_field"})
-    assert max(rows) <= 2 * 7 + 1
+    assert max(reads, default=0) <= 2 * 7 + 1
     check(slab, mesh, comm)
     first, last = slab_range(len(mesh.bars), comm.rank, comm.size)
     np.testing.assert_array_equal(slab.bar_fields["area"], mesh.bar_fields["area"][first:last])
     assert slab.bars.dtype == np.int32
 
 
-def test_vtkhdf_that_is_not_plain_is_left_to_vtk(comm, shared_tmp_path, small_pieces):
+def test_vtkhdf_that_is_not_plain_is_left_to_vtk(comm, shared_tmp_path):
     """One cell that is no line, on the last rank's share."""
     path = shared_tmp_path / "mixed.vtkhdf"
     mesh = lattice_file(comm, path)
@@ -82,54 +95,49 @@ def test_vtkhdf_that_is_not_plain_is_left_to_vtk(comm, shared_tmp_path, small_pi
     check(load_slab(SimpleNamespace(generator=None, file=path), comm), mesh, comm)
 
 
-def test_a_field_that_vtkhdf_has_not_is_named(comm, shared_tmp_path):
-    path = shared_tmp_path / "lattice.vtkhdf"
+@pytest.mark.parametrize("suffix", ["vtkhdf", "h5", "msh"])
+def test_a_field_that_is_missing_is_named(comm, shared_tmp_path, suffix):
+    path = shared_tmp_path / f"lattice.{suffix}"
     lattice_file(comm, path)
     with pytest.raises(InputError, match=r"section.strut.area_field = 'thickness'.*it has area"):
         load_slab(SimpleNamespace(generator=None, file=path), comm, {"thickness": "section.strut.area_field"})
 
 
-def test_members_of_a_group_are_read_once_by_all_ranks_together(comm, small_pieces):
+def test_members_of_a_group_are_read_once_by_all_ranks_together(comm, shared_tmp_path, reads):
     """In any order, and several times."""
+    path = shared_tmp_path / "lattice.h5"
+    mesh = lattice_file(comm, path)
     members = np.random.default_rng(1).permutation(np.tile(np.arange(0, 100, 3), 2))
-    rows = []
 
-    class Dataset:
-        name = "/bar_groups/third"
+    def write(path, members=members):
+        with h5py.File(path, "r+", locking=False) as file:
+            file.pop("bar_groups", None)
+            file["bar_groups/third"] = members
 
-        def __len__(self):
-            return len(members)
-
-        def __getitem__(self, key):
-            rows.append(len(members[key]))
-            return members[key]
-
-    mine = _shares.route_members(Dataset(), 100, comm, "FILE")
-    assert np.concatenate(comm.allgather(mine)).tolist() == list(range(0, 100, 3))
-    assert comm.allreduce(sum(rows)) == len(members) and max(rows) <= 7
-    members[-1] = 100  # on the last rank alone
-    with pytest.raises(InputError, match="FILE: /bar_groups/third has member 100, but numbers go from 0 to 99"):
-        _shares.route_members(Dataset(), 100, comm, "FILE")
+    on_rank_0(comm, path, write)
+    reads.clear()
+    slab = read_slab(path, comm)
+    assert np.concatenate(comm.allgather(slab.bar_groups["third"])).tolist() == list(range(0, 100, 3))
+    of_nodes = sum(map(len, mesh.node_groups.values()))
+    assert comm.allreduce(sum(reads)) == len(mesh.points) + len(mesh.bars) + of_nodes + len(members) and max(reads) <= 7
+    members[-1] = 10**6  # on the last rank alone
+    on_rank_0(comm, path, write)
+    with pytest.raises(InputError, match="/bar_groups/third has member 1000000, but numbers go from 0 to"):
+        read_slab(path, comm)
 
 
 def test_vtk_reads_plain_files_as_the_ranks_do(comm, shared_tmp_path):
     path = shared_tmp_path / "lattice.vtkhdf"
     lattice_file(comm, path)
-    mesh = read_whole(path) if comm.rank == 0 else None
-    check(vtk.read_on(path, comm, {}), comm.bcast(mesh), comm)
-
-
-@pytest.fixture
-def small_parts(monkeypatch):
-    """Several pieces of text and of rows a rank."""
-    monkeypatch.setattr(_gmsh_stream, "PIECE", 5)
-    monkeypatch.setattr(_gmsh_stream, "_BYTES", 61)
+    mesh = comm.bcast(vtk.read(path) if comm.rank == 0 else None)
+    slab = vtk.read_on(path, comm)
+    check(slab, mesh, comm)
+    assert list(slab.bar_fields) == list(mesh.bar_fields)
 
 
 def same_as_of_one_rank(comm, path):
-    """Read a .msh file in parts, and compare with the reader of whole files; return the slab."""
-    slab = gmsh.read_on(path, comm, {})
-    assert slab is not None
+    """Read a .msh file in parts, and compare with what one rank reads; return the slab."""
+    slab = read_slab(path, comm)
     mesh = comm.bcast(read_whole(path) if comm.rank == 0 else None)
     check(slab, mesh, comm)
     assert list(slab.node_groups) == list(mesh.node_groups) and list(slab.bar_groups) == list(mesh.bar_groups)
@@ -137,61 +145,60 @@ def same_as_of_one_rank(comm, path):
     return slab
 
 
-@pytest.mark.parametrize("kind", ["4.1 ascii", "4.1 binary"])
-def test_gmsh_is_read_in_parts(comm, shared_tmp_path, small_parts, kind):
-    path = shared_tmp_path / "truss.msh"
-    if comm.rank == 0:
-        path.write_bytes(GMSH[kind])
-    comm.Barrier()
-    same_as_of_one_rank(comm, path)
+@pytest.mark.parametrize("kind", GMSH)
+def test_gmsh_is_read_in_parts(comm, shared_tmp_path, kind):
+    same_as_of_one_rank(comm, on_rank_0(comm, shared_tmp_path / "truss.msh", GMSH[kind]))
 
 
-def test_gmsh_of_bars_in_the_order_of_their_tags_is_read_in_parts(comm, shared_tmp_path, small_parts):
-    path = shared_tmp_path / "lattice.msh"
-    mesh = lattice_file(comm, path, fields=False)
-    check(same_as_of_one_rank(comm, path), mesh, comm)
+def test_copies_of_bars_in_gmsh_2_are_joined_across_ranks(comm, shared_tmp_path):
+    """Each bar is listed once for each of its groups, all of the second group after those of the first."""
+    n = 23
+    rows = [f"{k + 1} 1 2 1 1 {k + 1} {k + 2}" for k in range(n)]
+    rows += [f"{n + k + 1} 1 2 2 1 {k + 1} {k + 2}" for k in range(0, n, 2)]
+    nodes = "\n".join(f"{k + 1} {k} 0 0" for k in range(n + 1))
+    text = (
+        f"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n{n + 1}\n{nodes}\n$EndNodes\n"
+        f"$Elements\n{len(rows)}\n" + "\n".join(rows) + "\n$EndElements\n"
+    )
+    slab = same_as_of_one_rank(comm, on_rank_0(comm, shared_tmp_path / "two.msh", text.encode()))
+    mesh = whole(slab, comm)
+    assert mesh.n_bars == n and mesh.bars.tolist() == [[k, k + 1] for k in range(n)]
+    groups = {name: members.tolist() for name, members in mesh.bar_groups.items()}
+    assert groups == {"group_1": list(range(n)), "group_2": list(range(0, n, 2))}
 
 
-def test_gmsh_with_tags_far_apart_and_in_any_order_is_read_in_parts(comm, shared_tmp_path, small_parts):
-    path = shared_tmp_path / "sparse.msh"
-    if comm.rank == 0:
-        tags = [7_000_000_000_000, 3, 900, 12, 5]
-        nodes = "\n".join([*map(str, tags), *(f"{k} 0 {k * k}" for k in range(5))])
-        lines = "\n".join(f"{90 - k} {tags[k]} {tags[(k + 2) % 5]}" for k in range(5))
-        path.write_text(
-            f"$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 5 3 {max(tags)}\n1 1 0 5\n{nodes}\n$EndNodes\n"
-            f"$Elements\n1 5 86 90\n1 1 1 5\n{lines}\n$EndElements\n"
-        )
-    comm.Barrier()
-    slab = same_as_of_one_rank(comm, path)
+def test_gmsh_with_tags_far_apart_and_in_any_order_is_read_in_parts(comm, shared_tmp_path):
+    tags = [7_000_000_000_000, 3, 900, 12, 5]
+    nodes = "\n".join([*map(str, tags), *(f"{k} 0 {k * k}" for k in range(5))])
+    lines = "\n".join(f"{90 - k} {tags[k]} {tags[(k + 2) % 5]}" for k in range(5))
+    text = (
+        f"$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 5 3 {max(tags)}\n1 1 0 5\n{nodes}\n$EndNodes\n"
+        f"$Elements\n1 5 86 90\n1 1 1 5\n{lines}\n$EndElements\n"
+    )
+    slab = same_as_of_one_rank(comm, on_rank_0(comm, shared_tmp_path / "sparse.msh", text.encode()))
     assert whole(slab, comm).bars.tolist() == [[k, (k + 2) % 5] for k in range(5)]
 
 
 @pytest.mark.parametrize(
-    ("old", "new"),
+    ("old", "new", "message"),
     [
-        ("1 5 3 900", "1 6 3 900"),
-        ("\n900\n", "\n3\n"),
-        ("1 3 900", "1 3 901"),
-        ("0 0 0", "0 zero 0"),
-        ("$EndElements", "7\n$EndElements"),
-        ("4.1 0 8", "2.2 0 8"),
+        ("1 5 3 900", "1 6 3 900", "section $Nodes declares 6 nodes, its blocks hold 5"),
+        ("\n900\n", "\n3\n", "section $Nodes: node 3 is listed more than once"),
+        ("1 3 900", "1 3 901", "section $Elements: node 901 is not in $Nodes"),
+        ("0 0 0", "0 zero 0", "section $Nodes, line 8: 'zero' is not a number"),
+        ("$EndElements", "7\n$EndElements", "section $Elements: 1 numbers more than its counts declare"),
+        ("$Nodes", "$Comments\nbars in the order of their tags\n$EndComments\n$Nodes", "do not follow one another"),
     ],
 )
-def test_gmsh_with_something_wrong_is_left_to_the_reader_of_whole_files(comm, shared_tmp_path, small_parts, old, new):
-    path = shared_tmp_path / "wrong.msh"
+def test_all_ranks_tell_what_is_wrong_with_gmsh(comm, shared_tmp_path, old, new, message):
     text = (
         "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 5 3 900\n1 1 0 5\n3\n900\n12\n5\n6\n"
         "0 0 0\n1 0 0\n2 1 0\n3 0 1\n4 4 4\n"
-        "$EndNodes\n$Elements\n1 4 1 4\n1 1 1 4\n1 3 900\n2 900 12\n3 12 5\n4 5 6\n$EndElements\n"
+        "$EndNodes\n$Elements\n1 4 1 9\n1 1 1 4\n1 3 900\n2 900 12\n3 12 5\n9 5 6\n$EndElements\n"
     )
-    if comm.rank == 0:
-        path.write_text(text)
-    comm.Barrier()
-    assert gmsh.read_on(path, comm, {}) is not None
-    comm.Barrier()
-    if comm.rank == 0:
-        assert old in text
-        path.write_text(text.replace(old, new, 1))
-    comm.Barrier()
-    assert gmsh.read_on(path, comm, {}) is None
+    assert old in text
+    path = on_rank_0(comm, shared_tmp_path / "wrong.msh", text.replace(old, new, 1).encode())
+    with pytest.raises(InputError) as caught:
+        read_slab(path, comm)
+    assert message in str(caught.value)
+    assert len(set(comm.allgather(str(caught.value)))) == 1

@@ -5,7 +5,7 @@ import pytest
 
 from pfem_petsc import Case, Simulation, open_result, write_mesh
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.readers import read_slab
+from pfem_petsc.formats import read_slab
 
 POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
 BARS = np.array([[0, 1], [1, 2]])

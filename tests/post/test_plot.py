@@ -13,7 +13,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.energies import LOST, STORED, SUPPLIED
+from pfem_petsc.columns import LOST, STORED, SUPPLIED
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.chart import COLOURS, Chart
 from pfem_petsc.post.histories import balance_error, draw_energies, draw_momentum, draw_probes

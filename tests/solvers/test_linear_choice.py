@@ -4,7 +4,7 @@ import pytest
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
-from pfem_petsc.solvers.linear import choose_linear
+from pfem_petsc.solvers.linear import Demand, choose_linear
 
 BIG = 30_000
 
@@ -38,14 +38,16 @@ BIG = 30_000
     ids=str,
 )
 def test_choices(wishes, krylov, preconditioner, matrix_free, lagged):
-    choice = choose_linear(**{"request": "auto", "unknowns": BIG, "step_ratio": 1.0, **wishes})
+    wishes = dict(wishes)
+    request, operator = (wishes.pop(key, "auto") for key in ("request", "operator"))
+    choice = choose_linear(request, operator, Demand(**{"unknowns": BIG, "step_ratio": 1.0, **wishes}))
     assert (choice.krylov, choice.preconditioner, choice.matrix_free) == (krylov, preconditioner, matrix_free)
     assert choice.lagged == lagged
 
 
 def test_no_operator_without_matrix_for_unsymmetric_schemes():
     with pytest.raises(InputError, match="this integrator needs a matrix"):
-        choose_linear("auto", BIG, 1.0, symmetric=False, operator="matrix_free")
+        choose_linear("auto", "matrix_free", Demand(BIG, 1.0, symmetric=False))
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pfem_petsc import Case, Simulation, Truss
 from pfem_petsc.contact.links import Transform
 from pfem_petsc.errors import InputError
 from pfem_petsc.solvers.background_grid import interpolate, restrict
-from pfem_petsc.solvers.linear import choose_linear
+from pfem_petsc.solvers.linear import Demand, choose_linear
 from pfem_petsc.solvers.multigrid import GridMultigrid
 from pfem_petsc.stepping.problem import StepProblem
 
@@ -224,9 +224,9 @@ def test_same_motion_as_with_a_factorisation(comm, shared_tmp_path, scheme):
 
 def test_what_it_cannot_do_is_refused():
     with pytest.raises(InputError, match='solver.linear = "multigrid".*not symmetric; use "gamg"'):
-        choose_linear("multigrid", 30_000, 100.0, symmetric=False)
+        choose_linear("multigrid", "auto", Demand(30_000, 100.0, symmetric=False))
     with pytest.raises(InputError, match='solver.linear = "multigrid" is matrix-free'):
-        choose_linear("multigrid", 30_000, 100.0, operator="assembled")
+        choose_linear("multigrid", "assembled", Demand(30_000, 100.0))
 
 
 DROP = ("mesh.cells=[3,3,3]", "time.end=3e-5", "time.step=1.5e-6", "time.integrator=newmark")

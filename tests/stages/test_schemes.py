@@ -10,7 +10,7 @@ from helpers.kills import differences
 from helpers.stages import BLOCK, FLOOR, PLATE, check_balances
 
 from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.case.reading import INTEGRATORS
+from pfem_petsc.case.model import INTEGRATORS
 from pfem_petsc.registry import choices
 
 HELD = [{"node_set": "base", "fix": "xyz"}]

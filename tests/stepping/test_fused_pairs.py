@@ -141,7 +141,7 @@ def test_a_stopped_run_with_pairs_goes_on_to_the_same_end(tmp_path):
     with pytest.raises(EarlyStop):
         for _ in simulation.batches(min_steps=1):
             if simulation.model.pairs.force.any():
-                simulation._loop.stop._signal = 15
+                simulation._synchroniser.stop._signal = 15
     assert 0 < simulation.state.step < 100
     rest = Simulation(Case.from_dict(tables), MPI.COMM_SELF, output=tmp_path / "many", restart=True, quiet=True)
     for _ in rest.batches(min_steps=1):

@@ -13,7 +13,6 @@ from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
 from pfem_petsc.stepping.problem import StepProblem
-from pfem_petsc.stepping.stepper import load_of
 from pfem_petsc.stepping.time_stepping import make_stepper
 
 pytestmark = pytest.mark.parallel
@@ -56,7 +55,7 @@ class Twin:
         state.position[:], state.v, state.a = self.start[self.owned], self.v[self.owned], self.a[self.owned]
         self.stepper.evaluate(commit=False)
         self.balance = plan.scheme.balance(state, H)
-        state.external = load_of(self.stepper, self.balance)
+        state.external = self.stepper.load_of(self.balance)
         self.basis = np.tile(np.eye(3), (n, 1, 1))
         frames = self._frames(walls) if walls else None
         self.problem = StepProblem(self.model, state, self.balance, state.external, Transform(self.model, frames))

@@ -5,7 +5,7 @@ laws.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -14,8 +14,9 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, listed
-from ...case.rupture import Rupture
-from ...energies import BAR_ENERGIES
+from ...case.tables import Rupture
+from ...columns import BAR_ENERGIES
+from ...registry import lookup
 from ..compiled import inlined
 
 
@@ -287,7 +288,7 @@ class Law:
     internal : name and unit of each internal variable of a bar, zero at the start; the unit ``""`` is a pure number.
         They are fields of the snapshots if a case selects them, and arrays of the checkpoints. A variable named
         ``slack`` is 1 while the bar is slack: it is counted in the history and shown in the field ``status``
-    energies : names of the energy densities, of :data:`~pfem_petsc.energies.BAR_ENERGIES`: functions of strain and
+    energies : names of the energy densities, of :data:`~pfem_petsc.columns.BAR_ENERGIES`: functions of strain and
         internal variables. If the dissipation is not such a function, the law stores it in a further internal variable
     bar_data : names of the numbers that differ from bar to bar and that ``Parameters.pack_bars`` gives; the response
         reads them after the packed parameters, ``p = (*pack(), *pack_bars())``
@@ -335,7 +336,7 @@ class Law:
     def __post_init__(self) -> None:
         for name in self.energies:
             if name not in BAR_ENERGIES:
-                raise ValueError(f"a law gives {name!r}, which is none of {', '.join(BAR_ENERGIES)} (energies.py)")
+                raise ValueError(f"a law gives {name!r}, which is none of {', '.join(BAR_ENERGIES)} (columns.py)")
 
     @property
     def rows(self) -> tuple[tuple[str, str], ...]:
@@ -379,3 +380,24 @@ def mean_of_work(response: Callable[..., Any]) -> Callable[..., Any]:
         return mean, (stress - mean) / change
 
     return mean_stress
+
+
+LAWS = "pfem_petsc.mechanics.materials"
+"""The package of the laws."""
+
+
+def law_name(keys: Mapping[str, Any]) -> Any:
+    """Return the law of a table; without the key ``law`` it depends on whether there is a ``yield_stress``."""
+    if keys.get("law") is not None:
+        return keys["law"]
+    return "elastic" if keys.get("yield_stress") is None else "elastoplastic"
+
+
+def law_of(material: MaterialKeys) -> Law:
+    """Return the law of a material."""
+    return material.choose(lookup(LAWS, law_name(dict(material)), "material.law").LAW)
+
+
+def internal_variables(materials: Mapping[str, MaterialKeys]) -> dict[str, str]:
+    """Return name and unit of all internal variables of the laws of materials, in their order."""
+    return {name: unit for material in materials.values() for name, unit in law_of(material).internal}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from ..path_keys import PathKeys
+from ..keys import PathKeys
 
 if TYPE_CHECKING:
     from ...solvers.linear import LinearChoice
@@ -30,4 +30,4 @@ def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> 
     """The stepper of a case. Collective."""
     from ..path_stepper import PathStepper
 
-    return PathStepper(model, choice, parameters, component=False)
+    return PathStepper(model, choice, parameters)

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 from pydantic import model_validator
 
 from ...errors import InputError
-from ..path_keys import PathKeys
+from ..keys import PathKeys
 
 if TYPE_CHECKING:
     from ...solvers.linear import LinearChoice
     from ...stepping.model import Model
-    from ..path_stepper import PathStepper
+    from ..path_stepper import ComponentStepper
 
 __all__ = ["Parameters", "make_stepper"]
 
@@ -27,8 +27,8 @@ class Parameters(PathKeys):
         return self
 
 
-def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> PathStepper:
+def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> ComponentStepper:
     """The stepper of a case. Collective."""
-    from ..path_stepper import PathStepper
+    from ..path_stepper import ComponentStepper
 
-    return PathStepper(model, choice, parameters, component=True)
+    return ComponentStepper(model, choice, parameters)

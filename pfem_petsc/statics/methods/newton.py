@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pydantic import model_validator
-
-from ...case.base import NonNegativeFloat, PositiveFloat, StrictModel
-from ...errors import InputError
+from ...case.base import NonNegativeFloat, PositiveFloat
+from ..keys import Increments
 
 if TYPE_CHECKING:
     from ...solvers.linear import LinearChoice
@@ -16,10 +14,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Parameters", "make_stepper"]
 
-_SMALLEST = 2.0**-10  # relative to the first increment
 
-
-class Parameters(StrictModel):
+class Parameters(Increments):
     """Increments of the load factor."""
 
     step: PositiveFloat = 0.1
@@ -35,24 +31,6 @@ class Parameters(StrictModel):
     """largest viscosity of the nodes over their stiffness; 0: none. Carries the truss over limit points"""
     stabilise_share: PositiveFloat = 0.05
     """share of the viscosity in the energy that the truss absorbs, beyond which the run warns"""
-
-    @property
-    def smallest(self) -> float:
-        """The smallest increment."""
-        return _SMALLEST * self.step if self.min_step is None else self.min_step
-
-    @property
-    def largest(self) -> float:
-        """The largest increment."""
-        return self.step if self.max_step is None else self.max_step
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Parameters:
-        if self.smallest > self.step:
-            raise InputError(f"min_step = {self.min_step!r} is larger than step = {self.step!r}")
-        if self.largest < self.step:
-            raise InputError(f"max_step = {self.max_step!r} is smaller than step = {self.step!r}")
-        return self
 
 
 def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> StaticStepper:

@@ -1,0 +1,243 @@
+"""Mesh files: the suffix chooses the format.
+
+Each module of this folder is a format. It has ``SUFFIXES``, the suffixes of its files in small letters, and one or more
+of the functions
+
+- ``read(path, fields) -> WholeMesh``, which rank 0 calls: the mesh with those of the named bar fields that the file has
+  (None: all);
+- ``read_on(path, comm, fields) -> MeshSlab | None``, in its place or beside it, of all ranks together: with exactly
+  these bar fields, by the keys that ask for them; None for files that it leaves to ``read``;
+- ``write(path, mesh)``, which one rank calls with a :class:`~pfem_petsc.mesh.whole.WholeMesh`. What it writes, one file
+  or several in the folder of ``path``, takes its place when it is complete.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import shutil
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from mpi4py import MPI
+    from numpy.typing import ArrayLike
+
+    from ..mesh.slab import MeshSlab
+    from ..mesh.whole import WholeMesh
+
+__all__ = ["read_slab", "read_whole", "suffixes", "write_mesh", "write_whole", "writer_of"]
+
+_GEOMETRY = "; this is a geometry: mesh it by `gmsh -1 {name} -o {stem}.msh`"
+_MESHIO = "; convert it by `meshio convert {name} {stem}.vtu`"
+_CONVERT = {
+    **dict.fromkeys((".geo", ".geo_unrolled", ".step", ".stp", ".brep"), _GEOMETRY),
+    **dict.fromkeys((".vtk", ".med", ".bdf", ".nas", ".fem", ".xdmf", ".mesh", ".unv"), _MESHIO),
+}
+"""How to make a file that is read out of another; meshio is installed with the program."""
+
+
+def suffixes(*what: str) -> dict[str, ModuleType]:
+    """Return the module of each suffix; ``what`` are functions of which it must have one, as ``write``."""
+    from ..registry import choices, lookup
+
+    modules = [lookup(__name__, name, "") for name in choices(__name__)]
+    return {suffix: m for m in modules if any(hasattr(m, name) for name in what) for suffix in m.SUFFIXES}
+
+
+def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
+    """Read this rank's part of the mesh in a file, with cell fields by name, each with the key that asks for it, for
+    messages. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, if there is no such file, no reader for its suffix, or its content is not a mesh of bars.
+    """
+    from ..mesh.slab import check_size
+    from ..mesh.whole import read_and_scatter
+    from ..parallel.agreement import on_root
+
+    # files that rank 0 sends on need not be there on other machines
+    reader = importlib.import_module(on_root(comm, lambda: _reader_of(path, "mesh.file: ").__name__))
+    wanted = fields or {}
+    slab = reader.read_on(path, comm, wanted) if hasattr(reader, "read_on") else None
+    if slab is None:
+        return read_and_scatter(lambda path: _read(reader, path, wanted), path, comm)
+    check_size(slab.n_nodes, str(path))
+    return slab
+
+
+def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
+    """Read a mesh file as it is, unchecked, with the named bar fields; None: with all. For one rank.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_slab`.
+    """
+    from mpi4py import MPI
+
+    from ..mesh.whole import WholeMesh
+
+    path = Path(path)
+    reader = _reader_of(path, "")
+    wanted = None if fields is None else dict.fromkeys(fields, "bar_fields")
+    slab = reader.read_on(path, MPI.COMM_SELF, wanted) if hasattr(reader, "read_on") else None
+    if slab is None:
+        whole = _read(reader, path, wanted)
+    else:
+        whole = WholeMesh(slab.points, slab.bars.astype("int64"), slab.node_groups, slab.bar_groups, slab.bar_fields)
+        whole.warnings = slab.warnings
+    whole.source = str(path)
+    return whole
+
+
+def _read(reader: Any, path: Path, fields: Mapping[str, str] | None) -> WholeMesh:
+    from ..errors import InputError
+    from ..mesh.whole import missing_field
+
+    whole = reader.read(path, fields)
+    missing = missing_field(path, fields or {}, whole.bar_fields if whole.known_fields is None else whole.known_fields)
+    if missing is not None:
+        raise InputError(missing)
+    if fields is not None:
+        whole.bar_fields = {name: whole.bar_fields[name] for name in fields}
+    return whole
+
+
+def _reader_of(path: Path, key: str) -> Any:
+    """Return the module that reads a file; messages begin with the key that names the file."""
+    from ..errors import InputError
+    from ..files import readable_whole
+
+    known = suffixes("read", "read_on")
+    try:
+        with open(readable_whole(path), "rb"):
+            pass
+    except FileNotFoundError:
+        raise InputError(f"{key}there is no file {path}{_near(path, known)}") from None
+    except OSError as error:
+        raise InputError(f"{key}cannot open {path}: {error.strerror}") from None
+    if path.suffix.lower() not in known:
+        hint = _CONVERT.get(path.suffix.lower(), "").format(name=path.name, stem=path.stem)
+        raise InputError(f"{key}no reader for {path.name!r}; known suffixes: {', '.join(known)}{hint}")
+    return known[path.suffix.lower()]
+
+
+def _near(path: Path, known: Collection[str]) -> str:
+    """Return a hint at a mesh file with a similar name."""
+    folder = path.parent
+    try:
+        there = sorted(entry.name for entry in folder.iterdir() if entry.suffix.lower() in known)
+    except FileNotFoundError:
+        return f": there is no folder {folder}"
+    except OSError:
+        return ""
+    # the right name with another suffix comes first
+    match = [name for name in there if Path(name).stem == path.stem] or difflib.get_close_matches(path.name, there, n=1)
+    if match:
+        return f", did you mean {match[0]!r}?"
+    return f"; that folder has {', '.join(there[:5])}" + (", ..." if len(there) > 5 else "") if there else ""
+
+
+def writer_of(path: Path) -> Any:
+    """Return the module that writes a file.
+
+    Raises
+    ------
+    InputError
+        If there is none for its suffix.
+    """
+    from ..errors import InputError
+
+    known = suffixes("write")
+    if path.suffix.lower() not in known:
+        raise InputError(f"{path}: no writer for {path.suffix or 'no suffix'}; known suffixes: {', '.join(known)}")
+    return known[path.suffix.lower()]
+
+
+def write_whole(path: Path | str, mesh: WholeMesh) -> Path:
+    """Write a mesh to a file; an earlier one of this name is replaced when the new one is complete.
+
+    Returns
+    -------
+    The absolute path.
+
+    Raises
+    ------
+    InputError
+        If there is no writer for the suffix, the format cannot have what the mesh has, or the file cannot be written.
+    """
+    from ..errors import InputError
+
+    given = path
+    path = Path(path).absolute()
+    writer = writer_of(path)
+    new = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        new.mkdir()
+        try:
+            writer.write(new / path.name, mesh)
+            for file in sorted(new.iterdir()):
+                os.replace(file, path.with_name(file.name))
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
+    except InputError as error:
+        raise InputError(str(error).replace(str(new / path.name), str(given))) from error
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
+    return path
+
+
+def write_mesh(
+    path: Path | str,
+    points: ArrayLike,
+    bars: ArrayLike,
+    *,
+    node_groups: Mapping[str, ArrayLike] | None = None,
+    bar_groups: Mapping[str, ArrayLike] | None = None,
+    bar_fields: Mapping[str, ArrayLike] | None = None,
+    comm: MPI.Comm | None = None,
+) -> Path:
+    """Write nodes and bars to a file for ``mesh.file``; an earlier file of this name is replaced. Collective.
+
+    Parameters
+    ----------
+    path : name of the file; its suffix selects the format (``docs/meshes.md``); ``.h5`` stores everything exactly
+    points : (nodes, 3) positions [m]
+    bars : (bars, 2) integers, the nodes at both ends of each bar, numbered from 0
+    node_groups, bar_groups : numbers of the members, or a boolean mask, for each name
+    bar_fields : (bars,) numbers for each name, such as areas [m2] for ``area_field`` of sections
+    comm : communicator whose rank 0 writes its arrays; default: COMM_WORLD
+
+    Returns
+    -------
+    The absolute path.
+
+    Raises
+    ------
+    InputError
+        On all ranks, for arrays of wrong shape or type; a mesh that cannot be simulated (coordinates that are not
+        finite, bars of zero length, two bars between the same nodes, nodes without bars); a file that cannot be
+        written.
+    """
+    from mpi4py import MPI
+
+    from ..mesh.slab import slab_from_arrays
+    from ..mesh.whole import WholeMesh, check_mesh
+    from ..parallel.agreement import on_root
+
+    def write(path: Path) -> Path:
+        writer_of(path)
+        slab = slab_from_arrays(str(path), points, bars, node_groups or {}, bar_groups or {}, bar_fields or {})
+        check_mesh(slab, MPI.COMM_SELF)
+        mesh = WholeMesh(slab.points, slab.bars, slab.node_groups, slab.bar_groups, slab.bar_fields)
+        return write_whole(path, mesh)
+
+    return on_root(MPI.COMM_WORLD if comm is None else comm, write, Path(path).absolute())

@@ -1,0 +1,39 @@
+"""Numbers in texts, fast for large files."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+
+def numbers_of(text: bytes) -> np.ndarray:
+    """Return all numbers of a text, separated by white space, as float64: whole numbers are exact up to 2^53.
+
+    Raises
+    ------
+    ValueError
+        If there is anything else.
+    """
+    if not text.strip():
+        return np.empty(0)
+    with warnings.catch_warnings():
+        # text other than numbers ends the parsing, with a warning in older NumPy and an error in newer versions
+        warnings.simplefilter("error")
+        try:
+            return np.fromstring(text, dtype=np.float64, sep=" ")
+        except DeprecationWarning as error:
+            raise ValueError(str(error)) from None
+
+
+def number_of(text: str) -> float:
+    """Return a number, NaN for another text; Fortran's exponents (1.D+3) are known."""
+    try:
+        return float(text.upper().replace("D", "E"))
+    except ValueError:
+        return float("nan")
+
+
+def shown(text: bytes) -> str:
+    """Return the beginning of a text for messages."""
+    return text[:60].decode("utf-8", "replace")

@@ -1,0 +1,400 @@
+"""3MF files with beam lattices (.3mf): beams are bars, beam sets are bar groups, radii give areas.
+
+Coordinates have the unit of the file and are converted to metres; written files are in metres. All objects of the build
+are read, with their components and transforms; triangles are left out. A beam whose radii differ has the area of a
+round bar of the same volume. Node groups are those that this program writes, as metadata that others pass over.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+from xml.parsers import expat
+from xml.sax.saxutils import escape, quoteattr
+
+import numpy as np
+
+from ..errors import InputError
+from ..mesh.slab import check_memory
+from ..mesh.whole import WholeMesh
+from ._numbers import numbers_of
+
+SUFFIXES = (".3mf",)
+
+_UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
+_CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+_LATTICES = "http://schemas.microsoft.com/3dmanufacturing/beamlattice/"
+_MODEL = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
+_GROUP = "node_group."
+"""Beginning of the local names of metadata with a node group: name and numbers from 0, separated by a line break."""
+
+# text of lattices is compressed to a tenth or a twentieth
+_SMALL, _COMPRESSED = 10**7, 200
+_DEEPEST = 50
+_INSTANCES = 10**6
+
+
+def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
+    """Return the beam lattices in a 3MF file, with the field ``area``.
+
+    Raises
+    ------
+    InputError
+        Naming the line of the model, if the file is not 3MF, or has no beam lattice.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            name = _model_name(path, archive)
+            model = _Model(f"{path}: {name}")
+            with archive.open(name) as stream:
+                model.parse(stream)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
+        raise InputError(f"{path}: is not 3MF, or damaged ({error}): write it again") from None
+    return _assembled(path, model)
+
+
+def _model_name(path: Path, archive: zipfile.ZipFile) -> str:
+    """Return the name of the model from the relationships of the package, in which no part is mostly blanks."""
+    found = ["3D/3dmodel.model"]
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if tag.rpartition(":")[2] == "Relationship" and attributes.get("Type") == _MODEL:
+            found.insert(-1, attributes.get("Target", "").lstrip("/"))
+
+    def checked(name: str) -> str:
+        part = archive.getinfo(name)
+        if part.file_size > max(_SMALL, _COMPRESSED * part.compress_size):
+            raise InputError(
+                f"{path}: {name} has {part.file_size:,} bytes in {part.compress_size:,} compressed ones, as no "
+                "lattice has: the file is damaged: write it again"
+            )
+        return name
+
+    names = archive.namelist()
+    if "_rels/.rels" in names:
+        parser = expat.ParserCreate()
+        parser.StartElementHandler = start
+        try:
+            parser.Parse(archive.read(checked("_rels/.rels")), True)
+        except (expat.ExpatError, LookupError, ValueError) as error:
+            raise InputError(f"{path}: _rels/.rels: {error}") from None
+    for name in found:
+        if name in names:
+            return checked(name)
+    raise InputError(f"{path}: has no model (3D/3dmodel.model): it is not 3MF")
+
+
+@dataclass
+class _Object:
+    """What an object of the model has: texts of the file, and arrays of them after :meth:`finish`."""
+
+    name: str = ""
+    vertices: list[str] = field(default_factory=list)
+    beams: list[tuple[str, str, str, str]] = field(default_factory=list)
+    radius: str = ""
+    lists: list[tuple[str, list[str]]] = field(default_factory=list)
+    components: list[tuple[str, np.ndarray]] = field(default_factory=list)
+
+    def finish(self, where: str) -> None:
+        """Convert texts to arrays: ``points`` (n, 3), ``ends`` (n, 2), ``radii`` (n, 2), ``sets`` by name, and whether
+        vertices (n,) are ``used``, as ends of beams."""
+        self.points = _numbers(self.vertices, f"{where}: a vertex", 3).reshape(-1, 3)
+        radius = self.radius or "nan"
+        texts = [f"{a} {b} {one or radius} {two or one or radius}" for a, b, one, two in self.beams]
+        table = _numbers(texts, f"{where}: a beam", 4).reshape(-1, 4)
+        self.ends, self.radii = _whole(table[:, :2], len(self.points), f"{where}: beams: vertex"), table[:, 2:]
+        bad = np.flatnonzero(~(self.radii >= 0.0).all(axis=1))
+        if len(bad):
+            text = f"beam {bad[0]} has no radius (r1, or radius of the beamlattice) that is positive"
+            raise InputError(f"{where}: {text}")
+        self.sets: dict[str, np.ndarray] = {}
+        for name, numbers in self.lists:
+            members = _numbers(numbers, f"{where}: beamset {name}")
+            self.sets[name.replace("/", "_")] = _whole(members, len(self.ends), f"{where}: beamset {name}: beam")
+        self.used = np.zeros(len(self.points), bool)
+        self.used[self.ends] = True
+        self.vertices, self.beams, self.lists = [], [], []
+
+
+class _Model:
+    """The model of a package, as the XML is read: objects, what is built of them, and metres in the unit of the file.
+
+    ``not_read`` are the namespaces of required extensions that are not read, ``node_groups`` the numbers of vertices.
+    """
+
+    def __init__(self, where: str) -> None:
+        self.where = where
+        self.objects: dict[str, _Object] = {}
+        self.items: list[tuple[str, np.ndarray]] = []
+        self.scale, self.triangles = 1e-3, 0
+        self.not_read: list[str] = []
+        self.node_groups: dict[str, np.ndarray] = {}
+        self._current = _Object()
+        self._metadata: list[list[str]] = []
+        self._in_metadata = False
+        self._namespaces: dict[str, str] = {}
+        self._counts: dict[str, tuple[int, int]] = {}
+
+    def parse(self, stream: IO[bytes]) -> None:
+        """Read the XML.
+
+        Raises
+        ------
+        InputError
+            Naming the line, for any content that is not a model.
+        """
+        parser = expat.ParserCreate(namespace_separator=" ")
+        parser.buffer_text = True
+        parser.StartElementHandler, parser.EndElementHandler = self._start, self._end
+        parser.CharacterDataHandler = self._characters
+        parser.StartNamespaceDeclHandler = lambda prefix, uri: self._namespaces.update({prefix or "": uri})
+        parser.StartDoctypeDeclHandler = self._refuse_doctype
+        self._line = lambda: f"{self.where}: line {parser.CurrentLineNumber}"
+        try:
+            parser.ParseFile(stream)
+        except KeyError as error:
+            raise InputError(f"{self._line()}: the attribute {error} is missing") from None
+        except (expat.ExpatError, LookupError, ValueError) as error:  # the last two for unknown encodings
+            raise InputError(f"{self.where}: {error}: the file is damaged: write it again") from None
+        for number, found in self.objects.items():
+            found.finish(f"{self.where}: object {number}")
+        for texts in self._metadata:
+            name, _, numbers = "".join(texts).partition("\n")
+            members = _numbers(numbers.split(), f"{self.where}: node group {name}")
+            self.node_groups[name] = _whole(members, 2**53, f"{self.where}: node group {name}: node")
+
+    def _refuse_doctype(self, *_: Any) -> None:
+        raise InputError(f"{self._line()}: a document type, which 3MF does not allow")
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        get = attributes.get
+        match tag.rpartition(" ")[2]:
+            case "vertex":
+                self._current.vertices.append(f"{attributes['x']} {attributes['y']} {attributes['z']}")
+            case "beam":
+                self._current.beams.append((attributes["v1"], attributes["v2"], get("r1", ""), get("r2", "")))
+            case "triangle":
+                self.triangles += 1
+            case "ref" if self._current.lists:
+                self._current.lists[-1][1].append(attributes["index"])
+            case "object":
+                self._current = self.objects[attributes["id"]] = _Object(get("name", ""))
+            case "beamlattice":
+                self._current.radius = get("radius", "")
+            case "beamset":
+                name = get("name") or get("identifier") or f"beamset_{len(self._current.lists)}"
+                self._current.lists.append((name, []))
+            case "component":
+                self._current.components.append(self._placed(attributes))
+            case "item":
+                self.items.append(self._placed(attributes))
+            case "metadata" if get("name", "").partition(":")[2].startswith(_GROUP):
+                self._metadata.append([])
+                self._in_metadata = True
+            case "model":
+                unit = get("unit", "millimeter")
+                if unit not in _UNITS:
+                    raise InputError(f"{self._line()}: unit {unit!r}; known: {', '.join(_UNITS)}")
+                self.scale = _UNITS[unit]
+                required = [self._namespaces.get(prefix, prefix) for prefix in get("requiredextensions", "").split()]
+                self.not_read = [uri for uri in required if not uri.startswith(_LATTICES)]
+
+    def _end(self, tag: str) -> None:
+        self._in_metadata = False
+
+    def _characters(self, text: str) -> None:
+        if self._in_metadata:
+            self._metadata[-1].append(text)
+
+    def _placed(self, attributes: dict[str, str]) -> tuple[str, np.ndarray]:
+        """Return the object of a component or item, and its transform (4, 3): applied to rows [x, y, z, 1] from the
+        right."""
+        if any(key.rpartition(" ")[2] == "path" for key in attributes):
+            raise InputError(
+                f"{self._line()}: an object in another part of the file (production extension), "
+                "which is not read: export without it"
+            )
+        text = attributes.get("transform")
+        if text is None:
+            return attributes["objectid"], np.eye(4, 3)
+        return attributes["objectid"], _numbers([text], f"{self._line()}: transform", 12).reshape(4, 3)
+
+    def check_instances(self) -> int:
+        """Return the number of vertices of all objects of the build where beams end, after their number was checked.
+
+        Raises
+        ------
+        InputError
+            If a component or item has no object, or has itself as a component; or if there are too many of them.
+        """
+        counts = [self._count(number, 0) for number, _ in self.items]
+        instances = sum(count for count, _ in counts)
+        if instances > _INSTANCES:
+            raise InputError(
+                f"{self.where}: the build places {instances:,} objects and components, and at most {_INSTANCES:,} are "
+                "read: write the lattice as fewer, larger objects"
+            )
+        return sum(nodes for _, nodes in counts)
+
+    def _count(self, number: str, depth: int) -> tuple[int, int]:
+        """Return how many objects and components an object consists of, and their number of vertices with beams."""
+        if number not in self.objects:
+            raise InputError(f"{self.where}: there is no object {number}, which the build or a component names")
+        if depth > _DEEPEST:
+            raise InputError(f"{self.where}: object {number} is a component of itself")
+        if number not in self._counts:
+            found = self.objects[number]
+            parts = [self._count(other, depth + 1) for other, _ in found.components]
+            nodes = int(found.used.sum()) + sum(part[1] for part in parts)
+            self._counts[number] = 1 + sum(part[0] for part in parts), nodes
+        return self._counts[number]
+
+    def placed(self, number: str, place: np.ndarray) -> Iterator[tuple[_Object, np.ndarray]]:
+        """Return content and transform (4, 3) of an object and its components, those that have beams."""
+        found = self.objects[number]
+        if len(found.ends):
+            yield found, place
+        for other, inner in found.components:
+            yield from self.placed(other, np.vstack([inner[:3] @ place[:3], inner[3] @ place[:3] + place[3]]))
+
+
+def _numbers(texts: list[str], what: str, width: int = 0) -> np.ndarray:
+    """Return the numbers of texts, each with ``width`` of them; 0: any number."""
+    try:
+        values = numbers_of(" ".join(texts).encode())
+        if not width or len(values) == width * len(texts):
+            return values
+    except ValueError:
+        pass
+    wrong = next((text for text in texts if not _are_numbers(text, width)), "")
+    raise InputError(f"{what}: {wrong[:60]!r} are not {f'{width} ' if width else ''}numbers")
+
+
+def _are_numbers(text: str, width: int) -> bool:
+    try:
+        found = len([float(word) for word in text.split()])
+    except ValueError:
+        return False
+    return found == width if width else found > 0
+
+
+def _whole(values: np.ndarray, n: int, what: str) -> np.ndarray:
+    wrong = values[~((values >= 0.0) & (values < n) & (values == np.rint(values)))]
+    if wrong.size:
+        raise InputError(f"{what} {wrong.flat[0]:g} is not there; they are numbered from 0 to {n - 1}")
+    return values.astype(np.int64)
+
+
+def _assembled(path: Path, model: _Model) -> WholeMesh:
+    """Return the lattices of all items of the build as one mesh."""
+    check_memory(model.check_instances(), str(path))
+    placed = [each for item in model.items for each in model.placed(*item)]
+    if not placed:
+        raise InputError(f"{path}: has no beam lattice; a surface of triangles is read from STL")
+    points, bars, radii = [], [], []
+    groups: dict[str, dict[str, list[np.ndarray]]] = {"node_groups": {}, "bar_groups": {}}
+    n_nodes = n_bars = 0
+    for k, (found, place) in enumerate(placed):
+        own = found.points[found.used] * model.scale
+        if not np.array_equal(place, np.eye(4, 3)):
+            own = own @ place[:3] + place[3] * model.scale
+        number = np.cumsum(found.used) - 1 + n_nodes
+        points.append(own)
+        bars.append(number[found.ends])
+        radii.append(found.radii * (abs(np.linalg.det(place[:3])) ** (1.0 / 3.0) * model.scale))
+        sets = dict(found.sets)
+        if len(placed) > 1:
+            name = found.name or f"object_{k}"
+            sets[name] = np.concatenate([sets.get(name, np.empty(0, np.int64)), np.arange(len(found.ends))])
+        for group, members in sets.items():
+            groups["bar_groups"].setdefault(group, []).append(members + n_bars)
+        for group, members in model.node_groups.items():
+            inside = members[members < len(found.used)]
+            groups["node_groups"].setdefault(group, []).append(number[inside[found.used[inside]]])
+        n_nodes, n_bars = n_nodes + len(own), n_bars + len(found.ends)
+    mesh = WholeMesh(np.concatenate(points), np.concatenate(bars))
+    for kind, named in groups.items():
+        setattr(mesh, kind, {name: np.unique(np.concatenate(parts)) for name, parts in named.items()})
+    one, two = np.concatenate(radii).T
+    area = np.where(one == two, np.pi * one * one, np.pi / 3.0 * (one * one + one * two + two * two))
+    if (area > 0.0).all():
+        mesh.bar_fields["area"] = area
+    for uri in model.not_read:
+        mesh.warnings.append(f"{path}: requires the extension {uri}, which is not read")
+    if (one != two).any():
+        text = f"{int((one != two).sum())} beams whose radii differ have a constant area, with the same volume"
+        mesh.warnings.append(f"{path}: {text}")
+    left = sum(int((~found.used).sum()) for found, _ in placed)
+    if left or model.triangles:
+        mesh.warnings.append(f"{path}: left out {model.triangles} triangles and {left} vertices where no beam ends")
+    return mesh
+
+
+_OWN = "urn:pfem_petsc"
+_TYPES = (
+    '<?xml version="1.0" encoding="UTF-8"?>\n'
+    '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">'
+    '<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>'
+    '<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>\n'
+)
+_RELATIONS = (
+    '<?xml version="1.0" encoding="UTF-8"?>\n'
+    '<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">'
+    '<Relationship Target="/3D/3dmodel.model" Id="rel0" '
+    'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>\n'
+)
+_SHORT = 1e-3
+"""Of the shortest bar: beams shorter than this may be left out by the programs that read the file."""
+
+
+def write(path: Path, mesh: WholeMesh) -> None:
+    """Write the mesh; coordinates to the last digit.
+
+    Raises
+    ------
+    InputError
+        If the bars have no areas.
+    """
+    area = mesh.bar_fields.get("area")
+    if area is None or not (area > 0.0).all():
+        raise InputError(
+            f"{path.name}: 3MF needs a radius of each bar, and the mesh has no field area with positive areas [m2]: "
+            "give one to all bars (--area of the verb mesh)"
+        )
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("[Content_Types].xml", _TYPES)
+        archive.writestr("_rels/.rels", _RELATIONS)
+        with archive.open("3D/3dmodel.model", "w", force_zip64=True) as file:
+            for text in _model_text(mesh, np.sqrt(area / np.pi)):
+                file.write(text.encode())
+
+
+def _model_text(mesh: WholeMesh, radius: np.ndarray) -> Iterator[str]:
+    yield '<?xml version="1.0" encoding="UTF-8"?>\n<model unit="meter" xml:lang="en-US"'
+    yield f' xmlns="{_CORE}" xmlns:b="{_LATTICES}2017/02" xmlns:own="{_OWN}" requiredextensions="b">\n'
+    for number, (name, members) in enumerate(mesh.node_groups.items()):
+        numbers = " ".join(map(str, members.tolist()))
+        yield f'<metadata name="own:{_GROUP}{number}" type="xs:string">{escape(name)}\n{numbers}</metadata>\n'
+    yield '<resources><object id="1" type="model" name="truss"><mesh>\n<vertices>\n'
+    yield "".join(f'<vertex x="{x!r}" y="{y!r}" z="{z!r}"/>\n' for x, y, z in mesh.points.tolist())
+    length = np.linalg.norm(mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]], axis=1)
+    shortest = _SHORT * float(length.min(initial=1.0))
+    yield f'</vertices>\n<triangles/>\n<b:beamlattice radius="{float(radius[0])!r}" minlength="{shortest!r}"'
+    yield ' cap="sphere">\n<b:beams>\n'
+    if (radius == radius[0]).all():
+        yield "".join(f'<b:beam v1="{a}" v2="{b}"/>\n' for a, b in mesh.bars.tolist())
+    else:
+        rows = zip(mesh.bars.tolist(), radius.tolist(), strict=True)
+        yield "".join(f'<b:beam v1="{a}" v2="{b}" r1="{r!r}" r2="{r!r}"/>\n' for (a, b), r in rows)
+    yield "</b:beams>\n"
+    if mesh.bar_groups:
+        yield "<b:beamsets>\n"
+        for number, (name, members) in enumerate(mesh.bar_groups.items()):
+            yield f'<b:beamset name={quoteattr(name)} identifier="set{number}">\n'
+            yield "".join(f'<b:ref index="{i}"/>\n' for i in members.tolist()) + "</b:beamset>\n"
+        yield "</b:beamsets>\n"
+    yield '</b:beamlattice></mesh></object></resources>\n<build><item objectid="1"/></build>\n</model>\n'

@@ -1,0 +1,377 @@
+"""VTK files (.vtu, .vtkhdf): lines are bars, arrays of points and cells are groups and bar fields.
+
+Other cells are left out, with a warning; a line of several points is as many bars less one. A cell array of integers
+named ``group`` or ``section`` assigns every bar with value i to the bar group ``group_i`` or ``section_i``; a field
+array of strings named ``group_names`` or ``section_names`` replaces these names by its i-th entry. Point arrays of the
+same names define node groups (a negative value: no group). An array named ``group:NAME`` is the group NAME of those
+with a value other than 0; these may overlap. Other cell arrays with one component are bar fields.
+
+Each rank reads its share of a .vtkhdf file that has lines of two points alone; VTK reads all others, in a process of
+its own, because it aborts the process on some damaged files. That process runs this module as a program, which
+therefore imports no MPI.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from ..mesh.slab import MeshSlab
+    from ..mesh.whole import WholeMesh
+
+SUFFIXES = (".vtu", ".vtkhdf")
+
+_LINE, _POLY_LINE = 3, 4
+_NAMED = ("group", "section")
+"""Arrays of numbers of groups, whose names are elsewhere."""
+_MASK = "group:"
+_REFUSED = 3
+"""Status of the process for a file without a mesh of bars; the reason is on stdout."""
+_ALL = "*"
+"""In the place of names of fields: all of them."""
+_ESCAPED = {'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"}
+
+
+def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
+    """Return the mesh in a VTK file, with the named cell fields; None: all.
+
+    Raises
+    ------
+    InputError
+        For any content that is not an unstructured grid of lines.
+    """
+    from ..mesh.whole import WholeMesh
+
+    with tempfile.TemporaryDirectory() as folder:
+        result = Path(folder, "mesh.npz")
+        command = [sys.executable, "-P", "-m", __name__, str(path.resolve()), str(result)]
+        command += [_ALL] if fields is None else list(fields)
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)
+        if done.returncode == _REFUSED:
+            raise InputError(f"{path}: {done.stdout.strip()}")
+        if done.returncode < 0:
+            raise InputError(
+                f"{path}: VTK ended with signal {signal.Signals(-done.returncode).name} while reading it; "
+                "the file is damaged or too large for this machine: write it again"
+            )
+        if done.returncode:
+            last = done.stderr.strip().splitlines()[-1:] or ["no message"]
+            raise InputError(f"{path}: cannot be read with VTK ({last[0]}); is VTK 9.2 or newer installed?")
+        with np.load(result, allow_pickle=False) as arrays:
+            mesh = WholeMesh(points=arrays["points"], bars=arrays["bars"])
+            for key in arrays.files:
+                kind, slash, name = key.partition("/")
+                if slash:
+                    getattr(mesh, kind)[name] = arrays[key]
+            if arrays["left_out"]:
+                mesh.warnings.append(f"{path}: left out {arrays['left_out']} cells that are not lines")
+            if arrays["snapshots"] > 1:
+                text = f"has {arrays['snapshots']} snapshots: the mesh and its fields are those of the last one"
+                mesh.warnings.append(f"{path}: {text}")
+            mesh.known_fields = arrays["cell_fields"].tolist()
+    return mesh
+
+
+# ---- the process that reads by VTK
+
+
+def _extract(path: str, result: str, *fields: str) -> int:
+    """Read ``path``; write ``points``, ``bars``, ``node_groups/<name>``, ``bar_groups/<name>``, ``bar_fields/<name>``
+    of the named cell fields, and the names of all, ``cell_fields``, to ``result``; of the last of several snapshots."""
+    from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
+
+    if path.lower().endswith(".vtu"):
+        from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader as Reader
+    else:
+        from vtkmodules.vtkIOHDF import vtkHDFReader as Reader
+
+    # a damaged file can request any amount of memory, which takes time to fill: compressed files need at most 200 times
+    # their size, including arrays and copies
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    enough = (4 << 30) + 200 * Path(path).stat().st_size
+    resource.setrlimit(resource.RLIMIT_AS, (enough if most == resource.RLIM_INFINITY else min(enough, most), most))
+    listener = vtkStringOutputWindow()
+    vtkOutputWindow.SetInstance(listener)
+    reader = Reader()
+    reader.SetFileName(path)
+    reader.UpdateInformation()
+    snapshots = reader.GetNumberOfSteps() if hasattr(reader, "SetStep") else 1
+    if snapshots > 1:
+        reader.SetStep(snapshots - 1)
+    reader.Update()
+    # "ERROR: In FILE, line N", then on the next line "CLASS (ADDRESS): " and the message.
+    lines = listener.GetOutput().splitlines()
+    messages = [line.split("): ", 1)[-1] for line in lines if line and not line.startswith(("ERROR", "Warning"))]
+    try:
+        if lines:
+            raise ValueError(f"cannot be read: {(messages or lines)[0].strip()}")
+        arrays = dict(_arrays(reader.GetOutputDataObject(0), fields))
+    except ValueError as error:
+        print(error)
+        return _REFUSED
+    np.savez(result, snapshots=np.array(snapshots), **arrays)
+    return 0
+
+
+def _arrays(grid: Any, fields: tuple[str, ...]) -> Iterator[tuple[str, np.ndarray]]:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    if grid is None or not grid.IsA("vtkUnstructuredGrid"):
+        raise ValueError(f"holds a {grid.GetClassName() if grid else 'nothing'}, not an unstructured grid")
+    n_nodes, n_cells = grid.GetNumberOfPoints(), grid.GetNumberOfCells()
+    if n_nodes == 0 or n_cells == 0:
+        raise ValueError(f"{n_nodes} points and {n_cells} cells: not a mesh of bars, or a damaged file")
+    kinds = vtk_to_numpy(grid.GetCellTypesArray())
+    cells = np.flatnonzero((kinds == _LINE) | (kinds == _POLY_LINE))
+    if len(cells) == 0:
+        raise ValueError(f"cells of types {np.unique(kinds).tolist()}; bars are lines (type 3), and there are none")
+    ends = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
+    offsets = vtk_to_numpy(grid.GetCells().GetOffsetsArray()).astype(np.int64)
+    first, size = offsets[cells], offsets[cells + 1] - offsets[cells]
+    if np.any((size != 2) & (kinds[cells] == _LINE)) or np.any(size < 2):
+        raise ValueError("lines that do not have two ends; a bar has two")
+    if first.min() < 0 or (first + size).max() > len(ends):
+        raise ValueError("lines whose nodes do not exist: a damaged file")
+    # a line of several points is as many bars less one: the cell of each bar, and where its ends are listed
+    lines = np.repeat(cells, size - 1)
+    place = np.arange(len(lines)) - np.repeat(np.cumsum(size - 1) - (size - 1), size - 1) + np.repeat(first, size - 1)
+    yield "points", vtk_to_numpy(grid.GetPoints().GetData()).astype(np.float64)
+    yield "bars", ends[place[:, None] + np.array([0, 1])].astype(np.int64)
+    yield "left_out", np.array(n_cells - len(cells))
+    for kind, data, kept in (
+        ("node_groups", grid.GetPointData(), slice(None)),
+        ("bar_groups", grid.GetCellData(), lines),
+    ):
+        for name, members in _groups_of(data, grid.GetFieldData(), kept).items():
+            yield f"{kind}/{name}", members
+    known = {name: values for name, values in _numbers(grid.GetCellData()).items() if not name.startswith(_MASK)}
+    yield "cell_fields", np.array(list(known), dtype=str)
+    every = [name for name in known if name not in _NAMED and "/" not in name]
+    for name in every if fields == (_ALL,) else set(fields) & set(known):
+        yield f"bar_fields/{name}", known[name].astype(np.float64)[lines]
+
+
+def _numbers(data: Any) -> dict[str, np.ndarray]:
+    """Return the arrays of points or cells that have a name and one component."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    arrays = [data.GetArray(i) for i in range(data.GetNumberOfArrays())]
+    arrays = [array for array in arrays if array is not None and array.GetName()]
+    return {array.GetName(): vtk_to_numpy(array) for array in arrays if array.GetNumberOfComponents() == 1}
+
+
+def _groups_of(data: Any, fields: Any, kept: slice | np.ndarray) -> dict[str, np.ndarray]:
+    """Members by name, numbered among the points or the cells that are ``kept``."""
+    arrays = _numbers(data)
+    groups = {
+        name.removeprefix(_MASK): np.flatnonzero(values[kept])
+        for name, values in arrays.items()
+        if name.startswith(_MASK) and len(name) > len(_MASK)
+    }
+    for array in _NAMED:
+        if data.GetArray(array) is None:
+            continue
+        values = arrays.get(array)
+        if values is None or not np.array_equal(values, np.rint(values)):
+            raise ValueError(f"array {array!r} must hold one whole number for each")
+        values = values[kept]
+        names = fields.GetAbstractArray(f"{array}_names")
+        n_names = names.GetNumberOfValues() if names is not None and names.IsA("vtkStringArray") else 0
+        for value in np.unique(values[values >= 0]):
+            i = int(value)
+            groups[names.GetValue(i) if i < n_names else f"{array}_{i}"] = np.flatnonzero(values == value)
+    return groups
+
+
+# ---- files of lines alone, of which each rank reads its share
+
+
+def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab | None:
+    """Return this rank's slab of a .vtkhdf file of lines only; None on all ranks for files that VTK must read: it says
+    what is wrong, too. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, if a field is missing, or there are too many nodes or too little memory.
+    """
+    from mpi4py import MPI
+
+    from ..mesh.slab import check_memory
+    from ..mesh.whole import missing_field
+
+    plain = comm.bcast(_plain(path) if comm.rank == 0 and path.suffix.lower() == ".vtkhdf" else None)
+    if plain is None:
+        return None
+    n_nodes, masks, known = plain
+    missing = missing_field(path, fields or {}, known)
+    if missing is not None:
+        raise InputError(missing)
+    check_memory(n_nodes, str(path))
+    slab, fits = None, True
+    try:
+        slab = _share(path, comm, masks, known if fields is None else list(fields))
+    except MemoryError:
+        fits = False
+    if not comm.allreduce(fits, op=MPI.LAND):
+        raise InputError(f"{path}: the mesh does not fit in memory; use more ranks")
+    return slab if comm.allreduce(slab is not None, op=MPI.LAND) else None
+
+
+def _plain(path: Path) -> tuple[int, dict[str, list[str]], list[str]] | None:
+    """Return the number of nodes, names of arrays that mark groups of points and cells, and names of fields, of a file
+    in one part, without steps, of lines of two points in the order of ``Connectivity``; None for another one."""
+    import h5py
+
+    from .hdf5 import FAILURES
+
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            root = file["VTKHDF"]
+            kind = root.attrs["Type"]
+            if (kind.decode() if isinstance(kind, bytes) else str(kind)) != "UnstructuredGrid" or "Steps" in root:
+                return None
+            (n_nodes,), (n_bars,), (n_ends,) = (
+                root[name][:].tolist() for name in ("NumberOfPoints", "NumberOfCells", "NumberOfConnectivityIds")
+            )
+            shapes = {"Points": (n_nodes, 3), "Connectivity": (n_ends,), "Offsets": (n_bars + 1,), "Types": (n_bars,)}
+            holds = [_holds(root[name], shape, "f" if name == "Points" else "iu") for name, shape in shapes.items()]
+            masks: dict[str, list[str]] = {}
+            for kind, n in (("PointData", n_nodes), ("CellData", n_bars)):
+                data = root.get(kind, {})
+                masks[kind] = [name for name in data if name.startswith(_MASK) and len(name) > len(_MASK)]
+                holds += [_holds(data[name], (n,), "fiu") for name in masks[kind]]
+                holds += [name not in data for name in _NAMED]
+            cells = root.get("CellData", {})
+            known = [name for name in cells if not name.startswith(_MASK) and cells[name].ndim == 1]
+            holds += [_holds(cells[name], (n_bars,), "fiu") for name in known]
+            return (n_nodes, masks, known) if all(holds) and n_ends == 2 * n_bars and n_nodes and n_bars else None
+    except FAILURES:
+        return None
+
+
+def _holds(dataset: Any, shape: tuple[int, ...], kinds: str) -> bool:
+    """Return whether a dataset has this shape, numbers of these kinds, and was written."""
+    if dataset.shape != shape or dataset.dtype.kind not in kinds:
+        return False
+    return dataset.chunks is not None or dataset.id.get_storage_size() >= dataset.size * dataset.dtype.itemsize
+
+
+def _share(path: Path, comm: MPI.Comm, masks: dict[str, list[str]], fields: list[str]) -> MeshSlab | None:
+    """Return this rank's slab; None if its cells are not all lines in order, or the file is damaged."""
+    import h5py
+
+    from .hdf5 import FAILURES, pieces, read_shares, share_of
+
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            root = file["VTKHDF"]
+            slab = read_shares(root, comm, "Points", "Connectivity", {name: f"CellData/{name}" for name in fields})
+            slab.source = str(path)
+            first, last = slab.first_bar, slab.first_bar + len(slab.bars)
+            for start, stop in pieces(first, last):
+                in_order = np.array_equal(root["Offsets"][start : stop + 1], np.arange(2 * start, 2 * stop + 1, 2))
+                if not in_order or not (root["Types"][start:stop] == _LINE).all():
+                    return None
+            first_node, last_node = slab.first_node, slab.first_node + len(slab.points)
+            for kind, groups, start, stop in (
+                ("PointData", slab.node_groups, first_node, last_node),
+                ("CellData", slab.bar_groups, first, last),
+            ):
+                for name in masks[kind]:
+                    mask = share_of(root[kind][name], start, stop, bool)
+                    groups[name.removeprefix(_MASK)] = start + np.flatnonzero(mask)
+            return slab
+    except FAILURES:
+        return None
+
+
+# ---- writing
+
+
+def write(path: Path, mesh: WholeMesh) -> None:
+    """Write the mesh with its bar fields, to the last digit; groups are arrays of ones and zeros."""
+    from ..mesh.whole import without_slashes
+
+    hdf = path.suffix.lower() == ".vtkhdf"
+    data: dict[str, dict[str, np.ndarray]] = {"CellData": {}, "PointData": {}}
+    for kind, named, n in (
+        ("CellData", mesh.bar_fields, -1),
+        ("PointData", mesh.node_groups, len(mesh.points)),
+        ("CellData", mesh.bar_groups, len(mesh.bars)),
+    ):
+        for name, values in (without_slashes(named) if hdf else named).items():
+            if n >= 0:
+                mask = np.zeros(n, np.uint8)
+                mask[values] = 1
+                name, values = f"{_MASK}{name}", mask
+            data[kind][name] = np.ascontiguousarray(values)
+    (_write_vtkhdf if hdf else _write_vtu)(path, mesh, data)
+
+
+def _write_vtkhdf(path: Path, mesh: WholeMesh, data: dict[str, dict[str, np.ndarray]]) -> None:
+    """Version 1.0 of the format."""
+    import h5py
+
+    n = len(mesh.bars)
+    with h5py.File(path, "w", locking=False) as file:
+        root = file.create_group("VTKHDF", track_order=True)
+        root.attrs["Version"] = np.array([1, 0], np.int64)
+        root.attrs.create("Type", b"UnstructuredGrid", dtype=h5py.string_dtype("ascii", 16))
+        sizes = {"NumberOfPoints": len(mesh.points), "NumberOfCells": n, "NumberOfConnectivityIds": 2 * n}
+        for name, size in sizes.items():
+            root[name] = np.array([size], np.int64)
+        root["Points"] = np.asarray(mesh.points, np.float64)
+        root["Connectivity"] = np.asarray(mesh.bars, np.int64).ravel()
+        root["Offsets"] = np.arange(0, 2 * n + 1, 2, dtype=np.int64)
+        root["Types"] = np.full(n, _LINE, np.uint8)
+        for kind, arrays in data.items():
+            group = root.create_group(kind, track_order=True)  # in the order in which they are given
+            for name, values in arrays.items():
+                group[name] = values
+
+
+def _write_vtu(path: Path, mesh: WholeMesh, data: dict[str, dict[str, np.ndarray]]) -> None:
+    """Compressed."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    points, cells, grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(mesh.points, dtype=np.float64), deep=True))
+    offsets = np.arange(0, 2 * len(mesh.bars) + 1, 2, dtype=np.int64)
+    ends = np.ascontiguousarray(mesh.bars, dtype=np.int64).ravel()
+    cells.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(ends, deep=True))
+    grid.SetPoints(points)
+    grid.SetCells(_LINE, cells)
+    for kind, arrays in data.items():
+        for name, values in arrays.items():
+            array = numpy_to_vtk(values, deep=True)
+            array.SetName(escape(name, _ESCAPED))  # VTK writes names as they are
+            getattr(grid, f"Get{kind}")().AddArray(array)
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.SetFileName(str(path))
+    writer.SetInputData(grid)
+    if not writer.Write() or not path.is_file():
+        raise InputError(f"{path}: VTK could not write the file; is there room?")
+
+
+if __name__ == "__main__":
+    sys.exit(_extract(*sys.argv[1:]))

@@ -18,8 +18,8 @@ from .contact import Candidates, expected_candidates
 from .explicit import LocalSolution, jam, solve_locally
 from .forces import WallForces, held_by_supports
 from .frames import MIN_VOLUME, NodalFrames, Sliding
-from .links import LinkCoordinates, Transform
 from .projection import project
+from .transform import RowCoordinates, Transform
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -438,7 +438,7 @@ class Trial:
     candidates: Candidates
     frames: NodalFrames
     tied: tuple[np.ndarray, np.ndarray, np.ndarray]
-    links: tuple[LinkCoordinates, ...]
+    links: tuple[RowCoordinates, ...]
     transform: Transform
 
 
@@ -456,7 +456,7 @@ class Outcome:
 
     settled: bool
     candidates: Candidates
-    links: tuple[LinkCoordinates, ...]
+    links: tuple[RowCoordinates, ...]
     trial: Trial
     normal_forces: np.ndarray
     pull: np.ndarray
@@ -485,7 +485,7 @@ class ActiveSet:
         state: State,
         balance: Balance,
         held: np.ndarray,
-        links: Sequence[LinkCoordinates] = (),
+        links: Sequence[RowCoordinates] = (),
         remedy: str = "reduce time.step",
     ) -> None:
         self.contact, self._remedy = model.contact, remedy
@@ -501,7 +501,7 @@ class ActiveSet:
         self._all_links = tuple(links)
         self.links = tuple(link for link in links if link.reached(state, move, slack))
 
-    def place(self, candidates: Candidates, links: Sequence[LinkCoordinates], x: np.ndarray) -> Trial:
+    def place(self, candidates: Candidates, links: Sequence[RowCoordinates], x: np.ndarray) -> Trial:
         """Build the coordinates of candidates and links at positions (owned, 3). Collective.
 
         Raises
@@ -520,7 +520,7 @@ class ActiveSet:
         met = frames if candidates.anywhere else None
         for link in links:
             link.place(met, self.balance, self.state, x)
-        return Trial(candidates, frames, tied, tuple(links), Transform(self.model, met, links))
+        return Trial(candidates, frames, tied, tuple(links), Transform(self.model.mesh, met, links))
 
     def feasible(self, trial: Trial, u: np.ndarray, stiffness: np.ndarray | None = None) -> np.ndarray:
         """Return the increment (owned, 3) nearest to a guess that satisfies the frames' planes and links. Collective.
@@ -634,7 +634,7 @@ class ActiveSet:
 
     def _check_links(
         self, trial: Trial, bounds: Bounds, w: np.ndarray, x: np.ndarray, g: np.ndarray, noise: float, slack: float
-    ) -> tuple[bool, tuple[LinkCoordinates, ...], np.ndarray]:
+    ) -> tuple[bool, tuple[RowCoordinates, ...], np.ndarray]:
         """Return whether links are satisfied at positions (owned, 3), the links of the next solve, and the part of the
         residual force that walls must balance. Collective."""
         kept, met, at = True, list(trial.links), trial.frames.nodes
@@ -648,8 +648,8 @@ class ActiveSet:
                     met.append(link)
                 continue
             link.solve_forces(w, turned, bounds.arrays[0], noise)
-            link.push(g, -1.0)
-            kept &= link.kept(x, slack)
+            link.constraints.add_forces(g, -1.0)
+            kept &= link.satisfied(x, slack)
         self._link_iterations += not kept
         if self._link_iterations >= _ITERATIONS:
             raise NotConverged(f"constraints and positions did not agree in {_ITERATIONS} solves; {self._remedy}")
@@ -661,8 +661,8 @@ class ActiveSet:
         total = np.zeros_like(u)
         for link in self._all_links:
             if link not in outcome.links:
-                link.release()
-            link.push(total)
+                link.constraints.release()
+            link.constraints.add_forces(total)
         held = np.zeros(len(u), dtype=bool)
         if not outcome.trial.candidates.anywhere:
             return total, self.contact.nothing, held

@@ -189,8 +189,8 @@ class Impacts:
         if not self.active:
             return 0.0
         loss = self._on_walls(x, motion, load, time, displacements) if self.model.contact.any else 0.0
-        if self.model.pairs is not None:
-            loss += self._of_pairs(x, motion, load)
+        if len(self.model.links.two.at):
+            loss += self._of_rows(x, motion, load)
         return 0.0 if self.elastic else loss
 
     def _free(self, nodes: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> tuple:
@@ -304,20 +304,19 @@ class Impacts:
         given = 0.5 * (sums[:, 2:] ** 2).sum(axis=1) / (free.mass + sums[:, 1])
         return float((keeps * (sums[:, 0] - given)).sum())
 
-    def _of_pairs(self, x: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> float:
-        """Return the loss of closing pairs whose second nodes this rank owns, with the reduced mass. Collective."""
-        pairs, mass = self.model.pairs, self.model.inertia.mass
-        normal_forces = pairs.force > 0.0
-        fresh, parted = normal_forces & ~pairs.closed, pairs.closed & ~normal_forces
-        pairs.closed = normal_forces
-        at = np.flatnonzero(fresh | parted)
+    def _of_rows(self, x: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> float:
+        """Return the loss of closing rows over two nodes whose second nodes this rank owns, with the reduced mass."""
+        links, mass = self.model.links, self.model.inertia.mass
+        two, rows = links.two, links.two.record
+        rows.force[:] = links.force[two.at]
+        pressed = rows.force > 0.0
+        at = np.flatnonzero(pressed != rows.closed)
+        if len(at) == 0:
+            return 0.0
 
         def of_nodes(nodes: np.ndarray) -> np.ndarray:
             free_v, free_a = self._free(nodes, motion, load)
             return np.column_stack([x[nodes], free_v, free_a, mass[nodes]])
 
-        if len(at) == 0:
-            return 0.0
-        ends = pairs.gather_of(at, of_nodes)
-        mine = pairs.mine[1]
-        return close_rows(at, ends, pairs.normals, pairs.gaps, pairs.along, mine, self.slack, pairs.force, pairs.closed)
+        rows.closed[:] = pressed
+        return close_rows(rows, at, links.rows.gather_of(two.at[at], of_nodes), two.counted, self.slack)

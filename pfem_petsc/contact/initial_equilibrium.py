@@ -111,7 +111,7 @@ def start_at_rest(
     force = strengths[:, :, None] * normals + drag
     state.contact = np.zeros_like(load)
     state.contact[nodes] = force.sum(axis=1)
-    links.push(state.contact)
+    links.add_forces(state.contact)
     return contact.sums(nodes, force, x[nodes], strengths > 0.0)
 
 

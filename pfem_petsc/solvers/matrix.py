@@ -12,7 +12,7 @@ from petsc4py import PETSc
 from ..mechanics.compiled import kernel
 
 if TYPE_CHECKING:
-    from ..contact.links import Transform
+    from ..contact.transform import Transform
     from ..mechanics.supports import Directions, Supports
     from ..mesh.distribution import DistributedMesh
     from ..stepping.problem import StepProblem
@@ -246,7 +246,7 @@ class HessianMatrix:
         return self.mat
 
     def couple(self, links: Iterable) -> None:
-        """Set the coordinates of links (``contact.links.LinkCoordinates``) for steps with bounds. Collective."""
+        """Set the coordinates of links (``contact.transform.RowCoordinates``) for steps with bounds. Collective."""
         for link in links:
             matrix = link.matrix()
             if not self._chain:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.links import Transform
+from ..contact.transform import Transform
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import DIRECT, LinearChoice
@@ -241,7 +241,7 @@ class StaticStepper(ImplicitStepper):
         if direct:
             return -1
         balance = Equilibrium().balance(state, 0.0)
-        problem = StepProblem(model, state, balance, state.external, Transform(model))
+        problem = StepProblem(model, state, balance, state.external, Transform(model.mesh))
         self.hessian.put(problem, bars)
         held = held_nodes(model, walls)
         held[walls.nodes[walls.touching.any(axis=1)]] = True

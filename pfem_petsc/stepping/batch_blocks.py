@@ -189,9 +189,7 @@ def pass_block(block, finished, pressing, rows, alone, nodes, shared, f, u, cont
         first = NODE_BLOCK * block
         last = min(first + NODE_BLOCK, n)
         solve_block(block, nodes, shared, f, 0, shared.speeds[: 3 * (last - first)], u[first:last].reshape(-1))
-    count, changed = solve_rows(
-        block, rows, shared.x, shared.h, shared.half, nodes.mass, nodes.damping, shared.alpha, shared.eta, u, contact
-    )
+    count, changed = solve_rows(block, rows, nodes, shared, u, contact)
     pressing += count
     while finished < len(rows.ready) and rows.ready[finished] <= block:
         if alone[finished]:
@@ -221,7 +219,7 @@ def _add_pushes(block, rows, contact, speeds, sums):
 @kernel
 def sum_rows(rows, pressing):
     """Write the forces on the second nodes of each table to ``rows.totals``, as
-    :func:`~pfem_petsc.contact.pair_loops.table_forces` does; ``pressing`` rows have a force."""
+    :func:`~pfem_petsc.contact.constraint_set.last_forces` does; ``pressing`` rows have a force."""
     force, normals, place = rows.force, rows.normals, rows.place
     for k in range(len(rows.totals)):
         x = y = z = 0.0
@@ -263,7 +261,7 @@ def finish_rows(rows, changed, slack, x, half, nodes, alpha, eta, u, v, a, conta
                 ends[end, m, 3 + c] = v[i, c] if fixed else free_v[m, c]
                 ends[end, m, 6 + c] = a[i, c] if fixed else free_a[m, c]
     counted = np.ones(len(force), dtype=np.bool_)
-    return close_rows(at, ends, rows.normals, rows.least, rows.along, counted, slack, force, closed)
+    return close_rows(rows, at, ends, counted, slack)
 
 
 class Pressed(NamedTuple):

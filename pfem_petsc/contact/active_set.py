@@ -15,7 +15,7 @@ from ..errors import NotConverged
 from ..integrators.base import Balance, State
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .contact import Candidates, expected_candidates
-from .explicit import LocalSolution, jam, solve_locally
+from .explicit import LocalSolution, Rubbing, jam, solve_locally
 from .forces import WallForces, held_by_supports
 from .frames import MIN_VOLUME, NodalFrames, Sliding
 from .projection import project
@@ -327,10 +327,11 @@ class StepFriction:
         self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray
     ) -> LocalSolution:
         """Solve the local problems of some nodes of the frames."""
-        nodes = frames.nodes[at]
-        planes = frames.normals[at], frames.offsets[at]
-        start, stiffness = self.state.position[nodes], self._stiffness[nodes]
-        return solve_locally(self.contact, nodes, planes, x, reaction, start, self._way, stiffness, slipping)
+        nodes, contact = frames.nodes[at], self.contact
+        planes = contact.fixed[nodes], frames.normals[at], frames.offsets[at]
+        rough = contact.friction, contact.static_friction
+        rubbing = Rubbing(self.state.position[nodes], self._way, *planes, *rough, self._stiffness[nodes])
+        return solve_locally(rubbing, x, reaction, slipping, contact.size)
 
     def _may_stick(
         self, nodes: np.ndarray, slipping: np.ndarray, x: np.ndarray, normal_forces: np.ndarray, normals: np.ndarray

@@ -19,6 +19,7 @@ from .constraints.base import Constraint, ConstraintKeys, SetPart
 from .contact import near_planes
 from .fixed_rows import FixedRows, TwoNodeRows
 from .pairs import find_pairs
+from .projection import project
 from .rows import (
     Planes,
     RowSet,
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
 PACKAGE = "pfem_petsc.contact.constraints"
 _ZERO = np.zeros(1)
-_NO_NODES = np.empty(0, dtype=bool)
 
 
 class ConstraintSet:
@@ -74,9 +74,13 @@ class ConstraintSet:
             self.fixed_jacobian[at] = rows.gradients(np.zeros((len(rows.numbers), 3)), at)
         self.two = TwoNodeRows(rows, self.fixed_jacobian)
         self._members = rows.gather(contact.members) > 0.0
+        self._flat_members = np.ascontiguousarray(self._members[:, contact.flat])
+        self._walled_nodes = self._members.any(axis=1)
         self._near_walls = bool(self._members.any())
+        self._turning = not rows.fixed.all()
         walled, shared = mesh.comm.allreduce(np.array([self._near_walls, not self.two.every], dtype=np.int64))
         self.walled, self.alone = walled > 0, walled + shared == 0
+        self._partial = self.walled and contact.partial  # whose flags travel with positions
         self._x, self._hard = np.empty((len(rows.numbers), 3)), np.empty(len(rows.numbers))
         self._blocks: FixedRows | None = None  # for nodes of the stiffness
         self._blocks_of = np.empty(0)
@@ -118,7 +122,7 @@ class ConstraintSet:
         if self.alone:
             self.force = self.two.separate(balance.predictor, u, stiffness, contact)
             return contact if self.force.any() else none
-        rows, x, walls = self.rows, self._x, len(self.contact.walls) if self.walled else 0
+        rows, x, walls = self.rows, self._x, len(self.contact.walls) if self._partial else 0
         displacements = self.contact.motion.displacements(balance.time)
         far = np.empty((0, 7 + walls))
         if not rows.partners.alone:
@@ -129,13 +133,25 @@ class ConstraintSet:
             far = rows.partners.bring(leaving)
         free_positions(rows.where, balance.predictor, u, far, x)
 
-        def given(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, Planes | None]:
-            start = rows.spread(state.position, far[:, 4:7]) if balance.acting < 1.0 else None
-            free_stiffness(rows.where, stiffness, far, self._hard)
-            return self._hard, start, self._planes(nodes, x, far[:, 7:] > 0.0, displacements)
+        near, pushed = self._near(x, balance.time), x
+        if len(near):
+            pushed, moved = x.copy(), x[near]
+            normals, offsets = self._planes(near, x, far[:, 7:] > 0.0, displacements)
+            project(moved, rows.free[near] == 0.0, normals, offsets, tolerance, np.zeros(offsets.shape))
+            pushed[near] = moved
 
-        near = self._near(x, balance.time)
-        self.force, self.jacobian = rows.project(x, tolerance, near, given, self.fixed_jacobian)
+        def given(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, Planes | None]:
+            turns = balance.acting < 1.0 and self._turning
+            start = rows.spread(state.position, far[:, 4:7]) if turns else None
+            free_stiffness(rows.where, stiffness, far, self._hard)
+            if not self._near_walls:
+                return self._hard, start, None
+            walled, place = np.flatnonzero(nodes & self._walled_nodes), np.full(len(x), -1)
+            place[walled] = np.arange(len(walled))
+            normals, offsets = self._planes(walled, x, far[:, 7:] > 0.0, displacements)
+            return self._hard, start, (place, normals, np.einsum("nwi,ni->nw", normals, x[walled]) - offsets)
+
+        self.force, self.jacobian = rows.project(x, pushed, tolerance, given, self.fixed_jacobian)
         if not self.force.any():
             return none
         load = rows.forces(self.jacobian, self.force)
@@ -143,31 +159,27 @@ class ConstraintSet:
         return contact if load[rows.mine].any() else none
 
     def _near(self, x: np.ndarray, time: float) -> np.ndarray:
-        """(n,) bool: nodes at positions (n, 3) beyond a wall."""
-        if not self._near_walls:
-            return _NO_NODES
+        """(m,) nodes at positions (n, 3) beyond a wall."""
         near, flat = np.zeros(len(x), dtype=bool), self.contact.flat
-        members = np.ascontiguousarray(self._members[:, flat])
-        offsets = self.contact.plane_offsets(time)[flat]
-        near_planes(x, self.contact.normals[flat], offsets, np.zeros(len(offsets), bool), members, _ZERO, near)
-        return near
+        if self._near_walls:
+            offsets = self.contact.plane_offsets(time)[flat]
+            everywhere = np.zeros(len(offsets), dtype=bool)
+            near_planes(x, self.contact.normals[flat], offsets, everywhere, self._flat_members, _ZERO, near)
+        return np.flatnonzero(near)
 
-    def _planes(self, nodes: np.ndarray, x: np.ndarray, away: np.ndarray, displacements: np.ndarray) -> Planes | None:
-        """Walls at some of the nodes (n,) bool at positions x (n, 3); ``away`` (m, w): walls that can stop nodes that
-        other ranks own."""
-        if not self._near_walls:
-            return None
+    def _planes(
+        self, nodes: np.ndarray, x: np.ndarray, away: np.ndarray, displacements: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Normals (m, w, 3) and offsets (m, w) of walls at some nodes (m,), at positions x (n, 3); ``away`` (k, w):
+        walls that can stop nodes that other ranks own."""
         rows, contact = self.rows, self.contact
-        nodes = np.flatnonzero(nodes & self._members.any(axis=1))
-        place = np.full(len(x), -1)
-        place[nodes] = np.arange(len(nodes))
         where = rows.where[nodes]
-        own = where >= 0
-        applicable = np.empty((len(nodes), len(contact.walls)), dtype=bool)
-        applicable[own] = contact.applicable(where[own], x[nodes[own]], displacements)
-        applicable[~own] = away[-1 - where[~own]]
-        normals, offsets = contact.planes(applicable, x[nodes], displacements)
-        return place, normals, np.einsum("nwi,ni->nw", normals, x[nodes]) - offsets
+        applicable = self._members[nodes]
+        if contact.partial:
+            own = where >= 0
+            applicable[own] = contact.applicable(where[own], x[nodes[own]], displacements)
+            applicable[~own] = away[-1 - where[~own]]
+        return contact.planes(applicable, x[nodes], displacements)
 
     @property
     def batched(self) -> bool:
@@ -303,13 +315,15 @@ class ConstraintSet:
         rests = rows.gather(on_walls) > 0.0
         every, hard = rows.gather(a), rows.gather(mass)
         normals, _ = contact.planes(rests, rows.gather(state.position), contact.motion.displacements(state.time))
-        gaps = np.where(rests, np.einsum("nwi,ni->nw", normals, every), np.inf)
-        values = rows.along(self.jacobian, every) + closed
+        pushed, offsets = every.copy(), np.where(rests, 0.0, -np.inf)
+        project(pushed, rows.free == 0.0, normals, offsets, 0.0, np.zeros(offsets.shape))
+        gaps = np.einsum("nwi,ni->nw", normals, every) - offsets
+        values, pushed = (rows.along(self.jacobian, a) + closed for a in (every, pushed))
         largest = rows.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)
         place = np.where(rests.any(axis=1), np.arange(len(every)), -1)
         with agreed(rows.mesh.comm):
             system = rows.system(self.jacobian, values, hard, (place, normals, gaps))
-            self.force = rows.solve(system, 1e-13 * largest)
+            self.force = rows.solve(system, pushed, 1e-13 * largest)
         change[rows.here] = (rows.forces(self.jacobian, self.force) * rows.free)[rows.mine]
         return change
 

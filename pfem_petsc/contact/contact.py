@@ -18,7 +18,7 @@ from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED, resolvable
 from .explicit import ExplicitContact
 from .forces import ContactLog, WallForces
-from .frames import MIN_VOLUME, NodalFrames, build_frames
+from .frames import MIN_VOLUME, NodalFrames, Planes, build_frames
 from .tied import FreshTies, NoTies, Ties
 from .wall_motion import WallMotion
 
@@ -328,7 +328,7 @@ class Contact:
         if rank is None:
             rank = np.einsum("iwk,ik->iw", normals, at) - offsets
         tolerance = ON_BOUND * self.size
-        frames = build_frames(nodes, self.fixed[nodes], normals, offsets, rank, tolerance, at, least)
+        frames = build_frames(nodes, Planes(self.fixed[nodes], normals, offsets, rank, at), tolerance, least)
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction

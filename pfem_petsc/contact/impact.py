@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -50,9 +50,17 @@ def plane_gaps(nodes, x, normals, offsets):
     return every, gaps
 
 
+class Masses(NamedTuple):
+    """Masses and damping of nodes (n,); (0,) without damping."""
+
+    mass: np.ndarray
+    damping: np.ndarray
+
+
 @kernel
-def unpressed(nodes, v, a, contact, mass, damping, alpha, eta):
+def unpressed(nodes, v, a, contact, masses, alpha, eta):
     """Return velocities and accelerations (m, 3) of nodes (m,) without the contact forces (owned, 3)."""
+    mass, damping = masses.mass, masses.damping
     free_v, free_a = np.empty((len(nodes), 3)), np.empty((len(nodes), 3))
     damped = len(damping) > 0
     for j in range(len(nodes)):
@@ -65,23 +73,57 @@ def unpressed(nodes, v, a, contact, mass, damping, alpha, eta):
     return free_v, free_a
 
 
+class Approach(NamedTuple):
+    """Nodes (m,) near walls (w,) at the start of a step.
+
+    Attributes
+    ----------
+    normals, gaps : (m, w, 3), (m, w) [m]
+    v, a : (m, 3) without contact
+    rates, pulls : (w, 3) velocities and accelerations of the walls
+    """
+
+    normals: np.ndarray
+    gaps: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    rates: np.ndarray
+    pulls: np.ndarray
+
+
+class Touched(NamedTuple):
+    """Contacts of the nodes (owned,) of a rank with walls (w,).
+
+    Attributes
+    ----------
+    touching : (owned, w) bool, contacts in this step
+    closed : (owned, w) bool, contacts that have closed and whose node has not left the wall; updated
+    fixed : (owned, 3) bool, prescribed components
+    restitution : (w,)
+    slack : distance at which a node has left [m]
+    """
+
+    touching: np.ndarray
+    closed: np.ndarray
+    fixed: np.ndarray
+    restitution: np.ndarray
+    slack: float
+
+
 @kernel
-def stop_nodes(
-    nodes, touching, closed, normals, gaps, v, a, rates, pulls, mass, fixed, restitution, counted, slack, speeds
-):
+def stop_nodes(nodes, approach, touched, mass, counted, speeds):
     """Return the energy [J] that nodes (m,) lose when they close on walls, and the nodes that are on walls afterwards.
 
     Parameters
     ----------
-    touching : (owned, w) bool, contacts in this step
-    closed : (owned, w) bool, contacts that have closed and whose node has not left the wall; updated
-    normals, gaps : (m, w, 3), (m, w) at the start of the step [m]
-    v, a : (m, 3) there, without contact; rates, pulls : (w, 3) velocities and accelerations of the walls
-    mass, fixed : (owned,), (owned, 3)
-    restitution, counted : (w,); only counted walls contribute to the energy
-    slack : distance at which a node has left [m]
+    approach, touched : see :class:`Approach` and :class:`Touched`
+    mass : (owned,)
+    counted : (w,) bool, walls that contribute to the energy
     speeds : (m, w) output: approach velocities of closing contacts, else zero [m/s]
     """
+    normals, gaps, v, a, rates, pulls = approach
+    touching, closed, fixed = touched.touching, touched.closed, touched.fixed
+    restitution, slack = touched.restitution, touched.slack
     w = closed.shape[1]
     met = np.empty(len(nodes), dtype=np.int64)
     count = 0
@@ -205,7 +247,7 @@ class Impacts:
             return self._guided(
                 nodes,
                 motion,
-                *unpressed(nodes, v, a, state.contact, inertia.mass, damping, balance.alpha, balance.eta),
+                *unpressed(nodes, v, a, state.contact, Masses(inertia.mass, damping), balance.alpha, balance.eta),
             )
         free_v, load = v[nodes], load[nodes]
         if inertia.damped:
@@ -249,23 +291,9 @@ class Impacts:
                 balance = self.stepper.balance
                 rates[free.at] = free.state.v + balance.eta / balance.alpha * (free_fall - free.balanced)
             self._free_rates = free.state.v
-        loss, self.met = stop_nodes(
-            nodes,
-            log.touching,
-            self.stepper.closed,
-            normals,
-            gaps,
-            free_v,
-            free_a,
-            rates,
-            pulls,
-            self.model.inertia.mass,
-            contact.fixed,
-            contact.restitution,
-            self.counted,
-            self.slack,
-            speeds,
-        )
+        approach = Approach(normals, gaps, free_v, free_a, rates, pulls)
+        touched = Touched(log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.slack)
+        loss, self.met = stop_nodes(nodes, approach, touched, self.model.inertia.mass, self.counted, speeds)
         if contact.ties.any:
             loss += self._tied(nodes, normals, speeds, free_v, rates)
         if free is not None:

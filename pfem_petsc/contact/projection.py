@@ -41,13 +41,15 @@ def _solve(gram, rhs, n, factor, out):
 
 
 @kernel
-def _best_set(free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, multipliers, move):
-    """Find the optimum for the planes ``among[:count]``; return the number of active planes, 0 if there is none.
+def _best_set(free, gap, among, tolerance, chosen, multipliers, move):
+    """Find the optimum for the planes ``among``; return the number of active planes, 0 if there is none.
 
     ``chosen`` and ``multipliers`` (3,) receive the active planes, ``move`` (3,) the displacement to the optimum.
     """
+    gram, factor = np.zeros((3, 3)), np.zeros((3, 3))
+    rhs, solution = np.zeros(3), np.zeros(3)
     best = math.inf
-    found = 0
+    found, count = 0, len(among)
     active = np.zeros(3, dtype=np.int64)
     trial = np.zeros(3)
     for i in range(count):
@@ -126,10 +128,6 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
     gap = np.zeros(w)
     usable = np.zeros(w, dtype=np.bool_)
     among = np.zeros(w, dtype=np.int64)
-    gram = np.zeros((3, 3))
-    factor = np.zeros((3, 3))
-    rhs = np.zeros(3)
-    solution = np.zeros(3)
     chosen = np.zeros(3, dtype=np.int64)
     strengths = np.zeros(3)
     move = np.zeros(3)
@@ -165,7 +163,7 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
             if found == 1:
                 count = 0
         while count > 0:
-            found = _best_set(free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, strengths, move)
+            found = _best_set(free, gap, among[:count], tolerance, chosen, strengths, move)
             if found == 0:
                 if infeasible < 0:
                     infeasible = i

@@ -130,28 +130,23 @@ def gather_rows(at, array, vectors):
 
 
 @kernel
-def broken_groups(groups, values, x, near, tolerance, chosen, tolerances):
-    """Mark groups with a row below its bound, or with nodes near walls; return their number.
+def broken_groups(groups, values, x, tolerance, chosen, tolerances):
+    """Mark groups with a row below its bound; return their number.
 
     Parameters
     ----------
     groups : Groups
-    values : (r,) rows; x : (n, 3) positions; near : (n,) bool, (0,) for none
+    values : (r,) rows; x : (n, 3) positions
     tolerance : a row violated by at most this, or by rounding of the group's positions, counts as satisfied
     chosen, tolerances : (groups,) output; tolerances of chosen groups only
     """
     starts, rows, node_starts, nodes = groups
     count = 0
-    walled = len(near) > 0
     for g in range(len(starts) - 1):
-        broken = False
+        chosen[g] = False
         for q in range(starts[g], starts[g + 1]):
-            broken = broken or not values[rows[q]] >= -tolerance
-        if walled and not broken:
-            for q in range(node_starts[g], node_starts[g + 1]):
-                broken = broken or near[nodes[q]]
-        chosen[g] = broken
-        if broken:
+            chosen[g] = chosen[g] or not values[rows[q]] >= -tolerance
+        if chosen[g]:
             largest = 0.0
             for q in range(node_starts[g], node_starts[g + 1]):
                 for c in range(3):
@@ -513,27 +508,25 @@ class RowSet:
             data[1 - end, cut] = swap(self.mesh.comm, self.owners[at[cut], 1 - end], data[end, cut])
         return data
 
-    def solve(self, system: System, tolerance: float) -> np.ndarray:
+    def solve(self, system: System, pushed: np.ndarray, tolerance: float) -> np.ndarray:
         """Return forces (r,) [N] that satisfy linear rows; those violated by at most the tolerance count as satisfied.
+
+        ``pushed`` (r,): the rows where walls alone act; groups without violated ones need no forces.
 
         Raises
         ------
         SimulationFailure
             On ranks with rows that are infeasible.
         """
-        near = system.plane >= 0
-        near[near] = (system.gaps[system.plane[near]] < -tolerance).any(axis=1)
         nowhere, force = np.zeros((len(self.numbers), 3)), np.zeros(len(system.values))
-        groups, tolerances = self._broken(system.values, nowhere, near, tolerance)
+        groups, tolerances = self._broken(pushed, nowhere, tolerance)
         self._solve(groups, system, tolerances, force, np.empty_like(nowhere))
         return force
 
-    def _broken(
-        self, values: np.ndarray, x: np.ndarray, near: np.ndarray, tolerance: float
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _broken(self, values: np.ndarray, x: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
         groups = len(self.groups.starts) - 1
         chosen, tolerances = np.empty(groups, dtype=bool), np.empty(groups)
-        if not broken_groups(self.groups, values, x, near, tolerance, chosen, tolerances):
+        if not broken_groups(self.groups, values, x, tolerance, chosen, tolerances):
             return np.empty(0, dtype=np.int64), tolerances
         return np.flatnonzero(chosen), tolerances
 
@@ -557,15 +550,14 @@ class RowSet:
         return " and ".join(sorted(kinds, reverse=True))
 
     def project(
-        self, x: np.ndarray, tolerance: float, near: np.ndarray, given: Given, jacobian: np.ndarray
+        self, x: np.ndarray, pushed: np.ndarray, tolerance: float, given: Given, jacobian: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return forces (r,) [N] that satisfy the rows, and the gradients (r, k, 3) along which they act.
 
         Parameters
         ----------
-        x : (n, 3) positions without rows [m]
+        x, pushed : (n, 3) positions without rows, and where walls alone push the nodes [m]
         tolerance : [m]
-        near : (n,) bool, nodes that may be beyond walls; (0,) for none
         given : asked where groups are to be solved, with their nodes (n,) bool; gives the stiffness (n,) of the nodes
             [N/m], positions (n, 3) where the forces act, None: at the solution, and planes
         jacobian : (r, k, 3) gradients of fixed rows
@@ -575,24 +567,30 @@ class RowSet:
         SimulationFailure
             On ranks with rows that are infeasible.
         """
-        values = self.values(x)
+        values = self.values(pushed)
         force = np.zeros(len(values))
-        groups, tolerances = self._broken(values, x, near, tolerance)
+        groups, tolerances = self._broken(values, x, tolerance)
         if len(groups) == 0:
             return force, jacobian
+        if pushed is not x:
+            values = self.values(x)
         chosen = np.zeros(len(self._turning), dtype=bool)
         chosen[groups] = True
         stiffness, start, planes = given(chosen[self.group_of_node])
-        jacobian, at, moves = jacobian.copy(), x.copy(), np.empty_like(x)
+        moves = np.empty_like(x)
+        turning = groups[self._turning[groups]]
+        if len(turning) == 0:
+            self._solve(groups, self.system(jacobian, values, stiffness, planes), tolerances, force, moves)
+            return force, jacobian
+        jacobian, at, rows = jacobian.copy(), x.copy(), None
         system = self.system(jacobian, values, stiffness, planes)
-        rows = None
         for _ in range(_ITERATIONS):
             chosen[:] = False
             chosen[groups] = True
             fewer = np.flatnonzero(chosen[self.group_of_row])
-            turning = fewer[~self.fixed[fewer]]
-            if len(turning) and (rows is None or start is None):
-                jacobian[turning] = self.gradients(at if start is None else start, turning)
+            turned = fewer[~self.fixed[fewer]]
+            if rows is None or start is None:
+                jacobian[turned] = self.gradients(at if start is None else start, turned)
             if rows is not None:
                 linearise(fewer, system, x, at, self.values(at, fewer))
             rows = fewer

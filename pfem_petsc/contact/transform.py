@@ -29,7 +29,6 @@ BlocksOf = Callable[[np.ndarray], np.ndarray]
 
 _LEAST = 0.05  # of a pivot below which a row is deferred
 _TURN = 1e-10  # of a gradient that counts as none
-_NOWHERE = np.empty(0, dtype=bool)
 
 
 class RowCoordinates:
@@ -167,7 +166,7 @@ class RowCoordinates:
         start = self._start if self._part == 0.0 else None
         with agreed(self.comm):
             given = k, start, None
-            force, jacobian = rows.project(x, tolerance, _NOWHERE, lambda nodes: given, self.constraints.fixed_jacobian)
+            force, jacobian = rows.project(x, x, tolerance, lambda nodes: given, self.constraints.fixed_jacobian)
         u[here] += (rows.forces(jacobian, force) * rows.free / k[:, None])[rows.mine]
 
     def forward(self, w: np.ndarray) -> None:

@@ -11,7 +11,7 @@ from numba.extending import intrinsic
 
 from ..contact.explicit import find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows, solve_rows
-from ..contact.impact import join_nodes, plane_gaps, stop_nodes, unpressed
+from ..contact.impact import Approach, join_nodes, plane_gaps, stop_nodes, unpressed
 from ..integrators._leapfrog import advance, advance_loaded, centre, kick, move
 from ..mechanics.columns import join_planes, split_planes
 from ..mechanics.compiled import borrowing, kernel
@@ -250,7 +250,7 @@ def finish_rows(rows, changed, slack, x, half, nodes, alpha, eta, u, v, a, conta
         for i in around:
             centre(u[i], eta, half[i], v[i])
             accelerations(u[i], alpha, a[i])
-        free_v, free_a = unpressed(around, v, a, contact, nodes.mass, nodes.damping, alpha, eta)
+        free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
         for m in range(count):
             i = around[m]
             ends[end, m, 9] = nodes.mass[i]
@@ -265,8 +265,8 @@ def finish_rows(rows, changed, slack, x, half, nodes, alpha, eta, u, v, a, conta
 
 
 class Pressed(NamedTuple):
-    """Results of :func:`~pfem_petsc.contact.flat.press_nodes` for all blocks of a step: room for ``nodes`` (n,), the
-    planes that they are ``touching`` (n, w), and their ``places`` (n, 3); ``offsets`` (w,) of the infeasible node; and
+    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` for all blocks of a step: room for ``nodes`` (n,),
+    the planes that they are ``touching`` (n, w), their ``places`` (n, 3); ``offsets`` (w,) of the infeasible node; and
     the sums of each wall, ``force`` (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
 
     nodes: np.ndarray
@@ -298,7 +298,7 @@ def mark_blocks(marks, nodes, value):
 def find_pressed(block, walls, free):
     """Write the nodes of a block that lie beyond a plane at ``free`` (3 m,) to ``walls.room``; return their number."""
     first = NODE_BLOCK * block
-    return find_beyond(first, free, walls.normals, walls.offsets, walls.all_nodes, walls.members, walls.room)
+    return find_beyond(first, free, walls, walls.room)
 
 
 @kernel
@@ -310,7 +310,6 @@ def press_block(block, m, nodes, walls, free, u, alpha, eta, contact, pressed, c
     ``free``, ``u``: positions and increments of the nodes of the block, flat.
     """
     first = NODE_BLOCK * block
-    planes = (walls.normals, walls.offsets, walls.all_nodes, walls.members)
     damped = len(nodes.damping) > 0
     found = walls.room[:m].copy()
     places, stiffness = np.empty((m, 3)), np.empty(m)
@@ -319,10 +318,7 @@ def press_block(block, m, nodes, walls, free, u, alpha, eta, contact, pressed, c
         stiffness[j] = alpha * nodes.mass[i] + (eta * nodes.damping[i] if damped else 0.0)
         for c in range(3):
             places[j, c] = free[3 * (i - first) + c]
-    sums = (pressed.force, pressed.contacts, pressed.moment)
-    infeasible, offsets, total, touching = press_nodes(
-        found, places, walls.fixed, *planes, walls.tolerance, stiffness, *sums
-    )
+    infeasible, offsets, total, touching = press_nodes(found, places, walls, stiffness, pressed)
     for j in range(m):
         i = found[j]
         for c in range(3):
@@ -354,30 +350,16 @@ def stop_at_walls(x, half, nodes, walls, alpha, eta, u, v, a, contact, touched, 
         centre(u[i], eta, half[i], v[i])
         accelerations(u[i], alpha, a[i])
     all_normals, gaps = plane_gaps(around, x, walls.normals, walls.offsets)
-    free_v, free_a = unpressed(around, v, a, contact, nodes.mass, nodes.damping, alpha, eta)
+    free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
     for j in range(len(around)):
         i = around[j]
         for c in range(3):
             if walls.fixed[i, c]:  # wall forces do not change prescribed components
                 free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
     still = np.zeros(walls.normals.shape)
-    return stop_nodes(
-        around,
-        walls.touching,
-        walls.closed,
-        all_normals,
-        gaps,
-        free_v,
-        free_a,
-        still,
-        still,
-        nodes.mass,
-        walls.fixed,
-        walls.restitution,
-        np.ones(len(walls.offsets), dtype=np.bool_),
-        walls.slack,
-        np.empty(gaps.shape),
-    )
+    approach = Approach(all_normals, gaps, free_v, free_a, still, still)
+    counted = np.ones(len(walls.offsets), dtype=np.bool_)
+    return stop_nodes(around, approach, walls, nodes.mass, counted, np.empty(gaps.shape))
 
 
 @kernel

@@ -7,7 +7,7 @@ import pytest
 from helpers.bar_twins import STEP, Law, shaken, whole_truss
 
 from pfem_petsc import Case
-from pfem_petsc.contact.frames import build_frames
+from pfem_petsc.contact.frames import Planes, build_frames
 from pfem_petsc.contact.transform import Transform
 from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
 from pfem_petsc.stepping.model import Model
@@ -80,7 +80,7 @@ class Twin:
         fixed = self.model.supports.fixed[mine]
         gaps = np.tile(np.arange(len(walls), dtype=float), (len(mine), 1))
         every = np.tile(normals, (len(mine), 1, 1))
-        frames = build_frames(mine, fixed, every, offsets, gaps)
+        frames = build_frames(mine, Planes(fixed, every, offsets, gaps, np.zeros((len(mine), 3))))
         basis = np.zeros((self.model.mesh.n_nodes, 3, 3))
         basis[self.owned[mine]] = frames.basis
         total = self.model.comm.allreduce(basis)

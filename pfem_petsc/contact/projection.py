@@ -338,9 +338,10 @@ class System(NamedTuple):
 
 
 @borrowing
-def _project_alone(r, at, system, tolerance, force, moves):
+def _project_alone(group, groups, system, tolerance, force, moves):
     """Project the nodes of a single row, whose walls must remain satisfied; return 1, 0 if they do not, or -1 if
     nothing moves the row."""
+    r = groups.rows[groups.starts[group]]
     square, gram = 0.0, 0.0
     for k in range(system.ends.shape[1]):
         i = system.ends[r, k]
@@ -361,8 +362,8 @@ def _project_alone(r, at, system, tolerance, force, moves):
             if i >= 0:
                 for c in range(3):
                     moves[i, c] += strength * (system.gradients[r, k, c] * system.free[i, c]) / system.stiffness[i]
-    for q in range(len(at)):
-        i = at[q]
+    for q in range(groups.node_starts[group], groups.node_starts[group + 1]):
+        i = groups.nodes[q]
         for w in range(system.gaps.shape[1]):
             gap, square = math.inf, 0.0
             if system.plane[i] >= 0:
@@ -400,26 +401,28 @@ def project_groups(which, groups, system, tolerances, force, moves):
     starts, members, node_starts, every_node = groups
     walls, width = gaps.shape[1], ends.shape[1]
     for group in which:
-        rows = members[starts[group] : starts[group + 1]]
-        nodes = every_node[node_starts[group] : node_starts[group + 1]]
         tolerance = tolerances[group]
-        size = len(rows)
-        for i in nodes:
+        begin, end, first, last = starts[group], starts[group + 1], node_starts[group], node_starts[group + 1]
+        size = end - begin
+        for q in range(first, last):
+            i = every_node[q]
             moves[i, 0] = moves[i, 1] = moves[i, 2] = 0.0
             if plane[i] >= 0:
                 size += walls
-        if len(rows) == 1:
-            done = _project_alone(rows[0], nodes, system, tolerance, force, moves)
+        if end - begin == 1:
+            done = _project_alone(group, groups, system, tolerance, force, moves)
             if done < 0:
                 return group
             if done > 0:
                 continue
-            for i in nodes:
+            for q in range(first, last):
+                i = every_node[q]
                 moves[i, 0] = moves[i, 1] = moves[i, 2] = 0.0
         node, vector = np.full((size, width), -1), np.zeros((size, width, 3))
         value, row = np.empty(size), np.full(size, -1)
         n = 0
-        for r in rows:
+        for q in range(begin, end):
+            r = members[q]
             force[r] = 0.0
             if not values[r] < math.inf and values[r] == values[r]:
                 continue
@@ -433,7 +436,8 @@ def project_groups(which, groups, system, tolerances, force, moves):
             if square > FREE_PART:
                 value[n], row[n] = values[r], r
                 n += 1
-        for i in nodes:
+        for q in range(first, last):
+            i = every_node[q]
             at = plane[i]
             for w in range(walls):
                 if at < 0 or not gaps[at, w] < math.inf:

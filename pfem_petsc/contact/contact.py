@@ -19,7 +19,7 @@ from ..tolerances import BEYOND, ON_BOUND, PROJECTED, resolvable
 from .explicit import ExplicitContact
 from .forces import ContactLog, WallForces
 from .frames import MIN_VOLUME, NodalFrames, Planes, build_frames
-from .tied import FreshTies, NoTies, Ties
+from .tied import FreshTies, Ties
 from .wall_motion import WallMotion
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class Contact:
         self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)
         self.rebounds = False
         self.has_friction = bool(self.static_friction.any())
-        self.ties = Ties(self, walls) if any(wall.tied for wall in walls) else NoTies(self, walls)
+        self.ties = Ties(self, walls)
         self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
         self.partial = any(wall.partial for wall in self.walls)
         self.normals = np.zeros((len(walls), 3))

@@ -446,7 +446,7 @@ class ExplicitContact:
     ) -> tuple[np.ndarray, np.ndarray, WallForces]:
         """See :meth:`~pfem_petsc.contact.contact.Contact.explicit`."""
         contact, self._part = self.contact, part
-        if contact.motion.free is not None:
+        if contact.motion.bodies.any:
             self.push_walls(predictor + u, stiffness, time, tolerance)
         if self.plain:
             return self._press_planes(predictor, u, stiffness, time, tolerance)
@@ -470,7 +470,7 @@ class ExplicitContact:
 
     def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
         """Find the final positions of walls with mass in an explicit step. Collective."""
-        free = self.contact.motion.free
+        free = self.contact.motion.bodies
         failure: SimulationFailure | None = None
 
         def forces() -> tuple[np.ndarray, np.ndarray]:
@@ -644,9 +644,9 @@ class ExplicitContact:
         squares, arrivals = (state.memory.setdefault(name, np.zeros(shape)) for name in ("rebound", "arrival"))
         way = displacements - self.contact.motion.displacements(state.time)
         unpushed = way.copy()
-        if self.contact.motion.free is not None:  # use the motion without the recoil of the wall
-            at = self.contact.motion.free.at
-            unpushed[at] = self.contact.motion.free.unpushed() - self.contact.motion.free.state.x
+        bodies = self.contact.motion.bodies
+        if bodies.any:  # use the motion without the recoil of the wall
+            unpushed[bodies.at] = bodies.unpushed() - bodies.state.x
         start = state.position[nodes]
         approach = -np.einsum("mwi,mwi->mw", normals, (free - start)[:, None, :] - unpushed)
         arrival = -np.einsum("mwi,mwi->mw", normals, (moved - start)[:, None, :] - way)

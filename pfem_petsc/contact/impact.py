@@ -198,11 +198,10 @@ class Impacts:
         contact = self.model.contact
         self.met = np.flatnonzero(stepper.closed.any(axis=1))
         self.active = self.model.can_touch and stepper.scheme.inertial
-        free = contact.motion.free
+        bodies = contact.motion.bodies
         self.counted = np.ones(len(contact.names), dtype=bool)
-        if free is not None:
-            self.counted[free.at] = False
-        self._free_rates = free.state.v if free is not None else None  # at the start of the step
+        self.counted[bodies.at] = False
+        self._free_rates = bodies.state.v  # at the start of the step
         self.slack = ON_BOUND * self.model.size
         treatment = stepper.treatment
         # nothing is lost if nodes have no mass along the normal, or if a treatment restores the work of contact
@@ -270,11 +269,11 @@ class Impacts:
         displacements: np.ndarray,
     ) -> float:
         contact, log = self.model.contact, self.model.contact.log
-        free = contact.motion.free
-        if len(self.met) == 0 and len(log.last) == 0 and free is None:
+        free = contact.motion.bodies
+        if len(self.met) == 0 and len(log.last) == 0 and not free.any:
             return 0.0
         nodes = join_nodes(self.met, log.last, log.present)
-        if contact.plain and free is None:
+        if contact.plain and not free.any:
             normals, gaps = plane_gaps(nodes, x, contact.normals, contact.plane_offsets(time))
         else:
             normals, offsets = contact.planes(
@@ -284,7 +283,7 @@ class Impacts:
         free_v, free_a = self._free(nodes, motion, load)
         rates, speeds = contact.motion.rates(time, ahead=True), np.empty(gaps.shape)
         pulls = np.zeros(rates.shape)
-        if free is not None:
+        if free.any:
             free_fall = free.weight / free.mass[:, None]
             rates[free.at], pulls[free.at] = self._free_rates, free_fall
             if load is None:  # the motion without contact
@@ -296,7 +295,7 @@ class Impacts:
         loss, self.met = stop_nodes(nodes, approach, touched, self.model.inertia.mass, self.counted, speeds)
         if contact.ties.any:
             loss += self._tied(nodes, normals, speeds, free_v, rates)
-        if free is not None:
+        if free.any:
             loss += self._on_free_walls(nodes, normals, speeds)
         return loss
 
@@ -317,7 +316,7 @@ class Impacts:
 
         It is sum m s^2/2 - (sum m s n)^2/(2 (M + sum m)).
         """
-        contact, free = self.model.contact, self.model.contact.motion.free
+        contact, free = self.model.contact, self.model.contact.motion.bodies
         mass = self.model.inertia.mass[nodes, None]
         keeps = 1.0 - contact.restitution[free.at] ** 2
         sums = np.zeros((len(free.at), 5))

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from ..integrators.base import State
     from ..stepping.model import Model
 
-__all__ = ["start_at_rest"]
-
 Speeds = tuple[np.ndarray, np.ndarray]
 """Velocities of nodes (m, 3) and walls (w, 3) [m/s]."""
 

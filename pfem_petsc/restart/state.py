@@ -110,7 +110,7 @@ class RunState:
             "start_energy": recorder.start_energy,
             "energy_scale": recorder.energy_scale,
             "blow_up": blow_up.kept(),
-            "free_walls": self.model.contact.motion.kept(),
+            "free_walls": self.model.contact.motion.bodies.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
             **snapshots,
@@ -167,7 +167,7 @@ class RunState:
         sums = {n: np.array(mine["walls"][n], dtype=a.dtype).reshape(a.shape) for n, a in like.items()}
         stepper.solution.walls = dataclasses.replace(walls, **sums)
         stepper.solution.contacts = int(mine["contacts"])
-        self.model.contact.motion.load_state(scalars["free_walls"])
+        self.model.contact.motion.bodies.load_state(scalars["free_walls"])
         self.model.links.load_state(checkpoint.arrays)
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
         stepper.resume()

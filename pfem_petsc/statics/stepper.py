@@ -168,7 +168,7 @@ class StaticStepper(ImplicitStepper):
         state.a = lack / model.inertia.mass[:, None]
         self.totals_at_start = self.totals()
         self.scheme.start(state, self.h)
-        model.contact.motion.start(self.h)
+        model.contact.motion.bodies.start(self.h)
 
     def recorded(self) -> tuple[np.ndarray, np.ndarray]:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`; without acceleration."""

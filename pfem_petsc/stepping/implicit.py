@@ -102,7 +102,7 @@ class HalvedSteps(Stepper):
     def _set_part(self, part: float) -> None:
         if part != self.part:
             self.scheme.step_changed(self.state)
-            self.model.contact.motion.step_changed(self.scheme)
+            self.model.contact.motion.bodies.step_changed(self.scheme)
             self.step_changed = True
             self.part = part
         self.smallest = min(self.smallest, part)

@@ -114,7 +114,7 @@ def balance(stepper: Stepper, end: float) -> None:
     if stepper.prescribed.moving:
         stepper.prescribed.prescribe(stepper.balance)
     model.inertia.change(sum(weight * time for weight, time in stepper.balance.loads))
-    model.contact.motion.begin(state.time, stepper.part)
+    model.contact.motion.bodies.begin(state.time, stepper.part)
     state.external = load_of(stepper, stepper.balance)
     if stepper.scheme.inertial:
         model.bars.step = stepper.balance.time - state.time
@@ -134,7 +134,7 @@ def finish(stepper: Stepper, end: float) -> None:
     scheme.finish(state, found, stepper.solution.u, stepper.part)
     if scheme.solves_next_position and stepper.prescribed.moving:
         stepper.prescribed.take_rates(state.time)
-    contact.motion.finish(stepper.part, end)
+    contact.motion.bodies.finish(stepper.part, end)
     if scheme.turns_held and stepper.treatment is None:
         contact.calm(fresh, state.v, found.time, stepper.part)
 
@@ -313,17 +313,17 @@ def start_in_motion(stepper: Stepper) -> None:
     if model.bars.viscous and stepper.scheme.solves_next_position:  # the rate half a step before, to extrapolate from
         half = stepper.on_all(state.memory["half_velocity"])
         model.bars.set_rates(state.x, state.x - (0.5 * stepper.h) * half, (1.0 - EXTRAPOLATED) * half, 0.0)
-    motion = model.contact.motion
-    motion.start(stepper.h)
+    bodies = model.contact.motion.bodies
+    bodies.start(stepper.h)
     if stepper.scheme.solves_next_position:
-        v, speeds = state.v, motion.speeds
+        v, speeds = state.v, bodies.state.v
         solve_and_finish(stepper, state.time)
         stepper.totals_solved = stepper.totals()
         if model.inertia.damped:
             stepper.velocity_solved = state.v
         # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
         state.v = v
-        motion.set_speeds(speeds)
+        bodies.state.v = speeds
 
 
 def start_at_zero(stepper: Stepper) -> None:

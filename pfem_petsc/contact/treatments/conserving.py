@@ -15,8 +15,6 @@ from ...integrators.base import Scheme
 from ...registry import choices, lookup
 from .base import Treatment as Base
 
-__all__ = ["Treatment"]
-
 INTEGRATORS = "pfem_petsc.integrators"
 
 

@@ -23,8 +23,6 @@ from ...integrators.base import State
 from ...tolerances import FREE_PART, RANK
 from .base import STILL, Restitution
 
-__all__ = ["Treatment"]
-
 _TINY = 1e-200  # divides what is nothing
 
 

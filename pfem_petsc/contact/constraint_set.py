@@ -74,8 +74,10 @@ class ConstraintSet:
             self.fixed_jacobian[at] = rows.gradients(np.zeros((len(rows.numbers), 3)), at)
         self.two = TwoNodeRows(rows, self.fixed_jacobian)
         self._members = rows.gather(contact.members) > 0.0
-        self._flat_members = np.ascontiguousarray(self._members[:, contact.flat])
-        self._walled_nodes = self._members.any(axis=1)
+        walled = self._members.any(axis=1)
+        self._walled_nodes = np.flatnonzero(walled)
+        places = np.where(walled, np.cumsum(walled) - 1, -1)
+        self._walls = places, np.tile(contact.normals, (len(self._walled_nodes), 1, 1))
         self._near_walls = bool(self._members.any())
         self._turning = not rows.fixed.all()
         walled, shared = mesh.comm.allreduce(np.array([self._near_walls, not self.two.every], dtype=np.int64))
@@ -123,12 +125,12 @@ class ConstraintSet:
             self.force = self.two.separate(balance.predictor, u, stiffness, contact)
             return contact if self.force.any() else none
         rows, x, walls = self.rows, self._x, len(self.contact.walls) if self._partial else 0
-        displacements = self.contact.motion.displacements(balance.time)
         far = np.empty((0, 7 + walls))
         if not rows.partners.alone:
             at, leaving = rows.partners.rows, rows.partners.leaving(far.shape[1])
             leaving_nodes(at, balance.predictor, u, stiffness, state.position, leaving)
             if walls:
+                displacements = self.contact.motion.displacements(balance.time)
                 leaving[:, 7:] = self.contact.applicable(at, leaving[:, :3], displacements)
             far = rows.partners.bring(leaving)
         free_positions(rows.where, balance.predictor, u, far, x)
@@ -136,20 +138,19 @@ class ConstraintSet:
         near, pushed = self._near(x, balance.time), x
         if len(near):
             pushed, moved = x.copy(), x[near]
-            normals, offsets = self._planes(near, x, far[:, 7:] > 0.0, displacements)
-            project(moved, rows.free[near] == 0.0, normals, offsets, tolerance, np.zeros(offsets.shape))
+            gaps = self._gaps(near, x, far, balance.time)
+            normals = np.tile(self.contact.normals, (len(near), 1, 1))
+            offsets = np.where(gaps < np.inf, self.contact.plane_offsets(balance.time), -np.inf)
+            project(moved, rows.free[near] == 0.0, normals, offsets, tolerance, np.zeros(gaps.shape))
             pushed[near] = moved
 
-        def given(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, Planes | None]:
+        def given() -> tuple[np.ndarray, np.ndarray | None, Planes | None]:
             turns = balance.acting < 1.0 and self._turning
             start = rows.spread(state.position, far[:, 4:7]) if turns else None
             free_stiffness(rows.where, stiffness, far, self._hard)
             if not self._near_walls:
                 return self._hard, start, None
-            walled, place = np.flatnonzero(nodes & self._walled_nodes), np.full(len(x), -1)
-            place[walled] = np.arange(len(walled))
-            normals, offsets = self._planes(walled, x, far[:, 7:] > 0.0, displacements)
-            return self._hard, start, (place, normals, np.einsum("nwi,ni->nw", normals, x[walled]) - offsets)
+            return self._hard, start, (*self._walls, self._gaps(self._walled_nodes, x, far, balance.time))
 
         self.force, self.jacobian = rows.project(x, pushed, tolerance, given, self.fixed_jacobian)
         if not self.force.any():
@@ -160,26 +161,29 @@ class ConstraintSet:
 
     def _near(self, x: np.ndarray, time: float) -> np.ndarray:
         """(m,) nodes at positions (n, 3) beyond a wall."""
-        near, flat = np.zeros(len(x), dtype=bool), self.contact.flat
+        near = np.zeros(len(x), dtype=bool)
         if self._near_walls:
-            offsets = self.contact.plane_offsets(time)[flat]
+            offsets = self.contact.plane_offsets(time)
             everywhere = np.zeros(len(offsets), dtype=bool)
-            near_planes(x, self.contact.normals[flat], offsets, everywhere, self._flat_members, _ZERO, near)
+            near_planes(x, self.contact.normals, offsets, everywhere, self._members, _ZERO, near)
         return np.flatnonzero(near)
 
-    def _planes(
-        self, nodes: np.ndarray, x: np.ndarray, away: np.ndarray, displacements: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Normals (m, w, 3) and offsets (m, w) of walls at some nodes (m,), at positions x (n, 3); ``away`` (k, w):
-        walls that can stop nodes that other ranks own."""
-        rows, contact = self.rows, self.contact
-        where = rows.where[nodes]
+    def _gaps(self, nodes: np.ndarray, x: np.ndarray, far: np.ndarray, time: float) -> np.ndarray:
+        """Distances (m, w) of some nodes (m,) at positions x (n, 3) from walls, which are flat, infinite where these do
+        not apply; ``far`` (k, 7...): what other ranks know of their nodes."""
+        contact, at = self.contact, x[nodes]
+        # not a product of matrices: the digits must not depend on how many nodes there are
+        n = contact.normals.T
+        gaps = at[:, :1] * n[0] + at[:, 1:2] * n[1] + at[:, 2:] * n[2] - contact.plane_offsets(time)
         applicable = self._members[nodes]
-        if contact.partial:
+        if self._partial:
+            where = self.rows.where[nodes]
             own = where >= 0
-            applicable[own] = contact.applicable(where[own], x[nodes[own]], displacements)
-            applicable[~own] = away[-1 - where[~own]]
-        return contact.planes(applicable, x[nodes], displacements)
+            displacements = contact.motion.displacements(time)
+            applicable[own] = contact.applicable(where[own], at[own], displacements)
+            applicable[~own] = far[-1 - where[~own], 7:] > 0.0
+        gaps[~applicable] = np.inf
+        return gaps
 
     @property
     def batched(self) -> bool:
@@ -258,7 +262,8 @@ class ConstraintSet:
             raise InputError(f'{self.source}: constraint: constraints need contact.treatment = "scheme"')
         if treatment != "scheme" and not self.alone:
             several = np.bincount(rows.ends[rows.ends >= 0], minlength=len(rows.numbers)) > 1
-            lowest = int(rows.numbers[several | self._members.any(axis=1)].min(initial=2**62))
+            several[self._walled_nodes] = True
+            lowest = int(rows.numbers[several].min(initial=2**62))
             node = comm.allreduce(lowest, op=MPI.MIN)
             raise InputError(
                 f"{self.source}: contact_pair: node {node} is in several pairs, or a wall stops it as well, which "

@@ -275,7 +275,7 @@ _TAG = 7700  # of messages between ranks with nodes of the same rows, distinct f
 Planes = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Walls at nodes: ``plane``, ``normals`` and ``gaps`` of :class:`~pfem_petsc.contact.projection.System`."""
 
-Given = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray | None, Planes | None]]
+Given = Callable[[], tuple[np.ndarray, np.ndarray | None, Planes | None]]
 """See :meth:`RowSet.project`."""
 
 
@@ -558,8 +558,8 @@ class RowSet:
         ----------
         x, pushed : (n, 3) positions without rows, and where walls alone push the nodes [m]
         tolerance : [m]
-        given : asked where groups are to be solved, with their nodes (n,) bool; gives the stiffness (n,) of the nodes
-            [N/m], positions (n, 3) where the forces act, None: at the solution, and planes
+        given : asked if groups are to be solved; gives the stiffness (n,) of the nodes [N/m], positions (n, 3) where
+            the forces act, None: at the solution, and planes
         jacobian : (r, k, 3) gradients of fixed rows
 
         Raises
@@ -576,7 +576,7 @@ class RowSet:
             values = self.values(x)
         chosen = np.zeros(len(self._turning), dtype=bool)
         chosen[groups] = True
-        stiffness, start, planes = given(chosen[self.group_of_node])
+        stiffness, start, planes = given()
         moves = np.empty_like(x)
         turning = groups[self._turning[groups]]
         if len(turning) == 0:

@@ -83,6 +83,8 @@ class FreeWalls:
     @property
     def balanced(self) -> np.ndarray:
         """Return the accelerations (f, 3) of the last balance [m/s2]."""
+        if not self.any:
+            return self._u
         known = 0.0 if self._balance.a_hat is None else self._balance.a_hat
         return self._balance.alpha * self._u + known
 

@@ -73,6 +73,8 @@ class ConstraintSet:
             at = np.flatnonzero(rows.fixed)
             self.fixed_jacobian[at] = rows.gradients(np.zeros((len(rows.numbers), 3)), at)
         self.two = TwoNodeRows(rows, self.fixed_jacobian)
+        if len(self.two.at) == len(rows.source):
+            rows.pairs = self.two.ends, self.two.normals, self.two.least
         self._members = rows.gather(contact.members) > 0.0
         walled = self._members.any(axis=1)
         self._walled_nodes = np.flatnonzero(walled)

@@ -130,6 +130,15 @@ def gather_rows(at, array, vectors):
 
 
 @kernel
+def pair_values(ends, normals, least, x, values):
+    """Compute rows n . (x_2 - x_1) - least (r,) at positions (n, 3) of their nodes ``ends`` (2, r)."""
+    for r in range(len(values)):
+        i, j = ends[0, r], ends[1, r]
+        apart = normals[r, 0] * (x[j, 0] - x[i, 0]) + normals[r, 1] * (x[j, 1] - x[i, 1])
+        values[r] = apart + normals[r, 2] * (x[j, 2] - x[i, 2]) - least[r]
+
+
+@kernel
 def broken_groups(groups, values, x, tolerance, chosen, tolerances):
     """Mark groups with a row below its bound; return their number.
 
@@ -313,7 +322,10 @@ class RowSet:
     counted : (r,) bool, rows whose last node this rank owns
     free : (n, 3) 1.0 where a component may move, 0.0 where a support prescribes it
     groups : Groups; group_of_row, group_of_node : (r,), (n,)
+    pairs : nodes (2, r), directions (r, 3) and bounds (r,) if these are all that the rows depend on, else None
     """
+
+    pairs: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def __init__(self, sources: Sequence[Constraint], mesh: DistributedMesh, fixed: np.ndarray) -> None:
         self.mesh = mesh
@@ -452,7 +464,11 @@ class RowSet:
 
     def values(self, x: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Rows (r,) [m] at positions (n, 3); of some rows, ascending, if they are given, as below."""
-        return _joined(self._each(rows, "values", x))
+        if rows is not None or self.pairs is None:
+            return _joined(self._each(rows, "values", x))
+        values = np.empty(len(self.source))
+        pair_values(*self.pairs, x, values)
+        return values
 
     def gradients(self, x: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Gradients (r, k, 3) at positions (n, 3), zero behind the last node of a row."""

@@ -292,9 +292,9 @@ class Contact:
             self.log.book(walls, h, self.mesh.comm)
         return self.ties.take(walls.nodes, walls.touching, walls.places, time)
 
-    def calm(self, fresh: FreshTies, v: np.ndarray, time: float, h: float) -> None:
-        """See :meth:`~pfem_petsc.contact.tied.Ties.calm`; velocities (owned, 3), and the result of :meth:`record`."""
-        self.ties.calm(*fresh, v, self.motion.rates(time), h)
+    def damp_velocity(self, fresh: FreshTies, v: np.ndarray, time: float, h: float) -> None:
+        """See :meth:`~pfem_petsc.contact.tied.Ties.damp_velocity`; velocities (owned, 3), and the result of :meth:`record`."""
+        self.ties.damp_velocity(*fresh, v, self.motion.rates(time), h)
 
     def infeasible_message(self, node: int, offsets: np.ndarray) -> str:
         """Return the message about a node (owned index) whose planes are infeasible together."""

@@ -29,7 +29,6 @@ class PairRows(Constraint):
     """
 
     fixed = True
-    what = "contact pairs"
 
     def __init__(self, pair: ContactPair, nodes: np.ndarray) -> None:
         self.nodes, self.data = nodes, np.empty((len(nodes), 0))

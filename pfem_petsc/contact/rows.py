@@ -552,18 +552,13 @@ class RowSet:
         infeasible = project_groups(which, self.groups, system, tolerances, force, moves)
         if infeasible >= 0:
             raise SimulationFailure(
-                f"no positions of nodes {self._shown(infeasible)} satisfy their {self._kinds(infeasible)}, walls and "
+                f"no positions of nodes {self._shown(infeasible)} satisfy their contact pairs, constraints, walls and "
                 "supports"
             )
 
     def _shown(self, group: int) -> str:
         _, _, starts, nodes = self.groups
         return ", ".join(str(number) for number in self.numbers[nodes[starts[group] : starts[group + 1]]][:6])
-
-    def _kinds(self, group: int) -> str:
-        """Return what the rows of a group belong to."""
-        kinds = {self.sources[s].what for s in self.source[self.group_of_row == group]}
-        return " and ".join(sorted(kinds, reverse=True))
 
     def project(
         self, x: np.ndarray, pushed: np.ndarray, tolerance: float, given: Given, jacobian: np.ndarray

@@ -162,7 +162,7 @@ class Ties:
             normals[walls == k] = self.contact.walls[k].planes(own[walls == k])[0]
         return nodes[met], walls, normals
 
-    def calm(
+    def damp_velocity(
         self, nodes: np.ndarray, walls: np.ndarray, normals: np.ndarray, v: np.ndarray, rates: np.ndarray, h: float
     ) -> None:
         """Tie nodes where they come to rest on their walls, for schemes with x1 - x0 = h (v0 + v1)/2.

@@ -136,7 +136,7 @@ def finish(stepper: Stepper, end: float) -> None:
         stepper.prescribed.take_rates(state.time)
     contact.motion.bodies.finish(stepper.part, end)
     if scheme.turns_held and stepper.treatment is None:
-        contact.calm(fresh, state.v, found.time, stepper.part)
+        contact.damp_velocity(fresh, state.v, found.time, stepper.part)
 
 
 def place(stepper: Stepper, end: float) -> None:

@@ -199,4 +199,4 @@ def test_rows_that_contradict_each_other_fail_where_they_are(ropes, comm):
     except SimulationFailure as failure:
         failed = str(failure)
     assert bool(failed) == (len(link.rows.source) > 0)
-    assert "satisfy their constraints, walls and supports" in failed or not failed
+    assert "satisfy their contact pairs, constraints, walls and supports" in failed or not failed

@@ -293,7 +293,7 @@ class Contact:
         return self.ties.take(walls.nodes, walls.touching, walls.places, time)
 
     def damp_velocity(self, fresh: FreshTies, v: np.ndarray, time: float, h: float) -> None:
-        """See :meth:`~pfem_petsc.contact.tied.Ties.damp_velocity`; velocities (owned, 3), and the result of :meth:`record`."""
+        """See :meth:`~pfem_petsc.contact.tied.Ties.damp_velocity`; velocities (owned, 3), result of :meth:`record`."""
         self.ties.damp_velocity(*fresh, v, self.motion.rates(time), h)
 
     def infeasible_message(self, node: int, offsets: np.ndarray) -> str:

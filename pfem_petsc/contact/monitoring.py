@@ -385,15 +385,16 @@ class CrossingBars:
             if comm.allreduce(float(cells.sum())) <= _CELLS * number:
                 break
             cell *= 2.0
-        held = _Held(segments, radius + 0.5 * skin, meeting).sent(comm, low, cell)
-        start, keys, rows = _buckets(*held.cells(comm, low, cell))
-        counts = np.diff(start).astype(float)
+        grid = _Cells(low, cell, comm.size)
+        held = _Held(segments, radius + 0.5 * skin, meeting).sent(comm, grid)
+        buckets = _buckets(*held.cells(comm, grid))
+        counts = np.diff(buckets[0]).astype(float)
         if comm.allreduce(float((counts * counts).sum())) > 2.0 * _PAIRS * number:
             return None, 0.0
         room = max(1024, len(held.segments.ids))
         while True:
             out = np.empty((room, 2), np.int64)
-            found, gap = _compare(start, keys, rows, *held.segments, held.meeting, low, cell, skin, out)
+            found, gap = _compare(buckets, held.segments, held.meeting, grid, skin, out)
             if found <= room:
                 break
             room = found
@@ -412,6 +413,14 @@ class _Search(NamedTuple):
     intact: np.ndarray
 
 
+class _Cells(NamedTuple):
+    """Cells of space: the corner of the first (3,) and the length of their edges [m], and how many ranks hold them."""
+
+    low: np.ndarray
+    cell: float
+    size: int
+
+
 class _Held(NamedTuple):
     """Bars of a rank, the distances around them in which others are searched (n,) [m], and which of them are at links
     (n,) bool."""
@@ -420,26 +429,26 @@ class _Held(NamedTuple):
     margin: np.ndarray
     meeting: np.ndarray
 
-    def sent(self, comm: MPI.Comm, low: np.ndarray, cell: float) -> _Held:
+    def sent(self, comm: MPI.Comm, grid: _Cells) -> _Held:
         """Return the bars that pass cells of this rank. Collective."""
         if comm.size == 1:
             return self
         ends, margin = self.segments.ends, self.margin
-        count = _list_cells(ends, margin, low, cell, comm.size, -1, np.empty(0, np.int64), np.empty(0, np.int64))
+        count = _list_cells(ends, margin, grid, -1, np.empty(0, np.int64), np.empty(0, np.int64))
         ranks, rows = np.empty(count, np.int64), np.empty(count, np.int64)
-        _list_cells(ends, margin, low, cell, comm.size, -1, ranks, rows)
+        _list_cells(ends, margin, grid, -1, ranks, rows)
         each = np.unique(rows * comm.size + ranks)
         router = Router(comm, each % comm.size, each // comm.size)
         segments = _Segments(*(router.send(array) for array in self.segments))
         return _Held(segments, router.send(self.margin), router.send(self.meeting))
 
-    def cells(self, comm: MPI.Comm, low: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
+    def cells(self, comm: MPI.Comm, grid: _Cells) -> tuple[np.ndarray, np.ndarray]:
         """Return the cells of this rank that each bar passes: a key of the cell and the row of the bar."""
         ends, margin = self.segments.ends, self.margin
         room = 12 * len(margin)
         while True:
             keys, rows = np.empty(room, np.int64), np.empty(room, np.int64)
-            count = _list_cells(ends, margin, low, cell, comm.size, comm.rank, keys, rows)
+            count = _list_cells(ends, margin, grid, comm.rank, keys, rows)
             if count <= room:
                 return keys[:count], rows[:count]
             room = count
@@ -460,21 +469,22 @@ def _mixed(key):
 
 
 @inlined
-def _piece(ends, k, begin, end, margin, low, cell, first, last):
-    """Write the first and last cells (3,) of the box around a part of bar ``k`` and a margin [m]."""
+def _piece(ends, begin, end, margin, grid, span):
+    """Write the first and last cells (2, 3) of the box around a part of a bar (2, 3) and a margin [m]."""
     for c in range(3):
-        p = ends[k, 0, c] + begin * (ends[k, 1, c] - ends[k, 0, c])
-        q = ends[k, 0, c] + end * (ends[k, 1, c] - ends[k, 0, c])
-        first[c] = int(np.floor((min(p, q) - margin - low[c]) / cell))
-        last[c] = int(np.floor((max(p, q) + margin - low[c]) / cell))
+        p = ends[0, c] + begin * (ends[1, c] - ends[0, c])
+        q = ends[0, c] + end * (ends[1, c] - ends[0, c])
+        span[0, c] = int(np.floor((min(p, q) - margin - grid.low[c]) / grid.cell))
+        span[1, c] = int(np.floor((max(p, q) + margin - grid.low[c]) / grid.cell))
 
 
 @kernel
-def _list_cells(ends, margins, low, cell, size, rank, keys, rows):
+def _list_cells(ends, margins, grid, rank, keys, rows):
     """List the cells around bars, as far as there is room: the cell and the row of the bar, for cells of ``rank``; with
     -1, the rank of the cell and the row. Returns the length of the list."""
-    first = np.empty(3, np.int64)
-    last = np.empty(3, np.int64)
+    cell, size = grid.cell, grid.size
+    span = np.empty((2, 3), np.int64)
+    first, last = span[0], span[1]
     before = np.empty((2, 3), np.int64)
     count = 0
     for k in range(len(ends)):
@@ -482,7 +492,7 @@ def _list_cells(ends, margins, low, cell, size, rank, keys, rows):
         margin = margins[k] + 1e-9 * (length + cell)
         pieces = int(length / cell) + 1
         for piece in range(pieces):
-            _piece(ends, k, piece / pieces, (piece + 1) / pieces, margin, low, cell, first, last)
+            _piece(ends[k], piece / pieces, (piece + 1) / pieces, margin, grid, span)
             for i in range(first[0], last[0] + 1):
                 for j in range(first[1], last[1] + 1):
                     for m in range(first[2], last[2] + 1):
@@ -503,8 +513,7 @@ def _list_cells(ends, margins, low, cell, size, rank, keys, rows):
                             keys[count] = holder if rank < 0 else _key(i, j, m)
                             rows[count] = k
                         count += 1
-            before[0] = first
-            before[1] = last
+            before[:] = span
     return count
 
 
@@ -570,9 +579,12 @@ def _closest(ends, a, b):
 
 
 @kernel
-def _compare(start, keys, rows, ids, nodes, ends, radius, meeting, low, cell, skin, out):
+def _compare(buckets, segments, meeting, grid, skin, out):
     """Write the numbers of bars (pairs, 2) that pass through each other, as far as there is room; return how many, and
     by how much a distance differs at least from the sum of radii, at most ``skin`` [m]."""
+    start, keys, rows = buckets
+    ids, nodes, ends, radius = segments
+    low, cell = grid.low, grid.cell
     found = 0
     gap = skin
     place = np.empty(3, np.int64)

@@ -98,7 +98,7 @@ class RunState:
             "time": stepper.state.time,
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
             **{name: kept for name, kept in history.items() if name != "row"},
-            "free_walls": self.model.contact.motion.kept(),
+            "free_walls": self.model.contact.motion.bodies.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
             "row": history["row"],
             **snapshots,
@@ -178,7 +178,7 @@ class RunState:
         sums = {n: np.array(mine["walls"][n], dtype=a.dtype).reshape(a.shape) for n, a in like.items()}
         stepper.solution.walls = dataclasses.replace(walls, **sums)
         stepper.solution.contacts = int(mine["contacts"])
-        self.model.contact.motion.load_state(scalars["free_walls"])
+        self.model.contact.motion.bodies.load_state(scalars["free_walls"])
         self.model.links.load_state(arrays)
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
         stepper.resume()

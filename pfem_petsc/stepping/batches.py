@@ -85,7 +85,6 @@ class Batch:
         self._walls = WallArrays(*walls, PROJECTED * model.size, *work, *impact)
         self._probes = ProbeArrays(*recorder.probed())
         self._messages = model.mesh.messages()
-        self._lender = model.links.lender
         alpha, eta = 1.0 / (stepper.h * stepper.h), 0.5 / stepper.h
         stiffness = alpha * inertia.mass + (eta * inertia.damping if inertia.damped else 0.0)
         self._stiffness = stiffness if model.links else np.empty(0)
@@ -168,7 +167,7 @@ class Batch:
         if self._first:
             return_freed_memory()
             self._first = False
-        rows = self._lender.lend_rows(self._stiffness)
+        rows = self.model.links.export_rows(self._stiffness)
         done, lost, changed, failed, turned, infeasible, offsets, kinetic, u, touched, log.last, met, held = self._loop(
             len(due),
             stepper.h,
@@ -190,7 +189,7 @@ class Batch:
             due,
             self.sums,
         )
-        self._lender.take_rows(rows)
+        self.model.links.import_rows(rows)
         if lost:
             raise MPI.Exception(lost)
         state.support = support if self.model.supports.any else stepper.zero

@@ -28,7 +28,7 @@ from ._numbers import numbers_of, shown
 
 SUFFIXES = (".msh",)
 
-PIECE = 1 << 15
+PIECE = 1 << 14
 """Number of rows that are parsed and sent at a time."""
 
 BYTES = 1 << 18

@@ -23,7 +23,6 @@ from ..errors import InputError
 from ..mesh.exchange import Router
 from ..mesh.slab import MeshSlab, check_memory, index_type, slab_of, slab_range
 from ..mesh.whole import WholeMesh, missing_field
-from ..parallel.agreement import on_root
 from ._numbers import numbers_of, shown
 
 SUFFIXES = (".msh",)
@@ -83,10 +82,12 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
     InputError
         On all ranks, naming the section, for any content that is not a mesh of bars.
     """
-    pieces = _pieces(path, fields) if comm.rank == 0 else None
+    pieces = _pieces(path, fields) if comm.rank == 0 else iter(())
     parts = _Parts(comm, str(path))
-    while not isinstance(piece := on_root(comm, next, pieces), _Head):
+    while not isinstance(piece := comm.bcast(next(pieces, None)), _Head | InputError):
         parts.add(*piece)
+    if isinstance(piece, InputError):
+        raise piece
     slab = parts.slab(piece)
     if fields is not None:
         missing = missing_field(path, fields, {*piece.fields} - ({*fields} - {*slab.bar_fields}))
@@ -310,15 +311,17 @@ def _find(file: IO[bytes], text: bytes, at: int) -> int:
     return -1
 
 
-def _pieces(path: Path, fields: Mapping[str, str] | None) -> Iterator[tuple[Any, Any] | _Head]:
-    """Yield the number of nodes, pieces of rows, and at the end what there is to know about them."""
+def _pieces(path: Path, fields: Mapping[str, str] | None) -> Iterator[tuple[Any, Any] | _Head | InputError]:
+    """Yield the number of nodes, pieces of rows, and at the end what there is to know about them, or what is wrong."""
     try:
         with open(path, "rb") as file:
             yield from _parsed(path, file, fields)
+    except InputError as error:
+        yield error
     except MemoryError:
-        raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
+        yield InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks")
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        yield InputError(f"{path}: cannot be read: {error.strerror}")
 
 
 def _parsed(path: Path, file: IO[bytes], fields: Mapping[str, str] | None) -> Iterator[tuple[Any, Any] | _Head]:

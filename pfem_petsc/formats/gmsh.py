@@ -23,12 +23,11 @@ from ..errors import InputError
 from ..mesh.exchange import Router
 from ..mesh.slab import MeshSlab, check_memory, index_type, slab_of, slab_range
 from ..mesh.whole import WholeMesh, missing_field
-from ..parallel.agreement import on_root
 from ._numbers import numbers_of, shown
 
 SUFFIXES = (".msh",)
 
-PIECE = 1 << 15
+PIECE = 1 << 14
 """Number of rows that are parsed and sent at a time."""
 
 BYTES = 1 << 18
@@ -83,10 +82,12 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
     InputError
         On all ranks, naming the section, for any content that is not a mesh of bars.
     """
-    pieces = _pieces(path, fields) if comm.rank == 0 else None
+    pieces = _pieces(path, fields) if comm.rank == 0 else iter(())
     parts = _Parts(comm, str(path))
-    while not isinstance(piece := on_root(comm, next, pieces), _Head):
+    while not isinstance(piece := comm.bcast(next(pieces, None)), _Head | InputError):
         parts.add(*piece)
+    if isinstance(piece, InputError):
+        raise piece
     slab = parts.slab(piece)
     if fields is not None:
         missing = missing_field(path, fields, {*piece.fields} - ({*fields} - {*slab.bar_fields}))
@@ -310,15 +311,17 @@ def _find(file: IO[bytes], text: bytes, at: int) -> int:
     return -1
 
 
-def _pieces(path: Path, fields: Mapping[str, str] | None) -> Iterator[tuple[Any, Any] | _Head]:
-    """Yield the number of nodes, pieces of rows, and at the end what there is to know about them."""
+def _pieces(path: Path, fields: Mapping[str, str] | None) -> Iterator[tuple[Any, Any] | _Head | InputError]:
+    """Yield the number of nodes, pieces of rows, and at the end what there is to know about them, or what is wrong."""
     try:
         with open(path, "rb") as file:
             yield from _parsed(path, file, fields)
+    except InputError as error:
+        yield error
     except MemoryError:
-        raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
+        yield InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks")
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        yield InputError(f"{path}: cannot be read: {error.strerror}")
 
 
 def _parsed(path: Path, file: IO[bytes], fields: Mapping[str, str] | None) -> Iterator[tuple[Any, Any] | _Head]:
@@ -611,8 +614,11 @@ class _Parts:
         own = nodes.find(marked[:, 0], -1)
         self._refuse(_lowest(comm, marked[own < 0, 0]), "$Elements: node {} is not in $Nodes")
         router = Router(comm, slab_of(own, n_nodes, comm.size))
-        node_groups = _groups(0, head, router.send(own), router.send(marked[:, 1]))
-        bar_groups = _groups(1, head, bars.numbers, bars.places)
+        first_bar, _ = slab_range(bars.n, comm.rank, comm.size)
+        node_groups = _groups(
+            (0, first_node, len(tags)), head, router.send(own) - first_node, router.send(marked[:, 1])
+        )
+        bar_groups = _groups((1, first_bar, len(bars.ends)), head, bars.rows, bars.places)
         bar_fields = {}
         for kind in sorted(key for key in self._count if isinstance(key, tuple)):
             rows = self._joined(kind, np.empty((0, 2)))
@@ -630,7 +636,7 @@ class _Parts:
             n_bars=bars.n,
             first_node=first_node,
             points=self._joined("points", np.empty((0, 3))),
-            first_bar=slab_range(bars.n, comm.rank, comm.size)[0],
+            first_bar=first_bar,
             bars=bars.ends,
             node_groups=node_groups,
             bar_groups=bar_groups,
@@ -644,7 +650,8 @@ class _Parts:
         comm = self._comm
         first, last = slab_range(n, comm.rank, comm.size)
         ends = np.empty((last - first, 2), index_type(self._n_nodes))
-        tags, places = np.full(last - first, -1, np.int64), np.zeros(last - first, np.int32)
+        places = np.full(last - first, -1, np.int32)
+        tags = np.empty(last - first if head.repeated or head.fields else 0, np.int64)
         pieces = self._rows.pop("lines", [])
         lowest = min((_lowest(comm, rows[:, 0]) for _, rows in pieces), default=_NONE) if head.ordered else 0
         lost = _NONE
@@ -658,30 +665,34 @@ class _Parts:
             number, rows = router.send(number) - first, router.send(rows)
             found = nodes.find(rows[:, 1:3], -1)
             lost = min(lost, int(rows[:, 1:3][found < 0].min(initial=_NONE)))
-            tags[number], ends[number], places[number] = rows[:, 0], found, rows[:, 3]
+            ends[number], places[number] = found, rows[:, 3]
+            if len(tags):
+                tags[number] = rows[:, 0]
         self._refuse(comm.allreduce(lost, op=MPI.MIN), "$Elements: node {} is not in $Nodes")
-        if head.ordered and not comm.allreduce(bool((tags >= 0).all()), op=MPI.LAND):
+        if head.ordered and not comm.allreduce(bool((places >= 0).all()), op=MPI.LAND):
             text = "the tags of the lines do not follow one another, as $Comments says: remove that section"
             raise InputError(f"{self._source}: section $Elements: {text}")
-        bars = _Bars(n, ends, tags, np.arange(first, last), places)
+        bars = _Bars(n, ends, tags, np.arange(last - first, dtype=np.int32), places)
         return bars.joined(comm, head, self._n_nodes) if head.repeated else bars
 
 
 class _Bars(NamedTuple):
-    """Bars of this rank's range: ends (m, 2), tags (m,) of their lines; and their groups, ``numbers`` of bars and the
-    ``places`` of groups that they have, perhaps several times."""
+    """Bars of this rank's range: ends (m, 2), tags (m,) of their lines (none if nobody needs them); and their groups,
+    ``rows`` of bars and the ``places`` of groups that they have, perhaps several times."""
 
     n: int
     ends: np.ndarray
     tags: np.ndarray
-    numbers: np.ndarray
+    rows: np.ndarray
     places: np.ndarray
 
     def joined(self, comm: MPI.Comm, head: _Head, n_nodes: int) -> _Bars:
         """Join the copies of a bar, which version 2 lists once for each of its groups. Collective."""
         # copies meet where the first node is, in the order of their numbers
         meet = Router(comm, slab_of(self.ends[:, 0], n_nodes, comm.size))
-        ends, tags, number, places = (meet.send(each) for each in (self.ends, self.tags, self.numbers, self.places))
+        first, last = slab_range(self.n, comm.rank, comm.size)
+        own = (self.ends, self.tags, np.arange(first, last), self.places)
+        ends, tags, number, places = (meet.send(each) for each in own)
         order = np.lexsort((number, ends[:, 1], ends[:, 0]))
         ends, tags, number, places = ends[order], tags[order], number[order], places[order]
         begins = np.ones(len(ends), bool)
@@ -696,7 +707,6 @@ class _Bars(NamedTuple):
         # those that are kept are numbered anew, in their order
         kept = np.where(copy, number[leader], number)
         ask = Router(comm, slab_of(kept, self.n, comm.size))
-        first, last = slab_range(self.n, comm.rank, comm.size)
         stays = np.zeros(last - first, bool)
         at = ask.send(kept) - first
         stays[at] = True
@@ -706,22 +716,24 @@ class _Bars(NamedTuple):
         first, last = slab_range(n, comm.rank, comm.size)
         home = Router(comm, slab_of(number, n, comm.size))
         number, places = home.send(number), home.send(places)
-        of_bars, own = ~home.send(copy), number - first
+        of_bars, rows = ~home.send(copy), number - first
         new_ends, new_tags = np.empty((last - first, 2), ends.dtype), np.empty(last - first, np.int64)
-        new_ends[own[of_bars]], new_tags[own[of_bars]] = home.send(ends)[of_bars], home.send(tags)[of_bars]
-        return _Bars(n, new_ends, new_tags, number, places)
+        new_ends[rows[of_bars]], new_tags[rows[of_bars]] = home.send(ends)[of_bars], home.send(tags)[of_bars]
+        return _Bars(n, new_ends, new_tags, rows, places)
 
 
-def _groups(dimension: int, head: _Head, numbers: np.ndarray, places: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the members on this rank of the groups of a dimension, by name; the same names on all ranks."""
-    found: dict[str, list[np.ndarray]] = {}
-    for tag in sorted({tag for of, tags in head.groups if of == dimension for tag in tags}):
+def _groups(of: tuple[int, int, int], head: _Head, rows: np.ndarray, places: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the members on this rank of groups by name, the same names on all ranks; ``of`` are the dimension, and the
+    first and the count of this rank's nodes or bars, of which ``rows`` have groups."""
+    dimension, first, n = of
+    names = [name for (own, _), name in head.names.items() if own == dimension]
+    tags = sorted({tag for own, tags in head.groups if own == dimension for tag in tags})
+    masks: dict[str, np.ndarray] = {}
+    for tag in tags:
         has = np.array([tag in tags for _, tags in head.groups], bool)[places]
-        found.setdefault(head.names.get((dimension, tag), f"group_{tag}"), []).append(numbers[has])
-    for (of, _), name in head.names.items():
-        if of == dimension:
-            found.setdefault(name, [])
-    return {name: np.unique(np.concatenate([np.empty(0, np.int64), *parts])) for name, parts in found.items()}
+        masks.setdefault(head.names.get((dimension, tag), f"group_{tag}"), np.zeros(n, bool))[rows[has]] = True
+    masks |= {name: np.zeros(n, bool) for name in names if name not in masks}
+    return {name: first + np.flatnonzero(mask) for name, mask in masks.items()}
 
 
 # ---- writing

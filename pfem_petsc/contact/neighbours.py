@@ -22,7 +22,7 @@ _CELLS, _PAIRS = 64.0, 2000.0
 # Cells of 8 x 8 x 8 belong to one rank, so that most segments are sent to one or two.
 _BLOCK = 8
 
-_CHUNK = 1 << 18  # pairs compared at a time
+_CHUNK = 1 << 18  # pairs found at a time
 _SECOND = 1 << 62  # added to the numbers of the second set of segments
 
 
@@ -78,6 +78,7 @@ class NeighbourSearch:
         number, long, size = comm.allreduce(np.array([len(lengths), np.count_nonzero(lengths), sizes.sum()]))
         self._low, self._cell, self.crowded = low, 0.7 * size / max(long, 1.0), False
         self._held, self._start, change = one, np.zeros(1, np.int64), 1.0
+        self._keys, self._rows = np.empty(0, np.int64), np.empty(0, np.int32)
         while number:
             cells = ((lengths // self._cell + 1.0) * (2.0 + 2.0 * one.margin / self._cell) ** 3).sum()
             fits = comm.allreduce(float(cells)) <= _CELLS * number and (high - low).max() < 2.0**60 * self._cell
@@ -112,23 +113,17 @@ class NeighbourSearch:
 
     def pairs(self) -> Iterator[Pairs]:
         """Yield the pairs that this rank finds, a limited number at a time; each is found by one rank."""
-        counts = np.diff(self._start)
-        work = np.cumsum(np.append(0, counts * (counts - 1) // 2))
-        first = 0
-        while first < len(counts):
-            last = max(int(np.searchsorted(work, work[first] + _CHUNK, side="right")) - 1, first + 1)
-            room = int(work[last] - work[first])
-            rows, at, distance = np.empty((room, 2), np.int64), np.empty((room, 2)), np.empty(room)
-            buckets = self._start[first : last + 1], self._keys, self._rows
-            grid = self._low, self._cell, self._between
-            found = _compare(buckets, self._held, grid, rows, at, distance)
-            rows = rows[:found]
-            if found:
-                ids = self._held.ids[rows]
-                ids[ids >= _SECOND] -= _SECOND
-                reach = self._held.margin[rows].sum(axis=1)
-                yield Pairs(ids, self._held.labels[rows], at[:found], distance[:found], reach)
-            first = last
+        room = max(_CHUNK, int(np.diff(self._start).max(initial=0)))
+        found_rows, at, distance = np.empty((room, 2), np.int64), np.empty((room, 2)), np.empty(room)
+        buckets, grid = (self._start, self._keys, self._rows), (self._low, self._cell, self._between)
+        state = np.zeros(2, np.int64)
+        while state[0] < len(self._start) - 1:
+            found = slice(0, _compare(state, buckets, self._held, grid, (found_rows, at, distance)))
+            rows = found_rows[found]
+            ids, reach = self._held.ids[rows], self._held.margin[rows].sum(axis=1)
+            ids[ids >= _SECOND] -= _SECOND
+            if len(rows):
+                yield Pairs(ids, self._held.labels[rows], at[found].copy(), distance[found].copy(), reach)
 
 
 @inlined
@@ -238,15 +233,23 @@ def _closest(ends, a, b):
 
 
 @kernel
-def _compare(buckets, held, grid, found_rows, found_at, found_distance):
-    """Write the rows of segments that are pairs, where they are closest, and their distances; return how many."""
+def _compare(state, buckets, held, grid, out):
+    """Write the rows of segments that are pairs, where they are closest, and their distances; return how many.
+
+    Starts at a place of a bucket, ``state`` (2,), and leaves there where it goes on after the arrays are full.
+    """
     start, keys, rows = buckets
     ids, labels, ends, margin = held
     low, cell, between = grid
+    found_rows, found_at, found_distance = out
     found = 0
     place = np.empty(3, np.int64)
-    for bucket in range(len(start) - 1):
-        for p in range(start[bucket], start[bucket + 1]):
+    for bucket in range(state[0], len(start) - 1):
+        for p in range(max(start[bucket], state[1]), start[bucket + 1]):
+            if found + start[bucket + 1] - p > len(found_rows):
+                state[0] = bucket
+                state[1] = p
+                return found
             for q in range(p + 1, start[bucket + 1]):
                 if keys[p] != keys[q]:
                     continue
@@ -281,4 +284,5 @@ def _compare(buckets, held, grid, found_rows, found_at, found_distance):
                 found_at[found, 1] = t
                 found_distance[found] = np.sqrt(square)
                 found += 1
+    state[0] = len(start) - 1
     return found

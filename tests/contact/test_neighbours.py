@@ -19,8 +19,9 @@ def near(ends, one, two, samples=401):
 
 @pytest.mark.parametrize("sets", [1, 2])
 @pytest.mark.parametrize("flat", [False, True])
-def test_pairs_are_those_of_all_segments(comm, sets, flat):
+def test_pairs_are_those_of_all_segments(comm, sets, flat, monkeypatch):
     """Long and short segments and points, with margins and common labels, dealt to the ranks at random."""
+    monkeypatch.setattr("pfem_petsc.contact.neighbours._CHUNK", 1)  # pairs come in many pieces
     random = np.random.default_rng(2)
     n = 100
     ends = random.random((n, 1, 3)) + np.concatenate([np.zeros((n, 1, 3)), random.normal(size=(n, 1, 3))], axis=1)

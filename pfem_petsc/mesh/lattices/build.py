@@ -151,8 +151,10 @@ class _Left:
         pieces = [(np.empty(0, np.int64), np.empty((0, 2), np.int64))]
         for numbers, places in block.bars.pieces(*slab_range(block.bars.total, comm.rank, comm.size)):
             ends = np.stack([block.end(places, which)[0] for which in (0, 1)], axis=1)
-            drawn = random_numbers(keys.seed or 0, _MISSING, numbers) >= (keys.missing or 0.0)
-            pieces.append((numbers[drawn], ends[drawn]))
+            if keys.missing:
+                drawn = random_numbers(keys.seed or 0, _MISSING, numbers) >= keys.missing
+                numbers, ends = numbers[drawn], ends[drawn]
+            pieces.append((numbers, ends))
         self.bars, self.ends = (np.concatenate(parts) for parts in zip(*pieces))
         self.points, self.lost = np.empty((0, 3)), np.empty(0, np.int64)
         # the range of nodes at which these bars end, most of which are in the slab of this rank

@@ -13,7 +13,7 @@ import importlib
 import pkgutil
 import sys
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -53,9 +53,14 @@ def _own(package: str) -> tuple[str, ...]:
 
 
 @cache
+def _every_entry_point() -> EntryPoints:
+    return entry_points()
+
+
+@cache
 def _installed(package: str) -> dict[str, EntryPoint]:
     """Entry points of other distributions by name."""
-    points = entry_points(group=KINDS[package].group) if package in KINDS else ()
+    points = _every_entry_point().select(group=KINDS[package].group) if package in KINDS else ()
     return {point.name: point for point in points}
 
 

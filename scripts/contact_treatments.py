@@ -10,18 +10,17 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from pathlib import Path
 
 import matplotlib
 import numpy as np
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from pages import DOCS, insert, markdown
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 
-DOCS = Path(__file__).parent.parent / "docs"
 SPEED = 0.1
 FORCE, ENERGY = SPEED, 0.5 * SPEED**2  # rho c A v and m v^2/2 with rho = c = A = L = 1
 STEP = 0.01
@@ -66,20 +65,19 @@ def label(integrator: str, parameters: dict[str, float]) -> str:
 
 def table(results: dict) -> str:
     """Return the table, with one line per scheme and one column per treatment."""
-    lines = ["| integrator | " + " | ".join(TREATMENTS) + " |", "|---" * (1 + len(TREATMENTS)) + "|"]
-    for integrator, parameters in SCHEMES:
-        cells = []
-        for treatment in TREATMENTS:
-            rows = results[label(integrator, parameters), treatment]
-            if rows is None:
-                cells.append("-")
-                continue
-            force = max(abs(row["wall/wall/force"][0]) for row in rows) / FORCE
-            rebound = -rows[-1]["momentum"][0] / SPEED
-            energy = (rows[-1]["kinetic_energy"] + rows[-1]["elastic_energy"]) / ENERGY
-            cells.append(f"{force:.2f}, {rebound:.3f}, {energy:.4f}, {rows[-1]['wall/wall/releases']}")
-        lines.append(f"| {label(integrator, parameters)} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+
+    def cell(rows: list[dict] | None) -> str:
+        if rows is None:
+            return "-"
+        force = max(abs(row["wall/wall/force"][0]) for row in rows) / FORCE
+        rebound = -rows[-1]["momentum"][0] / SPEED
+        energy = (rows[-1]["kinetic_energy"] + rows[-1]["elastic_energy"]) / ENERGY
+        return f"{force:.2f}, {rebound:.3f}, {energy:.4f}, {rows[-1]['wall/wall/releases']}"
+
+    names = [label(*scheme) for scheme in SCHEMES]
+    return markdown(
+        ["integrator", *TREATMENTS], [[name, *(cell(results[name, each]) for each in TREATMENTS)] for name in names]
+    )
 
 
 def figure(results: dict) -> None:
@@ -141,19 +139,12 @@ def slide(integrator: str, parameters: dict[str, float], step: float) -> float:
 
 def sliding() -> str:
     """The table of slides."""
-    lines = ["| | 4 ms | 2 ms | 1 ms | by the new normal |", "|---|---|---|---|---|"]
+    rows = []
     for integrator, parameters, other in SLIDES:
         lost = (f"{round(slide(integrator, parameters, step), 4) + 0.0:.4f} %" for step in (4e-3, 2e-3, 1e-3))
         earlier = "the same" if other is None else ", ".join(f"{value:.1f}" for value in other) + " %"
-        lines.append(f"| {label(integrator, parameters)} | {' | '.join(lost)} | {earlier} |")
-    return "\n".join(lines)
-
-
-def insert(mark: str, end: str, table: str) -> None:
-    """Write a table between its marks in the document."""
-    document = DOCS / "contact.md"
-    before, rest = document.read_text().split(mark)
-    document.write_text(before + mark + table + "\n" + end + rest.split(end)[1])
+        rows.append([label(integrator, parameters), *lost, earlier])
+    return markdown(["", "4 ms", "2 ms", "1 ms", "by the new normal"], rows)
 
 
 def main() -> None:
@@ -161,14 +152,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sliding", action="store_true", help="the table of slides only")
     if parser.parse_args().sliding:
-        insert("<!-- table: scripts/contact_treatments.py --sliding -->\n", "<!-- end of slides -->", sliding())
+        start = "<!-- table: scripts/contact_treatments.py --sliding -->\n"
+        insert("contact.md", start, "<!-- end of slides -->", sliding() + "\n")
         return
     results = {
         (label(integrator, parameters), treatment): run(treatment, integrator, parameters)
         for integrator, parameters in SCHEMES
         for treatment in TREATMENTS
     }
-    insert("<!-- table: scripts/contact_treatments.py -->\n", "<!-- end of table -->", table(results))
+    start = "<!-- table: scripts/contact_treatments.py -->\n"
+    insert("contact.md", start, "<!-- end of table -->", table(results) + "\n")
     figure(results)
     growth = {key: max(row["energy_imbalance"] for row in rows) / ENERGY for key, rows in results.items() if rows}
     print(f"largest imbalance of the energy ledger over the start: {max(np.abs(list(growth.values()))):.1e}")

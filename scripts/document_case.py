@@ -20,8 +20,6 @@ from pfem_petsc.case.files import TableFile
 from pfem_petsc.case.model import KEYS, STAGE_TABLES, CaseModel, Family, StageName, StageOutput, shape_of
 from pfem_petsc.registry import choices, lookup
 
-__all__ = ["TABLES", "page", "rows", "type_text"]
-
 
 def _tables() -> dict[str, tuple[type[StrictModel] | Family, ...]]:
     """The tables of a case file by heading, with the models that have their keys."""

@@ -7,17 +7,15 @@ A key is documented by the text below it in its class.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
+from pages import DOCS, insert, markdown
 from pydantic_core import PydanticUndefined
 
 from pfem_petsc.mechanics.materials.base import LAWS, MaterialKeys
 from pfem_petsc.registry import choices, lookup
 
-__all__ = ["BEGIN", "END", "FILE", "text_of", "undocumented"]
-
-FILE = Path(__file__).parent.parent / "docs" / "case_file.md"
+FILE = DOCS / "case_file.md"
 BEGIN, END = "<!-- laws: made by scripts/document_laws.py -->\n", "<!-- end of laws -->\n"
 
 
@@ -41,12 +39,12 @@ def undocumented(name: str) -> list[str]:
 
 
 def _table(head: str, model: type[MaterialKeys], without: Any) -> str:
-    lines = [f"| {head} | default | |", "|---|---|---|"]
+    rows = []
     for key, field in model.model_fields.items():
-        if key not in without:
-            text = " ".join((field.description or "").split()).replace("``", "`").replace("|", "\\|")
-            lines.append(f"| `{key}` | {_default(field.default)} | {text} |")
-    return "\n".join(lines) + "\n\n"
+        text = " ".join((field.description or "").split()).replace("``", "`").replace("|", "\\|")
+        rows.append([f"`{key}`", _default(field.default), text])
+    rows = [row for row in rows if row[0].strip("`") not in without]
+    return markdown([head, "default", ""], rows) + "\n\n"
 
 
 def _default(value: Any) -> str:
@@ -57,9 +55,7 @@ def _default(value: Any) -> str:
 
 def main() -> None:
     """Rewrite the file."""
-    before, rest = FILE.read_text().split(BEGIN)
-    _, after = rest.split(END)
-    FILE.write_text(before + BEGIN + "\n" + "".join(text_of(name) for name in ("", *choices(LAWS))) + END + after)
+    insert(FILE.name, BEGIN, END, "\n" + "".join(text_of(name) for name in ("", *choices(LAWS))))
 
 
 if __name__ == "__main__":

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import itertools
 import re
-from pathlib import Path
 
 import numpy as np
 from impact_phases import SCHEMES, label
 from mpi4py import MPI
+from pages import insert, markdown
 
 from pfem_petsc import Case
 from pfem_petsc.errors import InputError
@@ -23,7 +23,6 @@ from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
 from pfem_petsc.stepping.time_stepping import make_stepper
 
-DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "contact.md"
 START, END = "<!-- table: scripts/friction_scan.py -->\n", "<!-- end of friction -->"
 PHASES, BEFORE, STEPS, LAST = 12, 3, 12, 4  # steps before the impact, of the run, and that are compared
 STEP, APPROACH, SLIP = 1e-3, 6.0, 3.0  # [s], [m/s]
@@ -124,10 +123,8 @@ def lines(schemes: tuple = SCHEMES) -> list[str]:
             reasons += [] if reason in reasons else [reason]
             cells[name, friction].append(f"({reasons.index(reason) + 1})")
     shown = [column for column in columns if not all(cell.startswith("(") for cell in cells[column])]
-    rows = ["| integrator | " + " | ".join(f"{name}, μ = {friction:g}" for name, friction in shown) + " |"]
-    rows.append("|---" * (1 + len(shown)) + "|")
-    for k, scheme in enumerate(schemes):
-        rows.append(f"| {label(*scheme)} | " + " | ".join(cells[column][k] for column in shown) + " |")
+    rows = [[label(*scheme), *(cells[column][k] for column in shown)] for k, scheme in enumerate(schemes)]
+    rows = markdown(["integrator", *(f"{name}, μ = {friction:g}" for name, friction in shown)], rows).splitlines()
     rows += ["", "Refused, with the reason that the program gives:", ""]
     rows += [f"{k}. {reason}" for k, reason in enumerate(reasons, 1)]
     never = [
@@ -140,8 +137,7 @@ def lines(schemes: tuple = SCHEMES) -> list[str]:
 
 def main() -> None:
     """Run everything, and insert the table between its marks in the document."""
-    before, rest = DOCUMENT.read_text().split(START)
-    DOCUMENT.write_text(before + START + "\n".join(lines()) + "\n" + END + rest.split(END)[1])
+    insert("contact.md", START, END, "\n".join(lines()) + "\n")
 
 
 if __name__ == "__main__":

@@ -9,27 +9,22 @@ from __future__ import annotations
 
 import argparse
 import re
-import subprocess
-import sys
+import shutil
 import tempfile
-import time
 import tomllib
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
+from pages import DOCS, program, save
 
 from pfem_petsc import open_result
 from pfem_petsc.case.schema import Case
 from pfem_petsc.case.toml import built_in_path, read_text
 from pfem_petsc.output.units import prefix_for
 
-__all__ = ["DATA", "PAGE", "PICTURES", "entries", "page"]
-
-ROOT = Path(__file__).resolve().parent.parent
-DATA = ROOT / "docs" / "gallery.toml"
-PAGE = ROOT / "docs" / "gallery.md"
-PICTURES = ROOT / "docs" / "images" / "gallery"
+DATA = DOCS / "gallery.toml"
+PAGE = DOCS / "gallery.md"
+PICTURES = DOCS / "images" / "gallery"
 SIZE = "960x540"
 
 HEAD = """# Gallery
@@ -85,45 +80,28 @@ def _number(entry: dict[str, Any]) -> str:
     return f"{factor * entry['value']:.7g} {unit} ± {factor * entry['tolerance']:.2g} {unit}"
 
 
-def run(name: str, folder: Path) -> dict[str, Any]:
-    """Run a case twice, so that nothing is compiled in the second, draw it, and return what it cost."""
-    times = []
-    for again in ("first", "second"):
-        _program(name, "-o", folder / again)
-        log = (folder / again / "log.txt").read_text()
-        found = re.findall(r"done: .* in ([\d.]+) (s|min)\b", log)
-        times.append(float(found[-1][0]) * (60.0 if found[-1][1] == "min" else 1.0) if found else 0.0)
-    start = time.perf_counter()
-    _draw(name, folder / "second", folder)
-    result = open_result(folder / "second")
-    print(f"{name}: {times[1]:.3g} s, drawn in {time.perf_counter() - start:.1f} s", flush=True)
-    return {"bars": len(result.bars), "steps": int(result.history["step"][-1]), "seconds": times[1]}
+def measure(name: str, folder: Path) -> dict[str, Any]:
+    """Run a case twice, so that nothing is compiled in the second run, and return what that cost."""
+    for _ in range(2):
+        shutil.rmtree(folder / "run", ignore_errors=True)
+        program(name, "-o", folder / "run")
+    found = re.findall(r"done: .* in ([\d.]+) (s|min)\b", (folder / "run" / "log.txt").read_text())
+    seconds = float(found[-1][0]) * (60.0 if found[-1][1] == "min" else 1.0) if found else 0.0
+    result = open_result(folder / "run")
+    return {"bars": len(result.bars), "steps": int(result.history["step"][-1]), "seconds": seconds}
 
 
 def draw(name: str, folder: Path) -> None:
-    """Run a case and draw it."""
-    _program(name, "-o", folder / "run")
-    _draw(name, folder / "run", folder)
-
-
-def _draw(name: str, run: Path, folder: Path) -> None:
-    entry, count = entries()[name], len(open_result(run).times)
+    """Draw the result in a folder."""
+    entry, count = entries()[name], len(open_result(folder / "run").times)
     options = ["--size", SIZE, "--video", "none", "--no-poster", *entry["render"]]
     if "modes" in entry:
-        options += ["--modes", str(entry["modes"]), "--frames", "4"]
+        options += ["--modes", entry["modes"], "--frames", "4"]
     else:
         options += ["--frames", f"0,{entry['frame'] % count}"]
-    _program("render", run, "-o", folder / "pictures", *options)
+    program("render", folder / "run", "-o", folder / "pictures", *options)
     frames = sorted((folder / "pictures").rglob("*.png"))
-    picture = Image.open(frames[1 if "modes" in entry else -1]).convert("RGB")
-    PICTURES.mkdir(parents=True, exist_ok=True)
-    picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-        PICTURES / f"{name}.png", optimize=True
-    )
-
-
-def _program(*arguments: Any) -> None:
-    subprocess.run([sys.executable, "-m", "pfem_petsc", *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
+    save(frames[1 if "modes" in entry else -1], PICTURES / f"{name}.png")
 
 
 def _record(name: str, cost: dict[str, Any]) -> None:
@@ -142,14 +120,15 @@ def main() -> None:
     parser.add_argument("--run", nargs="*", metavar="CASE", help="run, measure, draw these cases; without names: all")
     parser.add_argument("--draw", nargs="*", metavar="CASE", help="run and draw these cases; without names: all")
     arguments = parser.parse_args()
-    if arguments.draw is not None:
-        for name in arguments.draw or entries():
+    for chosen, measured in ((arguments.draw, False), (arguments.run, True)):
+        for name in chosen or entries() if chosen is not None else ():
             with tempfile.TemporaryDirectory() as folder:
+                if measured:
+                    _record(name, measure(name, Path(folder)))
+                else:
+                    program(name, "-o", Path(folder, "run"))
                 draw(name, Path(folder))
-    if arguments.run is not None:
-        for name in arguments.run or entries():
-            with tempfile.TemporaryDirectory() as folder:
-                _record(name, run(name, Path(folder)))
+            print(name, flush=True)
     PAGE.write_text(page())
 
 

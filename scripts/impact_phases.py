@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
 import numpy as np
 from mpi4py import MPI
+from pages import insert, markdown
 
 from pfem_petsc import Case
 from pfem_petsc.errors import InputError, SimulationFailure
@@ -30,15 +31,19 @@ from pfem_petsc.stepping.plan import make_plan
 from pfem_petsc.stepping.stepper import Stepper
 from pfem_petsc.stepping.time_stepping import make_stepper
 
-DOCS = Path(__file__).parent.parent / "docs"
 START, END = "<!-- table: scripts/impact_phases.py -->\n", "<!-- end of phases -->"
 START_REBOUNDS, END_REBOUNDS = "<!-- table: scripts/impact_phases.py, restitution -->\n", "<!-- end of rebounds -->"
-RESTITUTIONS = 0.2, 0.5, 0.8, 0.9, 1.0
 PHASES, ELEMENTS = 14, 20
 SPEED = 1e-4  # relative to the wave speed, small enough for linear rods even with large steps
 LIMIT = 1.0 / ELEMENTS  # explicit limit of the step with lumped mass, l/c [s]
-COLUMNS = (("scheme", "lumped"), ("scheme", "consistent"), ("stick", "lumped"), ("conserving", "lumped"))
-COLUMNS += (("mass_redistribution", "lumped"),)
+COLUMNS = {
+    f"{treatment}, {mass}": (treatment, mass, 0.0)
+    for treatment, mass in (
+        *(("scheme", "lumped"), ("scheme", "consistent"), ("stick", "lumped")),
+        *(("conserving", "lumped"), ("mass_redistribution", "lumped")),
+    )
+}
+REBOUNDS = {f"e = {e:g}": ("scheme", "lumped", e) for e in (0.2, 0.5, 0.8, 0.9, 1.0)}
 EXPLICIT = "central_differences", "chung_lee", "hulbert_chung", "souza_moura"
 STEPS = 0.2, 1.0, 5.0, 20.0
 """Steps relative to the explicit limit of the lumped rod; explicit schemes use 0.2 and 0.9 of their own limit."""
@@ -213,42 +218,26 @@ def judged(
     return Impacts(found.largest, found.last, found.releases, found.force, warned)
 
 
-def lines(of: Callable[..., Impacts | None]) -> Iterator[str]:
-    """Yield the rows of the table."""
-    yield "| integrator | step | " + " | ".join(f"{treatment}, {mass}" for treatment, mass in COLUMNS) + " |"
-    yield "|---" * (2 + len(COLUMNS)) + "|"
+def table(of: Callable[..., Impacts | None], columns: dict[str, tuple]) -> str:
+    """Return the table of columns with these treatments, mass matrices and restitutions."""
+    rows = []
     for integrator, parameters in SCHEMES:
         for k, size in enumerate(steps_of(integrator, parameters, "lumped")):
             found = [
-                of(integrator, parameters, treatment, mass, steps_of(integrator, parameters, mass)[k])
-                for treatment, mass in COLUMNS
+                of(integrator, parameters, treatment, mass, steps_of(integrator, parameters, mass)[k], restitution)
+                for treatment, mass, restitution in columns.values()
             ]
-            yield f"| {label(integrator, parameters)} | {size:.3g} | " + " | ".join(map(cell, found)) + " |"
-
-
-def rebounds(of: Callable[..., Impacts | None]) -> Iterator[str]:
-    """Yield the rows of the table of walls with restitution."""
-    yield "| integrator | step | " + " | ".join(f"e = {e:g}" for e in RESTITUTIONS) + " |"
-    yield "|---" * (2 + len(RESTITUTIONS)) + "|"
-    for integrator, parameters in SCHEMES:
-        for size in steps_of(integrator, parameters, "lumped"):
-            found = [of(integrator, parameters, "scheme", "lumped", size, e) for e in RESTITUTIONS]
-            yield f"| {label(integrator, parameters)} | {size:.3g} | " + " | ".join(map(cell, found)) + " |"
+            rows.append([label(integrator, parameters), f"{size:.3g}", *map(cell, found)])
+    return markdown(["integrator", "step", *columns], rows) + "\n"
 
 
 def main() -> None:
     """Run everything, and insert the tables between their marks in the document."""
-    tables = ((lines, START, END), (rebounds, START_REBOUNDS, END_REBOUNDS))
-    if "--program" in sys.argv[1:]:
-        for table, _, _ in tables:
-            for line in table(impacts):
-                print(line, flush=True)
-        return
-    for table, start, end in tables:
-        rows = list(table(judged))
-        document = DOCS / "contact.md"
-        before, rest = document.read_text().split(start)
-        document.write_text(before + start + "\n".join(rows) + "\n" + end + rest.split(end)[1])
+    for columns, start, end in ((COLUMNS, START, END), (REBOUNDS, START_REBOUNDS, END_REBOUNDS)):
+        if "--program" in sys.argv[1:]:
+            print(table(impacts, columns), flush=True)
+        else:
+            insert("contact.md", start, end, table(judged, columns))
 
 
 if __name__ == "__main__":

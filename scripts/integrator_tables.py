@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from pages import DOCS, finished, markdown
 
 from pfem_petsc.integrators.base import Scheme, State
 from pfem_petsc.registry import lookup
 
-DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "integrators.md"
+DOCUMENT = DOCS / "integrators.md"
 SHARES = (0.05, 0.1, 0.2)  # h/T
 MEMORY = {"central_differences": ("half_velocity",), "houbolt": ("d0", "d1")}
 
@@ -129,10 +128,6 @@ def limit(row: Row) -> float:
     return low
 
 
-def _lines(head: list[str], rows: list[list[str]]) -> str:
-    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *rows))
-
-
 def accuracy_table() -> str:
     """Return the table of order, limit, high frequencies, damping ratio and period error."""
     rows = []
@@ -145,7 +140,7 @@ def accuracy_table() -> str:
             cells.append(f"{damping + 0.0:.4f}, {100 * period:+.2f} %".replace("-0.0000", "0.0000"))
         rows.append([row.label, str(order(row)), "∞" if np.isinf(bound) else f"{bound:.4f}", ends, *cells])
     head = ["scheme", "order", "limit Ω", "ρ(∞)", *(f"h/T = {share:g}: ξ, period" for share in SHARES)]
-    return _lines(head, rows)
+    return markdown(head, rows)
 
 
 def held_table() -> str:
@@ -168,12 +163,12 @@ def held_table() -> str:
         # a nilpotent matrix has eigenvalues of the size of rounding to a fraction of a power
         nilpotent = np.abs(np.linalg.matrix_power(matrix, len(matrix) + 1)).max() < 1e-12
         rows.append([row.label, "0" if nilpotent else f"{size:.3f}", *shown])
-    return _lines(["scheme", "ρ held", *(f"step {n}" for n in range(1, 7))], rows)
+    return markdown(["scheme", "ρ held", *(f"step {n}" for n in range(1, 7))], rows)
 
 
 def spin_table() -> str:
     """Return the table of remaining angular momentum and energy of a free bar after five turns of 100 steps each."""
-    from pfem_petsc import Case, Simulation
+    from pfem_petsc import Case
 
     stretch, h = 4e-3, 2.0 * np.pi / 100  # rho omega^2 l^2/(4 E), which also sets the bar's own frequency; omega = 1
     rows = []
@@ -190,16 +185,12 @@ def spin_table() -> str:
                 "solver": {"rtol": 1e-12},
             }
         )
-        with tempfile.TemporaryDirectory() as folder:
-            simulation = Simulation(case, output=folder, quiet=True)
-            simulation.start()
-            first = dict(simulation.row)
-            simulation.run()
-            last = simulation.row
-        spin = last["angular_momentum"][2] / first["angular_momentum"][2]
-        energy = [each["kinetic_energy"] + each["elastic_energy"] for each in (first, last)]
-        rows.append([row.label, f"{spin:.4f}", f"{energy[1] / energy[0]:.3f}"])
-    return _lines(["scheme", "angular momentum left", "energy left"], rows)
+        with finished(case) as result:
+            history = result.history
+            spin = history["angular_momentum"][-1, 2] / history["angular_momentum"][0, 2]
+            energy = history["kinetic_energy"] + history["elastic_energy"]
+        rows.append([row.label, f"{spin:.4f}", f"{energy[-1] / energy[0]:.3f}"])
+    return markdown(["scheme", "angular momentum left", "energy left"], rows)
 
 
 def damped_errors(row: Row, damping: str, steps: int) -> tuple[float, float]:
@@ -207,7 +198,7 @@ def damped_errors(row: Row, damping: str, steps: int) -> tuple[float, float]:
 
     One node of unit mass, and one held, on a unit bar; the free node starts at 0.1 m/s and moves for 4 s.
     """
-    from pfem_petsc import Case, Simulation, open_result
+    from pfem_petsc import Case
 
     ratio, speed, end = 0.2, 0.1, 4.0
     material = {"young_modulus": 1.0, "density": 2.0}
@@ -227,9 +218,8 @@ def damped_errors(row: Row, damping: str, steps: int) -> tuple[float, float]:
     }
     if damping == "dashpot":
         case["dashpot"] = [{"between": ["held", "free"], "coefficient": 2.0 * ratio}]
-    with tempfile.TemporaryDirectory() as folder:
-        Simulation(Case.from_dict(case), output=folder, quiet=True).run()
-        history = open_result(folder).history
+    with finished(Case.from_dict(case)) as result:
+        history = result.history
         t, x = history["time"], history["probe/free/position"][:, 0, 0] - 1.0
         reaction = history["probe/held/reaction"][:, 0, 0]
     fast = np.sqrt(1.0 - ratio**2)
@@ -249,21 +239,10 @@ def damped_table() -> str:
         shown += [(errors[of][0][1], errors[of][1][1]) for of in ("mass", "bars")]
         rows.append([row.label, *(f"{fine:.1e}, {np.log2(coarse / fine):.2f}" for coarse, fine in shown)])
     positions = ("`damping`", "`stiffness_damping`", "`dashpot`")
-    return _lines(["scheme", *positions, "reaction, `damping`", "reaction, `stiffness_damping`"], rows)
+    return markdown(["scheme", *positions, "reaction, `damping`", "reaction, `stiffness_damping`"], rows)
 
 
 TABLES = {"accuracy": accuracy_table, "damped": damped_table, "held": held_table, "spin": spin_table}
-
-
-def filled(text: str) -> str:
-    """Return the document with its tables recomputed."""
-    for name, table in TABLES.items():
-        start = f"<!-- table {name} -->\n"
-        before, found, after = text.partition(start)
-        if not found:
-            raise SystemExit(f"{DOCUMENT}: has no line {start.strip()}")
-        text = before + start + "\n" + table() + "\n\n" + after[after.index("<!-- end -->") :]
-    return text
 
 
 def main() -> None:
@@ -271,11 +250,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--check", action="store_true", help="change nothing; status 1 where the tables are old")
     check = parser.parse_args().check
-    old = DOCUMENT.read_text(encoding="utf-8")
-    new = filled(old)
+    text = old = DOCUMENT.read_text(encoding="utf-8")
+    for name, table in TABLES.items():
+        start = f"<!-- table {name} -->\n"
+        end = text[text.index("<!-- end -->", text.index(start)) :]
+        text = text[: text.index(start)] + start + "\n" + table() + "\n\n" + end
     if check:
-        sys.exit(old != new)
-    DOCUMENT.write_text(new, encoding="utf-8")
+        sys.exit(text != old)
+    DOCUMENT.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

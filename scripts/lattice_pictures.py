@@ -19,7 +19,6 @@ import matplotlib.pyplot as plt
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.lattices.making import cell_of_kind
 from pfem_petsc.post.render import render
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -77,7 +76,7 @@ SHAPES: dict[str, dict[str, Any]] = {
 
 def picture(keys: dict[str, Any], folder: Path) -> Any:
     """Return the picture of a lattice as an array (rows, columns, colours)."""
-    groups = list(cell_of_kind(lattice.Parameters(**keys)).groups)
+    groups = list(lattice.Parameters(**keys).unit_cell().groups)
     groups += ["skin"] * (keys["kind"] == "tetrahedral_octahedral")
     area = 2e-4 * keys["pitch"] ** 2
     stresses = [0.0] if len(groups) == 1 else [1e3, -1e3, 0.0]

@@ -16,7 +16,6 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,15 +81,22 @@ def measure(
         case(cells, ratio * critical, max(steps + 1, horizon), overrides), comm, output=folder, quiet=True
     )
     stepper = simulation.stepper
-    once = [0.0]
+    once = 0.0
+
+    def timed_renewal(*arguments: Any) -> None:
+        nonlocal once
+        began = time.process_time()
+        renew(*arguments)
+        once += time.process_time() - began
+
     if stepper.lagged is not None:
-        stepper.lagged.renew = timed(stepper.lagged.renew, once)
+        renew, stepper.lagged.renew = stepper.lagged.renew, timed_renewal
     newton, linear, began, set_up, ended = 0, 0, 0.0, 0.0, False
     running = iter(simulation)
     for made, done in enumerate(running):
         spent = comm.allreduce(time.process_time() - began, op=MPI.MAX)
         if made == 0:
-            began, set_up = time.process_time(), once[0]
+            began, set_up = time.process_time(), once
             continue
         newton += done.newton
         linear += done.linear
@@ -109,17 +115,6 @@ def measure(
         "bars": bars,
         "chosen": why,
     }
-
-
-def timed(function: Callable[..., Any], seconds: list[float]) -> Callable[..., Any]:
-    """Wrap a function such that its CPU time is accumulated."""
-
-    def call(*arguments: Any) -> None:
-        began = time.process_time()
-        function(*arguments)
-        seconds[0] += time.process_time() - began
-
-    return call
 
 
 def main() -> None:
@@ -150,15 +145,14 @@ def main() -> None:
                     continue
                 if "MUMPS" in name and 3 * (cells + 1) ** 3 > FACTORISED_UP_TO:
                     continue
-                ours = CHOLESKY if "Cholesky" in name else {}
-                for key, value in ours.items():
+                for key, value in CHOLESKY.items() if "Cholesky" in name else ():
                     options[key] = value
                 try:
                     row = measure(cells, ratio, overrides, arguments.steps, ENDED * best)
                 except PfemError as error:
                     row = {"seconds": np.nan, "set_up": 0.0, "ended": False, "newton": 0, "linear": 0, "bars": 0}
                     row["chosen"] = str(error)
-                for key in ours:
+                for key in CHOLESKY:
                     options.delValue(key)
                 best = float(np.fmin(best, row["seconds"]))
                 rows.append({"cells": cells, "ratio": ratio, "solver": name, **row})

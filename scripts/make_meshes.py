@@ -1,12 +1,13 @@
-"""Creates the example meshes of ``meshes/``, byte for byte identical at every call.
+"""Creates example meshes of ``meshes/``, byte for byte identical at every call.
 
     .venv/bin/python scripts/make_meshes.py
 
-- ``ring.msh`` (Gmsh 4.1): circular plane truss, X-braced, 14 bays, radii 22.83 and 22.37 m, one node towards +x.
 - ``space_truss.msh`` (Gmsh 2.2): an irregular ball of bars along the edges of a Delaunay tetrahedralisation.
 - ``bridge.msh`` (Gmsh 2.2): the plane bridge of ``docs/case_file.md``, 8 m in eight bays, 1 m high.
 - ``bracket.stl`` (in ``pfem_petsc/cases``): the closed surface of an angle bracket with three holes, in millimetres.
-- ``mast.vtu``: a square guyed-mast section of 12 bays, braced in every face and in plan.
+
+``ring.msh`` (Gmsh 4.1) is the ring of the generator: circular plane truss, X-braced, 14 bays, radii 22.83 and 22.37 m,
+one node towards +x. ``mast.vtu`` is a square section of a guyed mast, as text with the names of its groups.
 """
 
 from __future__ import annotations
@@ -16,41 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pfem_petsc.mesh.generators import ring
-
 FOLDER = Path(__file__).resolve().parent.parent / "meshes"
 
 
-def make_ring(path: Path) -> None:
-    """Write the ring of the generator, with its groups as physical points and curves."""
-    keys = {"outer_radius": 22.83, "inner_radius": 22.37, "bays": 14, "bracing": "x", "orientation": "vertex"}
-    slab = ring.generate(ring.Parameters(**keys), 0, 1)
-    point_names, curve_names = ("impact", "opposite"), tuple(slab.bar_groups)
-    names = [(0, tag, name) for tag, name in enumerate(point_names, 1)]
-    names += [(1, tag, name) for tag, name in enumerate(curve_names, 1)]
-    lines = ["$MeshFormat", "4.1 0 8", "$EndMeshFormat", "$PhysicalNames", str(len(names))]
-    lines += [f'{dimension} {tag} "{name}"' for dimension, tag, name in names]
-    lines += ["$EndPhysicalNames", "$Entities", f"{len(point_names)} {len(curve_names)} 0 0"]
-    for tag, name in enumerate(point_names, 1):
-        lines.append(f"{tag} {_numbers(slab.points[slab.node_groups[name][0]])} 1 {tag}")
-    for tag, name in enumerate(curve_names, 1):
-        points = slab.points[np.unique(slab.bars[slab.bar_groups[name]])]
-        lines.append(f"{tag} {_numbers(points.min(axis=0))} {_numbers(points.max(axis=0))} 1 {tag} 0")
-    n = slab.n_nodes
-    lines += ["$EndEntities", "$Nodes", f"1 {n} 1 {n}", f"1 1 0 {n}"]
-    lines += [str(tag) for tag in range(1, n + 1)] + [_numbers(point) for point in slab.points]
-    n_elements = len(point_names) + slab.n_bars
-    lines += ["$EndNodes", "$Elements", f"{len(names)} {n_elements} 1 {n_elements}"]
-    element = 0
-    for tag, name in enumerate(point_names, 1):
-        element += 1
-        lines += [f"0 {tag} 15 1", f"{element} {slab.node_groups[name][0] + 1}"]
-    for tag, name in enumerate(curve_names, 1):
-        bars = slab.bars[slab.bar_groups[name]] + 1
-        lines.append(f"1 {tag} 1 {len(bars)}")
-        for start, end in bars:
-            element += 1
-            lines.append(f"{element} {start} {end}")
+def write_gmsh(path: Path, points: np.ndarray, names: list[str], elements: list[str]) -> None:
+    """Write a file of Gmsh 2.2: ``names`` are lines of physical names, ``elements`` type, tags and nodes from 1."""
+    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", str(len(names)), *names]
+    lines += ["$EndPhysicalNames", "$Nodes", str(len(points))]
+    lines += [f"{k} {' '.join(repr(float(value)) for value in point)}" for k, point in enumerate(points, 1)]
+    lines += ["$EndNodes", "$Elements", str(len(elements)), *(f"{k} {each}" for k, each in enumerate(elements, 1))]
     path.write_text("\n".join([*lines, "$EndElements", ""]))
 
 
@@ -80,51 +55,11 @@ def make_space_truss(path: Path) -> None:
     hull = np.unique(np.concatenate([hull[:, pair] for pair in ((0, 1), (0, 2), (1, 2))]), axis=0)
     on_skin = np.isin(bars[:, 0] * len(points) + bars[:, 1], hull[:, 0] * len(points) + hull[:, 1])
     lowest, highest = int(points[:, 2].argmin()), int(points[:, 2].argmax())
-    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", "4"]
-    lines += ['0 1 "lowest"', '0 2 "highest"', '1 1 "skin"', '1 2 "core"', "$EndPhysicalNames"]
-    lines += ["$Nodes", str(len(points)), *(f"{i} {_numbers(p)}" for i, p in enumerate(points, 1)), "$EndNodes"]
-    lines += ["$Elements", str(2 + len(bars)), f"1 15 2 1 1 {lowest + 1}", f"2 15 2 2 2 {highest + 1}"]
-    for i, ((start, end), outside) in enumerate(zip(bars + 1, on_skin), 3):
-        group = 1 if outside else 2
-        lines.append(f"{i} 1 2 {group} {group} {start} {end}")
-    path.write_text("\n".join([*lines, "$EndElements", ""]))
-
-
-def make_mast(path: Path) -> None:
-    """Write a mast of square section, 1 m wide, 12 bays of 1 m, as XML text for ParaView."""
-    bays, width, height = 12, 1.0, 1.0
-    corner = 0.5 * width * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    points = np.array([[x, y, height * level] for level in range(bays + 1) for x, y in corner])
-    bars, section = [], []
-    for level in range(bays + 1):
-        here = 4 * level + np.arange(4)
-        round_about = np.roll(here, -1)
-        for kind, pairs in ((1, zip(here, round_about)), (2, [(here[0], here[2]), (here[1], here[3])])):
-            bars += list(pairs)
-            section += [kind] * (len(bars) - len(section))
-        if level < bays:
-            bars += list(zip(here, here + 4))
-            section += [0] * (len(bars) - len(section))
-            bars += [*zip(here, round_about + 4), *zip(round_about, here + 4)]
-            section += [2] * (len(bars) - len(section))
-    group = np.full(len(points), -1)
-    group[:4], group[-4:] = 0, 1
-    n = len(bars)
-    # Strings are stored as the numbers of their letters, each ended by 0.
-    text = ['<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="UInt64">']
-    text += ["<UnstructuredGrid>", "<FieldData>"]
-    for name, strings in (("section_names", ("legs", "horizontals", "braces")), ("group_names", ("base", "head"))):
-        letters = " ".join(str(code) for string in strings for code in (*string.encode(), 0))
-        text.append(
-            f'<Array type="String" Name="{name}" NumberOfTuples="{len(strings)}" format="ascii">{letters}</Array>'
-        )
-    text += ["</FieldData>", f'<Piece NumberOfPoints="{len(points)}" NumberOfCells="{n}">']
-    text += ["<PointData>", _array("Int32", "group", group), "</PointData>"]
-    text += ["<CellData>", _array("Int32", "section", section), "</CellData>"]
-    text += ["<Points>", _array("Float64", "Points", points, 3), "</Points>", "<Cells>"]
-    text += [_array("Int64", "connectivity", np.array(bars)), _array("Int64", "offsets", 2 * np.arange(1, n + 1))]
-    text += [_array("UInt8", "types", np.full(n, 3)), "</Cells>", "</Piece>", "</UnstructuredGrid>", "</VTKFile>", ""]
-    path.write_text("\n".join(text))
+    names = ['0 1 "lowest"', '0 2 "highest"', '1 1 "skin"', '1 2 "core"']
+    elements = [f"15 2 1 1 {lowest + 1}", f"15 2 2 2 {highest + 1}"]
+    for (start, end), group in zip((bars + 1).tolist(), np.where(on_skin, 1, 2)):
+        elements.append(f"1 2 {group} {group} {start} {end}")
+    write_gmsh(path, points, names, elements)
 
 
 def make_bridge(path: Path) -> None:
@@ -134,15 +69,9 @@ def make_bridge(path: Path) -> None:
     top = bays + 1
     chords = [(k, k + 1) for k in range(bays)] + [(top + k, top + k + 1) for k in range(bays - 1)]
     diagonals = [pair for k in range(bays) for pair in ((k, top + k), (top + k, k + 1))]
-    names = ['0 1 "left"', '0 2 "right"', '1 3 "chords"', '1 4 "diagonals"']
     elements = [f"15 2 1 1 {1}", f"15 2 2 2 {bays + 1}"]
     elements += [f"1 2 3 3 {a + 1} {b + 1}" for a, b in chords] + [f"1 2 4 4 {a + 1} {b + 1}" for a, b in diagonals]
-    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", str(len(names)), *names]
-    lines += ["$EndPhysicalNames", "$Nodes", str(len(points))]
-    lines += [f"{k} {_numbers(np.array(point))}" for k, point in enumerate(points, 1)]
-    lines += ["$EndNodes", "$Elements", str(len(elements))]
-    lines += [f"{k} {element}" for k, element in enumerate(elements, 1)]
-    path.write_text("\n".join([*lines, "$EndElements", ""]))
+    write_gmsh(path, np.array(points), ['0 1 "left"', '0 2 "right"', '1 3 "chords"', '1 4 "diagonals"'], elements)
 
 
 def make_bracket(path: Path) -> None:
@@ -199,22 +128,9 @@ def _face(outline: np.ndarray, holes: list[np.ndarray]) -> list[np.ndarray]:
     return [each if positive else each[::-1] for each, positive in zip(corners, sense > 0.0)]
 
 
-def _array(kind: str, name: str, values: np.ndarray, components: int = 1) -> str:
-    rows = np.asarray(values).reshape(-1, 3 if components == 3 else 2 if name == "connectivity" else 1)
-    lines = [_numbers(row) if components == 3 else " ".join(str(v) for v in row) for row in rows]
-    head = f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{components}" format="ascii">'
-    return "\n".join([head, *lines, "</DataArray>"])
-
-
-def _numbers(values: np.ndarray) -> str:
-    return " ".join(repr(float(value)) for value in values)
-
-
 if __name__ == "__main__":
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     FOLDER.mkdir(exist_ok=True)
-    make_ring(FOLDER / "ring.msh")
     make_space_truss(FOLDER / "space_truss.msh")
     make_bridge(FOLDER / "bridge.msh")
-    make_mast(FOLDER / "mast.vtu")
     make_bracket(FOLDER.parent / "pfem_petsc" / "cases" / "bracket.stl")

@@ -27,7 +27,8 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+TESTS = Path(__file__).resolve().parent.parent / "tests"
+sys.path[:0] = [str(TESTS), str(TESTS / "random_cases")]
 
 SAMPLES = 12
 """Values kept of each array, evenly spaced, from which the size of a difference is estimated."""
@@ -122,7 +123,7 @@ def _process(folder: Path, ranks: int, names: list[str]) -> list[str]:
 def work(folder: Path, names: list[str]) -> None:
     """Run cases one after the other and print the hashes of each as a line of JSON. Collective."""
     from mpi4py import MPI
-    from random_trusses.running import clear, run_case, run_in_two_parts
+    from random_trusses.running import clear, run_case, run_in_two_parts, steps_of
 
     comm, folder = MPI.COMM_WORLD, folder.resolve()
     os.chdir(folder / "cases")  # files that cases name lie there
@@ -132,7 +133,7 @@ def work(folder: Path, names: list[str]) -> None:
         source = str(folder / "cases" / f"{name}.toml")
         clear(comm, place / "whole", place / "parts")
         outcome = run_case(text, comm, place / "whole", source=source)
-        steps = comm.bcast(_steps(place / "whole") if outcome.status == 0 and comm.rank == 0 else 0)
+        steps = comm.bcast(steps_of(place / "whole") if outcome.status == 0 and comm.rank == 0 else 0)
         if steps > 2:
             run_in_two_parts(text, comm, place / "parts", steps // 2, source)
         if comm.rank == 0:
@@ -148,12 +149,6 @@ def work(folder: Path, names: list[str]) -> None:
 
 def _checkpoint(key: str) -> bool:
     return key.startswith("checkpoint")
-
-
-def _steps(folder: Path) -> int:
-    from pfem_petsc import open_result
-
-    return int(open_result(folder).history["step"][-1])
 
 
 def hashed(folder: Path) -> dict[str, list]:

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
-from PIL import Image
+from pages import DOCS, program, save
 
-IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
+IMAGES = DOCS / "images"
 RUNS = {
     "rod": ["rod_impact"],
     "rod_newmark": ["rod_impact", "--set", "time.integrator=newmark"],
@@ -42,50 +41,25 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="pictures-") as name:
         folder = Path(name)
         for run, words in RUNS.items():
-            _program(folder, *words, "-o", run, "--quiet")
+            program(*words, "-o", run, "--quiet", cwd=folder)
         for target, (picture, words) in PLOTS.items():
-            _program(folder, "plot", *words, "-o", target)
-            _write(folder / target / f"{picture}.png", target, 900)
+            program("plot", *words, "-o", target, cwd=folder)
+            save(folder / target / f"{picture}.png", IMAGES / f"{target}.png", width=900)
         for target, words in FRAMES.items():
             options = ["--size", "1280x720", "--video", "none", "--no-poster"]
-            _program(folder, "render", *words, *options, "-o", target)
-            _write(sorted((folder / target / "frames").glob("*.png"))[-1], target, 960)
+            program("render", *words, *options, "-o", target, cwd=folder)
+            last = sorted((folder / target / "frames").glob("*.png"))[-1]
+            save(last, IMAGES / f"{target}.png", width=960)
         browser = shutil.which("chromium") or shutil.which("google-chrome")
         if browser is None:
             print("render_page.png is left as it is: there is no Chromium")
             return
-        _program(folder, "render", "lattice", "--html", "-o", "page", "--frames", "20")
-        picture = folder / "page.png"
-        window = [
-            "--headless",
-            "--no-sandbox",
-            "--hide-scrollbars",
-            "--window-size=1280,720",
-            f"--screenshot={picture}",
-        ]
+        program("render", "lattice", "--html", "-o", "page", "--frames", "20", cwd=folder)
         page = (folder / "page" / "render.html").as_uri()
-        command = [
-            browser,
-            *window,
-            f"--screenshot={picture}",
-            "--enable-unsafe-swiftshader",
-            "--virtual-time-budget=4000",
-            page,
-        ]
-        subprocess.run(command, check=True, capture_output=True)
-        _write(picture, "render_page", 960)
-
-
-def _program(folder: Path, *words: str) -> None:
-    subprocess.run([sys.executable, "-m", "pfem_petsc", *words], cwd=folder, check=True, stdout=subprocess.DEVNULL)
-
-
-def _write(file: Path, name: str, width: int) -> None:
-    picture = Image.open(file).convert("RGB")
-    picture = picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
-    picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-        IMAGES / f"{name}.png", optimize=True
-    )
+        window = ["--headless", "--no-sandbox", "--hide-scrollbars", "--window-size=1280,720"]
+        window += [f"--screenshot={folder / 'page.png'}", "--enable-unsafe-swiftshader", "--virtual-time-budget=4000"]
+        subprocess.run([browser, *window, page], check=True, capture_output=True)
+        save(folder / "page.png", IMAGES / "render_page.png", width=960)
 
 
 if __name__ == "__main__":

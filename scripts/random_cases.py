@@ -18,6 +18,7 @@ import argparse
 import json
 import os
 import queue
+import re
 import shutil
 import signal
 import subprocess
@@ -31,7 +32,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TextIO
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+TESTS = Path(__file__).resolve().parent.parent / "tests"
+sys.path[:0] = [str(TESTS), str(TESTS / "random_cases")]
 
 CHUNK = 40
 """Number of cases per process, which limits side effects between cases."""
@@ -58,7 +60,8 @@ def main() -> int:
         from random_trusses.work import work
 
         seeds = json.loads(arguments.seeds)
-        work(arguments.worker, seeds, arguments.folder, arguments.restart_every, _sources(arguments))
+        sources = {number: str(path) for number, path in enumerate(arguments.cases)}
+        work(arguments.worker, seeds, arguments.folder, arguments.restart_every, sources)
         return 0
     if arguments.cases:
         seeds = list(range(len(arguments.cases)))
@@ -75,10 +78,6 @@ def main() -> int:
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return study.report(time.monotonic() - begin)
-
-
-def _sources(arguments: argparse.Namespace) -> dict[int, str]:
-    return {number: str(path) for number, path in enumerate(arguments.cases)}
 
 
 class Study:
@@ -109,7 +108,8 @@ class Study:
             several = self._work("run", clear, self.arguments.ranks)
             for seed, told in several.items():
                 if told["status"] != alone[seed]["status"]:
-                    self._fault(seed, "status differs between ranks", f"{alone[seed]['status']} on 1, {_told(told)}")
+                    detail = f"{alone[seed]['status']} on 1, {told['status']} on several: {told['message'][:200]}"
+                    self._fault(seed, "status differs between ranks", detail)
                 mine = {cause for cause, _ in alone[seed]["faults"]}
                 for cause, detail in told["faults"]:
                     if cause not in mine:
@@ -139,7 +139,7 @@ class Study:
             self.statuses["stopped and continued"] += bool(told.get("parts"))
             if told["status"] in (2, 3):
                 text = told["message"].replace(f"random-{seed}.toml", "CASE")
-                self.refusals[" ".join(word for word in text.split() if not _number(word))[:110]].append(seed)
+                self.refusals[" ".join(re.findall(r"(?<!\S)[^\s\d]+(?!\S)", text))[:110]].append(seed)
         for cause, detail in told["faults"]:
             self._fault(seed, cause, detail)
 
@@ -237,14 +237,6 @@ class Study:
             print(f"{len(found):6}  {cause}: {', '.join(self._name(seed) for seed, _ in found)}")
         print(f"{seconds:.0f} s, {bad} faults")
         return 1 if bad else 0
-
-
-def _told(told: dict) -> str:
-    return f"{told['status']} on several: {told['message'][:200]}"
-
-
-def _number(word: str) -> bool:
-    return any(letter.isdigit() for letter in word)
 
 
 def _pump(stream: TextIO, lines: queue.Queue[str | None]) -> None:

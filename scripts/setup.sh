@@ -93,8 +93,7 @@ apt_install() {
 
 available() { apt-cache show "$1" >/dev/null 2>&1; }
 
-# Windows of pyvista without a display, as grid.plot() and tests open them, need OSMesa or EGL; newer distributions have the
-# second alone. render, plot and report draw without.
+# Pictures are drawn without a display by OSMesa or EGL; newer distributions have the second alone.
 drawing_packages() {
     if ldconfig -p | grep -qE 'libOSMesa|libEGL\.so'; then
         return
@@ -256,7 +255,7 @@ check() {
 from mpi4py import MPI
 import petsc4py; petsc4py.init()
 from petsc4py import PETSc
-import h5py, numba, numpy, pydantic, pyvista, rich, matplotlib, imageio_ffmpeg
+import h5py, numba, numpy, scipy, pydantic, pyvista, rich, matplotlib, imageio_ffmpeg
 assert MPI.COMM_WORLD.size == PETSc.COMM_WORLD.size == 2, "PETSc and mpi4py do not share one MPI"
 assert PETSc.ScalarType is numpy.float64, "PETSc has complex or single-precision numbers: a real, double build is needed"
 if MPI.COMM_WORLD.rank == 0:

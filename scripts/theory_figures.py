@@ -6,7 +6,6 @@ python scripts/theory_figures.py [FOLDER]          # default: docs/images/theory
 from __future__ import annotations
 
 import argparse
-import tempfile
 from pathlib import Path
 
 import matplotlib
@@ -15,15 +14,14 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from integrator_tables import ROWS, radius
+from pages import DOCS, finished
 
-from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc import Case
+from pfem_petsc.columns import LOST, STORED, SUPPLIED
 from pfem_petsc.contact.projection import project
-from pfem_petsc.energies import LOST, STORED, SUPPLIED
 from pfem_petsc.mechanics.conserving import MEASURES
 
-__all__ = ["FOLDER", "bar", "contact", "energies", "integrators", "main", "nearest", "strain", "two_bar_load"]
-
-FOLDER = Path(__file__).resolve().parent.parent / "docs" / "images" / "theory"
+FOLDER = DOCS / "images" / "theory"
 # Okabe and Ito's colours, which colour-blind readers tell apart
 BLACK, ORANGE, SKY, GREEN = "#222222", "#E69F00", "#56B4E9", "#009E73"
 BLUE, RED, PINK = "#0072B2", "#D55E00", "#CC79A7"
@@ -160,10 +158,8 @@ def contact(folder: Path) -> Path:
 def energies(folder: Path) -> Path:
     """Energies of a smaller lattice_drop over time, stacked; their sum is constant."""
     smaller = ["mesh.cells=[6, 6, 6]", "node_set.top.nearest=[0.06, 0.06, 0.06]", "time.end=1.5e-4", "output.fields=[]"]
-    with tempfile.TemporaryDirectory() as results:
-        with Simulation(Case.load("lattice_drop", smaller), output=results, quiet=True) as simulation:
-            simulation.run()
-        history = open_result(results).history
+    with finished(Case.load("lattice_drop", smaller)) as result:
+        history = result.history
         time = 1e6 * history["time"]
         columns = {name: np.array(history[name]) for name in (*STORED, *LOST, *SUPPLIED)}
     total = columns["kinetic_energy"][0]

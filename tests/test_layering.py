@@ -14,7 +14,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "pfem_petsc"
 
 FLOORS = (
-    ("energies", "errors", "fields", "files", "signals", "tolerances", "version"),
+    ("columns", "errors", "fields", "files", "signals", "tolerances", "version"),
     ("registry",),
     ("parallel",),
     ("cases",),
@@ -33,7 +33,6 @@ FLOORS = (
     ("case",),  # above the physics whose keys it puts together
     ("restart",),
     ("preflight",),
-    ("recording",),
     ("run",),
     ("simulation",),
     ("__init__",),  # the public interface

@@ -1,4 +1,4 @@
-"""The lattices that are timed: a block of cubic, octet or body-centred cells that hits a floor."""
+"""What the bench times: jobs on a block of cubic, octet or body-centred cells that flies, or hits a floor."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ..case.schema import Case
 
-__all__ = ["KINDS", "PITCH", "WAVE_SPEED", "Job", "bars_of", "cells_for", "make_case"]
-
 YOUNG_MODULUS = 110e9  # [Pa] titanium
 DENSITY = 4500.0  # [kg/m3]
 AREA = 1e-6  # [m2]
@@ -19,6 +17,8 @@ PITCH = 0.01  # [m]
 YIELD_STRESS = 200e6  # [Pa]
 HARDENING = 1e9  # [Pa]
 WAVE_SPEED = math.sqrt(YOUNG_MODULUS / DENSITY)  # [m/s]
+CROSSING = PITCH / WAVE_SPEED  # [s] of a wave along the edge of a cell
+SPEED = 20.0  # [m/s] of the impact, and of the corners of a lattice that spins
 
 KINDS = {
     "cubic": lambda n: 3 * n * (n + 1) * (3 * n + 1),
@@ -26,6 +26,16 @@ KINDS = {
     "bcc": lambda n: 3 * n * (n + 1) ** 2 + 8 * n**3,
 }
 """Bars of n x n x n cells."""
+
+JOBS: dict[str, dict[str, Any]] = {
+    "explicit": {"step": 0.1 * CROSSING},
+    # short steps: thousands of them before the lattice leaves the floor
+    "explicit_contact": {"step": 0.02 * CROSSING, "contact": True},
+    "matrix_free": {"step": 2.0 * CROSSING, "operator": "matrix_free", "linear": "cg"},
+    "assembled": {"step": 2.0 * CROSSING, "operator": "assembled", "linear": "cg"},
+    "implicit_contact": {"step": 2.0 * CROSSING, "operator": "matrix_free", "contact": True},
+}
+"""The measurements by name, as attributes of :class:`Job`."""
 
 
 @dataclass(frozen=True)
@@ -36,65 +46,88 @@ class Job:
     ----------
     name : in the tables
     integrator : name of a time integration scheme
+    step : time step [s]
     operator : of an implicit scheme: ``matrix_free`` or ``assembled``
     linear : linear solver of an implicit scheme
     contact : the foot of the lattice presses on a floor in every step; else the lattice flies and spins
     plastic : bars can yield
     mass : ``lumped`` or ``consistent``
-    step : time step [s]
-    speed : of the impact [m/s]
     history_every : steps between rows of the history
     """
 
     name: str
     integrator: str
+    step: float
     operator: str = "auto"
     linear: str = "auto"
     contact: bool = False
     plastic: bool = False
     mass: str = "lumped"
-    step: float = 0.1 * PITCH / WAVE_SPEED
-    speed: float = 20.0
     history_every: int = 1
 
 
-def bars_of(kind: str, cells: int) -> int:
-    """Return the number of bars of ``cells`` x ``cells`` x ``cells`` cells."""
-    return KINDS[kind](cells)
+def jobs(
+    names: list[str], explicit: str, implicit: str, mass: str, plastic: bool | None, history_every: int
+) -> list[Job]:
+    """Return the jobs of these names.
+
+    Parameters
+    ----------
+    names : of :data:`JOBS`
+    explicit, implicit : integrators
+    mass : ``lumped`` or ``consistent``
+    plastic : whether bars can yield; None: in the explicit impact only
+    history_every : steps between rows of the history
+    """
+    return [
+        Job(
+            name,
+            explicit if name.startswith("explicit") else implicit,
+            plastic=name == "explicit_contact" if plastic is None else plastic,
+            mass=mass,
+            history_every=history_every,
+            **JOBS[name],
+        )
+        for name in names
+    ]
+
+
+def tiny_jobs(explicit: str) -> list[Job]:
+    """Return jobs with so few bars that the measured time is the cost of a step outside the loops over bars."""
+    step = 0.02 * CROSSING
+    return [
+        Job("tiny", explicit, step),
+        Job("tiny, history every 10", explicit, step, history_every=10),
+        Job("tiny, contact", explicit, 0.1 * step, contact=True),
+    ]
 
 
 def cells_for(kind: str, bars: int) -> int:
-    """Return the cells along an edge, at least one, of the lattice whose number of bars is nearest to ``bars``."""
-    n = 1
-    while bars_of(kind, n + 1) <= bars:
-        n += 1
-    return n if bars - bars_of(kind, n) <= bars_of(kind, n + 1) - bars else n + 1
+    """Return the cells along an edge of the lattice whose number of bars is nearest to ``bars``."""
+    most = 2 + math.ceil(bars ** (1.0 / 3.0))  # every kind has more than n^3 bars
+    return min(range(1, most), key=lambda n: abs(KINDS[kind](n) - bars))
 
 
-def make_case(job: Job, kind: str, cells: int, steps: int, **time: Any) -> Case:
-    """Return the case of a job on a lattice, with ``steps`` steps and a history but no fields.
-
-    ``time`` contains further keys of ``[time]``.
-    """
+def make_case(job: Job, kind: str, cells: int, steps: int) -> Case:
+    """Return the case of a job on a lattice, with ``steps`` steps and a history but no fields."""
     from ..case.schema import Case
 
-    edge = cells * PITCH
     material: dict[str, Any] = {"young_modulus": YOUNG_MODULUS, "density": DENSITY}
     if job.plastic:
         material |= {"yield_stress": YIELD_STRESS, "isotropic_hardening": HARDENING}
     table: dict[str, Any] = {
-        "title": f"{job.name}: {kind} lattice of {bars_of(kind, cells):,} bars",
+        "title": f"{job.name}: {kind} lattice of {KINDS[kind](cells):,} bars",
         "mesh": {"generator": "lattice", "kind": kind, "cells": [cells, cells, cells], "pitch": PITCH},
         "material": {"strut": material},
         "section": {"strut": {"area": AREA, "material": "strut"}},
-        "initial": {"velocity": [0.0, 0.0, -job.speed]},
-        "time": {"integrator": job.integrator, "step": job.step, "end": steps * job.step, "mass": job.mass, **time},
+        "time": {"integrator": job.integrator, "step": job.step, "end": steps * job.step, "mass": job.mass},
         "output": {"fields_every": 0, "fields": [], "history_every": job.history_every},
         "solver": {"operator": job.operator, "linear": job.linear},
     }
     if job.contact:
+        table["initial"] = {"velocity": [0.0, 0.0, -SPEED]}
         table["wall"] = [{"name": "floor", "type": "plane", "point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}]
     else:
         # a spin with the same speed at the corners, which strains and rotates bars
-        table["initial"] = {"angular_velocity": [2.0 * job.speed / edge, 0.0, 0.0]}
+        table["initial"] = {"angular_velocity": [2.0 * SPEED / (cells * PITCH), 0.0, 0.0]}
     return Case.from_dict(table, source="bench", folder=Path.cwd())

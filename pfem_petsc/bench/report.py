@@ -1,4 +1,4 @@
-"""The table of the bench and its JSON."""
+"""The table of the bench, its JSON, and its roofline."""
 
 from __future__ import annotations
 
@@ -9,48 +9,29 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .bandwidth import BYTES_PER_ELEMENT, Bandwidth
-from .measure import Record
-from .messages import Messages
-from .traffic import ASSUMED, OPERATIONS
+import numpy as np
+
+from .machine import BYTES_PER_ELEMENT, Bandwidth, Messages, processor
+from .measure import ASSUMED, OPERATIONS, Record
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-__all__ = [
-    "HEADER",
-    "bandwidth_line",
-    "document",
-    "line",
-    "memory_parts",
-    "memory_slopes",
-    "messages_line",
-    "processor",
-]
-
 _FORMAT = "{:18} {:>11} {:>9} {:>9} {:>9} {:>8} {:>6} {:>6} {:>6} {:>7} {:>6} {:>6}"
 _NAMES = (
-    "job",
-    "bars",
-    "step ms",
-    "best ms",
-    "cpu ms",
-    "bars/s",
-    "moved",
-    "bound",
-    "memory",
-    "newton",
-    "setup",
-    "first",
+    *("job", "bars", "step ms", "best ms", "cpu ms", "bars/s"),
+    *("moved", "bound", "memory", "newton", "setup", "first"),
 )
 _UNITS = ("", "", "median", "", "", "", "B/bar", "%", "B/bar", "/cg", "s", "step s")
 HEADER = f"{_FORMAT.format(*_NAMES)}\n{_FORMAT.format(*_UNITS)}"
 """Two lines over the table."""
 
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe and Ito
+_MARKS = "os^Dv<>p"
+
 
 def line(record: Record) -> str:
     """Return a row of the table."""
-    iterations = f"{record.newton:.1f}/{record.linear:.0f}" if record.newton or record.linear else "-"
     return _FORMAT.format(
         record.job,
         f"{record.bars:,}",
@@ -61,35 +42,30 @@ def line(record: Record) -> str:
         f"{record.traffic / record.bars:.0f}",
         f"{record.share:.0f}" if record.share else "-",
         f"{record.memory / record.bars:.0f}",
-        iterations,
+        f"{record.newton:.1f}/{record.linear:.0f}" if record.newton or record.linear else "-",
         f"{record.setup:.2f}",
         f"{record.first:.2f}",
     )
 
 
-def bandwidth_line(bandwidth: Bandwidth) -> str:
-    """Describe the bandwidth."""
+def machine_lines(bandwidth: Bandwidth, messages: Messages | None) -> str:
+    """Describe the bandwidth, and the cost of messages."""
     text = f"STREAM triad ({BYTES_PER_ELEMENT} B an element): one process {bandwidth.alone / 1e9:.1f} GB/s"
     if bandwidth.ranks > 1:
         text += f", {bandwidth.ranks} at once {bandwidth.together / 1e9:.1f} GB/s ({bandwidth.ratio:.2f} x)"
-    return text
-
-
-def messages_line(messages: Messages) -> str:
-    """Describe the cost of messages."""
-    return (
-        f"messages: latency {1e6 * messages.latency:.1f} us, {messages.bandwidth / 1e9:.1f} GB/s, "
-        f"a sum over all ranks {1e6 * messages.reduction:.1f} us"
-    )
+    if messages is not None:
+        text += f"\nmessages: latency {1e6 * messages.latency:.1f} us, {messages.bandwidth / 1e9:.1f} GB/s, "
+        text += f"a sum over all ranks {1e6 * messages.reduction:.1f} us"
+    return text + "\n"
 
 
 def memory_slopes(records: list[Record]) -> dict[str, float]:
     """Return bytes per bar from the two largest sizes of each job with at least two sizes."""
     slopes = {}
     for name in dict.fromkeys(record.job for record in records):
-        sized = sorted((r for r in records if r.job == name), key=lambda r: r.bars)
-        if len(sized) > 1 and sized[-1].bars > sized[-2].bars:
-            slopes[name] = (sized[-1].memory - sized[-2].memory) / (sized[-1].bars - sized[-2].bars)
+        *_, less, more = [None, None, *sorted((r for r in records if r.job == name), key=lambda r: r.bars)]
+        if less is not None and more.bars > less.bars:
+            slopes[name] = (more.memory - less.memory) / (more.bars - less.bars)
     return slopes
 
 
@@ -103,24 +79,13 @@ def memory_parts(record: Record) -> str:
     )
 
 
-def processor() -> str:
-    """Return the name of the processor."""
-    try:
-        for text in Path("/proc/cpuinfo").read_text().splitlines():
-            if text.startswith("model name"):
-                return text.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
 def document(
     comm: MPI.Comm,
     bandwidth: Bandwidth,
     messages: Messages | None,
     records: list[Record],
     tiny: list[Record],
-    operations: float | None = None,
+    operations: float | None,
 ) -> str:
     """Return all measurements as JSON."""
     from ..output.layout import describe_run
@@ -144,3 +109,48 @@ def document(
         "overhead": [asdict(record) for record in tiny],
     }
     return json.dumps(content, indent=1) + "\n"
+
+
+def draw_roofline(path: Path, bandwidth: Bandwidth, operations: float, records: list[Record], title: str) -> None:
+    """Draw operations a second over operations a byte: the limits of the machine, and each job and size, as a PNG.
+
+    S. Williams, A. Waterman, D. Patterson, "Roofline: an insightful visual performance model for multicore
+    architectures", Communications of the ACM 52(4), 2009.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+    from matplotlib.ticker import NullFormatter
+
+    figure, axes = pyplot.subplots(figsize=(8.0, 5.5), layout="constrained")
+    ridge, low = operations / bandwidth.together, 0.06
+    intensity = np.geomspace(0.05, max(5.0, 20.0 * ridge), 200)
+    axes.plot(intensity, 1e-9 * np.minimum(operations, bandwidth.together * intensity), "k", linewidth=1.5)
+    for text, at, offset in (
+        (f"STREAM triad {bandwidth.together / 1e9:.1f} GB/s", (low, 1e-9 * bandwidth.together * low), (14, -4)),
+        (f"compiled loop in the cache {operations / 1e9:.1f} GFLOP/s", (1.2 * ridge, 1e-9 * operations), (0, -6)),
+    ):
+        axes.annotate(text, at, fontsize=9, xytext=offset, textcoords="offset points", va="top")
+    sizes = sorted({record.bars for record in records})
+    jobs = list(dict.fromkeys(record.job for record in records))
+    for record in records:
+        number = jobs.index(record.job)
+        axes.plot(
+            record.operations / record.traffic,
+            1e-9 * record.operations / record.best,
+            _MARKS[number % len(_MARKS)],
+            color=_COLOURS[number % len(_COLOURS)],
+            markersize=6.0 + 3.0 * sizes.index(record.bars),
+            alpha=0.85,
+            label=record.job if record.bars == sizes[0] else None,
+        )
+    axes.set(xscale="log", yscale="log", xlabel="floating-point operations a byte", ylabel="GFLOP/s", title=title)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
+    axes.grid(True, which="both", alpha=0.25)
+    bars = ", ".join(f"{size:,}" for size in sizes)
+    axes.legend(title=f"larger marks, more bars:\n{bars}" if len(sizes) > 1 else f"{bars} bars", fontsize=9)
+    figure.savefig(path, dpi=150)
+    pyplot.close(figure)

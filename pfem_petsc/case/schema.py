@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from ..errors import InputError
-from ..registry import add_plugin, has_plugin, lookup, nearest
+from ..registry import add_plugin, has_plugin, nearest
 from .editing import (
     TABLES,
     apply_overrides,
@@ -121,9 +121,6 @@ class Case(_Tables):
 
     def __repr__(self) -> str:
         return f"<Case {self.name}: {self.title}>"
-
-    def _repr_html_(self) -> str:
-        return lookup("pfem_petsc.post", "inline", "").of_case(self)
 
     @property
     def stages(self) -> tuple[Case, ...]:

@@ -85,7 +85,7 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """A copy of nested tables and lists in Python's own types, for those of NumPy, tuples, ranges, paths and tables."""
+    """Return nested tables and lists in Python's own types; NumPy's, tuples, ranges, paths and tables are resolved."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | range):

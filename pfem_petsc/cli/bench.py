@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..bench.cases import JOBS, KINDS, cells_for, jobs, tiny_jobs
 from ..errors import InputError
-from .parser import PROGRAM
-from .petsc_options import start_petsc
+from .parser import PROGRAM, start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -27,9 +28,6 @@ docs/performance.md. Nothing else should run during the measurement.
 
 exit status: 0 done, 2 invalid input, 3 a run failed"""
 
-JOBS = ("explicit", "explicit_contact", "matrix_free", "assembled", "implicit_contact")
-KINDS = ("cubic", "octet", "bcc")
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
@@ -41,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[10_000, 100_000, 1_000_000],
         help="approximate numbers of bars",
     )
-    parser.add_argument("--kind", choices=KINDS, default="cubic", help="cells of the lattice")
-    parser.add_argument("--jobs", choices=JOBS, nargs="+", default=list(JOBS), help="what to time; default: all")
+    parser.add_argument("--kind", choices=list(KINDS), default="cubic", help="cells of the lattice")
+    parser.add_argument("--jobs", choices=list(JOBS), nargs="+", default=list(JOBS), help="what to time; default: all")
     parser.add_argument("--explicit", metavar="NAME", default="central_differences", help="explicit integrator")
     parser.add_argument("--implicit", metavar="NAME", default="newmark", help="implicit integrator")
     parser.add_argument("--mass", choices=("lumped", "consistent"), default="lumped", help="mass matrix")
@@ -63,101 +61,67 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     """Measure and print. Collective."""
     start_petsc(arguments.petsc_options, comm.rank)
-    from ..bench.bandwidth import measure_bandwidth
-    from ..bench.cases import cells_for
-    from ..bench.jobs import jobs, tiny_jobs
+    from ..bench.machine import measure_bandwidth, measure_messages, measure_operations, processor
     from ..bench.measure import time_job
-    from ..bench.messages import measure_messages
-    from ..bench.report import (
-        HEADER,
-        bandwidth_line,
-        document,
-        line,
-        memory_parts,
-        memory_slopes,
-        messages_line,
-        processor,
-    )
+    from ..bench.report import HEADER, document, draw_roofline, line, machine_lines, memory_parts, memory_slopes
+    from ..parallel.agreement import on_root
 
     if not 0.0 < arguments.seconds < float("inf"):
         raise InputError(f"--seconds {arguments.seconds}: give a positive time")
-    _check_output(arguments.output, comm)
-    _check_output(arguments.roofline, comm)
+    on_root(comm, _require_writable, arguments.output, arguments.roofline)
 
     def say(text: str) -> None:
         if comm.rank == 0:
             print(text, flush=True)
 
+    kind, seconds, explicit = arguments.kind, arguments.seconds, arguments.explicit
     chosen = jobs(
-        arguments.jobs,
-        arguments.explicit,
-        arguments.implicit,
-        arguments.mass,
-        arguments.plastic,
-        arguments.history_every,
+        arguments.jobs, explicit, arguments.implicit, arguments.mass, arguments.plastic, arguments.history_every
     )
+    begin = time.perf_counter()
+    for job in chosen:  # compile or load kernels and start libraries before the measurements
+        time_job(job, kind, 2, comm, None, 0.0)
     if arguments.compile:
-        begin = time.perf_counter()
-        for job in chosen:
-            time_job(job, arguments.kind, 2, comm, None, 0.0)
-        time_job(tiny_jobs(arguments.explicit)[0], "cubic", 2, comm, None, 0.0, 3000)
+        time_job(tiny_jobs(explicit)[0], "cubic", 2, comm, None, 0.0, 3000)
         say(f"loops for this machine are compiled: {time.perf_counter() - begin:.1f} s")
         return 0
-    say(f"{processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {arguments.kind} lattices")
-    bandwidth = measure_bandwidth(comm)
-    say(bandwidth_line(bandwidth))
-    messages = measure_messages(comm)
-    say(messages_line(messages) + "\n" if messages is not None else "")
-    for job in chosen:  # compile or load kernels and start libraries before the measurements
-        time_job(job, arguments.kind, 2, comm, None, 0.0)
+    title = f"{processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {kind} lattices"
+    say(title)
+    bandwidth, messages = measure_bandwidth(comm), measure_messages(comm)
+    say(machine_lines(bandwidth, messages))
     say(HEADER)
     records = []
     for size in sorted(arguments.sizes):
         for job in chosen:
-            record = time_job(job, arguments.kind, cells_for(arguments.kind, size), comm, bandwidth, arguments.seconds)
-            records.append(record)
-            say(line(record))
+            records.append(time_job(job, kind, cells_for(kind, size), comm, bandwidth, seconds))
+            say(line(records[-1]))
     say("")
     for job in chosen:
         say(memory_parts(max((r for r in records if r.job == job.name), key=lambda r: r.bars)))
     for name, slope in memory_slopes(records).items():
         say(f"memory of {name}: {slope:.0f} B per additional bar")
-    tiny = [time_job(job, "cubic", 2, comm, None, arguments.seconds, 3000) for job in tiny_jobs(arguments.explicit)]
+    tiny = [time_job(job, "cubic", 2, comm, None, seconds, 3000) for job in tiny_jobs(explicit)]
     for record in tiny:
         say(f"outside the loops over bars and nodes: {1e6 * record.median:.0f} us a step ({record.job})")
-    operations = None
-    if arguments.roofline is not None:
-        from ..bench.roofline import draw, measure_operations
-
-        operations = measure_operations(comm)
-        if comm.rank == 0:
-            title = f"{processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {arguments.kind} lattices"
-            draw(arguments.roofline, bandwidth, operations, records, title)
-    if arguments.output is not None and comm.rank == 0:
+    operations = measure_operations(comm) if arguments.roofline else None
+    if arguments.roofline and comm.rank == 0:
+        draw_roofline(arguments.roofline, bandwidth, operations, records, title)
+    if arguments.output and comm.rank == 0:
         arguments.output.write_text(document(comm, bandwidth, messages, records, tiny, operations), encoding="utf-8")
     return 0
 
 
 def _size(text: str) -> int:
-    try:
-        size = int(float(text)) if float(text) == int(float(text)) else 0
-    except (ValueError, OverflowError):
-        size = 0
-    if size < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number")
-    return size
+    with contextlib.suppress(ValueError, OverflowError):
+        if float(text) == int(float(text)) > 0:
+            return int(float(text))
+    raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number")
 
 
-def _check_output(path: Path | None, comm: MPI.Comm) -> None:
-    """Check that the output file can be written before the measurements, which take minutes. Collective."""
-    from ..parallel.agreement import on_root
-
-    def try_it() -> None:
-        if path is None:
-            return
+def _require_writable(*paths: Path | None) -> None:
+    """Open the output files before the measurements, which take minutes."""
+    for path in filter(None, paths):
         try:
             path.open("a").close()
         except OSError as error:
             raise InputError(f"--output {path}: cannot be written: {error.strerror}") from error
-
-    on_root(comm, try_it)

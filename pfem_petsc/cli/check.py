@@ -41,7 +41,9 @@ def ranks(arguments: argparse.Namespace) -> str:
 def run(arguments: argparse.Namespace, comm: MPI.Comm | None = None) -> int:
     """Build the simulation without a step, and print its summary. Collective."""
     if arguments.env:
-        return _check_machine(arguments)
+        if arguments.case is not None or arguments.overrides:
+            raise InputError("check --env checks the machine and takes no case: give one of the two")
+        return _check_machine()
     if arguments.case is None:
         raise InputError(
             f"the following arguments are required: CASE (give it before --set), or --env; see {PROGRAM} check --help"
@@ -52,27 +54,20 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm | None = None) -> int:
     simulation = Simulation(case, comm, check_only=True)
     summary = simulation.summary()
     closer, warnings = simulation.inspect()
-    obstacle = simulation.obstacle()
     summary |= closer
+    obstacle, notice = simulation.obstacle(), simulation.plan.scheme.notice
     if comm.rank == 0:
         width = max(map(len, summary), default=0)
-        print(printable(case.title))
-        for label, text in summary.items():
-            print(f"  {label:{width}}  {text}")
-        for text in warnings:
-            print(f"warning: {text}")
-        if simulation.plan.scheme.notice:
-            print(f"note: {simulation.plan.scheme.notice}")
-        if not obstacle:
-            print("This case can run.")
+        lines = [printable(case.title), *(f"  {label:{width}}  {text}" for label, text in summary.items())]
+        lines += [f"warning: {text}" for text in warnings]
+        lines += [f"note: {notice}"] if notice else []
+        print("\n".join(lines if obstacle else [*lines, "This case can run."]))
     if obstacle:
         raise InputError(obstacle)
     return 0
 
 
-def _check_machine(arguments: argparse.Namespace) -> int:
-    if arguments.case is not None or arguments.overrides:
-        raise InputError("check --env checks the machine and takes no case: give one of the two")
+def _check_machine() -> int:
     from .environment import inspect_environment, report
 
     found = inspect_environment()

@@ -1,36 +1,39 @@
-"""What this machine has of what the program needs: versions, features, and the commands that bring what is missing."""
+"""What this machine has of what the program needs, and the commands that bring what is missing."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from importlib import metadata
 from typing import Any, NamedTuple
 
-__all__ = ["Finding", "inspect_environment", "remedies", "report"]
+Run = Callable[[list[str]], tuple[int, str]]
+"""Returns status and output of a command."""
 
 LIMIT = 120.0  # seconds of a probe; the first import of some packages compiles them
 
 PACKAGES = {  # distribution: module, and what it is for
     "numpy": ("numpy", "arrays"),
     "numba": ("numba", "compiled loops"),
+    "scipy": ("scipy", "filters, modes"),
     "pydantic": ("pydantic", "case files"),
     "rich": ("rich", "progress"),
     "shtab": ("shtab", "completion in shells"),
     "matplotlib": ("matplotlib", "curves"),
     "Pillow": ("PIL", "pictures"),
     "vtk": ("vtkmodules", "pictures"),
-    "pyvista": ("pyvista", "grids"),
+    "pyvista": ("pyvista", "pictures"),
     "imageio-ffmpeg": ("imageio_ffmpeg", "films"),
 }
 OPTIONAL = {
     "meshio": ("meshio", "foreign mesh formats"),
-    "scipy": ("scipy", "modes where SLEPc is missing"),
+    "plotly": ("plotly", "render --html"),
     "slepc4py": ("slepc4py", "modes of large models"),
     "pandas": ("pandas", "tables as data frames"),
 }
@@ -74,25 +77,24 @@ class Finding(NamedTuple):
     remedy: str = ""
 
 
-def inspect_environment(run: Callable[[list[str]], tuple[int, str]] | None = None) -> list[Finding]:
+def inspect_environment(run: Run | None = None) -> list[Finding]:
     """Return what is there and what is missing. Each probe is a separate process, because broken libraries may crash.
 
     Parameters
     ----------
     run : returns status and output of a command; default: runs it
     """
-    run = run or _run
-    bring = remedies()
+    run, bring = run or _run, remedies()
     version = ".".join(map(str, sys.version_info[:3]))
-    found = [Finding("python", "ok", version) if sys.version_info >= (3, 11) else _old(version, bring)]
-    minimum = _minimum_versions()
-    for name, (module, use) in PACKAGES.items():
-        found.append(_package(name, module, use, minimum.get(name.lower(), ""), "missing", bring, run))
-    found += _mpi_and_petsc(bring, run)
-    found.append(_launcher(bring, run))
-    found.append(_drawing(bring, run))
-    found += [_package(name, module, use, "", "optional", bring, run) for name, (module, use) in OPTIONAL.items()]
-    return found
+    old = f"{version} is too old: 3.11 or newer is needed" if sys.version_info < (3, 11) else ""
+    return [
+        _finding("python", old, version, bring["python"]),
+        *_packages(PACKAGES, "missing", bring, run),
+        *_mpi_and_petsc(bring, run),
+        _launcher(bring, run),
+        _drawing(bring, run),
+        *_packages(OPTIONAL, "optional", bring, run),
+    ]
 
 
 def report(found: Iterable[Finding]) -> list[str]:
@@ -109,37 +111,35 @@ def report(found: Iterable[Finding]) -> list[str]:
 def remedies() -> dict[str, str]:
     """Return the commands that bring things here: of conda in its environments, of Debian where apt-get is."""
     pip = f"{os.path.relpath(sys.executable) if sys.prefix != sys.base_prefix else 'python3'} -m pip install "
-    if os.environ.get("CONDA_PREFIX"):
-        conda = "conda install -c conda-forge "
-        return {
-            "pip": conda,
-            "python": conda + '"python>=3.11"',
-            "mpi4py": conda + "mpi4py openmpi",
-            "petsc4py": conda + "petsc4py petsc=*=real*",
-            "h5py": conda + '"h5py=*=mpi*"',
-            "slepc4py": conda + "slepc4py",
-            "drawing": conda + "mesalib",
-        }
-    if shutil.which("apt-get"):
-        apt = "apt-get install --no-install-recommends "
-        return {
-            "pip": pip,
-            "python": "a distribution with Python 3.11 or newer, or conda (docs/installing.md)",
-            "mpi4py": apt + "python3-mpi4py openmpi-bin",
-            "petsc4py": apt + "python3-petsc4py-real, or bash scripts/setup.sh",
-            "h5py": apt + "python3-h5py-mpi",
-            "slepc4py": apt + "python3-slepc4py-real",
-            "drawing": apt + "libosmesa6, or libegl1 libgl1-mesa-dri",
-        }
-    return {
-        "pip": pip,
-        "python": "Python 3.11 or newer, for example by conda (docs/installing.md)",
-        "mpi4py": pip + "mpi4py",
-        "petsc4py": "module load petsc, set PETSC_DIR, or bash scripts/setup.sh --build-petsc",
-        "h5py": "HDF5_MPI=ON CC=mpicc " + pip + "--no-binary=h5py h5py",
-        "slepc4py": pip + "slepc4py",
-        "drawing": "OSMesa or EGL of Mesa, for example by module load mesa",
+    conda = "conda install -c conda-forge "
+    apt = "apt-get install --no-install-recommends "
+    table = {  # in conda, on Debian, elsewhere
+        "pip": (conda, pip, pip),
+        "python": (
+            conda + '"python>=3.11"',
+            "a distribution with Python 3.11 or newer, or conda (docs/installing.md)",
+            "Python 3.11 or newer, for example by conda (docs/installing.md)",
+        ),
+        "mpi4py": (conda + "mpi4py openmpi", apt + "python3-mpi4py openmpi-bin", pip + "mpi4py"),
+        "petsc4py": (
+            conda + "petsc4py petsc=*=real*",
+            apt + "python3-petsc4py-real, or bash scripts/setup.sh",
+            "module load petsc, set PETSC_DIR, or bash scripts/setup.sh --build-petsc",
+        ),
+        "h5py": (
+            conda + '"h5py=*=mpi*"',
+            apt + "python3-h5py-mpi",
+            "HDF5_MPI=ON CC=mpicc " + pip + "--no-binary=h5py h5py",
+        ),
+        "slepc4py": (conda + "slepc4py", apt + "python3-slepc4py-real", pip + "slepc4py"),
+        "drawing": (
+            conda + "mesalib",
+            apt + "libosmesa6, or libegl1 libgl1-mesa-dri",
+            "OSMesa or EGL of Mesa, for example by module load mesa",
+        ),
     }
+    system = 0 if os.environ.get("CONDA_PREFIX") else 1 if shutil.which("apt-get") else 2
+    return {what: commands[system] for what, commands in table.items()}
 
 
 def _run(command: list[str]) -> tuple[int, str]:
@@ -154,112 +154,84 @@ def _python(code: str) -> list[str]:
     return [sys.executable, "-c", code]
 
 
-def _old(version: str, bring: dict[str, str]) -> Finding:
-    return Finding("python", "missing", f"{version} is too old: 3.11 or newer is needed", bring["python"])
+def _finding(name: str, problem: str, text: str, remedy: str, lacking: str = "missing") -> Finding:
+    return Finding(name, lacking, problem, remedy) if problem else Finding(name, "ok", text)
 
 
-def _minimum_versions() -> dict[str, str]:
-    try:
-        required = metadata.requires("pfem_petsc") or []
-    except metadata.PackageNotFoundError:
-        return {}
-    pairs = (re.match(r"([\w.-]+)>=([\d.]+)$", text.split(";")[0].strip()) for text in required)
-    return {pair[1].lower(): pair[2] for pair in pairs if pair}
-
-
-def _older(version: str, minimum: str) -> bool:
+def _too_old(version: str, minimum: str) -> str:
     parts = [[int(part) for part in re.findall(r"\d+", text)[:3]] for text in (version, minimum)]
-    return bool(minimum) and parts[0] < parts[1]
+    return f"{version} is too old: {minimum} or newer is needed" if minimum and parts[0] < parts[1] else ""
 
 
-def _package(
-    name: str,
-    module: str,
-    use: str,
-    minimum: str,
-    lacking: str,
-    bring: dict[str, str],
-    run: Callable[[list[str]], tuple[int, str]],
-) -> Finding:
-    code = f"import {module}; from importlib.metadata import version; print(version({name!r}))"
-    status, output = run(_python(code))
-    remedy = bring.get(name, bring["pip"] + (f'"{name}>={minimum}"' if minimum else name))
-    if status:
-        return Finding(name, lacking, f"cannot be imported: {_last(output)} ({use})", remedy)
-    version = output.strip()
-    if _older(version, minimum):
-        return Finding(name, lacking, f"{version} is too old: {minimum} or newer is needed ({use})", remedy)
-    return Finding(name, "ok", version)
+def _packages(packages: dict[str, tuple[str, str]], lacking: str, bring: dict[str, str], run: Run) -> Iterator[Finding]:
+    required: list[str] = []
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        required = metadata.requires("pfem_petsc") or []
+    pairs = (re.match(r"([\w.-]+)>=([\d.]+)$", text.split(";")[0].strip()) for text in required)
+    minimum = {pair[1].lower(): pair[2] for pair in pairs if pair}
+    for name, (module, use) in packages.items():
+        code = f"import {module}; from importlib.metadata import version; print(version({name!r}))"
+        status, output = run(_python(code))
+        version, least = output.strip(), minimum.get(name.lower(), "") if lacking == "missing" else ""
+        problem = f"cannot be imported: {_last(output)}" if status else _too_old(version, least)
+        remedy = bring.get(name, bring["pip"] + (f'"{name}>={least}"' if least else name))
+        yield _finding(name, problem and f"{problem} ({use})", version, remedy, lacking)
 
 
-def _mpi_and_petsc(bring: dict[str, str], run: Callable[[list[str]], tuple[int, str]]) -> list[Finding]:
+def _mpi_and_petsc(bring: dict[str, str], run: Run) -> Iterator[Finding]:
     status, output = run(_python(_MPI))
-    found = [
-        Finding("mpi4py", "missing", f"cannot be imported: {_last(output)}", bring["mpi4py"])
-        if status
-        else Finding("mpi4py", "ok", output.strip())
-    ]
+    problem = f"cannot be imported: {_last(output)}" if status else ""
+    yield _finding("mpi4py", problem, output.strip(), bring["mpi4py"])
     status, output = run(_python(_PETSC))
     if status:
         old = "numpy.dtype size changed" in output or "compiled using NumPy 1" in output
         remedy = bring["pip"] + '"numpy<2"' if old else bring["petsc4py"]
-        return [*found, Finding("petsc4py", "missing", f"cannot be imported: {_last(output)}", remedy)]
+        yield Finding("petsc4py", "missing", f"cannot be imported: {_last(output)}", remedy)
+        return
     about: dict[str, Any] = json.loads(output.strip().splitlines()[-1])
     text = f"PETSc {about['version']}, {about['scalar']}, {about['index']} indices"
-    if about["scalar"] != "float64":
-        found.append(Finding("petsc4py", "missing", f"{text}: a real, double build is needed", bring["petsc4py"]))
-    elif _older(about["version"], "3.18"):
-        found.append(Finding("petsc4py", "missing", f"{text}: 3.18 or newer is needed", bring["petsc4py"]))
-    else:
-        found.append(Finding("petsc4py", "ok", text))
+    problem = f"{text}: 3.18 or newer is needed" if _too_old(about["version"], "3.18") else ""
+    problem = problem if about["scalar"] == "float64" else f"{text}: a real, double build is needed"
+    yield _finding("petsc4py", problem, text, bring["petsc4py"])
     uses = {"mumps": "direct solver on ranks", "hypre": "-pc_type hypre", "ptscotch": "partitions of mesh files"}
     for name, use in uses.items():
-        if about[name] is None:
-            found.append(Finding(f"petsc: {name}", "optional", f"not reported by this petsc4py ({use})"))
-        elif about[name]:
-            found.append(Finding(f"petsc: {name}", "ok", use))
-        else:
-            found.append(Finding(f"petsc: {name}", "optional", f"not in this PETSc ({use})", bring["petsc4py"]))
-    return found
+        lack = "not reported by this petsc4py" if about[name] is None else "not in this PETSc"
+        remedy = "" if about[name] is None else bring["petsc4py"]
+        yield _finding(f"petsc: {name}", "" if about[name] else f"{lack} ({use})", use, remedy, "optional")
 
 
-def _launcher(bring: dict[str, str], run: Callable[[list[str]], tuple[int, str]]) -> Finding:
+def _launcher(bring: dict[str, str], run: Run) -> Finding:
     """Two ranks: one MPI for all, and a parallel h5py."""
-    name = "2 ranks"
     launcher = shutil.which("mpirun") or shutil.which("mpiexec")
     if launcher is None:
-        return Finding(name, "missing", "there is no mpirun in PATH: runs on one rank work", bring["mpi4py"])
+        return Finding("2 ranks", "missing", "there is no mpirun in PATH: runs on one rank work", bring["mpi4py"])
     status, output = run([launcher, "-n", "2", *_python(_TOGETHER)])
     line = re.search(r"^found (.*)$", output, flags=re.MULTILINE)
-    if (status or line is None) and "run as root" in output:
-        text = "Open MPI refuses to run as root: runs on one rank work"
-        return Finding(name, "missing", text, "export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1")
+    text, remedy = "", bring["h5py"]
     if status or line is None:
-        return Finding(name, "missing", f"mpirun -n 2 fails: {_last(output)}", bring["mpi4py"])
+        text, remedy = f"mpirun -n 2 fails: {_last(output)}", bring["mpi4py"]
+        if "run as root" in output:
+            text = "Open MPI refuses to run as root: runs on one rank work"
+            remedy = "export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1"
+        return Finding("2 ranks", "missing", text, remedy)
     mpi, petsc, parallel, hdf5, file = json.loads(line[1])
     if not mpi == petsc == 2:
         text = f"mpi4py sees {mpi} rank(s) and PETSc {petsc}: these and mpirun belong to different MPI installations"
-        return Finding(name, "missing", text, bring["petsc4py"])
-    if not parallel:
-        remedy = bring["h5py"]
+        remedy = bring["petsc4py"]
+    elif not parallel:
+        text = f"h5py (HDF5 {hdf5}) in {file} is not the parallel build"
         if remedy.startswith("apt-get") and file.startswith(sys.prefix + os.sep) and sys.prefix != sys.base_prefix:
             # a wheel in the environment hides the one of the distribution
             remedy = bring["pip"].replace(" install ", " uninstall --yes ") + f"h5py && {remedy}"
-        return Finding(name, "missing", f"h5py (HDF5 {hdf5}) in {file} is not the parallel build", remedy)
-    return Finding(name, "ok", f"mpirun, mpi4py and PETSc agree; h5py is parallel (HDF5 {hdf5})")
+    return _finding("2 ranks", text, f"mpirun, mpi4py and PETSc agree; h5py is parallel (HDF5 {hdf5})", remedy)
 
 
-def _drawing(bring: dict[str, str], run: Callable[[list[str]], tuple[int, str]]) -> Finding:
-    code = "from pfem_petsc.post.headless import require_rendering as r; r(); import os; "
+def _drawing(bring: dict[str, str], run: Run) -> Finding:
+    code = "from pfem_petsc.post.scene import require_rendering as r; r(); import os; "
     status, output = run(_python(code + "print(os.environ.get('VTK_DEFAULT_OPENGL_WINDOW', 'default'))"))
-    if status:
-        return Finding(
-            "OpenGL",
-            "optional",
-            "windows of pyvista need a display (grid.plot(); render, plot and report draw without)",
-            bring["drawing"],
-        )
-    return Finding("OpenGL", "ok", output.strip().splitlines()[-1].removeprefix("vtk"))
+    problem = "render, report and grid.plot() cannot draw (runs and plot need none)" if status else ""
+    window = output.strip().rpartition("\n")[2].removeprefix("vtk")
+    return _finding("OpenGL", problem, window, bring["drawing"], "optional")
 
 
 def _last(output: str) -> str:

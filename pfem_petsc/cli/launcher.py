@@ -6,20 +6,19 @@ environment of the launcher.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import sys
 import time
 import traceback
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from ..errors import NUMPY_REMEDY, EarlyStop, InputError, PfemError, SimulationFailure, numpy_is_too_new, printable
 
 if TYPE_CHECKING:
     from mpi4py import MPI
-
-__all__ = ["collectively", "launched_rank", "on_first_rank", "refuse"]
 
 RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "SLURM_PROCID")
 
@@ -71,13 +70,12 @@ def on_first_rank(function: Callable[[], int], debug: bool, uses_mpi: bool) -> i
     try:
         status = function()
         sys.stdout.flush()  # errors of writing are reported here, not lost at the end of the process
-        return status
-    except BrokenPipeError:
-        # The reader of the output has exited (``list | head``); the interpreter must not flush into the closed pipe.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    except BrokenPipeError:  # the reader of the output has exited (``list | head``)
+        status = 0
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - whatever it is becomes a message and a status
-        return _print(error, debug)
+        status = _print(error, debug)
+    _let_go_of_closed_streams()
+    return status
 
 
 def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
@@ -100,8 +98,7 @@ def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - whatever it is becomes a message and a status
         if not _all_arrive(failures):
             comm.Abort(_print(error, debug, f"rank {comm.rank}: "))
-        status = _print(error, debug) if comm.rank == 0 else None
-        status = failures.bcast(status, root=0)
+        status = failures.bcast(_print(error, debug) if comm.rank == 0 else None, root=0)
     failures.Free()
     _let_go_of_closed_streams()
     return status
@@ -120,22 +117,20 @@ def _all_arrive(comm: MPI.Comm) -> bool:
 
 def _print(error: BaseException, debug: bool, who: str = "") -> int:
     """Print one message for an error and return its exit status."""
-    status, text = _message(error)
+    status, text = exit_message(error)
     if debug:
         text = "".join(traceback.format_exception(error)) + text
-    try:
-        sys.stdout.flush()
-    except OSError:
-        _to_nowhere(sys.stdout)
-    try:
-        print(f"{who}{printable(text)}", file=sys.stderr, flush=True)
-    except OSError:
-        _to_nowhere(sys.stderr)
+    for stream, shown in ((sys.stdout, ""), (sys.stderr, f"{who}{printable(text)}\n")):
+        with contextlib.suppress(OSError):
+            stream.write(shown)
+            stream.flush()
+    _let_go_of_closed_streams()
     return status
 
 
 def _let_go_of_closed_streams() -> None:
-    """Redirect closed streams: Python flushes both at exit, and exits with status 120 if that fails."""
+    """Redirect streams whose terminal is closed or disk is full: Python flushes both at exit, and a failure there
+    is exit status 120."""
     for stream in (sys.stdout, sys.stderr):
         try:
             number = stream.fileno()
@@ -145,40 +140,31 @@ def _let_go_of_closed_streams() -> None:
             stream.flush()
             os.write(number, b"")  # writing to a closed terminal fails even without data
         except OSError:
-            _to_nowhere(stream)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
 
 
-def _to_nowhere(stream: TextIO) -> None:
-    """Redirect a stream whose terminal is closed or disk is full, into which the interpreter must not flush at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def _message(error: BaseException) -> tuple[int, str]:
-    if isinstance(error, EarlyStop):
-        return error.exit_status, f"stopped: {error}"
-    if isinstance(error, PfemError):
-        return error.exit_status, f"error: {error}"
-    if isinstance(error, KeyboardInterrupt):
-        return SimulationFailure.exit_status, "stopped: interrupted; no checkpoint was written"
-    if isinstance(error, MemoryError):
-        return SimulationFailure.exit_status, f"error: out of memory: {error}; use more machines or a smaller mesh"
-    if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith(__package__.partition(".")[0]):
-        way = "scripts/setup.sh makes an environment that has it: source .venv/bin/activate"
-        return InputError.exit_status, f"error: {error}; {way}"
-    if numpy_is_too_new(error):
-        return InputError.exit_status, f"error: {NUMPY_REMEDY}"
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
-        where = f"{error.filename}: " if error.filename else "standard output, or a file that is being written: "
-        return SimulationFailure.exit_status, f"error: {where}{error.strerror}; make room, or write elsewhere"
-    if type(error).__module__ == "petsc4py.PETSc" and getattr(error, "ierr", 0) in _PETSC_REFUSED:
-        reason = " ".join(str(error).split())
-        return (
-            InputError.exit_status,
-            f"error: PETSc rejects an option: {reason}; check what follows -- (docs/linear_solvers.md)",
-        )
-    detail = " ".join(str(error).split()) or "no message"
-
-    return (
-        SimulationFailure.exit_status,
-        f"internal error: {type(error).__name__}: {detail[:500]}; run with --debug to see where",
-    )
+def exit_message(error: BaseException) -> tuple[int, str]:
+    """Return the exit status of an error and its message, with the remedy."""
+    reason = " ".join(str(error).split())
+    match error:
+        case EarlyStop():
+            return error.exit_status, f"stopped: {error}"
+        case PfemError():
+            return error.exit_status, f"error: {error}"
+        case KeyboardInterrupt():
+            return SimulationFailure.exit_status, "stopped: interrupted; no checkpoint was written"
+        case MemoryError():
+            return SimulationFailure.exit_status, f"error: out of memory: {error}; use more machines or a smaller mesh"
+        case ModuleNotFoundError() if not str(error.name).startswith(__package__.partition(".")[0]):
+            way = "scripts/setup.sh makes an environment that has it: source .venv/bin/activate"
+            return InputError.exit_status, f"error: {error}; {way}"
+        case _ if numpy_is_too_new(error):
+            return InputError.exit_status, f"error: {NUMPY_REMEDY}"
+        case OSError(errno=errno.ENOSPC | errno.EDQUOT | errno.EIO):
+            where = f"{error.filename}: " if error.filename else "standard output, or a file that is being written: "
+            return SimulationFailure.exit_status, f"error: {where}{error.strerror}; make room, or write elsewhere"
+        case _ if type(error).__module__ == "petsc4py.PETSc" and getattr(error, "ierr", 0) in _PETSC_REFUSED:
+            check = "check what follows -- (docs/linear_solvers.md)"
+            return InputError.exit_status, f"error: PETSc rejects an option: {reason}; {check}"
+    detail = f"{type(error).__name__}: {(reason or 'no message')[:500]}"
+    return SimulationFailure.exit_status, f"internal error: {detail}; run with --debug to see where"

@@ -23,8 +23,6 @@ from .parser import PROGRAM, Parser, add_debug
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-__all__ = ["main"]
-
 VERBS = ("run", "list", "check", "mesh", "render", "plot", "report", "info", "sweep", "bench", "completion")
 """Modules of this package: ``EXAMPLE``, ``RANKS``, ``add_arguments(parser)`` and ``run(arguments[, comm])``."""
 
@@ -49,21 +47,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     cut = words.index("--") if "--" in words else len(words)
-    own, petsc_options = words[:cut], words[cut + 1 :]
-    debug = "--debug" in own
+    debug = "--debug" in words[:cut]
     # overflows are reported by their consequences
     warnings.filterwarnings("default" if debug else "ignore", category=RuntimeWarning)
     warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     try:
-        _require_text(words)
-        arguments, verb = _parse(own)
-        if petsc_options and verb.RANKS != "all":
-            raise InputError(f"{arguments.verb} takes no PETSc options: {' '.join(petsc_options)}")
+        arguments, verb = _parse(words[:cut], words[cut + 1 :])
     except InputError as error:
         return refuse(error, debug)
     except SystemExit as done:  # --help and --version
         return int(done.code or 0)
-    arguments.petsc_options = petsc_options
 
     def run_verb(*comm: MPI.Comm) -> int:
         if arguments.verb != "run":
@@ -76,17 +69,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     return on_first_rank(run_verb, debug, uses_mpi=ranks == "one")
 
 
-def _require_text(words: Sequence[str]) -> None:
-    for word in words:
+def _parse(words: Sequence[str], petsc_options: Sequence[str] = ()) -> tuple[argparse.Namespace, ModuleType]:
+    for word in (*words, *petsc_options):
         try:
             word.encode()
         except UnicodeEncodeError as error:
             shown = word.encode(errors="surrogateescape").decode(errors="backslashreplace")
             raise InputError(f"{shown}: has bytes that are not UTF-8: rename the file, or give other text") from error
-
-
-def _parse(words: list[str]) -> tuple[argparse.Namespace, ModuleType]:
-    parser, verbs = make_parser()
     if not words:
         raise InputError(f"CASE or a verb is missing: {', '.join(VERBS)}; see {PROGRAM} --help")
     if words[0] not in (*VERBS, "-h", "--help", "--version"):
@@ -94,16 +83,22 @@ def _parse(words: list[str]) -> tuple[argparse.Namespace, ModuleType]:
         if near and not Path(words[0]).exists() and words[0] not in built_in_cases():
             raise InputError(f"{words[0]}: there is no such verb or case; did you mean '{near[0]}'?")
         words = ["run", *words]
+    parser, verbs = make_parser()
     # One rank prints help.
     with contextlib.redirect_stdout(io.StringIO()) if launched_rank() else contextlib.nullcontext():
         arguments, unknown = parser.parse_known_args(words)
+    verb = verbs[arguments.verb]
     if unknown:
         # the common parser would refer to its own help
         raise InputError(f"unrecognized arguments: {' '.join(unknown)}; see {PROGRAM} {arguments.verb} --help")
-    return arguments, verbs[arguments.verb]
+    if petsc_options and verb.RANKS != "all":
+        raise InputError(f"{arguments.verb} takes no PETSc options: {' '.join(petsc_options)}")
+    arguments.petsc_options = list(petsc_options)
+    return arguments, verb
 
 
 def make_parser() -> tuple[Parser, dict[str, ModuleType]]:
+    """Return the parser of all verbs, and their modules by name."""
     from .. import __version__
 
     parser = Parser(

@@ -1,18 +1,24 @@
-"""The parser of the command line, and options that several verbs share."""
+"""The words of the command line: parser, options that several verbs share, and those after ``--`` for PETSc."""
 
 from __future__ import annotations
 
 import argparse
+import difflib
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
 from ..errors import InputError
 
-__all__ = ["Parser", "add_case", "add_debug", "add_result", "seconds", "surviving"]
-
 PROGRAM = "python -m pfem_petsc"
+
+PREFIXES = ("pfem_contact_", "pfem_assembled_", "pfem_coarse_", "pfem_mass_", "pfem_")
+"""Prefixes of the program's solvers, described in docs/linear_solvers.md."""
+
+_SOLVER = ("snes_", "ksp_", "pc_", "mg_", "sub_", "mat_mumps_", "esteig_", "linesearch_")
+_FILES = ("-options_file", "-options_file_yaml")
 
 
 class Parser(argparse.ArgumentParser):
@@ -109,3 +115,49 @@ def seconds(text: str) -> float:
     if not 1 <= len(parts) <= 3 or min(parts) < 0.0 or not 0.0 < total < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} is not a duration: give seconds, or hours:minutes:seconds")
     return total
+
+
+def start_petsc(options: Sequence[str], rank: int) -> None:
+    """Start PETSc with options; rank 0 warns about those without effect.
+
+    Raises
+    ------
+    InputError
+        If an options file is missing, or PETSc rejects an option.
+    """
+    import petsc4py
+
+    for word, file in zip(options, [*options[1:], ""], strict=False):
+        if word in _FILES and not Path(file).is_file():
+            raise InputError(f"{word} {file}: there is no such file; name a file of PETSc options after {word}")
+    try:
+        petsc4py.init([PROGRAM, *options])
+        from petsc4py import PETSc  # noqa: F401 - PETSc is started here
+    except Exception as error:
+        if type(error).__name__ != "Error":  # PETSc.Error cannot be imported before PETSc is started
+            raise
+        raise InputError(f"PETSc does not start with the options {' '.join(options)}: {error}") from error
+    if rank == 0:
+        for line in without_effect(options):
+            print(f"warning: {line}", file=sys.stderr, flush=True)
+
+
+def without_effect(options: Sequence[str]) -> list[str]:
+    """Return one line for each solver option that none of the program's solvers reads."""
+    lines = []
+    for word in options:
+        name = word.lstrip("-")
+        if not re.match(r"--?[A-Za-z]", word) or not (name.startswith("pfem_") or name.startswith(_SOLVER)):
+            continue
+        prefix = next((p for p in PREFIXES if name.startswith(p)), "")
+        rest = name.removeprefix(prefix)
+        if prefix and rest.startswith(_SOLVER):
+            continue
+        at = min((found.start() for found in re.finditer("|".join(_SOLVER), rest)), default=None)
+        wanted = difflib.get_close_matches(rest[:at] if at else "", PREFIXES, n=1, cutoff=0.4) if prefix else []
+        near = f"; did you mean -{(wanted or ['pfem_'])[0]}{rest[at:]}?" if at is not None else ""
+        lines.append(
+            f"the PETSc option {word} has no effect: options of the solvers begin with one of "
+            f"{', '.join('-' + p for p in reversed(PREFIXES))} (docs/linear_solvers.md){near}"
+        )
+    return lines

@@ -144,7 +144,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     options: dict[str, Any] = {name: getattr(arguments, name) for name in SHARED}
     options |= {"marks": arguments.mark, "comm": comm, "clim": tuple(arguments.clim) if arguments.clim else None}
     if arguments.path is not None:
-        from ..post.shots import camera_path
+        from ..post.camera import camera_path
 
         options["path"] = camera_path(arguments.path)
     paths = [_checked_once(result, comm) for result in arguments.result]
@@ -186,18 +186,18 @@ def _interactive(paths: list[Path], arguments: argparse.Namespace) -> int:
     if isinstance(frame, list):
         raise InputError("render: --frames is the number of one snapshot with --html and --window, as --frames 12")
     if arguments.html:
-        from ..post.web_page import render_html
+        from ..post.interactive import render_html
 
         print(render_html(paths[0], arguments.output, frame=frame, **options))
         return 0
-    from ..post.window import show
+    from ..post.interactive import show
 
     show(paths[0], frame=frame, **options)
     return 0
 
 
 def _draw_modes(paths: list[Path], arguments: argparse.Namespace, options: dict[str, Any]) -> list[Path]:
-    from ..post.modes import render_modes
+    from ..post.render import render_modes
 
     if len(paths) > 1:
         raise InputError("render: --modes draws one result; give one RESULT")

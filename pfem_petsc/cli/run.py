@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EarlyStop, SimulationFailure
-from .parser import PROGRAM, add_case, add_plugins, seconds
-from .petsc_options import start_petsc
+from .parser import PROGRAM, add_case, add_plugins, seconds, start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -103,10 +102,8 @@ def _load(arguments: argparse.Namespace) -> Case:
 
 def _command(arguments: argparse.Namespace, case: Case, ranks: int) -> str:
     """Return the shell command that continues this run."""
-    launcher = []
-    if ranks > 1:
-        launcher = ["srun" if "SLURM_STEP_NUM_TASKS" in os.environ else "mpirun", "-n", str(ranks)]
-    words = [*launcher, *PROGRAM.split(), str(arguments.case)]
+    launcher = ["srun" if "SLURM_STEP_NUM_TASKS" in os.environ else "mpirun", "-n", str(ranks)]
+    words = [*(launcher if ranks > 1 else ()), *PROGRAM.split(), str(arguments.case)]
     words += ["-o", str(arguments.output)] if arguments.output is not None else []
     words += ["--quiet"] if arguments.quiet else []
     words += ["--wall-time", f"{arguments.wall_time:g}"] if arguments.wall_time is not None else []

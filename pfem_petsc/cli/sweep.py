@@ -71,32 +71,27 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _values(text: str) -> tuple[str, list[Any]]:
     """Return key and values of ``KEY=VALUE,VALUE``; each value is TOML, or else plain text."""
-    key, equals, values = text.partition("=")
-    if not equals or not values.strip():
+    key, _, values = text.partition("=")
+    found = _toml(f"[{values}]")
+    if not values.strip() or found == []:
         raise InputError(f"--vary {text}: expected KEY=VALUES, like time.step=1e-5,2e-5")
-    try:
-        found = tomllib.loads(f"values = [{values}]")
-    except (ValueError, RecursionError):
-        return key.strip(), [_value(part) for part in _parts(values)]
-    if len(found) != 1:
-        raise InputError(f"--vary {text}: expected KEY=VALUES, like time.step=1e-5,2e-5")
-    return key.strip(), found["values"]
-
-
-def _parts(values: str) -> list[str]:
-    """Divide at the commas that are not within a list, a table or a text in quotes."""
+    if found is not None:
+        return key.strip(), found
     parts, begun = [], ""
     for piece in values.split(","):
         begun = f"{begun},{piece}" if begun else piece
+        # a comma within a list, a table or a text in quotes divides no values
         if all(begun.count(a) == begun.count(b) for a, b in ("[]", "{}")) and begun.count('"') % 2 == 0:
             parts.append(begun.strip())
             begun = ""
-    return [*parts, begun.strip()] if begun else parts
+    parts += [begun.strip()] if begun else []
+    return key.strip(), [part if (value := _toml(part)) is None else value for part in parts]
 
 
-def _value(text: str) -> Any:
+def _toml(text: str) -> Any:
+    """Return the value of a text, None if it is none."""
     try:
-        found = tomllib.loads(f"value = {text}")
-    except (ValueError, RecursionError):
-        return text
-    return found["value"] if len(found) == 1 else text
+        (value,) = tomllib.loads(f"value = {text}").values()
+    except (ValueError, RecursionError):  # also that of several keys
+        return None
+    return value

@@ -15,11 +15,11 @@ from ..errors import NotConverged
 from ..integrators.base import Balance, State
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .contact import Candidates, expected_candidates
-from .explicit import LocalSolution, jam, solve_locally
+from .explicit import LocalSolution, Rubbing, jam, solve_locally
 from .forces import WallForces, held_by_supports
 from .frames import MIN_VOLUME, NodalFrames, Sliding
-from .links import LinkCoordinates, Transform
 from .projection import project
+from .transform import RowCoordinates, Transform
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -327,10 +327,11 @@ class StepFriction:
         self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray
     ) -> LocalSolution:
         """Solve the local problems of some nodes of the frames."""
-        nodes = frames.nodes[at]
-        planes = frames.normals[at], frames.offsets[at]
-        start, stiffness = self.state.position[nodes], self._stiffness[nodes]
-        return solve_locally(self.contact, nodes, planes, x, reaction, start, self._way, stiffness, slipping)
+        nodes, contact = frames.nodes[at], self.contact
+        planes = contact.fixed[nodes], frames.normals[at], frames.offsets[at]
+        rough = contact.friction, contact.static_friction
+        rubbing = Rubbing(self.state.position[nodes], self._way, *planes, *rough, self._stiffness[nodes])
+        return solve_locally(rubbing, x, reaction, slipping, contact.size)
 
     def _may_stick(
         self, nodes: np.ndarray, slipping: np.ndarray, x: np.ndarray, normal_forces: np.ndarray, normals: np.ndarray
@@ -438,7 +439,7 @@ class Trial:
     candidates: Candidates
     frames: NodalFrames
     tied: tuple[np.ndarray, np.ndarray, np.ndarray]
-    links: tuple[LinkCoordinates, ...]
+    links: tuple[RowCoordinates, ...]
     transform: Transform
 
 
@@ -456,7 +457,7 @@ class Outcome:
 
     settled: bool
     candidates: Candidates
-    links: tuple[LinkCoordinates, ...]
+    links: tuple[RowCoordinates, ...]
     trial: Trial
     normal_forces: np.ndarray
     pull: np.ndarray
@@ -485,7 +486,7 @@ class ActiveSet:
         state: State,
         balance: Balance,
         held: np.ndarray,
-        links: Sequence[LinkCoordinates] = (),
+        links: Sequence[RowCoordinates] = (),
         remedy: str = "reduce time.step",
     ) -> None:
         self.contact, self._remedy = model.contact, remedy
@@ -501,7 +502,7 @@ class ActiveSet:
         self._all_links = tuple(links)
         self.links = tuple(link for link in links if link.reached(state, move, slack))
 
-    def place(self, candidates: Candidates, links: Sequence[LinkCoordinates], x: np.ndarray) -> Trial:
+    def place(self, candidates: Candidates, links: Sequence[RowCoordinates], x: np.ndarray) -> Trial:
         """Build the coordinates of candidates and links at positions (owned, 3). Collective.
 
         Raises
@@ -520,7 +521,7 @@ class ActiveSet:
         met = frames if candidates.anywhere else None
         for link in links:
             link.place(met, self.balance, self.state, x)
-        return Trial(candidates, frames, tied, tuple(links), Transform(self.model, met, links))
+        return Trial(candidates, frames, tied, tuple(links), Transform(self.model.mesh, met, links))
 
     def feasible(self, trial: Trial, u: np.ndarray, stiffness: np.ndarray | None = None) -> np.ndarray:
         """Return the increment (owned, 3) nearest to a guess that satisfies the frames' planes and links. Collective.
@@ -634,7 +635,7 @@ class ActiveSet:
 
     def _check_links(
         self, trial: Trial, bounds: Bounds, w: np.ndarray, x: np.ndarray, g: np.ndarray, noise: float, slack: float
-    ) -> tuple[bool, tuple[LinkCoordinates, ...], np.ndarray]:
+    ) -> tuple[bool, tuple[RowCoordinates, ...], np.ndarray]:
         """Return whether links are satisfied at positions (owned, 3), the links of the next solve, and the part of the
         residual force that walls must balance. Collective."""
         kept, met, at = True, list(trial.links), trial.frames.nodes
@@ -648,8 +649,8 @@ class ActiveSet:
                     met.append(link)
                 continue
             link.solve_forces(w, turned, bounds.arrays[0], noise)
-            link.push(g, -1.0)
-            kept &= link.kept(x, slack)
+            link.constraints.add_forces(g, -1.0)
+            kept &= link.satisfied(x, slack)
         self._link_iterations += not kept
         if self._link_iterations >= _ITERATIONS:
             raise NotConverged(f"constraints and positions did not agree in {_ITERATIONS} solves; {self._remedy}")
@@ -661,8 +662,8 @@ class ActiveSet:
         total = np.zeros_like(u)
         for link in self._all_links:
             if link not in outcome.links:
-                link.release()
-            link.push(total)
+                link.constraints.release()
+            link.constraints.add_forces(total)
         held = np.zeros(len(u), dtype=bool)
         if not outcome.trial.candidates.anywhere:
             return total, self.contact.nothing, held

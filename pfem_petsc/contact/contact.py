@@ -18,8 +18,8 @@ from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED, resolvable
 from .explicit import ExplicitContact
 from .forces import ContactLog, WallForces
-from .frames import MIN_VOLUME, NodalFrames, build_frames
-from .tied import FreshTies, NoTies, Ties
+from .frames import MIN_VOLUME, NodalFrames, Planes, build_frames
+from .tied import FreshTies, Ties
 from .wall_motion import WallMotion
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class Contact:
         self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)
         self.rebounds = False
         self.has_friction = bool(self.static_friction.any())
-        self.ties = Ties(self, walls) if any(wall.tied for wall in walls) else NoTies(self, walls)
+        self.ties = Ties(self, walls)
         self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
         self.partial = any(wall.partial for wall in self.walls)
         self.normals = np.zeros((len(walls), 3))
@@ -292,9 +292,9 @@ class Contact:
             self.log.book(walls, h, self.mesh.comm)
         return self.ties.take(walls.nodes, walls.touching, walls.places, time)
 
-    def calm(self, fresh: FreshTies, v: np.ndarray, time: float, h: float) -> None:
-        """See :meth:`~pfem_petsc.contact.tied.Ties.calm`; velocities (owned, 3), and the result of :meth:`record`."""
-        self.ties.calm(*fresh, v, self.motion.rates(time), h)
+    def damp_velocity(self, fresh: FreshTies, v: np.ndarray, time: float, h: float) -> None:
+        """See :meth:`~pfem_petsc.contact.tied.Ties.damp_velocity`; velocities (owned, 3), result of :meth:`record`."""
+        self.ties.damp_velocity(*fresh, v, self.motion.rates(time), h)
 
     def infeasible_message(self, node: int, offsets: np.ndarray) -> str:
         """Return the message about a node (owned index) whose planes are infeasible together."""
@@ -328,7 +328,7 @@ class Contact:
         if rank is None:
             rank = np.einsum("iwk,ik->iw", normals, at) - offsets
         tolerance = ON_BOUND * self.size
-        frames = build_frames(nodes, self.fixed[nodes], normals, offsets, rank, tolerance, at, least)
+        frames = build_frames(nodes, Planes(self.fixed[nodes], normals, offsets, rank, at), tolerance, least)
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction

@@ -20,11 +20,40 @@ if TYPE_CHECKING:
     from .contact import Contact
 
 
-@borrowing
-def find_beyond(first, free, normals, offsets, all_nodes, members, found):
-    """Write the nodes, from node ``first`` on, whose positions ``free`` (3 m,) lie beyond a plane to ``found``; return
-    their number. Other arguments: see :func:`press_planes`.
+class FlatWalls(NamedTuple):
+    """Planes n . x >= d without further features, and the nodes (n,) of a rank.
+
+    Attributes
+    ----------
+    fixed : (n, 3) bool, components that supports prescribe
+    normals, offsets : (w, 3), (w,) [m]
+    all_nodes : (w,) bool, whether a plane applies to all nodes; members : (n, w) bool, to which nodes otherwise
+    tolerance : a plane violated by at most this counts as satisfied [m]
+    room : (n,) int64, workspace
     """
+
+    fixed: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    all_nodes: np.ndarray
+    members: np.ndarray
+    tolerance: float
+    room: np.ndarray
+
+
+class WallSums(NamedTuple):
+    """Of each wall ``force`` (w, 3) [N], number of ``contacts`` (w,), and ``moment`` about the origin (w, 3) [N m]."""
+
+    force: np.ndarray
+    contacts: np.ndarray
+    moment: np.ndarray
+
+
+@borrowing
+def find_beyond(first, free, walls, found):
+    """Write the nodes, from node ``first`` on, whose positions ``free`` (3 m,) lie beyond planes of :class:`FlatWalls`
+    to ``found``; return their number."""
+    normals, offsets, all_nodes, members = walls.normals, walls.offsets, walls.all_nodes, walls.members
     n = len(free) // 3
     beyond = 0
     for k in range(len(offsets)):  # without branches
@@ -48,16 +77,17 @@ def find_beyond(first, free, normals, offsets, all_nodes, members, found):
 
 
 @kernel
-def press_nodes(
-    nodes, places, fixed, normals, offsets, all_nodes, members, tolerance, stiffness, force, contacts, moment
-):
-    """Project ``nodes`` (m,) at ``places`` (m, 3) [m], in place, and add the forces of the planes to their sums:
-    ``force`` (w, 3) [N], number of ``contacts`` (w,) and ``moment`` about the origin (w, 3) [N m].
+def press_nodes(nodes, places, walls, stiffness, sums):
+    """Project ``nodes`` (m,) at ``places`` (m, 3) [m], in place, onto planes of :class:`FlatWalls`, and add the forces
+    of the planes to ``sums``, see :class:`WallSums`.
 
-    ``stiffness`` (m,) force for a displacement of each of them [N/m]; other arguments: see :func:`press_planes`.
-    Returns the index of the first infeasible node among them, or -1; their offsets (m, w), -inf where a plane does not
-    apply; the total force (m, 3) [N]; and planes that they touch (m, w).
+    ``stiffness`` (m,) force for a displacement of each of them [N/m]. Returns the index of the first infeasible node
+    among them, or -1; their offsets (m, w), -inf where a plane does not apply; the total force (m, 3) [N]; and planes
+    that they touch (m, w).
     """
+    fixed, normals, offsets = walls.fixed, walls.normals, walls.offsets
+    all_nodes, members, tolerance = walls.all_nodes, walls.members, walls.tolerance
+    force, contacts, moment = sums.force, sums.contacts, sums.moment
     w, m = len(offsets), len(nodes)
     held = np.empty((m, 3), dtype=np.bool_)
     all_normals = np.empty((m, w, 3))
@@ -96,27 +126,22 @@ def press_nodes(
 
 
 @kernel
-def press_planes(predictor, u, fixed, normals, offsets, all_nodes, members, tolerance, stiffness, room):
-    """Project nodes that lie beyond planes onto them, and sum the forces of the planes.
+def press_planes(predictor, u, walls, stiffness, sums):
+    """Project nodes that lie beyond planes onto them, and add the forces of the planes to ``sums``, a WallSums.
 
     Parameters
     ----------
     predictor, u : (n, 3); the free positions are predictor + u [m]; ``u`` is corrected in place
-    fixed : (n, 3) bool, components that supports prescribe
-    normals, offsets : (w, 3), (w,) planes n . x >= d [m]
-    all_nodes : (w,) bool, whether a plane applies to all nodes; members : (n, w) bool, to which nodes otherwise
-    tolerance : [m]
+    walls : FlatWalls
     stiffness : (n,) force for a displacement of the node [N/m]
-    room : (n,) int64, workspace
 
     Returns
     -------
     tuple
         Nodes (m,); index of the first infeasible node among them, or -1; their offsets (m, w), -inf where a plane does
-        not apply; total force (m, 3) [N]; planes that they touch (m, w); positions (m, 3) [m]; and per plane the force
-        (w, 3) [N], number of contacts (w,) and moment about the origin (w, 3) [N m].
+        not apply; total force (m, 3) [N]; planes that they touch (m, w); and positions (m, 3) [m].
     """
-    n, w = len(u), len(offsets)
+    n, room = len(u), walls.room
     free = np.empty(3 * NODE_BLOCK)
     m = 0
     for first in range(0, n, NODE_BLOCK):
@@ -124,7 +149,7 @@ def press_planes(predictor, u, fixed, normals, offsets, all_nodes, members, tole
         where, more = predictor[first:last].reshape(-1), u[first:last].reshape(-1)
         for j in range(len(where)):
             free[j] = where[j] + more[j]
-        m += find_beyond(first, free[: len(where)], normals, offsets, all_nodes, members, room[m:])
+        m += find_beyond(first, free[: len(where)], walls, room[m:])
     nodes = room[:m].copy()
     places, own = np.empty((m, 3)), np.empty(m)
     for j in range(m):
@@ -132,14 +157,11 @@ def press_planes(predictor, u, fixed, normals, offsets, all_nodes, members, tole
         for c in range(3):
             places[j, c] = predictor[nodes[j], c] + u[nodes[j], c]
     start = places.copy()
-    force, contacts, moment = np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3))
-    infeasible, all_offsets, total, touching = press_nodes(
-        nodes, places, fixed, normals, offsets, all_nodes, members, tolerance, own, force, contacts, moment
-    )
+    infeasible, all_offsets, total, touching = press_nodes(nodes, places, walls, own, sums)
     for j in range(m):
         for c in range(3):
             u[nodes[j], c] += places[j, c] - start[j, c]
-    return nodes, infeasible, all_offsets, total, touching, places, force, contacts, moment
+    return nodes, infeasible, all_offsets, total, touching, places
 
 
 def jam(contact: Contact, node: int, normals: np.ndarray) -> str:
@@ -200,8 +222,41 @@ _SLIDES = 1e-13  # of the position: slips beyond are no rounding
 _OVERSHOOT = 0.9  # of the drag over the normal force, from which on sweeps go a part of the way
 
 
+class Rubbing(NamedTuple):
+    """Nodes (m,) at walls (w,) with friction in a step.
+
+    Attributes
+    ----------
+    before, way : (m, 3), (w, 3) positions of the nodes at its start, and displacements of the walls [m]
+    fixed : (m, 3) bool, components that supports prescribe
+    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; -inf where a wall does not apply
+    dynamic, static : (w,) coefficients of friction
+    stiffness : (m,) force for a displacement of a node [N/m]
+    """
+
+    before: np.ndarray
+    way: np.ndarray
+    fixed: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    dynamic: np.ndarray
+    static: np.ndarray
+    stiffness: np.ndarray
+
+    def of(self, some: np.ndarray, static: np.ndarray) -> Rubbing:
+        """Return some of the nodes (k,), with other static coefficients."""
+        nodes = {name: getattr(self, name)[some] for name in ("before", "fixed", "normals", "offsets", "stiffness")}
+        return self._replace(static=static, **nodes)
+
+    def apply(self, some: np.ndarray, static: np.ndarray, x: np.ndarray, normal: np.ndarray, drag: np.ndarray) -> None:
+        """See :func:`add_friction`, for some of the nodes (k,)."""
+        part = x[some], normal[some], drag[some]
+        add_friction(self.of(some, static), *part)
+        x[some], normal[some], drag[some] = part
+
+
 @inlined
-def slides_along_guide(i, x, before, way, fixed, normals, dynamic, normal_forces, drag):
+def slides_along_guide(i, rubbing, x, normal_forces, drag):
     """Forces on a node that supports leave one component, pressed by one wall with friction: in closed form.
 
     Where it is, and so its slip s, is decided by the wall alone. Along the free component f, with lambda_0 the normal
@@ -213,6 +268,7 @@ def slides_along_guide(i, x, before, way, fixed, normals, dynamic, normal_forces
     bool
         Whether it is such a node, slides, and a normal force does it; otherwise nothing has changed.
     """
+    before, way, fixed, normals, _, dynamic, _, _ = rubbing
     free = -1
     for c in range(3):
         if not fixed[i, c]:
@@ -253,18 +309,13 @@ def slides_along_guide(i, x, before, way, fixed, normals, dynamic, normal_forces
 
 
 @kernel
-def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiffness, normal_forces, drag):
+def add_friction(rubbing, x, normal_forces, drag):
     """Apply friction forces to the nodes in contact with walls that have friction.
 
     Parameters
     ----------
+    rubbing : Rubbing
     x : (m, 3) positions under the normal forces alone, changed in place [m]
-    before : (m, 3) positions at the start of the step [m]
-    way : (w, 3) displacements of the walls in the step [m]
-    fixed : (m, 3) bool, components that supports prescribe
-    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; -inf where a wall does not apply
-    dynamic, static : (w,) coefficients of friction
-    stiffness : (m,) force for a displacement of the node [N/m]
     normal_forces : (m, w) normal forces [N], changed in place
     drag : (m, w, 3) friction forces, output [N]
 
@@ -273,17 +324,18 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
     int
         First node whose sweeps did not converge, or -1.
     """
+    before, way, fixed, normals, offsets, dynamic, static, stiffness = rubbing
     m, w = offsets.shape
     trial = np.zeros(3)
     unsettled = -1
     for i in range(m):
-        rubbing = False
+        pressed = False
         for k in range(w):
             for c in range(3):
                 drag[i, k, c] = 0.0
             if normal_forces[i, k] > 0.0:
-                rubbing = rubbing or static[k] > 0.0
-        if not rubbing or slides_along_guide(i, x, before, way, fixed, normals, dynamic, normal_forces, drag):
+                pressed = pressed or static[k] > 0.0
+        if not pressed or slides_along_guide(i, rubbing, x, normal_forces, drag):
             continue
         soft = 1.0 / stiffness[i]
         reach = stiffness[i] * (
@@ -394,7 +446,7 @@ class ExplicitContact:
     ) -> tuple[np.ndarray, np.ndarray, WallForces]:
         """See :meth:`~pfem_petsc.contact.contact.Contact.explicit`."""
         contact, self._part = self.contact, part
-        if contact.motion.free is not None:
+        if contact.motion.bodies.any:
             self.push_walls(predictor + u, stiffness, time, tolerance)
         if self.plain:
             return self._press_planes(predictor, u, stiffness, time, tolerance)
@@ -405,20 +457,11 @@ class ExplicitContact:
     def _press_planes(
         self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
     ) -> tuple:
-        contact = self.contact
-        offsets = contact.plane_offsets(time)
-        nodes, infeasible, offsets, force, touching, places, *sums = press_planes(
-            predictor,
-            u,
-            contact.fixed,
-            contact.normals,
-            offsets,
-            contact.all_nodes,
-            contact.members,
-            tolerance,
-            stiffness,
-            self._room,
-        )
+        contact, w = self.contact, len(self.contact.walls)
+        planes = contact.normals, contact.plane_offsets(time), contact.all_nodes, contact.members
+        walls = FlatWalls(contact.fixed, *planes, tolerance, self._room)
+        sums = WallSums(np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3)))
+        nodes, infeasible, offsets, force, touching, places = press_planes(predictor, u, walls, stiffness, sums)
         if infeasible >= 0:
             raise SimulationFailure(contact.infeasible_message(nodes[infeasible], offsets[infeasible]))
         if len(nodes) == 0:
@@ -427,7 +470,7 @@ class ExplicitContact:
 
     def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
         """Find the final positions of walls with mass in an explicit step. Collective."""
-        free = self.contact.motion.free
+        free = self.contact.motion.bodies
         failure: SimulationFailure | None = None
 
         def forces() -> tuple[np.ndarray, np.ndarray]:
@@ -601,9 +644,9 @@ class ExplicitContact:
         squares, arrivals = (state.memory.setdefault(name, np.zeros(shape)) for name in ("rebound", "arrival"))
         way = displacements - self.contact.motion.displacements(state.time)
         unpushed = way.copy()
-        if self.contact.motion.free is not None:  # use the motion without the recoil of the wall
-            at = self.contact.motion.free.at
-            unpushed[at] = self.contact.motion.free.unpushed() - self.contact.motion.free.state.x
+        bodies = self.contact.motion.bodies
+        if bodies.any:  # use the motion without the recoil of the wall
+            unpushed[bodies.at] = bodies.unpushed() - bodies.state.x
         start = state.position[nodes]
         approach = -np.einsum("mwi,mwi->mw", normals, (free - start)[:, None, :] - unpushed)
         arrival = -np.einsum("mwi,mwi->mw", normals, (moved - start)[:, None, :] - way)
@@ -635,19 +678,9 @@ class ExplicitContact:
         tolerance = PROJECTED * self.contact.size
         for _ in range(_CURVED_ROUNDS):
             at, normal_forces, drag = moved.copy(), strength.copy(), np.zeros(normals.shape)
-            unsettled = add_friction(
-                at,
-                before,
-                way,
-                fixed,
-                normals,
-                offsets,
-                self.contact.friction,
-                self.contact.static_friction,
-                stiffness,
-                normal_forces,
-                drag,
-            )
+            rough = contact.friction, contact.static_friction
+            rubbing = Rubbing(before, way, fixed, normals, offsets, *rough, stiffness)
+            unsettled = add_friction(rubbing, at, normal_forces, drag)
             if unsettled >= 0:
                 raise SimulationFailure(
                     jam(contact, nodes[unsettled], normals[unsettled])
@@ -689,49 +722,24 @@ class LocalSolution(NamedTuple):
 
 
 def solve_locally(
-    contact: Contact,
-    nodes: np.ndarray,
-    planes: tuple[np.ndarray, np.ndarray],
-    x: np.ndarray,
-    reaction: np.ndarray,
-    start: np.ndarray,
-    wall_motion: np.ndarray,
-    stiffness: np.ndarray,
-    slipping: np.ndarray,
+    rubbing: Rubbing, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray, size: float
 ) -> LocalSolution:
-    """Solve the local problems of nodes (k,) at tangent planes, normals (k, w, 3) and offsets (k, w) [m].
+    """Solve the local problems of nodes (k,) at tangent planes.
 
     Slipping nodes use the dynamic coefficient only; whether they stick is determined by a trial.
 
     Parameters
     ----------
+    rubbing : Rubbing
     x, reaction : (k, 3) positions [m] and forces by walls [N]
-    start : (k, 3) positions at the start of the step [m]
-    wall_motion : (w, 3) displacements of the walls in the step [m]
-    stiffness : (k,) [N/m]
     slipping : (k,) bool
+    size : length that tolerances are relative to [m]
     """
-    normals, offsets = planes
-    fixed = contact.fixed[nodes]
+    fixed, normals, offsets, stiffness = rubbing.fixed, rubbing.normals, rubbing.offsets, rubbing.stiffness
     moved = x - np.where(fixed, 0.0, reaction) / stiffness[:, None]
     normal_forces, drag = np.zeros(offsets.shape), np.zeros(normals.shape)
-    project(moved, fixed, normals, offsets, PROJECTED * contact.size, normal_forces)
+    project(moved, fixed, normals, offsets, PROJECTED * size, normal_forces)
     normal_forces *= stiffness[:, None]
-    for group, static in ((slipping, contact.friction), (~slipping, contact.static_friction)):
-        part = np.flatnonzero(group)
-        place, press, pull = moved[part], normal_forces[part], drag[part]
-        add_friction(
-            place,
-            start[part],
-            wall_motion,
-            fixed[part],
-            normals[part],
-            offsets[part],
-            contact.friction,
-            static,
-            stiffness[part],
-            press,
-            pull,
-        )
-        moved[part], normal_forces[part], drag[part] = place, press, pull
+    for group, static in ((slipping, rubbing.dynamic), (~slipping, rubbing.static)):
+        rubbing.apply(np.flatnonzero(group), static, moved, normal_forces, drag)
     return LocalSolution(moved, normal_forces, drag, stiffness)

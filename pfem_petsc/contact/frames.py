@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -134,50 +135,52 @@ class NodalFrames:
         self.upper[at] = np.where(which, values, self.upper[at])
 
 
-def build_frames(
-    nodes: np.ndarray,
-    fixed: np.ndarray,
-    normals: np.ndarray,
-    offsets: np.ndarray,
-    rank: np.ndarray,
-    tolerance: float = 0.0,
-    places: np.ndarray | None = None,
-    least: float = MIN_VOLUME,
-) -> NodalFrames:
-    """Build frames of nodes from their planes, lowest rank first.
+class Planes(NamedTuple):
+    """Planes of nodes (m,) near walls (w,).
+
+    Attributes
+    ----------
+    fixed : (m, 3) bool, prescribed components: their axes are rows of B
+    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; offset -inf where a wall does not apply
+    rank : (m, w) order in which planes are taken, usually the distance [m]
+    places : (m, 3) expected positions of the nodes [m]
+    """
+
+    fixed: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    rank: np.ndarray
+    places: np.ndarray
+
+
+class _Output(NamedTuple):
+    """Arrays of :class:`NodalFrames` to be filled."""
+
+    basis: np.ndarray
+    inverse: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    rows: np.ndarray
+    signs: np.ndarray
+    shared: np.ndarray
+    bounds: np.ndarray
+
+
+def build_frames(nodes: np.ndarray, planes: Planes, tolerance: float = 0.0, least: float = MIN_VOLUME) -> NodalFrames:
+    """Build frames of nodes (m,) from their planes, lowest rank first.
 
     Parameters
     ----------
     nodes : (m,) owned local indices
-    fixed : (m, 3) bool, prescribed components: their axes are rows of B
-    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; offset -inf where a wall does not apply
-    rank : (m, w) order in which planes are taken, usually the distance [m]
+    planes : Planes
     tolerance : opposite bounds that overlap by at most this are replaced by their mean [m]
-    places : (m, 3) expected positions of the nodes [m]; default: the origin
     least : volume of the rows below which a plane is deferred
     """
-    frames = NodalFrames(nodes, offsets.shape[1])
-    if places is not None:
-        frames.places = places
-    frames.oblique, frames.contradiction = _build(
-        fixed,
-        normals,
-        offsets,
-        rank,
-        tolerance,
-        frames.places,
-        least,
-        frames.basis,
-        frames.inverse,
-        frames.lower,
-        frames.upper,
-        frames.rows,
-        frames.signs,
-        frames.shared,
-        frames.bounds,
-    )
-    frames.normals = normals
-    frames.offsets = np.where(frames.rows >= 0, offsets, -np.inf)
+    frames = NodalFrames(nodes, planes.offsets.shape[1])
+    frames.places, frames.normals = planes.places, planes.normals
+    output = _Output(*(getattr(frames, name) for name in _Output._fields))
+    frames.oblique, frames.contradiction = _build(planes, tolerance, least, output)
+    frames.offsets = np.where(frames.rows >= 0, planes.offsets, -np.inf)
     return frames
 
 
@@ -197,23 +200,10 @@ def _rest(vector, spanned, n, out):
 
 
 @kernel
-def _build(
-    fixed,
-    normals,
-    offsets,
-    rank,
-    tolerance,
-    places,
-    least,
-    basis,
-    inverse,
-    lower,
-    upper,
-    rows,
-    signs,
-    shares,
-    bounds,
-):
+def _build(planes, tolerance, least, output):
+    """Fill an _Output; return whether any basis is not the identity, and a node with infeasible bounds, else -1."""
+    fixed, normals, offsets, rank, places = planes
+    basis, inverse, lower, upper, rows, signs, shares, bounds = output
     m, w = offsets.shape
     taken = np.zeros(3, dtype=np.bool_)
     spanned = np.zeros((3, 3))

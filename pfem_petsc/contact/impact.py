@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -50,9 +50,17 @@ def plane_gaps(nodes, x, normals, offsets):
     return every, gaps
 
 
+class Masses(NamedTuple):
+    """Masses and damping of nodes (n,); (0,) without damping."""
+
+    mass: np.ndarray
+    damping: np.ndarray
+
+
 @kernel
-def unpressed(nodes, v, a, contact, mass, damping, alpha, eta):
+def unpressed(nodes, v, a, contact, masses, alpha, eta):
     """Return velocities and accelerations (m, 3) of nodes (m,) without the contact forces (owned, 3)."""
+    mass, damping = masses.mass, masses.damping
     free_v, free_a = np.empty((len(nodes), 3)), np.empty((len(nodes), 3))
     damped = len(damping) > 0
     for j in range(len(nodes)):
@@ -65,23 +73,57 @@ def unpressed(nodes, v, a, contact, mass, damping, alpha, eta):
     return free_v, free_a
 
 
+class Approach(NamedTuple):
+    """Nodes (m,) near walls (w,) at the start of a step.
+
+    Attributes
+    ----------
+    normals, gaps : (m, w, 3), (m, w) [m]
+    v, a : (m, 3) without contact
+    rates, pulls : (w, 3) velocities and accelerations of the walls
+    """
+
+    normals: np.ndarray
+    gaps: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    rates: np.ndarray
+    pulls: np.ndarray
+
+
+class Touched(NamedTuple):
+    """Contacts of the nodes (owned,) of a rank with walls (w,).
+
+    Attributes
+    ----------
+    touching : (owned, w) bool, contacts in this step
+    closed : (owned, w) bool, contacts that have closed and whose node has not left the wall; updated
+    fixed : (owned, 3) bool, prescribed components
+    restitution : (w,)
+    slack : distance at which a node has left [m]
+    """
+
+    touching: np.ndarray
+    closed: np.ndarray
+    fixed: np.ndarray
+    restitution: np.ndarray
+    slack: float
+
+
 @kernel
-def stop_nodes(
-    nodes, touching, closed, normals, gaps, v, a, rates, pulls, mass, fixed, restitution, counted, slack, speeds
-):
+def stop_nodes(nodes, approach, touched, mass, counted, speeds):
     """Return the energy [J] that nodes (m,) lose when they close on walls, and the nodes that are on walls afterwards.
 
     Parameters
     ----------
-    touching : (owned, w) bool, contacts in this step
-    closed : (owned, w) bool, contacts that have closed and whose node has not left the wall; updated
-    normals, gaps : (m, w, 3), (m, w) at the start of the step [m]
-    v, a : (m, 3) there, without contact; rates, pulls : (w, 3) velocities and accelerations of the walls
-    mass, fixed : (owned,), (owned, 3)
-    restitution, counted : (w,); only counted walls contribute to the energy
-    slack : distance at which a node has left [m]
+    approach, touched : see :class:`Approach` and :class:`Touched`
+    mass : (owned,)
+    counted : (w,) bool, walls that contribute to the energy
     speeds : (m, w) output: approach velocities of closing contacts, else zero [m/s]
     """
+    normals, gaps, v, a, rates, pulls = approach
+    touching, closed, fixed = touched.touching, touched.closed, touched.fixed
+    restitution, slack = touched.restitution, touched.slack
     w = closed.shape[1]
     met = np.empty(len(nodes), dtype=np.int64)
     count = 0
@@ -156,11 +198,10 @@ class Impacts:
         contact = self.model.contact
         self.met = np.flatnonzero(stepper.closed.any(axis=1))
         self.active = self.model.can_touch and stepper.scheme.inertial
-        free = contact.motion.free
+        bodies = contact.motion.bodies
         self.counted = np.ones(len(contact.names), dtype=bool)
-        if free is not None:
-            self.counted[free.at] = False
-        self._free_rates = free.state.v if free is not None else None  # at the start of the step
+        self.counted[bodies.at] = False
+        self._free_rates = bodies.state.v  # at the start of the step
         self.slack = ON_BOUND * self.model.size
         treatment = stepper.treatment
         # nothing is lost if nodes have no mass along the normal, or if a treatment restores the work of contact
@@ -189,8 +230,8 @@ class Impacts:
         if not self.active:
             return 0.0
         loss = self._on_walls(x, motion, load, time, displacements) if self.model.contact.any else 0.0
-        if self.model.pairs is not None:
-            loss += self._of_pairs(x, motion, load)
+        if len(self.model.links.two.at):
+            loss += self._of_rows(x, motion, load)
         return 0.0 if self.elastic else loss
 
     def _free(self, nodes: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> tuple:
@@ -205,7 +246,7 @@ class Impacts:
             return self._guided(
                 nodes,
                 motion,
-                *unpressed(nodes, v, a, state.contact, inertia.mass, damping, balance.alpha, balance.eta),
+                *unpressed(nodes, v, a, state.contact, Masses(inertia.mass, damping), balance.alpha, balance.eta),
             )
         free_v, load = v[nodes], load[nodes]
         if inertia.damped:
@@ -228,11 +269,11 @@ class Impacts:
         displacements: np.ndarray,
     ) -> float:
         contact, log = self.model.contact, self.model.contact.log
-        free = contact.motion.free
-        if len(self.met) == 0 and len(log.last) == 0 and free is None:
+        free = contact.motion.bodies
+        if len(self.met) == 0 and len(log.last) == 0 and not free.any:
             return 0.0
         nodes = join_nodes(self.met, log.last, log.present)
-        if contact.plain and free is None:
+        if contact.plain and not free.any:
             normals, gaps = plane_gaps(nodes, x, contact.normals, contact.plane_offsets(time))
         else:
             normals, offsets = contact.planes(
@@ -242,33 +283,19 @@ class Impacts:
         free_v, free_a = self._free(nodes, motion, load)
         rates, speeds = contact.motion.rates(time, ahead=True), np.empty(gaps.shape)
         pulls = np.zeros(rates.shape)
-        if free is not None:
+        if free.any:
             free_fall = free.weight / free.mass[:, None]
             rates[free.at], pulls[free.at] = self._free_rates, free_fall
             if load is None:  # the motion without contact
                 balance = self.stepper.balance
                 rates[free.at] = free.state.v + balance.eta / balance.alpha * (free_fall - free.balanced)
             self._free_rates = free.state.v
-        loss, self.met = stop_nodes(
-            nodes,
-            log.touching,
-            self.stepper.closed,
-            normals,
-            gaps,
-            free_v,
-            free_a,
-            rates,
-            pulls,
-            self.model.inertia.mass,
-            contact.fixed,
-            contact.restitution,
-            self.counted,
-            self.slack,
-            speeds,
-        )
+        approach = Approach(normals, gaps, free_v, free_a, rates, pulls)
+        touched = Touched(log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.slack)
+        loss, self.met = stop_nodes(nodes, approach, touched, self.model.inertia.mass, self.counted, speeds)
         if contact.ties.any:
             loss += self._tied(nodes, normals, speeds, free_v, rates)
-        if free is not None:
+        if free.any:
             loss += self._on_free_walls(nodes, normals, speeds)
         return loss
 
@@ -289,7 +316,7 @@ class Impacts:
 
         It is sum m s^2/2 - (sum m s n)^2/(2 (M + sum m)).
         """
-        contact, free = self.model.contact, self.model.contact.motion.free
+        contact, free = self.model.contact, self.model.contact.motion.bodies
         mass = self.model.inertia.mass[nodes, None]
         keeps = 1.0 - contact.restitution[free.at] ** 2
         sums = np.zeros((len(free.at), 5))
@@ -304,20 +331,19 @@ class Impacts:
         given = 0.5 * (sums[:, 2:] ** 2).sum(axis=1) / (free.mass + sums[:, 1])
         return float((keeps * (sums[:, 0] - given)).sum())
 
-    def _of_pairs(self, x: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> float:
-        """Return the loss of closing pairs whose second nodes this rank owns, with the reduced mass. Collective."""
-        pairs, mass = self.model.pairs, self.model.inertia.mass
-        normal_forces = pairs.force > 0.0
-        fresh, parted = normal_forces & ~pairs.closed, pairs.closed & ~normal_forces
-        pairs.closed = normal_forces
-        at = np.flatnonzero(fresh | parted)
+    def _of_rows(self, x: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> float:
+        """Return the loss of closing rows over two nodes whose second nodes this rank owns, with the reduced mass."""
+        links, mass = self.model.links, self.model.inertia.mass
+        two, rows = links.two, links.two.record
+        rows.force[:] = links.force[two.at]
+        pressed = rows.force > 0.0
+        at = np.flatnonzero(pressed != rows.closed)
+        if len(at) == 0:
+            return 0.0
 
         def of_nodes(nodes: np.ndarray) -> np.ndarray:
             free_v, free_a = self._free(nodes, motion, load)
             return np.column_stack([x[nodes], free_v, free_a, mass[nodes]])
 
-        if len(at) == 0:
-            return 0.0
-        ends = pairs.gather_of(at, of_nodes)
-        mine = pairs.mine[1]
-        return close_rows(at, ends, pairs.normals, pairs.gaps, pairs.along, mine, self.slack, pairs.force, pairs.closed)
+        rows.closed[:] = pressed
+        return close_rows(rows, at, links.rows.gather_of(two.at[at], of_nodes), two.counted, self.slack)

@@ -18,16 +18,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..tolerances import ON_BOUND
-from .explicit import add_friction
+from .explicit import Rubbing
 from .forces import WallForces
 from .projection import project
 
 if TYPE_CHECKING:
     from ..integrators.base import State
     from ..stepping.model import Model
-    from .contact import Contact
 
-__all__ = ["start_at_rest"]
+Speeds = tuple[np.ndarray, np.ndarray]
+"""Velocities of nodes (m, 3) and walls (w, 3) [m/s]."""
 
 _ROUNDS = 60  # each at least halves the error
 _FAST = 1e16  # weight of velocities relative to accelerations in the direction of slip
@@ -93,9 +93,9 @@ def start_at_rest(
         if contact.has_friction:
             slack = ON_BOUND * model.wave_speed
             strengths *= weight[:, None]
-            _apply_friction(
-                contact, nodes, v, rates, accelerations, slack, weight, moved, normals, planes, strengths, drag
-            )
+            rough = contact.friction, contact.static_friction
+            rubbing = Rubbing(v[nodes], accelerations, fixed, normals, planes, *rough, weight)
+            _apply_friction(rubbing, (v[nodes], rates), slack, moved, strengths, drag)
             strengths /= weight[:, None]
         before, hold = hold, weight[:, None] * (moved - free)
         sizes = [np.abs(part).max(initial=0.0) for part in (hold - before, between - earlier, hold, between)]
@@ -111,49 +111,27 @@ def start_at_rest(
     force = strengths[:, :, None] * normals + drag
     state.contact = np.zeros_like(load)
     state.contact[nodes] = force.sum(axis=1)
-    links.push(state.contact)
+    links.add_forces(state.contact)
     return contact.sums(nodes, force, x[nodes], strengths > 0.0)
 
 
 def _apply_friction(
-    contact: Contact,
-    nodes: np.ndarray,
-    v: np.ndarray,
-    rates: np.ndarray,
-    accelerations: np.ndarray,
-    slack: float,
-    weight: np.ndarray,
-    a: np.ndarray,
-    normals: np.ndarray,
-    planes: np.ndarray,
-    normal_forces: np.ndarray,
-    drag: np.ndarray,
+    rubbing: Rubbing, speeds: Speeds, slack: float, a: np.ndarray, normal_forces: np.ndarray, drag: np.ndarray
 ) -> None:
     """Apply friction at the start: update accelerations (m, 3), normal (m, w) and friction (m, w, 3) forces in place.
 
     For nodes that slide, the velocity determines the direction of slip; for the others it is that of their acceleration
-    relative to the wall.
+    relative to the wall. ``rubbing`` has accelerations in place of positions; those of nodes are relative to zero.
     """
-    away = v[nodes][:, None, :] - rates
-    away -= np.einsum("mwi,mwi->mw", away, normals)[:, :, None] * normals
+    v, rates = speeds
+    away = v[:, None, :] - rates
+    away -= np.einsum("mwi,mwi->mw", away, rubbing.normals)[:, :, None] * rubbing.normals
     slides = ((np.linalg.norm(away, axis=2) > slack) & (normal_forces > 0.0)).any(axis=1)
-    largest = max(float(np.abs(a).max(initial=0.0)), float((normal_forces / weight[:, None]).max(initial=0.0)))
+    weight = rubbing.stiffness[:, None]
+    largest = max(float(np.abs(a).max(initial=0.0)), float((normal_forces / weight).max(initial=0.0)))
     for group in (slides, ~slides):
         part = np.flatnonzero(group)
-        moved, press, pull = a[part], normal_forces[part], drag[part]
-        fast = np.linalg.norm(v[nodes[part]], axis=1).max(initial=0.0) + np.abs(rates).max(initial=0.0)
+        fast = np.linalg.norm(v[part], axis=1).max(initial=0.0) + np.abs(rates).max(initial=0.0)
         factor = _FAST * largest / fast if group is slides and fast > 0.0 else 0.0
-        add_friction(
-            moved,
-            -factor * v[nodes[part]],
-            factor * rates if factor else accelerations,
-            contact.fixed[nodes[part]],
-            normals[part],
-            planes[part],
-            contact.friction,
-            contact.static_friction,
-            weight[part],
-            press,
-            pull,
-        )
-        a[part], normal_forces[part], drag[part] = moved, press, pull
+        along = rubbing._replace(before=-factor * v, way=factor * rates if factor else rubbing.way)
+        along.apply(part, rubbing.static, a, normal_forces, drag)

@@ -1,4 +1,4 @@
-"""What a run records and checks of contact: history columns, nodes beyond walls, bars through walls, crossing bars."""
+"""What a run checks of contact: nodes beyond walls, bars through walls, crossing bars."""
 
 from __future__ import annotations
 
@@ -13,79 +13,14 @@ from ..fields import STATUS
 from ..mechanics.compiled import inlined, kernel
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
-from ..output.sums import WALL
 from ..tolerances import BEYOND
 from .contact import Contact
-from .forces import WallForces, held_by_supports
+from .forces import held_by_supports
 
 if TYPE_CHECKING:
-    from ..stepping.impulses import Impulses
     from ..stepping.model import Model
     from ..stepping.stepper import Stepper
     from .walls.base import BaseWall
-
-
-_COUNTS = ("contacts", "releases")
-_WALL = [(name, (3,) if size == 3 else (), np.int64 if name in _COUNTS else float) for name, size in WALL.sizes.items()]
-
-
-def contact_columns(contact: Contact) -> list[tuple[str, tuple[int, ...], type]]:
-    """Return name, shape and type of the columns of a case's walls."""
-    columns: list[tuple[str, tuple[int, ...], type]] = [("active_set_changes", (), np.int64)] if contact.any else []
-    for k, name in enumerate(contact.names):
-        columns += [(f"wall/{name}/{what}", shape, kind) for what, shape, kind in _WALL]
-        if contact.moving[k]:
-            columns += [(f"wall/{name}/{what}", (3,), float) for what in ("position", "velocity")]
-    return columns
-
-
-class ContactColumns:
-    """Converts sums over ranks to the columns of :func:`contact_columns`, in their order.
-
-    Attributes
-    ----------
-    size : length of a rank's contribution: the number of changes of the active set, and the ``WALL`` of
-        :mod:`~pfem_petsc.output.sums` for each wall
-    width : number of values in the columns
-    """
-
-    def __init__(self, contact: Contact) -> None:
-        self.contact = contact
-        walls = len(contact.names)
-        self.size = 1 + WALL.width * walls if contact.any else 0
-        starts = 1 + np.cumsum([0, *(WALL.width + 6 * contact.moving)]).astype(np.int64)
-        self.width = int(starts[-1]) if contact.any else 0
-        self._at = starts[:-1, None] + np.arange(WALL.width)
-        self._moving = np.flatnonzero(contact.moving)
-        self._motion_at = starts[self._moving, None] + np.arange(WALL.width, WALL.width + 6)
-
-    def fill(self, sums: np.ndarray, walls: WallForces, impulses: Impulses) -> None:
-        """Write this rank's contribution into ``sums`` (size,)."""
-        log = self.contact.log
-        sums[0] = log.changes
-        share = sums[1:].reshape(-1, WALL.width)
-        share[:, WALL["force"]] = walls.force
-        share[:, WALL["moment"]] = walls.moment
-        share[:, WALL.first("contacts")] = walls.contacts
-        share[:, WALL.first("releases")] = log.releases
-        impulses.fill_walls(share)
-
-    def contacts(self, sums: np.ndarray) -> np.ndarray | None:
-        """Return the number of nodes that touch each wall (walls,) from the sums over ranks; None without walls."""
-        return sums[1 : self.size].reshape(-1, WALL.width)[:, WALL.first("contacts")] if self.size else None
-
-    def put(self, sums: np.ndarray, time: float, values: np.ndarray) -> None:
-        """Write the columns ``values`` (width,) at a time [s] from the sums over ranks, and reset the count of
-        changes."""
-        contact = self.contact
-        total = sums[1:].reshape(-1, WALL.width)
-        total[:, WALL.first("contact_time")] = contact.log.time
-        values[0] = sums[0]
-        values[self._at] = total
-        if len(self._moving):
-            motion = np.hstack([contact.positions(time), contact.motion.rates(time)])
-            values[self._motion_at] = motion[self._moving]
-        contact.log.changes = 0
 
 
 def check_positions(stepper: Stepper) -> None:
@@ -450,15 +385,16 @@ class CrossingBars:
             if comm.allreduce(float(cells.sum())) <= _CELLS * number:
                 break
             cell *= 2.0
-        held = _Held(segments, radius + 0.5 * skin, meeting).sent(comm, low, cell)
-        start, keys, rows = _buckets(*held.cells(comm, low, cell))
-        counts = np.diff(start).astype(float)
+        grid = _Cells(low, cell, comm.size)
+        held = _Held(segments, radius + 0.5 * skin, meeting).sent(comm, grid)
+        buckets = _buckets(*held.cells(comm, grid))
+        counts = np.diff(buckets[0]).astype(float)
         if comm.allreduce(float((counts * counts).sum())) > 2.0 * _PAIRS * number:
             return None, 0.0
         room = max(1024, len(held.segments.ids))
         while True:
             out = np.empty((room, 2), np.int64)
-            found, gap = _compare(start, keys, rows, *held.segments, held.meeting, low, cell, skin, out)
+            found, gap = _compare(buckets, held.segments, held.meeting, grid, skin, out)
             if found <= room:
                 break
             room = found
@@ -477,6 +413,14 @@ class _Search(NamedTuple):
     intact: np.ndarray
 
 
+class _Cells(NamedTuple):
+    """Cells of space: the corner of the first (3,) and the length of their edges [m], and how many ranks hold them."""
+
+    low: np.ndarray
+    cell: float
+    size: int
+
+
 class _Held(NamedTuple):
     """Bars of a rank, the distances around them in which others are searched (n,) [m], and which of them are at links
     (n,) bool."""
@@ -485,26 +429,26 @@ class _Held(NamedTuple):
     margin: np.ndarray
     meeting: np.ndarray
 
-    def sent(self, comm: MPI.Comm, low: np.ndarray, cell: float) -> _Held:
+    def sent(self, comm: MPI.Comm, grid: _Cells) -> _Held:
         """Return the bars that pass cells of this rank. Collective."""
         if comm.size == 1:
             return self
         ends, margin = self.segments.ends, self.margin
-        count = _list_cells(ends, margin, low, cell, comm.size, -1, np.empty(0, np.int64), np.empty(0, np.int64))
+        count = _list_cells(ends, margin, grid, -1, np.empty(0, np.int64), np.empty(0, np.int64))
         ranks, rows = np.empty(count, np.int64), np.empty(count, np.int64)
-        _list_cells(ends, margin, low, cell, comm.size, -1, ranks, rows)
+        _list_cells(ends, margin, grid, -1, ranks, rows)
         each = np.unique(rows * comm.size + ranks)
         router = Router(comm, each % comm.size, each // comm.size)
         segments = _Segments(*(router.send(array) for array in self.segments))
         return _Held(segments, router.send(self.margin), router.send(self.meeting))
 
-    def cells(self, comm: MPI.Comm, low: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
+    def cells(self, comm: MPI.Comm, grid: _Cells) -> tuple[np.ndarray, np.ndarray]:
         """Return the cells of this rank that each bar passes: a key of the cell and the row of the bar."""
         ends, margin = self.segments.ends, self.margin
         room = 12 * len(margin)
         while True:
             keys, rows = np.empty(room, np.int64), np.empty(room, np.int64)
-            count = _list_cells(ends, margin, low, cell, comm.size, comm.rank, keys, rows)
+            count = _list_cells(ends, margin, grid, comm.rank, keys, rows)
             if count <= room:
                 return keys[:count], rows[:count]
             room = count
@@ -525,21 +469,22 @@ def _mixed(key):
 
 
 @inlined
-def _piece(ends, k, begin, end, margin, low, cell, first, last):
-    """Write the first and last cells (3,) of the box around a part of bar ``k`` and a margin [m]."""
+def _piece(ends, begin, end, margin, grid, span):
+    """Write the first and last cells (2, 3) of the box around a part of a bar (2, 3) and a margin [m]."""
     for c in range(3):
-        p = ends[k, 0, c] + begin * (ends[k, 1, c] - ends[k, 0, c])
-        q = ends[k, 0, c] + end * (ends[k, 1, c] - ends[k, 0, c])
-        first[c] = int(np.floor((min(p, q) - margin - low[c]) / cell))
-        last[c] = int(np.floor((max(p, q) + margin - low[c]) / cell))
+        p = ends[0, c] + begin * (ends[1, c] - ends[0, c])
+        q = ends[0, c] + end * (ends[1, c] - ends[0, c])
+        span[0, c] = int(np.floor((min(p, q) - margin - grid.low[c]) / grid.cell))
+        span[1, c] = int(np.floor((max(p, q) + margin - grid.low[c]) / grid.cell))
 
 
 @kernel
-def _list_cells(ends, margins, low, cell, size, rank, keys, rows):
+def _list_cells(ends, margins, grid, rank, keys, rows):
     """List the cells around bars, as far as there is room: the cell and the row of the bar, for cells of ``rank``; with
     -1, the rank of the cell and the row. Returns the length of the list."""
-    first = np.empty(3, np.int64)
-    last = np.empty(3, np.int64)
+    cell, size = grid.cell, grid.size
+    span = np.empty((2, 3), np.int64)
+    first, last = span[0], span[1]
     before = np.empty((2, 3), np.int64)
     count = 0
     for k in range(len(ends)):
@@ -547,7 +492,7 @@ def _list_cells(ends, margins, low, cell, size, rank, keys, rows):
         margin = margins[k] + 1e-9 * (length + cell)
         pieces = int(length / cell) + 1
         for piece in range(pieces):
-            _piece(ends, k, piece / pieces, (piece + 1) / pieces, margin, low, cell, first, last)
+            _piece(ends[k], piece / pieces, (piece + 1) / pieces, margin, grid, span)
             for i in range(first[0], last[0] + 1):
                 for j in range(first[1], last[1] + 1):
                     for m in range(first[2], last[2] + 1):
@@ -568,8 +513,7 @@ def _list_cells(ends, margins, low, cell, size, rank, keys, rows):
                             keys[count] = holder if rank < 0 else _key(i, j, m)
                             rows[count] = k
                         count += 1
-            before[0] = first
-            before[1] = last
+            before[:] = span
     return count
 
 
@@ -635,9 +579,12 @@ def _closest(ends, a, b):
 
 
 @kernel
-def _compare(start, keys, rows, ids, nodes, ends, radius, meeting, low, cell, skin, out):
+def _compare(buckets, segments, meeting, grid, skin, out):
     """Write the numbers of bars (pairs, 2) that pass through each other, as far as there is room; return how many, and
     by how much a distance differs at least from the sum of radii, at most ``skin`` [m]."""
+    start, keys, rows = buckets
+    ids, nodes, ends, radius = segments
+    low, cell = grid.low, grid.cell
     found = 0
     gap = skin
     place = np.empty(3, np.int64)

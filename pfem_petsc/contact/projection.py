@@ -5,10 +5,11 @@ coupled nodes.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import borrowing, kernel
 from ..tolerances import FREE_PART, SINGULAR_ROW
 
 
@@ -40,13 +41,15 @@ def _solve(gram, rhs, n, factor, out):
 
 
 @kernel
-def _best_set(free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, multipliers, move):
-    """Find the optimum for the planes ``among[:count]``; return the number of active planes, 0 if there is none.
+def _best_set(free, gap, among, tolerance, chosen, multipliers, move):
+    """Find the optimum for the planes ``among``; return the number of active planes, 0 if there is none.
 
     ``chosen`` and ``multipliers`` (3,) receive the active planes, ``move`` (3,) the displacement to the optimum.
     """
+    gram, factor = np.zeros((3, 3)), np.zeros((3, 3))
+    rhs, solution = np.zeros(3), np.zeros(3)
     best = math.inf
-    found = 0
+    found, count = 0, len(among)
     active = np.zeros(3, dtype=np.int64)
     trial = np.zeros(3)
     for i in range(count):
@@ -125,10 +128,6 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
     gap = np.zeros(w)
     usable = np.zeros(w, dtype=np.bool_)
     among = np.zeros(w, dtype=np.int64)
-    gram = np.zeros((3, 3))
-    factor = np.zeros((3, 3))
-    rhs = np.zeros(3)
-    solution = np.zeros(3)
     chosen = np.zeros(3, dtype=np.int64)
     strengths = np.zeros(3)
     move = np.zeros(3)
@@ -164,7 +163,7 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
             if found == 1:
                 count = 0
         while count > 0:
-            found = _best_set(free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, strengths, move)
+            found = _best_set(free, gap, among[:count], tolerance, chosen, strengths, move)
             if found == 0:
                 if infeasible < 0:
                     infeasible = i
@@ -307,132 +306,173 @@ def complementary(matrix: np.ndarray, values: np.ndarray, tolerance: float) -> n
     return z if find_multipliers(np.ascontiguousarray(matrix), values, tolerance, z) else None
 
 
+class Groups(NamedTuple):
+    """Groups of rows that share nodes: group g has the rows[starts[g] : starts[g + 1]], and likewise the nodes."""
+
+    starts: np.ndarray
+    rows: np.ndarray
+    node_starts: np.ndarray
+    nodes: np.ndarray
+
+
+class System(NamedTuple):
+    """Rows and their nodes at free positions.
+
+    Attributes
+    ----------
+    ends, gradients : (r, k), (r, k, 3) nodes of each row, -1 for none, and its gradient there
+    values : (r,) rows [m], infinite for rows that do not apply
+    stiffness, free : (n,), (n, 3) of nodes: force for a displacement [N/m]; 0.0 where supports prescribe a component
+    plane : (n,) index of each node among those at walls, -1 for none
+    normals, gaps : (m, w, 3), (m, w) of walls at these nodes: distances [m], infinite where a wall does not apply
+    """
+
+    ends: np.ndarray
+    gradients: np.ndarray
+    values: np.ndarray
+    stiffness: np.ndarray
+    free: np.ndarray
+    plane: np.ndarray
+    normals: np.ndarray
+    gaps: np.ndarray
+
+
+@borrowing
+def _project_alone(group, groups, system, tolerance, force, moves):
+    """Project the nodes of a single row, whose walls must remain satisfied; return 1, 0 if they do not, or -1 if
+    nothing moves the row."""
+    r = groups.rows[groups.starts[group]]
+    square, gram = 0.0, 0.0
+    for k in range(system.ends.shape[1]):
+        i = system.ends[r, k]
+        if i < 0:
+            continue
+        for c in range(3):
+            part = system.gradients[r, k, c] * system.free[i, c]
+            square += part * part
+            gram += part * part / system.stiffness[i]
+    force[r] = 0.0
+    if system.values[r] < math.inf and square > FREE_PART and not system.values[r] >= -tolerance:
+        strength = -system.values[r] / gram
+        if not strength < math.inf:
+            return -1
+        force[r] = strength
+        for k in range(system.ends.shape[1]):
+            i = system.ends[r, k]
+            if i >= 0:
+                for c in range(3):
+                    moves[i, c] += strength * (system.gradients[r, k, c] * system.free[i, c]) / system.stiffness[i]
+    for q in range(groups.node_starts[group], groups.node_starts[group + 1]):
+        i = groups.nodes[q]
+        for w in range(system.gaps.shape[1]):
+            gap, square = math.inf, 0.0
+            if system.plane[i] >= 0:
+                gap = system.gaps[system.plane[i], w]
+            if not gap < math.inf:
+                continue
+            least = gap
+            for c in range(3):
+                part = system.normals[system.plane[i], w, c] * system.free[i, c]
+                square += part * part
+                gap += part * moves[i, c]
+            if square > FREE_PART and (least < -tolerance or gap < -tolerance):
+                return 0
+    return 1
+
+
 @kernel
-def solve_groups(
-    groups, starts, members, ends, pair_normals, least, x, stiffness, free, first_plane, planes, tolerance, force
-):
-    """Solve for the forces of the pairs of some groups, together with the walls at their nodes.
+def project_groups(which, groups, system, tolerances, force, moves):
+    """Solve for the forces of the rows of some groups (g,), and the displacements of their nodes, with their walls.
 
     Parameters
     ----------
-    groups : (g,) indices of the groups
-    starts, members : (groups + 1,), (p,) pairs of each group: members[starts[k] : starts[k + 1]]
-    ends, pair_normals, least : (2, p), (p, 3), (p,) nodes, directions and bounds of pairs, -inf for pairs that do not
-        apply
-    x, stiffness, free : (n, 3), (n,), (n, 3) of nodes; ``free`` is 0.0 where supports prescribe
-    first_plane : (n,) first row of a node among the planes, -1 for nodes of other groups
-    planes : (normals (k, w, 3), offsets (k, w), stopped (n, w) bool), -inf where a wall is no concern; the last says
-        which walls stop which nodes where several nodes have the same planes, (0, 0) where each has its own
-    tolerance : a constraint broken by no more counts as kept
-    force : (p,) out; written for these groups
+    which, groups : (g,) numbers of these groups; Groups
+    system : System
+    tolerances : (groups,) a row violated by at most this counts as satisfied [m]
+    force, moves : (r,), (n, 3) output [N], [m]; written for these groups only
 
     Returns
     -------
     int
-        First of the groups with infeasible constraints, else -1.
+        First of the groups with infeasible rows, else -1.
     """
-    normals, offsets, stopped = planes
-    walls = offsets.shape[1]
-    shared = len(stopped) > 0
-    for group in groups:
-        begin, end = starts[group], starts[group + 1]
-        if end - begin == 1:  # the common case: a single pair whose own solution violates no wall
-            p = members[begin]
-            i, j = ends[0, p], ends[1, p]
-            square, distance, soft_first, soft_second = 0.0, 0.0, 0.0, 0.0
-            for c in range(3):
-                back, forth = -pair_normals[p, c] * free[i, c], pair_normals[p, c] * free[j, c]
-                square += back**2 + forth**2
-                soft_first += back * back / stiffness[i]
-                soft_second += forth * forth / stiffness[j]
-                distance += pair_normals[p, c] * (x[j, c] - x[i, c])
-            soft = soft_first + soft_second
-            settled = square > FREE_PART and least[p] > -math.inf and soft > 0.0
-            strength = 0.0
-            if settled and distance - least[p] < -tolerance:
-                strength = -(distance - least[p]) / soft
-            for e in range(2):
-                node_here = ends[e, p]
-                at = first_plane[node_here]
-                sign = -1.0 if e == 0 else 1.0
-                for k in range(walls):
-                    if not settled or offsets[at, k] == -math.inf or (shared and not stopped[node_here, k]):
-                        continue
-                    gap, along, wall_square = -offsets[at, k], 0.0, 0.0
-                    for c in range(3):
-                        gap += normals[at, k, c] * x[node_here, c]
-                        part = normals[at, k, c] * free[node_here, c]
-                        wall_square += part**2
-                        along += part * sign * pair_normals[p, c] / stiffness[node_here]
-                    broken = gap < -tolerance or gap + along * strength < -tolerance
-                    if wall_square > FREE_PART and (broken or gap != gap):
-                        settled = False
-            if settled:
-                force[p] = strength
+    # each field of a record would count references
+    ends, gradients, values, stiffness, free, plane, normals, gaps = system
+    starts, members, node_starts, every_node = groups
+    walls, width = gaps.shape[1], ends.shape[1]
+    for group in which:
+        tolerance = tolerances[group]
+        begin, end, first, last = starts[group], starts[group + 1], node_starts[group], node_starts[group + 1]
+        size = end - begin
+        for q in range(first, last):
+            i = every_node[q]
+            moves[i, 0] = moves[i, 1] = moves[i, 2] = 0.0
+            if plane[i] >= 0:
+                size += walls
+        if end - begin == 1:
+            done = _project_alone(group, groups, system, tolerance, force, moves)
+            if done < 0:
+                return group
+            if done > 0:
                 continue
-        rows = (end - begin) * (1 + 2 * walls)
-        node = np.full((rows, 2), -1)
-        vector = np.zeros((rows, 2, 3))
-        value = np.empty(rows)
-        pair = np.full(rows, -1)
+            for q in range(first, last):
+                i = every_node[q]
+                moves[i, 0] = moves[i, 1] = moves[i, 2] = 0.0
+        node, vector = np.full((size, width), -1), np.zeros((size, width, 3))
+        value, row = np.empty(size), np.full(size, -1)
         n = 0
         for q in range(begin, end):
-            p = members[q]
-            force[p] = 0.0
-            if least[p] == -math.inf:
+            r = members[q]
+            force[r] = 0.0
+            if not values[r] < math.inf and values[r] == values[r]:
                 continue
-            i, j = ends[0, p], ends[1, p]
-            square, distance = 0.0, 0.0
-            for c in range(3):
-                vector[n, 0, c] = -pair_normals[p, c] * free[i, c]
-                vector[n, 1, c] = pair_normals[p, c] * free[j, c]
-                square += vector[n, 0, c] ** 2 + vector[n, 1, c] ** 2
-                distance += pair_normals[p, c] * (x[j, c] - x[i, c])
+            square = 0.0
+            for k in range(width):
+                i = ends[r, k]
+                node[n, k] = i
+                for c in range(3):
+                    vector[n, k, c] = gradients[r, k, c] * free[i, c] if i >= 0 else 0.0
+                    square += vector[n, k, c] * vector[n, k, c]
             if square > FREE_PART:
-                node[n, 0], node[n, 1] = i, j
-                value[n] = distance - least[p]
-                pair[n] = p
+                value[n], row[n] = values[r], r
                 n += 1
-        for q in range(begin, end):
-            for e in range(2):
-                i = ends[e, members[q]]
-                known = False
-                for b in range(begin, q + 1):  # the walls of a node in several pairs enter once
-                    for d in range(2):
-                        if (b < q or d < e) and ends[d, members[b]] == i:
-                            known = True
-                if known or first_plane[i] < 0:
+        for q in range(first, last):
+            i = every_node[q]
+            at = plane[i]
+            for w in range(walls):
+                if at < 0 or not gaps[at, w] < math.inf:
                     continue
-                for k in range(walls):
-                    at = first_plane[i]
-                    if offsets[at, k] == -math.inf or (shared and not stopped[i, k]):
-                        continue
-                    square, distance = 0.0, 0.0
-                    for c in range(3):
-                        vector[n, 0, c] = normals[at, k, c] * free[i, c]
-                        vector[n, 1, c] = 0.0
-                        square += vector[n, 0, c] ** 2
-                        distance += normals[at, k, c] * x[i, c]
-                    if square > FREE_PART:
-                        node[n, 0], node[n, 1] = i, -1
-                        value[n] = distance - offsets[at, k]
-                        pair[n] = -1
-                        n += 1
+                square = 0.0
+                for k in range(width):
+                    node[n, k] = -1
+                node[n, 0], row[n], value[n] = i, -1, gaps[at, w]
+                for c in range(3):
+                    vector[n, 0, c] = normals[at, w, c] * free[i, c]
+                    square += vector[n, 0, c] * vector[n, 0, c]
+                if square > FREE_PART:
+                    n += 1
         gram = np.zeros((n, n))
         for a in range(n):
             for b in range(a, n):
                 s = 0.0
-                for d in range(2):
-                    for e in range(2):
-                        if node[a, d] >= 0 and node[a, d] == node[b, e]:
-                            hard = stiffness[node[a, d]]
+                for d in range(width):
+                    i = node[a, d]
+                    if i < 0:
+                        continue
+                    for e in range(width):
+                        if node[b, e] == i:
                             for c in range(3):
-                                s += vector[a, d, c] * vector[b, e, c] / hard
+                                s += vector[a, d, c] * vector[b, e, c] / stiffness[i]
                 gram[a, b] = gram[b, a] = s
         z = np.zeros(n)
         if not find_multipliers(gram, value[:n], tolerance, z):
             return group
         for a in range(n):
-            if pair[a] >= 0:
-                force[pair[a]] = z[a]
+            if row[a] >= 0:
+                force[row[a]] = z[a]
+            for k in range(width):
+                i = node[a, k]
+                if i >= 0:
+                    for c in range(3):
+                        moves[i, c] += z[a] * vector[a, k, c] / stiffness[i]
     return -1

@@ -1,8 +1,9 @@
-"""Rows over several nodes, r(x) >= 0, from any source: layout, groups that share nodes, and their explicit solution."""
+"""Row sets: rows r(x) >= 0 over several nodes from any sources, on the ranks of their nodes, in groups that share
+nodes.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,15 +14,83 @@ from mpi4py import MPI
 
 from ..errors import SimulationFailure
 from ..mechanics.compiled import kernel
-from ..mesh.exchange import GhostExchange, Router
+from ..mesh.exchange import GhostExchange, Router, swap
+from ..mesh.slab import slab_of
 from ..parallel.natural import NaturalOrder
 from ..tolerances import FREE_PART
 from .constraints.base import Constraint
-from .projection import find_multipliers
-from .row_search import owner_starts, petsc_numbers, to_owners, with_groups
+from .projection import Groups, System, project_groups
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
+
+
+def owner_starts(mesh: DistributedMesh) -> np.ndarray:
+    """Return the first PETSc number owned by each rank, and the end, (ranks + 1,). Collective."""
+    return np.concatenate([[0], np.cumsum(mesh.comm.allgather(mesh.n_owned))]).astype(np.int64)
+
+
+def petsc_numbers(mesh: DistributedMesh, numbers: np.ndarray) -> np.ndarray:
+    """Return the PETSc numbers of nodes given by mesh numbers (n,), which any rank may own. Collective."""
+    comm, ids = mesh.comm, mesh.node_ids[: mesh.n_owned]
+    to_slab = Router(comm, slab_of(ids, mesh.n_nodes, comm.size))
+    known, at = to_slab.send(ids), to_slab.send(mesh.first_node + np.arange(mesh.n_owned))
+    order = np.argsort(known)
+    wanted, place = np.unique(numbers, return_inverse=True)
+    asking = Router(comm, slab_of(wanted, mesh.n_nodes, comm.size))
+    asked = asking.send(wanted)
+    return asking.reply(at[order[np.searchsorted(known[order], asked)]])[place.ravel()]
+
+
+def once(rows: np.ndarray) -> np.ndarray:
+    """Return the rows (r, k) without duplicates, sorted by the first two columns, which identify them."""
+    rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+    return rows[np.append(True, (np.diff(rows[:, :2], axis=0) != 0).any(axis=1))[: len(rows)]]
+
+
+def to_owners(rows: np.ndarray, columns: Sequence[int], starts: np.ndarray, comm: MPI.Comm) -> np.ndarray:
+    """Return the rows of all ranks with a node of this rank, without duplicates. Collective.
+
+    Parameters
+    ----------
+    rows : (r, k) int64
+    columns : of PETSc numbers of nodes, negative for none
+    starts : see :func:`owner_starts`
+    comm : MPI.Comm
+    """
+    owners = np.searchsorted(starts, rows[:, columns], side="right") - 1
+    keys = np.arange(len(rows))[:, None] * comm.size + owners
+    row, owner = np.divmod(np.unique(keys[owners >= 0]), comm.size)
+    return once(Router(comm, owner).send(rows[row]))
+
+
+def with_groups(rows: np.ndarray, columns: Sequence[int], starts: np.ndarray, comm: MPI.Comm) -> np.ndarray:
+    """Add the rows connected with those of this rank through shared nodes, repeated until complete. Collective.
+
+    ``rows`` (r, k) are all rows with a node of this rank; see :func:`to_owners`.
+    """
+    own = rows
+    order = [np.argsort(own[:, at], kind="stable") for at in columns]
+    first, last = starts[comm.rank], starts[comm.rank + 1]
+    known = np.empty(0, dtype=np.int64)
+    while True:
+        ends = np.unique(rows[:, columns])
+        asked = np.setdiff1d(ends[(ends >= 0) & ((ends < first) | (ends >= last))], known)
+        if comm.allreduce(len(asked), op=MPI.MAX) == 0:
+            return rows
+        known = np.union1d(known, asked)
+        asking = Router(comm, np.searchsorted(starts, asked, side="right") - 1)
+        wanted = asking.send(np.column_stack([asked, np.full(len(asked), comm.rank)]))
+        answers, ranks = [], []
+        for column, at in zip(columns, order, strict=True):
+            keys = own[at, column]
+            begin = np.searchsorted(keys, wanted[:, 0])
+            count = np.searchsorted(keys, wanted[:, 0], side="right") - begin
+            place = np.arange(count.sum()) + np.repeat(begin - np.cumsum(count) + count, count)
+            answers.append(own[at[place]])
+            ranks.append(np.repeat(wanted[:, 1], count))
+        answer = Router(comm, np.concatenate(ranks)).send(np.concatenate(answers))
+        rows = once(np.concatenate([rows, answer]))
 
 
 @kernel
@@ -48,6 +117,97 @@ def group_rows(ends, n, label):
                 label[a] = b
     for i in range(n):
         label[i] = _root(label, i)
+
+
+@kernel
+def gather_rows(at, array, vectors):
+    """Fill vectors (k, 3, r) of rows with nodes ``at`` (r, k) from those of nodes (n, 3)."""
+    for r in range(len(at)):
+        for k in range(at.shape[1]):
+            i = at[r, k]
+            for c in range(3):
+                vectors[k, c, r] = array[i, c]
+
+
+@kernel
+def pair_values(ends, normals, least, x, values):
+    """Compute rows n . (x_2 - x_1) - least (r,) at positions (n, 3) of their nodes ``ends`` (2, r)."""
+    for r in range(len(values)):
+        i, j = ends[0, r], ends[1, r]
+        apart = normals[r, 0] * (x[j, 0] - x[i, 0]) + normals[r, 1] * (x[j, 1] - x[i, 1])
+        values[r] = apart + normals[r, 2] * (x[j, 2] - x[i, 2]) - least[r]
+
+
+@kernel
+def broken_groups(groups, values, x, tolerance, chosen, tolerances):
+    """Mark groups with a row below its bound; return their number.
+
+    Parameters
+    ----------
+    groups : Groups
+    values : (r,) rows; x : (n, 3) positions
+    tolerance : a row violated by at most this, or by rounding of the group's positions, counts as satisfied
+    chosen, tolerances : (groups,) output; tolerances of chosen groups only
+    """
+    starts, rows, node_starts, nodes = groups
+    count = 0
+    for g in range(len(starts) - 1):
+        chosen[g] = False
+        for q in range(starts[g], starts[g + 1]):
+            chosen[g] = chosen[g] or not values[rows[q]] >= -tolerance
+        if chosen[g]:
+            largest = 0.0
+            for q in range(node_starts[g], node_starts[g + 1]):
+                for c in range(3):
+                    largest = max(largest, abs(x[nodes[q], c]))
+            tolerances[g] = max(tolerance, 16.0 * 2.0**-52 * largest)
+            count += 1
+    return count
+
+
+@kernel
+def advance_groups(which, groups, x, moves, at, tolerances, settled):
+    """Set nodes of groups (g,) to x + moves (n, 3) in ``at`` (n, 3), and set ``settled`` (g,) if they were there
+    already, to the tolerances (groups,)."""
+    _, _, node_starts, nodes = groups
+    for k in range(len(which)):
+        g = which[k]
+        same = True
+        for q in range(node_starts[g], node_starts[g + 1]):
+            i = nodes[q]
+            for c in range(3):
+                place = x[i, c] + moves[i, c]
+                same = same and abs(place - at[i, c]) <= tolerances[g]
+                at[i, c] = place
+        settled[k] = same
+
+
+@kernel
+def linearise(rows, system, x, at, own):
+    """Extrapolate ``own`` of rows (m,) at positions ``at`` (n, 3) to ``x`` (n, 3), into the values of a System."""
+    ends, gradients, values, _, free, _, _, _ = system
+    for k in range(len(rows)):
+        r = rows[k]
+        total = 0.0
+        for e in range(ends.shape[1]):
+            i = ends[r, e]
+            if i >= 0:
+                for c in range(3):
+                    total += gradients[r, e, c] * free[i, c] * (x[i, c] - at[i, c])
+        values[r] = own[k] + total
+
+
+@kernel
+def add_forces(ends, gradients, force, load):
+    """Add the forces (r,) of rows to those on their nodes (n, 3)."""
+    for r in range(len(force)):
+        if force[r] == 0.0:
+            continue
+        for k in range(ends.shape[1]):
+            i = ends[r, k]
+            if i >= 0:
+                for c in range(3):
+                    load[i, c] += force[r] * gradients[r, k, c]
 
 
 @kernel
@@ -84,96 +244,15 @@ def free_stiffness(where, stiffness, far, hard):
 
 
 @kernel
-def gather_rows(at, array, vectors):
-    """Fill vectors (k, 3, r) of rows with nodes ``at`` (r, k) from those of nodes (n, 3)."""
-    for r in range(len(at)):
-        for k in range(at.shape[1]):
-            i = at[r, k]
-            for c in range(3):
-                vectors[k, c, r] = array[i, c]
-
-
-@kernel
-def broken_groups(starts, rows, node_starts, nodes, values, x, near, tolerance, chosen, tolerances):
-    """Mark groups with a row below its bound, or with nodes near walls; return their number.
-
-    Parameters
-    ----------
-    starts, rows, node_starts, nodes : rows and nodes of each group: rows[starts[g] : starts[g + 1]]
-    values : (r,) rows; x : (n, 3) positions; near : (n,) bool, (0,) for none
-    tolerance : a row violated by at most this, or by rounding of the group's positions, counts as satisfied
-    chosen, tolerances : (groups,) output; tolerances of chosen groups only
-    """
-    count = 0
-    walled = len(near) > 0
-    for g in range(len(starts) - 1):
-        broken = False
-        for q in range(starts[g], starts[g + 1]):
-            broken = broken or not values[rows[q]] >= -tolerance
-        if walled and not broken:
-            for q in range(node_starts[g], node_starts[g + 1]):
-                broken = broken or near[nodes[q]]
-        chosen[g] = broken
-        if broken:
-            largest = 0.0
-            for q in range(node_starts[g], node_starts[g + 1]):
-                for c in range(3):
-                    largest = max(largest, abs(x[nodes[q], c]))
-            tolerances[g] = max(tolerance, 16.0 * 2.0**-52 * largest)
-            count += 1
-    return count
-
-
-@kernel
-def advance_groups(groups, node_starts, nodes, x, moves, at, tolerances, settled):
-    """Set nodes of groups (g,) to x + moves (n, 3) in ``at`` (n, 3), and set ``settled`` (g,) if they were there
-    already, to the tolerances (groups,)."""
-    for k in range(len(groups)):
-        g = groups[k]
-        same = True
-        for q in range(node_starts[g], node_starts[g + 1]):
-            i = nodes[q]
-            for c in range(3):
-                place = x[i, c] + moves[i, c]
-                same = same and abs(place - at[i, c]) <= tolerances[g]
-                at[i, c] = place
-        settled[k] = same
-
-
-@kernel
-def linearise(rows, ends, gradients, free, x, at, own, values):
-    """Write ``own`` of rows (m,) at positions ``at`` (n, 3), extrapolated to ``x`` (n, 3), into ``values`` (r,)."""
-    for k in range(len(rows)):
-        r = rows[k]
-        total = 0.0
-        for e in range(ends.shape[1]):
-            i = ends[r, e]
-            if i >= 0:
-                for c in range(3):
-                    total += gradients[r, e, c] * free[i, c] * (x[i, c] - at[i, c])
-        values[r] = own[k] + total
-
-
-@kernel
 def last_forces(counted, source, last, gradients, force, totals):
-    """Add the forces of counted rows on their last nodes to the totals (sources, 3)."""
+    """Write the forces of counted rows, sorted by source, on their last nodes to the totals (sources, 3)."""
+    before = -1
     for r in range(len(force)):
-        if force[r] != 0.0 and counted[r]:
+        if counted[r]:
             for c in range(3):
-                totals[source[r], c] += force[r] * gradients[r, last[r], c]
-
-
-@kernel
-def add_forces(ends, gradients, force, load):
-    """Add the forces (r,) of rows to those on their nodes (n, 3)."""
-    for r in range(len(force)):
-        if force[r] == 0.0:
-            continue
-        for k in range(ends.shape[1]):
-            i = ends[r, k]
-            if i >= 0:
-                for c in range(3):
-                    load[i, c] += force[r] * gradients[r, k, c]
+                push = force[r] * gradients[r, last[r], c]
+                totals[source[r], c] = totals[source[r], c] + push if source[r] == before else push
+            before = source[r]
 
 
 @kernel
@@ -191,18 +270,22 @@ def push_nodes(where, load, free, stiffness, u, contact):
 
 @kernel
 def mark_pressed(ends, where, force, held):
-    """Mark owned nodes (owned,) with active rows; return the number of marks."""
-    count = 0
+    """Mark owned nodes (owned,) with active rows."""
     for r in range(len(force)):
         if force[r] > 0.0:
             for k in range(ends.shape[1]):
                 if ends[r, k] >= 0 and where[ends[r, k]] >= 0:
                     held[where[ends[r, k]]] = True
-                    count += 1
-    return count
 
 
-_TAG = 7700  # of messages between ranks with nodes of the same rows, distinct from those of ghosts and pairs
+_ITERATIONS = 100  # linearisations of a problem
+_TAG = 7700  # of messages between ranks with nodes of the same rows, distinct from those of ghosts
+
+Planes = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Walls at nodes: ``plane``, ``normals`` and ``gaps`` of :class:`~pfem_petsc.contact.projection.System`."""
+
+Given = Callable[[], tuple[np.ndarray, np.ndarray | None, Planes | None]]
+"""See :meth:`RowSet.project`."""
 
 
 @dataclass(frozen=True)
@@ -222,54 +305,60 @@ class Alike:
         return dense.reshape(*self.rows.shape, -1)
 
 
-class RowLayout:
+class RowSet:
     """The rows of all sources on this rank: those of its nodes, and those of their groups. Construction is collective.
 
     Attributes
     ----------
     sources : of the rows here
     source, ids : (r,) index of the source of each row, and the row's number there
-    ends : (r, k) indices of its nodes, padded with -1; last : (r,) position of the last node
+    fixed : (r,) bool, rows whose gradients never turn
+    ends, owners : (r, k) indices of its nodes, padded with -1, and the ranks that own them; last : (r,) position of the
+        last node
     numbers : (n,) mesh numbers of the nodes, ascending
     where : (n,) local index of an owned node, else -1 minus its row among those of other ranks
     mine, here : (n,) bool, nodes that this rank owns, and their local indices (m,)
     partners : GhostExchange for values at nodes that other ranks own
-    counted : (r,) bool, rows whose last node this rank owns; order : their numbering over all ranks
-    last_owners : (r,) rank that owns the last node of each row
+    counted : (r,) bool, rows whose last node this rank owns
     free : (n, 3) 1.0 where a component may move, 0.0 where a support prescribes it
-    starts, members, node_starts, nodes : rows and nodes of each group: members[starts[g] : starts[g + 1]]
+    groups : Groups; group_of_row, group_of_node : (r,), (n,)
+    pairs : nodes (2, r), directions (r, 3) and bounds (r,) if these are all that the rows depend on, else None
     """
+
+    pairs: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def __init__(self, sources: Sequence[Constraint], mesh: DistributedMesh, fixed: np.ndarray) -> None:
         self.mesh = mesh
         self._find(sources)
+        self.fixed = np.array([source.fixed for source in sources], dtype=bool)[self.source]
         self.mine = self.where >= 0
         self.here = self.where[self.mine]
         self._away = np.flatnonzero(~self.mine)
         self._far = -1 - self.where[self._away]
-        self.free = self.gather(np.where(fixed, 0.0, 1.0))
+        self.free = 1.0 - self.gather(fixed)
         self._gather_groups()
-        self.counted = self.mine[self.ends[np.arange(len(self.ends)), self.last]]
-        counts = mesh.comm.allreduce(np.bincount(self.source[self.counted], minlength=len(self.sources)))
-        numbers = (np.cumsum(counts) - counts)[self.source] + self.ids
-        self.order = NaturalOrder(mesh.comm, numbers[self.counted], int(counts.sum()))
+        every = np.arange(len(self.ends))
+        self.counted = self.mine[self.ends[every, self.last]]
+        self.last_nodes = self.where[self.ends[every, self.last]]
 
     def _find(self, sources: Sequence[Constraint]) -> None:
         """Send the rows of all sources to the ranks of their nodes."""
         mesh, comm = self.mesh, self.mesh.comm
-        shapes = np.array([[*source.nodes.shape, source.data.shape[1]] for source in sources])
+        shapes = np.array([[*source.nodes.shape, source.data.shape[1]] for source in sources], dtype=np.int64)
+        shapes = shapes.reshape(-1, 3)
         before, largest = np.zeros_like(shapes), shapes.copy()
         comm.Exscan(shapes, before)
         comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
         self._widths, self._data = largest[:, 1:].T
-        k, m = int(self._widths.max()), int(self._data.max())
-        every = np.concatenate([source.nodes.ravel() for source in sources]).astype(np.int64)
-        at = petsc_numbers(mesh, every)
-        tables, first = [], 0
+        k, m = int(self._widths.max(initial=2)), int(self._data.max(initial=0))
+        every = np.concatenate([np.empty(0, dtype=np.int64), *(source.nodes.ravel() for source in sources)])
+        at = petsc_numbers(mesh, every) if sources else every
+        tables, first = [np.empty((0, 2 + 2 * k + m), dtype=np.int64)], 0
         for s, source in enumerate(sources):
             n, width = len(source.nodes), int(self._widths[s])
             table = np.full((n, 2 + 2 * k + m), -1, dtype=np.int64)
-            table[:, 0], table[:, 1] = s, (before[s, 0] if comm.rank else 0) + np.arange(n)
+            table[:, 0] = s
+            table[:, 1] = (before[s, 0] if comm.rank else 0) + np.arange(n) if source.ids is None else source.ids
             table[:, 2 : 2 + width] = at[first : first + n * width].reshape(n, width)
             table[:, 2 + k : 2 + k + width] = source.nodes.reshape(n, width)
             table[:, 2 + 2 * k : 2 + 2 * k + source.data.shape[1]] = source.data.view(np.int64)
@@ -284,13 +373,12 @@ class RowLayout:
         self.numbers, which, place = np.unique(number[some], return_index=True, return_inverse=True)
         self.ends = np.full(at.shape, -1)
         self.ends[some] = place.ravel()
+        self.owners = np.searchsorted(starts, at, side="right") - 1
         own = at[some][which]
         mine = (own >= starts[comm.rank]) & (own < starts[comm.rank + 1])
         ghosts = np.unique(own[~mine])
         self.where = np.where(mine, own - starts[comm.rank], -1 - np.searchsorted(ghosts, own))
         self.partners = GhostExchange(comm, starts, ghosts, _TAG)
-        end = at[np.arange(len(at)), self.last]
-        self.last_owners = np.searchsorted(starts, end, side="right") - 1
         self._first = np.searchsorted(self.source, np.arange(len(sources) + 1))
         self.sources, self._at = [], []
         for s, source in enumerate(sources):
@@ -304,31 +392,45 @@ class RowLayout:
         group_rows(self.ends, len(label), label)
         labels, self.group_of_node = np.unique(label, return_inverse=True)
         self.group_of_row = self.group_of_node[self.ends[:, 0]]
-        self.nodes = np.argsort(self.group_of_node, kind="stable")
-        self.members = np.argsort(self.group_of_row, kind="stable")
+        nodes = np.argsort(self.group_of_node, kind="stable")
+        rows = np.argsort(self.group_of_row, kind="stable")
         every = np.arange(len(labels) + 1)
-        self.node_starts = np.searchsorted(self.group_of_node[self.nodes], every)
-        self.starts = np.searchsorted(self.group_of_row[self.members], every)
+        starts = np.searchsorted(self.group_of_row[rows], every)
+        self.groups = Groups(starts, rows, np.searchsorted(self.group_of_node[nodes], every), nodes)
+        turning = np.zeros(len(labels), dtype=bool)
+        turning[self.group_of_row[~self.fixed]] = True
+        self._turning = turning
+
+    def order(self, some: np.ndarray) -> NaturalOrder:
+        """Return the order over all ranks of counted rows of sources ``some`` (sources,) bool, whose numbers have no
+        gaps. Collective."""
+        which = self.counted & some[self.source]
+        counts = self.mesh.comm.allreduce(np.bincount(self.source[which], minlength=len(self.sources)))
+        numbers = (np.cumsum(counts) - counts)[self.source] + self.ids
+        return NaturalOrder(self.mesh.comm, numbers[which], int(counts.sum()))
 
     @cached_property
     def alike(self) -> list[Alike]:
         """Return all groups, collected by shape."""
-        shapes, found = np.stack([np.diff(self.starts), np.diff(self.node_starts)]), []
+        starts, members, node_starts, nodes = self.groups
+        shapes, found = np.stack([np.diff(starts), np.diff(node_starts)]), []
         place = np.empty(len(self.numbers), dtype=np.int64)
-        place[self.nodes] = np.arange(len(self.nodes)) - self.node_starts[self.group_of_node[self.nodes]]
+        place[nodes] = np.arange(len(nodes)) - node_starts[self.group_of_node[nodes]]
         for p, q in np.unique(shapes, axis=1).T:
             groups = np.flatnonzero((shapes[0] == p) & (shapes[1] == q))
-            rows = self.members[self.starts[groups][:, None] + np.arange(p)]
-            nodes = self.nodes[self.node_starts[groups][:, None] + np.arange(q)]
-            found.append(Alike(rows, nodes, np.where(self.ends[rows] < 0, -1, place[self.ends[rows]])))
+            rows = members[starts[groups][:, None] + np.arange(p)]
+            own = nodes[node_starts[groups][:, None] + np.arange(q)]
+            found.append(Alike(rows, own, np.where(self.ends[rows] < 0, -1, place[self.ends[rows]])))
         return found
 
     def gather(self, values: np.ndarray) -> np.ndarray:
-        """Return values (n, ...) at the nodes from those at owned nodes (owned, ...). Collective."""
-        values = np.asarray(values, dtype=float)
-        width = int(np.prod(values.shape[1:]))
-        far = self.partners.bring(values[self.partners.rows].reshape(-1, width)) if width else np.empty((0, 0))
-        return self.spread(values, far.reshape(len(far), *values.shape[1:]))
+        """Return float64 values (n, ...) at the nodes from those at owned nodes (owned, ...). Collective."""
+        shape = values.shape[1:]
+        width = int(np.prod(shape))
+        far = np.empty((0, width))
+        if width and not self.partners.alone:
+            far = self.partners.bring(values[self.partners.rows].reshape(-1, width))
+        return self.spread(values, far.reshape(len(far), *shape)).astype(float, copy=False)
 
     def spread(self, values: np.ndarray, far: np.ndarray) -> np.ndarray:
         """Return values (n, ...) at the nodes from those at owned nodes (owned, ...) and those received (m, ...)."""
@@ -340,147 +442,13 @@ class RowLayout:
             every[self._away] = far[self._far]
         return every
 
-    def of_counted(self, values: np.ndarray) -> np.ndarray:
-        """Return values (r, ...) of this rank's rows from those of counted rows (c, ...). Collective."""
-        comm, shape = self.mesh.comm, values.shape[1:]
-        owners = self.last_owners
-        asking = Router(comm, owners)
-        asked = asking.send(self.source * (1 << 40) + self.ids)
-        own = self.source[self.counted] * (1 << 40) + self.ids[self.counted]
-        return asking.reply(values[np.searchsorted(own, asked)].reshape(len(asked), *shape))
-
-
-@kernel
-def solve_row_groups(
-    groups, starts, rows, node_starts, nodes, ends, gradients, values, stiffness, free, planes, tolerances, force, moves
-):
-    """Solve for the forces of the rows of some groups and the displacements of their nodes, with their walls.
-
-    Parameters
-    ----------
-    groups : (g,) which groups; starts, rows, node_starts, nodes :
-        see :func:`~pfem_petsc.contact.rows.broken_groups`
-    ends, gradients, values : (r, k), (r, k, 3), (r,) at the free positions; infinite for rows that do not apply
-    stiffness, free : (n,), (n, 3) of nodes; ``free`` is 0.0 where supports prescribe
-    planes : (first (n,), normals (m, w, 3), gaps (m, w)): index of a node among the planes, -1 for none, and distances
-        from walls at the free positions, infinite where a wall does not apply
-    tolerances : (groups,) a row violated by at most this counts as satisfied
-    force, moves : (r,), (n, 3) output; written for these groups only
-
-    Returns
-    -------
-    int
-        First of the groups with infeasible rows, else -1.
-    """
-    first_plane, normals, gaps = planes
-    walls = gaps.shape[1]
-    width = ends.shape[1]
-    for group in groups:
-        begin, end = starts[group], starts[group + 1]
-        tolerance = tolerances[group]
-        n_walled = 0
-        for q in range(node_starts[group], node_starts[group + 1]):
-            i = nodes[q]
-            for c in range(3):
-                moves[i, c] = 0.0
-            if first_plane[i] >= 0:
-                for k in range(walls):
-                    if gaps[first_plane[i], k] < math.inf:
-                        n_walled += 1
-        if end - begin == 1 and n_walled == 0:  # a single row
-            r = rows[begin]
-            force[r] = 0.0
-            square, gram = 0.0, 0.0
-            for k in range(width):
-                i = ends[r, k]
-                if i < 0:
-                    continue
-                for c in range(3):
-                    part = gradients[r, k, c] * free[i, c]
-                    square += part * part
-                    gram += part * part / stiffness[i]
-            if values[r] < math.inf and square > FREE_PART and not values[r] >= -tolerance:
-                strength = -values[r] / gram
-                if not strength < math.inf:
-                    return group
-                force[r] = strength
-                for k in range(width):
-                    i = ends[r, k]
-                    if i < 0:
-                        continue
-                    for c in range(3):
-                        moves[i, c] += strength * (gradients[r, k, c] * free[i, c]) / stiffness[i]
-            continue
-        size = end - begin + n_walled
-        node, vector = np.full((size, width), -1), np.zeros((size, width, 3))
-        value, row = np.empty(size), np.full(size, -1)
-        n = 0
-        for q in range(begin, end):
-            r = rows[q]
-            force[r] = 0.0
-            square = 0.0
-            if not values[r] < math.inf and values[r] == values[r]:
-                continue
-            for k in range(width):
-                i = ends[r, k]
-                node[n, k] = i
-                for c in range(3):
-                    vector[n, k, c] = gradients[r, k, c] * free[i, c] if i >= 0 else 0.0
-                    square += vector[n, k, c] * vector[n, k, c]
-            if square > FREE_PART:
-                value[n], row[n] = values[r], r
-                n += 1
-        for q in range(node_starts[group], node_starts[group + 1]):
-            i = nodes[q]
-            at = first_plane[i]
-            for w in range(walls):
-                if at < 0 or not gaps[at, w] < math.inf:
-                    continue
-                square = 0.0
-                for k in range(width):
-                    node[n, k] = -1
-                node[n, 0], row[n], value[n] = i, -1, gaps[at, w]
-                for c in range(3):
-                    vector[n, 0, c] = normals[at, w, c] * free[i, c]
-                    square += vector[n, 0, c] * vector[n, 0, c]
-                if square > FREE_PART:
-                    n += 1
-        gram = np.zeros((n, n))
-        for a in range(n):
-            for b in range(a, n):
-                s = 0.0
-                for d in range(width):
-                    i = node[a, d]
-                    if i < 0:
-                        continue
-                    for e in range(width):
-                        if node[b, e] == i:
-                            for c in range(3):
-                                s += vector[a, d, c] * vector[b, e, c] / stiffness[i]
-                gram[a, b] = gram[b, a] = s
-        z = np.zeros(n)
-        if not find_multipliers(gram, value[:n], tolerance, z):
-            return group
-        for a in range(n):
-            if row[a] >= 0:
-                force[row[a]] = z[a]
-            for k in range(width):
-                i = node[a, k]
-                if i >= 0:
-                    for c in range(3):
-                        moves[i, c] += z[a] * vector[a, k, c] / stiffness[i]
-    return -1
-
-
-_ITERATIONS = 100  # linearisations of a problem
-
-Planes = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Walls at nodes: place of each node among the planes (n,), -1 for none; normals (m, w, 3), and distances (m, w) [m] at
-the free positions, infinite for no concern."""
-
-
-class Rows(RowLayout):
-    """The rows of all sources that this rank has, and what they are at positions of their nodes."""
+    def of_counted(self, values: np.ndarray, some: np.ndarray) -> np.ndarray:
+        """Return values (m, ...) of the rows ``some`` (r,) bool from those of the counted ones (c, ...). Collective."""
+        asking = Router(self.mesh.comm, self.owners[np.arange(len(self.last)), self.last][some])
+        keys = self.source * (1 << 40) + self.ids
+        asked = asking.send(keys[some])
+        own = keys[self.counted & some]
+        return asking.reply(values[np.searchsorted(own, asked)].reshape(len(asked), *values.shape[1:]))
 
     def _each(self, rows: np.ndarray | None, method: str, *arrays: np.ndarray) -> list[np.ndarray]:
         """Return the results of a method of each source for arrays (n, 3), for some rows, ascending, or all."""
@@ -496,7 +464,11 @@ class Rows(RowLayout):
 
     def values(self, x: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Rows (r,) [m] at positions (n, 3); of some rows, ascending, if they are given, as below."""
-        return _joined(self._each(rows, "values", x))
+        if rows is not None or self.pairs is None:
+            return _joined(self._each(rows, "values", x))
+        values = np.empty(len(self.source))
+        pair_values(*self.pairs, x, values)
+        return values
 
     def gradients(self, x: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Gradients (r, k, 3) at positions (n, 3), zero behind the last node of a row."""
@@ -528,108 +500,115 @@ class Rows(RowLayout):
         """Return (r,) bool: rows with free components, which can be satisfied."""
         return self.along(jacobian**2, self.free) > FREE_PART
 
-    def solve(
-        self, jacobian: np.ndarray, values: np.ndarray, stiffness: np.ndarray, planes: Planes, tolerance: float
-    ) -> np.ndarray:
-        """Forces (r,) [N] of the rows.
+    def system(
+        self, jacobian: np.ndarray, values: np.ndarray, stiffness: np.ndarray, planes: Planes | None = None
+    ) -> System:
+        """Return rows (r,) with gradients (r, k, 3) for :meth:`project` and :meth:`solve`; ``stiffness`` (n,) [N/m]."""
+        if planes is None:
+            planes = np.full(len(self.numbers), -1), np.empty((0, 0, 3)), np.empty((0, 0))
+        return System(self.ends, jacobian, values, stiffness, self.free, *planes)
 
-        Parameters
-        ----------
-        jacobian, values : (r, k, 3) gradients, (r,) rows at the free positions; infinite for rows that do not apply
-        stiffness : (n,) force for a displacement of a node [N/m]
-        planes : see :data:`Planes`
-        tolerance : rows broken by no more count as kept [m]
+    def gather_of(self, at: np.ndarray, of_nodes: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Return values (2, m, n) at the first two nodes of rows ``at`` (m,); ``of_nodes`` gives (k, n) at owned nodes.
+
+        Ranks that own one of the two nodes must request the row at the same time; only these two communicate.
+        """
+        where = self.where[self.ends[at, :2]].T
+        mine = where >= 0
+        own = of_nodes(where[mine])
+        data = np.zeros((*where.shape, own.shape[1]))
+        data[mine] = own
+        cut = np.flatnonzero(mine[0] != mine[1])
+        if len(cut):
+            end = np.where(mine[0, cut], 0, 1)
+            data[1 - end, cut] = swap(self.mesh.comm, self.owners[at[cut], 1 - end], data[end, cut])
+        return data
+
+    def solve(self, system: System, pushed: np.ndarray, tolerance: float) -> np.ndarray:
+        """Return forces (r,) [N] that satisfy linear rows; those violated by at most the tolerance count as satisfied.
+
+        ``pushed`` (r,): the rows where walls alone act; groups without violated ones need no forces.
 
         Raises
         ------
         SimulationFailure
-            On ranks that have such rows: nothing keeps all of them.
+            On ranks with rows that are infeasible.
         """
-        place, _, gaps = planes
-        near = place >= 0
-        near[near] = (gaps[place[near]] < -tolerance).any(axis=1)
-        nowhere, force = np.zeros((len(self.numbers), 3)), np.zeros(len(values))
-        groups, tolerances = self._broken(values, nowhere, near, tolerance)
-        self._solve(groups, jacobian, values, stiffness, planes, tolerances, force, np.empty_like(nowhere))
+        nowhere, force = np.zeros((len(self.numbers), 3)), np.zeros(len(system.values))
+        groups, tolerances = self._broken(pushed, nowhere, tolerance)
+        self._solve(groups, system, tolerances, force, np.empty_like(nowhere))
         return force
 
-    def _broken(
-        self, values: np.ndarray, x: np.ndarray, near: np.ndarray, tolerance: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        groups = len(self.starts) - 1
+    def _broken(self, values: np.ndarray, x: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+        groups = len(self.groups.starts) - 1
         chosen, tolerances = np.empty(groups, dtype=bool), np.empty(groups)
-        arrays = self.starts, self.members, self.node_starts, self.nodes
-        if not broken_groups(*arrays, values, x, near, tolerance, chosen, tolerances):
+        if not broken_groups(self.groups, values, x, tolerance, chosen, tolerances):
             return np.empty(0, dtype=np.int64), tolerances
         return np.flatnonzero(chosen), tolerances
 
     def _solve(
-        self,
-        groups: np.ndarray,
-        jacobian: np.ndarray,
-        values: np.ndarray,
-        stiffness: np.ndarray,
-        planes: Planes,
-        tolerances: np.ndarray,
-        force: np.ndarray,
-        moves: np.ndarray,
+        self, which: np.ndarray, system: System, tolerances: np.ndarray, force: np.ndarray, moves: np.ndarray
     ) -> None:
-        arrays = self.starts, self.members, self.node_starts, self.nodes, self.ends
-        given = jacobian, values, stiffness, self.free, planes, tolerances
-        infeasible = solve_row_groups(groups, *arrays, *given, force, moves)
+        infeasible = project_groups(which, self.groups, system, tolerances, force, moves)
         if infeasible >= 0:
             raise SimulationFailure(
-                f"no positions of nodes {self._shown(infeasible)} satisfy their constraints, walls and supports"
+                f"no positions of nodes {self._shown(infeasible)} satisfy their contact pairs, constraints, walls and "
+                "supports"
             )
 
     def _shown(self, group: int) -> str:
-        nodes = self.nodes[self.node_starts[group] : self.node_starts[group + 1]]
-        return ", ".join(str(number) for number in self.numbers[nodes][:6])
+        _, _, starts, nodes = self.groups
+        return ", ".join(str(number) for number in self.numbers[nodes[starts[group] : starts[group + 1]]][:6])
 
     def project(
-        self,
-        x: np.ndarray,
-        tolerance: float,
-        near: np.ndarray,
-        given: Callable[[], tuple[np.ndarray, np.ndarray | None, Planes]],
+        self, x: np.ndarray, pushed: np.ndarray, tolerance: float, given: Given, jacobian: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return forces (r,) [N] that satisfy the rows, and the gradients (r, k, 3) along which they act.
 
         Parameters
         ----------
-        x : (n, 3) positions without rows [m]
+        x, pushed : (n, 3) positions without rows, and where walls alone push the nodes [m]
         tolerance : [m]
-        near : (n,) bool, nodes that may be beyond walls; (0,) for none
-        given : asked where groups are to be solved; gives the stiffness (n,) of the nodes [N/m], places (n, 3) where
+        given : asked if groups are to be solved; gives the stiffness (n,) of the nodes [N/m], positions (n, 3) where
             the forces act, None: at the solution, and planes
+        jacobian : (r, k, 3) gradients of fixed rows
 
         Raises
         ------
         SimulationFailure
-            On ranks that have such rows.
+            On ranks with rows that are infeasible.
         """
-        values = self.values(x)
-        force, jacobian = np.zeros(len(values)), np.zeros((*self.ends.shape, 3))
-        groups, tolerances = self._broken(values, x, near, tolerance)
+        values = self.values(pushed)
+        force = np.zeros(len(values))
+        groups, tolerances = self._broken(values, x, tolerance)
         if len(groups) == 0:
             return force, jacobian
+        if pushed is not x:
+            values = self.values(x)
+        chosen = np.zeros(len(self._turning), dtype=bool)
+        chosen[groups] = True
         stiffness, start, planes = given()
-        at, moves = x.copy(), np.empty_like(x)
-        chosen = np.zeros(len(self.starts) - 1, dtype=bool)
-        rows = None
+        moves = np.empty_like(x)
+        turning = groups[self._turning[groups]]
+        if len(turning) == 0:
+            self._solve(groups, self.system(jacobian, values, stiffness, planes), tolerances, force, moves)
+            return force, jacobian
+        jacobian, at, rows = jacobian.copy(), x.copy(), None
+        system = self.system(jacobian, values, stiffness, planes)
         for _ in range(_ITERATIONS):
             chosen[:] = False
             chosen[groups] = True
             fewer = np.flatnonzero(chosen[self.group_of_row])
+            turned = fewer[~self.fixed[fewer]]
             if rows is None or start is None:
-                jacobian[fewer] = self.gradients(at if start is None else start, fewer)
+                jacobian[turned] = self.gradients(at if start is None else start, turned)
             if rows is not None:
-                linearise(fewer, self.ends, jacobian, self.free, x, at, self.values(at, fewer), values)
+                linearise(fewer, system, x, at, self.values(at, fewer))
             rows = fewer
-            self._solve(groups, jacobian, values, stiffness, planes, tolerances, force, moves)
+            self._solve(groups, system, tolerances, force, moves)
             settled = np.empty(len(groups), dtype=bool)
-            advance_groups(groups, self.node_starts, self.nodes, x, moves, at, tolerances, settled)
-            groups = groups[~settled]
+            advance_groups(groups, self.groups, x, moves, at, tolerances, settled)
+            groups = groups[~settled & self._turning[groups]]
             if len(groups) == 0:
                 return force, jacobian
         raise SimulationFailure(

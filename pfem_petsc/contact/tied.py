@@ -24,14 +24,12 @@ if TYPE_CHECKING:
     from .frames import NodalFrames
     from .walls.base import WallKeys
 
-__all__ = ["FreshTies", "NoTies", "Ties"]
-
 FreshTies = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Nodes (k,) tied in a step, their walls (k,), and the walls' normals there (k, 3)."""
 
 
 class Ties:
-    """The tied nodes of this rank.
+    """The tied nodes of this rank; the state keeps nothing if no wall has ``tied = true``.
 
     Attributes
     ----------
@@ -46,11 +44,13 @@ class Ties:
         self.contact = contact
         self.tying = np.array([wall.tied for wall in walls], dtype=bool)
         self.any = bool(self.tying.any())
+        self._nowhere = np.zeros(contact.mesh.n_owned if not self.any else 0, dtype=bool)
+        self._nowhere.flags.writeable = False
 
     @property
     def held(self) -> np.ndarray:
         """(owned,) bool: nodes that are tied."""
-        return self._memory()[0] > 0
+        return self._memory()[0] > 0 if self.any else self._nowhere
 
     def walls(self, nodes: np.ndarray) -> np.ndarray:
         """Return the walls (m,) to which nodes (m,) are tied."""
@@ -99,6 +99,8 @@ class Ties:
         SimulationFailure
             On all ranks, if a node was moved through another wall.
         """
+        if not self.any:
+            return self.nobody
         nodes, walls, places = self.targets(time)
         with agreed(self.contact.mesh.comm):
             self.check(nodes, walls, np.where(self.contact.fixed[nodes], x[nodes], places), time)
@@ -146,6 +148,8 @@ class Ties:
 
         Returns the newly tied nodes (k,), their walls (k,), and the walls' normals there (k, 3).
         """
+        if not self.any:
+            return self.nobody
         tied_to, tied_at = self._memory()
         fresh = touching & self.tying & (tied_to[nodes] == 0)[:, None]
         met = fresh.any(axis=1)
@@ -158,7 +162,7 @@ class Ties:
             normals[walls == k] = self.contact.walls[k].planes(own[walls == k])[0]
         return nodes[met], walls, normals
 
-    def calm(
+    def damp_velocity(
         self, nodes: np.ndarray, walls: np.ndarray, normals: np.ndarray, v: np.ndarray, rates: np.ndarray, h: float
     ) -> None:
         """Tie nodes where they come to rest on their walls, for schemes with x1 - x0 = h (v0 + v1)/2.
@@ -173,6 +177,8 @@ class Ties:
         v : (owned, 3) velocities [m/s]; rates : (walls, 3) those of the walls
         h : step [s]
         """
+        if not self.any:
+            return
         tied_to, tied_at = self._memory()
         relative = v[nodes] - rates[walls]
         away = np.einsum("ki,ki->k", relative, normals)
@@ -186,30 +192,3 @@ class Ties:
         if "tied_to" not in memory:
             memory["tied_to"], memory["tied_at"] = np.zeros(owned, dtype=np.int64), np.zeros((owned, 3))
         return memory["tied_to"], memory["tied_at"]
-
-
-class NoTies(Ties):
-    """Null object for :class:`Ties` if no wall has ``tied = true``; keeps nothing in the state."""
-
-    def __init__(self, contact: Contact, walls: Sequence[WallKeys]) -> None:
-        super().__init__(contact, walls)
-        self._nowhere = np.zeros(contact.mesh.n_owned, dtype=bool)
-        self._nowhere.flags.writeable = False
-
-    @property
-    def held(self) -> np.ndarray:
-        """See :class:`Ties`."""
-        return self._nowhere
-
-    def pin(self, frames: NodalFrames, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See :class:`Ties`; not collective."""
-        return self.nobody
-
-    def take(self, nodes: np.ndarray, touching: np.ndarray, places: np.ndarray, time: float) -> FreshTies:
-        """See :class:`Ties`."""
-        return self.nobody
-
-    def calm(
-        self, nodes: np.ndarray, walls: np.ndarray, normals: np.ndarray, v: np.ndarray, rates: np.ndarray, h: float
-    ) -> None:
-        """See :class:`Ties`."""

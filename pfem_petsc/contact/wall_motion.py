@@ -22,22 +22,28 @@ Answer = tuple[np.ndarray, np.ndarray | None]
 
 
 class FreeWalls:
-    """The walls of a case that have a mass; the same on all ranks.
+    """The walls of a case that have a mass, if there are any; the same on all ranks.
 
     Attributes
     ----------
+    any : whether there are such walls
     at : (f,) indices of these walls among all walls of the case
     state : of the walls; x is the displacement from the initial position (f, 3)
     weight : (f, 3) [N], zero where gravity does not act
     """
 
     def __init__(
-        self, walls: Sequence[WallKeys], scheme: Scheme, comm: MPI.Comm, gravity: tuple[float, float, float]
+        self,
+        walls: Sequence[WallKeys],
+        scheme: Scheme | None = None,
+        comm: MPI.Comm | None = None,
+        gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         self.at = np.array([k for k, wall in enumerate(walls) if wall.mass is not None], dtype=np.int64)
-        self.mass = np.array([walls[k].mass for k in self.at])
+        self.any = len(self.at) > 0
+        self.mass = np.array([walls[k].mass for k in self.at], dtype=float)
         self.scheme, self.comm = scheme, comm
-        speeds = np.array([walls[k].velocity or (0.0, 0.0, 0.0) for k in self.at])
+        speeds = np.array([walls[k].velocity or (0.0, 0.0, 0.0) for k in self.at], dtype=float).reshape(-1, 3)
         n = len(self.at)
         heavy = np.array([walls[k].gravity for k in self.at], dtype=bool)
         self.weight = np.where(heavy, self.mass, 0.0)[:, None] * np.array(gravity)
@@ -47,11 +53,15 @@ class FreeWalls:
 
     def start(self, h: float) -> None:
         """Initialise the acceleration and the scheme's memory."""
+        if not self.any:
+            return
         self.state.a = self.weight / self.mass[:, None]
         self.scheme.start(self.state, h)
 
     def begin(self, time: float, h: float) -> None:
         """Set the balance of a step from ``time``; schemes that solve for the next position move the walls first."""
+        if not self.any:
+            return
         if self.scheme.solves_next_position and time > self.state.time:
             self.scheme.advance(self.state, h)
         self.state.time = time
@@ -59,6 +69,8 @@ class FreeWalls:
 
     def finish(self, h: float, end: float) -> None:
         """Complete the walls' state with the solution; ``end`` is the time of the truss then, to the last bit."""
+        if not self.any:
+            return
         self.scheme.finish(self.state, self._balance, self._u, h)
         if not self.scheme.solves_next_position:
             self.state.time = end
@@ -71,6 +83,8 @@ class FreeWalls:
     @property
     def balanced(self) -> np.ndarray:
         """Return the accelerations (f, 3) of the last balance [m/s2]."""
+        if not self.any:
+            return self._u
         known = 0.0 if self._balance.a_hat is None else self._balance.a_hat
         return self._balance.alpha * self._u + known
 
@@ -95,8 +109,10 @@ class FreeWalls:
             (f, 3) [N] and of their derivatives dF/du (f, 3, 3) [N/m], or None where these are not known
         tolerance : of the walls' positions [m]
         """
+        if not self.any:
+            forces()
+            return True
         balance = self._balance
-        n = 3 * len(self.at)
         weight = np.repeat(balance.alpha * self.mass, 3)
         rest = -self.weight if balance.a_hat is None else self.mass[:, None] * balance.a_hat - self.weight
         u = (-rest / (balance.alpha * self.mass[:, None])).ravel()
@@ -124,7 +140,7 @@ class FreeWalls:
                 if size > 0.0:
                     matrix = matrix + np.outer(dr - matrix @ du, du) / size
             earlier = u, residual
-            move = np.linalg.solve(matrix, -residual) if n else np.zeros(0)
+            move = np.linalg.solve(matrix, -residual)
             if np.abs(move).max(initial=0.0) <= tolerance:
                 break
             u = u + move
@@ -150,10 +166,13 @@ class FreeWalls:
 
     def step_changed(self, scheme: Scheme) -> None:
         """Notify the scheme that the step size has changed."""
-        scheme.step_changed(self.state)
+        if self.any:
+            scheme.step_changed(self.state)
 
-    def kept(self) -> dict[str, Any]:
-        """Return the state for a checkpoint."""
+    def kept(self) -> dict[str, Any] | None:
+        """Return the state for a checkpoint, None if no wall has mass."""
+        if not self.any:
+            return None
         state = self.state
         memory = {name: array.tolist() for name, array in state.memory.items()}
         return {
@@ -165,8 +184,10 @@ class FreeWalls:
             "increment": self._u.tolist(),
         }
 
-    def load_state(self, kept: dict[str, Any]) -> None:
+    def load_state(self, kept: dict[str, Any] | None) -> None:
         """Restore the state from a checkpoint."""
+        if kept is None:
+            return
         shape = self.state.x.shape
         for name in ("x", "v", "a"):
             setattr(self.state, name, np.array(kept[name], dtype=float).reshape(shape))
@@ -176,100 +197,24 @@ class FreeWalls:
             self.state.memory[name] = np.array(array, dtype=float).reshape(shape)
 
 
-class NoFreeWalls:
-    """Null object for :class:`FreeWalls` if no wall has mass."""
-
-    def __init__(self) -> None:
-        self.at = np.empty(0, dtype=np.int64)
-        self.mass = np.zeros(0)
-        self.weight = self.balanced = np.zeros((0, 3))
-        self.state = State(*(np.zeros((0, 3)) for _ in range(7)))
-        self.kinetic = 0.0
-
-    def start(self, h: float) -> None:
-        """Do nothing."""
-
-    def begin(self, time: float, h: float) -> None:
-        """Do nothing."""
-
-    def finish(self, h: float, end: float) -> None:
-        """Nothing moves."""
-
-    def step_changed(self, scheme: Scheme) -> None:
-        """Do nothing."""
-
-    def displacements(self, time: float) -> np.ndarray:
-        """Return no displacements, (0, 3)."""
-        return self.state.x
-
-    def solve(self, forces: Callable[[], Answer], tolerance: float) -> bool:
-        """Evaluate the forces once; return True."""
-        forces()
-        return True
-
-    def kept(self) -> None:
-        """Return None: a checkpoint needs nothing."""
-
-    def load_state(self, kept: None) -> None:
-        """Do nothing."""
-
-
 class WallMotion:
     """Displacements of all walls of a case.
 
     Attributes
     ----------
     moving : (w,) bool, walls that move
-    bodies : FreeWalls, the walls with mass; NoFreeWalls if there are none
+    bodies : FreeWalls, the walls with mass
     held : (w, 3) displacements at the start of a stage [m] of walls that stay in force and rest there
     """
 
     def __init__(self, walls: Sequence[WallKeys], holds: bool = False) -> None:
         self._motions = [None if holds else motion_of(wall) for wall in walls]
         self.held = np.zeros((len(walls), 3))
-        self.bodies: FreeWalls | NoFreeWalls = NoFreeWalls()
+        self.bodies = FreeWalls([])  # until their scheme is known
         self.moving = np.array(
             [wall.velocity is not None or wall.motion is not None or wall.mass is not None for wall in walls],
             dtype=bool,
         )
-
-    @property
-    def free(self) -> FreeWalls | None:
-        """The walls with mass, None if there are none."""
-        return self.bodies if len(self.bodies.at) else None
-
-    @property
-    def speeds(self) -> np.ndarray:
-        """Velocities (f, 3) [m/s] of walls with mass; (0, 3) if there are none."""
-        return self.bodies.state.v
-
-    def set_speeds(self, v: np.ndarray) -> None:
-        """Set the velocities (f, 3) [m/s] of walls with mass."""
-        self.bodies.state.v = v
-
-    def start(self, h: float) -> None:
-        """Initialise the state of walls with mass for steps of ``h`` [s]."""
-        self.bodies.start(h)
-
-    def begin(self, time: float, h: float) -> None:
-        """Begin a step of ``h`` from ``time`` [s] for walls with mass."""
-        self.bodies.begin(time, h)
-
-    def finish(self, h: float, end: float) -> None:
-        """Complete the state of walls with mass after a step of ``h`` to the time ``end`` [s]."""
-        self.bodies.finish(h, end)
-
-    def step_changed(self, scheme: Scheme) -> None:
-        """Notify the scheme of the walls with mass that the step size has changed."""
-        self.bodies.step_changed(scheme)
-
-    def kept(self) -> dict[str, Any] | None:
-        """Return the state for a checkpoint, None if no wall has mass."""
-        return self.bodies.kept()
-
-    def load_state(self, kept: dict[str, Any] | None) -> None:
-        """Restore walls with mass from a checkpoint."""
-        self.bodies.load_state(kept)
 
     def displacements(self, time: float) -> np.ndarray:
         """Return displacements (w, 3) [m] at a time [s]."""

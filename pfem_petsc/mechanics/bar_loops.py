@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..energies import BAR_ENERGIES
+from ..columns import BAR_ENERGIES
 from .columns import add_rows, address, copy_run, difference_of_ends, number_at, subtract_rows
 from .compiled import borrowing, inlined, kernel
 from .materials.base import Law
@@ -177,7 +177,7 @@ def make_force_kernels(law: Law, measure: Callable) -> dict[str, Any]:
 
     @inlined
     def sum_energies(work, energies):
-        """Add the sums of ``work`` to ``energies``, see :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]."""
+        """Add the sums of ``work`` to ``energies``, see :data:`~pfem_petsc.columns.BAR_ENERGIES` [J]."""
         for j in range(n_energies):
             s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0  # additions that do not wait for each other
             for i in range((4 + j) * CHUNK, (5 + j) * CHUNK, 8):
@@ -201,7 +201,7 @@ def make_force_kernels(law: Law, measure: Callable) -> dict[str, Any]:
     @kernel
     def forces(x, sweep, far, rest, heat, p, area, step, history, commit, f, energies):
         """Add internal forces to ``f``, and sums over counted bars to ``energies``, see
-        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; return the first failed bar or -1, whether any bar is so short
+        :data:`~pfem_petsc.columns.BAR_ENERGIES` [J]; return the first failed bar or -1, whether any bar is so short
         that it may be inverted, and how many bars have changed their state of rupture.
 
         ``sweep``: a :class:`~pfem_petsc.mechanics.sweep.Sweep`; ``far`` (b,) the upper end of each bar.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..energies import BAR_ENERGIES
+from ..columns import BAR_ENERGIES
 from ..errors import InputError
 from ..fields import STATUS
 from ..mesh.node_sets import group_hint
@@ -249,7 +249,7 @@ _OF_SPRINGS = BAR_ENERGIES.index("spring_energy")
 
 class StrainEnergy(NamedTuple):
     """Sums over the bars counted on this rank, and its springs, in the order of
-    :data:`~pfem_petsc.energies.BAR_ENERGIES` [J], the first collapsed bar (local index, -1: none), whether any bar is
+    :data:`~pfem_petsc.columns.BAR_ENERGIES` [J], the first collapsed bar (local index, -1: none), whether any bar is
     so short that it may be inverted, and how many local bars have changed their state of rupture."""
 
     energies: tuple[float, ...] = (0.0,) * len(BAR_ENERGIES)
@@ -597,7 +597,7 @@ def state_before_rupture(bars: Bars, x: np.ndarray, bar: int) -> tuple[BarBlock,
 
 def release(bars: Bars, x: np.ndarray, members: np.ndarray, state: float) -> np.ndarray:
     """Remove bars (local indices) up to a share, see :mod:`~pfem_petsc.mechanics.rupture`; return by how much the
-    energies of the bars counted on this rank change, in the order of :data:`~pfem_petsc.energies.BAR_ENERGIES`."""
+    energies of the bars counted on this rank change, in the order of :data:`~pfem_petsc.columns.BAR_ENERGIES`."""
     change = np.zeros(len(BAR_ENERGIES))
     for block in bars.blocks:
         mine = members[(members >= block.start) & (members < block.stop)].astype(np.int64)

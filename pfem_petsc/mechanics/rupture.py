@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba.extending import register_jitable
 
-from ..energies import STORED
+from ..columns import STORED
 from .bar_loops import no_bar_data, no_variables
 from .compiled import inlined, kernel
 from .materials.base import Law

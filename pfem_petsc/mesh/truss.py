@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
-from ..registry import lookup
 from .slab import slab_from_arrays
 
 if TYPE_CHECKING:
@@ -224,9 +223,6 @@ class Truss:
 
     def __hash__(self) -> int:
         return hash(self.digest)
-
-    def _repr_html_(self) -> str:
-        return lookup("pfem_petsc.post", "inline", "").of_truss(self)
 
     def __repr__(self) -> str:
         groups = [*(self.node_groups or ()), *(self.bar_groups or ())]

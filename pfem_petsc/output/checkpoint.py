@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import os
 import time
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 import h5py
 import numpy as np
@@ -35,33 +35,17 @@ from .hdf5 import (
     writes_together,
     writing,
 )
-from .integrity import check_seal, checksum, remedy, seal, seal_size
+from .integrity import checksum
 
 NAME, PREVIOUS = "checkpoint.h5", "checkpoint-previous.h5"
 
+_FORMAT, _VERSION = "pfem_petsc checkpoint", 1
+_LARGEST_SEAL = 1 << 20
+_BLOCK = 1 << 18  # number of bytes read at a time
 _ATTEMPTS = 20  # to open a file between two replacements
 
 
-@dataclass(frozen=True)
 class Checkpoint:
-    """Contents of a checkpoint.
-
-    Attributes
-    ----------
-    path : Path
-    arrays : dict of name to this rank's owned rows (n_owned, ...), in the types in which they were written
-    scalars : dict
-        As written; float64 exact to the last bit.
-    attributes : dict
-    """
-
-    path: Path
-    arrays: dict[str, np.ndarray]
-    scalars: dict[str, Any]
-    attributes: dict[str, Any]
-
-
-class OpenCheckpoint:
     """A checkpoint opened for reading: the same file on all ranks, unchanged between header and last array.
 
     Every rank opens the file once and reads it through that descriptor, even if a run replaces the checkpoint
@@ -74,7 +58,7 @@ class OpenCheckpoint:
 
     Attributes
     ----------
-    scalars, attributes : dicts, as they were written
+    scalars, attributes : dicts, as they were written; float64 exact to the last bit
     digest : of everything except the values of the arrays, whose checksums are part of it
 
     Raises
@@ -110,16 +94,23 @@ class OpenCheckpoint:
         if raw is not None:
             raw.close()
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def _header(self) -> tuple[dict[str, Any], dict[str, Any]]:
         with _sound(self.path), h5py.File(self._raw, "r") as file:
             state = file["state"][()]
             if zlib.crc32(state) != file["state"].attrs["checksum"]:
-                raise InputError(f"{self.path}: damaged: its state does not match the checksum; {remedy(self.path)}")
+                raise InputError(f"{self.path}: damaged: its state does not match the checksum; {_remedy(self.path)}")
         state = json.loads(state)
         return state["scalars"], state["attributes"]
 
-    def read(self, orders: Mapping[str, NaturalOrder]) -> Checkpoint:
-        """Read arrays, on any number of ranks. Collective.
+    def read(self, orders: Mapping[str, NaturalOrder]) -> dict[str, np.ndarray]:
+        """Return this rank's owned rows (n_owned, ...) of arrays, in the types of the file, by name, on any number of
+        ranks. Collective.
 
         Parameters
         ----------
@@ -132,8 +123,7 @@ class OpenCheckpoint:
             On all ranks, if the file is damaged, lacks one of the arrays, or has another number of rows.
         """
         path = self.path
-        slabs: dict[str, np.ndarray] = {}
-        expected: dict[str, int] = {}
+        slabs: dict[str, tuple[np.ndarray, int]] = {}
         # Reading needs no collective transfers: every rank reads its slab independently.
         with agreed(self.comm), _sound(path), h5py.File(self._raw, "r") as file:
             for name, order in orders.items():
@@ -148,29 +138,11 @@ class OpenCheckpoint:
                         f"{path}: {name} has {len(dataset)} rows, the case needs {order.n_global}: it belongs to "
                         "another mesh; restart the case it was written by"
                     )
-                slabs[name] = dataset[order.first : order.first + order.count]
-                expected[name] = int(dataset.attrs["checksum"])
-        for name, slab in slabs.items():
-            if checksum(self.comm, slab, orders[name].first) != expected[name]:
-                raise InputError(f"{path}: damaged: the values of {name} do not match their checksum; {remedy(path)}")
-        arrays = {name: orders[name].from_slab(slab) for name, slab in slabs.items()}
-        return Checkpoint(path, arrays, self.scalars, self.attributes)
-
-
-def read_checkpoint(path: Path | str, comm: MPI.Comm, orders: Mapping[str, NaturalOrder]) -> Checkpoint:
-    """Open, read and close a checkpoint; see :class:`OpenCheckpoint`. Collective."""
-    file = OpenCheckpoint(path, comm)
-    try:
-        return file.read(orders)
-    finally:
-        file.close()
-
-
-def read_checkpoint_header(path: Path | str, comm: MPI.Comm) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return scalars and attributes of a checkpoint on all ranks; raises as :class:`OpenCheckpoint`. Collective."""
-    file = OpenCheckpoint(path, comm)
-    file.close()
-    return file.scalars, file.attributes
+                slabs[name] = dataset[order.first : order.first + order.count], int(dataset.attrs["checksum"])
+        for name, (slab, expected) in slabs.items():
+            if checksum(self.comm, slab, orders[name].first) != expected:
+                raise InputError(f"{path}: damaged: the values of {name} do not match their checksum; {_remedy(path)}")
+        return {name: orders[name].from_slab(slab) for name, (slab, _) in slabs.items()}
 
 
 def newest_checkpoint(folder: Path | str) -> Path | None:
@@ -199,11 +171,103 @@ def asked_checkpoint(folder: Path | str, asked: bool | Path | str) -> Path | Non
     return newest
 
 
+def _seal_size(n_arrays: int) -> int:
+    """Return the size of the user block for the seal of a file with ``n_arrays``: a power of two, as HDF5 requires."""
+    return 1 << (511 + 64 * n_arrays).bit_length()
+
+
+def _seal(path: Path) -> None:
+    """Write the seal into the user block of a complete, closed file. Not collective."""
+    with h5py.File(path, "r", locking=False) as file:
+        size = file.userblock_size
+        found = [(dataset.id.get_offset(), dataset.id.get_storage_size()) for dataset in file["arrays"].values()]
+    arrays = sorted([offset, length] for offset, length in found if length)
+    content = {"size": path.stat().st_size, "seal_size": size, "arrays": arrays}
+    with open(path, "rb") as raw:
+        text = json.dumps({**content, "digest": _digest(raw, content)})
+    line = f"{_FORMAT} {_VERSION}\n{text}\n".encode()
+    if len(line) > size:
+        raise ValueError(f"{path}: seal of {len(line)} bytes for {size}")
+    with open(path, "r+b") as raw:
+        raw.write(line.ljust(size))
+
+
+def check_seal(path: Path, raw: BinaryIO | None = None) -> str:
+    """Compare a file, except the values of its arrays, with its seal; return the digest. Not collective.
+
+    Parameters
+    ----------
+    path : Path
+    raw : the file opened for reading, in case ``path`` was replaced since; default: opened here
+
+    Raises
+    ------
+    InputError
+        If the file is not a checkpoint, of another version, truncated, or damaged.
+    """
+    try:
+        with nullcontext(raw) if raw is not None else open(path, "rb") as raw:
+            return _checked(path, raw)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}; {_remedy(path)}") from error
+
+
+def _checked(path: Path, raw: BinaryIO) -> str:
+    raw.seek(0)
+    head = raw.read(_LARGEST_SEAL).split(b"\n", 2)
+    first = head[0].decode(errors="replace")
+    name, _, version = first.rpartition(" ")
+    if name != _FORMAT:
+        raise InputError(f"{path}: not a checkpoint of pfem_petsc, or damaged at its beginning; {_remedy(path)}")
+    if version != str(_VERSION):
+        raise InputError(
+            f"{path}: has version {version} of the checkpoint format, this program reads {_VERSION}: restart with "
+            f"the version of pfem_petsc that wrote it, or {_remedy(path)}"
+        )
+    digest = None
+    try:
+        content: dict[str, Any] = json.loads(head[1])
+        size, digest = int(content["size"]), content.pop("digest")
+        actual = os.fstat(raw.fileno()).st_size
+        if actual != size:
+            raise InputError(f"{path}: damaged: has {actual} bytes of {size}; {_remedy(path)}")
+        sound = _digest(raw, content) == digest
+    except (ValueError, KeyError, TypeError, IndexError, OverflowError, AttributeError):
+        sound = False
+    if not sound:
+        raise InputError(f"{path}: damaged: the description of its content does not match the digest; {_remedy(path)}")
+    return str(digest)
+
+
+def _remedy(path: Path) -> str:
+    """Return what a user can do without this checkpoint."""
+    previous = path.with_name(f"{path.stem}-previous{path.suffix}")
+    if previous.is_file():
+        return f"restart from the one before: --restart {previous}"
+    return "start without --restart"
+
+
+def _digest(raw: BinaryIO, content: dict[str, Any]) -> str:
+    """Return a digest of the seal's content and of all bytes after the user block except values of arrays."""
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
+    position = int(content["seal_size"])
+    for offset, length in [*content["arrays"], [int(content["size"]), 0]]:
+        raw.seek(position)
+        while position < offset:
+            block = raw.read(min(_BLOCK, offset - position))
+            if not block:
+                raise ValueError("the file ends early")
+            digest.update(block)
+            position += len(block)
+        position = offset + length
+    return digest.hexdigest()
+
+
 def _open(path: Path) -> BinaryIO:
     for _ in range(_ATTEMPTS):
         try:
             if path.exists() and not path.is_file():
-                raise InputError(f"{path}: is no file that a run has written; {remedy(path)}")
+                raise InputError(f"{path}: is no file that a run has written; {_remedy(path)}")
             return open(path, "rb")  # noqa: SIM115 - it stays open
         except FileNotFoundError:
             # a run may be between the two renamings of its next checkpoint
@@ -211,7 +275,7 @@ def _open(path: Path) -> BinaryIO:
                 break
             time.sleep(0.02)
         except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}; {remedy(path)}") from error
+            raise InputError(f"{path}: cannot be read: {error.strerror}; {_remedy(path)}") from error
     raise InputError(f"{path}: there is no such checkpoint; name an existing one, or start without --restart")
 
 
@@ -220,7 +284,7 @@ def _sound(path: Path) -> Iterator[None]:
     try:
         yield
     except HDF5_ERRORS as error:
-        raise InputError(f"{path}: not a checkpoint, or damaged: {first_line(error)}; {remedy(path)}") from error
+        raise InputError(f"{path}: not a checkpoint, or damaged: {first_line(error)}; {_remedy(path)}") from error
 
 
 def write_checkpoint(
@@ -260,7 +324,7 @@ def write_checkpoint(
     checks = {name: checksum(comm, slab, arrays[name][0].first) for name, slab in slabs.items()}
     state = json.dumps({"scalars": dict(scalars), "attributes": dict(attributes)}, default=_plain)
     try:
-        temporary = create_new(path, comm, _create, shapes, checks, state, userblock_size=seal_size(len(shapes)))
+        temporary = create_new(path, comm, _create, shapes, checks, state, userblock_size=_seal_size(len(shapes)))
     except InputError as error:
         raise SimulationFailure(f"{path}: no checkpoint could be written: {error}") from error
 
@@ -282,7 +346,7 @@ def write_checkpoint(
         file.close()
     with writing(comm, temporary):
         if comm.rank == 0:
-            seal(temporary)
+            _seal(temporary)
     first = first_of_machine(comm)
     with writing(comm, temporary):
         if first:  # a machine has one cache of the file

@@ -50,8 +50,9 @@ class Growing:
         """Set the number of rows. Collective for a shared file."""
         self._id.set_extent((n_rows, *self._tail))
 
-    def write(self, first: int, rows: np.ndarray | None, collective: bool = False) -> None:
-        """Write rows (n, ...) starting at row ``first``; None or no rows: join a collective transfer without data."""
+    def write(self, first: int | tuple[int, ...], rows: np.ndarray | None = None, collective: bool = False) -> None:
+        """Write rows (n, ...) starting at row ``first``, or an array at a place; None or nothing: join a collective
+        transfer without data."""
         if rows is None and not collective:
             return
         target = self._id.get_space()
@@ -63,7 +64,8 @@ class Growing:
         else:
             rows = np.ascontiguousarray(rows, dtype=self.dtype)
             source = h5py.h5s.create_simple(rows.shape)
-            target.select_hyperslab((first, *self._zeros), rows.shape)
+            start = first if isinstance(first, tuple) else (first, *self._zeros)
+            target.select_hyperslab(start, rows.shape)
         self._id.write(source, target, rows, self._type, _collective() if collective else None)
 
 
@@ -113,18 +115,18 @@ def create_growing(
     name: str,
     row_shape: tuple[int, ...],
     dtype: np.dtype | type,
-    rows_per_chunk: int,
+    chunk: int | tuple[int, ...],
     compressed: bool = False,
 ) -> h5py.Dataset:
     """Create an empty dataset (0, *row_shape) that grows by rows, and its parents. Collective for a shared file.
 
-    ``compressed``: by gzip, which all readers of HDF5 have, after a shuffle of bytes: the high bytes of near values are
-    alike.
+    ``chunk``: rows of a chunk, or its shape; ``compressed``: by gzip, which all readers of HDF5 have, after a shuffle
+    of bytes: the high bytes of near values are alike.
     """
     shape = (0, *row_shape)
     space = h5py.h5s.create_simple(shape, (h5py.h5s.UNLIMITED, *row_shape))
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    properties.set_chunk((rows_per_chunk, *(max(1, extent) for extent in row_shape)))
+    properties.set_chunk(chunk if isinstance(chunk, tuple) else (chunk, *(max(1, extent) for extent in row_shape)))
     if compressed:
         properties.set_shuffle()
         properties.set_deflate(_DEFLATE)

@@ -1,26 +1,76 @@
-"""The groups and datasets of a result file, its provenance, and the number of its complete rows."""
+"""The groups and datasets of a result file, its provenance, and what of it is complete."""
 
 from __future__ import annotations
 
 import json
 import platform
 import zlib
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 from mpi4py import MPI
 
+from ..errors import InputError
 from ..version import __version__
 from .hdf5 import chunk_rows, compressed_rows, create_growing, dataset_names, is_compressed, set_text, set_unit
-from .history import EVENT, ROWS_PER_CHUNK, create_history
-from .integrity import CHECKS
-from .modes import create_modes
-from .units import field_unit
+from .units import field_unit, unit_of
 
-# HDF5 1.10 limits an attribute, including its metadata, to 64 KiB.
 LONGEST_ATTRIBUTE = 1 << 15
+"""HDF5 1.10 limits an attribute, including its metadata, to 64 KiB."""
+CHECKS, EVENT, MODES = "checks", "event", "modes"
+"""Groups of checksums, of the table of events (what happened between recorded steps), and of modes."""
+MODE_VALUES = {"vibration": ("frequency", "Hz"), "buckling": ("load_factor", "")}
+"""Name and unit of the numbers of each kind of modes."""
+VTK_LINE = 3
+STEPS_PER_CHUNK = 256
+ROWS_PER_CHUNK, CHUNK_BYTES = 512, 1 << 16
+"""Of a table: few, so that a short run has a small file (the first row allocates a whole chunk)."""
+PER_STEP = ("PointOffsets", "CellDataRows", "CellOffsets", "ConnectivityIdOffsets", "PartOffsets", "NumberOfParts")
+"""Entries of a snapshot in /VTKHDF/Steps besides its time."""
+
+
+class Contents(NamedTuple):
+    """What a result file is made for.
+
+    Attributes
+    ----------
+    point_fields, cell_fields : names of the fields; the shape of their rows is that in the first snapshot
+    columns : of the history ("wall/floor/force") to the type of a value, with its shape
+    case_text : the resolved case
+    attributes : of ``/case``: numbers, texts, or any JSON data
+    events : columns of the table ``/event`` to their types, one of them ``step``; without any there is no such table
+    modes : kind of the modes that will be written, "vibration" or "buckling"
+    precision : of the fields, "float64" or "float32"; points are always float64, because strains from positions in
+        single precision are noise
+    compressed : whether points and fields are compressed without loss; a file that is continued keeps what it has
+    """
+
+    point_fields: Sequence[str]
+    cell_fields: Sequence[str]
+    columns: Mapping[str, np.dtype]
+    case_text: str
+    attributes: Mapping[str, Any]
+    events: Mapping[str, np.dtype] = {}
+    modes: str | None = None
+    precision: str = "float64"
+    compressed: bool = False
+
+    @property
+    def fields(self) -> dict[str, list[str]]:
+        """Sorted names of the fields by ``PointData`` and ``CellData``."""
+        return {"PointData": sorted(self.point_fields), "CellData": sorted(self.cell_fields)}
+
+
+class Kept(NamedTuple):
+    """What a restart keeps of a result file: events up to the ``step`` that the run goes on from, and the steps of the
+    last ``snapshot`` and of the last ``row``, where not all up to that step are."""
+
+    step: int
+    snapshot: int
+    row: int
 
 
 def describe_run(comm: MPI.Comm, attributes: Mapping[str, Any]) -> dict[str, Any]:
@@ -82,31 +132,10 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else str(value)
 
 
-VTK_LINE = 3
-STEPS_PER_CHUNK = 256
-# Entries of a snapshot in /VTKHDF/Steps besides its time.
-PER_STEP = ("PointOffsets", "CellDataRows", "CellOffsets", "ConnectivityIdOffsets", "PartOffsets", "NumberOfParts")
-
-
-def create_result(
-    file: h5py.File,
-    n_nodes: int,
-    n_bars: int,
-    columns: Mapping[str, tuple[int, ...]],
-    column_types: Mapping[str, Any],
-    case_text: str,
-    attributes: Mapping[str, Any],
-    modes: str | None = None,
-    events: Mapping[str, Any] | None = None,
-    compressed: bool = False,
-) -> None:
-    """Create the structure of a result file without fields: VTKHDF 2.0 without steps, history, case.
-
-    ``events``: columns of the table of events with their types, empty for none; ``compressed``: points, and fields that
-    are created later.
+def create_result(file: h5py.File, n_nodes: int, n_bars: int, contents: Contents) -> None:
+    """Create the structure of a result file without fields: VTKHDF 2.0 without steps, tables, case, modes.
 
     The mesh is one part, whatever the number of ranks, and all steps use the same connectivity (offset 0).
-    ``modes`` is the kind of those that there will be.
     """
     vtk = file.create_group("VTKHDF")
     vtk.attrs["Version"] = np.array([2, 0], dtype=np.int64)
@@ -122,6 +151,7 @@ def create_result(
     vtk.create_dataset("Connectivity", shape=(2 * n_bars,), dtype=np.int64)
     vtk.create_dataset("Offsets", shape=(n_bars + 1,), dtype=np.int64)
     vtk.create_dataset("Types", data=np.full(n_bars, VTK_LINE, dtype=np.uint8))
+    compressed = contents.compressed
     rows = compressed_rows(n_nodes, 24) if compressed else chunk_rows(n_nodes, 24)
     create_growing(vtk, "Points", (3,), np.float64, rows, compressed)
     steps = vtk.create_group("Steps")
@@ -139,14 +169,44 @@ def create_result(
     create_growing(snapshots, "time", (), np.float64, STEPS_PER_CHUNK)
     checks = file.create_group(CHECKS)
     checks.create_dataset("mesh", data=np.zeros(1, dtype=np.uint64))
-    create_growing(checks, "history", (), np.uint64, ROWS_PER_CHUNK)
-    create_history(file, columns, column_types)
-    if events:
-        create_growing(checks, EVENT, (), np.uint64, ROWS_PER_CHUNK)
-        create_history(file, dict.fromkeys(events, ()), events, EVENT)
-    write_case(file, case_text, attributes)
-    if modes is not None:
-        create_modes(file, modes, n_nodes)
+    _create_table(file, "history", contents.columns)
+    if contents.events:
+        _create_table(file, EVENT, contents.events)
+    write_case(file, contents.case_text, contents.attributes)
+    prepare_modes(file, contents.modes, n_nodes)
+
+
+def _create_table(file: h5py.File, name: str, columns: Mapping[str, np.dtype]) -> None:
+    """Create a table with an empty dataset per column, the attribute ``rows``, the number of complete rows, and its
+    checksums."""
+    group = file.create_group(name)
+    group.attrs["rows"] = np.int64(0)
+    for column, dtype in columns.items():
+        rows = max(1, min(ROWS_PER_CHUNK, CHUNK_BYTES // max(1, dtype.itemsize)))
+        set_unit(create_growing(group, column, dtype.shape, dtype.base, rows), unit_of(column))
+    create_growing(file[CHECKS], name, (), np.uint64, ROWS_PER_CHUNK)
+
+
+def prepare_modes(file: h5py.File, kind: str | None, n_nodes: int) -> None:
+    """Create the group ``/modes`` without modes, replacing an existing one, or remove it for None. Not collective.
+
+    ``eigenvalue`` (modes,), ``frequency`` [Hz] or ``load_factor`` (modes,), ``shape`` (modes, nodes, 3) in mesh
+    numbering; the attribute ``kind``. ``/checks/modes`` has one checksum per mode, written last; a mode without one is
+    ignored.
+    """
+    file.pop(MODES, None)
+    file[CHECKS].pop(MODES, None)
+    if kind is None:
+        return
+    group = file.create_group(MODES)
+    group.attrs.create("kind", kind.encode(), dtype=h5py.string_dtype("utf-8", len(kind)))
+    name, unit = MODE_VALUES[kind]
+    vibrates = kind == "vibration"
+    set_unit(create_growing(group, name, (), np.float64, 64), unit)
+    set_unit(create_growing(group, "eigenvalue", (), np.float64, 64), "1/s²" if vibrates else "")
+    shape = create_growing(group, "shape", (n_nodes, 3), np.float64, (1, chunk_rows(n_nodes, 24), 3))
+    set_unit(shape, "kg^-1/2" if vibrates else "")
+    create_growing(file[CHECKS], MODES, (), np.uint64, 64)
 
 
 def create_field(vtk: h5py.Group, kind: str, name: str, row_shape: tuple[int, ...], dtype: np.dtype) -> h5py.Dataset:
@@ -181,6 +241,26 @@ def field_datasets(vtk: h5py.Group) -> dict[str, h5py.Dataset]:
     return found
 
 
+def row_type(dataset: h5py.Dataset) -> np.dtype:
+    """Return the type of a row of a dataset, with its shape."""
+    return np.dtype((dataset.dtype, dataset.shape[1:])) if dataset.shape[1:] else dataset.dtype
+
+
+def check_version(file: h5py.File, path: Path) -> None:
+    """Refuse a result without checksums.
+
+    Raises
+    ------
+    InputError
+    """
+    if CHECKS not in file:
+        version = read_attributes(file["case"]).get("pfem_petsc", "an earlier one")
+        raise InputError(
+            f"{path}: has no checksums: version {version} of pfem_petsc wrote it; "
+            "run the case again, or read it with that version or ParaView"
+        )
+
+
 def complete_snapshots(file: h5py.File) -> int:
     """Return the number of complete snapshots; a killed run may have left parts of another one."""
     vtk, steps = file["VTKHDF"], file["VTKHDF/Steps"]
@@ -191,8 +271,7 @@ def complete_snapshots(file: h5py.File) -> int:
         len(file["snapshots/time"]),
     ]
     lengths += [len(steps[name]) for name in PER_STEP]
-    if CHECKS in file:  # 0.1.0 wrote none
-        lengths.append(len(file[CHECKS]["snapshots"]) if "snapshots" in file[CHECKS] else 0)
+    lengths.append(len(file[CHECKS]["snapshots"]) if "snapshots" in file[CHECKS] else 0)
     n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
     for name, dataset in field_datasets(vtk).items():
         rows = n_bars if name.startswith("CellData") else n_nodes
@@ -205,10 +284,12 @@ def complete_rows(file: h5py.File, table: str = "history") -> int:
     if table not in file:
         return 0
     rows = file[table]
-    return min(
-        [
-            int(rows.attrs["rows"]),
-            *([len(file[CHECKS][table])] if CHECKS in file else []),
-            *(len(rows[name]) for name in dataset_names(rows)),
-        ]
-    )
+    lengths = [len(rows[name]) for name in dataset_names(rows)]
+    return min(int(rows.attrs["rows"]), len(file[CHECKS][table]), *lengths)
+
+
+def complete_modes(file: h5py.File) -> int:
+    """Return the number of complete modes."""
+    if MODES not in file or MODES not in file[CHECKS]:
+        return 0
+    return min(len(file[CHECKS][MODES]), *(len(dataset) for dataset in file[MODES].values()))

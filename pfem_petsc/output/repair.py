@@ -4,33 +4,34 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
 from ..errors import InputError
 from .hdf5 import create_checked, dataset_names, fsync_all, grow, is_compressed, write_rows
-from .history import EVENT, check_columns
-from .integrity import CHECKS
 from .layout import (
+    CHECKS,
+    EVENT,
     PER_STEP,
+    Contents,
+    Kept,
     complete_rows,
     complete_snapshots,
     create_field,
     create_result,
     create_snapshot_checks,
     field_datasets,
+    prepare_modes,
     read_attributes,
+    row_type,
     write_case,
 )
 from .result import readable
 from .verify import examine
-
-__all__ = ["reopen", "repair"]
 
 COPIED = 1 << 28
 """Files up to this size [B] are rewritten for a restart and then replaced."""
@@ -38,16 +39,8 @@ PIECE = 1 << 24
 """Number of bytes that are read and written at once."""
 
 
-def repair(path: Path | str, last: tuple[int, int] | None = None, after_step: int | None = None) -> tuple[int, int]:
-    """Cut off what a killed run left incomplete, and everything after the ``last`` steps. One process.
-
-    Parameters
-    ----------
-    path : Path or str
-    last : (int, int), optional
-        Steps of the last snapshot and of the last history row that are kept.
-    after_step : int, optional
-        Step of the last event that is kept.
+def repair(path: Path | str, kept: Kept | None = None) -> tuple[int, int]:
+    """Cut off what a killed run left incomplete, and everything after the steps that are ``kept``. One process.
 
     Returns
     -------
@@ -61,71 +54,62 @@ def repair(path: Path | str, last: tuple[int, int] | None = None, after_step: in
     """
     path = Path(path)
     with readable(path), h5py.File(path, "r+", locking=False) as file:
-        n_snapshots, n_rows = _kept(file, last)
-        vtk, steps, history = file["VTKHDF"], file["VTKHDF/Steps"], file["history"]
+        counts = _counts(file, kept)
+        n_snapshots, vtk, steps = counts[0], file["VTKHDF"], file["VTKHDF/Steps"]
         # A kill in between must leave a file that VTK can read: VTK crashes on more times than steps, so the times are
         # removed first; it shows nothing for steps without data, so the data are removed last.
-        if len(steps["Values"]) > n_snapshots:
-            grow(steps["Values"], n_snapshots)
-        write_rows(steps["Values"], 0, file["snapshots/time"][: len(steps["Values"])])
+        grow(steps["Values"], n_snapshots)
+        write_rows(steps["Values"], 0, file["snapshots/time"][:n_snapshots])
         file.flush()
-        steps.attrs.modify("NSteps", np.int64(n_snapshots))
-        history.attrs.modify("rows", np.int64(n_rows))
+        _count(file, counts)
         file.flush()
-        for name in PER_STEP:
-            grow(steps[name], n_snapshots)
-        for name in ("step", "time"):
-            grow(file["snapshots"][name], n_snapshots)
         if n_snapshots == 0:
             # The first snapshot creates the fields, possibly not all of them.
             file[CHECKS].pop("snapshots", None)
-            for kind in ("PointData", "CellData"):
-                for name in list(vtk[kind]):
-                    del vtk[kind][name]
-                for name in list(steps[kind + "Offsets"]):
-                    del steps[kind + "Offsets"][name]
-        for name, dataset in field_datasets(vtk).items():
-            n = int(vtk["NumberOfCells" if name.startswith("CellData") else "NumberOfPoints"][0])
-            grow(dataset, n_snapshots * n)
-        for name in dataset_names(history):
-            grow(history[name], n_rows)
-        grow(file[CHECKS]["history"], n_rows)
-        if EVENT in file:
-            n_events = _kept_events(file, after_step)
-            file[EVENT].attrs.modify("rows", np.int64(n_events))
-            for dataset in (*file[EVENT].values(), file[CHECKS][EVENT]):
-                grow(dataset, n_events)
-        if n_snapshots:
-            grow(file[CHECKS]["snapshots"], n_snapshots)
+            for group in (vtk["PointData"], vtk["CellData"], steps["PointDataOffsets"], steps["CellDataOffsets"]):
+                for name in list(group):
+                    del group[name]
+        for name, n in _extents(file, counts).items():
+            grow(file[name], n)
     fsync_all(path)
-    return n_snapshots, n_rows
+    return counts[:2]
 
 
-def reopen(
-    path: Path,
-    after_step: int,
-    last: tuple[int, int],
-    sizes: tuple[int, int],
-    fields: Mapping[str, list[str]],
-    columns: Mapping[str, tuple[int, ...]],
-    case_text: str,
-    attributes: Mapping[str, Any],
-) -> None:
+def _count(file: h5py.File, counts: tuple[int, int, int]) -> None:
+    """Set the numbers of snapshots, history rows and events that a file counts as complete."""
+    file["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(counts[0]))
+    for table, n in (("history", counts[1]), (EVENT, counts[2])):
+        if table in file:
+            file[table].attrs.modify("rows", np.int64(n))
+
+
+def _extents(file: h5py.File, counts: tuple[int, int, int]) -> dict[str, int]:
+    """Return the numbers of rows of all growing datasets, but those of modes, for these numbers of snapshots, history
+    rows and events."""
+    n_snapshots, vtk = counts[0], file["VTKHDF"]
+    n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
+    rows = {f"VTKHDF/Steps/{name}": n_snapshots for name in (*PER_STEP, "Values")}
+    rows |= {f"snapshots/{name}": n_snapshots for name in ("step", "time")}
+    for name in field_datasets(vtk):
+        rows[f"VTKHDF/{name}"] = n_snapshots * (n_bars if name.startswith("CellData") else n_nodes)
+    for table, n in (("history", counts[1]), (EVENT, counts[2])):
+        if table in file:
+            rows |= {f"{table}/{name}": n for name in dataset_names(file[table])} | {f"{CHECKS}/{table}": n}
+    return rows | ({f"{CHECKS}/snapshots": n_snapshots} if n_snapshots else {})
+
+
+def reopen(path: Path, sizes: tuple[int, int], contents: Contents, kept: Kept) -> None:
     """Prepare a result file to be continued after a step, with mesh and fields unchanged. Not collective.
 
     Parameters
     ----------
     path : Path
-    after_step : int
-        The step from which the run continues.
-    last : (int, int)
-        Steps of the last snapshot and of the last history row that are kept.
     sizes : (int, int)
         Nodes and bars of the case.
-    fields : mapping of "PointData" and "CellData" to sorted names
-    columns : mapping of history column to the shape of one row's value
-    case_text, attributes
-        Replace the content of ``/case``; the step is added to its ``restarts_after_step``.
+    contents : Contents
+        Case and attributes replace the content of ``/case``; the step is added to its ``restarts_after_step``. Modes
+        are removed, and come anew.
+    kept : Kept
 
     Raises
     ------
@@ -135,17 +119,18 @@ def reopen(
     _refuse_damaged(path)
     with _replaced(path) as target:
         with readable(path), h5py.File(path, "r", locking=False) as file:
-            n_snapshots, n_rows = _kept(file, last)
-            _check_same(file, path, n_snapshots, sizes, fields, columns)
+            counts = _counts(file, kept)
+            _check_same(file, path, counts[0], sizes, contents)
             earlier = list(read_attributes(file["case"]).get("restarts_after_step", []))
-            described = {**attributes, "restarts_after_step": [*earlier, after_step]}
+            described = {**contents.attributes, "restarts_after_step": [*earlier, kept.step]}
+            contents = contents._replace(attributes=described)
             if target != path:
-                kept = n_snapshots, n_rows, _kept_events(file, after_step)
-                create_checked(target, _rebuild, file, kept, case_text, described)
-                return
-        repair(target, last, after_step)
-        with h5py.File(target, "r+", locking=False) as file:
-            write_case(file, case_text, described)
+                create_checked(target, _rebuild, file, counts, contents)
+        if target == path:
+            repair(target, kept)
+            with h5py.File(target, "r+", locking=False) as file:
+                write_case(file, contents.case_text, described)
+                prepare_modes(file, contents.modes, sizes[0])
 
 
 def _refuse_damaged(path: Path) -> None:
@@ -160,14 +145,7 @@ def _refuse_damaged(path: Path) -> None:
         )
 
 
-def _check_same(
-    file: h5py.File,
-    path: Path,
-    n_snapshots: int,
-    sizes: tuple[int, int],
-    fields: Mapping[str, list[str]],
-    columns: Mapping[str, tuple[int, ...]],
-) -> None:
+def _check_same(file: h5py.File, path: Path, n_snapshots: int, sizes: tuple[int, int], contents: Contents) -> None:
     vtk = file["VTKHDF"]
     has = (int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0]))
     if has != sizes:
@@ -175,47 +153,48 @@ def _check_same(
             f"{path}: has {has[0]} nodes and {has[1]} bars, the case has {sizes[0]} and {sizes[1]}: it was "
             "written with another mesh; restart the case it belongs to, or write elsewhere (-o)"
         )
-    for kind, names in fields.items():
+    for kind, names in contents.fields.items():
         if n_snapshots and sorted(vtk[kind]) != names:
             raise InputError(
                 f"{path}: has the fields {', '.join(sorted(vtk[kind])) or 'none'} ({kind}), the case requests "
                 f"{', '.join(names) or 'none'}: keep [output] fields unchanged, or write elsewhere (-o)"
             )
-    check_columns(file, path, columns)
+    group = file["history"]
+    for name, dtype in contents.columns.items():
+        found = group.get(name)
+        if not isinstance(found, h5py.Dataset) or found.shape[1:] != dtype.shape:
+            has = f"rows of shape {found.shape[1:]}" if isinstance(found, h5py.Dataset) else "nothing"
+            raise InputError(
+                f"{path}: history/{name}: the run records rows of shape {dtype.shape}, the file has {has}: it was "
+                "written with another case; restart with the same walls and probes, or write elsewhere (-o)"
+            )
+    others = sorted(set(dataset_names(group)) - set(contents.columns))
+    if others:
+        raise InputError(
+            f"{path}: the history has {', '.join(others)}, which the run does not record: it was written with another "
+            "case; restart with the same walls and probes, or write elsewhere (-o)"
+        )
 
 
-def _rebuild(
-    target: h5py.File,
-    source: h5py.File,
-    kept: tuple[int, int, int],
-    case_text: str,
-    attributes: Mapping[str, Any],
-) -> None:
+def _rebuild(target: h5py.File, source: h5py.File, counts: tuple[int, int, int], contents: Contents) -> None:
     """Fill a new file with what is kept of another: nothing that a kill or damage has left in that one comes along.
 
-    ``kept``: snapshots, history rows and events
+    ``counts``: snapshots, history rows and events
     """
-    n_snapshots, n_rows, n_events = kept
     vtk, history = source["VTKHDF"], source["history"]
     n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
-    columns = {name: history[name].shape[1:] for name in dataset_names(history)}
-    types = {name: history[name].dtype for name in columns}
+    columns = {name: row_type(history[name]) for name in dataset_names(history)}
     events = {name: dataset.dtype for name, dataset in source[EVENT].items()} if EVENT in source else {}
     compressed = is_compressed(vtk["Points"])
-    create_result(target, n_nodes, n_bars, columns, types, case_text, attributes, events=events, compressed=compressed)
-    rows: dict[str, int] = {"VTKHDF/Connectivity": 2 * n_bars, "VTKHDF/Offsets": n_bars + 1, f"{CHECKS}/mesh": 1}
-    rows |= {f"VTKHDF/Steps/{name}": n_snapshots for name in (*PER_STEP, "Values")}
-    rows |= {f"snapshots/{name}": n_snapshots for name in ("step", "time")}
-    rows |= {f"history/{name}": n_rows for name in columns} | {f"{CHECKS}/history": n_rows}
-    rows |= {f"{EVENT}/{name}": n_events for name in events} | ({f"{CHECKS}/{EVENT}": n_events} if events else {})
-    if n_snapshots:
+    create_result(target, n_nodes, n_bars, contents._replace(columns=columns, events=events, compressed=compressed))
+    if counts[0]:
         for name, dataset in field_datasets(vtk).items():
             kind, _, field = name.partition("/")
             if field:
                 create_field(target["VTKHDF"], kind, field, dataset.shape[1:], dataset.dtype)
-            rows[f"VTKHDF/{name}"] = n_snapshots * (n_bars if kind == "CellData" else n_nodes)
         create_snapshot_checks(target)
-        rows[f"{CHECKS}/snapshots"] = n_snapshots
+    rows = {"VTKHDF/Connectivity": 2 * n_bars, "VTKHDF/Offsets": n_bars + 1, f"{CHECKS}/mesh": 1}
+    rows |= _extents(target, counts)
     for name, n in rows.items():
         old, new = source[name], target[name]
         if new.maxshape[0] is None:
@@ -225,27 +204,19 @@ def _rebuild(
             piece = max(1, piece // new.chunks[0]) * new.chunks[0]
         for first in range(0, n, piece):
             write_rows(new, first, old[first : min(first + piece, n)])
-    target["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(n_snapshots))
-    target["history"].attrs.modify("rows", np.int64(n_rows))
-    if events:
-        target[EVENT].attrs.modify("rows", np.int64(n_events))
+    _count(target, counts)
 
 
-def _kept(file: h5py.File, last: tuple[int, int] | None) -> tuple[int, int]:
-    """Return the numbers of complete snapshots and history rows, up to the ``last`` steps."""
-    n_snapshots, n_rows = complete_snapshots(file), complete_rows(file)
-    if last is not None:
-        n_snapshots = int(np.searchsorted(file["snapshots/step"][:n_snapshots], last[0], side="right"))
-        n_rows = int(np.searchsorted(file["history/step"][:n_rows], last[1], side="right"))
-    return n_snapshots, n_rows
-
-
-def _kept_events(file: h5py.File, after_step: int | None) -> int:
-    """Complete events, up to the step that the run goes on from."""
-    n_events = complete_rows(file, EVENT)
-    if after_step is not None and n_events:
-        n_events = int(np.searchsorted(file[EVENT]["step"][:n_events], after_step, side="right"))
-    return n_events
+def _counts(file: h5py.File, kept: Kept | None) -> tuple[int, int, int]:
+    """Return the numbers of complete snapshots, history rows and events, up to the steps that are kept."""
+    found = complete_snapshots(file), complete_rows(file), complete_rows(file, EVENT)
+    if kept is None:
+        return found
+    steps = ("snapshots/step", kept.snapshot), ("history/step", kept.row), (f"{EVENT}/step", kept.step)
+    return tuple(
+        int(np.searchsorted(file[name][:n], last, side="right")) if n else 0
+        for n, (name, last) in zip(found, steps, strict=True)
+    )
 
 
 @contextmanager

@@ -12,11 +12,18 @@ import h5py
 import numpy as np
 
 from ..errors import InputError
-from ..registry import lookup, nearest
+from ..registry import nearest
 from .hdf5 import HDF5_ERRORS, dataset_names
-from .history import EVENT
-from .layout import complete_rows, complete_snapshots, read_attributes
-from .modes import MODES, NAMES, complete_modes
+from .layout import (
+    EVENT,
+    MODE_VALUES,
+    MODES,
+    check_version,
+    complete_modes,
+    complete_rows,
+    complete_snapshots,
+    read_attributes,
+)
 from .table import Table, flat_columns
 from .units import AXES, TIME, Axis
 
@@ -74,7 +81,7 @@ class Modes:
 
     def __init__(self, result: Result, names: list[str]) -> None:
         self._result, self._kept = result, names
-        self.kind = next(kind for kind, (name, _) in NAMES.items() if name in names)
+        self.kind = next(kind for kind, (name, _) in MODE_VALUES.items() if name in names)
 
     def __len__(self) -> int:
         return self._result.n_modes
@@ -97,7 +104,7 @@ class Modes:
     @property
     def values(self) -> np.ndarray:
         """(modes,) :attr:`frequency` or :attr:`load_factor`."""
-        return self._read(NAMES[self.kind][0])
+        return self._read(MODE_VALUES[self.kind][0])
 
     @property
     def shape(self) -> np.ndarray:
@@ -106,7 +113,7 @@ class Modes:
 
     def label(self, k: int) -> str:
         """Text of mode k, from 0: ``"mode 3: 149.4 Hz"``."""
-        name, unit = NAMES[self.kind]
+        name, unit = MODE_VALUES[self.kind]
         text = f"{self.values[k]:.6g} {unit}".rstrip()
         return f"mode {k + 1}: {text}" if unit else f"mode {k + 1}: {name.replace('_', ' ')} {text}"
 
@@ -187,6 +194,7 @@ class Result:
         self._patiently(self._look)
 
     def _look(self, file: h5py.File) -> None:
+        check_version(file, self.path)
         vtk = file["VTKHDF"]
         n = complete_snapshots(file)
         self.times: np.ndarray = file["snapshots/time"][:n]
@@ -304,9 +312,6 @@ class Result:
             columns |= flat_columns(name, self.history[name])
         return Table(columns)
 
-    def _repr_html_(self) -> str:
-        return lookup("pfem_petsc.post", "inline", "").of_result(self)
-
     def _snapshot(self, name: str, i: int, n_rows: int) -> np.ndarray:
         if not -len(self.times) <= i < len(self.times):
             raise IndexError(f"{self.path}: snapshot {i} of {len(self.times)}")
@@ -352,3 +357,54 @@ class Result:
             f"<Result {self.path}: {len(self.times)} snapshots of {self.n_nodes} nodes and {self.n_bars} bars, "
             f"{self._n_rows} history rows>"
         )
+
+
+def _impulse(history: Any, column: str) -> np.ndarray | None:
+    """Return the impulse (rows, 3) [N s] of a column of forces, None where the result has none."""
+    names = [f"{column.removesuffix('force')}{kind}" for kind in ("impulse", "jump_impulse")]
+    if "load_factor" in history or names[0] not in history:
+        return None
+    return sum(np.asarray(history[name], dtype=float) for name in names if name in history)
+
+
+def peak_force(result: Any, column: str) -> tuple[float, float, float]:
+    """Return the largest mean force [N] of a column, the time [s] at which its window ends, and the window [s].
+
+    The column is ``wall/NAME/force`` or ``support_force``. The window is the time of a wave forth and back in the
+    shortest bar at the wall or the supports, or the interval of the rows if that is longer. The mean is the change of
+    the impulse over it, zero before the run. Without an impulse, as in static analyses and old results, it is the
+    largest force of a row, with a window of zero.
+    """
+    history = result.history
+    time, force = history["time"], history[column]
+    impulse = _impulse(history, column)
+    window = 2.0 * float(result.attributes.get(f"wave_time/{column}", 0.0))
+    if impulse is None or not 0.0 < window < np.inf or len(time) < 2:
+        size = np.linalg.norm(force, axis=1)
+        peak = int(np.argmax(size))
+        return float(size[peak]), float(time[peak]), 0.0
+    window = max(window, float(np.diff(time).max()))
+    # the mean of a piecewise linear impulse is largest where the window begins or ends at a row
+    ends = np.unique(np.concatenate([time, np.minimum(time + window, time[-1])]))
+    change = [np.interp(ends, time, part) - np.interp(ends - window, time, part, left=0.0) for part in impulse.T]
+    mean = np.linalg.norm(change, axis=0) / window
+    peak = int(np.argmax(mean))
+    return float(mean[peak]), float(ends[peak]), window
+
+
+def touch_impulse(result: Any, wall: str) -> tuple[float, float]:
+    """Return the impulse [N s] of a wall in the rows in which nodes touch it, and that of all rows.
+
+    Nodes touch in a row with more nodes in contact than the row before, and in the first row with an impulse. The row
+    after each is counted too, as schemes correct the force there. As the interval of the rows falls, it converges to
+    the impulse that stops nodes, which no mean force of a row shows.
+    """
+    history = result.history
+    impulse = _impulse(history, f"wall/{wall}/force")
+    if impulse is None or len(impulse) < 2:
+        return 0.0, 0.0
+    changes = np.diff(impulse, axis=0)
+    touching = np.diff(np.asarray(history[f"wall/{wall}/contacts"], dtype=float)) > 0.0
+    touching[:1] |= changes[0].any()
+    touching[1:] |= touching[:-1].copy()
+    return float(np.linalg.norm(changes[touching].sum(axis=0))), float(np.linalg.norm(impulse[-1] - impulse[0]))

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from functools import cache
 from typing import NamedTuple
 
+from ..columns import declared
 from ..fields import FIELDS
 from ..mechanics.materials.base import LAWS
 from ..registry import modules
@@ -30,25 +31,6 @@ _LEAST = {"Pa": 0, "N": -6, "J": -9, "m/s": -6, "m/s²": -3}
 """Powers of the smallest prefixes in use: no one thinks in millipascal, and a picojoule is mostly rounding."""
 
 PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
-
-_UNITS = {
-    "time": "s",
-    "frequency": "Hz",
-    "eigenvalue": "1/s²",
-    "step_size": "s",
-    "position": "m",
-    "centre_of_mass": "m",
-    "velocity": "m/s",
-    "acceleration": "m/s²",
-    "force": "N",
-    "reaction": "N",
-    "support_force": "N",
-    "plastic_heat": "J",
-    "energy_imbalance": "J",
-    "impulse": "N s",
-    "momentum": "kg m/s",
-    "angular_momentum": "kg m²/s",
-}
 
 
 class Axis(NamedTuple):
@@ -92,10 +74,7 @@ AXES = {axis.symbol: axis for axis in (TIME, LOAD_FACTOR, POINT, MODE)}
 
 def unit_of(name: str) -> str:
     """Return the SI unit of a history column (``"wall/floor/force"`` -> ``"N"``); empty for pure numbers."""
-    last = name.rsplit("/", 1)[-1]
-    if last.endswith("_impulse"):
-        return "N s"
-    return "J" if last.endswith(("_energy", "_dissipation", "_work")) else _UNITS.get(last, "")
+    return declared(name).unit
 
 
 def field_unit(name: str) -> str:

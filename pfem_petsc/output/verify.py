@@ -1,7 +1,6 @@
 """Verification of a result file in a separate process.
 
-HDF5 may crash on a damaged file, so a separate process reads it first: ``python -m pfem_petsc.output.verify FILE
-deep|quick`` prints one line for each defect. :func:`examine` starts it.
+HDF5 may crash on a damaged file, so a separate process reads it first and prints one line for each defect.
 """
 
 from __future__ import annotations
@@ -16,12 +15,14 @@ from pathlib import Path
 
 from ..errors import InputError
 
-__all__ = ["examine"]
-
 QUICK = 1 << 28
 """Files up to this size [B] are read completely by default."""
 SHOWN = 5
-LAUNCHERS = ("OMPI_", "PMIX_", "PMI_", "OPAL_", "ORTE_", "PRTE_", "MPI_LOCALRANKID", "SLURM_PROCID", "PALS_")
+_START = """import sys, mpi4py
+mpi4py.rc.initialize = False
+from pfem_petsc.output.damage import main
+sys.exit(main())"""
+_LAUNCHERS = ("OMPI_", "PMIX_", "PMI_", "OPAL_", "ORTE_", "PRTE_", "MPI_LOCALRANKID", "SLURM_PROCID", "PALS_")
 
 
 def examine(path: Path, deep: bool | None = None) -> list[str]:
@@ -69,45 +70,10 @@ def _examined(path: Path, size: int, changed: int, deep: bool) -> tuple[tuple[st
 
 def _read_apart(path: Path, deep: bool) -> subprocess.CompletedProcess:
     # Without the environment variables of the ranks, with which h5py would start MPI.
-    variables = {name: value for name, value in os.environ.items() if not name.startswith(LAUNCHERS)}
+    variables = {name: value for name, value in os.environ.items() if not name.startswith(_LAUNCHERS)}
     root = str(Path(__file__).parents[2])
     variables["PYTHONPATH"] = os.pathsep.join([root, *filter(None, [variables.get("PYTHONPATH")])])
-    command = [sys.executable, "-m", "pfem_petsc.output.verify", str(path), "deep" if deep else "quick"]
+    command = [sys.executable, "-c", _START, str(path), "deep" if deep else "quick"]
     return subprocess.run(
         command, env=variables, capture_output=True, encoding="utf-8", errors="replace", stdin=subprocess.DEVNULL
     )
-
-
-def _main(path: Path, deep: bool) -> int:
-    import mpi4py
-
-    mpi4py.rc.initialize = False
-    import h5py
-
-    from .hdf5 import dataset_names
-    from .integrity import CHECKS, damages
-    from .layout import read_attributes
-    from .result import readable
-
-    try:
-        with readable(path), h5py.File(path, "r", locking=False) as file:
-            # all metadata, including those without a checksum of this program
-            dataset_names(file)
-            for name in ("VTKHDF", "VTKHDF/Steps", "history", "case"):
-                dict(file[name].attrs)
-            if CHECKS not in file:
-                version = read_attributes(file["case"]).get("pfem_petsc", "an earlier one")
-                raise InputError(
-                    f"{path}: has no checksums: version {version} of pfem_petsc wrote it; "
-                    "run the case again, or read it with that version, open_result or ParaView"
-                )
-            for line in damages(file, deep):
-                print(line, flush=True)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return error.exit_status
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(_main(Path(sys.argv[1]), sys.argv[2] == "deep"))

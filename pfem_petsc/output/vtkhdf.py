@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,11 +12,13 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from ..errors import PfemError, SimulationFailure
+from ..columns import Layout
+from ..errors import InputError, PfemError, SimulationFailure
 from ..parallel.agreement import on_root
 from .hdf5 import (
     Growing,
     create_new,
+    grow,
     is_compressed,
     open_shared,
     release,
@@ -26,10 +28,23 @@ from .hdf5 import (
     writes_together,
     writing,
 )
-from .history import RowTables
-from .integrity import CHECKS, gather_rows, mark_digest, mesh_digest, snapshot_digests, word_sum
-from .layout import PER_STEP, create_field, create_result, create_snapshot_checks, describe_run, field_datasets
-from .modes import prepare_modes, write_modes
+from .integrity import RowDigests, gather_rows, mark_digest, numbers_digest, snapshot_digests, summed, word_sum
+from .layout import (
+    CHECKS,
+    CHUNK_BYTES,
+    EVENT,
+    MODE_VALUES,
+    MODES,
+    PER_STEP,
+    Contents,
+    Kept,
+    create_field,
+    create_result,
+    create_snapshot_checks,
+    describe_run,
+    field_datasets,
+    row_type,
+)
 from .repair import reopen
 
 if TYPE_CHECKING:
@@ -38,9 +53,11 @@ if TYPE_CHECKING:
 
 
 _PIECE = 2**18  # number of bars whose connectivity is written at once on one rank
+# rows buffered in memory before they are written; fewer if rows are wide
+_BUFFER_ROWS, _BUFFER_BYTES = 1024, 1 << 24
 
 
-def write_connectivity(file: h5py.File, comm: MPI.Comm, path: Path, mesh: DistributedMesh) -> None:
+def _write_connectivity(file: h5py.File, comm: MPI.Comm, path: Path, mesh: DistributedMesh) -> None:
     """Write the ends of all bars in mesh numbering, their offsets, and the digest of the mesh. Collective.
 
     Bars that are evaluated on two ranks are written by the rank that counts them.
@@ -63,15 +80,83 @@ def write_connectivity(file: h5py.File, comm: MPI.Comm, path: Path, mesh: Distri
         end = first + stop + (stop == count and comm.rank == comm.size - 1)
         with writing(comm, path):
             write_rows(vtk["Offsets"], first + start, 2 * np.arange(first + start, end), collective=together)
-    digest = mesh_digest(comm, total & (2**64 - 1))
+    digest = summed(comm, [total])
     with writing(comm, path):
         if comm.rank == 0:
             write_rows(file[CHECKS]["mesh"], 0, digest)
         file.flush()
 
 
-class SnapshotData:
-    """Datasets of points and fields of an open result file; the first snapshot creates them and defines their shapes.
+class _Table:
+    """Appends rows to ``/history``, or to ``/event``.
+
+    Rank 0 has the values and writes them; the file grows on all ranks together. The attribute ``rows`` is updated after
+    a flush of the data, so that neither a reader nor a kill ever leaves an incomplete row counted.
+
+    Parameters
+    ----------
+    file : h5py.File
+        Open for writing on all ranks, with the group.
+    comm : MPI.Comm
+    path : Path
+        For messages.
+    name : of the group
+    columns : names, in the order of a row's vector
+    """
+
+    def __init__(self, file: h5py.File, comm: MPI.Comm, path: Path, name: str, columns: Mapping[str, Any]) -> None:
+        self._comm, self._path = comm, path
+        group = file[name]
+        self._columns = {column: Growing(group[column]) for column in columns}
+        self._digests = Growing(file[CHECKS][name])
+        self._rows_attribute = h5py.h5a.open(group.id, b"rows")
+        self.n_rows = int(group.attrs["rows"])
+        self._layout = Layout({column: row_type(group[column]) for column in columns})
+        row_bytes = sum(dtype.itemsize for dtype in self._layout.columns.values())
+        self._capacity = max(1, min(_BUFFER_ROWS, _BUFFER_BYTES // max(1, row_bytes)))
+        # Disk space of a write: the rows, and a new chunk in each column.
+        self.reserve_bytes = self._capacity * row_bytes + len(columns) * CHUNK_BYTES
+        self.n_buffered = 0
+        self._checksums = RowDigests(self._layout)
+        self._buffer = np.empty((self._capacity if comm.rank == 0 else 0, self._layout.width))
+
+    @property
+    def full(self) -> bool:
+        """Whether the buffer must be written before the next row; equal on all ranks."""
+        return self.n_buffered == self._capacity
+
+    def append(self, row: Mapping[str, Any] | None) -> None:
+        """Buffer one row: rank 0 passes a value for each column, the others None. No communication."""
+        if self._comm.rank == 0:
+            self._buffer[self.n_buffered] = self._layout.vector(row if row is not None else {})
+        self.n_buffered += 1
+
+    def write(self) -> None:
+        """Write the buffered rows without counting them; flush the file, then call :meth:`commit`. Collective."""
+        if self.n_buffered == 0:
+            return
+        first, self.n_rows = self.n_rows, self.n_rows + self.n_buffered
+        with writing(self._comm, self._path):
+            for dataset in (*self._columns.values(), self._digests):
+                dataset.grow(self.n_rows)
+        with writing(self._comm, self._path):
+            if self._comm.rank == 0:
+                rows = self._buffer[: self.n_buffered]
+                for name, (at, end, shape, _) in self._layout.places.items():
+                    self._columns[name].write(first, rows[:, at:end].reshape(len(rows), *shape))
+                self._digests.write(first, self._checksums.of_vectors(rows, first))
+        self.n_buffered = 0
+
+    def commit(self) -> None:
+        """Count the written rows as complete; flush the file afterwards. Collective."""
+        with writing(self._comm, self._path):
+            self._rows_attribute.write(np.array(self.n_rows, dtype=np.int64))
+
+
+class _Snapshots:
+    """Snapshots of an open result file: points and fields, their rows of ``/VTKHDF/Steps`` and ``/snapshots``, digests.
+
+    The first snapshot creates the datasets of the fields and defines their shapes.
 
     Parameters
     ----------
@@ -81,33 +166,38 @@ class SnapshotData:
     path : Path
         For messages.
     mesh : DistributedMesh
-    fields : names of the fields, by ``PointData`` and ``CellData``
-    precision : type of floating-point fields; points are always float64
+    contents : Contents
+
+    Attributes
+    ----------
+    count : number of snapshots
     """
 
-    def __init__(
-        self,
-        file: h5py.File,
-        comm: MPI.Comm,
-        path: Path,
-        mesh: DistributedMesh,
-        fields: Mapping[str, Sequence[str]],
-        precision: np.dtype,
-    ) -> None:
+    def __init__(self, file: h5py.File, comm: MPI.Comm, path: Path, mesh: DistributedMesh, contents: Contents) -> None:
         self._together = writes_together(comm)
         # the chunks of several ranks are compressed by one of them
         self._compressed = comm.size > 1 and is_compressed(file["VTKHDF/Points"])
-        self._vtk, self.comm, self.path = file["VTKHDF"], comm, path
-        self._fields, self._precision = fields, precision
+        self._file, self._vtk, self.comm, self.path = file, file["VTKHDF"], comm, path
+        self._fields, self._precision = contents.fields, np.dtype(contents.precision)
         self._nodes, self._bars = mesh.node_order, mesh.bar_order
+        self._sizes = int(mesh.n_nodes), int(mesh.n_bars)
         # bars evaluated on two ranks are written by the rank that counts them
         self._counted = _as_slice(mesh.counted)
-        self._data = self._datasets() if self._vtk["Steps"].attrs["NSteps"] else {}
+        steps = self._vtk["Steps"]
+        self.count = int(steps.attrs["NSteps"])
+        self._per_step = {name: Growing(steps[name]) for name in PER_STEP}
+        # one column, because there is one type of cell
+        self._wide = {name: (1, *steps[name].shape[1:]) for name in PER_STEP}
+        self._times = Growing(steps["Values"])
+        self._marks = {name: Growing(file["snapshots"][name]) for name in ("step", "time")}
+        self._n_steps = h5py.h5a.open(steps.id, b"NSteps")
+        self._data: dict[str, Growing] = {}
+        if self.count:
+            self._open_data(file[CHECKS]["snapshots"])
 
-    @property
-    def exists(self) -> bool:
-        """Whether the datasets have been created."""
-        return bool(self._data)
+    def _open_data(self, digests: h5py.Dataset) -> None:
+        self._data = {name: Growing(dataset) for name, dataset in field_datasets(self._vtk).items()}
+        self._digests = Growing(digests)
 
     def arrays(
         self, points: np.ndarray, point_data: Mapping[str, np.ndarray], cell_data: Mapping[str, np.ndarray]
@@ -142,26 +232,50 @@ class SnapshotData:
             for name, array in arrays.items()
         )
 
-    def create(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Create the datasets of the fields. Collective."""
-        for name, array in arrays.items():
-            if name != "Points":
-                kind, _, field = name.partition("/")
-                create_field(self._vtk, kind, field, array.shape[1:], self._row_type(name, array))
-        self._data = self._datasets()
-
-    def append(self, n: int, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Write the rows of snapshot n; return their digests, see
-        :func:`~pfem_petsc.output.integrity.snapshot_digests`. Collective.
+    def append(self, step: int, time: float, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write a snapshot except its time in ``/VTKHDF``, without counting it. Collective.
 
         One field after the other goes to mesh numbering, into its digest and into the file, while it is in the cache.
         """
+        n = self.count
+        if not self._data:
+            with writing(self.comm, self.path):
+                for name, array in arrays.items():
+                    if name != "Points":
+                        kind, _, field = name.partition("/")
+                        create_field(self._vtk, kind, field, array.shape[1:], self._row_type(name, array))
+                self._open_data(create_snapshot_checks(self._file))
         with writing(self.comm, self.path):
             for name in arrays:
                 self._data[name].grow((n + 1) * self._order(name).n_global)
         together = self._together or self._compressed
         sums = self._write_together(n, arrays) if together else self._write_alone(n, arrays)
-        return snapshot_digests(self.comm, sums)
+        digests = snapshot_digests(self.comm, sums)
+        with writing(self.comm, self.path):
+            for dataset in (*self._per_step.values(), *self._marks.values(), self._digests):
+                dataset.grow(n + 1)
+        rows = {"PointOffsets": n * self._sizes[0], "CellDataRows": n * self._sizes[1], "NumberOfParts": 1}
+        with writing(self.comm, self.path):
+            if self.comm.rank == 0:
+                for name, dataset in self._per_step.items():
+                    dataset.write(n, np.full(self._wide[name], rows.get(name, 0)))
+                self._marks["step"].write(n, np.array([step]))
+                self._marks["time"].write(n, np.array([time]))
+                mark = np.array([mark_digest(n, step, time)], dtype=np.uint64)
+                self._digests.write(n, np.concatenate([mark, digests])[None])
+
+    def publish(self, time: float) -> None:
+        """Count the snapshot, whose data have been flushed, and then write its time [s]. Collective."""
+        n = self.count
+        with writing(self.comm, self.path):
+            self._n_steps.write(np.array(n + 1, dtype=np.int64))
+            self._file.flush()
+        with writing(self.comm, self.path):
+            self._times.grow(n + 1)
+            if self.comm.rank == 0:
+                self._times.write(n, np.array([time], dtype=np.float64))
+            self._file.flush()
+        self.count = n + 1
 
     def _write_together(self, n: int, arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
         """Write by collective transfers, and return each rank's share of the digests."""
@@ -194,9 +308,6 @@ class SnapshotData:
         slab = slab.astype(self._row_type(name, slab), copy=False)
         return order.first, slab, word_sum(slab, order.first)
 
-    def _datasets(self) -> dict[str, Growing]:
-        return {name: Growing(dataset) for name, dataset in field_datasets(self._vtk).items()}
-
     def _order(self, name: str) -> NaturalOrder:
         return self._bars if name.startswith("CellData") else self._nodes
 
@@ -222,69 +333,6 @@ def _permuted(order: NaturalOrder, array: np.ndarray) -> np.ndarray:
     return slab
 
 
-class SnapshotIndex:
-    """Rows of ``/VTKHDF/Steps`` and ``/snapshots`` of an open result file, and the digests of its snapshots.
-
-    Parameters
-    ----------
-    file : h5py.File
-        Open on all ranks.
-    comm : MPI.Comm
-    path : Path
-        For messages.
-    mesh : DistributedMesh
-    """
-
-    def __init__(self, file: h5py.File, comm: MPI.Comm, path: Path, mesh: DistributedMesh) -> None:
-        self._file, self.comm, self.path = file, comm, path
-        self.n_nodes, self.n_bars = int(mesh.n_nodes), int(mesh.n_bars)
-        steps = file["VTKHDF/Steps"]
-        self._per_step = {name: Growing(steps[name]) for name in PER_STEP}
-        # one column, because there is one type of cell
-        self._wide = {name: (1, *steps[name].shape[1:]) for name in PER_STEP}
-        self._times = Growing(steps["Values"])
-        self._marks = {name: Growing(file["snapshots"][name]) for name in ("step", "time")}
-        self._n_steps = h5py.h5a.open(steps.id, b"NSteps")
-        # created with the first snapshot, which defines the fields
-        self._digests = Growing(file[CHECKS]["snapshots"]) if steps.attrs["NSteps"] else None
-
-    def create_checks(self) -> None:
-        """Create the dataset of digests, once the fields exist. Collective."""
-        self._digests = Growing(create_snapshot_checks(self._file))
-
-    def append(self, n: int, step: int, time: float, digests: np.ndarray) -> None:
-        """Write the rows of snapshot n, except its time in ``/VTKHDF``. Collective.
-
-        Parameters
-        ----------
-        n, step, time : number of the snapshot, its step and time [s]
-        digests : of its points and fields, in the order of :func:`~pfem_petsc.output.integrity.snapshot_digests`
-        """
-        with writing(self.comm, self.path):
-            for dataset in (*self._per_step.values(), *self._marks.values(), self._digests):
-                dataset.grow(n + 1)
-        rows = {"PointOffsets": n * self.n_nodes, "CellDataRows": n * self.n_bars, "NumberOfParts": 1}
-        with writing(self.comm, self.path):
-            if self.comm.rank == 0:
-                for name, dataset in self._per_step.items():
-                    dataset.write(n, np.full(self._wide[name], rows.get(name, 0)))
-                self._marks["step"].write(n, np.array([step]))
-                self._marks["time"].write(n, np.array([time]))
-                mark = np.array([mark_digest(n, step, time)], dtype=np.uint64)
-                self._digests.write(n, np.concatenate([mark, digests])[None])
-
-    def publish(self, n: int, time: float) -> None:
-        """Count snapshot n, whose data have been flushed, and then write its time [s]. Collective."""
-        with writing(self.comm, self.path):
-            self._n_steps.write(np.array(n + 1, dtype=np.int64))
-            self._file.flush()
-        with writing(self.comm, self.path):
-            self._times.grow(n + 1)
-            if self.comm.rank == 0:
-                self._times.write(n, np.array([time], dtype=np.float64))
-            self._file.flush()
-
-
 class ResultWriter:
     """Writes snapshots and history of a run to one file, the same for any number of ranks.
 
@@ -301,29 +349,12 @@ class ResultWriter:
     Parameters
     ----------
     path : Path or str
-        The file; replaced if it exists, unless ``append_after_step`` is given. Missing folders are created.
+        The file; replaced if it exists, unless ``kept`` is given. Missing folders are created.
     comm : MPI.Comm
     mesh : DistributedMesh
-    point_fields, cell_fields : sequences of str
-        Names of the fields; the shape of their rows is that in the first snapshot.
-    columns : mapping of history column ("wall/floor/force") to the shape of one row's value, () for a number
-    column_types : mapping of history column to type; default: float64
-    case_text : str
-        The resolved case.
-    attributes : mapping
-        Stored as attributes of ``/case``: numbers, texts, or any JSON data.
-    precision : "float64" or "float32"
-        Of the fields. Points are always float64, because strains from positions in single precision are noise.
-    compressed : bool
-        Whether points and fields are compressed without loss; a file that is continued keeps what it has.
-    append_after_step : int, optional
-        Continue an existing file; data after this step are removed.
-    last : (int, int), optional
-        Steps of the last snapshot and of the last history row that are kept then, where not all up to that step are.
-    modes : "vibration" or "buckling", optional
-        Kind of the modes that :meth:`write_modes` will write.
-    events : mapping, optional
-        Columns of the table ``/event`` to their types, one of them ``step``; without it there is no such table.
+    contents : Contents
+    kept : Kept, optional
+        Continue an existing file; data after these steps are removed.
 
     Raises
     ------
@@ -333,53 +364,39 @@ class ResultWriter:
     """
 
     def __init__(
-        self,
-        path: Path | str,
-        comm: MPI.Comm,
-        mesh: DistributedMesh,
-        *,
-        point_fields: Sequence[str],
-        cell_fields: Sequence[str],
-        columns: Mapping[str, tuple[int, ...]],
-        column_types: Mapping[str, Any],
-        case_text: str,
-        attributes: Mapping[str, Any],
-        precision: str = "float64",
-        compressed: bool = False,
-        append_after_step: int | None = None,
-        last: tuple[int, int] | None = None,
-        modes: str | None = None,
-        events: Mapping[str, Any] | None = None,
+        self, path: Path | str, comm: MPI.Comm, mesh: DistributedMesh, contents: Contents, kept: Kept | None = None
     ) -> None:
         require_parallel_hdf5(comm)
         self.path, self.comm = Path(path), comm
-        self.n_nodes, self.n_bars = int(mesh.n_nodes), int(mesh.n_bars)
-        self.node_order = mesh.node_order
+        self._mesh = mesh
         self._unpublished: Path | None = None  # temporary name until the file has complete data
-        fields = {"PointData": sorted(point_fields), "CellData": sorted(cell_fields)}
         self._file: h5py.File | None = None
         # The failure after which nothing can be written, and whether the open file can still be closed.
         self._failure: SimulationFailure | None = None
         self._broken = False
-
-        described = describe_run(comm, attributes)
-        sizes = (self.n_nodes, self.n_bars)
-        if append_after_step is None:
-            structure = (*sizes, columns, column_types, case_text, described, modes, events, compressed)
-            self._unpublished = create_new(self.path, comm, create_result, *structure, checked=True)
+        sizes = int(mesh.n_nodes), int(mesh.n_bars)
+        contents = contents._replace(attributes=describe_run(comm, contents.attributes))
+        if kept is None:
+            self._unpublished = create_new(self.path, comm, create_result, *sizes, contents, checked=True)
         else:
-            last = last or (append_after_step, append_after_step)
-            on_root(comm, reopen, self.path, append_after_step, last, sizes, fields, columns, case_text, described)
-            on_root(comm, prepare_modes, self.path, modes, self.n_nodes)
+            on_root(comm, reopen, self.path, sizes, contents, kept)
         with writing(comm, self.path):
             self._file = open_shared(self._unpublished or self.path, comm)
-        self.n_snapshots = int(self._file["VTKHDF/Steps"].attrs["NSteps"])
-        self._data = SnapshotData(self._file, comm, self.path, mesh, fields, np.dtype(precision))
-        self._index = SnapshotIndex(self._file, comm, self.path, mesh)
-        self._rows = RowTables(self._file, comm, self.path, columns, events)
-        if append_after_step is None:
+        if contents.events and EVENT not in self._file:
+            raise InputError(f"{self.path}: has no events, which the run records: write elsewhere (-o)")
+        self._snapshots = _Snapshots(self._file, comm, self.path, mesh, contents)
+        self._history = _Table(self._file, comm, self.path, "history", contents.columns)
+        self._tables = [self._history]
+        if contents.events:
+            self._tables.append(_Table(self._file, comm, self.path, EVENT, contents.events))
+        if kept is None:
             with self._whole_or_failed():
-                write_connectivity(self._file, comm, self.path, mesh)
+                _write_connectivity(self._file, comm, self.path, mesh)
+
+    @property
+    def n_snapshots(self) -> int:
+        """Number of snapshots in the file."""
+        return self._snapshots.count
 
     def write_snapshot(
         self,
@@ -409,62 +426,92 @@ class ResultWriter:
             On all ranks, for example if the disk is full or the file is missing.
         """
         file = self._ready()
-        arrays = self._data.arrays(points, point_data, cell_data)
-        self._require_room(self._data.n_bytes(arrays))
-        n = self.n_snapshots
+        arrays = self._snapshots.arrays(points, point_data, cell_data)
+        self._require_room(self._snapshots.n_bytes(arrays))
         with self._whole_or_failed():
-            if not self._data.exists:
-                with writing(self.comm, self.path):
-                    self._data.create(arrays)
-                    self._index.create_checks()
-            digests = self._data.append(n, arrays)
-            self._index.append(n, step, time, digests)
-            self._rows.write()
-            with writing(self.comm, self.path):
-                file.flush()
-            self._rows.commit()
-            self._index.publish(n, time)
+            self._snapshots.append(step, time, arrays)
+            self._write_rows(file)
+            self._snapshots.publish(time)
             self._publish()
-        self.n_snapshots = n + 1
 
     def append_history(self, row: Mapping[str, Any] | None) -> None:
         """Add a row: rank 0 passes a value for each column, the other ranks None. Collective.
 
         Rows are buffered until a snapshot, :meth:`flush_history`, :meth:`close`, or a thousand rows.
         """
-        if self._rows.history.full:
-            self.flush_history()
-        self._rows.history.append(row)
+        self._append(self._history, row)
 
     def append_event(self, row: Mapping[str, Any] | None) -> None:
         """Add an event: rank 0 passes a value for each column, the other ranks None. Collective."""
-        if self._rows.event.full:
+        self._append(self._tables[-1], row)
+
+    def _append(self, table: _Table, row: Mapping[str, Any] | None) -> None:
+        if table.full:
             self.flush_history()
-        self._rows.event.append(row)
+        table.append(row)
+
+    def _write_rows(self, file: h5py.File) -> None:
+        """Write the buffered rows, and count them once they are flushed. Collective."""
+        for table in self._tables:
+            table.write()
+        with writing(self.comm, self.path):
+            file.flush()
+        for table in self._tables:
+            table.commit()
 
     def flush_history(self) -> None:
         """Write the rows and events kept in memory. Collective."""
         file = self._ready()
-        if not self._rows.buffered:
+        if not any(table.n_buffered for table in self._tables):
             return
         self._require_room(0)
         with self._whole_or_failed():
-            self._rows.write()
-            with writing(self.comm, self.path):
-                file.flush()
-            self._rows.commit()
+            self._write_rows(file)
             with writing(self.comm, self.path):
                 file.flush()
             self._publish()
 
     def write_modes(self, eigenvalues: np.ndarray, values: np.ndarray, shapes: np.ndarray) -> None:
-        """Write all modes; see :func:`~pfem_petsc.output.modes.write_modes`. Collective."""
+        """Write all modes, replacing existing ones. Collective.
+
+        Parameters
+        ----------
+        eigenvalues, values : (k,); ``values`` are frequencies or load factors
+        shapes : (k, owned, 3)
+        """
         self.flush_history()
         file = self._ready()
-        self._require_room(24 * self.n_nodes * len(values))
+        self._require_room(24 * self._mesh.n_nodes * len(values))
         with self._whole_or_failed():
-            write_modes(file, self.comm, self.path, self.node_order, eigenvalues, values, shapes)
+            self._write_modes(file, eigenvalues, values, shapes)
             self._publish()
+
+    def _write_modes(self, file: h5py.File, eigenvalues: np.ndarray, values: np.ndarray, shapes: np.ndarray) -> None:
+        comm, path, order = self.comm, self.path, self._mesh.node_order
+        group, checks = file[MODES], file[CHECKS][MODES]
+        name = next(name for name, _ in MODE_VALUES.values() if name in group)
+        n = len(eigenvalues)
+        shape = Growing(group["shape"])
+        with writing(comm, path):
+            for dataset in (group[name], group["eigenvalue"], group["shape"]):
+                grow(dataset, n)
+        digests = np.zeros(n, dtype=np.uint64)
+        for k in range(n):
+            slab = np.ascontiguousarray(order.to_slab(shapes[k]))
+            total = snapshot_digests(comm, {"shape": word_sum(slab, order.first)})[0]
+            digests[k] = total ^ np.uint64(numbers_digest(k, eigenvalues[k], values[k]))
+            with writing(comm, path):
+                shape.write((k, order.first, 0), slab[None], collective=comm.size > 1)
+        with writing(comm, path):
+            if comm.rank == 0:
+                group[name][:] = values
+                group["eigenvalue"][:] = eigenvalues
+            file.flush()
+        with writing(comm, path):
+            grow(checks, n)
+            if comm.rank == 0:
+                checks[:] = digests
+            file.flush()
 
     def close(self) -> None:
         """Write buffered rows and close the file; a second call does nothing. Collective."""
@@ -522,12 +569,8 @@ class ResultWriter:
 
     def _require_room(self, n_bytes: int) -> None:
         try:
-            require_room(
-                self.comm,
-                self.path,
-                n_bytes + self._rows.reserve_bytes,
-                target=self._unpublished,
-            )
+            reserve = sum(table.reserve_bytes for table in self._tables)
+            require_room(self.comm, self.path, n_bytes + reserve, target=self._unpublished)
         except SimulationFailure as error:
             self._failure = error
             raise

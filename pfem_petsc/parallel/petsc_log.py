@@ -89,7 +89,7 @@ def instrument(simulation: Any) -> None:
         for path in paths:
             _cover(simulation, path, event.begin, _counted(simulation, path, event, counters))
     stage = PETSc.Log.Stage(STEPS)
-    _cover(simulation, "_loop.advance", stage.push, lambda *_: stage.pop())
+    _cover(simulation, "_advance", stage.push, lambda *_: stage.pop())
 
 
 def _counted(simulation: Any, path: str, event: Any, counters: _Counters) -> Callable[..., None]:

@@ -1,28 +1,30 @@
-"""A camera that is fixed for all frames and has the whole motion in view."""
+"""Cameras of a film: at rest with the whole motion in view, around the structure, along a path, or with it."""
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import InputError
 
-__all__ = ["VIEWS", "Camera", "aim", "direction", "fit"]
-
 VIEWS = ("auto", "xy", "xz", "yz", "iso", "front", "back", "left", "right", "top", "bottom")
 
+_X, _Y, _Z = (tuple(row) for row in np.eye(3).tolist())
 _FLAT = {  # direction from the structure to the eye, and the upward direction
-    "xy": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
-    "xz": ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
-    "yz": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    "front": ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
-    "back": ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-    "left": ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    "right": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    "top": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
-    "bottom": ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+    "xy": (_Z, _Y),
+    "xz": ((0.0, -1.0, 0.0), _Z),
+    "yz": (_X, _Z),
+    "front": ((0.0, -1.0, 0.0), _Z),
+    "back": (_Y, _Z),
+    "left": ((-1.0, 0.0, 0.0), _Z),
+    "right": (_X, _Z),
+    "top": (_Z, _Y),
+    "bottom": ((0.0, 0.0, -1.0), _Y),
 }
 _OPENING = 25.0  # degrees, vertical
 
@@ -48,71 +50,38 @@ class Camera:
     half_height: float
     parallel: bool
 
-    def project(self, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, ...]:
+    def project(self, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Project points (n, 3) [m] into a picture of ``size`` pixels.
 
         Returns
         -------
-        Columns and rows (n,) [pixels], how near the points are (n,), which is linear in the picture and larger where
-        nearer, and pixels per metre there (n,), 0 behind the eye.
+        Columns and rows (n,) [pixels], and pixels per metre there (n,), 0 behind the eye.
         """
         away = points - self.centre
         across, along, deep = away @ self.right, away @ self.up, away @ self.towards
-        if self.parallel:
-            scale = np.full(len(points), size[1] / (2.0 * self.half_height))
-            near = deep * scale
-        else:
-            distance = self.distance - deep
-            seen = distance > 0.02 * self.distance
-            near = np.where(seen, 1.0 / np.where(seen, distance, 1.0), 0.0)
-            scale = self._focal(size) * near
-        return 0.5 * size[0] + across * scale, 0.5 * size[1] - along * scale, near, scale
+        near = np.ones(len(points))
+        if not self.parallel:
+            ahead = 1.0 - deep / self.distance
+            near = np.where(ahead > 0.02, 1.0 / np.where(ahead > 0.02, ahead, 1.0), 0.0)
+        scale = size[1] / (2.0 * self.half_height) * near
+        return 0.5 * size[0] + across * scale, 0.5 * size[1] - along * scale, scale
 
     def zoomed(self, factor: float) -> Camera:
         """Return the camera that shows what is in the middle larger by a factor."""
         return replace(self, half_height=self.half_height / factor, distance=self.distance / factor)
-
-    def lift(self, size: tuple[int, int]) -> np.ndarray:
-        """Return (2,): what is nearer by a pixel has a nearness larger by ``lift[0] + lift[1]*near``."""
-        return np.array([1.0, 0.0]) if self.parallel else np.array([0.0, 1.0 / self._focal(size)])
-
-    def _focal(self, size: tuple[int, int]) -> float:
-        return 0.5 * size[1] * self.distance / self.half_height
-
-
-def aim(
-    points: np.ndarray,
-    bounds: np.ndarray,
-    normals: Sequence[np.ndarray],
-    view: str | Sequence[float],
-    aspect: float,
-    upward: Sequence[float] = (0.0, 0.0, 1.0),
-    margin: float = 1.05,
-) -> Camera:
-    """Return a camera that has all ``points`` in view.
-
-    Parameters
-    ----------
-    points : (n, 3) [m], points that must be visible (corners suffice)
-    bounds : (2, 3) [m], bounds of the structure's motion, from which ``"auto"`` determines whether it is flat
-    normals : allowed sides of the walls; the oblique view looks at walls from there
-    view : one of :data:`VIEWS`, or the direction (3,) from the structure to the eye
-    aspect : width over height of the picture
-    upward : upward direction of the oblique view
-    margin : factor on the visible extent
-
-    Raises
-    ------
-    InputError
-        For an unknown view.
-    """
-    return fit(points, *direction(view, bounds, normals, upward), aspect, margin)
 
 
 def direction(
     view: str | Sequence[float], bounds: np.ndarray, normals: Sequence[np.ndarray], upward: Sequence[float]
 ) -> tuple[np.ndarray, np.ndarray, bool]:
     """Return the direction to the eye (3,), the upward direction (3,), and whether there is no perspective.
+
+    Parameters
+    ----------
+    view : one of :data:`VIEWS`, or the direction (3,) from the structure to the eye
+    bounds : (2, 3) [m], bounds of the structure's motion, from which ``"auto"`` determines whether it is flat
+    normals : allowed sides of the walls; the oblique view looks at walls from there
+    upward : upward direction of the oblique view
 
     Raises
     ------
@@ -132,18 +101,37 @@ def direction(
     if view not in VIEWS:
         raise InputError(f"render: view = {view!r} is not known; it is one of {', '.join(VIEWS)}, or a direction x,y,z")
     if view == "auto":
-        view = _flat_view(bounds)
+        extent = bounds[1] - bounds[0]
+        flat = extent <= 1e-6 * max(extent.max(), 1e-300)
+        view = next((name for axis, name in ((2, "xy"), (1, "xz"), (0, "yz")) if flat[axis]), "iso")
     if view in _FLAT:
         towards, up = (np.array(vector) for vector in _FLAT[view])
         return towards, up, True
-    return *_oblique(normals, up), False
+    return _oblique(normals, up), up, False
+
+
+def _oblique(normals: Sequence[np.ndarray], upward: np.ndarray) -> np.ndarray:
+    """Return the direction of the eye: slightly from above, from the quadrant that sees most walls from the front."""
+    first, second = _level(upward)
+    # -second points towards the viewer in a right-handed picture, the default quadrant
+    quarters = [a * first + b * second for b in (-1.3, 1.3) for a in (0.9, -0.9)]
+    quarters += [1.3 * a * first + 0.9 * b * second for b in (-1.0, 1.0) for a in (1.0, -1.0)]
+    directions = [(each + 0.65 * upward) / np.linalg.norm(each + 0.65 * upward) for each in quarters]
+    seen = [sum(min(0.3, float(normal @ each)) for normal in normals) for each in directions]
+    return directions[int(np.argmax(np.round(seen, 6)))]
+
+
+def _level(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two unit vectors across an upward direction, the first one along x if that is not upward."""
+    first = np.array(_X if abs(up[0]) < 0.9 else _Y)
+    first -= (first @ up) * up
+    first /= np.linalg.norm(first)
+    return first, np.cross(up, first)
 
 
 def fit(
     points: np.ndarray,
-    towards: np.ndarray,
-    up: np.ndarray,
-    parallel: bool,
+    way: tuple[np.ndarray, np.ndarray, bool],
     aspect: float,
     margin: float = 1.05,
     centre: np.ndarray | None = None,
@@ -152,16 +140,20 @@ def fit(
 
     Parameters
     ----------
+    way : of :func:`direction`
+    aspect : width over height of the picture
+    margin : factor on the visible extent
     centre : (3,) [m], what is in the middle of the picture; None: the middle of the points
     """
+    towards, up, parallel = way
     right = np.cross(up, towards)
     right = right / np.linalg.norm(right)
     up = np.cross(towards, right)
-    ways = (right, up, towards)
-    spans = [points @ way for way in ways]
-    middle = [0.5 * (values.min() + values.max()) for values in spans] if centre is None else [centre @ w for w in ways]
-    centre = sum(value * way for value, way in zip(middle, ways, strict=True))
-    across, along, deep = (values - value for values, value in zip(spans, middle, strict=True))
+    axes = np.stack([right, up, towards])
+    spans = points @ axes.T
+    middle = 0.5 * (spans.min(axis=0) + spans.max(axis=0)) if centre is None else axes @ centre
+    across, along, deep = (spans - middle).T
+    centre = middle @ axes
     half = max(float(np.abs(along).max()), float(np.abs(across).max()) / aspect) * margin or 1.0
     if parallel:
         return Camera(towards, up, right, centre, 10.0 * (half * max(1.0, aspect) + np.ptp(deep)), half, True)
@@ -172,25 +164,132 @@ def fit(
     return Camera(towards, up, right, centre, distance, distance * slope, False)
 
 
-def _flat_view(bounds: np.ndarray) -> str:
-    extent = bounds[1] - bounds[0]
-    flat = extent <= 1e-6 * max(extent.max(), 1e-300)
-    for axis, view in ((2, "xy"), (1, "xz"), (0, "yz")):
-        if flat[axis]:
-            return view
-    return "iso"
+@dataclass(frozen=True)
+class Moves:
+    """The view of a film and its movement.
+
+    Parameters
+    ----------
+    view : name of a view, or the direction (3,) from the structure to the eye
+    zoom : factor on the size of the structure in the picture
+    orbit : angle [degrees] that the camera goes around the upward direction from the first frame to the last
+    path : (k, 4) times [s], azimuths and elevations [degrees], zooms; between these the camera moves smoothly
+    follow : "structure", or the name of a probe, that stays in the middle of the picture; None: nothing
+
+    Raises
+    ------
+    InputError
+        For numbers that make no film.
+    """
+
+    view: str | Sequence[float] = "auto"
+    zoom: float = 1.0
+    orbit: float = 0.0
+    path: np.ndarray | None = None
+    follow: str | None = None
+
+    def __post_init__(self) -> None:
+        if not 1e-3 <= self.zoom <= 1e3:
+            raise InputError(f"render: zoom = {self.zoom:g} must be from 0.001 to 1000")
+        if not np.isfinite(self.orbit):
+            raise InputError(f"render: orbit = {self.orbit:g} is not a number of degrees")
+        if self.path is None:
+            return
+        if self.orbit:
+            raise InputError("render: orbit and path both move the camera; give one of the two")
+        path = np.asarray(self.path, dtype=float)
+        if path.ndim != 2 or path.shape[1] != 4 or not len(path) or not np.isfinite(path).all():
+            raise InputError("render: path takes rows of four numbers: time, azimuth, elevation, zoom")
+        if (np.diff(path[:, 0]) <= 0.0).any():
+            raise InputError("render: path: times must increase from row to row")
+        if (np.abs(path[:, 2]) > 89.0).any() or (path[:, 3] <= 0.0).any():
+            raise InputError("render: path: elevations go from -89 to 89 degrees, and zooms are positive")
+        object.__setattr__(self, "path", path)
+
+    def cameras(self, motion: Any, aspect: float) -> list[Camera]:
+        """Return the camera of each frame of a motion; all have the same scale, but for the zooms of a path."""
+        towards, up, parallel = direction(self.view, motion.bounds, motion.normals, motion.upward)
+        points, count = motion.surroundings, len(motion.frames)
+        if not self.orbit and self.path is None and self.follow is None:
+            return [fit(points, (towards, up, parallel), aspect).zoomed(self.zoom)] * count
+        ways, zooms = [(towards, up, parallel)] * count, np.full(count, self.zoom)
+        if self.orbit:
+            angles = np.radians(self.orbit) * np.linspace(0.0, 1.0, count)
+            ways = [(_turned(towards, up, angle), up, parallel) for angle in angles]
+        if self.path is not None:
+            azimuths, elevations, factors = (_smooth(motion.times, self.path[:, 0], self.path[:, k]) for k in (1, 2, 3))
+            angles = zip(np.radians(azimuths), np.radians(elevations), strict=True)
+            ways = [(_towards(*each, motion.upward), motion.upward, False) for each in angles]
+            zooms = zooms * factors
+        if self.follow is None:
+            centre = motion.bounds.mean(axis=0)
+            made = [fit(points, way, aspect, centre=centre) for way in ways]
+        else:
+            centres = motion.boxes.mean(axis=1) if self.follow == "structure" else motion.probe(self.follow)
+            held = zip(ways, motion.hulls, centres, strict=True)
+            made = [fit(hull, way, aspect, margin=1.25, centre=centre) for way, hull, centre in held]
+        (made,) = at_one_scale([made])
+        return [camera.zoomed(zoom) for camera, zoom in zip(made, zooms, strict=True)]
 
 
-def _oblique(normals: Sequence[np.ndarray], upward: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the direction of the eye: slightly from above, from the quadrant that sees most walls from the front."""
-    first = np.array([1.0, 0.0, 0.0]) if abs(upward[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    first -= (first @ upward) * upward
-    first /= np.linalg.norm(first)
-    second = np.cross(upward, first)
-    # -second points towards the viewer in a right-handed picture, the default quadrant
-    quarters = [a * first + b * second for b in (-1.3, 1.3) for a in (0.9, -0.9)]
-    quarters += [1.3 * a * first + 0.9 * b * second for b in (-1.0, 1.0) for a in (1.0, -1.0)]
-    directions = [quarter + 0.65 * upward for quarter in quarters]
-    directions = [direction / np.linalg.norm(direction) for direction in directions]
-    seen = [sum(min(0.3, float(normal @ direction)) for normal in normals) for direction in directions]
-    return directions[int(np.argmax(np.round(seen, 6)))], upward
+def camera_path(file: Path | str) -> np.ndarray:
+    """Read the path of a camera (k, 4): columns time, azimuth, elevation, zoom, with or without a line of names.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or a line is not four numbers.
+    """
+    rows: list[list[float]] = []
+    try:
+        lines = list(csv.reader(Path(file).read_text().splitlines()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: the camera's path cannot be read ({error})") from error
+    for number, words in enumerate(lines, start=1):
+        if not words or words[0].lstrip().startswith("#"):
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            if number == 1:
+                continue
+            row = []
+        if len(row) != 4:
+            raise InputError(f"{file}: line {number} is not four numbers: time, azimuth, elevation, zoom")
+        rows.append(row)
+    return np.array(rows).reshape(-1, 4)
+
+
+def at_one_scale(films: list[list[Camera]]) -> list[list[Camera]]:
+    """Return the cameras of films with the smallest scale of all, so that sizes can be compared."""
+    every = [camera for film in films for camera in film]
+    half, distance = max(camera.half_height for camera in every), max(camera.distance for camera in every)
+    return [[replace(camera, half_height=half, distance=distance) for camera in film] for film in films]
+
+
+def _turned(vector: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
+    axis = axis / np.linalg.norm(axis)
+    along = (vector @ axis) * axis
+    return along + np.cos(angle) * (vector - along) + np.sin(angle) * np.cross(axis, vector)
+
+
+def _towards(azimuth: float, elevation: float, up: np.ndarray) -> np.ndarray:
+    """Return a direction from angles [rad]; the azimuth is from x, about the upward direction."""
+    first, second = _level(up)
+    return np.cos(elevation) * (np.cos(azimuth) * first + np.sin(azimuth) * second) + np.sin(elevation) * up
+
+
+def _smooth(times: np.ndarray, when: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Interpolate values between given times by cubics without overshoot, at rest at both ends.
+
+    The rates at inner times are the weighted harmonic means of the slopes beside them, zero where these have different
+    signs (Fritsch and Butland 1984, eq. 5): the camera passes through them without a stop where it goes on in the same
+    direction.
+    """
+    from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
+
+    if len(when) == 1:
+        return np.full(len(times), values[0])
+    rates = PchipInterpolator(when, values).derivative()(when) if len(when) > 2 else np.zeros(2)
+    rates[[0, -1]] = 0.0
+    return CubicHermiteSpline(when, values, rates)(np.clip(times, when[0], when[-1]))

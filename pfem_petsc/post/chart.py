@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 import csv
+import io
 import itertools
+import os
 import textwrap
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..errors import InputError
 from ..output.units import TIME, Axis, common_prefix, prefix_for
-
-__all__ = [
-    "COLOURS",
-    "FORMATS",
-    "REFERENCE",
-    "STYLE",
-    "Chart",
-    "boxes_allowed",
-    "check_formats",
-    "largest",
-    "literal",
-    "thinned",
-]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6b7280", "#000000")
 """For colour-blind eyes (Okabe and Ito 2008), without their yellow, which is too pale for lines on white."""
@@ -73,6 +63,22 @@ _LETTER = 0.075
 _POINTS = 3000  # approximate maximum number of points of a curve, more than a picture has columns
 
 
+class Curve(NamedTuple):
+    """A curve (n,) of a panel: its name in the legend, its style, and its name in tables if that is another one."""
+
+    name: str
+    values: np.ndarray
+    style: Mapping[str, Any] = MappingProxyType({})
+    key: str = ""
+
+
+def legend_beside(axes: Any, **options: Any) -> None:
+    """Put the legend to the right of a panel."""
+    if axes.get_legend_handles_labels()[0]:
+        place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}
+        axes.legend(**place, **{"handlelength": 1.4, **options})
+
+
 def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tuple[np.ndarray, np.ndarray]:
     """Return a curve (n,) with fewer points that looks the same: lowest and highest value of each time interval."""
     if len(time) <= points:
@@ -106,6 +112,23 @@ def boxes_allowed() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         yield
+
+
+def png(figure: Any, dpi: float = 100) -> bytes:
+    """Return a figure of matplotlib as PNG, with so many pixels per inch."""
+    made = io.BytesIO()
+    with boxes_allowed():
+        figure.savefig(made, format="png", dpi=dpi)
+    return made.getvalue()
+
+
+def opened(result: Path | str | Any) -> Any:
+    """Return a context of a result that is open, or opened by its path."""
+    if not isinstance(result, (str, os.PathLike)):
+        return nullcontext(result)
+    from ..output.result import open_result
+
+    return open_result(result)
 
 
 def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
@@ -208,34 +231,23 @@ class Chart:
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(texts), handlelength=1.4, borderaxespad=0.1)
 
     def curves(
-        self,
-        axes: Any,
-        label: str,
-        unit: str,
-        curves: Sequence[tuple[str, np.ndarray]],
-        title: str = "",
-        styles: Sequence[dict[str, Any]] | None = None,
-        legend: bool = True,
-        keys: Sequence[str] | None = None,
-        quantity: str = "",
+        self, axes: Any, label: str, unit: str, curves: Sequence[Curve], title: str = "", quantity: str = ""
     ) -> tuple[float, str]:
-        """Draw named curves (n,) of one unit into a panel; return the factor and unit of its axis.
+        """Draw curves of one unit into a panel, with their legend above; return the factor and unit of its axis.
 
-        ``keys`` are the names of the curves in tables; default: label and name. The unit is that which panels of the
-        quantity :meth:`share`, or else suits these curves.
+        The unit is that which panels of the quantity :meth:`share`, or else suits these curves.
         """
-        sizes = (largest(np.asarray(values)) for _, values in curves)
+        sizes = (largest(np.asarray(curve.values)) for curve in curves)
         factor, shown = self._scales.get(quantity) or prefix_for(max(sizes, default=0.0), unit)
-        for number, (name, values) in enumerate(curves):
-            time, thin = thinned(self.time, np.asarray(values, dtype=float) * factor)
-            options = {"color": COLOURS[number % len(COLOURS)], **(styles[number] if styles else {})}
+        for number, curve in enumerate(curves):
+            time, thin = thinned(self.time, np.asarray(curve.values, dtype=float) * factor)
+            options = {"color": COLOURS[number % len(COLOURS)], **curve.style}
             options |= {"marker": "o"} if len(time) == 1 else {}  # a line needs two points
-            axes.plot(time * self.factor, thin, label=literal(name), **options)
-            self.record(keys[number] if keys else " ".join(dict.fromkeys([title, name])).strip(), values, unit)
+            axes.plot(time * self.factor, thin, label=literal(curve.name), **options)
+            self.record(curve.key or curve.name, curve.values, unit)
         axes.set_ylabel(f"{label} [{shown}]" if shown else label)
         axes.set_title(literal(title))
-        if legend and len(curves) > 1:
-            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, handlelength=1.4)
+        self.legend_above(axes)
         return factor, shown
 
     def counts(self, axes: Any, label: str, values: np.ndarray, colour: str = COLOURS[0], before: bool = False) -> None:

@@ -1,36 +1,26 @@
-"""Curves selected by name: over time or another column, of one result or several."""
+"""Curves selected by name: over time or another column, of one result or several, and their spectra."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..energies import LOST, STORED, SUPPLIED
+from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.units import TIME, prefix_for, unit_of
 from ..registry import nearest
-from .chart import COLOURS, REFERENCE, Chart, largest, literal, thinned
+from .chart import COLOURS, REFERENCE, Chart, largest, legend_beside, literal, thinned
 from .closed_forms import closed_form
-from .filters import AS_COMPUTED, Filter
-
-__all__ = [
-    "History",
-    "column",
-    "draw_curves",
-    "labels_of",
-    "make_chart",
-    "read",
-    "unit_of_curve",
-    "usual_curves",
-    "words",
-]
+from .filters import AS_COMPUTED, Filter, amplitude_spectrum
 
 History = Mapping[str, np.ndarray]
 
 _DISPLACEMENT = "/displacement"  # of probes, whose columns have positions
+
+_PEAKS = 5  # of a spectrum, at most, that are told
 
 DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))
 
@@ -72,13 +62,13 @@ def column(history: History, name: str) -> dict[str, np.ndarray]:
         history = {whole: values - values[:1]}
     if whole not in list(history) or whole.startswith("event/"):
         known = [each for each in history if not each.startswith("event/")]
-        raise InputError(f"plot: the history holds no column '{whole}'{nearest(whole, known)}")
+        raise InputError(f"the history holds no column '{whole}'{nearest(whole, known)}")
     values = read(history, whole)
     if values.ndim == 3:
         values = values.sum(axis=1) if whole.endswith("/reaction") else values.mean(axis=1)
     if values.ndim == 1:
         if part:
-            raise InputError(f"plot: {name}: column '{whole}' is a number and has no components")
+            raise InputError(f"{name}: column '{whole}' is a number and has no components")
         return {whole: values}
     if part == "norm":
         return {name: np.linalg.norm(values, axis=1)}
@@ -165,6 +155,7 @@ def draw_curves(
     else:
         places = [read(result.history, "time") for result in results]
         over = first.axis.label(first.axis.unit)
+    sources = [_Source(*each) for each in zip(results, labels, places, strict=True)]
     every = [[column(result.history, name) for result in results] for name in names]
     sizes: dict[str, list[float]] = {}
     for name, found in zip(names, every, strict=True):
@@ -172,13 +163,21 @@ def draw_curves(
     for unit, magnitudes in sizes.items():
         chart.share(unit, unit, magnitudes)
     for axes, name, found in zip(chart.axes[:, 0], names, every, strict=True):
-        _panel(chart, axes, name, found, places, labels, over, chosen, [read(r.history, "time") for r in results])
+        _panel(chart, axes, name, found, sources, over, chosen)
         if exact is not None:
             _draw_exact(chart, axes, exact, found[0], places[0])
         axes.margins(x=0.0 if against is None else 0.02)
         if len(axes.lines) > 1:
-            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, handlelength=2.2)
+            legend_beside(axes, handlelength=2.2)
     return chart
+
+
+class _Source(NamedTuple):
+    """A result, its label, and the places of its rows on the axis (n,)."""
+
+    result: Any
+    label: str
+    place: np.ndarray
 
 
 def unit_of_curve(name: str) -> str:
@@ -192,18 +191,17 @@ def _panel(
     axes: Any,
     name: str,
     found: Sequence[dict[str, np.ndarray]],
-    places: Sequence[np.ndarray],
-    labels: Sequence[str],
+    sources: Sequence[_Source],
     over: str,
     chosen: Filter | None,
-    times: Sequence[np.ndarray],
 ) -> None:
     unit = unit_of_curve(name)
     axes.pfem_factor, shown = chart.scale(unit)
     parts = list(dict.fromkeys(part for curves in found for part in curves))
     several = len(found) > 1
-    shared = all(np.array_equal(place, places[0]) for place in places)
-    for number, (curves, place, label, time) in enumerate(zip(found, places, labels, times, strict=True)):
+    shared = all(np.array_equal(source.place, sources[0].place) for source in sources)
+    for number, (curves, (result, label, place)) in enumerate(zip(found, sources, strict=True)):
+        time = read(result.history, "time")
         for part, values in curves.items():
             touch = part.startswith(("wall/", "pair/", "constraint/")) and "/force" in part  # zero before the run
             filtered = chosen.apply(time, values, touch) if chosen is not None else values
@@ -249,3 +247,84 @@ def labels_of(results: Sequence[Any]) -> list[str]:
     return (
         [str(path) for path in paths] if len(set(paths)) == len(paths) else [f"{k}: {p}" for k, p in enumerate(paths)]
     )
+
+
+def draw_spectra(
+    results: Sequence[Any], names: Sequence[str], window: str = "hann", highest: float | None = None
+) -> Chart:
+    """Draw a panel with the amplitude spectrum of each named column; natural frequencies are dotted lines.
+
+    Parameters
+    ----------
+    results : open results of runs over time
+    names : columns, or components of them
+    window : see :func:`~pfem_petsc.post.filters.amplitude_spectrum`
+    highest : frequency at which the picture ends [Hz]; None: half the sampling rate
+    """
+    first = results[0]
+    if not names:
+        raise InputError("plot: no columns named for spectra; columns: " + ", ".join(first.history))
+    if highest is not None and not highest > 0.0:
+        raise InputError(f"plot: highest frequency = {highest:g} Hz must be positive")
+    for result in results:
+        if result.axis is not TIME:
+            raise InputError(f"{result.path}: spectra need a run over time, not a static analysis")
+    found = []
+    for name in names:
+        curves = {}
+        for label, result in zip(labels_of(results), results, strict=True):
+            time = read(result.history, "time")
+            for part, values in column(result.history, name).items():
+                key = f"{part}: {label}" if len(results) > 1 else part
+                curves[key] = amplitude_spectrum(time, values, window)
+        found.append(curves)
+    end = highest or max(frequency[-1] for curves in found for frequency, _ in curves.values())
+    title = first.case.title or first.case.name
+    chart = Chart(np.array([0.0, end]), title, len(names), heights=[1.1] * len(names))
+    chart.factor, shown = (1e-3, "kHz") if end >= 2e3 else (1.0, "Hz")
+    chart.axes[-1, 0].set_xlabel(f"frequency [{shown}]")
+    for axes, name, curves in zip(chart.axes[:, 0], names, found, strict=True):
+        unit = unit_of_curve(name)
+        top = 0.0
+        for k, (key, (frequency, amplitude)) in enumerate(curves.items()):
+            inside = (frequency > 0.0) & (frequency <= end)
+            axes.semilogy(
+                frequency[inside] * chart.factor, amplitude[inside], label=literal(key), color=COLOURS[k % len(COLOURS)]
+            )
+            chart.record(key, amplitude, unit, ("frequency [Hz]", frequency))
+            top = max(top, float(amplitude[inside].max(initial=0.0)))
+            if len(curves) == 1:
+                _tell_peaks(axes, frequency[inside], amplitude[inside], chart.factor, shown)
+        if top > 0.0:
+            axes.set_ylim(1e-6 * top, 4.0 * top)
+        axes.set_xlim(0.0, end * chart.factor)
+        for value in _natural(first):
+            if 0.0 < value <= end:
+                axes.axvline(value * chart.factor, color="#6b7280", linewidth=0.8, linestyle=":", zorder=0)
+        label = words(name.rsplit("/", 1)[-1])
+        axes.set_ylabel(f"amplitude of\n{label} [{unit}]" if unit else f"amplitude of\n{label}")
+        axes.set_title(literal(f"{name}, window: {window}"))
+        if len(curves) > 1:
+            legend_beside(axes)
+    return chart
+
+
+def _natural(result: Any) -> np.ndarray:
+    modes = result.modes if getattr(result, "n_modes", 0) else None
+    return modes.frequency if modes is not None and modes.kind == "vibration" else np.zeros(0)
+
+
+def _tell_peaks(axes: Any, frequency: np.ndarray, amplitude: np.ndarray, factor: float, unit: str) -> None:
+    """Write the frequencies of the highest peaks beside them; each is higher than all within 6 % of the picture."""
+    from scipy.signal import find_peaks
+
+    if len(amplitude) < 3:
+        return
+    apart = max(1.0, 0.06 * (frequency[-1] - frequency[0]) / (frequency[1] - frequency[0]))
+    peaks, _ = find_peaks(amplitude, height=3e-3 * amplitude.max(), distance=apart)
+    for k in peaks[np.argsort(-amplitude[peaks])][:_PEAKS]:
+        left, middle, right = np.log(np.maximum(amplitude[k - 1 : k + 2], 1e-300))
+        bend = left - 2.0 * middle + right
+        place = frequency[k] + (0.5 * (left - right) / bend if bend < 0.0 else 0.0) * (frequency[1] - frequency[0])
+        text, at = f"{place * factor:.4g} {unit}", (frequency[k] * factor, amplitude[k])
+        axes.annotate(text, at, xytext=(3, 4), textcoords="offset points", fontsize=8)

@@ -11,18 +11,6 @@ import numpy as np
 from ..errors import InputError
 from ..output.units import engineering
 
-__all__ = [
-    "AS_COMPUTED",
-    "WINDOWS",
-    "Filter",
-    "amplitude_spectrum",
-    "butterworth",
-    "cfc",
-    "cfc_coefficients",
-    "make_filter",
-    "window_mean",
-]
-
 AS_COMPUTED = "as computed"
 """The name of no filter."""
 
@@ -32,17 +20,7 @@ CFC_CORNER = 2.0775
 _ROWS = 10.0
 """Rows per second and unit of the channel frequency class, at least (SAE J211-1)."""
 
-_HALF_POWER = math.sqrt(2.0) - 1.0
-"""(f/f_d)^(2 n) at which two passes of order n have -3 dB: (1 + x)^-1 = 2^-1/2."""
-
-WINDOWS: dict[str, tuple[float, ...]] = {
-    "rectangular": (1.0,),
-    "hann": (0.5, 0.5),
-    "hamming": (0.54, 0.46),
-    "blackman": (0.42, 0.5, 0.08),
-    "flattop": (0.21557895, 0.41663158, 0.277263158, 0.083578947, 0.006947368),
-}
-"""Cosine sums a_0 - a_1 cos(2 pi k/n) + a_2 cos(4 pi k/n) - ... (Heinzel, Ruediger and Schilling 2002)."""
+WINDOWS = ("rectangular", "hann", "hamming", "blackman", "flattop")
 
 
 class Filter(NamedTuple):
@@ -82,7 +60,7 @@ def make_filter(text: str) -> Filter:
         return Filter(name, lambda time, values, zero=False: _chosen_mean(time, values, width, zero))
     if kind == "cfc" and len(numbers) == 1 and good:
         (size,) = numbers
-        corner = f"{CFC_CORNER * size * _HALF_POWER**0.25:.3g} Hz"
+        corner = f"{CFC_CORNER * size * (math.sqrt(2.0) - 1.0) ** 0.25:.3g} Hz"
         name = f"CFC {size:g} of SAE J211-1 (two passes, −3 dB at {corner})"
         return Filter(name, lambda time, values, zero=False: cfc(time, values, size, zero))
     if kind == "butterworth" and len(numbers) in (1, 2) and good:
@@ -130,32 +108,17 @@ def window_mean(time: np.ndarray, values: np.ndarray, width: float, zero_before:
     return np.where(span > 0.0, (integral - primitive(low)) / np.where(span > 0.0, span, 1.0), values)
 
 
-def cfc_coefficients(size: float, interval: float) -> tuple[float, float, float, float, float]:
-    """Return (a_0, a_1, a_2, b_1, b_2) of y_t = a_0 x_t + a_1 x_t-1 + a_2 x_t-2 + b_1 y_t-1 + b_2 y_t-2.
-
-    The two-pole Butterworth filter of a channel frequency class at a sampling interval T [s], which is applied forward
-    and then backward: w_d = 2 pi 2.0775 CFC, w_a = sin(w_d T/2)/cos(w_d T/2), a_0 = w_a^2/(1 + sqrt(2) w_a + w_a^2),
-    a_1 = 2 a_0, a_2 = a_0, b_1 = -2 (w_a^2 - 1)/(1 + sqrt(2) w_a + w_a^2),
-    b_2 = (-1 + sqrt(2) w_a - w_a^2)/(1 + sqrt(2) w_a + w_a^2).
-
-    Source: SAE J211-1 (March 1995), appendix C, equations C1 and following, as also in "Crash Analysis: Description of
-    Criteria", version 2.1.1, of the Workgroup Data Processing Vehicle Safety. ISO 6487:2002 has the same with
-    w_d = 2 pi CFC 1.25 5/3, which is 0.3 % higher. Both passes have -3 dB at 100, 300, 1000 and 1650 Hz for the classes
-    60, 180, 600 and 1000, which the standards name, to 0.1 dB.
-    """
-    w = math.tan(math.pi * CFC_CORNER * size * interval)
-    scale = 1.0 + math.sqrt(2.0) * w + w * w
-    a = w * w / scale
-    return a, 2.0 * a, a, -2.0 * (w * w - 1.0) / scale, (-1.0 + math.sqrt(2.0) * w - w * w) / scale
-
-
 def cfc(time: np.ndarray, values: np.ndarray, size: float, zero_before: bool = False) -> np.ndarray:
     """Return a history filtered by a channel frequency class of SAE J211-1: 60, 180, 600, 1000.
 
-    Two passes of :func:`cfc_coefficients`, forward and backward, so that nothing is shifted in time. Together they have
-    -6 dB at 2.0775 times the class and -3 dB at 1.67 times the class. They are applied in one pass over frequencies,
-    |H(f)|^2, to the history continued by odd reflection at both ends, or by zero before the start, and are equal to the
-    recursion but for how that starts.
+    Two passes of the two-pole Butterworth filter with the corner frequency f_d = 2.0775 CFC, forward and backward, so
+    that nothing is shifted in time. Together they have -6 dB at f_d and -3 dB at 1.67 times the class. The history is
+    continued by odd reflection at both ends, or by zero before the start.
+
+    Source: SAE J211-1 (March 1995), appendix C, equations C1 and following, as also in "Crash Analysis: Description of
+    Criteria", version 2.1.1, of the Workgroup Data Processing Vehicle Safety. ISO 6487:2002 has the same with
+    f_d = 1.25 5/3 CFC, which is 0.3 % higher. Both passes have -3 dB at 100, 300, 1000 and 1650 Hz for the classes
+    60, 180, 600 and 1000, which the standards name, to 0.1 dB.
 
     Parameters
     ----------
@@ -169,13 +132,8 @@ def cfc(time: np.ndarray, values: np.ndarray, size: float, zero_before: bool = F
     InputError
         If the history is too coarse or too short for the class, or has less than three rows.
     """
-
-    def gain(frequency: np.ndarray, interval: float) -> np.ndarray:
-        a0, a1, a2, b1, b2 = cfc_coefficients(size, interval)
-        z = np.exp(-2j * np.pi * frequency * interval)
-        return np.abs((a0 + a1 * z + a2 * z * z) / (1.0 - b1 * z - b2 * z * z)) ** 2
-
-    return _two_passes(time, values, _Passes(CFC_CORNER * size, 2, _ROWS * size, f"CFC {size:g}"), gain, zero_before)
+    passes = _Passes(CFC_CORNER * size, 2, _ROWS * size, f"CFC {size:g}")
+    return passes.applied(time, values, lambda interval: CFC_CORNER * size, zero_before)
 
 
 def butterworth(
@@ -187,13 +145,14 @@ def butterworth(
     interval h, with f_d so that it is 2^-1/2 at the cut-off. See :func:`cfc` for parameters and errors.
     """
 
-    def gain(frequency: np.ndarray, interval: float) -> np.ndarray:
-        ratio = np.tan(np.pi * np.minimum(frequency * interval, 0.5 - 1e-9)) / math.tan(math.pi * cutoff * interval)
-        return 1.0 / (1.0 + _HALF_POWER * ratio ** (2 * order))
+    def corner(interval: float) -> float:
+        # (f/f_d)^(2 n) at which two passes of order n have -3 dB: (1 + x)^-1 = 2^-1/2
+        ratio = (math.sqrt(2.0) - 1.0) ** (-0.5 / order)
+        return math.atan(ratio * math.tan(math.pi * cutoff * interval)) / (math.pi * interval)
 
     # more than two rows per period: tan(pi f_d h) is infinite there
     passes = _Passes(cutoff, order, 2.01 * cutoff, f"a cut-off of {engineering(cutoff, 'Hz', 3)}")
-    return _two_passes(time, values, passes, gain, zero_before)
+    return passes.applied(time, values, corner, zero_before)
 
 
 class _Passes(NamedTuple):
@@ -204,44 +163,47 @@ class _Passes(NamedTuple):
     rate: float
     what: str
 
+    def applied(
+        self, time: np.ndarray, values: np.ndarray, corner: Callable[[float], float], zero_before: bool
+    ) -> np.ndarray:
+        """Return the values after both passes with the corner [Hz] of an interval [s]."""
+        from scipy.signal import butter, sosfilt
 
-def _two_passes(
-    time: np.ndarray,
-    values: np.ndarray,
-    passes: _Passes,
-    gain: Callable[[np.ndarray, float], np.ndarray],
-    zero_before: bool,
-) -> np.ndarray:
-    time, values = np.asarray(time, dtype=float), np.asarray(values, dtype=float)
-    corner, order, rate, what = passes
-    steps = np.diff(time)
-    steps = steps[steps > 0.0]
-    if len(steps) < 2:
-        raise InputError(
-            f"filter: {what} needs a history of three rows or more, and this one has {len(steps) + 1}: "
-            "set [output] history_every, or give filter none"
-        )
-    longest = float(steps.max())
-    if longest * rate > 1.0 + 1e-6:
-        raise InputError(
-            f"filter: {what} needs {rate:.5g} rows of the history per second, and this one has "
-            f"{1 / longest:.4g} where they are farthest apart: set [output] history_every, or give a lower one"
-        )
-    if corner * (time[-1] - time[0]) < 1.0:
-        raise InputError(
-            f"filter: {what} is slower than the history of {engineering(time[-1] - time[0], 's')}: it has less than "
-            f"a period of {engineering(1 / corner, 's', 3)}; give a higher one"
-        )
-    grid, even = _evenly(time, values)
-    interval = (grid[-1] - grid[0]) / (len(grid) - 1)
-    # what the slowest pole forgets to rounding error
-    pad = math.ceil(36.0 / (2 * math.pi * corner * interval * math.sin(math.pi / (2 * order))))
-    longer = np.pad(even, pad, mode="reflect", reflect_type="odd")
-    if zero_before:
-        longer[:pad] = 0.0
-    frequency = np.fft.rfftfreq(len(longer), interval)
-    smooth = np.fft.irfft(np.fft.rfft(longer) * gain(frequency, interval), len(longer))[pad : pad + len(even)]
-    return smooth if grid is time else np.interp(time, grid, smooth)
+        time, values = np.asarray(time, dtype=float), np.asarray(values, dtype=float)
+        self._check(time)
+        grid, even = _evenly(time, values)
+        interval = (grid[-1] - grid[0]) / (len(grid) - 1)
+        # what the slowest pole forgets to rounding error
+        pad = math.ceil(36.0 / (2 * math.pi * self.corner * interval * math.sin(math.pi / (2 * self.order))))
+        longer = np.pad(even, pad, mode="reflect", reflect_type="odd")
+        if zero_before:
+            longer[:pad] = 0.0
+        sections = butter(self.order, corner(interval), fs=1.0 / interval, output="sos")
+        first = longer[0]  # constants pass: from rest without a jump
+        once = sosfilt(sections, longer - first)
+        last = once[-1]
+        smooth = (sosfilt(sections, (once - last)[::-1])[::-1] + (first + last))[pad : pad + len(even)]
+        return smooth if grid is time else np.interp(time, grid, smooth)
+
+    def _check(self, time: np.ndarray) -> None:
+        steps = np.diff(time)
+        steps = steps[steps > 0.0]
+        if len(steps) < 2:
+            raise InputError(
+                f"filter: {self.what} needs a history of three rows or more, and this one has {len(steps) + 1}: "
+                "set [output] history_every, or give filter none"
+            )
+        longest = float(steps.max())
+        if longest * self.rate > 1.0 + 1e-6:
+            raise InputError(
+                f"filter: {self.what} needs {self.rate:.5g} rows of the history per second, and this one has "
+                f"{1 / longest:.4g} where they are farthest apart: set [output] history_every, or give a lower one"
+            )
+        if self.corner * (time[-1] - time[0]) < 1.0:
+            raise InputError(
+                f"filter: {self.what} is slower than the history of {engineering(time[-1] - time[0], 's')}: it has "
+                f"less than a period of {engineering(1 / self.corner, 's', 3)}; give a higher one"
+            )
 
 
 def _evenly(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -280,10 +242,11 @@ def amplitude_spectrum(time: np.ndarray, values: np.ndarray, window: str = "hann
         raise InputError(f"spectrum: window = {window!r} is not known; it is one of {', '.join(WINDOWS)}")
     if len(time) < 8:
         raise InputError(f"spectrum: the history has {len(time)} rows; 8 or more are needed")
+    from scipy.signal import get_window
+
     grid, even = _evenly(np.asarray(time, dtype=float), np.asarray(values, dtype=float))
     n = len(even)
-    angle = 2.0 * np.pi * np.arange(n) / n
-    weight = sum((-1.0) ** k * a * np.cos(k * angle) for k, a in enumerate(WINDOWS[window]))
+    weight = get_window("boxcar" if window == "rectangular" else window, n)
     even = even - np.sum(weight * even) / np.sum(weight)
     transform = np.abs(np.fft.rfft(weight * even)) / np.sum(weight)
     transform[1 : (n + 1) // 2] *= 2.0

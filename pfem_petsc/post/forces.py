@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..output.units import TIME
-from .chart import COLOURS, REFERENCE, Chart, largest, literal
+from .chart import COLOURS, REFERENCE, Chart, Curve, largest, literal
 from .closed_forms import ClosedForm
 from .filters import AS_COMPUTED, Filter, make_filter
 
@@ -62,14 +62,11 @@ def draw_forces(
         heading = f"{source.capitalize()} '{name}'"
         known = None if exact is None or column not in exact.columns else exact.columns[column]
         for form, drawn, width in forms:
-            curves, styles, keys = [(form, drawn)], [{"linewidth": width}], [f"{column} {label}, {form}"]
+            curves = [Curve(form, drawn, {"linewidth": width}, f"{column} {label}, {form}")]
             if known is not None:
-                curves.append((exact.name, _pressing(known, normals.get(name))[0]))
-                styles.append(REFERENCE)
-                keys.append(f"{column} closed form")
-            axes = next(panels)
-            chart.curves(axes, label, "N", curves, heading, styles, legend=False, keys=keys, quantity="force")
-            chart.legend_above(axes)
+                pressing = _pressing(known, normals.get(name))[0]
+                curves.append(Curve(exact.name, pressing, REFERENCE, f"{column} closed form"))
+            chart.curves(next(panels), label, "N", curves, heading, "force")
             heading = ""
         if counts:
             chart.counts(next(panels), "nodes in\ncontact", history[f"{source}/{name}/contacts"], COLOURS[1])

@@ -12,15 +12,12 @@ from ..errors import InputError
 from ..output.bar import is_notebook
 from ..output.table import flat_columns
 from ..registry import nearest
-from .chart import COLOURS, STYLE
-from .inline import png
+from .chart import COLOURS, STYLE, png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..analysis import Step
-
-__all__ = ["LivePlot"]
 
 
 class LivePlot:

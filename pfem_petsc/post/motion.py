@@ -1,43 +1,38 @@
-"""The motion of a result for pictures: where its nodes, walls and probes are in each frame, and what is marked."""
+"""The motion of a result for pictures: its frames, where nodes, walls and probes are in each, and what is marked."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError
 from ..fields import STATUS
-from ..output.units import prefix_for
+from ..mechanics.bars import area_fields, bar_shapes, named_groups, section_of_bars
+from ..mesh import load_slab
+from ..output.units import MODE, Axis, prefix_for
 from ..registry import nearest
-from .contrast import GHOST, MARKS, TRAILS
+from .camera import Camera
+from .colours import GHOST, MARKS, TRAILS
 from .scene import Layer, Scene
 from .walls import Surface, wall_shifts, wall_surfaces, walls_present
 
-__all__ = ["Motion", "Overlays"]
+MOST_FRAMES = 300
+"""Snapshots that are drawn without an option: more make a film of over ten seconds."""
+
+_MOST = 20_000  # frames in slow motion
+STOUT = 0.2
+"""Largest radius of a drawn bar as a fraction of its length; nodes of stouter ones would hide their bars."""
+
+_LARGEST = 0.1  # of the extent of the truss: the largest displacement that is drawn
+PERIOD = 24  # frames of a period
+_STEPWISE = ("status",)  # fields whose numbers stand for words
 
 _STUB = 0.35  # of the initial length: the part of a broken bar that is drawn at each of its nodes
 _MOST_POINTS = 1000  # of a trajectory
 _MOST_NODES = 5000  # of which the outermost are found; of more, the corners of their box are in view
 _WAYS = 200  # directions in which nodes are outermost: a sphere is larger than their hull by 1 %
-
-
-@dataclass(frozen=True)
-class Overlays:
-    """What is drawn in addition to the bars.
-
-    Parameters
-    ----------
-    ghost : whether to draw the bars of the first snapshot, pale
-    marks : of "broken", "yielded"
-    trails : names of probes whose paths are drawn; empty: none
-    """
-
-    ghost: bool = False
-    marks: Sequence[str] = ()
-    trails: Sequence[str] = field(default_factory=tuple)
 
 
 class Motion:
@@ -47,8 +42,8 @@ class Motion:
     ----------
     result : an open result
     frames : numbers of its snapshots
-    scale : factor on displacements since the first snapshot
-    overlays : what is drawn in addition to the bars
+    options : ``scale`` of displacements, and what is drawn in addition to the bars: ``ghost``, ``marks``, ``trails``,
+        see :class:`~pfem_petsc.post.render.Options`
     note : receives messages
 
     Attributes
@@ -64,18 +59,17 @@ class Motion:
         For marks and probes that the result does not have, and a scale that is not finite.
     """
 
-    def __init__(
-        self, result: Any, frames: Sequence[int], scale: float, overlays: Overlays, note: Callable[[str], None]
-    ) -> None:
-        if not np.isfinite(scale):
-            raise InputError(f"render: scale = {scale:g}, the factor on displacements, must be finite")
-        self.result, self.frames, self.scale, self.note, self._overlays = result, list(frames), scale, note, overlays
+    def __init__(self, result: Any, frames: Sequence[int], options: Any, note: Callable[[str], None]) -> None:
+        if not np.isfinite(options.scale):
+            raise InputError(f"render: scale = {options.scale:g}, the factor on displacements, must be finite")
+        self.result, self.frames, self._options, self.note = result, list(frames), options, note
+        self.scale = options.scale
         self.bars = np.asarray(result.bars)
         self.start = np.asarray(result.positions(0), dtype=float)
         self.times = np.asarray(result.times, dtype=float)[self.frames]
         self.n_bars = len(self.bars)
         self._check_marks()
-        self._trails = {name: self._trail(name) for name in overlays.trails}
+        self._trails = {name: self._trail(name) for name in options.trails}
         self.reach, boxes = 0.0, []
         self._hulls: list[np.ndarray] = []
         for frame in self.frames:
@@ -84,7 +78,7 @@ class Motion:
             self._hulls.append(_outermost(points))
         self.boxes = np.array(boxes)
         low, high = self.boxes[:, 0].min(axis=0), self.boxes[:, 1].max(axis=0)
-        if overlays.ghost:
+        if options.ghost:
             low, high = np.fmin(low, self.start.min(axis=0)), np.fmax(high, self.start.max(axis=0))
         self.bounds = np.array([low, high])
         walls = result.case.every_wall
@@ -96,7 +90,7 @@ class Motion:
         self._decimals = _decimals(self.time_factor * every)
 
     def _check_marks(self) -> None:
-        for mark in self._overlays.marks:
+        for mark in self._options.marks:
             if mark not in MARKS:
                 raise InputError(f"render: mark = {mark!r} is not known; it is one of {', '.join(MARKS)}")
             if MARKS[mark].field not in self.result.cell_fields:
@@ -111,28 +105,19 @@ class Motion:
         Those that a stage does not have are left out.
         """
         times = self.result.times[self.frames]
-        displacements = dict(zip(self.frames, wall_shifts(self.result, times), strict=True))
-        present = dict(zip(self.frames, walls_present(self.result, times), strict=True))
+        shifts, present = wall_shifts(self.result, times), walls_present(self.result, times)
         still = {surface.name: surface for surface in wall_surfaces(walls, self.bounds, self.note)}
         surfaces: dict[int, list[Surface]] = {frame: [] for frame in self.frames}
         for k, wall in enumerate(walls):
-            if wall.name not in still:
-                continue
-            for frame in surfaces:
-                if not present[frame][k]:
+            for row, frame in enumerate(self.frames):
+                if wall.name not in still or not present[row, k]:
                     continue
-                surface, shift = still[wall.name], displacements[frame][k]
+                surface, shift = still[wall.name], shifts[row, k]
                 if shift.any():
                     point = tuple((np.asarray(wall.point) + shift).tolist())
                     (surface,) = wall_surfaces([wall.model_copy(update={"point": point})], self.bounds)
                 surfaces[frame].append(surface)
         return surfaces
-
-    @property
-    def places(self) -> Iterator[np.ndarray]:
-        """Yield the points (n, 3) [m] of all distinct wall surfaces that are drawn."""
-        for surface in {id(surface): surface for drawn in self.surfaces.values() for surface in drawn}.values():
-            yield surface.points
 
     @property
     def hulls(self) -> list[np.ndarray]:
@@ -145,9 +130,10 @@ class Motion:
     @property
     def surroundings(self) -> np.ndarray:
         """Points (n, 3) [m] that the camera has in view: the motion, and walls near it."""
-        near = self.hulls + ([_outermost(self.start)] if self._overlays.ghost else [])
+        near = self.hulls + ([_outermost(self.start)] if self._options.ghost else [])
         size = float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
-        for points in self.places:
+        drawn = {id(surface): surface.points for each in self.surfaces.values() for surface in each}
+        for points in drawn.values():
             # a distant wall would shrink the structure to a dot: it is drawn but does not affect the view
             gap = np.maximum(points.min(axis=0) - self.bounds[1], self.bounds[0] - points.max(axis=0))
             if gap.max() < 0.6 * size:
@@ -216,27 +202,26 @@ class Motion:
         rows = np.unique(np.linspace(0, len(when) - 1, _MOST_POINTS).astype(int))
         return when[rows], places[rows]
 
-    def layers(self, frame: int, scene: Scene, camera: Any) -> list[Layer]:
+    def layers(self, frame: int, scene: Scene, camera: Camera) -> list[Layer]:
         """Return what is drawn in addition to the bars of a frame."""
         made, points, thick = [], self.positions(frame), scene.thickness(camera)
-        if self._overlays.ghost:
+        if self._options.ghost:
             width = float(np.clip(0.6 * scene.width / scene.unit, 1.2, 2.4))
             made.append(Layer(self.start, self.bars, GHOST, width, -thick))
         gone = self.gone(frame)
-        if "yielded" in self._overlays.marks:
+        if "yielded" in self._options.marks:
             yielded = np.asarray(self.result.field("plastic_strain", frame)) != 0.0
             if gone is not None:
                 yielded &= ~gone
             if yielded.any():
-                made.append(scene.halo(points, np.flatnonzero(yielded), MARKS["yielded"].colour, camera))
-        if "broken" in self._overlays.marks and gone is not None and gone.any():
+                made.append(scene.rim(points, np.flatnonzero(yielded), MARKS["yielded"].colour))
+        if "broken" in self._options.marks and gone is not None and gone.any():
             made.append(self._stubs(points, gone, scene.width / scene.unit))
         for number, (when, places) in enumerate(self._trails.values()):
             past = max(1, int(np.searchsorted(when, self.result.times[frame], side="right")))
             rows = np.stack([np.arange(past - 1), np.arange(1, past)], axis=1)
-            for node in range(places.shape[1]):
-                colour = TRAILS[number % len(TRAILS)]
-                made.append(Layer(places[:, node], rows, colour, 2.4, thick))
+            colour = TRAILS[number % len(TRAILS)]
+            made += [Layer(places[:, node], rows, colour, 2.4, thick) for node in range(places.shape[1])]
         return made
 
     def _stubs(self, points: np.ndarray, gone: np.ndarray, width: float) -> Layer:
@@ -275,3 +260,235 @@ def _decimals(times: np.ndarray) -> int:
     most = int(np.clip(np.ceil(-np.log10(step)) + 2, 0, 6))
     exact = (n for n in range(most) if np.abs(np.round(times, n) - times).max() < 0.05 * step)
     return next(exact, most)
+
+
+def chosen_frames(
+    frames: int | Iterable[int] | None,
+    times: np.ndarray,
+    note: Callable[[str], None],
+    span: Sequence[float] | None = None,
+) -> list[int]:
+    """Return the numbers of the snapshots to draw.
+
+    Raises
+    ------
+    InputError
+        For numbers that the result does not have.
+    """
+    if len(times) == 0:
+        raise InputError("render: the result holds no snapshots; set [output] fields_every and run again")
+    if span is not None:
+        first, last = _checked(span, times)
+        within = [int(k) for k in np.flatnonzero((times >= first) & (times <= last))]
+        if not within:
+            raise InputError(f"render: span = {first:g} {last:g} holds no snapshot; give a longer one, or rate")
+    else:
+        within = list(range(len(times)))
+    count = len(within)
+    if frames is None and count > MOST_FRAMES:
+        note(f"{MOST_FRAMES} of {count} snapshots are drawn; ask for more with frames = {count}")
+        frames = MOST_FRAMES
+    if frames is None:
+        return within
+    if isinstance(frames, (int, np.integer)):
+        if frames < 1:
+            raise InputError(f"render: frames = {frames} must be positive; a list of numbers may count from the end")
+        if frames == 1:
+            return within[-1:]  # at the first one, most structures are at rest and look like their mesh
+        return [within[int(k)] for k in np.unique(np.linspace(0, count - 1, min(int(frames), count)).round())]
+    chosen = [int(k) for k in frames]
+    for k in chosen:
+        if not -len(times) <= k < len(times):
+            raise InputError(f"render: frame {k} does not exist; the result holds snapshots 0 to {len(times) - 1}")
+    if not chosen:
+        raise InputError("render: frames is an empty list")
+    return [k % len(times) for k in chosen]
+
+
+def even_times(times: np.ndarray, rate: float, span: Sequence[float] | None) -> np.ndarray:
+    """Return times at a rate [1/s] from the first snapshot to the last, or within a span.
+
+    Raises
+    ------
+    InputError
+        For a rate that makes no film.
+    """
+    if len(times) == 0:
+        raise InputError("render: the result holds no snapshots; set [output] fields_every and run again")
+    if not (np.isfinite(rate) and rate > 0.0):
+        raise InputError(f"render: rate = {rate:g} frames per simulated second must be positive")
+    first, last = (times[0], times[-1]) if span is None else _checked(span, times)
+    count = (last - first) * rate + 1.0
+    if not 2.0 <= count <= _MOST:
+        raise InputError(
+            f"render: rate = {rate:g} makes {count:.6g} frames of {first:g} to {last:g}; give 2 to {_MOST} frames"
+        )
+    return first + np.arange(int(count + 1e-9)) / rate
+
+
+def _checked(span: Sequence[float], times: np.ndarray) -> tuple[float, float]:
+    first, last = span
+    if not (np.isfinite(first) and first < last and last >= times[0] and first <= times[-1]):
+        raise InputError(
+            f"render: span = {first:g} {last:g} must be two increasing times between {times[0]:g} and {times[-1]:g}"
+        )
+    return max(first, float(times[0])), min(last, float(times[-1]))
+
+
+class Resampled:
+    """A result at other times: positions and fields are linear between snapshots, and constant outside.
+
+    Parameters
+    ----------
+    result : an open result
+    times : (n,) [s]
+    """
+
+    def __init__(self, result: Any, times: np.ndarray) -> None:
+        self._result, self.times = result, np.asarray(times, dtype=float)
+        own = np.asarray(result.times, dtype=float)
+        place = np.interp(self.times, own, np.arange(len(own)))
+        self._before = np.minimum(place.astype(int), len(own) - 1)
+        self._part = place - self._before
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._result, name)
+
+    def positions(self, i: int) -> np.ndarray:
+        """Positions (nodes, 3) [m] at a time."""
+        return self._mixed(lambda k: np.asarray(self._result.positions(k), dtype=float), i)
+
+    def field(self, name: str, i: int) -> np.ndarray:
+        """A field at a time; the status of bars is that of the snapshot before."""
+        if name in _STEPWISE:
+            return self._result.field(name, int(self._before[i]))
+        return self._mixed(lambda k: np.asarray(self._result.field(name, k), dtype=float), i)
+
+    def _mixed(self, values: Callable[[int], np.ndarray], i: int) -> np.ndarray:
+        k, part = int(self._before[i]), float(self._part[i])
+        if part < 1e-9:
+            return values(k)
+        before = values(k)
+        return before + part * (values(k + 1) - before)
+
+
+def drawn_radii(result: Any, note: Callable[[str], None] | None = None) -> np.ndarray | None:
+    """Return the radius of each bar (bars,) [m] as it is drawn, None where it is not known; ``note`` receives a remark
+    on bars that are drawn thinner than they are."""
+    radius = radii_of(result)
+    if radius is None:
+        return None
+    most = STOUT * _lengths(result)
+    stout = int(np.count_nonzero(radius > most))
+    if stout and note is not None:
+        note(
+            f"{stout} of {len(radius)} bars have a radius above {STOUT:g} of their length "
+            f"({radius.max():.3g} m at most), and are drawn with that; --radius-scale changes it"
+        )
+    return np.minimum(radius, most)
+
+
+def radii_of(result: Any) -> np.ndarray | None:
+    """Return the outer radius of each bar (bars,) [m], None where it is not known.
+
+    The mesh is made or read again, for the sections of bars and the fields of areas. Where it is not there any more,
+    all bars have the radius of the only section; with several sections, radii are not known. Springs and dashpots
+    between nodes have no section: they are as thin as the thinnest bar.
+    """
+    case = result.case
+    sections = list(getattr(case, "section", {}).values())
+    if not sections:
+        return None
+    length = _lengths(result)
+    try:
+        numbers, areas = _sections_and_areas(case, len(length))
+    except (InputError, OSError):
+        if len(sections) > 1 or sections[0].area is None:
+            return None
+        numbers, areas = np.zeros(len(length), dtype=int), np.full(len(length), sections[0].area)
+    radius = np.full(len(length), np.inf)
+    for number, section in enumerate(sections):
+        own = numbers == number
+        radius[own] = bar_shapes(section, length[own], areas[own]).radius
+    return np.where(np.isfinite(radius), radius, radius.min())
+
+
+def _lengths(result: Any) -> np.ndarray:
+    """Return the length of each bar (bars,) in the first snapshot [m]."""
+    start, bars = np.asarray(result.positions(0), dtype=float), np.asarray(result.bars)
+    return np.linalg.norm(start[bars[:, 1]] - start[bars[:, 0]], axis=1)
+
+
+def _sections_and_areas(case: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of the section of each bar (count,), -1 for none, and its area [m2]."""
+    from mpi4py import MPI
+
+    slab = load_slab(case.mesh, MPI.COMM_SELF, area_fields(case), named_groups(case))
+    if slab.n_bars > count:
+        raise InputError(f"the mesh of {case.source} has {slab.n_bars} bars now, the result {count}")
+    numbers, areas = np.full(count, -1), np.ones(count)
+    numbers[: slab.n_bars] = section_of_bars(case, slab)
+    for number, section in enumerate(case.section.values()):
+        own = np.flatnonzero(numbers == number)
+        areas[own] = section.area if section.area_field is None else slab.bar_fields[section.area_field][own]
+    return numbers, areas
+
+
+class ModeFrames:
+    """Modes as the snapshots of a result that :func:`~pfem_petsc.post.render.render` draws, a period each.
+
+    The field ``amplitude`` is the length of a node's displacement relative to the largest.
+
+    Parameters
+    ----------
+    result : an open result
+    modes : numbers of the modes from 1; None: all
+    period : frames of a period
+
+    Raises
+    ------
+    InputError
+        Where the result has no modes, or not these.
+    """
+
+    point_fields: Sequence[str] = ("amplitude",)
+    cell_fields: Sequence[str] = ()
+    axis: Axis = MODE
+
+    def __init__(self, result: Any, modes: Sequence[int] | None = None, period: int = PERIOD) -> None:
+        if period < 4:
+            raise InputError(f"render: {period} frames a period are too few for modes; give 4 or more")
+        found = result.modes
+        self._numbers = list(range(1, len(found) + 1)) if modes is None else list(modes)
+        for number in self._numbers:
+            if not 1 <= number <= len(found):
+                raise InputError(f"render: mode {number} does not exist; the result holds modes 1 to {len(found)}")
+        self._labels, self._period = [found.label(number - 1) for number in self._numbers], period
+        self.path, self.case, self.bars = result.path, result.case, result.bars
+        self._place = result.positions(-1)
+        shapes = found.shape[np.array(self._numbers, dtype=int) - 1]
+        sizes = np.linalg.norm(shapes, axis=2)
+        largest = sizes.max(axis=1)
+        self._amplitudes = sizes / largest[:, None]
+        extent = float(np.linalg.norm(np.ptp(self._place, axis=0))) or 1.0
+        self._shapes = shapes * (_LARGEST * extent / largest)[:, None, None]
+        # walls are where they are at the end
+        self.times = np.full(period * len(self._numbers), result.times[-1])
+        self.history: Mapping[str, np.ndarray] = result.history
+
+    def positions(self, i: int) -> np.ndarray:
+        """Positions (nodes, 3) [m] of frame i."""
+        mode, phase = divmod(i, self._period)
+        return self._place + np.sin(2.0 * np.pi * phase / self._period) * self._shapes[mode]
+
+    def field(self, name: str, i: int) -> np.ndarray:
+        """The amplitudes (nodes,) of frame i."""
+        return self._amplitudes[i // self._period]
+
+    def caption(self, i: int) -> str:
+        """The caption of frame i."""
+        return self._labels[i // self._period]
+
+    def instants(self, count: int) -> list[int]:
+        """Frames for a page: the first modes where they are largest."""
+        return [self._period * mode + self._period // 4 for mode in range(min(count, len(self._numbers)))]

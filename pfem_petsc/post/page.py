@@ -1,25 +1,88 @@
-"""The page around a drawing: title, time, colour bar, scale and axes. It is drawn once, and only the time changes."""
+"""The page around drawings: title, colour bar, scale, axes and curves, drawn once; the time and the marker change."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..errors import InputError
+from ..output.units import prefix_for, unit_of
 from .camera import Camera
-from .chart import boxes_allowed, literal
-from .fields import ColourScale
+from .chart import STYLE, boxes_allowed, largest, literal, thinned
+from .colours import ColourScale, Mark
+from .curves import column
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from PIL import Image
 
-__all__ = ["Page", "lay_over"]
+INK, PALE = "#1f242c", "#5b6472"
+_CURVE, _MARKER = "#2563b0", (217, 72, 43)
 
-INK = "#1f242c"
-PALE = "#5b6472"
+
+def over(below: np.ndarray, above: np.ndarray) -> None:
+    """Lay a picture (h, w, 4) uint8 over another (h, w, 3 or 4), which is changed.
+
+    All but opaque ones are multiplied by their opacity.
+    """
+    rest = 255 - above[..., 3:].astype(np.uint16)
+    below[:] = above[..., : below.shape[2]] + ((below * rest + 127) // 255).astype(np.uint8)
+
+
+def unmultiplied(picture: np.ndarray) -> np.ndarray:
+    """Return a picture (h, w, 4) that was multiplied by its opacity with plain colours."""
+    alpha = picture[..., 3:].astype(np.uint16)
+    colours = np.minimum(255 * picture[..., :3].astype(np.uint16) // np.maximum(alpha, 1), 255)
+    return np.concatenate([colours, alpha], axis=2).astype(np.uint8)
+
+
+def _canvas(figure: Figure) -> np.ndarray:
+    """Return a figure of matplotlib as a picture (h, w, 4) uint8, multiplied by its opacity."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    picture = np.asarray(canvas.buffer_rgba()).astype(np.uint16)
+    picture[..., :3] = (picture[..., :3] * picture[..., 3:] + 127) // 255
+    return picture.astype(np.uint8)
+
+
+def _figure(size: tuple[int, int], opacity: float, **options: Any) -> Figure:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, **options)
+    figure.patch.set(facecolor="white", alpha=opacity)
+    return figure
+
+
+def _font(pixels: float) -> Any:
+    from matplotlib import font_manager
+    from PIL import ImageFont
+
+    return ImageFont.truetype(font_manager.findfont("DejaVu Sans"), round(pixels))
+
+
+class Heading(NamedTuple):
+    """The texts of a page: titles of the case and the field, its colours, what is marked, and looks.
+
+    Attributes
+    ----------
+    title, field : titles
+    scale : colours of the field
+    marks : what is marked, told below the picture
+    still : whether the camera does not zoom: only then there is a length scale
+    transparent : whether the background is
+    """
+
+    title: str
+    field: str
+    scale: ColourScale
+    marks: Sequence[Mark] = ()
+    still: bool = True
+    transparent: bool = False
 
 
 class Page:
@@ -28,42 +91,19 @@ class Page:
     Parameters
     ----------
     size : width and height in pixels
-    title : of the case
-    field : title of the field
-    scale : its colours
+    heading : texts and colours
     camera : for the length scale and the axes
-    drawn_height : vertical extent of the camera's view in pixels; None: the region's height
-    still : whether the camera does not zoom: only then there is a length scale
-    transparent : whether the background is
-    legend : texts and colours of what is marked, below the picture
+    drawn_height : vertical extent of the camera's view in pixels
     """
 
-    def __init__(
-        self,
-        size: tuple[int, int],
-        title: str,
-        field: str,
-        scale: ColourScale,
-        camera: Camera,
-        drawn_height: int | None = None,
-        *,
-        still: bool = True,
-        transparent: bool = False,
-        legend: Sequence[tuple[str, tuple[int, int, int]]] = (),
-    ) -> None:
-        from matplotlib import font_manager
-        from PIL import ImageFont
-
-        self.size = size
+    def __init__(self, size: tuple[int, int], heading: Heading, camera: Camera, drawn_height: int) -> None:
+        self.size, self._heading, self._camera = size, heading, camera
         self._unit = min(size[0] / 1280, size[1] / 720)
-        self.region = self.region_of(size)
-        self.strip = self.strip_of(size)
-        path = font_manager.findfont("DejaVu Sans")
-        self._font = ImageFont.truetype(path, max(9, round(20 * self._unit)))
-        self._drawn_height = drawn_height or self.region[3]
-        self._still, self._transparent, self._legend, self._camera = still, transparent, legend, camera
+        self.region, self.strip = self.region_of(size), self.strip_of(size)
+        self._font = _font(max(9, 20 * self._unit))
+        self._axes = camera, _axes(camera, self._unit)
         with boxes_allowed():
-            self._background = self._draw(title, field, scale, camera)
+            self._background = np.ascontiguousarray(self._draw(drawn_height)[..., : 4 if heading.transparent else 3])
 
     @staticmethod
     def region_of(size: tuple[int, int]) -> tuple[int, int, int, int]:
@@ -77,176 +117,115 @@ class Page:
         """Return the height of the strip above a tile, in pixels."""
         return round(34 * min(size[0] / 1280, size[1] / 720))
 
-    def compose(self, drawing: np.ndarray, time: str, camera: Camera | None = None) -> np.ndarray:
-        """Return the page (height, width, 3 or 4) uint8 with a drawing of the region's size, and a text for the time.
+    def compose(
+        self, drawings: Sequence[np.ndarray], camera: Camera, time: str, captions: Sequence[str] = (), columns: int = 1
+    ) -> np.ndarray:
+        """Return the page (height, width, 3 or 4) uint8 with drawings (h, w, 3 or 4) on it.
 
         Parameters
         ----------
-        camera : for the axes; None: the page's
+        drawings : one of the region's size, or several, row by row, each below a strip with its caption
+        camera : for the axes
+        time : text of the time
+        captions : of several drawings
+        columns : of several drawings
         """
-        left, top, width, height = self.region
-        page = self._background.copy()
-        page[top : top + height, left : left + width] = drawing
-        return self._written(page, [(left + width, round(22 * self._unit), time)], "ra", camera)
+        from PIL import Image, ImageColor, ImageDraw
 
-    def compose_tiles(
-        self, drawings: list[np.ndarray], times: list[str], columns: int, camera: Camera | None = None, time: str = ""
-    ) -> np.ndarray:
-        """Return the page with several drawings of one size, row by row, each below a strip with its text."""
-        left, top, _, _ = self.region
-        page = self._background.copy()
-        texts = []
-        for number, (drawing, text) in enumerate(zip(drawings, times, strict=True)):
-            height, width = drawing.shape[:2]
-            x, y = left + (number % columns) * width, top + (number // columns) * (height + self.strip) + self.strip
-            page[y : y + height, x : x + width] = drawing
-            texts.append((x, y - round(0.8 * self.strip), text))
-        page = self._written(page, texts, "la", camera)
-        return self._written(page, [(left + self.region[2], round(22 * self._unit), time)], "ra") if time else page
-
-    def _written(
-        self, page: np.ndarray, texts: list[tuple[int, int, str]], anchor: str, camera: Camera | None = None
-    ) -> np.ndarray:
-        from PIL import Image, ImageDraw
-
-        image = Image.fromarray(page)
+        left, top, width, _ = self.region
+        page, strip = self._background.copy(), self.strip if captions else 0
+        texts = [(left + width, round(22 * self._unit), time, "ra")]
+        for number, drawing in enumerate(drawings):
+            high, wide = drawing.shape[:2]
+            x, y = left + (number % columns) * wide, top + (number // columns) * (high + strip) + strip
+            page[y : y + high, x : x + wide] = drawing
+            texts += [(x, y - round(0.8 * strip), captions[number], "la")] if captions else []
+        # as plain channels, because colours are multiplied by their opacity
+        image = Image.fromarray(page, "CMYK" if self._heading.transparent else "RGB")
         pen = ImageDraw.Draw(image)
-        for x, y, text in texts:
-            pen.text((x, y), text, font=self._font, fill=INK, anchor=anchor)
-        axes = _axes(camera or self._camera, self._unit)
-        place = (
-            round(self.size[0] - 92 * self._unit - axes.width / 2),
-            round(self.size[1] - 62 * self._unit - axes.height / 2),
-        )
-        image.paste(axes.convert(image.mode), place, axes.getchannel("A"))
-        return np.asarray(image)
+        ink = (*ImageColor.getrgb(INK), 255)[: page.shape[2]]
+        for x, y, text, anchor in texts:
+            pen.text((x, y), text, font=self._font, fill=ink, anchor=anchor)
+        if camera is not self._axes[0]:
+            self._axes = camera, _axes(camera, self._unit)
+        axes = self._axes[1]
+        grey = np.full((axes.height, axes.width, page.shape[2]), 255, dtype=np.uint8)
+        grey[..., :3] = ImageColor.getrgb(PALE)
+        corner = [
+            round(side - off * self._unit - axes.width / 2) for side, off in zip(self.size, (92, 62), strict=True)
+        ]
+        image.paste(Image.fromarray(grey, image.mode), tuple(corner), axes.getchannel("A"))
+        page = np.asarray(image)
+        return unmultiplied(page) if self._heading.transparent else page
 
-    def _draw(self, title: str, field: str, scale: ColourScale, camera: Camera) -> np.ndarray:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-        width, height = self.size
-        figure = Figure(figsize=(width / 100, height / 100), dpi=100)
-        figure.patch.set(facecolor="white", alpha=0.0 if self._transparent else 1.0)
-        canvas = FigureCanvasAgg(figure)
-        left, top, inner_width, inner_height = self.region
+    def _draw(self, drawn_height: int) -> np.ndarray:
+        (width, height), (left, _, inner_width, _) = self.size, self.region
+        figure = _figure(self.size, 0.0 if self._heading.transparent else 1.0)
+        title = self._heading.title
+        style = {"va": "top", "color": INK, "weight": "bold", "fontsize": self._points(22)}
+        text = figure.text(left / width, 1 - 22 * self._unit / height, literal(title), **style)
         # space for the time is left empty
-        room = inner_width - 230 * self._unit
-        text = figure.text(
-            left / width, 1 - 22 * self._unit / height, literal(title), va="top", color=INK, weight="bold"
-        )
-        text.set_fontsize(self._points(22))
-        while len(title) > 4 and text.get_window_extent(canvas.get_renderer()).width > room:
+        while len(title) > 4 and text.get_window_extent().width > inner_width - 230 * self._unit:
             title = title[:-2].rstrip(" …") + "…"
             text.set_text(literal(title))
-        self._colour_bar(figure, field, scale)
-        if camera.parallel and self._still:
-            self._length_scale(figure, 2 * camera.half_height / self._drawn_height, left)
-        self._marks(figure)
-        canvas.draw()
-        page = np.asarray(canvas.buffer_rgba())
-        return page.copy() if self._transparent else page[..., :3].copy()
-
-    def _marks(self, figure: Figure) -> None:
-        width, height = self.size
-        x = self.region[0] + self.region[2]
-        for text, colour in reversed(self._legend):
-            x -= (44 + 10 * len(text)) * self._unit
-            style = {"va": "center_baseline", "fontsize": self._points(16)}
-            y, shade = 22 * self._unit / height, tuple(value / 255 for value in colour)
+        self._colour_bar(figure)
+        if self._camera.parallel and self._heading.still:
+            self._length_scale(figure, 2 * self._camera.half_height / drawn_height)
+        x, style = left + inner_width, {"va": "center_baseline", "fontsize": self._points(16)}
+        for mark in reversed(self._heading.marks):
+            x -= (44 + 10 * len(mark.text)) * self._unit
+            y, shade = 22 * self._unit / height, tuple(value / 255 for value in mark.colour)
             figure.text(x / width, y, "\u25ac", color=shade, weight="bold", **style)
-            figure.text((x + 22 * self._unit) / width, y, text, color=INK, **style)
+            figure.text((x + 22 * self._unit) / width, y, mark.text, color=INK, **style)
+        return _canvas(figure)
 
     def _points(self, pixels: float) -> float:
         """Return the font size in points (at 100 dots per inch) for pixels of a page of 1280 by 720."""
         return max(6.0, 0.72 * pixels * self._unit)
 
-    def _colour_bar(self, figure: Figure, field: str, scale: ColourScale) -> None:
+    def _colour_bar(self, figure: Figure) -> None:
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import Normalize
         from matplotlib.ticker import MaxNLocator
 
-        width, height = self.size
-        left, top, inner_width, inner_height = self.region
-        bottom = self.size[1] - top - inner_height
-        axes = figure.add_axes(
-            (
-                (left + inner_width + 34 * self._unit) / width,
-                (bottom + 108 * self._unit) / height,
-                20 * self._unit / width,
-                (inner_height - 175 * self._unit) / height,
-            )
-        )
-        table = scale.cmap(np.linspace(0, 1, 256))[:, None, :]
-        low, high = scale.low * scale.factor, scale.high * scale.factor
-        axes.imshow(table, origin="lower", aspect="auto", extent=(0, 1, low, high))
-        axes.set_xticks([])
-        axes.yaxis.tick_right()
-        axes.yaxis.set_major_locator(MaxNLocator(nbins=7, steps=[1, 2, 2.5, 5, 10]))
-        axes.tick_params(labelsize=self._points(17), colors=INK, length=4 * self._unit, width=0.8, pad=4 * self._unit)
-        for spine in axes.spines.values():
-            spine.set_linewidth(0.8)
-            spine.set_color(PALE)
-        label = field.replace(" ", "\n", 1) + (f"\n[{scale.unit}]" if scale.unit else "")
-        figure.text(
-            (left + inner_width + 24 * self._unit) / width,
-            1 - (top + 52 * self._unit) / height,
-            label,
-            color=INK,
-            fontsize=self._points(18),
-            va="bottom",
-            linespacing=1.25,
-        )
+        (width, height), (left, top, inner_width, inner_height) = self.size, self.region
+        unit, scale, right = self._unit, self._heading.scale, left + inner_width
+        bottom = height - top - inner_height + 108 * unit
+        place = (right + 34 * unit) / width, bottom / height, 20 * unit / width, (inner_height - 175 * unit) / height
+        values = ScalarMappable(Normalize(scale.low * scale.factor, scale.high * scale.factor), scale.cmap)
+        bar = figure.colorbar(values, cax=figure.add_axes(place), ticks=MaxNLocator(nbins=7, steps=[1, 2, 2.5, 5, 10]))
+        ticks = {"labelsize": self._points(17), "colors": INK, "length": 4 * unit, "width": 0.8, "pad": 4 * unit}
+        bar.ax.tick_params(**ticks)
+        bar.ax.minorticks_off()
+        bar.outline.set(linewidth=0.8, edgecolor=PALE)
+        label = self._heading.field.replace(" ", "\n", 1) + (f"\n[{scale.unit}]" if scale.unit else "")
+        style = {"color": INK, "fontsize": self._points(18), "va": "bottom", "linespacing": 1.25}
+        figure.text((right + 24 * unit) / width, 1 - (top + 52 * unit) / height, label, **style)
 
-    def _length_scale(self, figure: Figure, metres_a_pixel: float, left: int) -> None:
+    def _length_scale(self, figure: Figure, metres_a_pixel: float) -> None:
         from matplotlib.lines import Line2D
 
-        from ..output.units import prefix_for
-
-        width, height = self.size
+        (width, height), unit = self.size, self._unit
         wish = 0.16 * self.region[2] * metres_a_pixel
         power = 10.0 ** math.floor(math.log10(wish))
         length = max(step * power for step in (1, 2, 5) if step * power <= wish * (1 + 1e-9))
-        pixels = length / metres_a_pixel
-        x, y, tick = left + 4 * self._unit, 22 * self._unit, 5 * self._unit
-        for (x0, y0), (x1, y1) in (
-            ((x, y), (x + pixels, y)),
-            ((x, y - tick), (x, y + tick)),
-            ((x + pixels, y - tick), (x + pixels, y + tick)),
-        ):
-            line = Line2D([x0 / width, x1 / width], [y0 / height, y1 / height], color=PALE, linewidth=1.4 * self._unit)
-            figure.add_artist(line)
-        factor, unit = prefix_for(length, "m")
-        figure.text(
-            (x + pixels + 10 * self._unit) / width,
-            y / height,
-            f"{length * factor:g} {unit}",
-            color=PALE,
-            va="center_baseline",
-            fontsize=self._points(16),
-        )
-
-
-def lay_over(page: np.ndarray, picture: np.ndarray) -> None:
-    """Lay a picture (h, w, 4) over a part of a page (h, w, 3 or 4), which is changed."""
-    opacity = picture[..., 3:].astype(np.float32) / 255.0
-    if page.shape[2] == 3:
-        page[:] = (picture[..., :3] * opacity + page * (1.0 - opacity) + 0.5).astype(np.uint8)
-        return
-    below = page[..., 3:].astype(np.float32) / 255.0 * (1.0 - opacity)
-    whole = opacity + below
-    mixed = (picture[..., :3] * opacity + page[..., :3] * below) / np.where(whole > 0.0, whole, 1.0)
-    page[:] = np.concatenate([mixed + 0.5, 255.0 * whole + 0.5], axis=2).clip(0, 255).astype(np.uint8)
+        x, y, tick, end = self.region[0] + 4 * unit, 22 * unit, 5 * unit, length / metres_a_pixel
+        across = np.array([0.0, 0.0, 0.0, end, end, end]) + x
+        along = y + np.array([tick, -tick, 0.0, 0.0, -tick, tick])
+        figure.add_artist(Line2D(across / width, along / height, color=PALE, linewidth=1.4 * unit))
+        factor, name = prefix_for(length, "m")
+        style = {"color": PALE, "va": "center_baseline", "fontsize": self._points(16)}
+        figure.text((x + end + 10 * unit) / width, y / height, f"{length * factor:g} {name}", **style)
 
 
 def _axes(camera: Camera, unit: float) -> Image.Image:
     """Return the coordinate axes as seen by the camera, in a square."""
-    from matplotlib import font_manager
-    from PIL import Image, ImageDraw, ImageFont
+    from PIL import Image, ImageDraw
 
     fine = 4  # drawn larger and reduced, for smooth edges
     side, size = round(112 * unit), 34 * unit * fine
-    image = Image.new("RGBA", (side * fine, side * fine), (255, 255, 255, 0))
+    image = Image.new("RGBA", (side * fine, side * fine))
     pen = ImageDraw.Draw(image)
-    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), max(9, round(15 * unit)) * fine)
     middle = np.full(2, side * fine / 2)
     for name, way in sorted(zip("xyz", np.eye(3)), key=lambda axis: float(axis[1] @ camera.towards)):
         arrow = np.array([way @ camera.right, -(way @ camera.up)])
@@ -259,5 +238,110 @@ def _axes(camera: Camera, unit: float) -> Image.Image:
         wings = [tip, *(tip - head * along + sign * 0.4 * head * across for sign in (1, -1))]
         pen.polygon([tuple(map(float, corner)) for corner in wings], fill=PALE)
         label = tip + 11 * unit * fine * along
-        pen.text((float(label[0]), float(label[1])), name, font=font, fill=PALE, anchor="mm")
+        pen.text(tuple(map(float, label)), name, font=_font(max(9, 15 * unit) * fine), fill=PALE, anchor="mm")
     return image.resize((side, side), Image.Resampling.LANCZOS)
+
+
+def history_curve(history: Any, name: str) -> np.ndarray:
+    """Return a column of the history as one number a row: of vectors the length, or ``NAME.x``; of nodes the mean.
+
+    Raises
+    ------
+    InputError
+        If there is no such column.
+    """
+    found = column(history, name)
+    return found[name] if name in found else column(history, f"{name}.norm")[f"{name}.norm"]
+
+
+class Inset:
+    """A curve of the history in a corner, drawn once; the marker at the time of the frame is drawn in each frame.
+
+    Parameters
+    ----------
+    results : open results, whose curves are all in the range of the axes
+    shown : number of the one that is shown
+    name : of a column, see :func:`history_curve`
+    size : width and height in pixels
+    """
+
+    def __init__(self, results: Sequence[Any], shown: int, name: str, size: tuple[int, int]) -> None:
+        from matplotlib import rc_context
+        from matplotlib.ticker import MaxNLocator
+
+        curves = [(np.asarray(r.history["time"], dtype=float), history_curve(r.history, name)) for r in results]
+        factor, unit = prefix_for(max(largest(values) for _, values in curves), unit_of(name.partition(".")[0]))
+        axis = results[shown].axis
+        time_factor, time_unit = prefix_for(max(largest(times) for times, _ in curves), axis.unit)
+        scale = size[1] / 180.0
+        with rc_context({**STYLE, "font.size": 9.0 * scale, "lines.linewidth": 1.3 * scale}), boxes_allowed():
+            figure = _figure(size, 0.88, layout="constrained")
+            axes = figure.add_subplot(facecolor="none")
+            for k, (times, values) in enumerate(curves):
+                line = thinned(times * time_factor, values * factor, 600)
+                axes.plot(*line, color=_CURVE, alpha=1.0 if k == shown else 0.0)  # others for the range alone
+            axes.xaxis.set_major_locator(MaxNLocator(nbins=5))
+            axes.yaxis.set_major_locator(MaxNLocator(nbins=4))
+            axes.set_xlabel(axis.label(time_unit), labelpad=1.0)
+            axes.margins(y=0.08)
+            kind, *parts, last = name.split("/") if "/" in name else ("", name)
+            label = f"{kind} '{'/'.join(parts)}', {last}" if parts else last
+            label = label.replace("_", " ") + (f" [{unit}]" if unit else "")
+            axes.set_title(literal(label), fontsize=9.5 * scale)
+            self._picture = _canvas(figure)
+            self._times, values = curves[shown]
+            self._corner = axes.transData.transform(np.stack([self._times * time_factor, values * factor], axis=1))
+        self._radius = 3.6 * scale
+
+    def at(self, time: float) -> np.ndarray:
+        """Return the picture (height, width, 4) uint8 with the marker at a time [s]."""
+        from PIL import Image, ImageDraw
+
+        image = Image.fromarray(self._picture)
+        if len(self._times):
+            x, y = (float(np.interp(time, self._times, self._corner[:, k])) for k in (0, 1))
+            y, r = self._picture.shape[0] - y, self._radius
+            if np.isfinite([x, y]).all():
+                ImageDraw.Draw(image).ellipse((x - r, y - r, x + r, y + r), fill=(*_MARKER, 255))
+        return np.asarray(image)
+
+
+def inset_room(tile: tuple[int, int], cover: Any, several: bool) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the size of an inset in a tile, and the corner (x, y) where it covers least of what is drawn.
+
+    Parameters
+    ----------
+    tile : width and height in pixels
+    cover : function of a corner and a size that returns how much is covered
+    several : whether there are several tiles
+
+    Raises
+    ------
+    InputError
+        If the tile is too narrow.
+    """
+    least = 220
+    if several and tile[0] < least:
+        raise InputError(
+            f"render: inset needs tiles of {least} pixels or more, and these have {tile[0]}: give a larger size, or "
+            "fewer results"
+        )
+    found = []
+    for share in (0.28, 0.25):
+        wide = max(share * tile[0], min((0.5 if several else 1.0) * tile[0], least))
+        room = round(wide), round(0.62 * wide)
+        corners = [(x, y) for y in (0, tile[1] - room[1]) for x in (0, tile[0] - room[0])]
+        found += [(cover(corner, room), room, corner) for corner in corners]
+    _, room, corner = min(found, key=lambda each: each[0])
+    return room, corner
+
+
+def grid(count: int, aspect: float, room: tuple[int, int]) -> tuple[int, int]:
+    """Return the columns and rows of tiles that make pictures of this aspect (width over height) largest."""
+
+    def drawn_width(columns: int) -> float:
+        rows = -(-count // columns)
+        return min(room[0] / columns, aspect * room[1] / rows)
+
+    columns = max(range(1, count + 1), key=lambda columns: (round(drawn_width(columns), 3), -columns))
+    return columns, -(-count // columns)

@@ -5,46 +5,26 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..errors import InputError
 from ..output.units import TIME
-from .chart import COLOURS, STYLE, Chart, check_formats
+from .chart import STYLE, Chart, check_formats, opened
 from .closed_forms import closed_form
-from .curves import History, draw_curves, make_chart, usual_curves
-from .energies import draw_energies
+from .curves import History, draw_curves, draw_spectra, usual_curves
 from .filters import WINDOWS, Filter, make_filter
 from .forces import draw_force_displacement, draw_forces
-from .options import opened
-from .spectra import draw_spectra
-from .vectors import draw_momentum, draw_probes
-
-__all__ = ["plot"]
+from .histories import draw_energies, draw_momentum, draw_probes, draw_solver
 
 
-def plot(
-    result_path: Path | str | Any | Sequence[Any],
-    output: Path | str | None = None,
-    *,
-    curves: Iterable[str] | None = None,
-    formats: Iterable[str] = ("png",),
-    force_filter: str | None = None,
-    against: str | None = None,
-    spectrum: Iterable[str] | None = None,
-    window: str = "hann",
-    highest: float | None = None,
-    closed_forms: bool = True,
-) -> list[Path]:
-    """Draw the history: ``energies.png``, ``momentum.png``, ``probes.png``, ``walls.png``, ``solver.png`` and others.
+@dataclass(frozen=True)
+class Options:
+    """Options of :func:`plot`.
 
     Parameters
     ----------
-    result_path : result file or its folder, or an open result; several of them are drawn over each other, into
-        ``comparison.png`` without ``curves``
-    output : folder of the pictures; None: beside the (first) result
     curves : names of history columns, drawn into ``curves.png`` instead of the other pictures; an existing
         ``curves.png`` is kept, and the new one is ``curves_2.png`` and so on
     formats : of :data:`~pfem_petsc.post.chart.FORMATS`; "csv" writes a table of each picture, with all rows in SI
@@ -56,6 +36,41 @@ def plot(
     window : of the spectra, one of :data:`~pfem_petsc.post.filters.WINDOWS`
     highest : frequency [Hz] at which the spectra end; None: half the sampling rate
     closed_forms : whether closed forms are drawn where the case has one
+
+    Raises
+    ------
+    InputError
+        For an unknown format or window, and options that exclude each other.
+    """
+
+    curves: Iterable[str] | None = None
+    formats: Iterable[str] = ("png",)
+    force_filter: str | None = None
+    against: str | None = None
+    spectrum: Iterable[str] | None = None
+    window: str = "hann"
+    highest: float | None = None
+    closed_forms: bool = True
+
+    def __post_init__(self) -> None:
+        if self.spectrum is not None and (self.curves is not None or self.against is not None):
+            raise InputError("plot: spectrum is a picture of its own: give it without curves and against")
+        if self.against is not None and self.curves is None:
+            raise InputError(f"plot: against = {self.against!r} needs curves, the columns to draw over it")
+        if self.window not in WINDOWS:
+            raise InputError(f"plot: window = {self.window!r} is not known; it is one of {', '.join(WINDOWS)}")
+        object.__setattr__(self, "formats", check_formats(self.formats))
+
+
+def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | None = None, **options: Any) -> list[Path]:
+    """Draw the history: ``energies.png``, ``momentum.png``, ``probes.png``, ``walls.png``, ``solver.png`` and others.
+
+    Parameters
+    ----------
+    result_path : result file or its folder, or an open result; several of them are drawn over each other, into
+        ``comparison.png`` without ``curves``
+    output : folder of the pictures; None: beside the (first) result
+    options : see :class:`Options`
 
     Returns
     -------
@@ -72,10 +87,11 @@ def plot(
 
     several = isinstance(result_path, Sequence) and not isinstance(result_path, str)
     paths = list(result_path) if several else [result_path]
-    suffixes = check_formats(formats)
-    chosen = make_filter(force_filter) if force_filter is not None else None
-    names, sines = (None if found is None else list(found) for found in (curves, spectrum))
-    _check_options(paths, names, sines, against, window)
+    given = Options(**options)
+    suffixes = given.formats
+    chosen = make_filter(given.force_filter) if given.force_filter is not None else None
+    if not paths:
+        raise InputError("plot: no result named")
     with ExitStack() as stack, matplotlib.rc_context(STYLE):
         results = [stack.enter_context(opened(path)) for path in paths]
         folder = Path(output) if output is not None else Path(results[0].path).parent
@@ -86,32 +102,19 @@ def plot(
                 )
             if chosen is not None and result.axis is not TIME:
                 raise InputError(
-                    f"{result.path}: filter = {force_filter!r} needs a run over time, not a static analysis"
+                    f"{result.path}: filter = {given.force_filter!r} needs a run over time, not a static analysis"
                 )
-        if sines is not None:
-            chart = draw_spectra(results, sines, window, highest)
+        if given.spectrum is not None:
+            chart = draw_spectra(results, list(given.spectrum), given.window, given.highest)
             return chart.save(_free(folder / "spectra", suffixes), suffixes)
-        if names is not None:
-            chart = draw_curves(results, names, against, chosen, closed_forms)
+        if given.curves is not None:
+            chart = draw_curves(results, list(given.curves), given.against, chosen, given.closed_forms)
             return chart.save(_free(folder / "curves", suffixes), suffixes)
         if len(results) > 1:
-            chart = draw_curves(results, usual_curves(results), None, chosen, closed_forms)
+            chart = draw_curves(results, usual_curves(results), None, chosen, given.closed_forms)
             return chart.save(folder / "comparison", suffixes)
         (result,) = results
-        return _usual(result, folder, suffixes, chosen, closed_forms)
-
-
-def _check_options(
-    paths: list[Any], names: list[str] | None, sines: list[str] | None, against: str | None, window: str
-) -> None:
-    if not paths:
-        raise InputError("plot: no result named")
-    if sines is not None and (names is not None or against is not None):
-        raise InputError("plot: spectrum is a picture of its own: give it without curves and against")
-    if against is not None and names is None:
-        raise InputError(f"plot: against = {against!r} needs curves, the columns to draw over it")
-    if window not in WINDOWS:
-        raise InputError(f"plot: window = {window!r} is not known; it is one of {', '.join(WINDOWS)}")
+        return _usual(result, folder, suffixes, chosen, given.closed_forms)
 
 
 def _usual(
@@ -130,7 +133,7 @@ def _usual(
         "pairs": draw_forces(history, "pair", (), title, chosen),
         "constraints": draw_forces(history, "constraint", (), title, chosen),
         "force_displacement": draw_force_displacement(result, title, chosen, exact),
-        "solver": _solver(history, title),
+        "solver": draw_solver(history, title),
     }
     written = [path for name, chart in drawn.items() if chart for path in chart.save(folder / name, suffixes)]
     if "csv" in suffixes and hasattr(result, "table"):
@@ -143,27 +146,3 @@ def _free(file: Path, suffixes: Sequence[str]) -> Path:
     numbered = (file.with_name(f"{file.name}_{k}") for k in itertools.count(2))
     free = (p for p in itertools.chain([file], numbered) if not any(Path(f"{p}.{s}").exists() for s in suffixes))
     return next(free)
-
-
-def _solver(history: History, title: str) -> Chart | None:
-    labels = {
-        "newton_iterations": "Newton\niterations",
-        "linear_iterations": "linear\niterations",
-        "active_contacts": "nodes in\ncontact",
-    }
-    names = [name for name in labels if name in history]
-    # without iterations (explicit schemes) or without walls these panels would be empty
-    walls = any(name.startswith("wall/") for name in history)
-    names = [name for name in names if (walls and name == "active_contacts") or np.any(history[name])]
-    if not names or (names == ["active_contacts"] and _is_shown(history)):
-        return None
-    chart = make_chart(history, title, len(names), heights=[0.7] * len(names))
-    for number, (axes, name) in enumerate(zip(chart.axes[:, 0], names, strict=True)):
-        chart.counts(axes, labels[name], history[name], COLOURS[number], before=name.endswith("_iterations"))
-    return chart
-
-
-def _is_shown(history: History) -> bool:
-    """Whether the nodes in contact are those of a single wall: their number is in the picture of the walls."""
-    walls = [name for name in history if name.startswith("wall/") and name.endswith("/contacts")]
-    return len(walls) == 1 and np.array_equal(history[walls[0]], history["active_contacts"])

@@ -1,10 +1,15 @@
-"""Pictures and films of results, without a display or a graphics library."""
+"""Pictures and films of results, side by side when there are several, without a display."""
 
 from __future__ import annotations
 
+import os
+import pickle
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,67 +17,53 @@ import numpy as np
 
 from ..errors import InputError
 from ..parallel.agreement import agreed
-from .fields import ColourField, ColourScale
-from .files import emptied, save
-from .film import Film, Look
-from .frames import Resampled, chosen_frames, even_times
-from .motion import Motion, Overlays
-from .options import kinds_of_films, limits_of, opened
-from .radii import drawn_radii
-from .scene import TUBE_LIMIT, Style
-from .shots import Moves
+from .camera import Camera, Moves, at_one_scale
+from .chart import opened
+from .colours import MARKS, ColourField, ColourScale, limits_of
+from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_times
+from .page import Heading, Inset, Page, grid, inset_room, over
+from .scene import FEW, TUBE_LIMIT, Scene, Style, few_threads
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-__all__ = ["render"]
-
+STYLES = ("auto", "tubes", "lines")
+VIDEOS = {
+    "mp4": ("mp4",),
+    "gif": ("gif",),
+    "both": ("mp4", "gif"),
+    "none": (),
+    "webm": ("webm",),
+    "webp": ("webp",),
+}
 SHORT = 2.0  # seconds below which a film is too short to follow
 TELL = 5.0  # seconds between two progress messages
+SHARE = 12  # frames for which it is worth to start another process
+_POSTER, _TILES = (1600, 900), 6
+
+# H.264 with 4:2:0 colours is supported everywhere, and requires even sizes
+_ENCODERS = {
+    "mp4": [
+        *("-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white", "-c:v", "libx264", "-preset", "medium", "-crf", "18"),
+        *("-pix_fmt", "yuv420p", "-movflags", "+faststart"),
+    ],
+    "gif": [
+        "-vf",
+        "scale='min(800,iw)':-2:flags=lanczos,split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none",
+    ],
+    # with a transparent background
+    "webm": ["-c:v", "libvpx-vp9", "-pix_fmt", "yuva420p", "-crf", "24", "-b:v", "0", "-row-mt", "1", "-cpu-used", "4"],
+    # moving pictures for web pages
+    "webp": ["-vf", "scale='min(960,iw)':-2:flags=lanczos", "-c:v", "libwebp_anim", "-q:v", "70", "-loop", "0"],
+}
 
 
-def render(
-    result_path: Path | str | Any | Sequence[Path | str | Any],
-    output: Path | str | None = None,
-    *,
-    field: str = "stress",
-    component: str | int | None = None,
-    frames: int | Iterable[int] | None = None,
-    fps: float = 24,
-    size: tuple[int, int] = (1280, 720),
-    view: str | Sequence[float] = "auto",
-    video: str | None = None,
-    poster: bool = True,
-    clim: tuple[float, float] | None = None,
-    symmetric: bool = False,
-    cmap: Any = None,
-    scale: float = 1.0,
-    style: str = "auto",
-    radius_scale: float = 1.0,
-    bar_width: float | None = None,
-    nodes: bool | None = None,
-    ghost: bool = False,
-    marks: Sequence[str] = (),
-    trails: Sequence[str] = (),
-    inset: str | None = None,
-    zoom: float = 1.0,
-    orbit: float = 0.0,
-    path: Any = None,
-    follow: str | None = None,
-    rate: float | None = None,
-    span: Sequence[float] | None = None,
-    labels: Sequence[str] | None = None,
-    transparent: bool = False,
-    title: str | None = None,
-    note: Callable[[str], None] = print,
-    comm: MPI.Comm | None = None,
-) -> list[Path]:
-    """Draw a result: ``frames/frame_0000.png`` ..., a film ``render.mp4`` or another, and a poster ``render.png``.
+@dataclass(frozen=True)
+class Options:
+    """Options of :func:`render`.
 
     Parameters
     ----------
-    result_path : result file or its folder, or an open result; or several of them, which are drawn side by side
-    output : folder of the pictures; None: beside the result, of several: ``side_by_side`` beside the first
     field : point or cell field that colours the bars
     component : "x", "y" or "z" of a vector field; None: its length
     frames : numbers of snapshots, or how many of them (evenly spaced); None: all, up to 300
@@ -94,14 +85,107 @@ def render(
     marks : "broken" bars as stubs, "yielded" ones with a rim
     trails : names of probes whose trajectories are drawn
     inset : column of the history, drawn as a curve with a marker in a corner, of several results with the same axes
-    zoom, orbit, path, follow : of the camera, see :class:`~pfem_petsc.post.shots.Moves`
+    zoom, orbit, path, follow : of the camera, see :class:`~pfem_petsc.post.camera.Moves`
     rate : frames per simulated second, between snapshots if need be; None: frames are snapshots
     span : first and last time [s] of the film
     labels : of several results; None: the names of their folders
     transparent : whether frames and film have a transparent background
     title : None: that of the case
+
+    Raises
+    ------
+    InputError
+        For values that make no picture.
+    """
+
+    field: str = "stress"
+    component: str | int | None = None
+    frames: int | Iterable[int] | None = None
+    fps: float = 24
+    size: tuple[int, int] = (1280, 720)
+    view: str | Sequence[float] = "auto"
+    video: str | None = None
+    poster: bool = True
+    clim: tuple[float, float] | None = None
+    symmetric: bool = False
+    cmap: Any = None
+    scale: float = 1.0
+    style: str = "auto"
+    radius_scale: float = 1.0
+    bar_width: float | None = None
+    nodes: bool | None = None
+    ghost: bool = False
+    marks: Sequence[str] = ()
+    trails: Sequence[str] = ()
+    inset: str | None = None
+    zoom: float = 1.0
+    orbit: float = 0.0
+    path: Any = None
+    follow: str | None = None
+    rate: float | None = None
+    span: Sequence[float] | None = None
+    labels: Sequence[str] | None = None
+    transparent: bool = False
+    title: str | None = None
+
+    def __post_init__(self) -> None:
+        video, size = self.video or ("webm" if self.transparent else "mp4"), self.size
+        if video not in VIDEOS:
+            raise InputError(f"render: video = {video!r} is not known; it is one of {', '.join(VIDEOS)}")
+        if self.transparent and video in ("mp4", "both"):
+            raise InputError(
+                f"render: video = {video!r}: MP4 has no transparent background; use webm, webp, gif or none"
+            )
+        if size[0] < 160 or size[1] < 120 or max(size) > 8192:
+            raise InputError(
+                f"render: size = {size[0]} x {size[1]} pixels is out of range; widths are 160 to 8192, heights 120 to "
+                "8192"
+            )
+        if not 1e-3 <= self.fps <= 1e3:
+            raise InputError(f"render: fps = {self.fps:g} must be from 0.001 to 1000 frames per second")
+        if self.style not in STYLES:
+            raise InputError(f"render: style = {self.style!r} is not known; it is one of {', '.join(STYLES)}")
+        if not 1e-6 <= self.radius_scale <= 1e6:
+            raise InputError(f"render: radius_scale = {self.radius_scale:g} must be from 1e-6 to 1e6")
+        if self.bar_width is not None and not 0.0 < self.bar_width <= 500.0:
+            raise InputError(f"render: bar_width = {self.bar_width:g} must be positive, and 500 pixels at most")
+        assert self.moves  # refuses what makes no film
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of films to make."""
+        return VIDEOS[self.video or ("webm" if self.transparent else "mp4")]
+
+    @property
+    def moves(self) -> Moves:
+        """The view and its movement."""
+        return Moves(self.view, self.zoom, self.orbit, self.path, self.follow)
+
+    def style_of(self, result: Any, note: Callable[[str], None]) -> Style:
+        """Return how the bars of a result are drawn."""
+        tubes = len(result.bars) <= TUBE_LIMIT if self.style == "auto" else self.style == "tubes"
+        radius = drawn_radii(result, note if self.style == "tubes" else None) if tubes else None
+        return Style(tubes, None if radius is None else self.radius_scale * radius, self.bar_width, self.nodes)
+
+
+def render(
+    result_path: Path | str | Any | Sequence[Path | str | Any],
+    output: Path | str | None = None,
+    *,
+    note: Callable[[str], None] = print,
+    comm: MPI.Comm | None = None,
+    **options: Any,
+) -> list[Path]:
+    """Draw a result: ``frames/frame_0000.png`` ..., a film ``render.mp4`` or another, and a poster ``render.png``.
+
+    Parameters
+    ----------
+    result_path : result file or its folder, or an open result; or several of them, which are drawn side by side
+    output : folder of the pictures; None: beside the result, of several: ``side_by_side`` beside the first
     note : receives messages, such as walls that cannot be drawn, and progress
-    comm : its ranks divide the frames, and the first one makes the film; None: this process draws all
+    comm : its ranks divide the frames, and the first one makes the film; None, or one rank: processes of this machine
+        divide the frames of a long film
+    options : see :class:`Options`
 
     Returns
     -------
@@ -114,68 +198,244 @@ def render(
     """
     first = comm is None or comm.rank == 0
     tell = note if first else _nothing
-    kinds = kinds_of_films(video, fps, size, style, radius_scale, bar_width, transparent)
-    moves = Moves(view, zoom, orbit, path, follow).checked()
-    many = isinstance(result_path, (list, tuple))
+    chosen = Options(**options)
+    paths = list(result_path) if isinstance(result_path, (list, tuple)) else [result_path]
     with ExitStack() as stack:
-        results = [stack.enter_context(opened(each)) for each in (result_path if many else [result_path])]
+        results = [stack.enter_context(opened(each)) for each in paths]
         if not results:
             raise InputError("render: no result to draw")
-        names = _labels(results, labels)
-        folder = _folder(results, output)
-        shown, chosen = _timed(results, frames, rate, span, tell)
-        colours = [ColourField(result, field, component) for result in shown]
-        limits = limits_of(clim, symmetric, [colour.limits(chosen) for colour in colours] if clim is None else [])
-        if all(colour.rounded for colour in colours):
-            tell(f"{colours[0].title} is zero in all frames, to rounding")
-        overlays = Overlays(ghost, tuple(marks), tuple(trails))
-        motions = [Motion(result, chosen, scale, overlays, tell) for result in shown]
-        look = Look(
-            [_style(result, style, radius_scale, bar_width, nodes, note) for result in results],
-            *(moves, tuple(marks), inset, names, transparent),
-        )
-        heading = title if title is not None else (results[0].case.title or results[0].case.name)
-        film = Film(motions, colours, ColourScale(limits, cmap, colours[0].unit), heading, look)
-        _tell_length(film, fps, rate, kinds, tell)
-        pictures = _draw_frames(film, folder / "frames", size, tell, comm)
+        if output is None:
+            beside = Path(results[0].path).parent
+            output = beside / "side_by_side" if len(results) > 1 else beside
+        folder = Path(output)
+        film = Film(results, chosen, tell)
+        film.tell_length(tell)
+        with agreed(comm) if comm is not None else nullcontext():
+            if first:
+                _emptied(folder / "frames")
+        if comm is None or comm.size == 1:
+            helpers = _helpers(paths, folder, chosen, film.count)
+            shares = [slice(k, None, len(helpers) + 1) for k in range(len(helpers) + 1)]
+        else:
+            helpers, shares = [], [slice(comm.rank, None, comm.size)]
+        film.write(folder / "frames", shares[0], tell)
+        for helper, share in zip(helpers, shares[1:], strict=True):
+            if helper.wait() != 0:  # it may not know a law of the user's, for example
+                film.write(folder / "frames", share, tell)
+        if comm is not None:
+            comm.Barrier()
         written = []
-        if first and poster:
-            written.append(save(film.poster(), folder / "render.png"))
-        if first and kinds:
-            from .video import encode
-
-            written += [encode(folder / "frames" / "frame_%04d.png", folder / f"render.{k}", fps) for k in kinds]
+        if first and chosen.poster:
+            written.append(_save(film.poster(), folder / "render.png"))
+        film.close()
+        if first:
+            pattern = folder / "frames" / "frame_%04d.png"
+            written += [encode(pattern, folder / f"render.{kind}", chosen.fps) for kind in chosen.kinds]
     if comm is not None:
         written = comm.bcast(written)
-    return written + pictures
+    return written + [folder / "frames" / f"frame_{number:04d}.png" for number in range(film.count)]
+
+
+def render_modes(
+    result_path: Path | str,
+    output: Path | str | None = None,
+    *,
+    modes: Sequence[int] | None = None,
+    period: int = PERIOD,
+    **options: Any,
+) -> list[Path]:
+    """Draw the modes of a result as :func:`render` draws its snapshots.
+
+    Parameters
+    ----------
+    result_path : result file or its folder
+    output : folder of the pictures; None: ``modes`` beside the result
+    modes : numbers of the modes from 1; None: all
+    period : frames of a period
+    options : of ``render``, but for ``field``, ``component`` and ``frames``; ``scale`` 1 draws a tenth of the truss's
+        extent as the largest displacement
+
+    Returns
+    -------
+    The files written: poster, films, frames.
+
+    Raises
+    ------
+    InputError
+        As ``render``, and where the result has no such modes.
+    """
+    with opened(result_path) as result:
+        frames = ModeFrames(result, modes, period)
+        folder = Path(output) if output is not None else Path(result.path).parent / "modes"
+        count = len(frames.times)
+        return render(frames, folder, field="amplitude", frames=count, **{"clim": (0.0, 1.0)} | options)
+
+
+class Film:
+    """Frames of results, side by side when there are several; all have the same number of frames.
+
+    Parameters
+    ----------
+    results : open results
+    options : what is drawn, and how
+    note : receives messages
+
+    Raises
+    ------
+    InputError
+        For options that do not fit the results.
+    """
+
+    def __init__(self, results: Sequence[Any], options: Options, note: Callable[[str], None]) -> None:
+        self.options, labels = options, options.labels
+        if labels is not None and len(labels) != len(results):
+            raise InputError(f"render: {len(labels)} labels for {len(results)} results; give one for each")
+        self._labels = labels or [Path(result.path).absolute().parent.name for result in results]
+        shown, chosen = _timed(results, options, note)
+        self.count = len(chosen)
+        self.colours = [ColourField(result, options.field, options.component) for result in shown]
+        limits = limits_of(options.clim, options.symmetric, self.colours, chosen)
+        if all(colour.rounded for colour in self.colours):
+            note(f"{self.colours[0].title} is zero in all frames, to rounding")
+        self.scale = ColourScale(limits, options.cmap, self.colours[0].unit)
+        self.motions = [Motion(result, chosen, options, note) for result in shown]
+        self.styles = [options.style_of(result, note) for result in results]
+        for motion, style in zip(self.motions, self.styles, strict=True):
+            if style.radius is not None and len(style.radius):
+                motion.reach = 1.2 * float(style.radius.max())  # balls of nodes are that much wider than bars
+        case = results[0].case
+        self.title = options.title if options.title is not None else (case.title or case.name)
+        self._scenes: list[Scene] = []
+
+    def tell_length(self, note: Callable[[str], None]) -> None:
+        """Say how long the film lasts where that is not what one expects."""
+        rate, fps = self.options.rate, self.options.fps
+        if rate is not None and self.motions[0].result.axis.unit == "s":
+            slower = rate / fps
+            pace = f"{slower:.3g} times slower" if slower >= 1.0 else f"{1.0 / slower:.3g} times faster"
+            note(f"{self.count} frames last {self.count / fps:.1f} s: {pace} than simulated")
+        elif self.options.kinds and self.count > 1 and self.count / fps < SHORT:
+            slower = max(1, round(self.count / 5.0))
+            lasts = f"the film of {self.count} frames lasts {self.count / fps:.1f} s"
+            note(f"{lasts}; with fps = {slower} (--fps {slower}) it lasts about 5 s")
+
+    def write(self, folder: Path, share: slice, note: Callable[[str], None]) -> None:
+        """Draw a share of the frames into a folder."""
+        self.start(self.options.size)
+        told = time.monotonic()
+        for number in range(self.count)[share]:
+            if time.monotonic() - told > TELL:
+                told = time.monotonic()
+                note(f"{number} of {self.count} frames are drawn")
+            _save(self.frame(number), folder / f"frame_{number:04d}.png")
+
+    def start(self, size: tuple[int, int]) -> None:
+        """Prepare frames of a size."""
+        _, _, width, height = Page.region_of(size)
+        self._columns, tile = 1, (width, height)
+        several = len(self.motions) > 1
+        if several:
+            aspect = np.mean([self._aspect(motion) for motion in self.motions])
+            self._columns, rows = grid(len(self.motions), float(aspect), (width, height))
+            tile = (width // self._columns, height // rows - Page.strip_of(size))
+        self._prepare(size, tile)
+        self._insets: list[Inset] = []
+        if self.options.inset is not None:
+            room, self._corner = inset_room(tile, lambda corner, room: self._covered(tile, corner, room), several)
+            results = [motion.result for motion in self.motions]
+            self._insets = [Inset(results, k, self.options.inset, room) for k in range(len(results))]
+
+    def frame(self, number: int) -> np.ndarray:
+        """Return a page (height, width, 3 or 4) uint8."""
+        drawings = [self._draw(k, number) for k in range(len(self.motions))]
+        for motion, inset, drawing in zip(self.motions, self._insets, drawings, strict=False):
+            picture, (x, y) = inset.at(float(motion.times[number])), self._corner
+            over(drawing[y : y + picture.shape[0], x : x + picture.shape[1]], picture)
+        motion, camera = self.motions[0], self._cameras[0][number]
+        captions = list(self._labels) if len(drawings) > 1 else []
+        return self._page.compose(drawings, camera, motion.time(motion.frames[number]), captions, self._columns)
+
+    def poster(self) -> np.ndarray:
+        """Return six instants on one page, in a grid that suits the shape of the motion."""
+        motion, several = self.motions[0], len(self.motions) > 1
+        own = getattr(motion.result, "instants", None)
+        wanted = max(2, _TILES // len(self.motions))
+        chosen = instants(motion.result, motion.frames, wanted) if own is None else own(wanted)
+        _, _, width, height = Page.region_of(_POSTER)
+        columns, rows = grid(len(chosen), self._aspect(motion), (width, height))
+        if several:
+            columns, rows = len(chosen), len(self.motions)
+        self._prepare(_POSTER, (width // columns, height // rows - Page.strip_of(_POSTER)))
+        drawings, captions = [], []
+        for k in range(len(self.motions)):
+            for frame in chosen:
+                drawings.append(self._draw(k, motion.frames.index(frame)))
+                captions.append(f"{self._labels[k]}, {motion.time(frame)}" if several else motion.time(frame))
+        return self._page.compose(drawings, self._cameras[0][0], "", captions, columns)
+
+    def close(self) -> None:
+        """Give the windows back."""
+        for scene in self._scenes:
+            scene.close()
+        self._scenes = []
+
+    def _prepare(self, size: tuple[int, int], tile: tuple[int, int]) -> None:
+        """Make cameras, page and scenes for tiles of a page, in pixels."""
+        self.close()
+        options = self.options
+        self._cameras = [options.moves.cameras(motion, tile[0] / tile[1]) for motion in self.motions]
+        if len(self.motions) > 1 and options.path is None:
+            self._cameras = at_one_scale(self._cameras)
+        marks = [MARKS[mark] for mark in options.marks]
+        field, still = self.colours[0].title, options.path is None
+        heading = Heading(self.title, field, self.scale, marks, still, options.transparent)
+        self._page = Page(size, heading, self._cameras[0][0], tile[1])
+        _, _, width, height = Page.region_of(size)
+        for motion, style, colour, film in zip(self.motions, self.styles, self.colours, self._cameras, strict=True):
+            # lines of a small model stay visible in a tile; those of a large one would merge
+            share = (tile[0] * tile[1] / (width * height)) ** (0.25 if motion.n_bars <= FEW else 0.5)
+            unit = min(size[0] / 1280, size[1] / 720) * share
+            closest = min(film, key=lambda camera: camera.half_height)  # widths are those of bars at the closest
+            self._scenes.append(Scene(motion, closest, tile, style, colour.on_nodes, unit, options.transparent))
+
+    def _draw(self, k: int, number: int) -> np.ndarray:
+        motion, colour, scene, camera = self.motions[k], self.colours[k], self._scenes[k], self._cameras[k][number]
+        frame = motion.frames[number]
+        shades, layers = self.scale.colours(colour.values(frame)), motion.layers(frame, scene, camera)
+        surfaces, gone = motion.surfaces[frame], motion.gone(frame)
+        return scene.draw(motion.positions(frame), shades, camera, surfaces, gone, layers)
+
+    def _aspect(self, motion: Motion) -> float:
+        """Return the width of the motion over its height, in the picture."""
+        look, points = self.options.moves.cameras(motion, 1.0)[0], motion.surroundings
+        across, along = (float(np.ptp(points @ way)) for way in (look.right, look.up))
+        return across / max(along, 1e-3 * across, 1e-300)
+
+    def _covered(self, tile: tuple[int, int], corner: tuple[int, int], room: tuple[int, int]) -> float:
+        """Return how much of the bars is in a part of a tile over the film, and a little for each wall that is."""
+
+        def places(points: np.ndarray, camera: Camera) -> np.ndarray:
+            return np.stack(camera.project(points, tile)[:2], axis=1)
+
+        low, high, covered = np.array(corner), np.add(corner, room), 0.0
+        for motion, cameras in zip(self.motions, self._cameras, strict=True):
+            for number in np.unique(np.linspace(0, self.count - 1, 7).astype(int)):
+                frame = motion.frames[number]
+                ends = motion.positions(frame)[motion.bars]
+                along = [ends[:, 0] + part * (ends[:, 1] - ends[:, 0]) for part in (0.0, 0.3, 0.6)]
+                bars = places(np.concatenate(along), cameras[number])
+                covered += float(((bars > low) & (bars < high)).all(axis=1).mean())
+                for surface in motion.surfaces[frame]:
+                    wall = places(np.asarray(surface.points), cameras[number])
+                    covered += 1e-3 * bool(((wall.min(axis=0) < high) & (wall.max(axis=0) > low)).all())
+        return covered
 
 
 def _nothing(text: str) -> None:
-    """Receive messages of ranks that do not print."""
+    """Receive messages of processes that do not print."""
 
 
-def _labels(results: Sequence[Any], labels: Sequence[str] | None) -> list[str]:
-    if labels is None:
-        return [Path(result.path).absolute().parent.name for result in results]
-    if len(labels) != len(results):
-        raise InputError(f"render: {len(labels)} labels for {len(results)} results; give one for each")
-    return list(labels)
-
-
-def _folder(results: Sequence[Any], output: Path | str | None) -> Path:
-    if output is not None:
-        return Path(output)
-    beside = Path(results[0].path).parent
-    return beside / "side_by_side" if len(results) > 1 else beside
-
-
-def _timed(
-    results: Sequence[Any],
-    frames: int | Iterable[int] | None,
-    rate: float | None,
-    span: Sequence[float] | None,
-    note: Callable[[str], None],
-) -> tuple[list[Any], list[int]]:
+def _timed(results: Sequence[Any], options: Options, note: Callable[[str], None]) -> tuple[list[Any], list[int]]:
     """Return the results at common times, and the numbers of those that are drawn."""
     times = np.asarray(results[0].times, dtype=float)
     if len({result.axis for result in results}) > 1:
@@ -183,59 +443,122 @@ def _timed(
         raise InputError(f"render: the results are over different axes ({names}): draw them one by one")
     if any(len(result.times) == 0 for result in results):
         raise InputError("render: the result holds no snapshots; set [output] fields_every and run again")
-    if rate is not None:
-        if frames is not None:
+    if options.rate is not None:
+        if options.frames is not None:
             raise InputError("render: frames and rate both choose the frames; give one of the two")
-        times = even_times(times, rate, span)
+        times = even_times(times, options.rate, options.span)
         return [Resampled(result, times) for result in results], list(range(len(times)))
-    chosen = chosen_frames(frames, times, note, span)
+    chosen = chosen_frames(options.frames, times, note, options.span)
     return [results[0], *(Resampled(result, times) for result in results[1:])], chosen
 
 
-def _style(
-    result: Any,
-    style: str,
-    radius_scale: float,
-    bar_width: float | None,
-    nodes: bool | None,
-    note: Callable[[str], None],
-) -> Style:
-    tubes = len(result.bars) <= TUBE_LIMIT if style == "auto" else style == "tubes"
-    radius = drawn_radii(result, note if style == "tubes" else None) if tubes else None
-    return Style(tubes, None if radius is None else radius_scale * radius, bar_width, nodes)
+def instants(result: Any, frames: Sequence[int], count: int) -> list[int]:
+    """Select snapshots: first, last, first contact, most deformed, and those that fill the longest gaps.
+
+    Parameters
+    ----------
+    result : an open result, whose history has contact and deformation
+    frames : snapshots to choose from
+    count : maximum number of snapshots
+    """
+    frames = sorted(set(frames))
+    if len(frames) <= count:
+        return frames
+    times = np.asarray(result.times, dtype=float)[frames]
+    chosen = {0, len(frames) - 1}
+    history = result.history
+    when = np.asarray(history["time"], dtype=float)
+    for name, pick in (("active_contacts", lambda v: np.argmax(v > 0)), ("elastic_energy", np.argmax)):
+        values = np.asarray(history[name]) if name in history else np.zeros(0)
+        if values.size and values.max() > 0:
+            chosen.add(int(np.argmin(np.abs(times - when[int(pick(values))]))))
+    while len(chosen) < count:
+        distance = np.abs(np.arange(len(frames))[:, None] - np.array(sorted(chosen))).min(axis=1)
+        chosen.add(int(np.argmax(distance)))
+    return [frames[k] for k in sorted(chosen)]
 
 
-def _tell_length(film: Film, fps: float, rate: float | None, kinds: Sequence[str], note: Callable[[str], None]) -> None:
-    """Say how long the film lasts where that is not what one expects."""
-    if rate is not None and film.motions[0].result.axis.unit == "s":
-        slower = rate / fps
-        pace = f"{slower:.3g} times slower" if slower >= 1.0 else f"{1.0 / slower:.3g} times faster"
-        note(f"{film.count} frames last {film.count / fps:.1f} s: {pace} than simulated")
-    elif kinds and film.count > 1 and film.count / fps < SHORT:
-        slower = max(1, round(film.count / 5.0))
-        lasts = f"the film of {film.count} frames lasts {film.count / fps:.1f} s"
-        note(f"{lasts}; with fps = {slower} (--fps {slower}) it lasts about 5 s")
+def _helpers(paths: Sequence[Any], folder: Path, options: Options, count: int) -> list[subprocess.Popen]:
+    """Start processes that draw the other shares of a long film; each has one thread.
+
+    They read the results again, so that there are none for results that are open already, nor under ``mpirun``.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    processes = min(cores, count // SHARE)
+    launched = any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMI_RANK"))
+    if processes < 2 or launched or not all(isinstance(path, (str, os.PathLike)) for path in paths):
+        return []
+    few_threads()
+    code = "from pfem_petsc.post.render import _help; _help()"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": dict(os.environ)}
+    helpers = []
+    for number in range(1, processes):
+        helpers.append(subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, **quiet))
+        order = [Path(path) for path in paths], folder, options, slice(number, None, processes)
+        with helpers[-1].stdin as channel:
+            pickle.dump(order, channel)
+    return helpers
 
 
-def _draw_frames(
-    film: Film, folder: Path, size: tuple[int, int], note: Callable[[str], None], comm: MPI.Comm | None
-) -> list[Path]:
-    """Draw the frames of this rank; return the files of all."""
-    rank, ranks = (comm.rank, comm.size) if comm is not None else (0, 1)
-    if comm is None:
-        emptied(folder)
-    else:
-        with agreed(comm):
-            if rank == 0:
-                emptied(folder)
-    film.start(size)
-    told = time.monotonic()
-    files = [folder / f"frame_{number:04d}.png" for number in range(film.count)]
-    for number in range(rank, film.count, ranks):
-        if time.monotonic() - told > TELL:
-            told = time.monotonic()
-            note(f"{number} of {film.count} frames are drawn")
-        save(film.frame(number), files[number])
-    if comm is not None:
-        comm.Barrier()
-    return files
+def _help() -> None:
+    """Draw the share of the frames that the process that started this one has written to the input."""
+    paths, folder, options, share = pickle.loads(sys.stdin.buffer.read())
+    with ExitStack() as stack:
+        film = Film([stack.enter_context(opened(path)) for path in paths], options, _nothing)
+        film.write(folder / "frames", share, _nothing)
+        film.close()
+
+
+def _emptied(folder: Path) -> None:
+    """Create the folder of the frames and remove frames of an earlier film, which would end up in this one."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for old in folder.glob("frame_*.png"):
+            old.unlink()
+    except OSError as error:
+        raise InputError(
+            f"{folder}: pictures cannot be written here ({error.strerror}); give another folder"
+        ) from error
+
+
+def _save(picture: np.ndarray, file: Path) -> Path:
+    from PIL import Image
+
+    try:
+        # fast compression, because a film has hundreds of frames
+        Image.fromarray(picture).save(file, compress_level=3)
+    except OSError as error:
+        raise InputError(f"{file}: the picture cannot be written ({error}); give another folder") from error
+    return file
+
+
+def encode(pattern: Path, target: Path, fps: float) -> Path:
+    """Encode pictures to a film.
+
+    Parameters
+    ----------
+    pattern : path with a ``%04d`` for the number, from 0
+    target : ``.mp4`` (H.264, yuv420p), ``.gif`` (at most 800 pixels wide), ``.webm`` (VP9, with transparency) or
+        ``.webp`` (at most 960 pixels wide, with transparency)
+    fps : pictures per second
+
+    Raises
+    ------
+    InputError
+        If ffmpeg cannot be found or fails, with the last line of its output.
+    """
+    import imageio_ffmpeg
+
+    try:
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise InputError(
+            f"{target}: no ffmpeg for the film ({error}); install imageio-ffmpeg, or use video = none"
+        ) from error
+    command = [program, "-y", "-loglevel", "error", "-framerate", f"{fps:g}", "-i", str(pattern)]
+    command += [*_ENCODERS[target.suffix.lstrip(".")], str(target)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        last = done.stderr.strip().splitlines()[-1:] or ["no message"]
+        raise InputError(f"{target}: ffmpeg failed ({last[0]}); the pictures are in {pattern.parent}")
+    return target

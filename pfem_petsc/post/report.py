@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from ..energies import LOST, STORED, SUPPLIED
+from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.history import EVENT
-from ..output.modes import NAMES
-from ..output.peaks import peak_force, touch_impulse
+from ..output.layout import EVENT, MODE_VALUES
+from ..output.result import peak_force, touch_impulse
 from ..output.units import engineering, prefix_for
-from .energies import balance_error
+from .histories import balance_error
 from .plot import plot
 
 __all__ = ["write_report"]
@@ -207,7 +206,7 @@ def _events(result: Any) -> str:
 def _modes(result: Any) -> str:
     if not getattr(result, "n_modes", 0):
         return ""
-    name, unit = NAMES[result.modes.kind]
+    name, unit = MODE_VALUES[result.modes.kind]
     lines = [[str(k + 1), f"{value:.6g}"] for k, value in enumerate(result.modes.values)]
     return _grid(["mode", name.replace("_", " ") + (f" [{unit}]" if unit else "")], lines)
 

@@ -1,27 +1,268 @@
-"""Bars, walls and what is laid over them, drawn into an image; each frame moves the nodes and changes the colours."""
+"""The one renderer: bars, walls and lines over them, drawn by VTK without a display; frames move points in place."""
 
 from __future__ import annotations
 
+import functools
+import os
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..contact.walls.base import Surface
+from ..errors import InputError
+from ..mechanics.compiled import kernel
 from .camera import Camera
-from .raster import blend_triangles, draw_bars, resolve
-from .walls import Surface
-
-__all__ = ["TUBE_LIMIT", "Layer", "Scene", "Style"]
 
 TUBE_LIMIT = 20_000
 """Number of bars up to which bars are drawn as tubes of their radii; more are lines."""
+FEW = 2000
+"""Bars of a small model."""
 
-WALL_COLOUR = (116, 125, 138)
-EDGE_COLOUR = (75, 85, 99)
-NODE_COLOUR = (31, 36, 44)
-_LIGHT = np.array([-0.4, 0.7, 1.0]) / np.linalg.norm([-0.4, 0.7, 1.0])
-_DARK = np.zeros(3)
-_EVERYWHERE = 1e30  # how much farther away walls are where they hide nothing
+WALL_COLOUR, EDGE_COLOUR, NODE_COLOUR = (116, 125, 138), (75, 85, 99), (31, 36, 44)
+VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
+
+_LIGHT = np.array([-0.4, 0.7, 1.0]) / np.linalg.norm([-0.4, 0.7, 1.0])  # right, up, to the eye
+_AMBIENT, _DIFFUSE, _SPECULAR = 0.42, 0.66, 0.35
+_ROUND = 2.5  # pixels: radius from which a bar has a round surface; thinner ones are flat, with a shade across
+_MOST_PIXELS = (1.5e6, 1e7)  # up to which 3 x 3 (small models) and 2 x 2 pixels are averaged to one
+
+# Nothing is shown, so a display is not tried first: it may be closed, or remote over ssh.
+_HEADLESS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
+
+# Draw a red square if there is a library: a crash, a hang or an empty image all count as "does not work". So
+# does a window of another kind than asked for, which VTK takes where the library is missing, with warnings each time.
+_PROBE = """
+import os
+import vtkmodules.vtkRenderingOpenGL2
+from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow, vtkWindowToImageFilter
+renderer, window, grab = vtkRenderer(), vtkRenderWindow(), vtkWindowToImageFilter()
+renderer.SetBackground(1, 0, 0)
+window.SetOffScreenRendering(1)
+window.SetSize(16, 16)
+window.AddRenderer(renderer)
+window.Render()
+assert os.environ.get("VTK_DEFAULT_OPENGL_WINDOW") in (None, window.GetClassName())
+grab.SetInput(window)
+grab.Update()
+assert grab.GetOutput().GetPointData().GetScalars().GetTuple(100)[0] > 200
+print("drawn")
+"""
+
+
+def _works(window: str | None) -> bool:
+    environment = dict(os.environ) if window is None else {**os.environ, VARIABLE: window}
+    try:
+        probe = subprocess.run(
+            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True, timeout=60, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return probe.returncode == 0 and "drawn" in probe.stdout
+
+
+@functools.cache
+def require_rendering() -> None:
+    """Ensure that VTK can draw in this process, with EGL or OSMesa, whichever works: without a library it would crash.
+
+    The user's choice in ``VTK_DEFAULT_OPENGL_WINDOW`` is tried first, the default of VTK last. Call this before the
+    first render window.
+
+    Raises
+    ------
+    InputError
+        If no OpenGL library works; the message states what to install.
+    """
+    own = [os.environ[VARIABLE]] if VARIABLE in os.environ else []
+    for window in [*own, *_HEADLESS, None]:
+        if _works(window):
+            if window is not None:
+                os.environ[VARIABLE] = window
+            return
+    raise InputError(
+        "render: no OpenGL library works here, so nothing can be drawn; install one that needs no display "
+        "(Debian, Ubuntu: apt-get install libosmesa6, or libegl1 libgl1-mesa-dri; conda: mesalib)"
+    )
+
+
+def few_threads() -> None:
+    """Have the software renderer use one thread in this process and those that it starts, if no window is open yet."""
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+
+
+class _Mesh(NamedTuple):
+    """Points and normals (p, 3) float32 and colours (p, 3) uint8 of all bars; no normals where bars are flat."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    colours: np.ndarray
+
+
+class _Bars(NamedTuple):
+    """Nodes (b, 2), radii (b,) [m], rows (b, 2) of the colours of both ends, and the form (m, 4) of a bar."""
+
+    ends: np.ndarray
+    radius: np.ndarray
+    rows: np.ndarray
+    form: np.ndarray
+
+
+class _View(NamedTuple):
+    """What bars see of the camera, each (4,): ``a[:3]·x + a[3]`` is the least radius [m] and the fade (0 to 1) at x;
+    the direction to the eye is ``eye[:3] - eye[3] x``; and the direction to the light (3,)."""
+
+    eye: np.ndarray
+    least: np.ndarray
+    fade: np.ndarray
+    light: np.ndarray
+
+
+@kernel
+def _unit(a, other):
+    """Return a vector over its length, or another one if it has none."""
+    length = (a[0] * a[0] + a[1] * a[1] + a[2] * a[2]) ** 0.5
+    return (a[0] / length, a[1] / length, a[2] / length) if length > 0.0 else other
+
+
+@kernel
+def _across(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@kernel
+def _along(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
+def _fill(mesh, x, colours, bars, view):
+    """Place the points of all bars, in a frame of their axis and the direction to the eye, and colour them.
+
+    A point of the form is (end, along, across, facing): ``x[end] + radius (along a + across u + facing v)``. Bars of a
+    negative radius are shrunk to nothing.
+    """
+    eye, least, fade, light = view
+    form, flat = bars.form, len(mesh.normals) == 0
+    shaded = flat and _along(light, light) > 0.0
+    for k in range(len(bars.ends)):
+        first, last = x[bars.ends[k, 0]], x[bars.ends[k, 1]]
+        axis = _unit((last[0] - first[0], last[1] - first[1], last[2] - first[2]), (1.0, 0.0, 0.0))
+        ahead = (eye[0] - eye[3] * first[0], eye[1] - eye[3] * first[1], eye[2] - eye[3] * first[2])
+        side = _across(axis, ahead)
+        if _along(side, side) < 1e-18 * _along(ahead, ahead):  # seen along its axis: any direction is across
+            side = _across(axis, (0.0, 1.0, 0.0) if abs(axis[1]) < 0.9 else (1.0, 0.0, 0.0))
+        side = _unit(side, (0.0, 0.0, 1.0))
+        facing = _across(side, axis)
+        lit, slope = 0.785 * max(0.0, _along(light, facing)), 0.35 * _along(light, side)
+        there = bars.radius[k] >= 0.0
+        for q in range(len(form)):
+            end = int(form[q, 0])
+            place, row, hue = x[bars.ends[k, end if there else 0]], k * len(form) + q, bars.rows[k, end]
+            radius = max(bars.radius[k], _along(least, place) + least[3]) if there else 0.0
+            pale = 0.5 * min(1.0, max(0.0, _along(fade, place) + fade[3]))
+            # of the light that a cylinder sends back in the mean, with a slope from its bright to its dark side
+            share = min(1.0, _AMBIENT + _DIFFUSE * max(0.0, lit + slope * form[q, 2])) if shaded else 1.0
+            for c in range(3):
+                normal = form[q, 1] * axis[c] + form[q, 2] * side[c] + form[q, 3] * facing[c]
+                mesh.points[row, c] = place[c] + radius * normal
+                colour = float(colours[hue, c])
+                mesh.colours[row, c] = np.uint8((colour + (255.0 - colour) * pale) * share + 0.5)
+                if not flat:
+                    mesh.normals[row, c] = normal
+
+
+def _form(kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (m, 4) of a bar, see :func:`_fill`, and its cells (c, 2 or 4).
+
+    A ``line`` is two points, a ``strip`` faces the eye, a ``prism`` has open ends, and ``round`` bars and ``rough``
+    ones, of fewer sides, are cylinders with half a sphere at each end.
+    """
+    if kind == "line":
+        return np.array([[0.0, 0, 0, 0], [1, 0, 0, 0]]), np.array([[0, 1]])
+    if kind == "strip":
+        return np.array([[0.0, 0, -1, 0], [0, 0, 1, 0], [1, 0, 1, 0], [1, 0, -1, 0]]), np.array([[0, 1, 2, 3]])
+    sides, rings = {"round": (20, 5), "rough": (8, 2), "prism": (6, 1)}[kind]
+    angle, height = 2.0 * np.pi * np.arange(sides) / sides, np.linspace(-np.pi / 2, 0.0, rings)
+    height[-1] = 0.0
+    levels = [(0.0, level) for level in height] + [(1.0, -level) for level in height[::-1]]
+    points = [
+        [end, np.sin(level), np.cos(level) * np.cos(turn), np.cos(level) * np.sin(turn)]
+        for end, level in levels
+        for turn in angle
+    ]
+    here = np.arange(sides * (len(levels) - 1)).reshape(-1, sides)
+    beside = np.roll(here, -1, axis=1)
+    return np.array(points), np.stack([here, here + sides, beside + sides, beside], axis=-1).reshape(-1, 4)
+
+
+class Segments:
+    """Bars as one PolyData in a plotter of pyvista, whose points and colours change in place.
+
+    Parameters
+    ----------
+    plotter : of pyvista; None: the mesh is in none
+    ends : (b, 2) int, nodes
+    kind : see :func:`_form`
+    on_nodes : whether colours are those of nodes, and not of bars
+    width : of lines, in pixels of the window
+
+    Attributes
+    ----------
+    mesh : the PolyData
+    rows : (p,) int, the node or the bar whose colour each point of the mesh has
+    """
+
+    def __init__(self, plotter: Any, ends: np.ndarray, kind: str, on_nodes: bool, width: float = 1.0) -> None:
+        import pyvista
+
+        ends = np.ascontiguousarray(ends, dtype=np.int64)
+        form, cells = _form(kind)
+        count, m = len(ends), len(form)
+        rows = ends if on_nodes else np.repeat(np.arange(count), 2).reshape(-1, 2)
+        self.rows = rows[:, form[:, 0].astype(int)].ravel()
+        self._bars = _Bars(ends, np.zeros(count), rows, form)
+        kept = (cells + m * np.arange(count)[:, None, None]).reshape(-1, cells.shape[1])
+        self.mesh = pyvista.PolyData()
+        self.mesh.points = np.zeros((count * m, 3), dtype=np.float32)
+        cells = pyvista.CellArray.from_regular_cells(kept)
+        self.mesh.SetLines(cells) if kind == "line" else self.mesh.SetPolys(cells)
+        self.mesh.point_data["colour"] = np.zeros((count * m, 3), dtype=np.uint8)
+        solid = kind not in ("line", "strip")
+        if solid:
+            self.mesh.point_data.active_normals = np.zeros((count * m, 3), dtype=np.float32)
+        if plotter is None:
+            return
+        shine = (
+            {"ambient": _AMBIENT, "diffuse": _DIFFUSE, "specular": _SPECULAR, "specular_power": 10.0} if solid else {}
+        )
+        options: dict[str, Any] = {"scalars": "colour", "rgb": True, "preference": "point", "line_width": width}
+        self.actor = plotter.add_mesh(self.mesh, lighting=solid, reset_camera=False, render=False, **options, **shine)
+        self.actor.prop.specular_color = "white"
+        self.actor.prop.interpolation = "Phong" if kind == "round" else "Gouraud"
+
+    def move(
+        self, points: np.ndarray, radius: np.ndarray, colours: np.ndarray | None = None, view: _View | None = None
+    ) -> None:
+        """Draw bars between points (n, 3) [m] with radii (b,) [m], negative for none, and colours (n or b, 3) uint8.
+
+        Without a view, from any side.
+        """
+        if view is None:
+            view = _View(np.array([0.36, 0.48, 0.8, 0.0]), np.zeros(4), np.zeros(4), np.zeros(3))
+        if colours is None:
+            colours = np.zeros((int(self._bars.rows.max(initial=-1)) + 1, 3), dtype=np.uint8)
+        data = self.mesh.point_data
+        normals = np.asarray(data["Normals"]) if "Normals" in data else np.zeros((0, 3), dtype=np.float32)
+        mesh = _Mesh(np.asarray(self.mesh.points), normals, np.asarray(data["colour"]))
+        bars = self._bars._replace(radius=np.ascontiguousarray(radius, dtype=float))
+        _fill(mesh, np.ascontiguousarray(points, dtype=float), np.ascontiguousarray(colours), bars, view)
+        self.mesh.GetPoints().Modified()
+        for name in data:
+            data[name].VTKObject.Modified()
+        self.mesh.Modified()
 
 
 @dataclass(frozen=True)
@@ -30,31 +271,31 @@ class Style:
 
     Parameters
     ----------
-    tubes : whether bars have the radii of their sections, and shades; None: up to :data:`TUBE_LIMIT` bars
+    tubes : whether bars have the radii of their sections
     radius : (b,) [m] of the bars; None: not known
     bar_width : of bars without radii, and the least width of tubes, in pixels; None: by the size of the model
     nodes : whether to draw nodes as balls; None: for small models
+    shaded : whether bars have shades
     """
 
-    tubes: bool | None = None
+    tubes: bool
     radius: np.ndarray | None = field(default=None, repr=False)
     bar_width: float | None = None
     nodes: bool | None = None
+    shaded: bool = True
 
 
-@dataclass(frozen=True)
-class Layer:
+class Layer(NamedTuple):
     """Lines in addition to the bars.
 
-    Parameters
+    Attributes
     ----------
     points : (n, 3) [m]
     lines : (m, 2) int
     colour : red, green, blue
     width : in pixels of a picture of 1280 by 720
-    shift : how much nearer to the eye than their points they are, in such pixels, so that they hide what is at the same
-        place, or are hidden by it
-    rim : whether they are as near as their axes, so that what they outline hides them
+    shift : how much nearer to the eye than their points they are, in such pixels
+    radius : (m,) [m], if they are as wide as bars and the width more
     """
 
     points: np.ndarray
@@ -62,7 +303,7 @@ class Layer:
     colour: tuple[int, int, int]
     width: float
     shift: float = 0.0
-    rim: bool = False
+    radius: np.ndarray | None = None
 
 
 class Scene:
@@ -70,54 +311,85 @@ class Scene:
 
     Parameters
     ----------
-    points : (n, 3) float64 [m], nodes of the first frame, from which widths are chosen
-    bars : (b, 2) int, ends of the bars
+    motion : has the nodes of the first snapshot (``start``), ``bars``, and the ``bounds`` of the motion, for depth
     camera : a camera at the distance of those of all frames
-    bounds : (2, 3) [m], bounds of the motion, for depth
     size : width and height in pixels
     style : how bars are drawn
-    transparent : whether the background is
-    unit : pixels for each pixel of a page of 1280 by 720; None: by the size
+    on_nodes : whether colours are those of nodes
+    unit : pixels for each pixel of a page of 1280 by 720
+    transparent : whether the background is; else it is white
     """
 
     def __init__(
         self,
-        points: np.ndarray,
-        bars: np.ndarray,
+        motion: Any,
         camera: Camera,
-        bounds: np.ndarray,
         size: tuple[int, int],
-        style: Style | None = None,
+        style: Style,
+        on_nodes: bool = False,
+        unit: float = 1.0,
         transparent: bool = False,
-        unit: float | None = None,
     ) -> None:
-        style = style or Style()
-        self._bars, self._size, self._transparent = np.ascontiguousarray(bars, dtype=np.int64), size, transparent
-        self.tubes = len(bars) <= TUBE_LIMIT if style.tubes is None else style.tubes
+        require_rendering()
+        import pyvista
+
+        bars, count, area = motion.bars, len(motion.bars), size[0] * size[1]
+        self._bars, self.size, self.unit = bars, size, unit
         # more pixels than asked for are drawn and averaged, for smooth edges
-        area = size[0] * size[1]
-        self._factor = 3 if len(bars) <= TUBE_LIMIT and area <= 1.5e6 else (2 if area <= 1e7 else 1)
-        self.unit = min(size[0] / 1110, size[1] / 604) if unit is None else unit
+        self._factor = 3 if count <= FEW and area <= _MOST_PIXELS[0] else 2 if area <= _MOST_PIXELS[1] else 1
         pixels = size[1] / (2.0 * camera.half_height)
-        ends = points[bars[:, 1]] - points[bars[:, 0]]
-        lengths = pixels * np.linalg.norm(ends, axis=1)
-        shortest = float(np.quantile(lengths, 0.1)) if len(bars) else 1.0
-        self.width = style.bar_width or _width(len(bars), lengths, shortest, self.unit)
-        self._radius = np.zeros(len(bars))
-        if self.tubes and style.radius is not None:
-            self._radius = np.ascontiguousarray(style.radius, dtype=float)
-        self.nodes = len(bars) <= 400 and shortest > 3.0 * self.width if style.nodes is None else style.nodes
-        corners = np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T
-        self._corners = corners
-        height, width = size[1] * self._factor, size[0] * self._factor
-        self._image = np.zeros((height, width, 4), dtype=np.uint8)
-        self._depth = np.zeros((height, width), dtype=np.float32)
+        lengths = pixels * np.linalg.norm(motion.start[bars[:, 1]] - motion.start[bars[:, 0]], axis=1)
+        shortest = float(np.quantile(lengths, 0.1)) if count else 1.0
+        self.width = style.bar_width or _width(count, lengths, shortest, unit)
+        self._radius = np.zeros(count) if not style.tubes or style.radius is None else np.asarray(style.radius, float)
+        self._corners = np.array(np.meshgrid(*motion.bounds.T)).reshape(3, -1).T
+        window = [side * self._factor for side in size]
+        self._plotter = pyvista.Plotter(off_screen=True, window_size=window, lighting="none")
+        self._plotter.disable_anti_aliasing()
+        self._light = pyvista.Light(light_type="scene light")
+        self._plotter.add_light(self._light)
+        self._plotter.renderer.SetUseOIT(False)  # walls are drawn in their order
+        self._plotter.background_color = "black" if transparent else "white"
+        self._channels = 4 if transparent else 3
+        if transparent:  # colours over nothing are multiplied by their opacity
+            self._plotter.render_window.SetAlphaBitPlanes(1)
+            self._plotter.renderer.SetBackgroundAlpha(0.0)
+        thick = max(0.5 * self.width, pixels * float(np.quantile(self._radius, 0.9)) if count else 0.0)
+        wide = thick >= _ROUND * unit
+        self._shaded = style.shaded
+        if not style.shaded:
+            kind = "strip"
+        elif count <= FEW:
+            kind = "round" if wide else "rough"
+        else:
+            kind = (
+                "line"
+                if count > TUBE_LIMIT and not style.tubes
+                else "rough"
+                if wide and count <= TUBE_LIMIT
+                else "strip"
+            )
+        self.segments = Segments(self._plotter, bars, kind, on_nodes, self.width * self._factor)
+        nodes = count <= 400 and shortest > 3.0 * self.width if style.nodes is None else style.nodes
+        self._nodes = self._balls() if nodes else None
+        self._extra: list[Any] = []
+
+    def _balls(self) -> tuple[Segments, np.ndarray, np.ndarray]:
+        """Return nodes as bars without length, their numbers, and their radii."""
+        used, radius = np.unique(self._bars), np.zeros(int(self._bars.max(initial=-1)) + 1)
+        for end in (0, 1):
+            np.maximum.at(radius, self._bars[:, end], self._radius)
+        kind = "round" if len(used) <= FEW else "rough"
+        return Segments(self._plotter, np.stack([used, used], axis=1), kind, False), used, 1.2 * radius[used]
+
+    def close(self) -> None:
+        """Give the window back."""
+        self._plotter.close()
 
     def draw(
         self,
         points: np.ndarray,
         colours: np.ndarray,
-        on_nodes: bool,
         camera: Camera,
         surfaces: Sequence[Surface] = (),
         gone: np.ndarray | None = None,
@@ -128,8 +400,7 @@ class Scene:
         Parameters
         ----------
         points : (n, 3) float64 [m]
-        colours : (n, 3) uint8 of nodes or (b, 3) of bars
-        on_nodes : whether the colours are those of nodes
+        colours : (n, 3) or (b, 3) uint8
         camera : of this frame
         surfaces : walls
         gone : (b,) bool, bars that are left out
@@ -137,110 +408,120 @@ class Scene:
 
         Returns
         -------
-        (height, width, 3) uint8, or (height, width, 4) with a transparent background
+        (height, width, 3) uint8, or (height, width, 4) with a transparent background, multiplied by the opacity
         """
-        self._image[:], self._depth[:] = 0, -np.inf
-        size = self._image.shape[1], self._image.shape[0]
-        if camera.parallel:  # walls are behind all bars, so that they hide none
-            self._draw_walls(surfaces, camera, size)
-        x, y, near, scale = camera.project(points, size)
-        if not camera.parallel:
-            places = points if on_nodes else 0.5 * (points[self._bars[:, 0]] + points[self._bars[:, 1]])
-            colours = self._paler(colours, places, camera)
-        hidden = np.zeros(0, dtype=bool) if gone is None else gone
-        least = 0.5 * self.width * self._factor
-        # lines of a pixel have a shade each
-        draw_bars(
-            self._image,
-            self._depth,
-            *(x, y, near, scale, self._bars, hidden, self._radius, least, np.ascontiguousarray(colours), on_nodes),
-            *(_LIGHT, camera.lift(size)),
-        )
-        if self.nodes:
-            self._draw_nodes(x, y, near, scale, camera.lift(size))
-        for layer in layers:
-            self._draw_layer(layer, camera, size)
-        if not camera.parallel:
-            self._draw_walls(surfaces, camera, size)
-        made = np.empty((self._size[1], self._size[0], 4), dtype=np.uint8)
-        resolve(self._image, self._factor, self._transparent, made)
-        return made if self._transparent else made[..., :3]
+        for actor in self._extra:
+            self._plotter.remove_actor(actor, reset_camera=False, render=False)
+        radius = self._radius if gone is None else np.where(gone, -1.0, self._radius)
+        self.segments.move(points, radius, colours, self.view(camera, 0.5 * self.width, fades=True))
+        if self._nodes is not None:
+            balls, used, sizes = self._nodes
+            ink = np.tile(np.array(NODE_COLOUR, dtype=np.uint8), (len(used), 1))
+            balls.move(points, sizes, ink, self.view(camera, 0.7 * self.width))
+        self._extra = [self._add(layer, camera) for layer in layers if len(layer.lines)]
+        self._extra += self._add_walls(surfaces, camera)
+        return self.picture(camera)
 
-    def _draw_nodes(self, x: np.ndarray, y: np.ndarray, near: np.ndarray, scale: np.ndarray, lift: np.ndarray) -> None:
-        used = np.unique(self._bars)
-        itself = np.stack([used, used], axis=1)
-        radius = np.zeros(len(x))
-        for end in (0, 1):
-            np.maximum.at(radius, self._bars[:, end], self._radius)
-        colours = np.tile(np.array(NODE_COLOUR, dtype=np.uint8), (len(used), 1))
-        least = 0.7 * self.width * self._factor
-        hidden = np.zeros(0, dtype=bool)
-        draw_bars(
-            self._image,
-            self._depth,
-            *(x, y, near, scale, itself, hidden, 1.2 * radius[used], least, colours, False, _LIGHT, 1.05 * lift),
-        )
+    def picture(self, camera: Camera) -> np.ndarray:
+        """Return what the window shows from a camera, as :meth:`draw`."""
+        import pyvista
+        from PIL import Image
+        from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
 
-    def _draw_layer(self, layer: Layer, camera: Camera, size: tuple[int, int]) -> None:
-        x, y, near, scale = camera.project(np.asarray(layer.points, dtype=float), size)
-        lift = camera.lift(size)
-        near = near + layer.shift * self.unit * self._factor * (lift[0] + lift[1] * near)
-        if layer.rim:
-            lift = 0.0 * lift
-        lines = np.ascontiguousarray(layer.lines, dtype=np.int64)
-        colours = np.tile(np.array(layer.colour, dtype=np.uint8), (len(lines), 1))
-        radius, hidden = np.zeros(len(lines)), np.zeros(0, dtype=bool)
-        least = 0.5 * layer.width * self.unit * self._factor
-        draw_bars(
-            self._image,
-            self._depth,
-            *(x, y, near, scale, lines, hidden, radius, max(least, 0.5), colours, False, _DARK, lift),
-        )
+        point_camera(self._plotter, camera)
+        self._light.position = camera.centre + camera.distance * self.view(camera, 0.0).light
+        self._light.focal_point = camera.centre
+        window, (width, height) = self._plotter.render_window, self._plotter.window_size
+        window.Render()
+        made = vtkUnsignedCharArray()
+        read = window.GetPixelData if self._channels == 3 else window.GetRGBACharPixelData
+        read(0, 0, width - 1, height - 1, 0, made, 0)
+        picture = pyvista.convert_array(made).reshape(height, width, self._channels)[::-1]
+        # reduced as plain channels, because they are multiplied by the opacity already
+        image = Image.fromarray(np.ascontiguousarray(picture), "RGB" if self._channels == 3 else "CMYK")
+        return np.array(image.reduce(self._factor))
 
-    def halo(self, points: np.ndarray, bars: np.ndarray, colour: tuple[int, int, int], camera: Camera) -> Layer:
-        """Return a layer that outlines bars (numbers) by a rim of two pixels."""
-        return Layer(points, self._bars[bars], colour, self.thickness(camera, bars) + 4.0, rim=True)
+    def view(self, camera: Camera, least: float, fades: bool = False) -> _View:
+        """Return what bars see of a camera, with a least radius in pixels."""
+        metres = 2.0 * camera.half_height / self.size[1] * least
+        near = 0.0 if camera.parallel else 1.0 / camera.distance
+        flat = np.append(-near * metres * camera.towards, metres * (1.0 + near * camera.centre @ camera.towards))
+        fade = np.zeros(4)
+        if fades and not camera.parallel:  # what is far away is paler, to show thousands of bars in space
+            depths = self._corners @ camera.towards
+            fade = np.append(-camera.towards, depths.max()) / max(float(np.ptp(depths)), 1e-300)
+        eye = camera.towards if camera.parallel else camera.centre + camera.distance * camera.towards
+        light = float(self._shaded) * (_LIGHT @ np.stack([camera.right, camera.up, camera.towards]))
+        return _View(np.append(eye, float(not camera.parallel)), flat, fade, light)
 
-    def thickness(self, camera: Camera, bars: np.ndarray | slice = slice(None)) -> float:
-        """Return the width of the widest of some bars (numbers), in pixels of a page of 1280 by 720."""
-        pixels = self._size[1] / (2.0 * camera.half_height)
-        return max(self.width, 2.0 * pixels * float(self._radius[bars].max(initial=0.0))) / self.unit
+    def thickness(self, camera: Camera) -> float:
+        """Return the width of the widest bar, in pixels of a page of 1280 by 720."""
+        pixels = self.size[1] / (2.0 * camera.half_height)
+        return max(self.width, 2.0 * pixels * float(self._radius.max(initial=0.0))) / self.unit
 
-    def _paler(self, colours: np.ndarray, places: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return colours that fade with the depth of their positions (n, 3), to show thousands of bars in space."""
-        depths = self._corners @ camera.towards
-        deep = max(float(np.ptp(depths)), 1e-300)
-        depth = np.clip((depths.max() - places @ camera.towards) / deep, 0.0, 1.0).astype(np.float32)
-        return (colours + (255.0 - colours) * (0.5 * depth)[:, None]).astype(np.uint8)
+    def rim(self, points: np.ndarray, bars: np.ndarray, colour: tuple[int, int, int]) -> Layer:
+        """Return a layer that outlines bars (numbers) by two pixels."""
+        return Layer(points, self._bars[bars], colour, self.width / self.unit + 4.0, -1.0, self._radius[bars])
 
-    def _draw_walls(self, surfaces: Sequence[Surface], camera: Camera, size: tuple[int, int]) -> None:
-        """Draw walls from the farthest polygon to the nearest, and their edges."""
-        pieces = []
-        for surface in surfaces:
-            points = np.asarray(surface.points, dtype=float)
-            first = points[surface.faces[0]]
-            normal = np.cross(first[1] - first[0], first[2] - first[1])
-            facing = float(normal @ camera.towards) / (np.linalg.norm(normal) or 1.0)
+    def _add(self, layer: Layer, camera: Camera) -> Any:
+        pixel = 2.0 * camera.half_height / self.size[1] * self.unit
+        radius = np.zeros(len(layer.lines))
+        if layer.radius is not None:
+            radius = layer.radius + 2.0 * pixel
+        points = np.asarray(layer.points, dtype=float) + layer.shift * pixel * camera.towards
+        made = Segments(self._plotter, layer.lines, "strip", False)
+        view = self.view(camera, max(0.5 * layer.width * self.unit, 0.4))._replace(light=np.zeros(3))
+        colours = np.tile(np.array(layer.colour, dtype=np.uint8), (len(layer.lines), 1))
+        made.move(points, radius, colours, view)
+        return made.actor
+
+    def _add_walls(self, surfaces: Sequence[Surface], camera: Camera) -> list[Any]:
+        """Draw walls from the farthest to the nearest, and their edges."""
+        actors = []
+        # without perspective, walls are behind all bars, so that they hide none
+        depth = 4.0 * np.linalg.norm(np.ptp(self._corners, axis=0)) if camera.parallel else 0.0
+        for surface in sorted(surfaces, key=lambda each: float((np.asarray(each.points) @ camera.towards).mean())):
+            points = np.asarray(surface.points, dtype=float) - depth * camera.towards
+            normal = np.cross(*np.diff(points[np.asarray(surface.faces)[0]][:3], axis=0))
+            facing = float(normal @ camera.towards) > 1e-12 * float(np.linalg.norm(normal))
             # a wall between the eye and the structure must be transparent
-            strength = 150 if camera.parallel else (110 if facing > 0 else 35)
-            colours = np.empty((len(points), 4), dtype=np.uint8)
-            colours[:, :3] = WALL_COLOUR
-            colours[:, 3] = strength * (1.0 - np.clip(surface.depth, 0.0, 1.0))
-            x, y, near, scale = camera.project(points, size)
-            if camera.parallel:
-                near = near - _EVERYWHERE
-            corners = np.asarray(surface.faces)
-            triangles = np.concatenate([corners[:, [0, k, k + 1]] for k in range(1, corners.shape[1] - 1)])
-            order = np.argsort(near[triangles].mean(axis=1), kind="stable")
-            pieces.append((float(near.mean()), (x, y, near, scale), triangles[order], colours, surface))
-        lift = camera.lift(size)
-        for _, projected, triangles, colours, surface in sorted(pieces, key=lambda piece: piece[0]):
-            blend_triangles(self._image, self._depth, *projected, np.ascontiguousarray(triangles), colours)
-            edge = np.ascontiguousarray(np.asarray(surface.edge, dtype=np.int64).reshape(-1, 2))
-            ink = np.tile(np.array(EDGE_COLOUR, dtype=np.uint8), (len(edge), 1))
-            radius, hidden = np.zeros(len(edge)), np.zeros(0, dtype=bool)
-            least = max(0.5, 0.9 * self.unit * self._factor)
-            draw_bars(self._image, self._depth, *projected, edge, hidden, radius, least, ink, False, _DARK, 0.0 * lift)
+            strength = 150 if camera.parallel else 110 if facing else 35
+            actors.append(add_wall(self._plotter, surface, points, strength, camera.towards))
+            edge = np.asarray(surface.edge, dtype=np.int64).reshape(-1, 2)
+            if len(edge):
+                actors.append(self._add(Layer(points, edge, EDGE_COLOUR, 1.8), camera))
+        return actors
+
+
+def add_wall(plotter: Any, surface: Surface, points: np.ndarray, strength: int, towards: np.ndarray) -> Any:
+    """Add a wall, which one sees through and which fades out behind, to a plotter; return the actor.
+
+    Parameters
+    ----------
+    points : (n, 3) [m], where its points are
+    strength : opacity at its face, up to 255
+    towards : (3,), the direction to the eye: polygons are drawn from the farthest to the nearest
+    """
+    import pyvista
+
+    faces = np.asarray(surface.faces)
+    order = np.argsort((points @ towards)[faces].mean(axis=1), kind="stable")
+    mesh = pyvista.PolyData.from_regular_faces(points.astype(np.float32), faces[order])
+    opacity = strength * (1.0 - np.clip(np.asarray(surface.depth), 0.0, 1.0))
+    mesh.point_data["shade"] = np.column_stack([np.tile(WALL_COLOUR, (len(points), 1)), opacity]).astype(np.uint8)
+    options: dict[str, Any] = {"reset_camera": False, "render": False, "lighting": False}
+    actor = plotter.add_mesh(mesh, scalars="shade", rgb=True, preference="point", **options)
+    actor.ForceTranslucentOn()
+    return actor
+
+
+def point_camera(plotter: Any, camera: Camera) -> None:
+    """Have a plotter look as a camera does."""
+    plotter.camera.position = camera.centre + camera.distance * camera.towards
+    plotter.camera.focal_point, plotter.camera.up = camera.centre, camera.up
+    plotter.camera.parallel_projection, plotter.camera.parallel_scale = camera.parallel, camera.half_height
+    plotter.camera.view_angle = 2.0 * np.degrees(np.arctan2(camera.half_height, camera.distance))
+    plotter.renderer.ResetCameraClippingRange()
 
 
 def _width(count: int, lengths: np.ndarray, shortest: float, unit: float) -> float:

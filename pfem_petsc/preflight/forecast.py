@@ -1,25 +1,25 @@
-"""Estimates of the memory, time and disk space of a run."""
+"""Summary before a run, and estimates of its memory, time and disk space."""
 
 from __future__ import annotations
 
+import resource
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
 from ..files import memory_of_machine
+from ..modes.find import describe_modes
 from ..output.units import duration, engineering
 from ..solvers.linear import DIRECT
 
 if TYPE_CHECKING:
     from ..case.schema import Case
+    from ..fields import Fields
     from ..mesh.distribution import DistributedMesh
-    from ..recording.recorder import Fields
     from ..stepping.model import Model
     from ..stepping.plan import Plan
-
-__all__ = ["checkpoint_bytes", "forecast", "memory_warning", "result_bytes"]
 
 # Resident memory of a rank per bar, in excess of an empty process [B]; measured with lattices: 54 explicit, 74 if bars
 # yield on a floor, 170 matrix-free (between 10^6 and 4 x 10^6 bars), 510 assembled, 1580 with GAMG (10^5 to 5 x 10^5);
@@ -40,20 +40,22 @@ _SECONDS_EXPLICIT = 1.5e-8
 _SECONDS_PER_ITERATION = 4e-8
 _SECONDS_PER_STEP = 2.5e-4
 
+_THICK = 0.3
+"""Relative density above which struts are no lattice of slender bars (Gibson and Ashby, Cellular Solids, 1997)."""
+
 
 def forecast(
     case: Case,
     model: Model,
     plan: Plan,
     fields: Fields,
-    columns: Mapping[str, tuple[int, ...]],
-    types: Mapping[str, Any],
+    columns: Mapping[str, np.dtype],
 ) -> dict[str, str]:
     """Return label and text of the estimates of memory and, if the steps are known, of time and disk. Collective."""
     held = model.comm.allreduce(_needed(model, plan))
     entries = {"memory needed": f"about {engineering(held, 'B', 3)} on all ranks"}
     if plan.steps is not None:
-        size = result_bytes(case, model.mesh, plan.steps, fields.points, fields.cells, columns, types)
+        size = result_bytes(case, model.mesh, plan.steps, fields.points, fields.cells, columns)
         entries["run time"] = (
             f"about {duration(_seconds(model, plan))} of steps on idle cores, within a factor of 3; start, "
             "compilation and output are extra"
@@ -71,8 +73,7 @@ def result_bytes(
     steps: int,
     point_fields: Collection[str],
     cell_fields: Collection[str],
-    columns: Mapping[str, tuple[int, ...]],
-    types: Mapping[str, Any],
+    columns: Mapping[str, np.dtype],
 ) -> float:
     """Return the size of the result file [B]: snapshots, history rows, and the structure of the file."""
     output = case.output
@@ -80,7 +81,7 @@ def result_bytes(
     snapshots = 2 + (steps - 1) // output.fields_every if output.fields_every else 2
     rows = 2 + (steps - 1) // output.history_every
     a_snapshot = mesh.n_nodes * (24 + 3 * item * len(point_fields)) + mesh.n_bars * item * len(cell_fields)
-    a_row = sum(int(np.prod(shape)) * np.dtype(types.get(name, float)).itemsize for name, shape in columns.items())
+    a_row = sum(dtype.itemsize for dtype in columns.values())
     # a chunk of the history is allocated as a whole
     chunks = -(-rows // 512) * 512
     return 1e5 + 33.0 * mesh.n_bars + snapshots * (a_snapshot + 80.0) + chunks * a_row
@@ -95,13 +96,10 @@ def memory_warning(case: Case, model: Model, plan: Plan) -> list[str]:
     """Return a warning if the ranks on a machine need more memory than it has. Collective."""
     comm = model.comm
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
-    try:
-        needed, available = machine.allreduce(_needed(model, plan)), memory_of_machine()
-        ranks = machine.size
-    finally:
-        machine.Free()
-    worst = max(comm.allgather((needed / available, needed, available, ranks, MPI.Get_processor_name())))
-    ratio, needed, available, ranks, name = worst
+    needed, available, ranks = machine.allreduce(_needed(model, plan)), memory_of_machine(), machine.size
+    machine.Free()
+    mine = (needed / available, needed, available, ranks, MPI.Get_processor_name())
+    ratio, needed, available, ranks, name = max(comm.allgather(mine))
     if ratio <= 1.0:
         return []
     return [
@@ -113,20 +111,63 @@ def memory_warning(case: Case, model: Model, plan: Plan) -> list[str]:
 
 def _needed(model: Model, plan: Plan) -> float:
     """Return the maximum memory of this rank [B]."""
-    bars = len(model.mesh.bars)
     kind = "" if plan.linear is None else plan.linear.preconditioner
+    each = _PER_BAR.get(kind, max(_PER_BAR.values()))
     if kind in DIRECT or model.case.modes is not None:
         # fill-in in three dimensions: the factors of n unknowns have O(n^(4/3)) entries
         each = _PER_BAR_FACTORISED * (model.mesh.n_bars / _FACTORISED_AT) ** (1.0 / 3.0)
-    else:
-        each = _PER_BAR.get(kind, max(_PER_BAR.values()))
-    return _EMPTY + each * bars
+    return _EMPTY + each * len(model.mesh.bars)
 
 
 def _seconds(model: Model, plan: Plan) -> float:
     """Return the time of all steps on the slowest rank [s], an order of magnitude only for implicit schemes."""
-    bars = max(model.comm.allgather(len(model.mesh.bars)))
+    bars = model.comm.allreduce(len(model.mesh.bars), op=MPI.MAX)
     if plan.linear is None:
         return plan.steps * (_SECONDS_PER_STEP + _SECONDS_EXPLICIT * bars)
     iterations = 50.0 if plan.linear.preconditioner not in DIRECT else 100.0
     return plan.steps * (10.0 * _SECONDS_PER_STEP + _SECONDS_PER_ITERATION * iterations * bars)
+
+
+def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
+    """Return label and text of sizes, distribution, time step and solver. Collective."""
+    mesh, comm = model.mesh, model.comm
+    owned, ghosts = np.array(comm.allgather((mesh.n_owned, mesh.n_local - mesh.n_owned))).T
+    # kibibytes on Linux
+    peak = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0)
+    ranks = f"{comm.size}"
+    if comm.size > 1:
+        ranks += (
+            f", owning {owned.min():,} to {owned.max():,} nodes ({mesh.partitioner}), at most {ghosts.max():,} ghosts"
+        )
+    walls = [
+        wall.name if wall.mass is None else f"{wall.name} ({engineering(wall.mass, 'kg')})" for wall in case.every_wall
+    ]
+    return {
+        "nodes": f"{mesh.n_nodes:,}",
+        "bars": f"{mesh.n_bars:,}",
+        "ranks": ranks,
+        "extent": " x ".join(engineering(float(d), "m") for d in model.high - model.low),
+        **_density(model),
+        "mass": engineering(model.total_mass, "kg") + f" ({case.mass})",
+        "wave speed": engineering(model.wave_speed, "m/s"),
+        **plan.entries(case),
+        **describe_modes(model),
+        "linear solver": plan.linear.why if plan.linear is not None else "none: nodes are solved independently",
+        "walls": ", ".join(walls) or "none",
+        **({"contact pairs": ", ".join(pair.name for pair in case.contact_pair)} if case.contact_pair else {}),
+        **({"constraints": ", ".join(f"{c.name} ({c.kind})" for c in case.constraint)} if case.constraint else {}),
+        "memory": f"{engineering(peak, 'B', 3)} in use on all ranks",
+    }
+
+
+def _density(model: Model) -> dict[str, str]:
+    """Return the relative density of a lattice: the volume of its bars over that of what it fills. Collective."""
+    mesh = model.mesh
+    if mesh.volume is None:
+        return {}
+    lengths, own = model.bars.mesh_lengths, 0.0
+    for block in model.bars.blocks:
+        own += float((block.counted_area * lengths[block.start : block.counted]).sum())
+    ratio = model.comm.allreduce(own) / mesh.volume
+    thick = "; struts so thick overlap at nodes, where this counts them more than once" if ratio > _THICK else ""
+    return {"relative density": f"{ratio:.4g} (volume of bars over {engineering(mesh.volume, 'm3')}){thick}"}

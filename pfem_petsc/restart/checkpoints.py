@@ -7,43 +7,30 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from mpi4py import MPI
 
 from ..case.toml import split_key, value_text
 from ..errors import InputError
-from ..output import result as results
 from ..output.checkpoint import (
     NAME,
     PREVIOUS,
-    OpenCheckpoint,
+    Checkpoint,
     asked_checkpoint,
-    read_checkpoint_header,
-    write_checkpoint,
+    check_seal,
 )
-from ..output.integrity import check_seal, checksum
 from ..output.result import open_result
 from ..output.units import engineering
 from ..output.verify import examine
 from ..parallel.agreement import on_root
-from ..parallel.natural import NaturalOrder
 from ..tolerances import TIME
-from ..version import __version__
-from .state import STATE_VERSION, RunState
+from .state import STATE_VERSION
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..output.checkpoint import Checkpoint
-    from ..recording.monitors import BlowUp
-    from ..recording.recorder import Recorder
-    from ..stepping.ledger import Ledger
-    from ..stepping.model import Model
     from ..stepping.plan import Plan
-    from ..stepping.stepper import Stepper
 
 
 FREE = ("title", "plugins", "time.end", "static.end", "modes", "output", "solver")
@@ -108,29 +95,6 @@ def check_version(path: Path, attributes: Mapping[str, Any]) -> None:
         )
 
 
-def check_mesh_is_the_same(path: Path, mark: int, attributes: Mapping[str, Any], source: str) -> None:
-    """Refuse a checkpoint of a mesh with other nodes or bars (the content of a mesh file may have changed).
-
-    Raises
-    ------
-    InputError
-    """
-    if attributes.get("mesh_mark") != mark:
-        raise InputError(
-            f"{path}: the mesh of {source} is not the one that it was written with (other nodes or bars): restore "
-            "the mesh, or start without --restart"
-        )
-
-
-def mesh_mark(model: Model, node_order: NaturalOrder, bar_order: NaturalOrder, counted: np.ndarray) -> int:
-    """Return a checksum of coordinates and bar ends, the same on any number of ranks. Collective."""
-    mesh = model.mesh
-    points = node_order.to_slab(mesh.points[: mesh.n_owned])
-    ends = bar_order.to_slab(mesh.node_ids[mesh.bars[counted]].astype(np.int64, copy=False).reshape(-1, 2))
-    comm: MPI.Comm = model.comm
-    return checksum(comm, points, node_order.first) ^ checksum(comm, ends, bar_order.first)
-
-
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
     """Flatten nested tables and lists of tables: {"wall[0].point": ...}."""
     found: dict[str, Any] = {}
@@ -169,7 +133,7 @@ class Restart:
     """
 
     path: Path
-    file: OpenCheckpoint
+    file: Checkpoint
     changed: list[str]
     continues: bool
 
@@ -200,12 +164,14 @@ class Restart:
         return int(self.scalars["snapshot"]), int(self.scalars["row"]["step"])
 
 
-def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | None) -> Restart | str | None:
+def find_restart(
+    case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | None
+) -> tuple[Restart | None, list[str]]:
     """Find the checkpoint for ``--restart`` in an output folder. Collective.
 
     Returns
     -------
-    Restart, or a message that states why the run starts from zero, or None if no restart was requested
+    Restart or None, and messages: why a run that should go on starts from zero
 
     Raises
     ------
@@ -213,15 +179,15 @@ def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | 
         If a named file is missing, or a checkpoint is damaged, or belongs to another case or version.
     """
     if asked is None or asked is False:
-        return None
+        return None, []
     path = on_root(comm, asked_checkpoint, folder, asked)
     if path is None:
-        return f"{folder}: no checkpoint to restart from: starting from zero"
-    file = OpenCheckpoint(path, comm)
+        return None, [f"{folder}: no checkpoint to restart from: starting from zero"]
+    file = Checkpoint(path, comm)
     check_version(path, file.attributes)
     changed = changed_keys(path, file.attributes["case"], case.to_dict(), case.source)
     continues = on_root(comm, _continues, folder, path)
-    return Restart(path, file, changed, continues)
+    return Restart(path, file, changed, continues), []
 
 
 def finished(case: Case, comm: MPI.Comm, folder: Path, end: float | None) -> float | None:
@@ -234,7 +200,7 @@ def _finished(case: Case, path: Path, end: float) -> float | None:
         return None
     try:
         examine(path)
-        with results.open_result(path) as result:
+        with open_result(path) as result:
             reached = [float(times[-1]) for times in (result.history["time"], result.times) if len(times)]
             before, now = result.case.to_dict(), case.to_dict()
             changed_keys(path, before, now, case.source)
@@ -287,7 +253,7 @@ def _refuse_other(restart: Restart) -> None:
 
 def _refuse_loss(path: Path, plan: Plan) -> None:
     """Refuse a restart that would truncate results beyond the end of the run."""
-    with results.open_result(path) as result:
+    with open_result(path) as result:
         steps, times = result.history["step"], result.history["time"]
         snapshots = int(plan.beyond(result.steps, result.times).sum())
     rows = int(plan.beyond(steps, times).sum())
@@ -305,7 +271,7 @@ def _refuse_loss(path: Path, plan: Plan) -> None:
 def _refuse_gap(path: Path, restart: Restart) -> None:
     """Refuse a restart whose results end before the checkpoint."""
     examine(path, deep=False)
-    with results.open_result(path) as result:
+    with open_result(path) as result:
         steps = result.history["step"]
         last = int(steps[-1]) if len(steps) else -1
     if last < restart.last[1]:
@@ -346,94 +312,6 @@ def _prepare(folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
     return aside
 
 
-class Checkpoints:
-    """Checkpoints of one run, in its output folder. Construction is collective.
-
-    Parameters
-    ----------
-    case : Case
-    stepper : Stepper
-    plan : Plan
-    folder : Path
-    """
-
-    def __init__(self, case: Case, stepper: Stepper, plan: Plan, folder: Path) -> None:
-        self.case, self.plan, self.path = case, plan, folder / NAME
-        self.stage = stepper.model.case.number
-        self.comm = stepper.model.comm
-        self.state = RunState(stepper)
-        self.last_step = -1
-        self._model = stepper.model
-
-    @cached_property
-    def _mark(self) -> int:
-        """Checksum of the mesh, which runs without checkpoints do not need. Collective at first use."""
-        state = self.state
-        return mesh_mark(self._model, state.node_order, state.bar_order, state.counted)
-
-    @property
-    def wanted(self) -> bool:
-        """Whether the case requests checkpoints."""
-        return bool(self.case.output.checkpoint_every or self.case.output.checkpoint_minutes)
-
-    def due(self, step: int) -> bool:
-        """Return whether the case requests a checkpoint after this step."""
-        every = self.case.output.checkpoint_every
-        return bool(every) and step % every == 0
-
-    def write(
-        self,
-        ledger: Ledger,
-        recorder: Recorder,
-        blow_up: BlowUp,
-        row: dict[str, Any],
-        snapshots: dict[str, Any],
-        stage: dict[str, Any] | None = None,
-    ) -> None:
-        """Write a checkpoint with the last history row and what is kept of the snapshots. Collective.
-
-        ``stage``: what the history keeps of the stages before, None for a case without stages.
-
-        Raises
-        ------
-        SimulationFailure
-            On all ranks; earlier checkpoints are kept.
-        """
-        scalars = self.state.scalars(ledger, recorder, blow_up, row, snapshots)
-        if stage is not None:
-            scalars["stage"] = {"number": self.stage, "history": stage, "start": self.state.stage_start()}
-        if scalars["step"] == self.last_step:
-            return
-        attributes = {
-            "state_version": STATE_VERSION,
-            "pfem_petsc": __version__,
-            "name": self.case.name,
-            "overrides": list(self.case.overrides),
-            "case": self.case.to_dict(),
-            "plan": self.plan.record(),
-            "mesh_mark": self._mark,
-            "external_functions": self.state.model.external.functions,
-        }
-        write_checkpoint(self.path, self.comm, self.state.arrays(), scalars, attributes)
-        self.last_step = scalars["step"]
-
-    def restore(self, restart: Restart) -> Checkpoint:
-        """Restore the stepper from a checkpoint, instead of starting it; return the checkpoint. Collective.
-
-        Raises
-        ------
-        InputError
-            On all ranks, if the checkpoint is damaged or belongs to another mesh.
-        """
-        check_mesh_is_the_same(restart.path, self._mark, restart.attributes, self.case.source)
-        checkpoint = restart.file.read(self.state.orders(restart.scalars))
-        restart.file.close()
-        self.state.load_state(checkpoint)
-        if restart.continues:
-            self.last_step = restart.step
-        return checkpoint
-
-
 def kept_overrides(name: str, folder: Path, restart: bool | Path) -> list[str]:
     """Return the texts ``KEY=VALUE`` of the run that a restart continues. Not collective.
 
@@ -450,7 +328,8 @@ def kept_overrides(name: str, folder: Path, restart: bool | Path) -> list[str]:
     """
     path = asked_checkpoint(folder, restart)
     if path is not None:
-        _, found = read_checkpoint_header(path, MPI.COMM_SELF)
+        with Checkpoint(path, MPI.COMM_SELF) as checkpoint:
+            found = checkpoint.attributes
     else:
         # the run may have finished without a checkpoint
         try:

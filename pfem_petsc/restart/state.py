@@ -26,24 +26,23 @@ on wall-clock time (synchronisation, progress, wall time) start from scratch in 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..errors import InputError
 from ..mechanics.bars import StrainEnergy
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..output.checkpoint import Checkpoint
+from ..output.integrity import checksum
 from ..parallel.natural import NaturalOrder
 from ..stepping.model import StageStart
 
 if TYPE_CHECKING:
-    from ..recording.monitors import BlowUp
-    from ..recording.recorder import Recorder
-    from ..stepping.ledger import Ledger
     from ..stepping.stepper import Stepper
-
-__all__ = ["STATE_VERSION", "RunState"]
 
 STATE_VERSION = 7
 """Changed with the meaning of what is saved."""
@@ -65,15 +64,7 @@ class RunState:
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.model = stepper.model
-        mesh, comm = self.model.mesh, self.model.comm
-        self.comm = comm
-        self.counted = mesh.counted
-        self.node_order = mesh.node_order
-
-    @property
-    def bar_order(self) -> NaturalOrder:
-        """Order of the bars, created at the first checkpoint to save memory."""
-        return self.model.mesh.bar_order
+        self.comm, self.mesh = self.model.comm, self.model.mesh
 
     def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
         """Return name to (order, rows owned by this rank) of all arrays; the same names on all ranks."""
@@ -84,18 +75,18 @@ class RunState:
             kinds |= other
         for name in kinds.keys() - own.keys():
             shape, kind = kinds[name]
-            own[name] = np.zeros((self.model.mesh.n_owned, *shape), dtype=kind)
-        nodes = {name: (self.node_order, own[name]) for name in sorted(kinds)}
-        bars = {name: (self.bar_order, array[self.counted]) for name, array in self._bar_arrays().items()}
+            own[name] = np.zeros((self.mesh.n_owned, *shape), dtype=kind)
+        nodes = {name: (self.mesh.node_order, own[name]) for name in sorted(kinds)}
+        bars = {name: (self.mesh.bar_order, array[self.mesh.counted]) for name, array in self._bar_arrays().items()}
         return {**nodes, **bars, **self.model.links.arrays()}
 
     def scalars(
-        self, ledger: Ledger, recorder: Recorder, blow_up: BlowUp, row: dict[str, Any], snapshots: dict[str, Any]
+        self, ledger: Mapping[str, Any], history: Mapping[str, Any], snapshots: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return the numbers, including the last history row and what is kept of the snapshots. Collective."""
+        """Return the numbers, with what this rank's ledger, the history and the snapshots keep. Collective."""
         stepper, energy, walls = self.stepper, self.stepper.energy, self.stepper.solution.walls
         mine = {
-            "ledger": ledger.kept(),
+            "ledger": ledger,
             "energy": list(energy.energies),
             "walls": {name: getattr(walls, name).tolist() for name in walls.sums},
             "contact_log": self.model.contact.log.share(),
@@ -106,13 +97,10 @@ class RunState:
             "step": stepper.number,
             "time": stepper.state.time,
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
-            "iterations": list(recorder.iterations),
-            "start_energy": recorder.start_energy,
-            "energy_scale": recorder.energy_scale,
-            "blow_up": blow_up.kept(),
-            "free_walls": self.model.contact.motion.kept(),
+            **{name: kept for name, kept in history.items() if name != "row"},
+            "free_walls": self.model.contact.motion.bodies.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
-            "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
+            "row": history["row"],
             **snapshots,
             "node_arrays": sorted(set().union(*self.comm.allgather(set(self._node_arrays())))),
             "memories": memories,
@@ -120,26 +108,49 @@ class RunState:
             "ranks": self.comm.allgather(mine),
         }
 
-    def stage_start(self) -> dict[str, Any] | None:
-        """The numbers of what the stage starts from; its arrays are among those of nodes. None for a first stage."""
-        return None if self.model.start is None else self.model.start.scalars()
+    @cached_property
+    def mesh_mark(self) -> int:
+        """Checksum of coordinates and bar ends, the same on any number of ranks. Collective at first use."""
+        mesh, nodes, bars = self.mesh, self.mesh.node_order, self.mesh.bar_order
+        points = nodes.to_slab(mesh.points[: mesh.n_owned])
+        ends = mesh.node_ids[mesh.bars[mesh.counted]].astype(np.int64, copy=False).reshape(-1, 2)
+        return checksum(self.comm, points, nodes.first) ^ checksum(self.comm, bars.to_slab(ends), bars.first)
+
+    def restore(self, file: Checkpoint, source: str) -> None:
+        """Restore the stepper from a checkpoint, instead of its ``start``, and close the file. Collective.
+
+        ``source``: the case's file, for the message
+
+        Raises
+        ------
+        InputError
+            On all ranks, if the checkpoint is damaged or belongs to another mesh: the content of a mesh file may have
+            changed.
+        """
+        if file.attributes.get("mesh_mark") != self.mesh_mark:
+            raise InputError(
+                f"{file.path}: the mesh of {source} is not the one that it was written with (other nodes or bars): "
+                "restore the mesh, or start without --restart"
+            )
+        arrays = file.read(self.orders(file.scalars))
+        file.close()
+        self._load_state(file.scalars, arrays)
 
     def orders(self, scalars: dict[str, Any]) -> dict[str, NaturalOrder]:
         """Return the orders of the arrays of a checkpoint with these numbers: nodal rows by owner, bars in slabs."""
-        slab = np.arange(self.bar_order.first, self.bar_order.first + self.bar_order.count)
-        bars = NaturalOrder(self.comm, slab, self.model.mesh.n_bars)
-        orders = dict.fromkeys(scalars["node_arrays"], self.node_order) | dict.fromkeys(scalars["bar_arrays"], bars)
+        mine = self.mesh.bar_order
+        bars = NaturalOrder(self.comm, np.arange(mine.first, mine.first + mine.count), self.mesh.n_bars)
+        orders = dict.fromkeys(scalars["node_arrays"], self.mesh.node_order)
+        orders |= dict.fromkeys(scalars["bar_arrays"], bars)
         return orders | {name: order for name, (order, _) in self.model.links.arrays().items()}
 
-    def load_state(self, checkpoint: Checkpoint) -> None:
-        """Restore the stepper from a checkpoint, instead of its ``start``. Collective."""
-        stepper, state, owned = self.stepper, self.stepper.state, self.model.mesh.n_owned
-        scalars = checkpoint.scalars
+    def _load_state(self, scalars: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+        stepper, state, owned = self.stepper, self.stepper.state, self.mesh.n_owned
         if scalars.get("stage") is not None and scalars["stage"]["start"] is not None:
-            held = {name.removeprefix(_STAGE): a for name, a in checkpoint.arrays.items() if name.startswith(_STAGE)}
+            held = {name.removeprefix(_STAGE): a for name, a in arrays.items() if name.startswith(_STAGE)}
             self.model.begin_stage(StageStart.restored(scalars["stage"]["start"], held))
         for name in scalars["node_arrays"]:
-            values = checkpoint.arrays[name]
+            values = arrays[name]
             if name.startswith(_STAGE):
                 continue
             if name.startswith(_MEMORY):
@@ -155,34 +166,24 @@ class RunState:
         if len(scalars["memories"]) == self.comm.size:
             mine = scalars["memories"][self.comm.rank]
             state.memory = {name: array for name, array in state.memory.items() if name in mine}
-        self.model.mesh.update_ghosts(state.x)
-        self._load_bars(checkpoint)
+        self.mesh.update_ghosts(state.x)
+        self._load_bars({name: arrays[name] for name in scalars["bar_arrays"]})
         state.step, state.time = int(scalars["step"]) - self.model.first_step, float(scalars["time"])
         for name, value in scalars["stepper"].items():
             setattr(stepper, name, value)
-        mine = self._share(scalars["ranks"])
+        mine = self.share(scalars["ranks"])
         stepper.energy = StrainEnergy(tuple(float(value) for value in mine["energy"]))
         walls = stepper.solution.walls
         like = {name: getattr(walls, name) for name in mine["walls"]}
         sums = {n: np.array(mine["walls"][n], dtype=a.dtype).reshape(a.shape) for n, a in like.items()}
         stepper.solution.walls = dataclasses.replace(walls, **sums)
         stepper.solution.contacts = int(mine["contacts"])
-        self.model.contact.motion.load_state(scalars["free_walls"])
-        self.model.links.load_state(checkpoint.arrays)
+        self.model.contact.motion.bodies.load_state(scalars["free_walls"])
+        self.model.links.load_state(arrays)
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
         stepper.resume()
 
-    def load_sums(self, checkpoint: Checkpoint, ledger: Ledger, recorder: Recorder, blow_up: BlowUp) -> dict[str, Any]:
-        """Restore ledger, recorder and divergence check, created after :meth:`load_state`; return the last row."""
-        scalars = checkpoint.scalars
-        ledger.load_state(self._share(scalars["ranks"])["ledger"])
-        recorder.iterations = [int(n) for n in scalars["iterations"]]
-        recorder.start_energy = scalars["start_energy"]
-        recorder.energy_scale = scalars["energy_scale"]
-        blow_up.load_state(scalars["blow_up"])
-        return dict(scalars["row"])
-
-    def _share(self, ranks: list[dict[str, Any]]) -> dict[str, Any]:
+    def share(self, ranks: list[dict[str, Any]]) -> dict[str, Any]:
         """Return this rank's share of the sums: its own on the same number of ranks, else all on rank 0."""
         if len(ranks) == self.comm.size:
             return ranks[self.comm.rank]
@@ -190,14 +191,12 @@ class RunState:
 
     def _node_arrays(self) -> dict[str, np.ndarray]:
         """Return the rows of owned nodes, by name, of every array of the state, including any added later."""
-        state, owned = self.stepper.state, self.model.mesh.n_owned
-        found = {}
-        for item in dataclasses.fields(state):
-            value = getattr(state, item.name)
-            if isinstance(value, np.ndarray):
-                found[item.name] = value[:owned]
+        state, owned = self.stepper.state, self.mesh.n_owned
+        fields = {item.name: getattr(state, item.name) for item in dataclasses.fields(state)}
+        found = {name: value[:owned] for name, value in fields.items() if isinstance(value, np.ndarray)}
         found |= {_MEMORY + name: array for name, array in state.memory.items()}
-        found |= {_KEPT + name: _numbers(getattr(self.stepper, name)) for name in self.stepper.kept_arrays}
+        kept = {name: getattr(self.stepper, name) for name in self.stepper.kept_arrays}
+        found |= {_KEPT + name: a.astype(np.uint8) if a.dtype == bool else a for name, a in kept.items()}
         if self.model.start is not None:
             found |= {_STAGE + name: array for name, array in self.model.start.arrays().items()}
         # a case without walls has no columns for them
@@ -216,14 +215,14 @@ class RunState:
         kept = {_KEPT + name: getattr(self.stepper, name) for name in self.stepper.kept_bars}
         return found | {name: array for name, array in kept.items() if array.shape[1]}
 
-    def _load_bars(self, checkpoint: Checkpoint) -> None:
+    def _load_bars(self, arrays: dict[str, np.ndarray]) -> None:
         """Restore the bar arrays; bars evaluated on two ranks get the same values on both."""
-        mesh, bars = self.model.mesh, self.model.bars
+        mesh, bars = self.mesh, self.model.bars
         asking = Router(self.comm, slab_of(mesh.bar_ids, mesh.n_bars, self.comm.size))
-        asked = asking.send(mesh.bar_ids) - self.bar_order.first
+        asked = asking.send(mesh.bar_ids) - self.mesh.bar_order.first
         history = bars.history()
-        for name in checkpoint.scalars["bar_arrays"]:
-            values = asking.reply(checkpoint.arrays[name][asked])
+        for name, array in arrays.items():
+            values = asking.reply(array[asked])
             if name.startswith(_LAW):
                 history[:, bars.kept_names.index(name.removeprefix(_LAW))] = values
             elif name.startswith(_KEPT):
@@ -240,7 +239,3 @@ def _summed(shares: list[Any], factor: float = 1.0) -> Any:
     if isinstance(shares[0], dict):
         return {name: _summed([share[name] for share in shares], factor) for name in shares[0]}
     return factor * sum(np.array(share) for share in shares)
-
-
-def _numbers(array: np.ndarray) -> np.ndarray:
-    return array.astype(np.uint8) if array.dtype == bool else array

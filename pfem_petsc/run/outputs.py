@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,18 +11,26 @@ from mpi4py import MPI
 
 from ..analysis import Analysis, Step
 from ..case.schema import Case
+from ..columns import declared
 from ..errors import EarlyStop, SimulationFailure, printable
+from ..fields import Fields
 from ..mechanics.compiled import Compilation
 from ..modes.find import Found, find_modes, weakest_member
-from ..output.modes import NAMES
+from ..output.checkpoint import NAME as CHECKPOINT
+from ..output.layout import MODE_VALUES, Contents, Kept
 from ..output.progress import Progress
 from ..output.units import MODE
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import on_root
+from ..preflight.forecast import summarise
 from ..preflight.inspection import warnings_before
-from ..preflight.sanity import odd_accelerations
-from ..preflight.summary import summarise
-from ..recording.observers import (
+from ..preflight.values import odd_accelerations
+from ..restart.checkpoints import RESULT, Restart, prepare_folder
+from ..restart.state import RunState
+from ..signals import early
+from ..stepping.batches import Batches
+from ..stepping.model import Model
+from .observers import (
     Callback,
     Checkpointing,
     Events,
@@ -32,162 +40,11 @@ from ..recording.observers import (
     RuptureReport,
     Snapshots,
 )
-from ..recording.recorder import Fields, Recorder
-from ..restart.checkpoints import RESULT, Checkpoints, Restart, prepare_folder
-from ..signals import early
-from ..stepping.batches import Batches
-from ..stepping.model import Model
-from ..stepping.plan import Plan
 from .stages import Stages
 from .synchroniser import Synchroniser
 
 if TYPE_CHECKING:
-    from ..output.checkpoint import Checkpoint
     from ..stepping.stepper import Stepper
-
-
-def open_progress(
-    case: Case,
-    model: Model,
-    plan: Plan,
-    start: tuple[int, float],
-    folder: Path,
-    quiet: bool,
-    notes: Iterable[str],
-) -> Progress:
-    """Open the progress report and write summary, warnings and notes. Collective.
-
-    ``start``: step and time [s] from which the run continues.
-    """
-    progress = Progress(
-        model.comm,
-        printable(case.title),
-        plan.steps,
-        plan.end or 0.0,
-        quiet,
-        folder / "log.txt",
-        start_step=start[0],
-        start_time=start[1],
-        axis=plan.axis,
-    )
-    progress.summary(summarise(case, model, plan))
-    own = plan.plans[model.case.number] if case.stage else plan
-    for warning in model.warnings + odd_accelerations(case) + warnings_before(model.case, model, own):
-        progress.warning(warning)
-    if plan.scheme.notice:
-        progress.message(plan.scheme.notice)
-    for note in notes:
-        progress.message(note)
-    return progress
-
-
-def open_result_file(
-    case: Case,
-    model: Model,
-    plan: Plan,
-    history: History,
-    fields: Fields,
-    events: Mapping[str, Any],
-    folder: Path,
-    restart: Restart | None,
-    step: int,
-) -> ResultWriter:
-    """Open the result file, new or, if a restart continues it, truncated after ``step``. Collective."""
-    continues = restart is not None and restart.continues
-    return ResultWriter(
-        folder / RESULT,
-        model.comm,
-        model.mesh,
-        point_fields=fields.points,
-        cell_fields=fields.cells,
-        columns=history.columns,
-        column_types=history.types,
-        case_text=case.to_toml(),
-        attributes=_attributes(case, model, plan, history.recorder),
-        precision=case.output.precision,
-        compressed=case.output.compression == "gzip",
-        append_after_step=step if continues else None,
-        last=restart.last if continues else None,
-        modes=case.modes.kind if case.modes is not None else None,
-        events=events,
-    )
-
-
-def _attributes(case: Case, model: Model, plan: Plan, recorder: Recorder) -> dict[str, Any]:
-    attributes: dict[str, Any] = {
-        "name": case.name,
-        "folder": str(case.folder.resolve()),
-        "overrides": list(case.overrides),
-        "axis": plan.axis.symbol,
-        "time_step": plan.step,
-        "linear_solver": plan.linear.why if plan.linear is not None else "none",
-        "partitioner": model.mesh.partitioner,
-    }
-    if case.stage:
-        attributes["stages"] = [stage.name for stage in case.stage]
-    if plan.steps is not None:
-        attributes["steps"] = plan.steps
-    for name, nodes in recorder.probe_nodes.items():
-        attributes[f"probe_nodes/{name}"] = nodes.tolist()
-    return attributes | _wave_times(case, model)
-
-
-def _wave_times(case: Case, model: Model) -> dict[str, float]:
-    """Return the time [s] of a wave through the shortest bar at each wall, and at the supports, of all stages.
-
-    Collective.
-    """
-    sets: dict[str, list[str | None]] = {}
-    for stage in case.stages:
-        for wall in stage.wall:
-            sets.setdefault(f"wall/{wall.name}/force", []).append(wall.node_set)
-        for support in stage.support:
-            sets.setdefault("support_force", []).append(support.node_set)
-    mesh, bars, found = model.mesh, model.bars, {}
-    for column, names in sets.items():
-        members = np.zeros((mesh.n_local, 1))
-        for name in names:
-            members[: mesh.n_owned][slice(None) if name is None else model.nodes[name]] = 1.0
-        mesh.update_ghosts(members)
-        times = [np.inf]
-        for block in bars.blocks:
-            own = slice(block.start, block.stop)
-            near = (members[bars.ends[own], 0] > 0.0).any(axis=1)
-            if block.density > 0.0 and near.any():
-                shortest = float(bars.mesh_lengths[own][near].min())
-                times.append(shortest * float(np.sqrt(block.density / block.modulus)))
-        found[f"wave_time/{column}"] = model.comm.allreduce(min(times), op=MPI.MIN)
-    return found
-
-
-def resume_observers(
-    restart: Restart, checkpoint: Checkpoint, checkpoints: Checkpoints, history: History, snapshots: Snapshots
-) -> None:
-    """Give history and snapshots what a checkpoint holds of them. Collective."""
-    sums = history.ledger, history.recorder, history.blow_up
-    history.row = checkpoints.state.load_sums(checkpoint, *sums)
-    snapshots.load_state(restart.scalars)
-    history.contact_watch.start = history.recorder.start_energy
-    if restart.scalars.get("stage") is not None:
-        history.load_stage(restart.scalars["stage"]["history"])
-
-
-def tell_restart(restart: Restart, progress: Progress, place: str, functions: int) -> None:
-    """Report from where a run continues, what has changed, and missing functions. Collective.
-
-    Parameters
-    ----------
-    place : step and time of the checkpoint
-    functions : number of functions that give forces
-    """
-    changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
-    progress.message(f"restart from {restart.path}: {place}{changes}")
-    before = int(restart.attributes.get("external_functions", 0))
-    if before != functions:
-        progress.warning(
-            f"{restart.path}: the run had {before} function{'s' * (before != 1)} for forces, and this one has "
-            f"{functions}: functions are not in checkpoints; register them by Simulation.external_force before the run"
-        )
 
 
 _PATIENCE = 2.0
@@ -267,7 +124,7 @@ def _tell_members(stepper: Stepper, found: Found, progress: Progress) -> None:
 
 
 def _told(found: Found, asked: int) -> list[str]:
-    name, unit = NAMES[found.kind]
+    name, unit = MODE_VALUES[found.kind]
     head = "natural frequencies" if found.kind == "vibration" else "buckling: factors of the axial forces"
     lines = [f"modes by {found.solver}"]
     if found.at_walls:
@@ -291,20 +148,12 @@ def _told(found: Found, asked: int) -> list[str]:
 def _write_file(stepper: Stepper, found: Found, folder: Path) -> None:
     """Write a separate file for ParaView, with one step per mode, whose time is the number of the mode. Collective."""
     model, state = stepper.model, stepper.state
-    name, _ = NAMES[found.kind]
-    columns = {"time": (), "step": (), name: (), "eigenvalue": ()}
+    name, _ = MODE_VALUES[found.kind]
     case = model.case
-    with ResultWriter(
-        folder / MODES_FILE,
-        model.comm,
-        model.mesh,
-        point_fields=["displacement", name],
-        cell_fields=[],
-        columns=columns,
-        column_types={"step": np.int64},
-        case_text=case.to_toml(),
-        attributes={"name": case.name, "folder": str(case.folder.resolve()), "kind": found.kind, "axis": MODE.symbol},
-    ) as writer:
+    columns = {one: declared(one).dtype for one in ("time", "step", name, "eigenvalue")}
+    attributes = {"name": case.name, "folder": str(case.folder.resolve()), "kind": found.kind, "axis": MODE.symbol}
+    contents = Contents(["displacement", name], [], columns, case.to_toml(), attributes)
+    with ResultWriter(folder / MODES_FILE, model.comm, model.mesh, contents) as writer:
         for k, (value, eigenvalue) in enumerate(zip(found.values, found.eigenvalues, strict=True)):
             row = {"time": float(k + 1), "step": k + 1, name: value, "eigenvalue": eigenvalue}
             writer.append_history(row if model.comm.rank == 0 else None)
@@ -312,9 +161,32 @@ def _write_file(stepper: Stepper, found: Found, folder: Path) -> None:
             writer.write_snapshot(float(k + 1), k + 1, state.position, fields, {})
 
 
-def remove_modes(folder: Path, comm: object) -> None:
-    """Remove the file of modes of a continued run, which do not belong to its new end. Collective."""
-    on_root(comm, (folder / MODES_FILE).unlink, True)
+def _wave_times(case: Case, model: Model) -> dict[str, float]:
+    """Return the time [s] of a wave through the shortest bar at each wall, and at the supports, of all stages.
+
+    Collective.
+    """
+    sets: dict[str, list[str | None]] = {}
+    for stage in case.stages:
+        for wall in stage.wall:
+            sets.setdefault(f"wall/{wall.name}/force", []).append(wall.node_set)
+        for support in stage.support:
+            sets.setdefault("support_force", []).append(support.node_set)
+    mesh, bars, found = model.mesh, model.bars, {}
+    for column, names in sets.items():
+        members = np.zeros((mesh.n_local, 1))
+        for name in names:
+            members[: mesh.n_owned][slice(None) if name is None else model.nodes[name]] = 1.0
+        mesh.update_ghosts(members)
+        times = [np.inf]
+        for block in bars.blocks:
+            own = slice(block.start, block.stop)
+            near = (members[bars.ends[own], 0] > 0.0).any(axis=1)
+            if block.density > 0.0 and near.any():
+                shortest = float(bars.mesh_lengths[own][near].min())
+                times.append(shortest * float(np.sqrt(block.density / block.modulus)))
+        found[f"wave_time/{column}"] = model.comm.allreduce(min(times), op=MPI.MIN)
+    return found
 
 
 class Outputs:
@@ -339,7 +211,7 @@ class Outputs:
     ) -> None:
         self._stages, self._synchroniser, self._folder, self._quiet = stages, synchroniser, folder, quiet
         self._compilation = compilation
-        self.fields = self._fields()
+        self.fields = Fields(self._analysis.model, stages.fields)
         self.progress: Progress | None = None
         self.history: History | None = None
         self.snapshots: Snapshots | None = None
@@ -354,10 +226,6 @@ class Outputs:
     @property
     def _analysis(self) -> Analysis:
         return self._stages.analysis
-
-    def _fields(self) -> Fields:
-        names = self._stages.fields
-        return Fields(self._analysis.model, None if names is None else [*names[0], *names[1]])
 
     @property
     def is_open(self) -> bool:
@@ -384,43 +252,116 @@ class Outputs:
         PfemError
             On all ranks.
         """
-        analysis, folder = self._analysis, self._folder
-        case, stepper, model, plan = self._stages.case, analysis.stepper, analysis.model, self._stages.plan
-        checkpoints = Checkpoints(case, stepper, plan, folder)
+        stages, folder, plan = self._stages, self._folder, self._stages.plan
+        analysis, model = stages.analysis, stages.model
+        state = RunState(analysis.stepper)
         if restart is not None:
             # before any change to the folder, because the checkpoint may be refused
-            checkpoint = checkpoints.restore(restart)
+            state.restore(restart.file, stages.case.source)
+            self._continues = restart.continues
         aside = prepare_folder(model.comm, folder, restart, plan)
         notes = [*notes, *([] if aside is None else [f"{folder}: earlier results were moved to {aside}"])]
-        start = stepper.number, stepper.place
-        self.progress = open_progress(case, model, plan, start, folder, self._quiet, notes)
-        self._compilation.progress = self.progress
+        self.progress = self._compilation.progress = self._open_progress(notes)
         if restart is None:
             analysis.start()
             self._synchroniser.synchronise()
-        self._observe(checkpoints)
-        history = self.history
+        self._observe(state)
         if restart is not None:
-            self._continues = restart.continues
-            resume_observers(restart, checkpoint, checkpoints, history, self.snapshots)
-            place = f"step {start[0]}, {plan.axis.place(start[1])}"
-            tell_restart(restart, self.progress, place, model.external.functions)
-            remove_modes(folder, model.comm)
-        events = self._stages.events
-        self._writer = open_result_file(case, model, plan, history, self.fields, events, folder, restart, start[0])
-        history.writer = self.events.writer = self.snapshots.writer = self._writer
+            self.history.ledger.load_state(state.share(restart.scalars["ranks"])["ledger"])
+            self.history.load_state(restart.scalars)
+            self.snapshots.load_state(restart.scalars)
+            self._tell_restart(restart)
+            # the file of modes does not belong to the new end
+            on_root(model.comm, (folder / MODES_FILE).unlink, True)
+        kept = None
+        if self._continues:
+            self.checkpointing.last_step = restart.step
+            kept = Kept(analysis.stepper.number, *restart.last)
+        self._write_to(ResultWriter(folder / RESULT, model.comm, model.mesh, self._contents(), kept))
 
-    def _observe(self, checkpoints: Checkpoints) -> None:
+    def _open_progress(self, notes: Iterable[str]) -> Progress:
+        """Open the progress report and write summary, warnings and notes. Collective."""
+        stages, plan = self._stages, self._stages.plan
+        case, model, stepper = stages.case, stages.model, stages.analysis.stepper
+        progress = Progress(
+            model.comm,
+            printable(case.title),
+            plan.steps,
+            plan.end or 0.0,
+            self._quiet,
+            self._folder / "log.txt",
+            start_step=stepper.number,
+            start_time=stepper.place,
+            axis=plan.axis,
+        )
+        progress.summary(summarise(case, model, plan))
+        warnings = warnings_before(model.case, model, stages.analysis.plan)
+        for warning in model.warnings + odd_accelerations(case) + warnings:
+            progress.warning(warning)
+        for text in (*([plan.scheme.notice] if plan.scheme.notice else []), *notes):
+            progress.message(text)
+        return progress
+
+    def _tell_restart(self, restart: Restart) -> None:
+        """Report from where the run continues, what has changed, and missing functions. Collective."""
+        stepper, functions = self._analysis.stepper, self._stages.model.external.functions
+        place = f"step {stepper.number}, {self._stages.plan.axis.place(stepper.place)}"
+        changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
+        self.progress.message(f"restart from {restart.path}: {place}{changes}")
+        before = int(restart.attributes.get("external_functions", 0))
+        if before != functions:
+            self.progress.warning(
+                f"{restart.path}: the run had {before} function{'s' * (before != 1)} for forces, and this one has "
+                f"{functions}: functions are not in checkpoints; register them by Simulation.external_force before the "
+                "run"
+            )
+
+    def _contents(self) -> Contents:
+        """Return what the result file is made for. Collective."""
+        stages, plan, recorder = self._stages, self._stages.plan, self.history.recorder
+        case, model = stages.case, stages.model
+        attributes: dict[str, Any] = {
+            "name": case.name,
+            "folder": str(case.folder.resolve()),
+            "overrides": list(case.overrides),
+            "axis": plan.axis.symbol,
+            "time_step": plan.step,
+            "linear_solver": plan.linear.why if plan.linear is not None else "none",
+            "partitioner": model.mesh.partitioner,
+        }
+        if case.stage:
+            attributes["stages"] = [stage.name for stage in case.stage]
+        if plan.steps is not None:
+            attributes["steps"] = plan.steps
+        for name, nodes in recorder.probe_nodes.items():
+            attributes[f"probe_nodes/{name}"] = nodes.tolist()
+        return Contents(
+            self.fields.points,
+            self.fields.cells,
+            recorder.columns,
+            case.to_toml(),
+            attributes | _wave_times(case, model),
+            {name: np.dtype(kind) for name, kind in stages.events.items()},
+            case.modes.kind if case.modes is not None else None,
+            case.output.precision,
+            case.output.compression == "gzip",
+        )
+
+    def _write_to(self, writer: ResultWriter) -> None:
+        self._writer = self.history.writer = self.events.writer = self.snapshots.writer = writer
+
+    def _observe(self, state: RunState) -> None:
         """Make the observers of the present stage. Collective."""
-        analysis, warn = self._analysis, self.progress.warning
+        stages, analysis, warn, tell = self._stages, self._analysis, self.progress.warning, self.progress.message
         stepper = analysis.stepper
-        self.history = History(stepper, analysis.plan, self._synchroniser, warn, self._stages.columns)
+        self.history = History(stages, self._synchroniser, warn)
         if hasattr(stepper, "message"):
             stepper.message = warn
-        self.events = Events(stepper, self.progress.message)
-        self.ruptures = RuptureReport(stepper, self.history, self.progress.message)
+        self.events = Events(stepper, tell)
+        self.ruptures = RuptureReport(stepper, self.history, tell)
         self.snapshots = Snapshots(analysis, self.fields, warn)
-        self.checkpointing = Checkpointing(checkpoints, self.history, self.snapshots, self._synchroniser)
+        saved = self.history, self.snapshots, self._synchroniser
+        self.checkpointing = Checkpointing(stages, self._folder / CHECKPOINT, state, *saved)
         self._report = ProgressReport(self.progress, analysis, self.history)
 
     def begin_stage(self) -> None:
@@ -431,25 +372,21 @@ class Outputs:
         SimulationFailure
             On all ranks, where the next stage cannot begin in the present state.
         """
-        stages, history, snapshots, last = self._stages, self.history, self.snapshots, self.checkpointing.last_step
-        writer = self._writer
+        stages, history, snapshots, last_step = self._stages, self.history, self.snapshots, self.checkpointing.last_step
         self._complete_stage()
         self.tell_remarks()
-        row = history.end_of_stage()
+        row = history.recorder.row()
         kick = stages.advance()
         stepper = stages.analysis.stepper
-        name, number = stepper.model.case.name, stages.number
         self.progress.message(
-            f"stage {name!r} ({number + 1} of {len(stages.case.stage)}) begins after step {stepper.number}, "
-            f"{stages.plan.axis.place(stepper.place)}"
+            f"stage {stages.model.case.name!r} ({stages.number + 1} of {len(stages.case.stage)}) begins after step "
+            f"{stepper.number}, {stages.plan.axis.place(stepper.place)}"
         )
-        self._synchroniser.follow(stages.analysis)
-        self.fields = self._fields()
-        checkpoints = Checkpoints(stages.case, stepper, stages.plan, self._folder)
-        checkpoints.last_step = last
-        self._observe(checkpoints)
-        self.history.go_on(history, row, kick)
-        self.events.writer = self.snapshots.writer = writer
+        self.fields = Fields(stages.model, stages.fields)
+        self._observe(RunState(stepper))
+        self.checkpointing.last_step = last_step
+        self.history.begin_stage(history, row, kick)
+        self._write_to(self._writer)
         self.snapshots.load_state(snapshots.kept())
 
     def _complete_stage(self) -> None:

@@ -3,36 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
 from ..analysis import Analysis
+from ..columns import declared
 from ..contact.contact import check_start
 from ..errors import InputError, SimulationFailure
+from ..fields import Fields
 from ..modes.find import describe_modes
 from ..modes.initial_state import InitialState
 from ..output.units import TIME as AXIS
-from ..output.units import Axis
 from ..preflight.inspection import warnings_of_stage
-from ..recording.recorder import Fields, Recorder, StageColumns
 from ..statics.analysis import StaticAnalysis
 from ..stepping.model import Model
 from ..stepping.plan import make_plan
 from ..stepping.stage import end_of_stage, hand_over
 from ..stepping.time_stepping import TimeStepping
 from ..tolerances import TIME
+from .recorder import Recorder
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..integrators.base import Scheme
-    from ..solvers.linear import LinearChoice
     from ..stepping.stepper import Stepper
 
 
-def make_analysis(model: Model, recorded: Mapping[str, Any] | None) -> Analysis:
+def _make_analysis(model: Model, recorded: Mapping[str, Any] | None) -> Analysis:
     """Create the analysis of a model's case. Collective.
 
     ``recorded``: record of the plan of the continued run, None for a new run
@@ -45,50 +43,24 @@ def make_analysis(model: Model, recorded: Mapping[str, Any] | None) -> Analysis:
     return TimeStepping(model, make_plan(model, recorded))
 
 
-@dataclass(frozen=True)
 class StagedPlan:
     """The plans of all stages on one axis; see :class:`~pfem_petsc.stepping.plan.Plan`.
 
     Attributes
     ----------
-    plans : of the stages
-    names : of the stages
+    plans, names : of the stages
+    scheme, linear, step : of the first stage
+    steps, end : of all stages together; None where that of one is not known before
+    axis : time [s]; a static stage takes as much of it as its load factor or points count
     """
 
-    plans: tuple[Any, ...]
-    names: tuple[str, ...]
-
-    @property
-    def scheme(self) -> Scheme:
-        """Of the first stage."""
-        return self.plans[0].scheme
-
-    @property
-    def linear(self) -> LinearChoice | None:
-        """Of the first stage."""
-        return self.plans[0].linear
-
-    @property
-    def step(self) -> float:
-        """Of the first stage."""
-        return self.plans[0].step
-
-    @property
-    def steps(self) -> int | None:
-        """Steps of all stages, None where that of one is not known before."""
-        counts = [plan.steps for plan in self.plans]
-        return None if None in counts else sum(counts)
-
-    @property
-    def end(self) -> float | None:
-        """Where the last stage ends, None where that is not known before."""
-        ends = [plan.end for plan in self.plans]
-        return None if None in ends else sum(ends)
-
-    @property
-    def axis(self) -> Axis:
-        """Time [s]; a static stage takes as much of it as its load factor or points count."""
-        return AXIS._replace(key=f"stage[{len(self.plans) - 1}].{self.plans[-1].axis.key}")
+    def __init__(self, plans: tuple[Any, ...], names: tuple[str, ...]) -> None:
+        self.plans, self.names = plans, names
+        self.scheme, self.linear, self.step = plans[0].scheme, plans[0].linear, plans[0].step
+        counts, ends = [plan.steps for plan in plans], [plan.end for plan in plans]
+        self.steps: int | None = None if None in counts else sum(counts)
+        self.end: float | None = None if None in ends else sum(ends)
+        self.axis = AXIS._replace(key=f"stage[{len(plans) - 1}].{plans[-1].axis.key}")
 
     def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Return which of the recorded steps and times are beyond the end."""
@@ -96,11 +68,9 @@ class StagedPlan:
 
     def entries(self, case: Case) -> dict[str, str]:
         """Label and text of what a user checks before a run."""
-        found = {}
-        for name, plan, stage in zip(self.names, self.plans, case.stages, strict=True):
-            texts = plan.entries(stage)
-            found[f"stage {name}"] = "; ".join(f"{label}: {text}" for label, text in texts.items())
-        return found
+        texts = [plan.entries(stage) for plan, stage in zip(self.plans, case.stages, strict=True)]
+        lines = ["; ".join(f"{label}: {text}" for label, text in each.items()) for each in texts]
+        return {f"stage {name}": line for name, line in zip(self.names, lines, strict=True)}
 
     def record(self) -> dict[str, Any]:
         """Choices that a restart must keep."""
@@ -125,9 +95,9 @@ class Stages:
     analysis : of the present stage
     plan : of the whole run
     functions : that give forces in the present stage and in those after it, see :meth:`call`
-    columns : of the history, None for a case without stages
-    fields : names of the fields to write (of nodes, of bars), None for a case without stages
-    events : columns of events
+    columns : of the history, name to type with the shape of a value, None for a case without stages
+    fields : names of the fields to write, None for a case without stages
+    events : columns of events and their types
 
     Raises
     ------
@@ -140,25 +110,25 @@ class Stages:
         self._cases = case.stages
         self.functions: list[Callable[..., Any]] = []
         self.analysis: Analysis
-        self.columns: StageColumns | None = None
-        self.fields: tuple[list[str], list[str]] | None = None
+        self.columns: dict[str, np.dtype] | None = None
+        self.fields: list[str] | None = None
+        self.events: dict[str, Any] = {}
         first = Model(self._cases[0], comm, later=self._cases[1:])
         if not case.stage:
-            self.analysis = make_analysis(first, recorded)
+            self.analysis = _make_analysis(first, recorded)
             self.plan = self.analysis.plan
-            self.events = self.analysis.stepper.event_columns
+            self.events |= self.analysis.stepper.event_columns
             return
-        self.events: dict[str, Any] = {}
         records = [None] * len(case.stage) if recorded is None else recorded["stages"]
-        self.columns = StageColumns()
+        self.columns = {name: declared(name).dtype for name in ("time", "step", "stage")}
         plans, warnings, told = [], [], []
         points, cells = {}, {}
         for k, (stage, record) in enumerate(zip(self._cases, records, strict=True)):
             model = first if k == 0 else Model(stage, comm, first.mesh)
-            analysis = make_analysis(model, record)
+            analysis = _make_analysis(model, record)
             plans.append(analysis.plan)
-            self.columns.add(Recorder(analysis.stepper, None))
-            self.events = {**self.events, **analysis.stepper.event_columns}
+            self.columns |= Recorder(analysis.stepper).columns
+            self.events |= analysis.stepper.event_columns
             fields = Fields(model)
             points |= dict.fromkeys(fields.points)
             cells |= dict.fromkeys(fields.cells)
@@ -173,7 +143,7 @@ class Stages:
             else:
                 analysis.close()
         self.plan = StagedPlan(tuple(plans), tuple(stage.name for stage in self._cases))
-        self.fields = list(points), list(cells)
+        self.fields = [*points, *cells]
         self.model.warnings = warnings
 
     @property
@@ -235,7 +205,7 @@ class Stages:
             for function in self.functions if stage.time is not None else ():
                 model.external.call(function)
             check_start(model.contact, old.state.position, model.size)
-            analysis = make_analysis(model, self.plan.plans[number].record())
+            analysis = _make_analysis(model, self.plan.plans[number].record())
         except InputError as error:
             raise SimulationFailure(f"{where}: {error}") from error
         hand_over(old.stepper, analysis.stepper)

@@ -8,11 +8,11 @@ import time
 import numpy as np
 from mpi4py import MPI
 
-from ..analysis import Analysis
 from ..errors import SimulationFailure
 from ..output.lock import FolderLock
 from ..output.units import duration
 from ..signals import SignalNotes, early
+from .stages import Stages
 
 _WALL_TIME = 1000  # code of the wall time, larger than all signal numbers
 
@@ -69,8 +69,7 @@ class Synchroniser:
 
     Parameters
     ----------
-    comm : MPI.Comm
-    analysis : Analysis
+    stages : Stages
     stop : StopRequest
     lock : FolderLock, renewed at each synchronisation
     interval : wall-clock time between checkpoints [s], None for none
@@ -81,30 +80,19 @@ class Synchroniser:
     checkpoint_due : whether the time between checkpoints has elapsed
     """
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        analysis: Analysis,
-        stop: StopRequest,
-        lock: FolderLock,
-        interval: float | None = None,
-    ) -> None:
-        self.comm, self.stop, self.interval = comm, stop, interval
-        self._analysis, self.lock = analysis, lock
+    def __init__(self, stages: Stages, stop: StopRequest, lock: FolderLock, interval: float | None = None) -> None:
+        self.comm, self.stop, self.interval = stages.comm, stop, interval
+        self._stages, self.lock = stages, lock
         self.request = 0
         self.checkpoint_due = False
         self._last_checkpoint = time.monotonic()
         self._last = (0, time.monotonic())
         self._next = 0
 
-    def follow(self, analysis: Analysis) -> None:
-        """Go on with the analysis of the next stage."""
-        self._analysis = analysis
-
     @property
     def alarm(self) -> bool:
         """Whether this rank has a fault."""
-        return self._analysis.fault is not None or self.stop.code != 0
+        return self._stages.analysis.fault is not None or self.stop.code != 0
 
     def due(self, step: int) -> bool:
         """Return whether all ranks synchronise after this step; equal on all ranks."""
@@ -122,8 +110,9 @@ class Synchroniser:
         PfemError
             On all ranks: the earliest fault, of the lowest rank that has one; later ones may be its consequences.
         """
-        fault, step = self._analysis.fault, self._analysis.stepper.number
-        since = self._analysis.stepper.fault_step if fault is not None else step
+        analysis = self._stages.analysis
+        fault, step = analysis.fault, analysis.stepper.number
+        since = analysis.stepper.fault_step if fault is not None else step
         try:
             self.lock.renew()
         except SimulationFailure as lost:

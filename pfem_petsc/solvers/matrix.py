@@ -187,7 +187,7 @@ class HessianMatrix:
         return self.mat
 
     def couple(self, links: Iterable) -> None:
-        """Set the coordinates of links (``contact.links.LinkCoordinates``) for steps with bounds. Collective."""
+        """Set the coordinates of links (``contact.transform.RowCoordinates``) for steps with bounds. Collective."""
         for link in links:
             matrix = link.matrix()
             if not self._chain:

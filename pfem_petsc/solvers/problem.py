@@ -36,7 +36,7 @@ class Mechanics(Protocol):
 class Coordinates(Protocol):
     """Coordinates w of a solve, u = T w, in which each row of contact is a bound on one unknown.
 
-    Implemented by :class:`~pfem_petsc.contact.links.Transform`, which describes the methods.
+    Implemented by :class:`~pfem_petsc.contact.transform.Transform`, which describes the methods.
 
     Attributes
     ----------

@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..contact.links import Transform
+from ..contact.transform import Transform
 from ..errors import NotConverged
 from ..solvers.lagged import LaggedPreconditioner
 from ..solvers.linear import DIRECT, LinearChoice, configure, is_failed_factorisation, linear_reason
@@ -65,7 +65,7 @@ class BorderedSystem:
     ) -> None:
         self.model, self.hessian, self.lagged, self.scheme = model, hessian, lagged, scheme
         self._unit = unit
-        self._transform = Transform(model)
+        self._transform = Transform(model.mesh)
         self.direct = choice.krylov == "preonly"
         self.linear = 0
         mesh = model.mesh
@@ -244,7 +244,7 @@ def free_motions(model: Model, state: State) -> str:
     if not names_motions(model):
         return ""
     matrix = HessianMatrix(model.mesh, model.supports)
-    problem = StepProblem(model, state, Equilibrium().balance(state, 0.0), state.external, Transform(model))
+    problem = StepProblem(model, state, Equilibrium().balance(state, 0.0), state.external, Transform(model.mesh))
     matrix.update(problem, np.zeros_like(state.position))
     scale = model.comm.allreduce(float(model.nodal_stiffness.max(initial=0.0)), op=MPI.MAX)
     stability = Stability(model, matrix)

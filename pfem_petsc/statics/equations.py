@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from petsc4py import PETSc
 
-from ..contact.links import Transform
+from ..contact.transform import Transform
 from ..errors import InputError
 from ..parallel.agreement import agreed
 from ..solvers.matrix import HessianMatrix
@@ -33,7 +33,7 @@ class Equations:
 
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
-        self._transform = Transform(stepper.model)
+        self._transform = Transform(stepper.model.mesh)
         self._hessian: tuple[int, HessianMatrix] | None = None
 
     def positions(self, at: float) -> PETSc.Vec:

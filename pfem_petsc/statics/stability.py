@@ -209,8 +209,7 @@ def held_nodes(model: Model, walls: WallForces) -> np.ndarray:
     held[walls.nodes[walls.touching[:, special].any(axis=1)]] = True
     if contact.ties.any:
         held[contact.ties.nodes()[0]] = True
-    for link in model.links:
-        link.mark(held)
+    model.links.mark(held)
     return held
 
 

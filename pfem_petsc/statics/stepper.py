@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.links import Transform
+from ..contact.transform import Transform
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import DIRECT, LinearChoice
@@ -114,7 +114,7 @@ class StaticStepper(ImplicitStepper):
         state.a = lack / model.inertia.mass[:, None]
         self.totals_at_start = self.totals()
         self.scheme.start(state, self.h)
-        model.contact.motion.start(self.h)
+        model.contact.motion.bodies.start(self.h)
 
     def recorded(self) -> tuple[np.ndarray, np.ndarray]:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`; without acceleration."""
@@ -230,7 +230,7 @@ class StaticStepper(ImplicitStepper):
         if direct:
             return -1
         balance = Equilibrium().balance(state, 0.0)
-        problem = StepProblem(model, state, balance, state.external, Transform(model))
+        problem = StepProblem(model, state, balance, state.external, Transform(model.mesh))
         self.hessian.put(problem, bars)
         held = held_nodes(model, walls)
         held[walls.nodes[walls.touching.any(axis=1)]] = True

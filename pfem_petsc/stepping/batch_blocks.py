@@ -9,14 +9,14 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
+from ..columns import HEAD
 from ..contact.explicit import find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows, solve_rows
-from ..contact.impact import join_nodes, plane_gaps, stop_nodes, unpressed
+from ..contact.impact import Approach, join_nodes, plane_gaps, stop_nodes, unpressed
 from ..integrators._leapfrog import advance, advance_loaded, centre, kick, move
 from ..mechanics.columns import join_planes, split_planes
 from ..mechanics.compiled import borrowing, kernel
 from ..mesh.ordering import NODE_BLOCK
-from ..output.sums import HEAD
 from .explicit import accelerations, explicit_increments, hold_still
 from .impulses import WALLS, fill_impulses
 from .ledger_loops import (
@@ -190,9 +190,7 @@ def pass_block(block, finished, pressing, rows, alone, nodes, shared, f, u, cont
         first = NODE_BLOCK * block
         last = min(first + NODE_BLOCK, n)
         solve_block(block, nodes, shared, f, 0, shared.speeds[: 3 * (last - first)], u[first:last].reshape(-1))
-    count, changed = solve_rows(
-        block, rows, shared.x, shared.h, shared.half, nodes.mass, nodes.damping, shared.alpha, shared.eta, u, contact
-    )
+    count, changed = solve_rows(block, rows, nodes, shared, u, contact)
     pressing += count
     while finished < len(rows.ready) and rows.ready[finished] <= block:
         if alone[finished]:
@@ -222,7 +220,7 @@ def _add_pushes(block, rows, contact, speeds, sums):
 @kernel
 def sum_rows(rows, pressing):
     """Write the forces on the second nodes of each table to ``rows.totals``, as
-    :func:`~pfem_petsc.contact.pair_loops.table_forces` does; ``pressing`` rows have a force."""
+    :func:`~pfem_petsc.contact.constraint_set.last_forces` does; ``pressing`` rows have a force."""
     force, normals, place = rows.force, rows.normals, rows.place
     for k in range(len(rows.totals)):
         x = y = z = 0.0
@@ -253,7 +251,7 @@ def finish_rows(rows, changed, slack, x, half, nodes, alpha, eta, u, v, a, conta
         for i in around:
             centre(u[i], eta, half[i], v[i])
             accelerations(u[i], alpha, a[i])
-        free_v, free_a = unpressed(around, v, a, contact, nodes.mass, nodes.damping, alpha, eta)
+        free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
         for m in range(count):
             i = around[m]
             ends[end, m, 9] = nodes.mass[i]
@@ -264,12 +262,12 @@ def finish_rows(rows, changed, slack, x, half, nodes, alpha, eta, u, v, a, conta
                 ends[end, m, 3 + c] = v[i, c] if fixed else free_v[m, c]
                 ends[end, m, 6 + c] = a[i, c] if fixed else free_a[m, c]
     counted = np.ones(len(force), dtype=np.bool_)
-    return close_rows(at, ends, rows.normals, rows.least, rows.along, counted, slack, force, closed)
+    return close_rows(rows, at, ends, counted, slack)
 
 
 class Pressed(NamedTuple):
-    """Results of :func:`~pfem_petsc.contact.flat.press_nodes` for all blocks of a step: room for ``nodes`` (n,), the
-    planes that they are ``touching`` (n, w), and their ``places`` (n, 3); ``offsets`` (w,) of the infeasible node; and
+    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` for all blocks of a step: room for ``nodes`` (n,),
+    the planes that they are ``touching`` (n, w), their ``places`` (n, 3); ``offsets`` (w,) of the infeasible node; and
     the sums of each wall, ``force`` (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
 
     nodes: np.ndarray
@@ -301,7 +299,7 @@ def mark_blocks(marks, nodes, value):
 def find_pressed(block, walls, free):
     """Write the nodes of a block that lie beyond a plane at ``free`` (3 m,) to ``walls.room``; return their number."""
     first = NODE_BLOCK * block
-    return find_beyond(first, free, walls.normals, walls.offsets, walls.all_nodes, walls.members, walls.room)
+    return find_beyond(first, free, walls, walls.room)
 
 
 @kernel
@@ -313,7 +311,6 @@ def press_block(block, m, nodes, walls, free, u, alpha, eta, contact, pressed, c
     ``free``, ``u``: positions and increments of the nodes of the block, flat.
     """
     first = NODE_BLOCK * block
-    planes = (walls.normals, walls.offsets, walls.all_nodes, walls.members)
     damped = len(nodes.damping) > 0
     found = walls.room[:m].copy()
     places, stiffness = np.empty((m, 3)), np.empty(m)
@@ -322,10 +319,7 @@ def press_block(block, m, nodes, walls, free, u, alpha, eta, contact, pressed, c
         stiffness[j] = alpha * nodes.mass[i] + (eta * nodes.damping[i] if damped else 0.0)
         for c in range(3):
             places[j, c] = free[3 * (i - first) + c]
-    sums = (pressed.force, pressed.contacts, pressed.moment)
-    infeasible, offsets, total, touching = press_nodes(
-        found, places, walls.fixed, *planes, walls.tolerance, stiffness, *sums
-    )
+    infeasible, offsets, total, touching = press_nodes(found, places, walls, stiffness, pressed)
     for j in range(m):
         i = found[j]
         for c in range(3):
@@ -357,30 +351,16 @@ def stop_at_walls(x, half, nodes, walls, alpha, eta, u, v, a, contact, touched, 
         centre(u[i], eta, half[i], v[i])
         accelerations(u[i], alpha, a[i])
     all_normals, gaps = plane_gaps(around, x, walls.normals, walls.offsets)
-    free_v, free_a = unpressed(around, v, a, contact, nodes.mass, nodes.damping, alpha, eta)
+    free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
     for j in range(len(around)):
         i = around[j]
         for c in range(3):
             if walls.fixed[i, c]:  # wall forces do not change prescribed components
                 free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
     still = np.zeros(walls.normals.shape)
-    return stop_nodes(
-        around,
-        walls.touching,
-        walls.closed,
-        all_normals,
-        gaps,
-        free_v,
-        free_a,
-        still,
-        still,
-        nodes.mass,
-        walls.fixed,
-        walls.restitution,
-        np.ones(len(walls.offsets), dtype=np.bool_),
-        walls.slack,
-        np.empty(gaps.shape),
-    )
+    approach = Approach(all_normals, gaps, free_v, free_a, still, still)
+    counted = np.ones(len(walls.offsets), dtype=np.bool_)
+    return stop_nodes(around, approach, walls, nodes.mass, counted, np.empty(gaps.shape))
 
 
 @kernel

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..columns import HEAD
 from ..contact.forces import compare_contacts
 from ..integrators._leapfrog import centre
 from ..mechanics.bar_loops import first_inverted
@@ -15,7 +16,6 @@ from ..mechanics.columns import Columns, Sweep, gather_history, slide_planes, sp
 from ..mechanics.compiled import borrowing, kernel
 from ..mechanics.rows import CHUNK, new_rows
 from ..mesh.ordering import NODE_BLOCK
-from ..output.sums import HEAD
 from .batch_blocks import (
     advance_block,
     complete,
@@ -141,7 +141,7 @@ class ImpulseArrays(NamedTuple):
 
 
 class ProbeArrays(NamedTuple):
-    """Nodes of all probes, see :meth:`~pfem_petsc.recording.recorder.Recorder.probed`."""
+    """Nodes of all probes, see :meth:`~pfem_petsc.run.recorder.Recorder.probed`."""
 
     nodes: np.ndarray
     places: np.ndarray

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
+from ..columns import ENERGIES, HEAD, WALL
 from ..contact.forces import WallForces
-from ..energies import ENERGIES
 from ..errors import SimulationFailure
 from ..mechanics.bar_loops import fused_parts
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.columns import Columns, make_columns, new_planes, no_columns
 from ..mesh.ordering import NODE_BLOCK
-from ..output.sums import HEAD, WALL
 from ..parallel.heap import return_freed_memory
 from ..tolerances import PROJECTED
 from .batch_loop import BarArrays, ImpulseArrays, NodeArrays, ProbeArrays, StateArrays, WallArrays, make_fused_loop
@@ -22,8 +21,6 @@ from .ledger import LeapfrogLedger
 from .stepper import Solution
 
 if TYPE_CHECKING:
-    from ..recording.observers import History
-    from ..recording.recorder import Recorder
     from .ledger import Ledger
     from .stepper import Stepper
     from .time_stepping import TimeStepping
@@ -45,10 +42,10 @@ class Batch:
 
     Attributes
     ----------
-    sums : (:data:`MOST`, width) for each step, the sums that :meth:`~pfem_petsc.recording.recorder.Recorder.row` uses
+    sums : (:data:`MOST`, width) for each step, the sums that :meth:`~pfem_petsc.run.recorder.Recorder.row` uses
     """
 
-    def __init__(self, stepper: Stepper, ledger: LeapfrogLedger, recorder: Recorder) -> None:
+    def __init__(self, stepper: Stepper, ledger: LeapfrogLedger, recorder: Any) -> None:
         self.stepper, self.ledger = stepper, ledger
         model = stepper.model
         self.model = model
@@ -88,7 +85,6 @@ class Batch:
         self._walls = WallArrays(*walls, PROJECTED * model.size, *work, *impact)
         self._probes = ProbeArrays(*recorder.probed())
         self._messages = model.mesh.messages()
-        self._lender = model.links.lender
         alpha, eta = 1.0 / (stepper.h * stepper.h), 0.5 / stepper.h
         stiffness = alpha * inertia.mass + (eta * inertia.damping if inertia.damped else 0.0)
         self._stiffness = stiffness if model.links else np.empty(0)
@@ -171,7 +167,7 @@ class Batch:
         if self._first:
             return_freed_memory()
             self._first = False
-        rows = self._lender.lend_rows(self._stiffness)
+        rows = self.model.links.export_rows(self._stiffness)
         done, lost, changed, failed, turned, infeasible, offsets, kinetic, u, touched, log.last, met, held = self._loop(
             len(due),
             stepper.h,
@@ -193,7 +189,7 @@ class Batch:
             due,
             self.sums,
         )
-        self._lender.take_rows(rows)
+        self.model.links.import_rows(rows)
         if lost:
             raise MPI.Exception(lost)
         state.support = support if self.model.supports.any else stepper.zero
@@ -240,7 +236,7 @@ class Batches:
         """The same for the next stage."""
         return Batches(self._min_steps)
 
-    def advance(self, analysis: TimeStepping, history: History, left: int) -> bool:
+    def advance(self, analysis: TimeStepping, history: Any, left: int) -> bool:
         """Make fused steps that need only rows of the history.
 
         Parameters

@@ -15,6 +15,7 @@ from petsc4py import PETSc
 
 from ..contact.active_set import ActiveSet
 from ..contact.contact import Candidates
+from ..contact.transform import RowCoordinates
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.lagged import LaggedPreconditioner
@@ -101,7 +102,7 @@ class HalvedSteps(Stepper):
     def _set_part(self, part: float) -> None:
         if part != self.part:
             self.scheme.step_changed(self.state)
-            self.model.contact.motion.step_changed(self.scheme)
+            self.model.contact.motion.bodies.step_changed(self.scheme)
             self.step_changed = True
             self.part = part
         self.smallest = min(self.smallest, part)
@@ -143,7 +144,7 @@ class ImplicitStepper(HalvedSteps):
             self.lagged = LaggedPreconditioner(
                 model, choice.preconditioner, symmetric, self.scheme.symmetric, choice.matrix_free
             )
-        self.links = [link.coordinates() for link in model.links]
+        self.links = [RowCoordinates(model.links)] if model.links else []
         self.hessian.couple(self.links)
         if self.lagged is not None:
             self.lagged.inner.couple(self.links)
@@ -229,7 +230,7 @@ class ImplicitStepper(HalvedSteps):
 
     def solve(self, balance: Balance) -> Solution:
         state, links = self.state, self.model.links
-        kept = state.contact, state.support, self.held, links.save()
+        kept = state.contact, state.support, self.held, links.state
         try:
             solution = self._with_walls(balance)
             # an explicit scheme with consistent mass has one solution only
@@ -240,7 +241,7 @@ class ImplicitStepper(HalvedSteps):
                     raise NotConverged(f"{self.when(balance)}: {reason}; {remedy}", reason.partition(":")[0])
         except NotConverged:
             state.contact, state.support, self.held, forces = kept
-            links.restore(forces)
+            links.state = forces
             raise
         return solution
 

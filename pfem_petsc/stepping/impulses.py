@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..columns import HEAD, PAIR, WALL
 from ..integrators.base import State
 from ..mechanics.compiled import kernel
-from ..output.sums import HEAD, PAIR, WALL
 from ..tolerances import RANK
 
 if TYPE_CHECKING:

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
+from ..columns import ENERGIES, HEAD
 from ..contact.impact import Impacts
-from ..energies import ENERGIES
 from ..mechanics.bars import StrainEnergy, state_before_rupture
 from ..mechanics.conserving import MEASURES
 from ..mechanics.materials.base import SMALL
-from ..output.sums import HEAD
 from .impulses import Impulses, NoImpulses, wall_shares
 from .ledger_loops import (
     DAMPING,
@@ -244,7 +243,7 @@ class Ledger:
 
     Attributes
     ----------
-    sums : of a row, in the layout of :data:`~pfem_petsc.output.sums.HEAD`: works and dissipations since the start [J],
+    sums : of a row, in the layout of :data:`~pfem_petsc.columns.HEAD`: works and dissipations since the start [J],
         and totals of this rank's nodes at the present state; valid after :meth:`complete`
     impulses : Impulses
     impacts : Impacts

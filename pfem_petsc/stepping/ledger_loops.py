@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..energies import BAR_ENERGIES
+from ..columns import BAR_ENERGIES, HEAD, PAIR, WALL
 from ..mechanics.compiled import inlined, kernel
-from ..output.sums import HEAD, PAIR, WALL
 from .impulses import WALLS
 
 WORKS = ("external", "contact", "damping", "inertial", "internal")
@@ -260,7 +259,7 @@ def add_works(sums, works, step) -> None:
 
     Parameters
     ----------
-    sums : (HEAD.width,) in the layout of :data:`~pfem_petsc.output.sums.HEAD`
+    sums : (HEAD.width,) in the layout of :data:`~pfem_petsc.columns.HEAD`
     works : (5,) see :data:`WORKS`
     step : StepWorks
     """

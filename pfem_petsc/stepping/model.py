@@ -9,11 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.constraint_link import ConstraintLink
+from ..contact.constraint_set import ConstraintSet
 from ..contact.contact import Contact, adjust_start
-from ..contact.links import Link, Links
-from ..contact.pair_link import PairLink
-from ..contact.pairs import ContactPairs
 from ..errors import InputError
 from ..mechanics.bars import Bars, area_fields, check_areas, named_groups, section_of_bars
 from ..mechanics.compiled import kernel
@@ -80,35 +77,9 @@ class StageStart:
         return cls(int(scalars["step"]), float(scalars["time"]), **arrays, **vectors, walls=walls)
 
 
-def make_links(
-    case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, fixed: np.ndarray, contact: Contact
-) -> tuple[Links, ContactPairs | None]:
-    """Create all links in the order in which a step treats them; also return the contact pairs. Collective.
-
-    Parameters
-    ----------
-    case : Case
-    nodes : owned local indices of each node set
-    mesh : Mesh
-    fixed : (owned, 3) bool, prescribed components
-    contact : Contact
-
-    Raises
-    ------
-    InputError
-        On all ranks, for nodes that cannot be paired, or a constraint with invalid keys.
-    """
-    links: list[Link] = []
-    pairs = None
-    if case.contact_pair:
-        pairs = ContactPairs(case, nodes, mesh, fixed, contact)
-        links.append(PairLink(pairs))
-    if case.constraint:
-        links.append(ConstraintLink(case, nodes, mesh, fixed, contact))
-    return Links(links), pairs
-
-
-def refuse_inclined(source: str, mesh: DistributedMesh, nodes: np.ndarray, contact: Contact, links: Links) -> None:
+def refuse_inclined(
+    source: str, mesh: DistributedMesh, nodes: np.ndarray, contact: Contact, links: ConstraintSet
+) -> None:
     """Refuse walls, contact pairs and constraints at owned nodes (m,) with such supports. Collective.
 
     Raises
@@ -126,13 +97,12 @@ def refuse_inclined(source: str, mesh: DistributedMesh, nodes: np.ndarray, conta
                     f"{source}: wall {name!r}: {what} {both.min()}, which the wall could also stop: contact "
                     "requires supports along axes; give the wall a node_set without such nodes"
                 )
-        for link in links:
-            both = np.intersect1d(numbers, link.numbers)
-            if len(both):
-                raise InputError(
-                    f"{source}: contact_pair, constraint: {what} {both[0]}, which is part of one: these require "
-                    "supports along axes"
-                )
+        both = np.intersect1d(numbers, links.rows.numbers)
+        if len(both):
+            raise InputError(
+                f"{source}: contact_pair, constraint: {what} {both[0]}, which is part of one: these require "
+                "supports along axes"
+            )
 
 
 @kernel
@@ -155,7 +125,7 @@ class Model:
     nodal_stiffness : (owned,) sum of E A/l0 of a node's bars [N/m]
     node_rounding, rounding : residuals of nodes (owned,) due to rounding of positions [N], and their 2-norm
     warnings : about the mesh
-    links : pairs and constraints that couple nodes to nodes, see :mod:`pfem_petsc.contact.links`
+    links : ConstraintSet, pairs and constraints that couple nodes to nodes
     can_touch : whether nodes can touch walls or each other
     start : where a stage starts from, None for the start of a run
     """
@@ -184,7 +154,7 @@ class Model:
             self.temperatures = Temperatures(case, mesh, self.bars)
             self.rest_lengths = RestLengths(case, self.bars)
         self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
-        self.links, self.pairs = make_links(case, self.nodes, mesh, self.supports.fixed, self.contact)
+        self.links = ConstraintSet(case, self.nodes, mesh, self.supports.fixed, self.contact)
         self.can_touch = self.contact.any or bool(self.links)
         if self.supports.inclined is not None:
             refuse_inclined(case.source, mesh, self.supports.inclined.nodes, self.contact, self.links)
@@ -273,7 +243,7 @@ class Model:
     @property
     def steady(self) -> bool:
         """Whether the model is constant in time, and the fused loop supports its bars and contact."""
-        return self.constant and self.links.lender is not None
+        return self.constant and self.links.batched
 
     def initial_velocity(self) -> np.ndarray:
         """Return initial velocities (owned, 3) [m/s]; later ``[initial]`` tables override earlier ones. Collective."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.links import Transform
+from ..contact.transform import Transform
 from ..integrators.base import Balance, State
 from ..solvers.matrix import HessianMatrix
 

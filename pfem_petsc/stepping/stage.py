@@ -52,9 +52,8 @@ def hand_over(old: Stepper, new: Stepper) -> None:
 
 
 def _hand_over_links(old: Model, new: Model) -> None:
-    saved = old.links.save()
     new.links.load_state({name: values.copy() for name, (_, values) in old.links.arrays().items()})
-    new.links.restore(saved)
+    new.links.state = old.links.state
 
 
 def _hand_over_contact(old: Stepper, new: Stepper) -> None:

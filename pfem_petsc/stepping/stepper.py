@@ -378,10 +378,10 @@ class Stepper(ABC):
         if model.bars.viscous and self.scheme.solves_next_position:  # the rate half a step before, to extrapolate from
             half = self.on_all(state.memory["half_velocity"])
             model.bars.set_rates(state.x, state.x - (0.5 * self.h) * half, (1.0 - EXTRAPOLATED) * half, 0.0)
-        motion = model.contact.motion
-        motion.start(self.h)
+        bodies = model.contact.motion.bodies
+        bodies.start(self.h)
         if self.scheme.solves_next_position:
-            v, speeds = state.v, motion.speeds
+            v, speeds = state.v, bodies.state.v
             for phase in (self._set_balance, self._solve_balance, self._finish):
                 phase(state.time)
             self.totals_solved = self.totals()
@@ -389,7 +389,7 @@ class Stepper(ABC):
                 self.velocity_solved = state.v
             # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
             state.v = v
-            motion.set_speeds(speeds)
+            bodies.state.v = speeds
 
     def start_without_motion(self) -> None:
         """Initialise positions, internal forces and loads at time zero, where nothing moves. Collective."""
@@ -608,7 +608,7 @@ class Stepper(ABC):
         if self.prescribed.moving:
             self.prescribed.prescribe(self.balance)
         model.inertia.change(sum(weight * time for weight, time in self.balance.loads))
-        model.contact.motion.begin(state.time, self.part)
+        model.contact.motion.bodies.begin(state.time, self.part)
         state.external = self.load_of(self.balance)
         if self.scheme.inertial:
             model.bars.step = self.balance.time - state.time
@@ -626,9 +626,9 @@ class Stepper(ABC):
         scheme.finish(state, found, self.solution.u, self.part)
         if scheme.solves_next_position and self.prescribed.moving:
             self.prescribed.take_rates(state.time)
-        contact.motion.finish(self.part, end)
+        contact.motion.bodies.finish(self.part, end)
         if scheme.turns_held and self.treatment is None:
-            contact.calm(fresh, state.v, found.time, self.part)
+            contact.damp_velocity(fresh, state.v, found.time, self.part)
 
     def _place_supports(self, end: float) -> None:
         """Give supports that move their exact positions and rates."""

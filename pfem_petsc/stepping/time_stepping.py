@@ -116,7 +116,7 @@ def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) ->
                 "not rows over time"
             )
         model.contact.motion.bodies = FreeWalls(walls, plan.scheme, model.comm, tuple(model.external.gravity))
-    model.links.check(model, plan.linear is None)
+    model.links.check(model.case.contact.treatment, model.size)
     for k, name in enumerate(model.contact.names):
         key = f"{model.case.source}: wall {name!r}"
         if model.contact.restitution[k]:

@@ -1,4 +1,8 @@
-"""Processes that make the runs of a sweep, several at a time; none is forked from a process in which MPI runs."""
+"""Processes that make the runs of a sweep, several at a time, and what such a process does.
+
+None is forked from a process in which MPI runs. Tasks come to a process through stdin and reports leave through stdout,
+as pickles; what libraries print goes to stderr.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +15,14 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
-from .worker import Report, Task
-
-__all__ = ["environment", "performed"]
+if TYPE_CHECKING:
+    from ..case.schema import Case
 
 OF_A_LAUNCH = (
     *("PMIX_", "PMI_", "OPAL_", "ORTE_", "PRTE_LAUNCHED", "OMPI_COMM_", "OMPI_APP_", "OMPI_UNIVERSE_", "OMPI_FILE_"),
@@ -24,6 +31,24 @@ OF_A_LAUNCH = (
 """Variables that a launcher of MPI sets, and that would make another process a rank of the same job."""
 
 _PATIENCE = 10.0  # seconds in which a process that is told to end must end
+_WATCH = 1.0  # seconds between two looks for the parent process
+
+
+class Task(NamedTuple):
+    """A run: case, folder of the results, and limit of its wall time [s], None for none."""
+
+    case: Case
+    output: Path
+    wall_time: float | None
+
+
+class Report(NamedTuple):
+    """How a run has ended: exit status, message, wall time [s] and number of steps."""
+
+    status: int
+    message: str
+    wall_time: float
+    steps: int
 
 
 def environment() -> dict[str, str]:
@@ -33,12 +58,11 @@ def environment() -> dict[str, str]:
 
 
 class _Process:
-    """A worker in a separate process, started with its first task, and again after it has ended."""
+    """A separate process for tasks, started with its first one, and again after it has ended."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the process lives
-        self._ended = False
 
     def perform(self, task: Task) -> Report:
         """Send a task, and wait for the report."""
@@ -46,34 +70,28 @@ class _Process:
             self._errors.seek(0)
             self._errors.truncate()
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "pfem_petsc.studies.worker"],
+                [sys.executable, "-m", "pfem_petsc.studies.pool"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
                 env=environment(),
-                start_new_session=True,  # Ctrl-C reaches this process alone, which ends the workers
+                start_new_session=True,  # Ctrl-C reaches this process alone, which ends the others
             )
-        process = self._process
         try:
-            pickle.dump(task, process.stdin)
-            process.stdin.flush()
-            return Report(*pickle.load(process.stdout))
+            pickle.dump(task, self._process.stdin)
+            self._process.stdin.flush()
+            return Report(*pickle.load(self._process.stdout))
         except (OSError, EOFError, pickle.UnpicklingError):
-            status = process.wait()
+            status = self._process.wait()
             self.close()
-            return Report(status or 1, self._last_words(status), float("nan"), 0)
-
-    def _last_words(self, status: int) -> str:
-        if self._ended:
-            return "the run was ended"
-        how = f"by {signal.Signals(-status).name}" if status < 0 else f"with status {status}"
-        self._errors.seek(0)
-        lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        return f"the process of the run ended {how}" + (f": {lines[-1]}" if lines else "")
+            how = f"by {signal.Signals(-status).name}" if status < 0 else f"with status {status}"
+            self._errors.seek(0)
+            lines = ["", *self._errors.read().decode(errors="replace").strip().splitlines()]
+            message = f"the process of the run ended {how}" + (f": {lines[-1]}" if lines[-1] else "")
+            return Report(status or 1, message, float("nan"), 0)
 
     def end(self) -> None:
         """End a run at once; may be called from another thread."""
-        self._ended = True
         process = self._process
         if process is not None:
             process.terminate()
@@ -97,42 +115,77 @@ def performed(tasks: Sequence[Task], processes: int) -> Iterator[tuple[int, Repo
 
     If the iteration is left before its end, runs in progress are ended, and no others begin.
     """
-    waiting: queue.SimpleQueue[int] = queue.SimpleQueue()
-    done: queue.SimpleQueue[tuple[int, Report | BaseException]] = queue.SimpleQueue()
-    for number in range(len(tasks)):
-        waiting.put(number)
+    workers = [_Process() for _ in range(max(min(processes, len(tasks)), 1))]
+    idle: queue.SimpleQueue[_Process] = queue.SimpleQueue()
     stopped = threading.Event()
-    workers = [_Process() for _ in range(min(processes, len(tasks)))]
 
-    def work(worker: _Process) -> None:
+    def with_next(task: Task) -> Report:
+        worker = idle.get()
         try:
-            while not stopped.is_set():
-                try:
-                    number = waiting.get_nowait()
-                except queue.Empty:
-                    return
-                try:
-                    done.put((number, worker.perform(tasks[number])))
-                except Exception as error:  # noqa: BLE001 - raised by the main thread
-                    done.put((number, error))
+            return worker.perform(task)
         finally:
-            worker.close()
+            idle.put(worker)
+            if stopped.is_set():
+                worker.close()
 
-    threads = [threading.Thread(target=work, args=(worker,), daemon=True) for worker in workers]
-    for thread in threads:
-        thread.start()
-    ended = 0
-    try:
-        while ended < len(tasks):
-            number, report = done.get()
-            if isinstance(report, BaseException):
-                raise report
-            ended += 1
-            yield number, report
-    finally:
-        if ended < len(tasks):
+    with contextlib.ExitStack() as ending, ThreadPoolExecutor(len(workers)) as pool:
+        for worker in workers:
+            ending.callback(worker.close)
+            idle.put(worker)
+        runs = {pool.submit(with_next, task): number for number, task in enumerate(tasks)}
+        try:
+            for run in as_completed(runs):
+                yield runs[run], run.result()
+        finally:
             stopped.set()
-            for worker in workers:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for worker in workers if not all(run.done() for run in runs) else ():
                 worker.end()
-        for thread in threads:
-            thread.join()
+
+
+def perform(task: Task) -> Report:
+    """Execute a run in this process, and return its outcome."""
+    from mpi4py import MPI
+
+    from ..errors import PfemError
+    from ..simulation import Simulation
+
+    begin, steps = time.perf_counter(), 0
+    status, message = 0, ""
+    try:
+        with Simulation(
+            task.case, MPI.COMM_SELF, output=task.output, quiet=True, wall_time=task.wall_time
+        ) as simulation:
+            try:
+                status = simulation.run()
+            finally:
+                steps = simulation.stepper.number
+    except PfemError as error:
+        status, message = error.exit_status, str(error)
+    except Exception as error:  # noqa: BLE001 - whatever it is becomes a row of the table
+        status, message = 1, f"{type(error).__name__}: {error}"
+    return Report(status, message, time.perf_counter() - begin, steps)
+
+
+def _follow_parent() -> None:
+    """Stop the run in progress, with a checkpoint, when the process that makes the sweep has gone. Runs in a thread."""
+    parent = os.getppid()
+    while os.getppid() == parent:
+        time.sleep(_WATCH)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _main() -> None:
+    """Perform tasks until there are no more, or nobody is there to give them."""
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    with contextlib.suppress(EOFError):
+        while True:
+            report = perform(pickle.load(sys.stdin.buffer))
+            pickle.dump(tuple(report), replies)
+            replies.flush()
+
+
+if __name__ == "__main__":
+    _main()

@@ -5,24 +5,23 @@ from __future__ import annotations
 import itertools
 import re
 import shutil
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from ..case.schema import Case
-from ..energies import LOST, STORED, SUPPLIED
+from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.peaks import peak_force, touch_impulse
-from ..output.result import Result, open_result
+from ..output.result import Result, open_result, peak_force, touch_impulse
 from ..output.table import Table, flat_columns
-from .pool import performed
-from .progress import SweepProgress
-from .worker import Report, Task
+from ..output.units import duration
+from .pool import Report, Task, performed
 
-__all__ = ["sweep"]
-
+_BETWEEN = 10.0  # seconds between lines of progress where they are not rewritten
 _OWN = ("run", "status", "message", "wall_time", "steps")
 """Columns that a table has besides parameters and results."""
 
@@ -79,27 +78,37 @@ def sweep(
     if not isinstance(processes, int) or isinstance(processes, bool) or processes < 1:
         raise InputError(f"sweep: processes = {processes!r}: give a positive whole number")
     _require_one_rank()
-    folder = Path(output) if output is not None else Path("results") / f"{case.name}-sweep"
+    if results is not None and not callable(results) and not isinstance(results, Mapping):
+        raise InputError(f"sweep: results = {results!r:.60}: expected a function, or functions by name")
+    asked = list(results) if isinstance(results, Mapping) else []
+    for name in set(asked) & set(_OWN):
+        raise InputError(f"sweep: results: the table has a column {name!r} already")
     cases, refused = _cases(case, changes)
-    columns = _Columns(results)
-    folder = _prepared(folder)
-    progress = SweepProgress(len(changes), quiet)
-    rows: list[dict[str, Any]] = [{} for _ in changes]
-    tasks = {number: Task(each, folder / f"{number:04d}", wall_time) for number, each in cases.items()}
-    numbers = list(tasks)
+    folder = _prepared(Path(output) if output is not None else Path("results") / f"{case.name}-sweep")
+    tasks = [Task(each, folder / f"{number:04d}", wall_time) for number, each in cases.items()]
+    numbers = list(cases)
+    rows: dict[int, dict[str, Any]] = {}
+    found: dict[int, dict[str, Any]] = {}
+    progress = _Progress(len(changes), quiet)
     for number, report in itertools.chain(
         ((number, Report(2, text, 0.0, 0)) for number, text in refused.items()),
-        ((numbers[k], report) for k, report in performed([tasks[number] for number in numbers], processes)),
+        ((numbers[k], report) for k, report in performed(tasks, processes)),
     ):
-        row: dict[str, Any] = {"run": number, **_shown(changes[number]), **report._asdict()}
-        row |= columns.of(folder / f"{number:04d}", report)
-        rows[number] = row
-        if not keep and row["status"] == 0:
-            shutil.rmtree(folder / f"{number:04d}", ignore_errors=True)
-        progress.done(row)
-        _table([row for row in rows if row], columns).to_csv(folder / "sweep.csv")
-    progress.close()
-    return _table(rows, columns)
+        place = folder / f"{number:04d}"
+        if not report.status:
+            try:
+                found[number] = _results_of(open_result(place), results)
+            except Exception as error:  # noqa: BLE001 - of a user's function; the other runs go on
+                text = error.args[0] if isinstance(error, KeyError) and error.args else error
+                report = report._replace(status=1, message=f"results: {type(error).__name__}: {text}")
+        rows[number] = {"run": number, **_shown(changes[number]), **report._asdict()}
+        if not keep and report.status == 0:
+            shutil.rmtree(place, ignore_errors=True)
+        progress.done(report)
+        table = _table(rows, found, asked, results is None)
+        table.to_csv(folder / "sweep.csv")
+    progress.done(None)
+    return table
 
 
 def _combinations(vary: Any) -> list[dict[str, Any]]:
@@ -156,71 +165,65 @@ def _prepared(folder: Path) -> Path:
 
 def _shown(changes: Mapping[str, Any]) -> dict[str, Any]:
     """The values of a row: numbers, texts and lists of them; all others as texts."""
-    return {key: _shown_value(value) for key, value in changes.items()}
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return value.tolist()
+        if isinstance(value, list | tuple):
+            return [plain(part) for part in value]
+        return value if isinstance(value, str | int | float | np.number) else str(value)
+
+    return {key: plain(value) for key, value in changes.items()}
 
 
-def _shown_value(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, list | tuple):
-        return [_shown_value(part) for part in value]
-    return value if isinstance(value, str | int | float | np.number) else str(value)
+def _table(rows: dict[int, dict[str, Any]], found: dict[int, dict[str, Any]], asked: list[str], usual: bool) -> Table:
+    """Make the table of rows and results, by number of the run; results that a run lacks are nan.
 
-
-def _table(rows: list[dict[str, Any]], columns: _Columns) -> Table:
-    """Make the table of rows; results that a row lacks are nan, and energies that never occur are left out."""
-    names = list(dict.fromkeys(name for row in rows for name in row if name not in columns.names))
-    names += [name for name in columns.names if not columns.usual or any(row.get(name) for row in rows)]
-    return Table({name: [row.get(name, float("nan")) for row in rows] for name in names})
-
-
-class _Columns:
-    """The columns of results.
-
-    Attributes
-    ----------
-    names : of those that were asked for or have occurred, in order
-    usual : whether they are those that nobody has chosen
+    ``asked`` are the names of results where no run has any; of the ``usual`` ones those that never occur are left out.
     """
+    ordered = [rows[number] | found.get(number, {}) for number in sorted(rows)]
+    own = [name for row in rows.values() for name in row]
+    names = [name for number in sorted(found) for name in found[number]] or asked
+    if usual:
+        names = [name for name in names if any(row.get(name) for row in ordered)]
+    return Table({name: [row.get(name, float("nan")) for row in ordered] for name in dict.fromkeys([*own, *names])})
 
-    def __init__(self, results: Any) -> None:
-        self.names: list[str] = list(results) if isinstance(results, Mapping) else []
-        if results is not None and not callable(results) and not isinstance(results, Mapping):
-            raise InputError(f"sweep: results = {results!r:.60}: expected a function, or functions by name")
-        for name in results if isinstance(results, Mapping) else ():
-            if name in _OWN:
-                raise InputError(f"sweep: results: the table has a column {name!r} already")
-        self._results, self.usual = results, results is None
-        self._parts: dict[str, list[str]] = {}  # columns of components, in place of the vectors that were asked for
 
-    def of(self, folder: Path, report: Report) -> dict[str, Any]:
-        """Return the results of a run by name; none for runs that were not finished."""
-        if report.status:
-            return {}
-        try:
-            found = dict(self._values(open_result(folder)))
-        except Exception as error:  # noqa: BLE001 - of a user's function; the other runs go on
-            text = error.args[0] if isinstance(error, KeyError) and error.args else error
-            return {"status": 1, "message": f"results: {type(error).__name__}: {text}"}
-        self.names = [part for name in self.names for part in self._parts.get(name, [name])]
-        self._parts.clear()
-        self.names += [name for name in found if name not in self.names]
-        return found
+class _Progress:
+    """Counts finished runs on stderr: one line that is rewritten on a terminal, else a line now and then."""
 
-    def _values(self, result: Result) -> Iterator[tuple[str, Any]]:
-        if self._results is None:
-            yield from _default_results(result)
-        elif isinstance(self._results, Mapping):
-            for name, what in self._results.items():
-                if callable(what):
-                    yield name, what(result)
-                else:
-                    last = _last(result, name, what)
-                    self._parts[name] = list(last)
-                    yield from last.items()
-        else:
-            values = self._results(result)
-            yield from values.items() if isinstance(values, Mapping) else [("result", values)]
+    def __init__(self, runs: int, quiet: bool) -> None:
+        self._runs, self._ended, self._failed, self._quiet = runs, 0, 0, quiet
+        self._begin = self._last = perf_counter()
+
+    def done(self, report: Report | None) -> None:
+        """Count a run that has ended; None: all have."""
+        now = perf_counter()
+        rewrites = sys.stderr is not None and sys.stderr.isatty()
+        text = f" in {duration(now - self._begin)}"
+        if report is not None:
+            self._ended += 1
+            self._failed += report.status != 0
+            text = f", {duration((now - self._begin) / self._ended * (self._runs - self._ended))} left"
+        failed = f", {self._failed} without result (see the column message)" if self._failed else ""
+        text = f"sweep: {self._ended} of {self._runs} runs{failed}{text}"
+        if not self._quiet and (report is None or rewrites or now - self._last > _BETWEEN):
+            self._last = now
+            line = f"\r{text:<78}" if rewrites else text
+            print(line, end="" if rewrites and report else "\n", file=sys.stderr, flush=True)
+
+
+def _results_of(result: Result, results: ResultFunction | Mapping[str, ResultFunction | str] | None) -> dict[str, Any]:
+    """Return the results of a run by name, as :func:`sweep` takes them."""
+    if results is None:
+        return dict(_default_results(result))
+    if callable(results):
+        values = results(result)
+        return dict(values) if isinstance(values, Mapping) else {"result": values}
+    found: dict[str, Any] = {}
+    for name, what in results.items():
+        found |= {name: what(result)} if callable(what) else _last(result, name, what)
+    return found
 
 
 def _last(result: Result, label: str, name: str) -> dict[str, Any]:

@@ -31,24 +31,6 @@ from .studies import (
     rod_key,
 )
 
-__all__ = [
-    "EXPLICIT",
-    "FITTED",
-    "NOT",
-    "OPEN",
-    "PARTLY",
-    "REPRODUCED",
-    "ROUGH",
-    "SHORT",
-    "SMOOTH",
-    "Claim",
-    "Measures",
-    "listed",
-    "measure_all",
-    "pick",
-    "verdict",
-]
-
 REPRODUCED, PARTLY, NOT, OPEN = "reproduced", "partly", "not reproduced", "not checkable"
 FITTED = "fitted"  # a result used to choose missing data cannot count as reproduced
 SHORT = {

@@ -8,8 +8,6 @@ from .measures import REST, RodImpact
 from .schemes import PAPER
 from .studies import BAR_ELEMENTS, BAR_STEPS
 
-__all__ = ["bar_claims"]
-
 AROUND = 0.05  # of 5.13 m/s: means within this oscillate around it
 CLEAR = 2.0  # times as much: clearly more
 SAME = 0.02  # of the exact force: medians within this are practically identical; contact times within twice as much

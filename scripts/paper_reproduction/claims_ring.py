@@ -9,8 +9,6 @@ from .measures import RingImpact, spread
 from .schemes import PAPER
 from .studies import BAR_STEPS, OTHER_RINGS, REFINED, RING_STEPS, refined_key, ring_key
 
-__all__ = ["conclusion_claims", "phases_text", "ring_claims"]
-
 REFLECTION, SECOND = 0.035, 0.12  # what the paper reads off: end of the first contact, second impact [s]
 NEAR = {REFLECTION: 0.001, SECOND: 0.005}  # [s]
 IDENTICAL = 0.05  # of the range of a displacement: curves this near are practically identical

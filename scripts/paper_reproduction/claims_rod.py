@@ -10,8 +10,6 @@ from .measures import REST, tip_velocity
 from .schemes import PAPER, SCHEMES
 from .studies import rod_key
 
-__all__ = ["phase_rows", "rod_claims"]
-
 SIMILAR = 0.1  # of the speed of arrival: undershoots that differ by less are alike
 JUMP = 0.05  # of the speed of arrival: what is left of a jump after its decay
 QUICK = 5  # steps within which a jump is over

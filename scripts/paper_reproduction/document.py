@@ -6,6 +6,8 @@ from collections import Counter
 from pathlib import Path
 from string import Template
 
+from pages import markdown
+
 from .claims import FITTED, NOT, OPEN, PARTLY, REPRODUCED, Claim, Measures
 from .claims_bars import bar_claims
 from .claims_ring import conclusion_claims, phases_text, ring_claims
@@ -14,8 +16,6 @@ from .exact import BAR, PLASTIC_BAR, ROD, Rod
 from .measures import RodImpact
 from .schemes import IN_TABLES, SCHEMES
 from .studies import BAR_STEPS, OTHER_RINGS, OTHER_SCHEMES, RING_STEPS, bar_key, rod_key
-
-__all__ = ["all_claims", "impact_row", "write_document"]
 
 TEMPLATE = Path(__file__).with_name("paper.md")
 
@@ -61,7 +61,7 @@ def write_document(readings: list[Measures], file: Path) -> dict[str, Counter]:
 def _summary(verdicts: dict[str, Counter]) -> str:
     order = (REPRODUCED, PARTLY, NOT, FITTED, OPEN)
     rows = [[name, *(str(counts[verdict]) for verdict in order)] for name, counts in verdicts.items()]
-    return _table(["reading", *order], rows)
+    return markdown(["reading", *order], rows)
 
 
 def _lines(readings: list[Measures]) -> list[tuple[str, Measures, str]]:
@@ -75,24 +75,19 @@ def _lines(readings: list[Measures]) -> list[tuple[str, Measures, str]]:
     return lines
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def _claims_table(claims: list[list[Claim]], names: list[str]) -> str:
     rows = []
     for readings in zip(*claims, strict=True):
         first = readings[0]
         rows.append([first.where, first.statement, first.measured, *(f"**{claim.verdict}**" for claim in readings)])
-    return _table(["Where", "The paper", f"Measured here ({names[0]})", "Verdict", *names[1:]], rows)
+    return markdown(["Where", "The paper", f"Measured here ({names[0]})", "Verdict", *names[1:]], rows)
 
 
 def _phases_table(readings: list[Measures]) -> str:
     rows = [row for measures in readings for row in phase_rows(measures)]
-    distinct = list(dict.fromkeys(map(tuple, rows)))
+    distinct = dict.fromkeys(map(tuple, rows))
     head = ["scheme", "mass", "variation beyond the jump", "F max", "contacts", "energy left", "not finished"]
-    return _table(head, [list(row) for row in distinct])
+    return markdown(head, distinct)
 
 
 def impact_row(name: str, bar: RodImpact, exact: Rod) -> list[str]:
@@ -120,7 +115,7 @@ def _rod_table(readings: list[Measures]) -> str:
         if run.failure:
             row[1], row[4], row[6:] = f"ended at t = {run.time[-1]:.2f}", "", ["", ""]
         rows.append(row)
-    return _table(_HEAD, [["exact", "1", "1", "1", "1", "0", "1", "1"], *rows])
+    return markdown(_HEAD, [["exact", "1", "1", "1", "1", "0", "1", "1"], *rows])
 
 
 def _bar_table(readings: list[Measures], step: str, plastic: bool) -> str:
@@ -132,7 +127,7 @@ def _bar_table(readings: list[Measures], step: str, plastic: bool) -> str:
         else:
             reason = m.runs[bar_key(scheme, m.reading, step, plastic)].failure
             rows.append([name, "refused: " + _limit(reason), *[""] * 6])
-    return _table(_HEAD, rows)
+    return markdown(_HEAD, rows)
 
 
 def _limit(reason: str) -> str:
@@ -149,7 +144,7 @@ def _ring_table(readings: list[Measures], step: str) -> str:
         values = (ring.strain, ring.left, ring.dissipated, ring.kept)
         shown = [f"about {value:.1g}" if chaotic else f"{value:.3f}" for value in values]
         rows.append([name, phases_text(ring, chaotic), *shown])
-    return _table(["scheme", "contact [ms]", "largest strain", "plastic strain left", "plastic work", "energy"], rows)
+    return markdown(["scheme", "contact [ms]", "largest strain", "plastic strain left", "plastic work", "energy"], rows)
 
 
 def _other_rings(m: Measures) -> str:
@@ -160,4 +155,4 @@ def _other_rings(m: Measures) -> str:
             name = f"{ring}, radii {outer:g} and {inner:g} m"
             strain = f"about {found.strain:.1g}" if rough else f"{found.strain:.3f}"
             rows.append([name, SCHEMES[scheme].name, phases_text(found, rough), strain])
-    return _table(["ring", "scheme", "contact [ms]", "largest strain"], rows)
+    return markdown(["ring", "scheme", "contact [ms]", "largest strain"], rows)

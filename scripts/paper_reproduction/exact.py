@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["BAR", "PLASTIC_BAR", "ROD", "Rod"]
-
 
 @dataclass(frozen=True)
 class Rod:
@@ -64,17 +62,16 @@ class Rod:
 
     def tip_velocity(self, end: float) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the curve of the tip's velocity [s], [m/s]; the plastic one is known to the end of the plateau."""
-        v, t0, t1 = self.speed, self.impact, self.release
-        if self.yields:
-            return np.array([0.0, t0, t0, t1]), np.array([v, v, 0.0, 0.0])
-        return np.array([0.0, t0, t0, t1, t1, end]), np.array([v, v, 0.0, 0.0, -v, -v])
+        return self._corners(end, self.speed, 0.0, -self.speed)
 
     def contact_force(self, end: float) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the curve of the contact force [s], [N]."""
-        t0, t1, force = self.impact, self.release, self.force
-        if self.yields:
-            return np.array([0.0, t0, t0, t1]), np.array([0.0, 0.0, force, force])
-        return np.array([0.0, t0, t0, t1, t1, end]), np.array([0.0, 0.0, force, force, 0.0, 0.0])
+        return self._corners(end, 0.0, self.force, 0.0)
+
+    def _corners(self, end: float, before: float, during: float, after: float) -> tuple[np.ndarray, np.ndarray]:
+        times = [0.0, self.impact, self.impact, self.release, self.release, end]
+        known = 4 if self.yields else 6
+        return np.array(times[:known]), np.array([before, before, during, during, after, after][:known])
 
     def mean_velocity(self, time: np.ndarray) -> np.ndarray:
         """Velocity of the centre of mass (n,) [m/s] of the elastic rod: linear from v to -v during contact."""

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from pages import save
 
 from pfem_petsc.post.chart import STYLE
 
@@ -19,9 +21,7 @@ from .exact import BAR, PLASTIC_BAR, ROD, Rod
 from .measures import tip_velocity, wall_force
 from .running import Run
 from .schemes import LIKELY, PAPER, SCHEMES
-from .studies import BAR_STEPS, bar_key, refined_key, rod_key
-
-__all__ = ["draw_bars", "draw_phases", "draw_rod", "draw_rods", "legend", "new_figure", "save", "styled"]
+from .studies import bar_key, refined_key, rod_key
 
 EXACT = {"color": "#111418", "linewidth": 2.2, "alpha": 0.55, "linestyle": "-"}
 FINE = {"color": "#6b7280", "linewidth": 1.8, "alpha": 0.8, "linestyle": (0, (4, 1.5))}
@@ -32,9 +32,7 @@ def styled(draw: Callable) -> Callable:
     """Decorator: draw in the project's style."""
 
     def wrapped(*arguments: Any) -> Any:
-        import matplotlib
-
-        with matplotlib.rc_context(STYLE):
+        with rc_context(STYLE):
             return draw(*arguments)
 
     return wrapped
@@ -47,38 +45,25 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def legend(figure: Figure, extra: list[tuple[str, dict]], columns: int = 4) -> None:
-    """The paper's schemes and more below the panels, where they cover nothing."""
+def finish(figure: Figure, file: Path, title: str, extra: list[tuple[str, dict]], columns: int = 4) -> None:
+    """Write a figure with its title, and with the paper's schemes and more below the panels, where they cover
+    nothing."""
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
     handles = [Line2D([], [], label=label, **style) for label, style in extra]
-    for scheme in PAPER:
-        entry = SCHEMES[scheme]
-        style = {"color": entry.colour, "linestyle": entry.dash, "linewidth": entry.width + 0.4}
-        handles.append(Line2D([], [], label=entry.name, **style))
+    for entry in (SCHEMES[scheme] for scheme in PAPER):
+        handles.append(Line2D([], [], label=entry.name, **(entry.style | {"linewidth": entry.width + 0.4})))
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, handlelength=2.2, columnspacing=1.6)
-
-
-def save(figure: Figure, file: Path) -> None:
-    """Write a compact PNG: a palette of 256 colours is enough for curves."""
-    import io
-
-    from PIL import Image
-
-    file.parent.mkdir(parents=True, exist_ok=True)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=DPI)
-    Image.open(buffer).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
+    save(figure, file, DPI)
 
 
 def _curves(
     axes: Axes, runs: dict[str, Run], keys: dict[str, str], values: Callable, scale: tuple[float, float]
 ) -> None:
     """One curve a scheme; ``scale`` multiplies time and value."""
-    order = [scheme for scheme in SCHEMES if scheme in PAPER]
-    for scheme in order:
-        run, entry = runs[keys[scheme]], SCHEMES[scheme]
+    for scheme in (scheme for scheme in SCHEMES if scheme in PAPER):
+        run = runs[keys[scheme]]
         if run.history:
-            style = {"color": entry.colour, "linestyle": entry.dash, "linewidth": entry.width}
-            axes.plot(run.time * scale[0], values(run) * scale[1], **style)
+            axes.plot(run.time * scale[0], values(run) * scale[1], **SCHEMES[scheme].style)
 
 
 @styled
@@ -103,9 +88,7 @@ def draw_rod(runs: dict[str, Run], file: Path, force: bool) -> None:
     title = (
         "Figure 4. Rod against a wall: contact force" if force else "Figure 3. Rod against a wall: velocity of the tip"
     )
-    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
-    legend(figure, [("exact", EXACT)])
-    save(figure, file)
+    finish(figure, file, title, [("exact", EXACT)])
 
 
 @styled
@@ -137,9 +120,7 @@ def draw_bars(runs: dict[str, Run], file: Path, number: int, plastic: bool, forc
     panels[-1].set_xlabel("time [µs]")
     what = "contact force" if force else "velocity of the impacted node"
     kind = "elastoplastic" if plastic else "elastic"
-    figure.suptitle(f"Figure {number}. Two {kind} bars: {what}", x=0.01, ha="left", fontsize=12, fontweight="bold")
-    legend(figure, extra)
-    save(figure, file)
+    finish(figure, file, f"Figure {number}. Two {kind} bars: {what}", extra)
 
 
 def _smoothed(time: np.ndarray, values: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
@@ -155,8 +136,7 @@ def draw_phases(readings: list[Measures], file: Path) -> None:
     panels = figure.subplots(2, len(readings), sharex=True, sharey="row", squeeze=False)
     for column, measures in enumerate(readings):
         for scheme in (scheme for scheme in SCHEMES if scheme in PAPER):
-            entry, rods = SCHEMES[scheme], measures.phases[scheme]
-            style = {"color": entry.colour, "linestyle": entry.dash, "linewidth": entry.width}
+            style, rods = SCHEMES[scheme].style, measures.phases[scheme]
             x = [phase / len(rods) for phase, rod in enumerate(rods) if rod is not None]
             ended = [rod for rod in rods if rod is not None]
             panels[0, column].plot(x, [rod.excess for rod in ended], marker="o", markersize=3, **style)
@@ -165,21 +145,14 @@ def draw_phases(readings: list[Measures], file: Path) -> None:
         panels[1, column].set_xlabel("impact within the step")
     panels[0, 0].set_ylabel("variation beyond the jump [v₀]")
     panels[1, 0].set_ylabel("energy left")
-    figure.suptitle("Rod: what depends on the phase of the impact", x=0.01, ha="left", fontsize=12, fontweight="bold")
-    legend(figure, [])
-    save(figure, file)
+    finish(figure, file, "Rod: what depends on the phase of the impact", [])
 
 
 def draw_rods(runs: dict[str, Run], readings: list[Measures], folder: Path) -> list[Path]:
     """Draw figures 3, 4, 7 to 10, and that of the study of phases."""
-    assert set(BAR_STEPS) == {"0.5", "2"}
-    files = [folder / f"figure_{n:02d}.png" for n in (3, 4, 7, 8, 9, 10)]
-    draw_rod(runs, files[0], False)
-    draw_rod(runs, files[1], True)
-    draw_bars(runs, files[2], 7, False, False)
-    draw_bars(runs, files[3], 8, True, False)
-    draw_bars(runs, files[4], 9, False, True)
-    draw_bars(runs, files[5], 10, True, True)
-    files.append(folder / "phases.png")
-    draw_phases(readings, files[-1])
-    return files
+    draw_rod(runs, folder / "figure_03.png", False)
+    draw_rod(runs, folder / "figure_04.png", True)
+    for number, plastic, force in ((7, False, False), (8, True, False), (9, False, True), (10, True, True)):
+        draw_bars(runs, folder / f"figure_{number:02d}.png", number, plastic, force)
+    draw_phases(readings, folder / "phases.png")
+    return [*(folder / f"figure_{n:02d}.png" for n in (3, 4, 7, 8, 9, 10)), folder / "phases.png"]

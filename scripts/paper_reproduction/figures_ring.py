@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
+from pages import save
 
-from .figures import legend, new_figure, save, styled
+from .figures import DPI, finish, new_figure, styled
 from .running import Run
 from .schemes import LIKELY, PAPER, SCHEMES
 from .studies import INSTANTS, RING_STEPS, ring_key
-
-__all__ = ["draw_ring"]
 
 WALL = 22.93  # [m]
 STRAIN = LinearSegmentedColormap.from_list("strain", ["#1f4e9c", "#7a4fbf", "#d9482b", "#f2a33a"])
@@ -26,9 +25,9 @@ def _displacement(runs: dict[str, Run], file: Path, number: int, step: str) -> N
     nodes = (("impact", "(a) node 1, the vertex that hits"), ("opposite", "(b) node 2, the opposite vertex"))
     for axes, (probe, title) in zip(panels, nodes):
         for scheme in [scheme for scheme in SCHEMES if scheme in PAPER]:
-            run, entry = runs[ring_key(scheme, LIKELY, step)], SCHEMES[scheme]
+            run = runs[ring_key(scheme, LIKELY, step)]
             x = run.history[f"probe/{probe}/position"][:, 0, 0]
-            axes.plot(run.time * 1e3, x - x[0], color=entry.colour, linestyle=entry.dash, linewidth=entry.width)
+            axes.plot(run.time * 1e3, x - x[0], **SCHEMES[scheme].style)
         axes.set_title(title)
         axes.set_xlabel("time [ms]")
         axes.set_ylabel("horizontal displacement [m]")
@@ -36,9 +35,7 @@ def _displacement(runs: dict[str, Run], file: Path, number: int, step: str) -> N
     panels[0].axhline(0.1, color="#111418", linewidth=1.0, linestyle=(0, (5, 3)))
     panels[0].annotate("wall", (199.0, 0.1), xytext=(0, 3), textcoords="offset points", ha="right", fontsize=9)
     name = f"Figure {number}. Ring against a wall, reconstructed geometry: Δt = {RING_STEPS[step] * 1e3:g} ms"
-    figure.suptitle(name, x=0.01, ha="left", fontsize=12, fontweight="bold")
-    legend(figure, [], columns=3)
-    save(figure, file)
+    finish(figure, file, name, [], columns=3)
 
 
 @styled
@@ -80,13 +77,12 @@ def _shapes(runs: dict[str, Run], file: Path) -> None:
     figure.colorbar(colours, ax=panels, label="size of plastic strain", shrink=0.75, pad=0.015)
     title = "Figure 14. Deformed ring (central differences, Δt = 0.05 ms; grey: at rest; inset: zone of impact)"
     figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
-    save(figure, file)
+    save(figure, file, DPI)
 
 
 def draw_ring(runs: dict[str, Run], folder: Path) -> list[Path]:
     """Draw figures 12 to 14."""
-    files = [folder / f"figure_{n}.png" for n in (12, 13, 14)]
-    _displacement(runs, files[0], 12, "0.5")
-    _displacement(runs, files[1], 13, "0.05")
-    _shapes(runs, files[2])
-    return files
+    _displacement(runs, folder / "figure_12.png", 12, "0.5")
+    _displacement(runs, folder / "figure_13.png", 13, "0.05")
+    _shapes(runs, folder / "figure_14.png")
+    return [folder / f"figure_{n}.png" for n in (12, 13, 14)]

@@ -9,17 +9,6 @@ import numpy as np
 from .exact import Rod
 from .running import Run
 
-__all__ = [
-    "RingImpact",
-    "RodImpact",
-    "contact_episodes",
-    "measure_ring",
-    "measure_rod",
-    "spread",
-    "tip_velocity",
-    "wall_force",
-]
-
 ENERGIES = ("kinetic_energy", "elastic_energy", "plastic_dissipation")
 WINDOW = 20  # steps after the first contact in which the velocity jump is evaluated
 PAUSE = 2.5e-3  # a release of the ring shorter than this belongs to the same contact [s]
@@ -137,24 +126,21 @@ class RingImpact:
 
     Attributes
     ----------
-    episodes : first and last time of each contact [s]
-    phases : the same with releases shorter than 2.5 ms passed over [s]
+    phases : first and last time of each contact, with releases shorter than 2.5 ms passed over [s]
     touching : time in contact [s]
     thrown : farthest that node 1 is from where it first touched, in the 25 ms after that [m]
     strain, plastic_strain : largest of all bars and snapshots, and plastic strain left at the end
-    elastic, dissipated : largest elastic energy and plastic work at the end, of the kinetic energy at the start
+    dissipated : plastic work at the end, of the kinetic energy at the start
     kept : kinetic, elastic and plastic energy at the end, of the kinetic energy at the start
     shortened : displacement of node 1 against that of node 2 at the end [m]
     """
 
-    episodes: list[tuple[float, float]]
     phases: list[tuple[float, float]]
     touching: float
     thrown: float
     strain: float
     plastic_strain: float
     left: float
-    elastic: float
     dissipated: float
     kept: float
     shortened: float
@@ -177,14 +163,12 @@ def measure_ring(run: Run) -> RingImpact:
         else:
             phases.append((start, end))
     return RingImpact(
-        episodes=episodes,
         phases=phases,
         touching=float(touching.sum() * run.h),
         thrown=float(one[early].max() - one[early].min()),
         strain=float(max(strains)),
         plastic_strain=float(max(plastic)),
         left=float(plastic[-1]),
-        elastic=float(history["elastic_energy"].max() / kinetic),
         dissipated=float(history["plastic_dissipation"][-1] / kinetic),
         kept=float(sum(history[name][-1] for name in ENERGIES) / kinetic),
         shortened=float((one[0] - two[0]) - (one[-1] - two[-1])),

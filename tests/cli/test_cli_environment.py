@@ -182,8 +182,8 @@ def test_a_numpy_that_is_too_new_has_its_remedy(tmp_path, monkeypatch):
     monkeypatch.setitem(pfem_petsc._HOMES, "Bound", "binding_of_a_test")
     with pytest.raises(InputError, match=r'python -m pip install "numpy<2"') as caught:
         pfem_petsc.Bound  # noqa: B018 - imported at its first use
-    assert launcher._message(caught.value.__cause__) == (2, f"error: {caught.value}")
-    assert launcher._message(ValueError("numpy is here"))[1].startswith("internal error: ValueError")
+    assert launcher.exit_message(caught.value.__cause__) == (2, f"error: {caught.value}")
+    assert launcher.exit_message(ValueError("numpy is here"))[1].startswith("internal error: ValueError")
 
 
 @pytest.fixture(scope="module")

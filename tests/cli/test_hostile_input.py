@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case
-from pfem_petsc.cli.launcher import _message
+from pfem_petsc.cli.launcher import exit_message
 from pfem_petsc.cli.main import main
-from pfem_petsc.cli.petsc_options import PREFIXES, without_effect
+from pfem_petsc.cli.parser import PREFIXES, without_effect
 from pfem_petsc.errors import InputError, printable
 from pfem_petsc.restart.checkpoints import _prepare
 
@@ -126,7 +126,7 @@ def test_control_characters_do_not_reach_the_terminal():
 
 
 def test_a_full_disk_under_the_output_is_told():
-    status, text = _message(OSError(28, os.strerror(28)))
+    status, text = exit_message(OSError(28, os.strerror(28)))
     assert status == 3
     assert "No space left on device" in text
 

@@ -73,14 +73,14 @@ def test_every_step_is_optimal(name, supported, comm, shared_tmp_path):
     supports = [{"node_set": "held", "fix": "y"}, {"node_set": "hinged", "fix": "xz"}] if supported else []
     case = crowded(WALLS[name], shared_tmp_path / "m.vtu", supports=supports)
     run = simulation(case, comm, shared_tmp_path)
-    stepper, pairs, contact = run.stepper, run.model.pairs, run.model.contact
-    assert pairs.coupled.shared.all()
+    stepper, pairs, contact = run.stepper, run.model.links, run.model.contact
+    assert (np.bincount(pairs.rows.ends.ravel()) > 1).all()
     solve, seen = stepper.solve, []
 
     def checked(balance):
         solution = solve(balance)
         x = balance.predictor + solution.u
-        gaps = pairs.distances(pairs.gather(x)) - pairs.gaps
+        gaps = pairs.rows.values(pairs.rows.gather(x))
         assert gaps.min() > -1e-12 and pairs.force.min() >= 0.0
         assert np.abs(gaps[pairs.force > 0.0]).max(initial=0.0) < 1e-12
         walls = contact.gaps(x, balance.time)
@@ -90,7 +90,7 @@ def test_every_step_is_optimal(name, supported, comm, shared_tmp_path):
         # what pushes a node is its pairs' and walls' forces
         state = stepper.state
         push = np.zeros_like(x)
-        pairs.push(push)
+        pairs.add_forces(push)
         held, touching = solution.walls.nodes, solution.walls.touching
         alone = np.setdiff1d(np.arange(len(x)), held)
         np.testing.assert_allclose(state.contact[alone], push[alone], atol=1e-12)
@@ -102,8 +102,8 @@ def test_every_step_is_optimal(name, supported, comm, shared_tmp_path):
             np.testing.assert_allclose(np.einsum("mwi,mw->mi", normals, strengths), rest, atol=1e-9)
             assert strengths.min() > -1e-9
             assert np.abs(np.where(touching, walls[held], 0.0)).max() < 1e-12
-        both = np.intersect1d(held, pairs.pressed()[0])
-        mine = (pairs.force > 0.0) & pairs.mine[0]  # a pair counts where its first node is owned
+        both = np.intersect1d(held, pairs.two.pressed(pairs.force)[0])
+        mine = (pairs.force > 0.0) & (pairs.two.nodes[0] >= 0)  # a pair counts where its first node is owned
         seen.append((comm.allreduce(len(both)), comm.allreduce(int(mine.sum()))))
         return solution
 
@@ -141,10 +141,12 @@ def test_no_room(heavy, comm, shared_tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"integrator": "newmark"}, "is in several pairs, which needs an explicit integrator with lumped mass"),
         ({"integrator": "newmark", "one": True, "treatment": "stick"}, "a wall stops it as well, which needs contact"),
         ({"treatment": "stick"}, "is in several pairs, or a wall stops it as well, which needs contact.treatment"),
-        ({"friction": 0.2}, "wall 'wall1' stops nodes of pairs: such a wall must be flat, without mass, friction"),
+        (
+            {"friction": 0.2},
+            "wall 'wall1' stops nodes of pairs or constraints: such a wall must be flat, without mass, friction",
+        ),
         ({"mass": 2.0}, "such a wall must be flat, without mass"),
         ({"tied": True}, "and not tied"),
     ],

@@ -6,8 +6,8 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.energies import LOST, STORED, SUPPLIED
-from pfem_petsc.recording.monitors import CAUSES, ContactWatch
+from pfem_petsc.columns import LOST, STORED, SUPPLIED
+from pfem_petsc.run.monitors import CAUSES, ContactWatch
 
 
 def rod_held_at_one_end(integrator, step, **material):

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
-from pfem_petsc.contact.frames import MIN_VOLUME, build_frames
+from pfem_petsc.contact.frames import MIN_VOLUME, Planes, build_frames
 
 
 def frames_of(normals, offsets, fixed=(False, False, False), rank=None):
     normals = np.asarray(normals, dtype=float)[None]
     offsets = np.asarray(offsets, dtype=float)[None]
     rank = offsets * 0.0 if rank is None else np.asarray(rank, dtype=float)[None]
-    return build_frames(np.array([0]), np.array([fixed]), normals.copy(), offsets, rank, 1e-12)
+    planes = Planes(np.array([fixed]), normals.copy(), offsets, rank, np.zeros((1, 3)))
+    return build_frames(np.array([0]), planes, 1e-12)
 
 
 @pytest.mark.parametrize("walls", [1, 2, 3, 5])
@@ -70,14 +71,13 @@ def test_almost_parallel_planes_share_a_bound_that_is_exact_at_the_place(sign):
     normals = np.array([[[0.0, 0.0, 1.0], [angle, 0.0, sign]]])
     place = np.array([[7.0, 2.0, 0.5]])
     offsets = np.array([[0.1, normals[0, 1] @ place[0] + 0.05]])
-    frames = build_frames(
-        np.array([0]), np.zeros((1, 3), bool), normals, offsets, np.array([[0.0, 1.0]]), 1.0, places=place
-    )
+    planes = Planes(np.zeros((1, 3), bool), normals, offsets, np.array([[0.0, 1.0]]), place)
+    frames = build_frames(np.array([0]), planes, 1.0)
     assert frames.rows.tolist() == [[2, 2]] and frames.shared.tolist() == [[False, True]]
     # the node is 0.05 m beyond the second plane: at its bound it is on it
     moved = place[0] + [0.0, 0.0, frames.bounds[0, 1] - place[0, 2]]
     assert abs(normals[0, 1] @ moved - offsets[0, 1]) < 1e-15
-    same = build_frames(np.array([0]), np.zeros((1, 3), bool), normals[:, [0, 0]], offsets, np.array([[0.0, 1.0]]))
+    same = build_frames(np.array([0]), planes._replace(normals=normals[:, [0, 0]], places=np.zeros((1, 3))))
     assert not same.shared.any() and same.bounds.tolist() == offsets.tolist()
 
 

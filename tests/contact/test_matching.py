@@ -4,8 +4,14 @@ import time
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
-from pfem_petsc.contact.row_search import across, nearest_across, nearest_among_ranks
+from pfem_petsc.contact.pairs import across, nearest_among_ranks
+
+
+def nearest(points, queries, normal):
+    """The indices of the nearest points on one rank."""
+    return nearest_among_ranks(MPI.COMM_SELF, np.arange(len(points))[:, None], points, queries, normal)[:, 0]
 
 
 def looking_at_all(points, queries, normal):
@@ -35,7 +41,7 @@ def test_nearest_is_that_of_looking_at_all(kind):
         normal = rng.normal(size=3) if trial % 2 else np.eye(3)[trial % 3]
         normal = normal / np.linalg.norm(normal)
         points, queries = cloud(kind, rng, normal, *rng.integers(1, 200, size=2))
-        found = nearest_across(points, queries, normal)
+        found = nearest(points, queries, normal)
         np.testing.assert_array_equal(found, looking_at_all(points, queries, normal))
 
 
@@ -45,7 +51,7 @@ def test_40401_points_are_matched_in_seconds():
     points = np.column_stack([at, np.zeros(len(at))])
     order = np.random.default_rng(1).permutation(len(at))
     begin = time.process_time()
-    found = nearest_across(points, points[order] + [1e-3, 2e-3, 0.5], np.array([0.0, 0.0, 1.0]))
+    found = nearest(points, points[order] + [1e-3, 2e-3, 0.5], np.array([0.0, 0.0, 1.0]))
     assert time.process_time() - begin < 5.0
     np.testing.assert_array_equal(found, order)
 

@@ -1,6 +1,7 @@
 """Pairs are distributed with their nodes: no array of the size of all pairs, and the results of one rank."""
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,8 @@ from helpers.lattices import planes, simulation
 from mpi4py import MPI
 
 from pfem_petsc import Case
-from pfem_petsc.contact.pair_link import PairCoordinates
-from pfem_petsc.contact.pairs import ContactPairs
+from pfem_petsc.contact.constraint_set import ConstraintSet
+from pfem_petsc.contact.transform import RowCoordinates
 from pfem_petsc.stepping.model import Model
 
 
@@ -54,28 +55,30 @@ def test_nothing_is_of_the_size_of_all_pairs(comm, shared_tmp_path):
         counting = Counting(model.mesh.comm)
         counting.sizes = []
         model.mesh.comm = counting
-        pairs = ContactPairs(case, model.nodes, model.mesh, model.supports.fixed, model.contact)
-        total = comm.allreduce(int(pairs.mine[1].sum()))
+        pairs = ConstraintSet(case, model.nodes, model.mesh, model.supports.fixed, model.contact)
+        two = pairs.two
+        total = comm.allreduce(int(two.counted.sum()))
         assert total == len(case.node_set["left"].indices)
         # each pair is where its nodes are, and nowhere else
-        assert pairs.mine.any(axis=0).all()
-        ends = comm.allreduce(int(pairs.mine.sum()))
+        assert (two.nodes >= 0).any(axis=0).all()
+        ends = comm.allreduce(int((two.nodes >= 0).sum()))
         assert ends == 2 * total
         x = model.mesh.points[: model.mesh.n_owned].copy()
         u, mass = 0.01 * np.ones_like(x), np.ones(len(x))
         u[:, 0] *= np.where(x[:, 0] > 0.1, -1.0, 1.0)
-        coordinates = PairCoordinates(pairs)
-        pairs.force = pairs.part(x, u, mass)
+        coordinates = RowCoordinates(pairs)
+        pairs.force = two.separate(x, u, mass, np.zeros_like(x))
         assert pairs.any_pressed()
-        pairs.together(u, mass)
-        for change in (coordinates.increment, coordinates.gradient, coordinates.coordinates):
+        two.together(u, mass, pairs.force > 0.0)
+        coordinates.feasible(x, u, mass)
+        for change in (coordinates.forward, coordinates.adjoint, coordinates.inverse):
             change(u)
         assert coordinates.broken(x - u, 0.0) in (True, False)
         axes = {length for array in arrays_of([pairs, coordinates], set()) for length in array.shape}
-        nodes = {len(pairs.coupled.numbers), int(pairs.mine.sum())}
-        assert max(axes - nodes) <= max(len(pairs.table) + 1, 4)
+        own = len(two.at)
+        assert max(axes) <= max(36 * own + 1, 16)  # the transform couples six unknowns
         if comm.size == 3:  # ranks have a part of the pairs each, so that arrays of all would be seen
-            assert len(pairs.table) + 1 < total and total not in nodes and 2 * total not in nodes
+            assert own + 1 < total and not axes & {total, 2 * total, 6 * total}
         reduced.append(sorted(counting.sizes))
     assert reduced[0] == reduced[1]
 
@@ -85,24 +88,25 @@ def test_a_step_sends_what_the_distance_depends_on(comm, shared_tmp_path):
     """One number per node and direction along an axis, and compliances only where the stiffness is another array."""
     case = two_lattices(shared_tmp_path / "m.vtu", "central_differences", direction=(2.0, 0.0, 0.0))
     model = Model(Case.from_dict(case), comm)
-    pairs, widths = model.pairs, []
-    bring = pairs.partners.bring
+    pairs, widths = model.links, []
+    partners = pairs.rows.partners
+    bring = partners.bring
 
     def counting(leaving):
         widths.append(leaving.shape[1])
         return bring(leaving)
 
-    pairs.partners.bring = counting
+    partners.bring = counting
     x = model.mesh.points[: model.mesh.n_owned].copy()
     approach = 0.01 * np.where(x[:, :1] > 0.1015, -1.0, 1.0) * [1.0, 0.3, 0.2]
     forces, sent = [], [2, 1, 2]  # messages of steps with a stiffness, with the same one, and with another one
     for hard, messages in zip((soft := np.full(len(x), 2.0), soft, np.full(len(x), 4.0)), sent, strict=True):
-        u, contact = approach.copy(), np.zeros_like(x)
+        u = approach.copy()
         widths.clear()
-        pairs.explicit(x, u, hard, contact, 0.0, 1e-12)
-        assert widths == ([] if pairs.partners.alone else [1] * messages)
+        contact = pairs.explicit(SimpleNamespace(predictor=x), None, u, hard, np.zeros_like(x), 1e-12)
+        assert widths == ([] if partners.alone else [1] * messages)
         forces.append(pairs.force.copy())
-        gap = pairs.distances(pairs.gather(x + u))
+        gap = pairs.rows.values(pairs.rows.gather(x + u))
         assert gap[pairs.force > 0.0] == pytest.approx(0.0, abs=1e-15)
         assert np.allclose(u, approach + contact / hard[:, None], rtol=0, atol=1e-15)
         assert (contact[:, 1:] == 0.0).all()
@@ -142,7 +146,7 @@ def test_ranks_give_what_one_gives(name, comm, shared_tmp_path):
     if crowded:
         case["contact_pair"].append({**case["contact_pair"][0], "name": "across", "direction": [1.0, -0.4, 0.3]})
     run = simulation(case, comm, shared_tmp_path, "ranks")
-    cut = comm.allreduce(int((~run.model.pairs.mine).sum()))
+    cut = comm.allreduce(int((run.model.links.two.nodes < 0).sum()))
     assert comm.size < 3 or cut > 0
     rows = [step.row for step in run]
     alone = simulation(case, MPI.COMM_SELF, shared_tmp_path, f"alone{comm.rank}")
@@ -180,7 +184,7 @@ def test_steps_call_no_function_for_each_pair(floor, comm, shared_tmp_path):
             sys.setprofile(count)
             run.stepper.solve(run.stepper.balance)
             sys.setprofile(None)
-            counts[-1][1] = int((run.model.pairs.force > 0.0).sum())
+            counts[-1][1] = int((run.model.links.force > 0.0).sum())
         assert max(pressed for _, pressed in counts) > 5
         calls.append(max(number for number, _ in counts))
     assert calls[1] <= calls[0] + 20

@@ -153,6 +153,22 @@ def test_strut_is_a_contact_pair_on_a_line(integrator, examples, comm, shared_tm
     np.testing.assert_allclose(strut["kinetic_energy"], pairs["kinetic_energy"], rtol=1e-10)
 
 
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_nodes_in_a_pair_and_on_a_tether(integrator, examples, comm, shared_tmp_path):
+    """Both are kept, one after the other, and together they conserve momentum."""
+    pair = 'contact_pair=[{name="gap", first="tip", second="other", direction=[1, 0, 0], gap=0.05}]'
+    keys = ['initial.on=[{node_set="right", velocity=[-0.3, 0.1, -0.05]}]', "initial.velocity=[0.3, 0.0, 0.2]"]
+    run(two_rods(integrator, tether("tip", "other", 0.15), pair, *keys), comm, shared_tmp_path / "run")
+    result, history = open_result(shared_tmp_path / "run"), history_of(shared_tmp_path / "run")
+    for index in range(len(result.times)):
+        x = result.positions(index)
+        assert np.linalg.norm(x[4] - x[3]) < 0.15 + 1e-12 and x[4, 0] - x[3, 0] > 0.05 - 1e-12
+    assert history["constraint/rope/force"].any() and history["pair/gap/force"].any()
+    assert np.abs(history["momentum"] - history["momentum"][0]).max() < 1e-12
+    assert np.abs(history["energy_imbalance"]).max() < 1e-9
+
+
 def chain(integrator: str, *keys: str) -> Case:
     """Five point masses on a chain of tethers that share nodes, hanging along x, or falling from there."""
     own = ["mesh.elements=5", "node_set.foot.nearest=[0, 0, 0]", 'support=[{node_set="foot", fix="xyz"}]']
@@ -209,14 +225,7 @@ def test_chain_of_tethers_falls_on_a_floor(integrator, examples, comm, shared_tm
         ((tether("tip", "other", 0.2), "contact.treatment=stick"), r"constraints need contact.treatment = \"scheme\""),
         (
             (tether("tip", "other", 0.2), 'wall=[{type="sphere", point=[0, 0, 9], radius=1.0, side="outside"}]'),
-            r"wall 'wall1' stops constrained nodes",
-        ),
-        (
-            (
-                tether("tip", "other", 0.2),
-                'contact_pair=[{first="tip", second="other", direction=[1, 0, 0]}]',
-            ),
-            "in a contact_pair as well",
+            r"wall 'wall1' stops nodes of pairs or constraints",
         ),
     ],
 )

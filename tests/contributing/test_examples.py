@@ -99,10 +99,10 @@ def test_field_is_one_entry(comm, shared_tmp_path):
 @pytest.mark.slow
 def test_energy_term_is_one_line(tmp_path):
     """In a copy of the package: the columns of a row are laid out when it is imported."""
-    line = re.search(r"^```python\n(Energy\(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1]
+    line = re.search(r"^```python\n(energy\(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1]
     package = Path(fields.__file__).parent
     shutil.copytree(package, tmp_path / package.name)
-    path = tmp_path / package.name / "energies.py"
+    path = tmp_path / package.name / "columns.py"
     text = path.read_text()
     path.write_text(text.replace("ENERGIES = (\n", f"ENERGIES = (\n    {line.strip()},\n", 1))
     command = [sys.executable, "-m", "pfem_petsc", "run", "pendulum", "--set", "initial.velocity=[0.0, 2.0, 0.0]"]

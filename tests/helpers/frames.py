@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 from PIL import Image
 
+from pfem_petsc.post.camera import direction, fit
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.render import render
+from pfem_petsc.post.scene import Scene
 
 TINY = (240, 160)
 
@@ -33,3 +37,23 @@ def near(picture: np.ndarray, colour, within: int = 40) -> np.ndarray:
 def box(picture: np.ndarray) -> tuple[int, int, int, int]:
     rows, columns = (picture[..., :3].min(axis=2) < 200).nonzero()
     return rows.min(), rows.max(), columns.min(), columns.max()
+
+
+def corners(bounds) -> np.ndarray:
+    return np.array(np.meshgrid(*np.transpose(bounds))).reshape(3, -1).T
+
+
+def camera_of(bounds, view="iso", aspect=1.0, normals=()):
+    """The camera that has the corners of a box in view."""
+    return fit(corners(bounds), direction(view, np.asarray(bounds), normals, (0.0, 0.0, 1.0)), aspect)
+
+
+def picture_of(points, bars, colours, camera, size, style, layers=()) -> np.ndarray:
+    """Bars without text; layers may be a function of the scene."""
+    bounds = np.array([points.min(axis=0), points.max(axis=0)])
+    motion = SimpleNamespace(start=points, bars=np.array(bars), bounds=bounds)
+    scene = Scene(motion, camera, size, style, unit=min(size[0] / 1110, size[1] / 604))
+    added = layers(scene) if callable(layers) else layers
+    picture = scene.draw(points, np.array(colours, dtype=np.uint8), camera, layers=added)
+    scene.close()
+    return picture.astype(int)

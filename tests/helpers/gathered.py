@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from mpi4py import MPI
 
 from pfem_petsc.mesh.slab import MeshSlab, slab_range
+from pfem_petsc.mesh.whole import check_mesh
 
 
 def whole(slab: MeshSlab, comm: MPI.Comm) -> MeshSlab:
@@ -27,6 +30,22 @@ def whole(slab: MeshSlab, comm: MPI.Comm) -> MeshSlab:
         structured=slab.structured,
         warnings=slab.warnings,
     )
+
+
+def assert_part_of(slab: MeshSlab, alone: MeshSlab, comm: MPI.Comm) -> MeshSlab:
+    """Check that the slabs of all ranks are the sound mesh that one rank makes alone; return that of all."""
+    mesh = whole(slab, comm)
+    assert (mesh.n_nodes, mesh.n_bars) == (len(mesh.points), len(mesh.bars))
+    np.testing.assert_array_equal(mesh.points, alone.points)
+    np.testing.assert_array_equal(mesh.bars, alone.bars)
+    for found, expected in ((mesh.node_groups, alone.node_groups), (mesh.bar_groups, alone.bar_groups)):
+        assert list(found) == list(expected)
+        for name, members in expected.items():
+            np.testing.assert_array_equal(np.sort(found[name]), members)
+    for name, values in alone.bar_fields.items():
+        np.testing.assert_array_equal(np.concatenate(comm.allgather(slab.bar_fields[name])), values)
+    assert check_mesh(replace(slab, structured=False, warnings=[]), comm) == []
+    return mesh
 
 
 def slab_from(

@@ -27,6 +27,11 @@ def run_alone(name, *overrides) -> dict[str, np.ndarray]:
         return run(Case.load(name, [*overrides, "output.fields_every=0"]), folder, MPI.COMM_SELF)
 
 
+def inspected(case, comm=MPI.COMM_WORLD) -> tuple[dict[str, str], list[str]]:
+    """Entries and warnings of ``check``. Collective."""
+    return Simulation(case, comm, check_only=True).inspect()
+
+
 def touching(history, wall):
     """Whether the wall pushes, row by row."""
     return np.linalg.norm(history[f"wall/{wall}/force"], axis=1) > 0.0

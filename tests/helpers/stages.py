@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pfem_petsc.output.sums import HEAD
+from pfem_petsc.columns import HEAD
 
 FLOOR = {"name": "floor", "type": "plane", "point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}
 PLATE = {"name": "plate", "type": "plane", "point": [0.0, 0.0, 0.1], "normal": [0.0, 0.0, -1.0]}
@@ -63,7 +63,7 @@ def check_balances(history: dict[str, np.ndarray], tolerance: float = 1e-9) -> N
     """Energy is balanced over all stages, and momentum is what the impulses made of it."""
     scale = max(abs(history[name]).max() for name in ("elastic_energy", "kinetic_energy", "external_work"))
     assert abs(history["energy_imbalance"]).max() <= tolerance * scale
-    impulses = sum(history[name] for name in HEAD.sizes if name.endswith("_impulse"))
+    impulses = sum(history[name] for name in HEAD.places if name.endswith("_impulse"))
     impulses = impulses + sum(
         history[name] for name in history if name.startswith("wall/") and name.endswith("impulse")
     )

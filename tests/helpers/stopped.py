@@ -73,15 +73,15 @@ CASES = {
 
 def request_stop(simulation, last):
     """Let a run be asked to stop after a step, as by a signal."""
-    loop, advance = simulation._loop, simulation._loop.advance
+    advance = simulation._advance
 
     def advance_and_stop():
         made = advance()
-        if made.step == last and loop.comm.rank == loop.comm.size - 1:
-            loop.stop._signal = 15
+        if made.step == last and simulation.comm.rank == simulation.comm.size - 1:
+            simulation._synchroniser.stop._signal = 15
         return made
 
-    loop.advance = advance_and_stop
+    simulation._advance = advance_and_stop
 
 
 def simulate(case, overrides, folder, comm, stop_after=None, **options):

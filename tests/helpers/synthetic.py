@@ -120,6 +120,7 @@ def write_result(folder: Path, snapshots: int = 5) -> Path:
     from mpi4py import MPI
 
     from pfem_petsc.case.schema import Case
+    from pfem_petsc.output.layout import Contents
     from pfem_petsc.output.vtkhdf import ResultWriter
 
     case = Case.load("rod_impact")
@@ -130,18 +131,10 @@ def write_result(folder: Path, snapshots: int = 5) -> Path:
     mesh.comm, mesh.n_nodes, mesh.n_bars, mesh.n_owned = MPI.COMM_SELF, len(points), len(bars), len(points)
     mesh.blocks, mesh.node_ids = [block], np.arange(len(points))
     mesh.bars, mesh.bar_ids = bars.astype(np.int32), np.arange(len(bars))
-    columns = {name: np.shape(values)[1:] for name, values in made_up.history.items()}
-    writer = ResultWriter(
-        made_up.path,
-        MPI.COMM_SELF,
-        mesh,
-        point_fields=made_up.point_fields,
-        cell_fields=made_up.cell_fields,
-        columns=columns,
-        column_types={"step": np.int64},
-        case_text=case.to_toml(),
-        attributes={},
-    )
+    columns = {name: np.dtype((float, np.shape(values)[1:])) for name, values in made_up.history.items()}
+    columns["step"] = np.dtype(np.int64)
+    contents = Contents(made_up.point_fields, made_up.cell_fields, columns, case.to_toml(), {})
+    writer = ResultWriter(made_up.path, MPI.COMM_SELF, mesh, contents)
     for row in range(len(made_up.history["time"])):
         writer.append_history({name: values[row] for name, values in made_up.history.items()})
     for i, time in enumerate(made_up.times):

@@ -5,10 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 
 from pfem_petsc.mesh.distribution import DistributedMesh
+from pfem_petsc.output.layout import Contents, Kept
 
-COLUMNS = {"time": (), "step": (), "newton_iterations": (), "momentum": (3,), "wall/floor/force": (3,)}
-COLUMNS |= {"probe/tip/position": (2, 3)}
-TYPES = {"step": np.int64, "newton_iterations": np.int32}
+COLUMNS = {
+    "time": np.dtype(float),
+    "step": np.dtype(np.int64),
+    "newton_iterations": np.dtype(np.int32),
+    "momentum": np.dtype((float, (3,))),
+    "wall/floor/force": np.dtype((float, (3,))),
+    "probe/tip/position": np.dtype((float, (2, 3))),
+}
 POINT_FIELDS, CELL_FIELDS = ["displacement", "contact_force", "reached"], ["stress", "section"]
 
 
@@ -78,15 +84,12 @@ class Truss:
         }
 
 
-def options(**changes):
-    """Arguments of a ResultWriter for these results."""
-    given = {"point_fields": POINT_FIELDS, "cell_fields": CELL_FIELDS, "columns": COLUMNS, "column_types": TYPES}
-    return {
-        **given,
-        "case_text": 'title = "A truss, tiny"\n',
-        "attributes": {"command": "test", "argv": [1, 2]},
-        **changes,
-    }
+def options(append_after_step=None, **changes):
+    """Arguments of a ResultWriter for these results; ``changes``: of their contents."""
+    given = {"point_fields": POINT_FIELDS, "cell_fields": CELL_FIELDS, "columns": COLUMNS}
+    given |= {"case_text": 'title = "A truss, tiny"\n', "attributes": {"command": "test", "argv": [1, 2]}}
+    step = append_after_step
+    return {"contents": Contents(**given | changes), "kept": None if step is None else Kept(step, step, step)}
 
 
 def write(writer, truss, steps, every=5):

@@ -2,12 +2,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers.gathered import stiffness_modes, whole
+from helpers.gathered import assert_part_of, stiffness_modes, whole
+from mpi4py import MPI
 from pydantic import ValidationError
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice, mast, net, prism, ring, rod
-from pfem_petsc.mesh.whole import check_mesh
 
 pytestmark = pytest.mark.parallel
 
@@ -49,17 +49,7 @@ def reference_cubic(n):
 @pytest.mark.parametrize("name", GENERATED)
 def test_every_rank_makes_its_part_of_the_same_sound_mesh(comm, name):
     module, keys = GENERATED[name]
-    slab = made(module, comm, **keys)
-    mesh, alone = whole(slab, comm), module.generate(module.Parameters(**keys), 0, 1)
-    assert (mesh.n_nodes, mesh.n_bars) == (len(mesh.points), len(mesh.bars))
-    np.testing.assert_array_equal(mesh.points, alone.points)
-    np.testing.assert_array_equal(mesh.bars, alone.bars)
-    for kind in ("node_groups", "bar_groups"):
-        assert list(getattr(slab, kind)) == list(getattr(alone, kind))
-        for group, members in getattr(alone, kind).items():
-            np.testing.assert_array_equal(np.sort(getattr(mesh, kind)[group]), members)
-    slab.structured = False
-    assert check_mesh(slab, comm) == []
+    assert_part_of(made(module, comm, **keys), made(module, MPI.COMM_SELF, **keys), comm)
 
 
 @pytest.mark.parametrize(("n", "nodes", "bars"), [(10, 1_331, 10_230), (22, 12_167, 101_706), (48, 117_649, 1_023_120)])
@@ -68,34 +58,6 @@ def test_cubic_lattice_has_the_bars_of_the_reference(comm, n, nodes, bars):
     assert (mesh.n_nodes, mesh.n_bars) == (nodes, bars)
     np.testing.assert_array_equal(mesh.bars, reference_cubic(n))
     np.testing.assert_array_equal(mesh.points, np.indices((n + 1,) * 3).reshape(3, -1).T * 0.01)
-
-
-def test_octet_bars_join_all_nearest_neighbours(comm):
-    pitch = 0.2
-    mesh = whole(made(lattice, comm, kind="octet", cells=[3, 3, 3], pitch=pitch), comm)
-    length = np.linalg.norm(mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]], axis=1)
-    np.testing.assert_allclose(length, pitch / np.sqrt(2), rtol=1e-12)
-    distance = np.linalg.norm(mesh.points[:, None] - mesh.points[None], axis=2)
-    assert mesh.n_bars == np.count_nonzero(np.abs(distance - pitch / np.sqrt(2)) < 1e-9) / 2
-    interior = ((mesh.points > 0.1 * pitch) & (mesh.points < 2.9 * pitch)).all(axis=1)
-    bars_of_node = np.bincount(mesh.bars.ravel(), minlength=mesh.n_nodes)
-    assert set(bars_of_node[interior]) == {12}
-    # 4 nodes a cell and 12 x 4 / 2 bars a cell inside; the faces add theirs.
-    assert mesh.n_nodes == 4**3 + 3 * 4 * 3 * 3
-    assert mesh.n_bars == 4 * 3 * 4 * 9 + 12 * 27
-
-
-def test_bcc_has_half_diagonals_and_edges(comm):
-    mesh = whole(made(lattice, comm, kind="bcc", cells=[3, 3, 3], pitch=2.0), comm)
-    length = np.linalg.norm(mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]], axis=1)
-    assert np.count_nonzero(np.isclose(length, np.sqrt(3.0))) == 8 * 27
-    assert np.count_nonzero(np.isclose(length, 2.0)) == 3 * 3 * 16
-
-
-@pytest.mark.parametrize("kind", ["cubic", "octet", "bcc"])
-def test_lattices_are_no_mechanisms(comm, kind):
-    mesh = whole(made(lattice, comm, kind=kind, cells=[2, 2, 3], pitch=1.0), comm)
-    assert stiffness_modes(mesh.points, mesh.bars) == 6
 
 
 @pytest.mark.parametrize("kind", ["cubic", "octet", "bcc"])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.gathered import whole
+from helpers.gathered import assert_part_of, whole
 from mpi4py import MPI
 from pydantic import ValidationError
 
@@ -17,7 +17,6 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice
 from pfem_petsc.mesh.lattices.expressions import Expression
-from pfem_petsc.mesh.whole import check_mesh
 
 ROOT = Path(__file__).parents[2]
 
@@ -78,8 +77,6 @@ def test_values(text, expected):
         ("x @ y", "this operator is not known"),
         ("x ^ 2", r"this operator is not known; powers are \*\*"),
         ("x if y else z", "not arithmetic"),
-        ("(" * 500 + "x" + ")" * 500, "not an expression|nested too deep"),
-        ("-" * 1900 + "x", "nested too deep|not an expression"),
         ("x+" * 1500 + "x", "more than 2000"),
         ("10**400", None),
         ("9**9**9**9", None),
@@ -90,8 +87,17 @@ def test_what_is_no_arithmetic_is_refused(text, why):
     if why is None:  # computed in double precision, in no time
         assert not np.isfinite(Expression(text, ("x",))({"x": np.zeros(1)})).any()
         return
-    with pytest.raises(ValueError, match=why.replace("(", r"\(").replace("[", r"\[") if "|" not in why else why):
+    with pytest.raises(ValueError, match=why):
         Expression(text, ("x", "y", "z"))
+
+
+@pytest.mark.parametrize("text", ["(" * 500 + "x" + ")" * 500, "-" * 1900 + "x"])
+def test_deep_nesting_is_computed_or_refused(text):
+    """Which of both depends on the version of Python."""
+    try:
+        assert Expression(text, ("x",))({"x": np.ones(1)}) == 1.0
+    except ValueError as error:
+        assert re.match("not an expression|the expression is nested too deep", str(error))
 
 
 def write_grid(path, cells=False):
@@ -194,11 +200,8 @@ def test_examples_of_the_page_about_lattices_are_read(tmp_path, block):
 @pytest.mark.parametrize("more", [{}, {"keep": "x + y + z < 1.5"}, {"kind": "diamond"}])
 def test_nodes_go_where_the_map_says(comm, more):
     keys = {"map": ["x*(1 - 0.5*z)", "y + 0.1*sin(x)", "z"], "origin": [0.0, 0.0, 0.2], **more}
-    slab = generated(comm, **keys)
-    mesh, alone, block = whole(slab, comm), generated(**keys), generated(origin=[0.0, 0.0, 0.2])
-    np.testing.assert_array_equal(mesh.points, alone.points)
-    np.testing.assert_array_equal(mesh.bars, alone.bars)
-    assert check_mesh(slab, comm)[1:] == []
+    mesh = assert_part_of(generated(comm, **keys), generated(**keys), comm)
+    block = generated(origin=[0.0, 0.0, 0.2])
     if not more:
         x, y, z = block.points.T
         np.testing.assert_allclose(

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from helpers.generated import OCTET, degrees, generated, lengths
 
-from pfem_petsc.mesh.lattices.numbering import CellByCell, ItemByItem
-from pfem_petsc.mesh.lattices.shape import random_numbers
+from pfem_petsc.mesh.lattices.block import random_numbers
 
 
 def as_sets(mesh):
@@ -41,18 +40,6 @@ def test_copies_of_a_strut_join_nodes_at_constant_offsets():
     inside = ((middle > 1.5) & (middle < 4.5)).all(axis=1)
     assert np.count_nonzero(inside) > 500
     assert len(np.unique(np.diff(mesh.bars[inside], axis=1))) <= 24  # struts of a cell
-
-
-@pytest.mark.parametrize("numbering", [CellByCell, ItemByItem])
-def test_numbers_are_places_in_both_directions(numbering):
-    shapes = np.array([(3, 2, 4), (2, 2, 3), (3, 3, 2), (2, 0, 3), (1, 2, 4)])
-    numbers = numbering(shapes)
-    assert numbers.total == shapes.prod(axis=1).sum()
-    places = numbers.decode(np.arange(numbers.total))
-    np.testing.assert_array_equal(numbers.encode(*places), np.arange(numbers.total))
-    for item, shape in enumerate(shapes):
-        found = np.stack(places[1:], axis=1)[places.item == item]
-        assert set(map(tuple, found.tolist())) == set(np.ndindex(*shape))
 
 
 def test_graded_pitch_follows_its_differential_equation():

@@ -1,4 +1,4 @@
-"""Lattices that fill closed surfaces: what is inside, clipped struts, graded cells."""
+"""Lattices that fill closed surfaces: files that are read or refused, what is inside, clipped struts, graded cells."""
 
 from __future__ import annotations
 
@@ -6,18 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.gathered import whole
-from helpers.generated import degrees, lengths
-from helpers.surfaces import CORNERS, CUBE, filled, write_stl
+from helpers.gathered import assert_part_of
+from helpers.generated import CORNERS, CUBE, degrees, filled, lengths, write_stl
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, cases
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.lattices.surface_files import read_surface
-from pfem_petsc.mesh.whole import check_mesh
-
-"""Triangles of a unit cube, with outward normals."""
+from pfem_petsc.mesh.lattices.surface import read_surface
 
 
 def ball(path, radius=1.0, rings=24):
@@ -239,7 +235,7 @@ def test_graded_cells_cover_the_surface(tmp_path, kind, below):
 )
 def test_gradings_that_do_not_fit_the_surface(tmp_path, factor, origin, told, monkeypatch):
     path = write_stl(tmp_path / "cube.stl", CORNERS + (0.0, 0.0, 0.125), CUBE)
-    monkeypatch.setattr("pfem_petsc.mesh.lattices.shape._STEPS", 1)
+    monkeypatch.setattr("pfem_petsc.mesh.lattices.block._STEPS", 1)
     with pytest.raises(InputError, match=told):
         filled(kind="cubic", pitch=0.25, surface={"file": str(path)}, grading=(1, 1, factor), origin=origin)
 
@@ -280,15 +276,7 @@ def test_every_rank_has_its_part_of_the_same_lattice(comm, shared_tmp_path, keys
         ball(shared_tmp_path / "ball.stl", rings=12)
     comm.Barrier()
     keys = keys | {"surface": {"file": str(shared_tmp_path / "ball.stl")} | keys["surface"]}
-    slab, alone = filled(comm, **keys), filled(MPI.COMM_SELF, **keys)
-    mesh = whole(slab, comm)
-    np.testing.assert_array_equal(mesh.points, alone.points)
-    np.testing.assert_array_equal(mesh.bars, alone.bars)
-    for kind in ("node_groups", "bar_groups"):
-        for group, members in getattr(alone, kind).items():
-            np.testing.assert_array_equal(np.sort(getattr(mesh, kind)[group]), members)
-    slab.structured, slab.warnings = False, []
-    assert check_mesh(slab, comm) == []
+    assert_part_of(filled(comm, **keys), filled(MPI.COMM_SELF, **keys), comm)
 
 
 def test_a_surface_in_millimetres_is_suspected(tmp_path):
@@ -303,3 +291,76 @@ def test_a_surface_in_millimetres_is_suspected(tmp_path):
         filled(pitch=1e-20, surface={"file": str(path)})
     with pytest.raises(InputError, match=r"a surface of 12 x 12 x 12 m: .* nodes have"):
         filled(pitch=3e-3, surface={"file": str(path), "scale": 0.1})
+
+
+def test_obj_and_ply_are_read(tmp_path):
+    vertices = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in CORNERS)
+    obj = "".join(f"v {line}\n" for line in vertices.splitlines())
+    (tmp_path / "cube.obj").write_text(obj + "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in CUBE))
+    head = "ply\nformat ascii 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 12\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "cube.ply").write_text(head + vertices + "".join(f"3 {a} {b} {c}\n" for a, b, c in CUBE))
+    for name in ("cube.obj", "cube.ply"):
+        assert read_surface(tmp_path / name, 0.1).volume == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("open.stl", "the surface is not closed: 4 of its edges"),
+        ("empty.stl", "no surface of triangles"),
+        ("cube.step", "no reader for .step; known: .stl, .obj, .ply"),
+        ("absent.stl", "cannot open: No such file"),
+    ],
+)
+def test_files_that_are_refused(tmp_path, name, text):
+    write_stl(tmp_path / "open.stl", CORNERS, CUBE[:-2])
+    (tmp_path / "empty.stl").write_text("solid s\nendsolid s\n")
+    with pytest.raises(InputError, match=f"mesh.surface.file: .*{name}.*{text}|no reader"):
+        filled(surface={"file": str(tmp_path / name)})
+
+
+def test_damaged_files_are_refused(tmp_path, capfd):
+    """With one message, and nothing from VTK beside it."""
+    good = (Path(cases.__file__).parent / "bracket.stl").read_bytes()
+    random = np.random.default_rng(4)
+    for number in range(24):
+        data = bytearray(good)
+        if number % 3 == 0:
+            data = random.bytes(int(random.integers(0, 4000)))
+        elif number % 3 == 1:
+            data = good[: int(random.integers(0, len(good) - 50))]
+        else:
+            data[random.integers(84, len(data))] ^= 0xFF
+            for place in random.integers(84, len(data), 20):
+                data[place] = int(random.integers(0, 256))
+        path = tmp_path / f"damaged{number}{('.stl', '.ply', '.obj')[number // 3 % 3]}"
+        path.write_bytes(bytes(data))
+        with pytest.raises(InputError, match="no surface of triangles|is not closed|encloses no volume"):
+            read_surface(path, 1e-3)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_surface_without_volume_is_refused(tmp_path):
+    flat = write_stl(tmp_path / "flat.stl", CORNERS, [(0, 1, 3), (0, 3, 1)])
+    with pytest.raises(InputError, match="encloses no volume"):
+        read_surface(flat, 1.0)
+
+
+def test_too_coarse_a_lattice_is_refused(tmp_path):
+    path = write_stl(tmp_path / "cube.stl", CORNERS, CUBE)
+    with pytest.raises(InputError, match="no strut is inside the surface; use a smaller pitch"):
+        filled(kind="kelvin", pitch=5.0, surface={"file": str(path)})
+
+
+def test_file_is_relative_to_the_case(tmp_path):
+    write_stl(tmp_path / "cube.stl", CORNERS, CUBE)
+    case = {
+        "mesh": {"generator": "lattice", "pitch": 0.5, "surface": {"file": "cube.stl"}},
+        "material": {"m": {"young_modulus": 1e9, "density": 1000.0}},
+        "section": {"s": {"area": 1e-6, "material": "m"}},
+        "time": {"integrator": "central_differences", "step": "auto", "end": 1e-5},
+    }
+    read = Case.from_dict(case, folder=tmp_path)
+    assert read.mesh.parameters.surface.file == str((tmp_path / "cube.stl").resolve())
+    assert Case.from_toml(read.to_toml()).mesh == read.mesh

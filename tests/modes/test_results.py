@@ -16,7 +16,8 @@ from pfem_petsc.errors import EarlyStop, InputError, SimulationFailure
 from pfem_petsc.modes import find as choice
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.verify import examine
-from pfem_petsc.post.modes import ModeFrames, render_modes
+from pfem_petsc.post.motion import ModeFrames
+from pfem_petsc.post.render import render_modes
 
 
 def run(case, folder, comm=MPI.COMM_SELF, **options):

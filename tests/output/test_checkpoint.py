@@ -12,7 +12,7 @@ from helpers.launch import environment
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError, SimulationFailure
-from pfem_petsc.output.checkpoint import newest_checkpoint, read_checkpoint, write_checkpoint
+from pfem_petsc.output.checkpoint import Checkpoint, newest_checkpoint, write_checkpoint
 from pfem_petsc.output.integrity import checksum
 from pfem_petsc.parallel.natural import NaturalOrder
 
@@ -43,17 +43,18 @@ def write(path, comm=COMM, seed=1, scalars=SCALARS):
 
 def read(path, comm=COMM, seed=2, names=("positions", "active", "on"), n=N):
     order = NaturalOrder(comm, owned_ids(comm, seed, n), n)
-    return read_checkpoint(path, comm, dict.fromkeys(names, order))
+    with Checkpoint(path, comm) as file:
+        return file.read(dict.fromkeys(names, order)), file
 
 
 @pytest.mark.parallel
 def test_everything_comes_back_bit_for_bit_with_other_owners(shared_tmp_path):
     write(shared_tmp_path / "checkpoint.h5")
-    found = read(shared_tmp_path / "checkpoint.h5")
+    arrays, found = read(shared_tmp_path / "checkpoint.h5")
     for name, array in values().items():
         mine = array[owned_ids(COMM, 2)]
-        assert found.arrays[name].dtype == mine.dtype
-        assert found.arrays[name].tobytes() == mine.tobytes()
+        assert arrays[name].dtype == mine.dtype
+        assert arrays[name].tobytes() == mine.tobytes()
     assert found.scalars == SCALARS
     assert found.attributes == ATTRIBUTES
 
@@ -68,7 +69,7 @@ def test_a_file_of_all_ranks_equals_that_of_one(shared_tmp_path):
             for name in a["arrays"]:
                 assert a["arrays"][name][()].tobytes() == b["arrays"][name][()].tobytes()
                 assert a["arrays"][name].attrs["checksum"] == b["arrays"][name].attrs["checksum"]
-        assert read(shared_tmp_path / "alone.h5", MPI.COMM_SELF).scalars == SCALARS
+        assert read(shared_tmp_path / "alone.h5", MPI.COMM_SELF)[1].scalars == SCALARS
 
 
 @pytest.mark.parallel
@@ -76,8 +77,8 @@ def test_the_one_before_is_kept_and_no_other_file(shared_tmp_path):
     for step in (1, 2, 3):
         write(shared_tmp_path / "checkpoint.h5", scalars={"step": step})
     assert sorted(os.listdir(shared_tmp_path)) == ["checkpoint-previous.h5", "checkpoint.h5"]
-    assert read(shared_tmp_path / "checkpoint.h5").scalars["step"] == 3
-    assert read(shared_tmp_path / "checkpoint-previous.h5").scalars["step"] == 2
+    assert read(shared_tmp_path / "checkpoint.h5")[1].scalars["step"] == 3
+    assert read(shared_tmp_path / "checkpoint-previous.h5")[1].scalars["step"] == 2
     assert newest_checkpoint(shared_tmp_path) == shared_tmp_path / "checkpoint.h5"
     COMM.Barrier()
     if COMM.rank == 0:
@@ -123,12 +124,12 @@ def test_any_flipped_bit_or_cut_is_refused_or_harmless(tmp_path):
         damaged[position] ^= 1 << int(random.integers(8))
         path.write_bytes(damaged)
         try:
-            found = read(path, MPI.COMM_SELF)
+            arrays, found = read(path, MPI.COMM_SELF)
         except InputError as error:
             assert "checkpoint.h5" in str(error)
             refused += 1
         else:  # the flip hit a byte that means nothing
-            assert {name: array.tobytes() for name, array in found.arrays.items()} == expected
+            assert {name: array.tobytes() for name, array in arrays.items()} == expected
             assert found.scalars == SCALARS
     assert refused > 50
     for length in (0, 1, 100, len(whole) // 2, len(whole) - 8):
@@ -164,8 +165,9 @@ def test_many_arrays_fit_the_seal(tmp_path):
     order = NaturalOrder(MPI.COMM_SELF, np.arange(5), 5)
     arrays = {f"array{i}": (order, np.full(5, i, dtype=np.int64)) for i in range(200)}
     write_checkpoint(tmp_path / "c.h5", MPI.COMM_SELF, arrays, {}, {})
-    found = read_checkpoint(tmp_path / "c.h5", MPI.COMM_SELF, dict.fromkeys(arrays, order))
-    assert all((found.arrays[f"array{i}"] == i).all() for i in range(200))
+    with Checkpoint(tmp_path / "c.h5", MPI.COMM_SELF) as file:
+        found = file.read(dict.fromkeys(arrays, order))
+    assert all((found[f"array{i}"] == i).all() for i in range(200))
 
 
 def test_checksum_sees_swaps_and_depends_on_values_only():
@@ -211,9 +213,9 @@ def test_a_kill_leaves_a_complete_checkpoint(tmp_path, chance):
             writer.kill()
             written += len(writer.stdout.read().split())
             writer.wait()
-        found = read(newest_checkpoint(tmp_path), MPI.COMM_SELF)
+        arrays, found = read(newest_checkpoint(tmp_path), MPI.COMM_SELF)
         assert found.scalars["step"] >= written - 1 > 0
-        assert found.arrays["positions"].tobytes() == values()["positions"][owned_ids(MPI.COMM_SELF, 2)].tobytes()
+        assert arrays["positions"].tobytes() == values()["positions"][owned_ids(MPI.COMM_SELF, 2)].tobytes()
 
 
 def test_disk_full_keeps_the_checkpoint_before(small_disk):

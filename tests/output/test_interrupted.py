@@ -15,6 +15,7 @@ from helpers.truss import Truss, options, write
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError, SimulationFailure
+from pfem_petsc.output.layout import Kept
 from pfem_petsc.output.repair import repair
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.vtkhdf import ResultWriter
@@ -130,7 +131,7 @@ def test_repair_killed_between_its_flushes_leaves_a_file_that_vtk_reads(tmp_path
         states.append((len(steps["Values"]), int(steps.attrs["NSteps"]), data, int(rows), len(file["history/time"])))
 
     monkeypatch.setattr(h5py.File, "flush", watched)
-    assert repair(path, (8, 8)) == (2, 9)
+    assert repair(path, Kept(8, 8, 8)) == (2, 9)
     assert states[0][0] == 2
     assert states[0][1:] == (5, 5, 23, 23)
     assert states[1] == (2, 2, 5, 9, 23)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pfem_petsc.recording.recorder import Probes
+from pfem_petsc.run.recorder import Probes
 
 
 @pytest.mark.parallel

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from pfem_petsc.columns import Layout
 from pfem_petsc.output import integrity
-from pfem_petsc.output.integrity import RowDigests, row_digests, word_sum
+from pfem_petsc.output.integrity import RowDigests, word_sum
 from pfem_petsc.output.vtkhdf import _permuted
 from pfem_petsc.parallel.natural import NaturalOrder
 
@@ -23,13 +24,9 @@ def test_rows_as_vectors_have_the_checksums_of_their_columns():
     rng = np.random.default_rng(2)
     columns = {"time": rng.random(5), "step": rng.integers(0, 9, 5), "word": rng.integers(0, 3, 5).astype(np.uint8)}
     columns["force"] = -rng.random((5, 3))
-    places, at = {}, 0
-    for name, values in columns.items():
-        width = values.size // 5
-        places[name] = (at, at + width, values.dtype)
-        at += width
+    digests = RowDigests(Layout({name: np.dtype((values.dtype, values.shape[1:])) for name, values in columns.items()}))
     vectors = np.column_stack([values.reshape(5, -1).astype(float) for values in columns.values()])
-    assert np.array_equal(RowDigests(places)(vectors, 11), row_digests(columns, 11))
+    assert np.array_equal(digests.of_vectors(vectors, 11), digests.of_columns(columns, 11))
 
 
 @pytest.mark.parametrize(("shape", "dtype"), [((3,), "float64"), ((), "float64"), ((), "int8")])

@@ -11,7 +11,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.output import hdf5 as growing
-from pfem_petsc.output.integrity import damages
+from pfem_petsc.output.damage import damages
 from pfem_petsc.output.layout import complete_snapshots
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.vtkhdf import ResultWriter
@@ -57,7 +57,7 @@ def test_values_by_vtk_and_by_open_result(shared_tmp_path):
             assert result.history["newton_iterations"].dtype == np.int32
             np.testing.assert_array_equal(result.history.wall.floor.force, result.history["wall/floor/force"])
             np.testing.assert_array_equal(result.history["wall"]["floor"]["force"][:, 2], 2.0 * np.array(STEPS))
-            assert result.case_text == options()["case_text"]
+            assert result.case_text == options()["contents"].case_text
             assert result.attributes["ranks"] == COMM.size
             assert result.attributes["argv"] == [1, 2]
             assert {"petsc", "numpy", "h5py", "python", "pfem_petsc"} <= set(result.attributes)

@@ -91,5 +91,5 @@ def test_nothing_is_laid_over_methods_unless_asked(tmp_path):
 
     simulation = Simulation(Case.load("rod_impact", overrides=["time.end=0.02"]), output=tmp_path, quiet=True)
     simulation.run()
-    assert "advance" not in vars(simulation._loop)
+    assert "_advance" not in vars(simulation)
     assert "forces" not in vars(simulation.model.bars)

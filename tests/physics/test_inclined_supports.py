@@ -10,7 +10,7 @@ from helpers.runs import run
 from scipy.spatial.transform import Rotation
 
 from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.preflight.rigidity import unbraced_nodes
+from pfem_petsc.preflight.geometry import Geometry
 
 TURN = Rotation.from_rotvec([0.4, -0.9, 0.7]).as_matrix()
 POINTS = np.array(
@@ -180,7 +180,7 @@ def test_reports_before_a_run(comm, shared_tmp_path):
         case = tower(shared_tmp_path, comm, turned, **in_time("newmark"), modes={"count": 3})
         simulation = Simulation(case, comm, check_only=True)
         entries, warnings = simulation.inspect()
-        loose = unbraced_nodes(simulation.model)
+        loose = Geometry(simulation.model).unbraced()
         found.append((entries["rigidity"], simulation.summary()["modes"], loose, warnings, simulation.plan.frequency))
     assert found[0][:4] == found[1][:4]
     np.testing.assert_allclose(found[0][4], found[1][4], rtol=1e-3)

@@ -9,8 +9,8 @@ from helpers.bodies import two_lattices
 from helpers.runs import run
 
 from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.energies import LOST, STORED, SUPPLIED
-from pfem_petsc.recording import observers as recording
+from pfem_petsc.columns import LOST, STORED, SUPPLIED
+from pfem_petsc.run import observers as recording
 from pfem_petsc.stepping.ledger import LeapfrogLedger, Ledger
 
 

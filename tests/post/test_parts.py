@@ -6,19 +6,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.frames import camera_of, corners
 from helpers.synthetic import SyntheticResult, ring
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.camera import aim
-from pfem_petsc.post.fields import ColourField, ColourScale
-from pfem_petsc.post.poster import grid, instants
+from pfem_petsc.post.colours import ColourField, ColourScale
+from pfem_petsc.post.page import grid
+from pfem_petsc.post.render import instants
 from pfem_petsc.post.walls import plane, wall_surfaces
 
 BOX = np.array([[0.0, 0.0, 0.0], [2.0, 1.0, 1.0]])
-
-
-def corners(bounds):
-    return np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T
 
 
 @pytest.mark.parametrize(
@@ -27,13 +24,13 @@ def corners(bounds):
 )
 def test_flat_structures_are_seen_square_on(extent, towards):
     bounds = np.array([(3.0, 4.0, 5.0), np.add((3.0, 4.0, 5.0), extent)])
-    camera = aim(corners(bounds), bounds, [], "auto", 1.6)
+    camera = camera_of(bounds, "auto", 1.6)
     assert camera.parallel and np.array_equal(camera.towards, towards)
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 2.0])
 def test_oblique_view_holds_every_point(aspect):
-    camera = aim(corners(BOX), BOX, [], "auto", aspect)
+    camera = camera_of(BOX, "auto", aspect)
     assert not camera.parallel
     eye = camera.centre + camera.distance * camera.towards
     ahead = corners(BOX) - eye
@@ -47,13 +44,13 @@ def test_oblique_view_holds_every_point(aspect):
 
 @pytest.mark.parametrize("normal", [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
 def test_oblique_view_looks_at_walls_from_their_allowed_side(normal):
-    camera = aim(corners(BOX), BOX, [np.array(normal, dtype=float)], "iso", 1.6)
+    camera = camera_of(BOX, "iso", 1.6, [np.array(normal, dtype=float)])
     assert camera.towards @ normal > 0.25 and camera.towards[2] > 0
 
 
 def test_unknown_view_is_refused():
     with pytest.raises(InputError, match="'above' is not known"):
-        aim(corners(BOX), BOX, [], "above", 1.0)
+        camera_of(BOX, "above")
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 2.0), (-1, 0, 0), (1.0, -2.0, 0.5)])

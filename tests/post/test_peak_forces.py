@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation, Truss, open_result
-from pfem_petsc.output.peaks import peak_force, touch_impulse
+from pfem_petsc.output.result import peak_force, touch_impulse
 
 # a rod of unit E, rho and A whose end node, of mass l/2, is at the wall
 LENGTH, SPEED = 0.05, 0.5

@@ -13,12 +13,11 @@ from matplotlib.text import Text
 from PIL import Image
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.energies import LOST, STORED, SUPPLIED
+from pfem_petsc.columns import LOST, STORED, SUPPLIED
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.chart import COLOURS, Chart
-from pfem_petsc.post.energies import balance_error, draw_energies
+from pfem_petsc.post.histories import balance_error, draw_energies, draw_momentum, draw_probes
 from pfem_petsc.post.plot import plot
-from pfem_petsc.post.vectors import draw_momentum, draw_probes
 
 
 @pytest.fixture

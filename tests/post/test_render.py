@@ -16,10 +16,9 @@ from PIL import Image
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.contact.walls.plane import Parameters
 from pfem_petsc.errors import InputError
-from pfem_petsc.post import headless
-from pfem_petsc.post.modes import render_modes
+from pfem_petsc.post import scene
 from pfem_petsc.post.page import Page
-from pfem_petsc.post.render import render
+from pfem_petsc.post.render import render, render_modes
 from pfem_petsc.post.walls import walls_present
 
 SMALL = (480, 270)
@@ -226,15 +225,15 @@ def test_folder_that_cannot_be_made_is_refused(tmp_path):
 
 def test_crash_of_the_graphics_is_foreseen(monkeypatch):
     """A probe that dies like VTK without OpenGL ends in a message of what to install, not in a dead process."""
-    monkeypatch.setattr(headless, "_PROBE", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    monkeypatch.setattr(scene, "_PROBE", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     with pytest.raises(InputError, match=r"libosmesa6.*libegl1 libgl1-mesa-dri"):
-        headless.require_rendering.__wrapped__()
+        scene.require_rendering.__wrapped__()
 
 
 def test_a_display_that_is_not_there_does_not_matter(tmp_path):
     environment = {**os.environ, "DISPLAY": ":987"}
-    environment.pop(headless.VARIABLE, None)
-    code = "import os, pfem_petsc.post.headless as h; h.require_rendering(); print(os.environ[h.VARIABLE])"
+    environment.pop(scene.VARIABLE, None)
+    code = "import os, pfem_petsc.post.scene as h; h.require_rendering(); print(os.environ[h.VARIABLE])"
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() in ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
@@ -257,12 +256,12 @@ def test_a_window_of_another_kind_than_asked_for_does_not_count(tmp_path, monkey
         "vtkRenderer = vtkRenderWindow = vtkWindowToImageFilter = Anything\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setenv(headless.VARIABLE, "")  # so that the end of the test takes away what is set below
-    monkeypatch.delenv(headless.VARIABLE)
-    assert not headless._works("vtkEGLRenderWindow")
-    assert headless._works("vtkOSOpenGLRenderWindow")
-    headless.require_rendering.__wrapped__()
-    assert os.environ[headless.VARIABLE] == "vtkOSOpenGLRenderWindow"
+    monkeypatch.setenv(scene.VARIABLE, "")  # so that the end of the test takes away what is set below
+    monkeypatch.delenv(scene.VARIABLE)
+    assert not scene._works("vtkEGLRenderWindow")
+    assert scene._works("vtkOSOpenGLRenderWindow")
+    scene.require_rendering.__wrapped__()
+    assert os.environ[scene.VARIABLE] == "vtkOSOpenGLRenderWindow"
 
 
 def test_title_with_characters_that_the_font_lacks(tmp_path, recwarn):

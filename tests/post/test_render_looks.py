@@ -7,18 +7,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.frames import TINY, box, draw, drawing, near
+from helpers.frames import box, camera_of, draw, drawing, near, picture_of, pixels
 from helpers.synthetic import SyntheticResult, lattice, ring
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.cli.main import main
 from pfem_petsc.cli.render import _frames
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.camera import aim
-from pfem_petsc.post.contrast import GHOST, MARKS, TRAILS
-from pfem_petsc.post.frames import chosen_frames
-from pfem_petsc.post.radii import drawn_radii, radii_of
-from pfem_petsc.post.scene import Layer, Scene, Style
+from pfem_petsc.post.colours import GHOST, MARKS, TRAILS
+from pfem_petsc.post.motion import chosen_frames, drawn_radii, radii_of
+from pfem_petsc.post.page import Page
+from pfem_petsc.post.scene import Layer, Style
 
 
 @pytest.fixture
@@ -87,46 +86,47 @@ def test_radii_without_the_mesh(flying):
     assert radii_of(flying) is None
 
 
-@pytest.mark.parametrize("view", ["xy", "iso"])
-def test_tubes_have_their_radius(view):
-    """A bar of radius r across the view, and its nodes, are drawn 2 r wide and l + 2 r long, with round ends."""
-    points, bars, radius = np.array([[-0.5, 0, 0], [0.5, 0, 0.0]]), np.array([[0, 1]]), 0.1
-    size = (400, 300)
-    bounds = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
-    corners = np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T
-    camera = aim(corners, bounds, [], "xy" if view == "xy" else (0.0, -1.0, 0.0), 4 / 3)
-    scene = Scene(points, bars, camera, bounds, size, Style(radius=np.array([radius]), nodes=False))
-    picture = scene.draw(points, np.full((1, 3), 90, dtype=np.uint8), False, camera).astype(int)
+CUBE = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+VIEWS = pytest.mark.parametrize("view", ["xy", (0.0, 0.0, 1.0)], ids=["parallel", "perspective"])
+
+
+@pytest.mark.parametrize("count", [1, 2001, 20_001], ids=["few", "some", "many"])
+@pytest.mark.parametrize("view", ["xy", (0.0, -1.0, 0.0)], ids=["parallel", "perspective"])
+def test_tubes_have_their_radius(view, count):
+    """A bar of radius r across the view is 2 r wide and l + 2 r long, with round ends; as one of many, without."""
+    points, radius, size = np.array([[-0.5, 0, 0], [0.5, 0, 0.0]]), 0.1, (400, 300)
+    camera, style = camera_of(0.5 * CUBE, view, 4 / 3), Style(True, np.full(count, radius), nodes=False)
+    picture = picture_of(points, np.tile([[0, 1]], (count, 1)), np.full((count, 3), 90), camera, size, style)
     rows, columns = (picture.min(axis=2) < 250).nonzero()
-    scale = size[1] / (2 * camera.half_height)
-    assert np.ptp(rows) + 1 == pytest.approx(2 * radius * scale, abs=1.6)
-    assert np.ptp(columns) + 1 == pytest.approx(1.2 * scale, abs=1.6)
-    area = (2 * radius + math.pi * radius**2) * scale**2
-    assert len(rows) == pytest.approx(area, rel=0.04)
+    scale, ends = size[1] / (2 * camera.half_height), 1.0 if count <= 20_000 else 0.0
+    assert np.ptp(rows) + 1 == pytest.approx(2 * radius * scale, abs=1.6 if count == 1 else 4.0)
+    assert np.ptp(columns) + 1 == pytest.approx((1.0 + 2 * ends * radius) * scale, abs=2.0)
+    area = (2 * radius + ends * math.pi * radius**2) * scale**2
+    assert len(rows) == pytest.approx(area, rel=0.04 if count == 1 else 0.12)
 
 
-@pytest.mark.parametrize("parallel", [True, False], ids=["parallel", "perspective"])
-def test_what_is_nearer_hides(parallel):
-    """Two crossed bars in both orders, a red one in front; and a vertical one that pierces a horizontal one."""
+@VIEWS
+def test_what_is_nearer_hides(view):
+    """Two crossed bars in both orders, a red one in front."""
     points = np.array([[-1, 0, 0.1], [1, 0, 0.1], [0, -1, -0.1], [0, 1, -0.1]], dtype=float)
     red, blue = (200, 0, 0), (0, 0, 200)
-    bounds = np.array([[-1.0, -1, -1], [1, 1, 1]])
-    camera = aim(np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T, bounds, [], "xy" if parallel else (0, 0, 1), 1.0)
+    camera, style = camera_of(CUBE, view), Style(True, np.full(2, 0.15), nodes=False)
     for bars, colours in (([[0, 1], [2, 3]], (red, blue)), ([[2, 3], [0, 1]], (blue, red))):
-        style = Style(radius=np.full(2, 0.15), nodes=False)
-        scene = Scene(points, np.array(bars), camera, bounds, (160, 160), style)
-        middle = scene.draw(points, np.array(colours, dtype=np.uint8), False, camera).astype(int)[80, 80]
+        middle = picture_of(points, bars, colours, camera, (160, 160), style)[80, 80]
         assert middle[0] > middle[2] + 60
 
 
-def test_lines_and_tubes_are_chosen_by_the_number_of_bars(monkeypatch):
-    points, bars = lattice(3)
-    bounds = np.array([points.min(axis=0), points.max(axis=0)])
-    camera = aim(points, bounds, [], "iso", 1.5)
-    assert Scene(points, bars, camera, bounds, TINY).tubes
-    monkeypatch.setattr("pfem_petsc.post.scene.TUBE_LIMIT", len(bars) - 1)
-    assert not Scene(points, bars, camera, bounds, TINY).tubes
-    assert Scene(points, bars, camera, bounds, TINY, Style(tubes=True)).tubes
+@pytest.mark.slow
+def test_lines_and_tubes_are_chosen_by_the_number_of_bars(tmp_path):
+    """Up to 20,000 bars, thick ones hide most of the page."""
+    for cells, thick in ((3, True), (16, False)):
+        result = SyntheticResult(tmp_path / f"{cells}.vtkhdf", *lattice(cells), walls=())
+        without_mesh(result, math.pi * (0.1 / cells) ** 2)
+        plain, wide = (
+            (drawing(draw(tmp_path, result, frames=[0], radius_scale=factor)[0])[..., :3].min(axis=2) < 250).mean()
+            for factor in (0.01, 1.0)
+        )
+        assert (wide > 1.1 * plain) == thick
 
 
 def test_small_models_are_not_hair_thin(tmp_path, flying):
@@ -146,40 +146,35 @@ def test_ghost_stays_where_the_structure_was(tmp_path, flying):
     assert pale[1].min() < box(plain)[2] - 10
 
 
-@pytest.mark.parametrize("parallel", [True, False], ids=["parallel", "perspective"])
-def test_what_is_added_has_its_depth(parallel):
+@VIEWS
+def test_what_is_added_has_its_depth(view):
     """A trajectory or ghost in front of a bar is seen, one behind it hidden; at the same place, the shift decides."""
     points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    bounds = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-    camera = aim(np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T, bounds, [], "xy" if parallel else (0, 0, 1), 1.0)
-    scene = Scene(points, np.array([[0, 1]]), camera, bounds, (200, 200), Style(bar_width=8.0, nodes=False))
-    red, green = np.array([[255, 0, 0]], dtype=np.uint8), (0, 158, 115)
-    thick = scene.thickness(camera)
-    for height, shift, seen in ((0.8, 0.0, True), (-0.8, 0.0, False), (0.0, thick, True), (0.0, -thick, False)):
+    camera, style = camera_of(CUBE, view), Style(False, bar_width=8.0, nodes=False)
+    for height, sign, seen in ((0.8, 0.0, True), (-0.8, 0.0, False), (0.0, 1.0, True), (0.0, -1.0, False)):
         places = np.array([[0.0, -1.0, height], [0.0, 1.0, height]])
-        layer = Layer(places, np.array([[0, 1]]), green, 12.0, shift)
-        picture = scene.draw(points, red, False, camera, layers=[layer]).astype(int)
-        assert (picture[100, 100, 1] > picture[100, 100, 0]) == seen, (height, shift)
+
+        def layers(scene, places=places, sign=sign):
+            return [Layer(places, np.array([[0, 1]]), (0, 158, 115), 12.0, sign * scene.thickness(camera))]
+
+        picture = picture_of(points, [[0, 1]], [[255, 0, 0]], camera, (200, 200), style, layers)
+        assert (picture[100, 100, 1] > picture[100, 100, 0]) == seen, (height, sign)
         assert picture[40, 100, 1] > picture[40, 100, 0]
 
 
-def test_bars_of_small_models_are_seen_in_tiles_too(tmp_path, monkeypatch):
-    """A slender tower of some hundred bars: two pixels or more in frames and in the six instants of a page."""
+def test_bars_of_small_models_are_seen_in_tiles_too(tmp_path):
+    """A slender tower of some hundred bars: two pixels or more in the six instants of a page, too."""
     level = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
     points = np.concatenate([level + [0.0, 0.0, 1.4 * k] for k in range(20)])
     i, four = np.arange(76), np.tile([1, 1, 1, -3], 19)
     bars = np.concatenate([np.stack(ends, axis=1) for ends in ((i, i + 4), (i, i + 4 + four), (i + 4, i + 4 + four))])
     tower = SyntheticResult(tmp_path / "x" / "result.vtkhdf", points, bars, walls=(), snapshots=7)
-    widths = []
-
-    class Watched(Scene):
-        def __init__(self, *arguments):
-            super().__init__(*arguments)
-            widths.append(self.width)
-
-    monkeypatch.setattr("pfem_petsc.post.film.Scene", Watched)
-    draw(tmp_path, tower, frames=[0, 3, 6], poster=True, size=(960, 540))
-    assert len(widths) == 2 and min(widths) > 1.8
+    poster, frame = (pixels(file) for file in draw(tmp_path, tower, frames=[3], poster=True, size=(960, 540)))
+    for picture in (poster, frame):
+        left, top, width, height = Page.region_of((picture.shape[1], picture.shape[0]))
+        ink = picture[top + height // 10 : top + height, left : left + width, :3].min(axis=2) < 200
+        rows = ink[ink.any(axis=1)]
+        assert rows.sum() / len(rows) > 6.0  # four chords and a diagonal or more in each row
 
 
 def test_a_field_of_rounding_errors_has_no_colours(tmp_path, flying):

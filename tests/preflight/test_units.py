@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.runs import inspected
 
 from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.errors import InputError
-from pfem_petsc.preflight.inspection import warnings_before
 
 STEEL = {"young_modulus": 210e9, "density": 7850.0}
 PLASTIC = {"law": "elastoplastic", "isotropic_hardening": 1e9}
@@ -22,11 +22,6 @@ def case_with(material=None, section=None, **tables):
         **tables,
     }
     return Case(data, mesh=Truss([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]], [[0, 1], [1, 2]]))
-
-
-def warnings_of(case):
-    simulation = Simulation(case, check_only=True)
-    return "\n".join(warnings_before(simulation.case, simulation.model, simulation.plan))
 
 
 @pytest.mark.parametrize(
@@ -52,9 +47,9 @@ def warnings_of(case):
 def test_stresses_and_forces_in_other_units(wrong, right, told):
     """The strain stress / E, or force / (E A), that no structure has."""
     (key, value) = next(iter(next(iter(wrong.values())).items()))
-    text = warnings_of(case_with(**wrong))
+    text = "\n".join(inspected(case_with(**wrong))[1])
     assert f"a strain of {told}; " in text and "SI units" in text, (key, value)
-    assert "a strain of" not in warnings_of(case_with(**right))
+    assert "a strain of" not in "".join(inspected(case_with(**right))[1])
 
 
 def test_a_pretension_of_many_lengths(tmp_path):
@@ -63,7 +58,7 @@ def test_a_pretension_of_many_lengths(tmp_path):
     with pytest.raises(InputError, match="does not reach it at any length"):
         Simulation(case_with(material, {"pretension": -20e3}), check_only=True)
     case = case_with(material, {"pretension": 20e3})
-    assert "a strain of 2e+03; " in warnings_of(case)
+    assert "a strain of 2e+03; " in "".join(inspected(case)[1])
     with Simulation(case, output=tmp_path / "out", quiet=True) as simulation:
         np.testing.assert_allclose(simulation.model.bars.rest, 1.0 / 2001.0, rtol=1e-14)
         simulation.run()
@@ -76,12 +71,10 @@ def test_a_point_farther_than_the_size_of_the_truss(comm):
     """[2000, 0, 0] for a tip at 2 m; 1.5 m beside it the check alone says so."""
     for away, told in ((1998.0, True), (1.5, False)):
         node_set = {"feet": {"indices": [0, 2]}, "tip": {"nearest": [2.0 + away, 0.0, 0.0]}}
-        simulation = Simulation(case_with(node_set=node_set), comm, check_only=True)
-        warnings = warnings_before(simulation.case, simulation.model, simulation.plan)
-        assert (
-            any("node_set.tip.nearest: the nearest node is node 2, 1.998 km away" in text for text in warnings) == told
-        )
-        assert "away from the point, more than the length" in simulation.inspect()[0]["node set tip"]
+        entries, warnings = inspected(case_with(node_set=node_set), comm)
+        far = "node_set.tip.nearest: the nearest node is node 2, 1.998 km away"
+        assert any(far in text for text in warnings) == told
+        assert "away from the point, more than the length" in entries["node set tip"]
 
 
 def test_numbers_of_bifurcations_that_no_path_has(tmp_path):

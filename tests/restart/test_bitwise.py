@@ -6,7 +6,7 @@ from helpers.kills import differences
 from helpers.stopped import CASES, SHORT, TWO_RODS, everywhere, simulate
 
 from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.recording.observers import History, Snapshots
+from pfem_petsc.run.observers import History, Snapshots
 
 
 @pytest.mark.few_sets
@@ -48,7 +48,7 @@ def test_motion_that_has_come_to_rest_is_not_taken_for_unstable_after_a_restart(
 
 def _watched(simulation):
     history = simulation.outputs.history
-    return history.blow_up.kept(), history.recorder.energy_scale, simulation.model.pairs.force.copy()
+    return history.blow_up.kept(), history.recorder.energy_scale, simulation.model.links.force.copy()
 
 
 @pytest.mark.slow
@@ -63,7 +63,7 @@ def test_all_that_is_looked_at_in_later_steps_is_put_back(comm, shared_tmp_path)
         simulation.start()
         found.append(_watched(simulation))
         while simulation.state.step < simulation.plan.steps:
-            simulation._loop.advance()
+            simulation._advance()
         found.append(_watched(simulation))
         simulation.close()
     (_, before, after, _) = found
@@ -131,7 +131,7 @@ def test_killed_between_the_last_checkpoint_and_the_end_of_the_results(comm, sha
         simulation = Simulation(Case.load(case, overrides), comm, output=folders[1], quiet=True)
         with pytest.raises(Killed):
             simulation.run()
-        simulation._loop.finish("failed")
+        simulation._finish("failed")
     assert everywhere(comm, _last_steps, folders[1]) == (32 if lost == "row" else 33, 30)
     assert simulate(case, overrides, folders[1], comm, restart=True) == 33
     assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}

@@ -132,9 +132,10 @@ def test_state_of_another_version(copy, capsys):
     """A file that is whole, but whose state has another meaning."""
     from mpi4py import MPI
 
-    from pfem_petsc.output.checkpoint import read_checkpoint_header, write_checkpoint
+    from pfem_petsc.output.checkpoint import Checkpoint, write_checkpoint
 
-    scalars, attributes = read_checkpoint_header(copy / "checkpoint.h5", MPI.COMM_SELF)
+    with Checkpoint(copy / "checkpoint.h5", MPI.COMM_SELF) as file:
+        scalars, attributes = file.scalars, file.attributes
     write_checkpoint(copy / "checkpoint.h5", MPI.COMM_SELF, {}, scalars, {**attributes, "state_version": 0})
     assert main(rod(copy, "--restart", end=0.9)) == 2
     assert "version 0 of a run's state" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A dozen kills at random times; scripts/crash_test.py makes hundreds."""
+"""A dozen kills at random times; scripts/endurance.py makes hundreds."""
 
 import random
 

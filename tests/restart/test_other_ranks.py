@@ -69,7 +69,7 @@ def test_state_comes_back_to_the_last_bit_with_nodes_elsewhere(comm, shared_tmp_
     again = Simulation(Case.load(case, overrides), comm, output=folder, quiet=True, restart=True)
     again.start()
     after = _by_number(again, comm)
-    again._loop.finish("stopped")
+    again._finish("stopped")
     assert before.keys() == after.keys()
     for name in before:
         assert before[name].tobytes() == after[name].tobytes(), name

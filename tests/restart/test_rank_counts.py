@@ -54,16 +54,16 @@ node_set = "tip"
 KILLED = """
 import os, signal, sys
 from mpi4py import MPI
+from pfem_petsc import Simulation
 from pfem_petsc.cli.main import main
-from pfem_petsc.run.loop import RunLoop
-advance = RunLoop.advance
+advance = Simulation._advance
 main([*sys.argv[1:], "-o", "whole"])
 
 def killed(self):
-    if self._stages.analysis.state.step == 27 and MPI.COMM_WORLD.rank == MPI.COMM_WORLD.size - 1:
+    if self.state.step == 27 and MPI.COMM_WORLD.rank == MPI.COMM_WORLD.size - 1:
         os.kill(os.getpid(), signal.SIGKILL)
     return advance(self)
-RunLoop.advance = killed
+Simulation._advance = killed
 main([*sys.argv[1:], "-o", "killed"])
 """
 

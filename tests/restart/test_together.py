@@ -16,8 +16,8 @@ from pfem_petsc.errors import InputError
 @pytest.mark.slow
 def test_three_starts_and_two_restarts(tmp_path):
     """Two rounds of the script; more by hand."""
-    script = Path(__file__).parents[2] / "scripts" / "together.py"
-    line = [sys.executable, script, "--rounds", "2", "--seed", "1", "--folder", tmp_path]
+    script = Path(__file__).parents[2] / "scripts" / "endurance.py"
+    line = [sys.executable, script, "together", "2", "--seed", "1", "--folder", tmp_path]
     done = subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "2 rounds: " in done.stdout
@@ -60,22 +60,22 @@ def test_checkpoint_that_is_replaced_while_it_is_read(tmp_path):
     """Header and arrays are those of one file, whatever has its name by then."""
     from mpi4py import MPI
 
-    from pfem_petsc.output.checkpoint import OpenCheckpoint
+    from pfem_petsc.output.checkpoint import Checkpoint
 
     folder = tmp_path / "out"
     words = ["rod_impact", "-o", str(folder), "--quiet", "--set", "output.checkpoint_every=5"]
     assert main([*words, "time.end=0.1"]) == 0
     comm = MPI.COMM_SELF
-    file = OpenCheckpoint(folder / "checkpoint.h5", comm)
+    file = Checkpoint(folder / "checkpoint.h5", comm)
     simulation = Simulation(Case.load("rod_impact", ["time.end=0.1"]), output=tmp_path / "other", quiet=True)
     from pfem_petsc.restart.state import RunState
 
     orders = RunState(simulation.stepper).orders(file.scalars)
-    wanted = file.read(orders).arrays["x"]
+    wanted = file.read(orders)["x"]
     assert main([*words, "time.end=0.3", "--restart"]) == 0
-    later = OpenCheckpoint(folder / "checkpoint.h5", comm)
+    later = Checkpoint(folder / "checkpoint.h5", comm)
     assert (file.scalars["step"], later.scalars["step"]) == (10, 30)
-    assert (file.read(orders).arrays["x"] == wanted).all()
-    assert (later.read(orders).arrays["x"] != wanted).any()
+    assert (file.read(orders)["x"] == wanted).all()
+    assert (later.read(orders)["x"] != wanted).any()
     for one in (file, later):
         one.close()

@@ -5,7 +5,7 @@ import pytest
 from helpers.stopped import TWO_RODS
 
 from pfem_petsc import Case, Simulation, Truss
-from pfem_petsc.contact.links import Transform
+from pfem_petsc.contact.transform import Transform
 from pfem_petsc.errors import InputError
 from pfem_petsc.solvers.background_grid import interpolate, restrict
 from pfem_petsc.solvers.linear import Demand, choose_linear
@@ -55,7 +55,9 @@ def made(simulation):
     """The preconditioner of the first step, some components of which are held as if by walls."""
     stepper = simulation.stepper
     balance = stepper.scheme.balance(stepper.state, stepper.h)
-    problem = StepProblem(simulation.model, stepper.state, balance, stepper.state.external, Transform(simulation.model))
+    problem = StepProblem(
+        simulation.model, stepper.state, balance, stepper.state.external, Transform(simulation.model.mesh)
+    )
     problem.place(problem.increment(np.zeros_like(stepper.state.v)))
     multigrid = GridMultigrid(simulation.model)
     held = np.zeros((simulation.mesh.n_local, 3))

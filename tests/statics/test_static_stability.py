@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.contact.links import Transform
+from pfem_petsc.contact.transform import Transform
 from pfem_petsc.statics.scheme import Equilibrium
 from pfem_petsc.statics.stability import is_indefinite
 from pfem_petsc.stepping.problem import StepProblem
@@ -101,7 +101,7 @@ def test_conjugate_gradients_find_the_negative_curvature(comm, shared_tmp_path, 
         stepper = simulation.stepper
         model, state = stepper.model, stepper.state
         balance = Equilibrium().balance(state, 0.0)
-        problem = StepProblem(model, state, balance, state.external, Transform(model))
+        problem = StepProblem(model, state, balance, state.external, Transform(model.mesh))
         stepper.hessian.put(problem, model.bars.state_stiffness(state.x))
         free = np.zeros(model.mesh.n_owned, dtype=bool)
         assert is_indefinite(model, stepper.hessian, stepper.lagged, free) == (share > 1.0)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation, Truss
-from pfem_petsc.energies import ENERGIES
+from pfem_petsc.columns import ENERGIES
 from pfem_petsc.errors import SimulationFailure
-from pfem_petsc.recording.monitors import BlowUp
+from pfem_petsc.run.monitors import BlowUp
 
 pytestmark = pytest.mark.parallel
 

@@ -45,8 +45,8 @@ def compare(one, many, folder):
         np.testing.assert_array_equal(first.history[column], second.history[column], err_msg=column)
     for what in ARRAYS:
         np.testing.assert_array_equal(getattr(one.state, what), getattr(many.state, what), err_msg=what)
-    for what in ("force", "closed"):
-        np.testing.assert_array_equal(getattr(one.model.pairs, what), getattr(many.model.pairs, what), err_msg=what)
+    np.testing.assert_array_equal(one.model.links.force, many.model.links.force)
+    np.testing.assert_array_equal(one.model.links.two.record.closed, many.model.links.two.record.closed)
     return first.history
 
 
@@ -108,7 +108,7 @@ def test_ranks_make_fused_steps_with_pairs_of_their_own(supports, comm, shared_t
     tables = SQUEEZED | {"support": supports}
     one, count = made(tables, comm, shared_tmp_path / "one", False)
     many, fewer = made(tables, comm, shared_tmp_path / "many", True)
-    cut = comm.allreduce(int((~one.model.pairs.mine).sum()))
+    cut = comm.allreduce(int((one.model.links.two.nodes < 0).sum()))
     assert cut == 0 or comm.size > 2
     assert fewer == count if cut else fewer < count / 5
     history = compare(one, many, shared_tmp_path)
@@ -118,7 +118,7 @@ def test_ranks_make_fused_steps_with_pairs_of_their_own(supports, comm, shared_t
 @pytest.mark.parallel
 def test_pairs_between_ranks_take_single_steps(comm, shared_tmp_path):
     simulation, count = made(case(shared_tmp_path, end=0.004), comm, shared_tmp_path / "out", True)
-    cut = comm.allreduce(int((~simulation.model.pairs.mine).sum()))
+    cut = comm.allreduce(int((simulation.model.links.two.nodes < 0).sum()))
     assert count == 20 if cut else count < 10
 
 
@@ -140,8 +140,8 @@ def test_a_stopped_run_with_pairs_goes_on_to_the_same_end(tmp_path):
     simulation = Simulation(Case.from_dict(tables), MPI.COMM_SELF, output=tmp_path / "many", quiet=True)
     with pytest.raises(EarlyStop):
         for _ in simulation.batches(min_steps=1):
-            if simulation.model.pairs.force.any():
-                simulation._loop.stop._signal = 15
+            if simulation.model.links.force.any():
+                simulation._synchroniser.stop._signal = 15
     assert 0 < simulation.state.step < 100
     rest = Simulation(Case.from_dict(tables), MPI.COMM_SELF, output=tmp_path / "many", restart=True, quiet=True)
     for _ in rest.batches(min_steps=1):

@@ -96,7 +96,7 @@ def test_a_stopped_run_of_batches_goes_on_to_the_same_end(tmp_path):
     with pytest.raises(EarlyStop):
         for step in simulation.batches(min_steps=1):
             if step.step > 200:
-                simulation._loop.stop._signal = 15
+                simulation._synchroniser.stop._signal = 15
     assert 200 < simulation.state.step < 600
     rest = Simulation(case(walls), output=tmp_path / "part", restart=True, quiet=True)
     for _ in rest.batches(min_steps=1):

@@ -7,8 +7,8 @@ import pytest
 from helpers.bar_twins import STEP, Law, shaken, whole_truss
 
 from pfem_petsc import Case
-from pfem_petsc.contact.frames import build_frames
-from pfem_petsc.contact.links import Transform
+from pfem_petsc.contact.frames import Planes, build_frames
+from pfem_petsc.contact.transform import Transform
 from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
@@ -58,7 +58,7 @@ class Twin:
         state.external = self.stepper.load_of(self.balance)
         self.basis = np.tile(np.eye(3), (n, 1, 1))
         frames = self._frames(walls) if walls else None
-        self.problem = StepProblem(self.model, state, self.balance, state.external, Transform(self.model, frames))
+        self.problem = StepProblem(self.model, state, self.balance, state.external, Transform(self.model.mesh, frames))
         self.fixed = np.zeros((n, 3), dtype=bool)
         if supports:
             self.fixed[np.abs(self.truss.points[:, 2]) < 0.1] = (True, False, True)
@@ -79,7 +79,7 @@ class Twin:
         fixed = self.model.supports.fixed[mine]
         gaps = np.tile(np.arange(len(walls), dtype=float), (len(mine), 1))
         every = np.tile(normals, (len(mine), 1, 1))
-        frames = build_frames(mine, fixed, every, offsets, gaps)
+        frames = build_frames(mine, Planes(fixed, every, offsets, gaps, np.zeros((len(mine), 3))))
         basis = np.zeros((self.model.mesh.n_nodes, 3, 3))
         basis[self.owned[mine]] = frames.basis
         total = self.model.comm.allreduce(basis)

@@ -21,8 +21,8 @@ from pfem_petsc.cli.main import main
 from pfem_petsc.mechanics.compiled import Compilation
 from pfem_petsc.output.table import Table
 from pfem_petsc.solvers import matrix_free as outlive
-from pfem_petsc.studies import pool, worker
-from pfem_petsc.studies.worker import Report, Task
+from pfem_petsc.studies import pool
+from pfem_petsc.studies.pool import Report, Task
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +151,7 @@ def wait_for(condition, seconds=60.0):
 
 
 def test_worker_reports_what_it_does_not_know(tmp_path):
-    report = worker.perform(Task(3, tmp_path, None))
+    report = pool.perform(Task(3, tmp_path, None))
     assert isinstance(report, Report) and report.status == 2
     assert report.message.startswith("Simulation: expected a Case, got 3")
 

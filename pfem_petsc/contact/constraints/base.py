@@ -48,10 +48,14 @@ class Constraint(ABC):
     ----------
     nodes : (r, k) mesh numbers of the nodes of each row; k is the same on all ranks
     data : (r, m) float64, numbers of each row, such as a length; m is the same on all ranks, zero by default
+    fixed : whether gradients never turn, so that rows are linear
+    ids : (r,) number of each row in its table; None: counted over ranks
     """
 
     nodes: np.ndarray
     data: np.ndarray
+    fixed = False
+    ids: np.ndarray | None = None
 
     def of(self, nodes: np.ndarray, data: np.ndarray) -> Self:
         """Return the constraint with other rows (r, k), (r, m)."""

@@ -15,8 +15,6 @@ from ...integrators.base import Scheme
 from ...registry import choices, lookup
 from .base import Treatment as Base
 
-__all__ = ["Treatment"]
-
 INTEGRATORS = "pfem_petsc.integrators"
 
 
@@ -44,10 +42,10 @@ class Treatment(Base):
     def after(self) -> None:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         self.clear()
-        state, pairs = self.stepper.state, self.stepper.model.pairs
+        state = self.stepper.state
         debt = state.memory.setdefault("contact_debt", np.zeros_like(state.v))
         nodes, v, a = self._off_walls(debt)
-        if pairs is not None and pairs.any_pressed():
+        if self.stepper.model.links.any_pressed():
             ends, apart, free = self._apart(debt)
             nodes, v, a = np.append(nodes, ends), np.vstack([v, apart]), np.vstack([a, free])
         if len(nodes):
@@ -89,14 +87,16 @@ class Treatment(Base):
 
     def _apart(self, debt: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return nodes in contact through pairs (m,), their velocities and accelerations (m, 3). Collective."""
-        state, pairs, mass = self.stepper.state, self.stepper.model.pairs, self.stepper.model.inertia.mass
-        nodes, normals = pairs.pressed()
+        state, links, mass = self.stepper.state, self.stepper.model.links, self.stepper.model.inertia.mass
+        two = links.two
+        nodes, normals = two.pressed(links.force)
         work = np.zeros(len(state.v))
         work[nodes] = self._work(nodes)
-        ends = pairs.gather(np.column_stack([state.v, work, debt[:, 0]]))
-        reduced = pairs.reduced_mass(mass)
-        square = pairs.distances(ends[:, :, :3]) ** 2
+        ends = two.gather(np.column_stack([state.v, work, debt[:, 0]]))
+        reduced = two.reduced_mass(mass)
+        square = two.apart(ends[:, :, :3]) ** 2
         square -= 2.0 * (ends[0, :, 3] + ends[1, :, 3] + ends[1, :, 4]) / reduced
-        pairs.keep(debt[:, 0], np.where(square < 0.0, -0.5 * reduced * square, 0.0))
-        v = pairs.together(state.v, mass, np.sqrt(np.maximum(square, 0.0)))[nodes]
+        mine = two.counted & (links.force > 0.0)
+        debt[two.nodes[1, mine], 0] = np.where(square < 0.0, -0.5 * reduced * square, 0.0)[mine]
+        v = two.together(state.v, mass, links.force > 0.0, np.sqrt(np.maximum(square, 0.0)))[nodes]
         return nodes, v, self._accelerations(nodes, normals[:, :, None] * normals[:, None, :])

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from ...stepping.model import Model
     from ..contact import Contact
 
-__all__ = ["Redistribution", "Treatment", "redistribute"]
-
 
 class Redistribution:
     """The redistributed masses of this rank.

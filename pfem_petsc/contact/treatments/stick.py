@@ -23,8 +23,6 @@ from ...integrators.base import State
 from ...tolerances import FREE_PART, RANK
 from .base import STILL, Restitution
 
-__all__ = ["Treatment"]
-
 _TINY = 1e-200  # divides what is nothing
 
 
@@ -39,13 +37,13 @@ class Treatment(Restitution):
         super().before()
         if self.stepper.model.contact.has_friction:
             self._response = self._response_of()
-        state, pairs = self.stepper.state, self.stepper.model.pairs
+        state, links = self.stepper.state, self.stepper.model.links
         self._pressed = None
-        if self._frees and pairs is not None and pairs.any_pressed():
+        if self._frees and links.any_pressed():
             change = state.memory.get("contact_change", 0.0)
-            ends = pairs.gather(np.concatenate([state.contact + change, state.position], axis=1))
-            force = 0.5 * pairs.distances(ends[:, :, :3])  # half the relative force between the ends
-            self._pressed = pairs.force > 0.0, force, pairs.distances(ends[:, :, 3:])
+            ends = links.two.gather(np.concatenate([state.contact + change, state.position], axis=1))
+            force = 0.5 * links.two.apart(ends[:, :, :3])  # half the relative force between the ends
+            self._pressed = links.force > 0.0, force, links.two.apart(ends[:, :, 3:])
 
     def after(self) -> None:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
@@ -53,12 +51,12 @@ class Treatment(Restitution):
         state = self.stepper.state
         nodes, v, a = self.on_walls()
         v, a, friction = self._dragged(nodes, v, a)
-        pairs, mass = self.stepper.model.pairs, self.stepper.model.inertia.mass
-        if pairs is not None and pairs.any_pressed():
-            ends, _ = pairs.pressed()
+        links, mass = self.stepper.model.links, self.stepper.model.inertia.mass
+        if links.any_pressed():
+            ends, _ = links.two.pressed(links.force)
             nodes = np.append(nodes, ends)
-            v = np.vstack([v, pairs.together(state.v, mass)[ends]])
-            a = np.vstack([a, pairs.together(state.a, mass)[ends]])
+            v = np.vstack([v, links.two.together(state.v, mass, links.force > 0.0)[ends]])
+            a = np.vstack([a, links.two.together(state.a, mass, links.force > 0.0)[ends]])
         if self._pressed is not None:
             ends, slower = self._pairs_let_go()
             nodes, v, a = np.append(nodes, ends), np.vstack([v, slower]), np.vstack([a, state.a[ends]])
@@ -177,15 +175,16 @@ class Treatment(Restitution):
 
         Collective.
         """
-        state, pairs, mass = self.stepper.state, self.stepper.model.pairs, self.stepper.model.inertia.mass
+        state, links, mass = self.stepper.state, self.stepper.model.links, self.stepper.model.inertia.mass
+        two = links.two
         pressed, force, before = self._pressed
-        gone = pressed & ~(pairs.force > 0.0)
+        gone = pressed & ~(links.force > 0.0)
         if not self.stepper.model.comm.allreduce(bool(gone.any()), op=MPI.LOR):
             return np.empty(0, dtype=np.int64), np.empty((0, 3))
-        ends = pairs.gather(np.concatenate([state.position, state.v], axis=1))
-        work = 0.5 * force * (pairs.distances(ends[:, :, :3]) - before)
-        speed = pairs.distances(ends[:, :, 3:])
+        ends = two.gather(np.concatenate([state.position, state.v], axis=1))
+        work = 0.5 * force * (two.apart(ends[:, :, :3]) - before)
+        speed = two.apart(ends[:, :, 3:])
         gone &= (work > 0.0) & (speed > 0.0)
-        slower = np.sqrt(np.maximum(speed * speed - 2.0 * work / pairs.reduced_mass(mass), 0.0))
-        ends = pairs.local[pairs.mine & gone]
-        return ends, pairs.together(state.v, mass, slower, gone)[ends]
+        slower = np.sqrt(np.maximum(speed * speed - 2.0 * work / two.reduced_mass(mass), 0.0))
+        ends = two.nodes[(two.nodes >= 0) & gone]
+        return ends, two.together(state.v, mass, gone, slower)[ends]

@@ -11,8 +11,6 @@ from ...case.base import PositiveFloat, Vector3
 from .base import BaseWall, Surface, WallKeys, direction, revolved
 from .sphere import radial_planes
 
-__all__ = ["Parameters", "Wall", "surface"]
-
 
 class Parameters(WallKeys):
     """Keys of a cylindrical wall."""

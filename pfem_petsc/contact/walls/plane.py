@@ -8,8 +8,6 @@ from pydantic import field_validator
 from ...case.base import Vector3
 from .base import BaseWall, WallKeys, direction
 
-__all__ = ["Parameters", "Wall"]
-
 
 class Parameters(WallKeys):
     """Keys of a plane wall."""

@@ -11,8 +11,6 @@ from ...case.base import PositiveFloat, Vector3, listed
 from .base import Surface, WallKeys, direction, slab
 from .plane import Wall as Plane
 
-__all__ = ["Parameters", "Wall", "surface"]
-
 
 class Parameters(WallKeys):
     """Keys of a rectangular wall."""

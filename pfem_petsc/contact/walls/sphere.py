@@ -9,8 +9,6 @@ import numpy as np
 from ...case.base import PositiveFloat, Vector3
 from .base import BaseWall, Surface, WallKeys, revolved
 
-__all__ = ["Parameters", "Wall", "surface"]
-
 
 class Parameters(WallKeys):
     """Keys of a spherical wall."""

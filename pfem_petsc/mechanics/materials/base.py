@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 
 from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, listed
 from ...case.tables import Rupture
-from ...energies import BAR_ENERGIES
+from ...columns import BAR_ENERGIES
 from ...registry import lookup
 from ..compiled import inlined
 
@@ -288,7 +288,7 @@ class Law:
     internal : name and unit of each internal variable of a bar, zero at the start; the unit ``""`` is a pure number.
         They are fields of the snapshots if a case selects them, and arrays of the checkpoints. A variable named
         ``slack`` is 1 while the bar is slack: it is counted in the history and shown in the field ``status``
-    energies : names of the energy densities, of :data:`~pfem_petsc.energies.BAR_ENERGIES`: functions of strain and
+    energies : names of the energy densities, of :data:`~pfem_petsc.columns.BAR_ENERGIES`: functions of strain and
         internal variables. If the dissipation is not such a function, the law stores it in a further internal variable
     bar_data : names of the numbers that differ from bar to bar and that ``Parameters.pack_bars`` gives; the response
         reads them after the packed parameters, ``p = (*pack(), *pack_bars())``
@@ -336,7 +336,7 @@ class Law:
     def __post_init__(self) -> None:
         for name in self.energies:
             if name not in BAR_ENERGIES:
-                raise ValueError(f"a law gives {name!r}, which is none of {', '.join(BAR_ENERGIES)} (energies.py)")
+                raise ValueError(f"a law gives {name!r}, which is none of {', '.join(BAR_ENERGIES)} (columns.py)")
 
     @property
     def rows(self) -> tuple[tuple[str, str], ...]:

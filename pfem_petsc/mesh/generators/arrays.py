@@ -12,11 +12,9 @@ from pydantic import model_validator
 from ...case.base import StrictModel
 from ...errors import InputError
 from ...parallel.agreement import agreed
-from ..slab import MeshSlab, check_size, slab_of_whole, slab_range
+from ..slab import MeshSlab, check_size, slab_of_whole
 from ..truss import Truss
 from ..whole import WholeMesh, missing_field, scattered
-
-__all__ = ["Parameters", "generate_on"]
 
 
 class Parameters(StrictModel):
@@ -39,13 +37,18 @@ class Parameters(StrictModel):
 
     @model_validator(mode="after")
     def _whole(self) -> Parameters:
-        lists = {key: self.__dict__[key] for key in ("node_groups", "bar_groups", "bar_fields")}
         if self.truss is None and self.digest is None:
-            missing = [key for key in ("points", "bars") if self.__dict__[key] is None]
+            missing = [key for key in ("points", "bars") if getattr(self, key) is None]
             if missing:
                 raise ValueError(f"expected the keys points and bars; {missing[0]} is missing")
             try:
-                self.__dict__["truss"] = Truss(self.points, self.bars, **lists)
+                self.__dict__["truss"] = Truss(
+                    self.points,
+                    self.bars,
+                    node_groups=self.node_groups,
+                    bar_groups=self.bar_groups,
+                    bar_fields=self.bar_fields,
+                )
             except InputError as error:
                 raise InputError(str(error).removeprefix("Truss: ")) from error
         elif self.truss is not None and self.digest not in (None, self.truss.digest):
@@ -99,11 +102,6 @@ def generate_on(
             own = {name: truss.bar_fields[name] for name in fields}
             whole = WholeMesh(truss.points, truss.bars, dict(truss.node_groups), dict(truss.bar_groups), own)
         return scattered(whole, "mesh", comm)
-    return _own_part(truss, comm.rank, comm.size, fields)
-
-
-def _own_part(truss: Truss, rank: int, size: int, fields: Mapping[str, str]) -> MeshSlab:
-    slab = slab_of_whole(truss.points, truss.bars, truss.node_groups, truss.bar_groups, "mesh", rank, size)
-    first, last = slab_range(truss.n_bars, rank, size)
-    own = {name: truss.bar_fields[name][first:last] for name in fields}
-    return replace(slab, bar_fields=own, structured=False)
+    slab = slab_of_whole(truss.points, truss.bars, truss.node_groups, truss.bar_groups, "mesh", comm.rank, comm.size)
+    here = slice(slab.first_bar, slab.first_bar + len(slab.bars))
+    return replace(slab, bar_fields={name: truss.bar_fields[name][here] for name in fields}, structured=False)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ...case.base import PositiveFloat, StrictModel
-from ..slab import MeshSlab, check_length, slab_of_whole
-
-__all__ = ["Parameters", "generate"]
+from ..slab import MeshSlab
+from .base import check_lengths, dome
 
 
 class Parameters(StrictModel):
@@ -31,20 +30,8 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
 
     Source of geometry: Hrinda, Snap-through instability patterns in truss structures, AIAA 2010-2611.
     """
-    for name in ("apex_height", "ring_height", "half_side", "base_radius"):
-        check_length(getattr(parameters, name), f"mesh.{name}")
+    check_lengths(parameters, "apex_height", "ring_height", "half_side", "base_radius")
     a, z, base = parameters.half_side, parameters.ring_height, parameters.base_radius
     points = [[0.0, 0.0, parameters.apex_height], [a, a, z], [-a, a, z], [-a, -a, z], [a, -a, z]]
     points += [[base, 0.0, 0.0], [0.0, base, 0.0], [-base, 0.0, 0.0], [0.0, -base, 0.0]]
-    k = np.arange(4)
-    after = (k + 1) % 4
-    bars = [(np.zeros(4), 1 + k), (1 + k, 1 + after), (1 + k, 5 + k), (1 + k, 5 + after)]
-    return slab_of_whole(
-        np.array(points),
-        np.vstack([np.column_stack(pair) for pair in bars]).astype(np.int64),
-        {"apex": np.zeros(1), "ring": 1 + k, "feet": 5 + k},
-        {"spokes": k, "ring": 4 + k, "legs": np.arange(8, 16)},
-        "generator dome_16",
-        rank,
-        size,
-    )
+    return dome("dome_16", np.array(points), (0, 1), rank, size)

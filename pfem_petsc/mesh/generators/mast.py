@@ -6,9 +6,8 @@ import numpy as np
 
 from ...case.base import PositiveFloat, PositiveInt, StrictModel
 from ...errors import InputError
-from ..slab import MeshSlab, check_length, check_size, index_type, slab_range
-
-__all__ = ["Parameters", "generate"]
+from ..slab import MeshSlab, check_length, check_size
+from .base import Part
 
 
 class Parameters(StrictModel):
@@ -46,9 +45,8 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     check_length(p.height / n, "mesh.height (over mesh.bays)")
     check_length(p.width, "mesh.width")
     check_length(p.radius / p.elements, "mesh.radius (over mesh.elements)")
-    first_node, last_node = slab_range(n_nodes, rank, size)
-    first_bar, last_bar = slab_range(n_bars, rank, size)
-    numbers, bars = np.arange(first_node, last_node), np.arange(first_bar, last_bar)
+    part = Part(n_nodes, n_bars, rank, size)
+    numbers = part.nodes
 
     def place(nodes: np.ndarray) -> np.ndarray:
         """Points (k, 3) of mast nodes and anchors."""
@@ -69,43 +67,23 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     low, high = (place(node) for node in ends(guy))
     points[within] = low + (high - low) * ((k + 1) / p.elements)[:, None]
 
-    connected = np.empty((len(bars), 2), dtype=index_type(n_nodes))
-    of_mast = bars < mast_bars
-    bay, kind = np.divmod(bars[of_mast], 9)
+    of_mast = part.bars < mast_bars
+    bay, kind = np.divmod(part.bars, 9)
     leg = kind % 3
-    after = (leg + 1) % 3
-    ground = bay == n  # the last three: horizontals at the ground
-    kind = np.where(ground, 2, kind // 3)
-    bottom, top = 3 * bay, np.where(ground, 0, 3 * (bay + 1))
-    bottom = np.where(ground, 0, bottom)
-    # legs, diagonals that wind about the mast, horizontals
-    connected[of_mast, 0] = np.choose(kind, [bottom + leg, bottom + leg, top + leg])
-    connected[of_mast, 1] = np.choose(kind, [top + leg, top + after, top + after])
-    guy, k = np.divmod(bars[~of_mast] - mast_bars, p.elements)
+    after, ground = (leg + 1) % 3, bay == n  # the last three bars of the mast: horizontals at the ground
+    # legs, diagonals that wind about the mast, horizontals; guys
+    kind = np.where(of_mast, np.where(ground, 2, kind // 3), 3)
+    bottom, top = np.where(ground, 0, 3 * bay), np.where(ground, 0, 3 * (bay + 1))
+    guy, k = np.divmod(part.bars - mast_bars, p.elements)
     anchor, head = ends(guy)
     before = mast_nodes + 3 + guy * inner + k - 1
-    connected[~of_mast, 0] = np.where(k == 0, anchor, before)
-    connected[~of_mast, 1] = np.where(k == inner, head, before + 1)
-    mast = bars[of_mast]
-    return MeshSlab(
-        n_nodes=n_nodes,
-        n_bars=n_bars,
-        first_node=first_node,
-        points=points,
-        first_bar=first_bar,
-        bars=connected,
-        node_groups={
-            "base": numbers[numbers < 3],
-            "top": numbers[(numbers >= mast_nodes - 3) & (numbers < mast_nodes)],
-            "mast": numbers[numbers < mast_nodes],
-            "anchors": numbers[(numbers >= mast_nodes) & (numbers < mast_nodes + 3)],
-        },
-        bar_groups={
-            "legs": mast[kind == 0],
-            "diagonals": mast[kind == 1],
-            "horizontals": mast[kind == 2],
-            "guys": bars[~of_mast],
-        },
-        source="generator mast",
-        structured=True,
-    )
+    first = np.choose(kind, [bottom + leg, bottom + leg, top + leg, np.where(k == 0, anchor, before)])
+    second = np.choose(kind, [top + leg, top + after, top + after, np.where(k == inner, head, before + 1)])
+    node_groups = {
+        "base": numbers < 3,
+        "top": (numbers >= mast_nodes - 3) & (numbers < mast_nodes),
+        "mast": numbers < mast_nodes,
+        "anchors": (numbers >= mast_nodes) & (numbers < mast_nodes + 3),
+    }
+    bar_groups = {name: kind == k for k, name in enumerate(("legs", "diagonals", "horizontals", "guys"))}
+    return part.slab("mast", points, (first, second), node_groups, bar_groups)

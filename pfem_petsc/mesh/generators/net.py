@@ -7,9 +7,8 @@ from typing import Annotated
 import numpy as np
 
 from ...case.base import PositiveFloat, PositiveInt, StrictModel, listed
-from ..slab import MeshSlab, check_length, check_size, index_type, slab_range
-
-__all__ = ["Parameters", "generate"]
+from ..slab import MeshSlab, check_length, check_size
+from .base import Part
 
 
 class Parameters(StrictModel):
@@ -34,33 +33,21 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     check_size(n_nodes, "mesh.cells")
     for length, cells in zip(parameters.size, parameters.cells, strict=True):
         check_length(length / cells, "mesh.size (over mesh.cells)")
-    first_node, last_node = slab_range(n_nodes, rank, size)
-    first_bar, last_bar = slab_range(n_bars, rank, size)
-    numbers = np.arange(first_node, last_node)
+    part = Part(n_nodes, n_bars, rank, size)
+    numbers, bars = part.nodes, part.bars
     j, i = np.divmod(numbers, across)
     points = np.zeros((len(numbers), 3))
     points[:, 0] = parameters.size[0] * i / nx
     points[:, 1] = parameters.size[1] * j / ny
-    bars = np.arange(first_bar, last_bar)
     warp = bars < along
     start = np.where(warp, bars + bars // nx, bars - along)
-    ends = np.stack([start, start + np.where(warp, 1, across)], axis=1)
     corners = (0, nx, n_nodes - 1, n_nodes - across)
     side = ((i == 0) | (i == nx)).astype(int) + ((j == 0) | (j == ny))
-    return MeshSlab(
-        n_nodes=n_nodes,
-        n_bars=n_bars,
-        first_node=first_node,
-        points=points,
-        first_bar=first_bar,
-        bars=ends.astype(index_type(n_nodes)),
-        node_groups={
-            "corners": numbers[side == 2],
-            **{f"corner_{k}": numbers[numbers == node] for k, node in enumerate(corners, 1)},
-            "edges": numbers[side > 0],
-            "centre": numbers[numbers == nx // 2 + (ny // 2) * across],
-        },
-        bar_groups={"warp": bars[warp], "weft": bars[~warp]},
-        source="generator net",
-        structured=True,
-    )
+    node_groups = {
+        "corners": side == 2,
+        **{f"corner_{k}": numbers == node for k, node in enumerate(corners, 1)},
+        "edges": side > 0,
+        "centre": numbers == nx // 2 + (ny // 2) * across,
+    }
+    ends = start, start + np.where(warp, 1, across)
+    return part.slab("net", points, ends, node_groups, {"warp": warp, "weft": ~warp})

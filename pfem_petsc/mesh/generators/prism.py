@@ -8,9 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from ...case.base import Finite, PositiveFloat, StrictModel
-from ..slab import MeshSlab, check_length, check_size, index_type, slab_range
-
-__all__ = ["Parameters", "generate"]
+from ..slab import MeshSlab, check_length, check_size
+from .base import Part
 
 
 class Parameters(StrictModel):
@@ -40,34 +39,15 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     check_length(2.0 * parameters.radius * np.sin(np.pi / n), "mesh.radius (with mesh.sides)")
     check_length(parameters.height, "mesh.height")
     twist = 90.0 + 180.0 / n if parameters.twist is None else parameters.twist
-    first_node, last_node = slab_range(2 * n, rank, size)
-    first_bar, last_bar = slab_range(4 * n, rank, size)
-    numbers = np.arange(first_node, last_node)
-    top, corner = np.divmod(numbers, n)
+    part = Part(2 * n, 4 * n, rank, size)
+    top, corner = np.divmod(part.nodes, n)
     angles = np.deg2rad(360.0 * corner / n - 180.0 / n - 90.0 + twist * top)
     points = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1) * parameters.radius
     points[:, 2] = parameters.height * top
-    bars = np.arange(first_bar, last_bar)
-    kind, i = np.divmod(bars, n)
+    kind, i = np.divmod(part.bars, n)
     after, before = (i + 1) % n, (i - 1) % n
-    start = np.where(kind == 1, i + n, i)
-    end = np.choose(kind, [after, after + n, before + n, i + n])
+    ends = np.where(kind == 1, i + n, i), np.choose(kind, [after, after + n, before + n, i + n])
+    node_groups = {"bottom": top == 0, "top": top == 1, "first": part.nodes == 0, "second": part.nodes == 1}
     kinds = ("bottom_cables", "top_cables", "side_cables", "struts")
-    groups = {name: bars[kind == k] for k, name in enumerate(kinds)}
-    return MeshSlab(
-        n_nodes=2 * n,
-        n_bars=4 * n,
-        first_node=first_node,
-        points=points,
-        first_bar=first_bar,
-        bars=np.stack([start, end], axis=1).astype(index_type(2 * n)),
-        node_groups={
-            "bottom": numbers[top == 0],
-            "top": numbers[top == 1],
-            "first": numbers[numbers == 0],
-            "second": numbers[numbers == 1],
-        },
-        bar_groups={**groups, "cables": bars[kind < 3]},
-        source="generator prism",
-        structured=True,
-    )
+    bar_groups = {name: kind == k for k, name in enumerate(kinds)}
+    return part.slab("prism", points, ends, node_groups, {**bar_groups, "cables": kind < 3})

@@ -8,9 +8,8 @@ import numpy as np
 from pydantic import field_validator
 
 from ...case.base import PositiveFloat, StrictModel
-from ..slab import MeshSlab, check_length, check_size, index_type, slab_range
-
-__all__ = ["Parameters", "generate"]
+from ..slab import MeshSlab, check_length, check_size
+from .base import Part
 
 
 class Parameters(StrictModel):
@@ -58,41 +57,16 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     check_length(parameters.outer_radius - parameters.inner_radius, "mesh.outer_radius - mesh.inner_radius")
     check_length(parameters.inner_radius / n, "mesh.inner_radius / mesh.bays")
 
-    first_node, last_node = slab_range(2 * n, rank, size)
-    node = np.arange(first_node, last_node)
-    first_bar, last_bar = slab_range(n_bars, rank, size)
-    family, bay = np.divmod(np.arange(first_bar, last_bar), n)
+    part = Part(2 * n, n_bars, rank, size)
+    family, bay = np.divmod(part.bars, n)
     after = (bay + 1) % n
     start = np.choose(family, [bay, n + bay, bay, bay, n + bay])
     end = np.choose(family, [after, n + after, n + bay, n + after, after])
-
-    def nodes_among(first: int, last: int) -> np.ndarray:
-        return node[(node >= first) & (node < last)]
-
-    def bars_of(first: int, last: int) -> np.ndarray:
-        return first_bar + np.flatnonzero((family >= first) & (family < last))
-
-    return MeshSlab(
-        n_nodes=2 * n,
-        n_bars=n_bars,
-        first_node=first_node,
-        points=_points(parameters, node),
-        first_bar=first_bar,
-        bars=np.stack([start, end], axis=1).astype(index_type(2 * n)),
-        node_groups={
-            "outer": nodes_among(0, n),
-            "inner": nodes_among(n, 2 * n),
-            **{name: node[np.isin(node, members)] for name, members in _extremes(parameters).items()},
-        },
-        bar_groups={
-            "outer": bars_of(0, 1),
-            "inner": bars_of(1, 2),
-            "radial": bars_of(2, 3),
-            "diagonal": bars_of(3, 5),
-        },
-        source=f"generator ring ({parameters.bracing}, {n} bays)",
-        structured=True,
-    )
+    node_groups = {"outer": part.nodes < n, "inner": part.nodes >= n}
+    node_groups |= {name: np.isin(part.nodes, members) for name, members in _extremes(parameters).items()}
+    bar_groups = {"outer": family == 0, "inner": family == 1, "radial": family == 2, "diagonal": family >= 3}
+    source = f"ring ({parameters.bracing}, {n} bays)"
+    return part.slab(source, _points(parameters, part.nodes), (start, end), node_groups, bar_groups)
 
 
 def _points(parameters: Parameters, node: np.ndarray) -> np.ndarray:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ...case.base import PositiveFloat, StrictModel
-from ..slab import MeshSlab, check_length, slab_of_whole
-
-__all__ = ["Parameters", "generate"]
+from ..slab import MeshSlab
+from .base import check_lengths, circle, dome
 
 
 class Parameters(StrictModel):
@@ -31,26 +30,10 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
 
     Source of geometry: Levy and Spillers, Analysis of Geometrically Nonlinear Structures, section 2.4.2.
     """
-    for name in ("apex_height", "ring_height", "ring_radius", "base_radius"):
-        check_length(getattr(parameters, name), f"mesh.{name}")
-
-    def circle(radius: float, height: float, turned: float) -> np.ndarray:
-        angles = np.radians(60.0 * np.arange(6) + turned)
-        points = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.full(6, height)])
-        points[np.abs(points) < 1e-15 * radius] = 0.0
-        return points
-
-    ring = circle(parameters.ring_radius, parameters.ring_height, 0.0)
-    feet = circle(parameters.base_radius, 0.0, 30.0)
-    k = np.arange(6)
-    after = (k + 1) % 6
-    bars = [(np.zeros(6), 1 + k), (1 + k, 1 + after), (1 + k, 7 + k), (1 + after, 7 + k)]
-    return slab_of_whole(
-        np.vstack([[0.0, 0.0, parameters.apex_height], ring, feet]),
-        np.vstack([np.column_stack(pair) for pair in bars]).astype(np.int64),
-        {"apex": np.zeros(1), "ring": 1 + k, "feet": 7 + k},
-        {"spokes": k, "ring": 6 + k, "legs": np.arange(12, 24)},
-        "generator star_dome",
-        rank,
-        size,
-    )
+    check_lengths(parameters, "apex_height", "ring_height", "ring_radius", "base_radius")
+    angles = 60.0 * np.arange(6)
+    ring = circle(parameters.ring_radius, np.radians(angles))
+    ring[:, 2] = parameters.ring_height
+    feet = circle(parameters.base_radius, np.radians(angles + 30.0))
+    points = np.vstack([[0.0, 0.0, parameters.apex_height], ring, feet])
+    return dome("star_dome", points, (1, 0), rank, size)

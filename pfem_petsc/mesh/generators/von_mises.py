@@ -8,9 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from ...case.base import PositiveFloat, StrictModel
-from ..slab import MeshSlab, check_length, slab_of_whole
-
-__all__ = ["Parameters", "generate"]
+from ..slab import MeshSlab, slab_of_whole
+from .base import check_lengths, circle
 
 
 class Parameters(StrictModel):
@@ -30,15 +29,11 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     Node groups ``apex`` and ``feet``; bar group ``legs`` (all).
     """
     n = parameters.legs
-    check_length(parameters.half_span, "mesh.half_span")
-    check_length(parameters.rise, "mesh.rise")
-    angles = 2.0 * np.pi * np.arange(n) / n
-    feet = parameters.half_span * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(n)])
-    feet[np.abs(feet) < 1e-15 * parameters.half_span] = 0.0
+    check_lengths(parameters, "half_span", "rise")
     numbers = np.arange(1, n + 1)
     return slab_of_whole(
-        np.vstack([[0.0, 0.0, parameters.rise], feet]),
-        np.column_stack([np.zeros(n, dtype=np.int64), numbers]),
+        np.vstack([[0.0, 0.0, parameters.rise], circle(parameters.half_span, 2.0 * np.pi * np.arange(n) / n)]),
+        np.column_stack([0 * numbers, numbers]),
         {"apex": np.zeros(1), "feet": numbers},
         {"legs": np.arange(n)},
         f"generator von_mises ({n} legs)",

@@ -1,85 +1,183 @@
-"""A box of unit cells: numbers, places and joints of its nodes and bars, each from its number alone."""
+"""A box of unit cells: numbers, places, joints and positions of its nodes and bars, each from its number alone.
+
+An *item* is a point or a strut of the unit cell. It repeats at the places (i, j, k) of a box whose shape depends on the
+item: a point on the lower face of its cell occurs once more than there are cells along that axis.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
+from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 
-from ..slab import check_size
-from .cell import UnitCell
-from .numbering import CellByCell, ItemByItem, Numbering, Places
+from ...errors import InputError
+from ..slab import check_length, check_size
+from .cells import UnitCell
+from .expressions import COORDINATES, Expression
+from .keys import Parameters
+from .surface import Surface
 
-__all__ = ["FACES", "Block"]
+FACES = {
+    name: (axis, upper)
+    for axis, names in ((2, ("bottom", "top")), (0, ("left", "right")), (1, ("front", "back")))
+    for upper, name in enumerate(names)
+}
+"""Axis to which each face is normal, and whether it is the upper one, by name."""
 
-FACES = (("left", "right"), ("front", "back"), ("bottom", "top"))
-"""Names of the lower and upper faces normal to x, y and z."""
+PIECE = 1 << 17
+"""Number of nodes or bars generated at a time, to keep temporary arrays small."""
 
-Levels = list[float | np.ndarray]
-Move = Callable[[np.ndarray, np.ndarray, Places], np.ndarray]
+_STEPS = 16
+"""Runge-Kutta steps within a cell of graded pitch."""
 
 
-class Block:
-    """Cells in a box, of which no rank has more than what it asks for.
+class Places(NamedTuple):
+    """Items and their places: one item for all places, or arrays of one length."""
+
+    item: int | np.ndarray
+    i: np.ndarray
+    j: np.ndarray
+    k: np.ndarray
+
+
+class Numbering:
+    """Numbers of items in a block, each with a number of places along x, y and z: ``shapes`` (items, 3) int64."""
+
+    def __init__(self, shapes: np.ndarray) -> None:
+        self.shapes = shapes
+        self.total = int(shapes.astype(object).prod(axis=1).sum())
+
+    def pieces(self, first: int, last: int) -> Iterator[tuple[np.ndarray, Places]]:
+        """Divide the range [first, last) into numbers and what they are."""
+        for start in range(first, last, PIECE):
+            numbers = np.arange(start, min(start + PIECE, last))
+            yield numbers, self.decode(numbers)
+
+    def arrays(self, span: tuple[int, int], make: Callable[..., list[np.ndarray]]) -> list[np.ndarray]:
+        """Return what ``make(numbers, places)`` returns for a range of numbers, made piece by piece."""
+        first, last = span
+        empty = np.empty(0, np.int64)
+        whole = [np.empty((last - first, *part.shape[1:]), part.dtype) for part in make(empty, self.decode(empty))]
+        for numbers, places in self.pieces(first, last):
+            for array, part in zip(whole, make(numbers, places), strict=True):
+                array[numbers[0] - first : numbers[-1] + 1 - first] = part
+        return whole
+
+
+class ItemByItem(Numbering):
+    """All places of the first item, z fastest, then all of the next."""
+
+    def __init__(self, shapes: np.ndarray) -> None:
+        super().__init__(shapes)
+        self._starts = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))])
+
+    def encode(self, item: int | np.ndarray, i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
+        """Return the numbers of items at places."""
+        return (i * self.shapes[item, 1] + j) * self.shapes[item, 2] + (k + self._starts[item])
+
+    def decode(self, numbers: np.ndarray) -> Places:
+        """Return the items of numbers (int64), with their places."""
+        item = np.searchsorted(self._starts, numbers, side="right") - 1
+        row, k = np.divmod(numbers - self._starts[item], self.shapes[item, 2])
+        return Places(item, *np.divmod(row, self.shapes[item, 1]), k)
+
+    def pieces(self, first: int, last: int) -> Iterator[tuple[np.ndarray, Places]]:
+        """Divide the range [first, last) into numbers and what they are, one item at a time, which is faster."""
+        for item, (base, end) in enumerate(zip(self._starts[:-1].tolist(), self._starts[1:].tolist())):
+            for start in range(max(first, base), min(last, end), PIECE):
+                numbers = np.arange(start, min(start + PIECE, last, end))
+                yield numbers, Places(item, *np.unravel_index(numbers - base, tuple(self.shapes[item])))
+
+
+class CellByCell(Numbering):
+    """All items of the first cell, then those of the next, z fastest.
+
+    Far from the faces of the block, bars that are copies of one strut join nodes whose numbers differ by the same.
+    """
+
+    def __init__(self, shapes: np.ndarray) -> None:
+        super().__init__(shapes)
+        # Cells along an axis are of one class if they have the same items: those whose shape reaches that far.
+        self._class = [
+            np.searchsorted(np.unique(lengths), np.arange(lengths.max(initial=0)), side="right") for lengths in shapes.T
+        ]
+        present = [
+            np.stack([lengths > np.argmax(classes == c) for c in range(classes.max(initial=0) + 1)])
+            for lengths, classes in zip(shapes.T, self._class)
+        ]
+        # (classes of x, of y, of z, items): which items a cell has, and their order within it
+        has = present[0][:, None, None] & present[1][None, :, None] & present[2][None, None, :]
+        self._order = np.cumsum(has, axis=3) - 1
+        self._items = np.argsort(~has, axis=3, kind="stable")
+        self._along_z = _starts(has.sum(axis=3)[:, :, self._class[2]])
+        self._along_y = _starts(self._along_z[:, self._class[1], -1])
+        self._along_x = _starts(self._along_y[self._class[0], -1])
+
+    def encode(self, item: int | np.ndarray, i: np.ndarray, j: np.ndarray, k: np.ndarray) -> np.ndarray:
+        """Return the numbers of items at places."""
+        cx, cy, cz = self._class[0][i], self._class[1][j], self._class[2][k]
+        numbers = self._along_x[i] + self._along_y[cx, j]
+        numbers += self._along_z[cx, cy, k]
+        numbers += self._order[cx, cy, cz, item]
+        return numbers
+
+    def decode(self, numbers: np.ndarray) -> Places:
+        """Return the items of numbers (int64), with their places."""
+        i = np.searchsorted(self._along_x, numbers, side="right") - 1
+        cx, rest = self._class[0][i], numbers - self._along_x[i]
+        j = _found(self._along_y, cx, rest)
+        rest = rest - self._along_y[cx, j]
+        cy = self._class[1][j]
+        k = _found(self._along_z.reshape(-1, self._along_z.shape[2]), cx * self._along_z.shape[1] + cy, rest)
+        rest = rest - self._along_z[cx, cy, k]
+        return Places(self._items[cx, cy, self._class[2][k], rest], i, j, k)
+
+
+def _starts(counts: np.ndarray) -> np.ndarray:
+    """Return sums of what comes before along the last axis, and of all."""
+    return np.concatenate([np.zeros((*counts.shape[:-1], 1), np.int64), np.cumsum(counts, axis=-1)], axis=-1)
+
+
+def _found(starts: np.ndarray, row: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return the last column of each row of ``starts`` (rows, n) that is not above the value."""
+    beyond = int(starts[:, -1].max(initial=0)) + 1
+    length = starts.shape[1]
+    flat = (starts + beyond * np.arange(len(starts))[:, None]).ravel()
+    return np.searchsorted(flat, value + beyond * row, side="right") - 1 - length * row
+
+
+class Joints:
+    """Nodes and bars of cells in a box, without positions.
 
     Parameters
     ----------
     cell : UnitCell
-    cells : (3,) int
+    cells : (3,) int64
         Number of cells along each axis, or of layers where a cell has several.
-    levels : for each axis float, or (cells + 2,) float64 [m]
-        The edge of all cells, or the coordinates of their borders and of one more.
     closed : bool
         Whether the last cell along x is joined to the first.
     plain : bool
         Whether the numbering of the cell may be item by item.
     """
 
-    moves: list[Move]
-    """Called one after another with coordinates (n, 3), numbers and places of nodes; return other coordinates."""
-
-    def __init__(
-        self, cell: UnitCell, cells: np.ndarray, levels: Levels, closed: bool = False, plain: bool = True
-    ) -> None:
-        self.cell, self.cells, self.levels, self.closed = cell, np.asarray(cells, np.int64), levels, closed
-        self.moves = []
-        size = self.cells / np.array(cell.layers)
+    def __init__(self, cell: UnitCell, cells: np.ndarray, closed: bool, plain: bool = True) -> None:
+        self.cell, self.cells, self.closed = cell, cells, closed
+        size = cells / np.array(cell.layers)
         nodes = np.floor(size - cell.points + 1e-9).astype(np.int64).clip(min=-1) + 1
         bars = (nodes[cell.ends] - cell.offsets).min(axis=1).clip(min=0)
         if closed:
-            nodes[:, 0] = bars[:, 0] = self.cells[0]
+            nodes[:, 0] = bars[:, 0] = cells[0]
         n_nodes, n_bars = (int(counts.astype(object).prod(axis=1).sum()) for counts in (nodes, bars))
         check_size(n_nodes, "mesh.cells", n_bars)
-        number: type[Numbering] = ItemByItem if plain and cell.item_by_item else CellByCell
+        number = ItemByItem if plain and cell.item_by_item else CellByCell
         self.nodes, self.bars = number(nodes), number(bars)
         there = (nodes > 0).all(axis=1)
-        self._low = cell.points[there].min(axis=0, initial=np.inf)
-        self._high = (cell.points + nodes - 1)[there].max(axis=0, initial=-np.inf)
-
-    def extents(self) -> np.ndarray:
-        """Return the edges (3,) [m] of the block before it is moved."""
-        found = []
-        for axis, level in enumerate(self.levels):
-            size = self.cells[axis] / self.cell.layers[axis]
-            if isinstance(level, float):
-                found.append(size * level)
-            else:
-                whole = int(size)
-                found.append(level[whole] + (size - whole) * (level[whole + 1] - level[whole]))
-        return np.array(found)
-
-    def positions(self, numbers: np.ndarray, places: Places) -> np.ndarray:
-        """Return the positions (n, 3) [m] of nodes with given numbers and places."""
-        points = np.empty((len(numbers), 3))
-        for axis, index in enumerate(places[1:]):
-            level, at = self.levels[axis], self.cell.points[places.item, axis]
-            if isinstance(level, float):
-                points[:, axis] = (index + at) * level
-            else:
-                points[:, axis] = level[index] + at * (level[index + 1] - level[index])
-        for move in self.moves:
-            points = move(points, numbers, places)
-        return points
+        low = cell.points[there].min(axis=0, initial=np.inf)
+        self._limits = low, (cell.points + nodes - 1)[there].max(axis=0, initial=-np.inf)
+        self.faces = [name for name, (axis, _) in FACES.items() if axis or not closed]
 
     def end(self, places: Places, which: int) -> tuple[np.ndarray, Places]:
         """Return numbers and places of the first or second (``which`` = 0, 1) ends of bars.
@@ -88,38 +186,286 @@ class Block:
         """
         item, offset = places.item, self.cell.offsets[places.item, which]
         at = Places(self.cell.ends[item, which], *(index + offset[..., axis] for axis, index in enumerate(places[1:])))
-        i = at.i % self.cells[0] if self.closed else at.i
-        return self.nodes.encode(at.item, i, at.j, at.k), at
+        return self.nodes.encode(at.item, at.i % self.cells[0] if self.closed else at.i, at.j, at.k), at
 
-    def on_face(self, places: Places, axis: int, upper: bool) -> np.ndarray:
-        """Return which nodes (n,) are on an outer face: those farthest along the axis."""
-        if axis == 0 and self.closed:
-            return np.zeros(len(places.i), bool)
-        at = places[1 + axis] + self.cell.points[places.item, axis]
-        return at == (self._high if upper else self._low)[axis]
+    def on_face(self, places: Places, name: str) -> np.ndarray:
+        """Return which nodes (n,) are on an outer face: those farthest along its axis."""
+        axis, upper = FACES[name]
+        return places[1 + axis] + self.cell.points[places.item, axis] == self._limits[upper][axis]
 
     def groups_of(self, bars: Places) -> dict[str, np.ndarray]:
         """Return which bars (n,) are in each bar group."""
         skin = np.zeros(len(bars.i), bool)
-        for name in self.cell.skin:
-            axis = "xyz".index(name)
-            for upper in (False, True):
-                skin |= self.on_face(self.end(bars, 0)[1], axis, upper) & self.on_face(
-                    self.end(bars, 1)[1], axis, upper
-                )
-        found = {}
-        for name, members in self.cell.groups.items():
-            one = np.zeros(len(self.cell.ends), bool)
-            one[members] = True
-            found[name] = one[bars.item] & ~skin if np.ndim(bars.item) else np.full(len(skin), one[bars.item]) & ~skin
+        ends = [self.end(bars, which)[1] for which in (0, 1)] if self.cell.skin else []
+        for name, (axis, _) in FACES.items():
+            if COORDINATES[axis] in self.cell.skin:
+                skin |= self.on_face(ends[0], name) & self.on_face(ends[1], name)
+        struts = np.arange(len(self.cell.ends))
+        found = {name: np.isin(struts, some)[bars.item] & ~skin for name, some in self.cell.groups.items()}
         return found | ({"skin": skin} if self.cell.skin else {})
 
     def has_bare_nodes(self) -> bool:
         """Whether a node at a corner, an edge or a face of the block has no bar."""
         counts = np.array(self.cell.layers) * 3
         small = np.where(self.cells > counts, counts + self.cells % self.cell.layers, self.cells)
-        block = Block(self.cell, small, self.levels, self.closed)
+        block = Joints(self.cell, small, self.closed)
         used = np.zeros(block.nodes.total, bool)
         for _, bars in block.bars.pieces(0, block.bars.total):
             used[block.end(bars, 0)[0]] = used[block.end(bars, 1)[0]] = True
         return not used.all()
+
+
+class Block(Joints):
+    """The block that the keys of a lattice describe, of which no rank has more than what it asks for.
+
+    Parameters
+    ----------
+    keys : Parameters
+        With ``cells``.
+    plain : bool
+        Whether nothing is left out, so that nodes and bars keep the numbering of their kind.
+
+    Attributes
+    ----------
+    volume : of what the block fills [m3]
+
+    Raises
+    ------
+    InputError
+        For lengths, gradings, perturbations or maps that do not fit the block.
+    """
+
+    def __init__(self, keys: Parameters, plain: bool) -> None:
+        self.keys, self.expressions = keys, keys.expressions()
+        closed = keys.curved is not None and keys.curved.closed
+        check_length(keys.pitch, "mesh.pitch")
+        cell, cells = keys.unit_cell(), np.array(keys.cells, np.int64)
+        # the edge of all cells along an axis, or the coordinates of their borders and of one more
+        self._levels: list[float | np.ndarray] = []
+        for axis, factor in enumerate(keys.grading or (1.0, 1.0, 1.0)):
+            edge = keys.pitch * cell.aspect[axis]
+            if isinstance(factor, str):
+                try:
+                    self._levels.append(graded_levels(-(-int(cells[axis]) // cell.layers[axis]), edge, factor, axis))
+                except ValueError as error:
+                    raise InputError(f"mesh.grading[{axis}]: {error}") from None
+            else:
+                check_length(edge * factor, f"mesh.pitch times mesh.grading[{axis}]")
+                self._levels.append(float(edge * factor))
+        super().__init__(cell, cells, closed, plain)
+        self._amplitude = (keys.perturbation or 0.0) * keys.pitch
+        edges = [level if isinstance(level, float) else np.diff(level[:-1]).min() for level in self._levels]
+        shortest = float(np.linalg.norm(cell.spans * np.array(edges), axis=1).min())
+        if self._amplitude and 2.0 * math.sqrt(3.0) * self._amplitude >= shortest:
+            raise InputError(
+                f"mesh.perturbation = {keys.perturbation!r}: ends of a strut of {shortest:.4g} m could meet; choose "
+                f"less than {shortest / (2.0 * math.sqrt(3.0) * keys.pitch):.4g}"
+            )
+        self._extents = self._box()
+        farthest = float(np.abs(keys.origin or 0.0).max()) + float(self._extents.max())
+        check_length(farthest, "mesh.origin and the extent of the block")
+        for length, axis in zip(self._extents, COORDINATES):
+            check_length(float(length), f"mesh.cells: extent along {axis}")
+        self.volume = self._shell() if keys.curved is not None else float(np.prod(self._extents))
+
+    def _box(self) -> np.ndarray:
+        """Return the edges (3,) [m] of the block before it is moved."""
+        found = []
+        for level, cells, layers in zip(self._levels, self.cells, self.cell.layers):
+            size = cells / layers
+            if isinstance(level, float):
+                found.append(size * level)
+            else:
+                whole = int(size)
+                found.append(level[whole] + (size - whole) * (level[whole + 1] - level[whole]))
+        return np.array(found)
+
+    def _shell(self) -> float:
+        """Return the volume of the shell [m3] to which the block is mapped."""
+        curved, extents = self.keys.curved, self._extents
+        inner, outer = curved.radius, curved.radius + float(extents[2])
+        if curved.shape == "cylinder":
+            if not self.closed and extents[0] > 2.0 * np.pi * inner * (1.0 + 1e-9):
+                raise InputError(
+                    f"mesh.curved.radius = {inner!r}: the block is {extents[0]:.6g} m long, more than the "
+                    f"circumference of {2.0 * np.pi * inner:.6g} m; use fewer cells, or closed = true"
+                )
+            angle = 2.0 * np.pi if self.closed else extents[0] / inner
+            return float(0.5 * angle * (outer**2 - inner**2) * extents[1])
+        half = 0.5 * extents[:2] / inner
+        if half.max() >= 0.45 * np.pi:
+            raise InputError(
+                f"mesh.curved.radius = {inner!r}: the block spans {np.degrees(2.0 * half.max()):.0f} degrees of the "
+                "sphere; at most 160 are mapped: use fewer cells or a larger radius"
+            )
+        solid_angle = 4.0 * np.arcsin(np.sin(half[0]) * np.sin(half[1]))
+        return float(solid_angle * (outer**3 - inner**3) / 3.0)
+
+    def positions(self, numbers: np.ndarray, places: Places) -> np.ndarray:
+        """Return the positions (n, 3) [m] of nodes with given numbers and places."""
+        keys, points = self.keys, np.empty((len(numbers), 3))
+        for axis, (level, index) in enumerate(zip(self._levels, places[1:])):
+            at = self.cell.points[places.item, axis]
+            if isinstance(level, float):
+                points[:, axis] = (index + at) * level
+            else:
+                points[:, axis] = level[index] + at * (level[index + 1] - level[index])
+        if self._amplitude:
+            for axis in range(3):  # nodes of outer faces remain in them
+                held = [self.on_face(places, name) for name in self.faces if FACES[name][0] == axis]
+                drawn = random_numbers(keys.seed or 0, axis, numbers)
+                points[:, axis] += ~np.any(held, axis=0) * (self._amplitude * (2.0 * drawn - 1.0))
+        if keys.curved is not None:
+            points = self._curved(points)
+        if keys.origin is not None:
+            points = points + np.array(keys.origin)
+        if keys.map is not None:
+            points = np.stack([self.expressions.at(points, f"map[{axis}]") for axis in range(3)], axis=1)
+        return points
+
+    def _curved(self, points: np.ndarray) -> np.ndarray:
+        """Return where points (n, 3) [m] of the block are on its shell, with z outwards from the radius.
+
+        On a cylinder about the y axis, x = 0 goes to the positive z axis. On a sphere about the origin, lines of x and
+        y become great circles at angles x/radius and y/radius from the middle of the block, which goes to the positive
+        z axis (the equiangular projection of a face of a cube).
+        """
+        x, y, z = points.T
+        radius = self.keys.curved.radius
+        if self.keys.curved.shape == "cylinder":
+            angle = x * (2.0 * np.pi / float(self._extents[0]) if self.closed else 1.0 / radius)
+            return np.stack([(radius + z) * np.sin(angle), y, (radius + z) * np.cos(angle)], axis=1)
+        middle = 0.5 * self._extents
+        a, b = np.tan((x - middle[0]) / radius), np.tan((y - middle[1]) / radius)
+        factor = (radius + z) / np.sqrt(1.0 + a * a + b * b)
+        return np.stack([a * factor, b * factor, factor], axis=1)
+
+
+def random_numbers(seed: int, stream: int, numbers: np.ndarray) -> np.ndarray:
+    """Return a uniform random number in [0, 1) for each number (n,) int64, of one of several streams.
+
+    Each depends on seed, stream and number alone, and not on which others are asked for or in what order.
+
+    Notes
+    -----
+    The finaliser of SplitMix64 (G. L. Steele, D. Lea, C. H. Flood, "Fast splittable pseudorandom number generators",
+    OOPSLA 2014), applied to the seed with the stream and then to a counter.
+    """
+    start = _mixed(np.array([seed % (1 << 63)], np.uint64) ^ (np.uint64(stream) << np.uint64(56)))
+    counter = numbers.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    return (_mixed(counter + start) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+
+def _mixed(z: np.ndarray) -> np.ndarray:
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+def graded_levels(cells: int, edge: float, factor: str, axis: int) -> np.ndarray:
+    """Return the coordinates (cells + 2,) [m] of the borders of cells along an axis, and of one more.
+
+    Cell numbers s are mapped to coordinates x by dx/ds = edge factor(x), x(0) = 0 (Runge-Kutta of order 4).
+
+    Raises
+    ------
+    ValueError
+        If the factor is not positive somewhere.
+    """
+    levels = list(islice(_borders(edge, factor, axis), cells + 1))
+    # no expression has to hold beyond the last cell: what lies there only completes the arithmetic
+    return np.array([*levels, 2.0 * levels[-1] - levels[-2]])
+
+
+def graded_count(length: float, edge: float, factor: str, axis: int, most: int = 20_000) -> int:
+    """Return the least number of graded cells that cover a length [m] from x = 0 on.
+
+    Raises
+    ------
+    ValueError
+        If the factor is not positive somewhere, or more than ``most`` cells are needed.
+    """
+    start = 0.0
+    for count, end in enumerate(islice(_borders(edge, factor, axis), 1, most + 1), 1):
+        if end >= length - 1e-9 * (end - start):
+            return count
+        start = end
+    raise ValueError(f"{factor!r} takes more than {most:,} cells over {length:g} m, and reaches {start:g} m")
+
+
+def _borders(edge: float, factor: str, axis: int) -> Iterator[float]:
+    """Yield the coordinates [m] of the borders of graded cells, from 0 on."""
+    name = COORDINATES[axis]
+    expression = Expression(factor, (name,))
+
+    def slope(x: float) -> float:
+        value = float(expression({name: np.array([x])})[0])
+        if not (np.isfinite(value) and value > 0.0):
+            raise ValueError(f"{factor!r} is {value:g} at {name} = {x:g} m; expected a factor > 0 in the block")
+        return edge * value
+
+    x, h = 0.0, 1.0 / _STEPS
+    yield x
+    while True:
+        for _ in range(_STEPS):
+            k1 = slope(x)
+            k2 = slope(x + 0.5 * h * k1)
+            k3 = slope(x + 0.5 * h * k2)
+            x += h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + slope(x + h * k3))
+        yield x
+
+
+def fitted(keys: Parameters, surface: Surface) -> Parameters:
+    """Return the keys with cells that cover the surface, if they give none: from a corner of cells at ``origin``.
+
+    Along an axis whose grading is an expression the block begins at ``origin``, which must not be above the lower side
+    of the surface. All ranks compute the same.
+
+    Raises
+    ------
+    InputError
+        For a pitch that takes too many cells, and an origin or an expression that does not fit the surface.
+    """
+    if keys.cells is not None:
+        return keys
+    cell, (low, high) = keys.unit_cell(), surface.bounds
+    origin = np.array(keys.origin if keys.origin is not None else low)
+    start, count = origin.copy(), np.ones(3)
+    for axis, factor in enumerate(keys.grading or (1.0, 1.0, 1.0)):
+        edge = keys.pitch * cell.aspect[axis]
+        if isinstance(factor, str):
+            count[axis] = _graded_count(factor, axis, edge, (low, high, origin))
+            continue
+        first = np.floor((low[axis] - origin[axis]) / (edge * factor) + 1e-9)
+        count[axis] = max(np.ceil((high[axis] - origin[axis]) / (edge * factor) - 1e-9) - first, 1.0)
+        start[axis] += first * edge * factor
+    size = f"a surface of {' x '.join(f'{length:.4g}' for length in high - low)} m"
+    if keys.surface.scale == 1.0:
+        size += " (if its file is in millimetres, set mesh.surface.scale = 0.001)"
+    if not (count < float(np.iinfo(np.int64).max) / 16.0).all():
+        raise InputError(f"mesh.pitch = {keys.pitch!r}: too small for {size}")
+    check_size(
+        math.prod(int(number) for number in count.tolist()),
+        f"mesh.pitch = {keys.pitch!r}, with cells that cover {size}",
+    )
+    cells = tuple((count.astype(np.int64) * np.array(cell.layers)).tolist())
+    return keys.model_copy(update={"cells": cells, "origin": tuple(start.tolist())})
+
+
+def _graded_count(factor: str, axis: int, edge: float, box: tuple[np.ndarray, np.ndarray, np.ndarray]) -> int:
+    """Return the number of cells along an axis, from the origin to the upper side of the surface."""
+    name, (low, high, origin) = COORDINATES[axis], box
+    lowest, highest = (f"({', '.join(f'{x:.6g}' for x in point.tolist())})" for point in (low, high))
+    around = f"the surface is in the box from {lowest} to {highest} m"
+    if origin[axis] > low[axis] + 1e-9 * edge:
+        raise InputError(
+            f"mesh.grading[{axis}] = {factor!r}: an expression begins at mesh.origin, and the surface below it would "
+            f"stay empty: {around}; use {name} = {low[axis]:.9g} or less in mesh.origin, or leave mesh.origin out"
+        )
+    try:
+        return graded_count(float(high[axis] - origin[axis]), edge, factor, axis)
+    except ValueError as error:
+        raise InputError(
+            f"mesh.grading[{axis}]: {error}; {around}, and {name} of the expression is measured from "
+            f"{name} = {origin[axis]:.9g} m"
+        ) from None

@@ -1,16 +1,27 @@
-"""Expressions of coordinates in case files, such as ``"1e-6*(1 + 2*exp(-z/0.1))"``; nothing of them is run as code."""
+"""Expressions of coordinates in case files, such as ``"1e-6*(1 + 2*exp(-z/0.1))"``, and what their values at points
+are computed from; nothing of them is run as code."""
 
 from __future__ import annotations
 
 import ast
+import keyword
 import math
+import warnings
 from collections.abc import Callable, Mapping
-from functools import reduce
-from typing import Any
+from functools import cached_property, reduce
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-__all__ = ["RESERVED", "Expression"]
+from ...case.base import is_finite_number
+from ...errors import InputError
+from ...files import readable_whole
+
+if TYPE_CHECKING:
+    import pyvista
+
+COORDINATES = ("x", "y", "z")
 
 _OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Add: np.add,
@@ -45,24 +56,11 @@ _FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
 _CONSTANTS = {"pi": math.pi, "e": math.e}
 _LONGEST = 2000
 
-RESERVED = (
-    "x",
-    "y",
-    "z",
-    *_CONSTANTS,
-    *_FUNCTIONS,
-    "and",
-    "or",
-    "not",
-    "True",
-    "False",
-    "None",
-    "if",
-    "else",
-    "in",
-    "is",
-)
-"""Names that a variable of its own cannot have."""
+
+def can_be_variable(name: str) -> bool:
+    """Whether expressions can use a name for a variable besides the coordinates."""
+    taken = name in COORDINATES or name in _CONSTANTS or name in _FUNCTIONS
+    return name.isidentifier() and not keyword.iskeyword(name) and not taken
 
 
 class Expression:
@@ -81,102 +79,172 @@ class Expression:
         If the text is anything else; it says what.
     """
 
-    def __init__(self, text: str, variables: tuple[str, ...]) -> None:
+    def __init__(self, text: str, variables: tuple[str, ...] = COORDINATES) -> None:
         self.text, self.variables = text, variables
         if len(text) > _LONGEST:
             raise ValueError(f"the expression has {len(text)} characters, more than {_LONGEST}")
+        # each node of the tree before its parts, the last part first; without recursion, for long sums
+        self._steps: list[tuple[str | Callable[..., Any], int]] = []
         try:
-            tree = ast.parse(text.strip(), mode="eval")
-            self._nodes = self._checked(tree.body)
+            left: list[ast.AST] = [ast.parse(text.strip(), mode="eval").body]
+            while left:
+                function, parts = self._step(left.pop())
+                self._steps.append((function, len(parts)))
+                left += parts
         except SyntaxError as error:
             raise ValueError(f"not an expression: {error.msg} at character {error.offset}") from None
         except (RecursionError, MemoryError):
             raise ValueError("the expression is nested too deep") from None
-        self.used = {node.id for node, _, _ in self._nodes if isinstance(node, ast.Name)}
+        self.used = {function for function, _ in self._steps if isinstance(function, str)}
 
     def __call__(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the values (n,) float64 at the values (n,) of the variables; not finite where it is not defined."""
-        n = len(next(iter(values.values())))
-        found: dict[int, Any] = {}
+        found: list[Any] = []
         with np.errstate(all="ignore"):
-            for node, operators, parts in reversed(self._nodes):
-                found[id(node)] = self._value(node, operators, [found.pop(id(part)) for part in parts], values)
-            return np.broadcast_to(np.asarray(found[id(self._nodes[0][0])], dtype=float), n).copy()
+            for function, count in reversed(self._steps):
+                parts = found[len(found) - count :]
+                del found[len(found) - count :]
+                value = values[function] if isinstance(function, str) else function(*parts)
+                found.append(np.asarray(value, dtype=float))  # 1 and 0 for true and false
+        return np.broadcast_to(found[0], len(next(iter(values.values())))).copy()
 
-    def _checked(self, tree: ast.AST) -> list[tuple[ast.AST, list[ast.AST], list[ast.AST]]]:
-        """Return all nodes, each before its parts, with operators and parts; without recursion, for long sums.
+    def _step(self, node: ast.AST) -> tuple[str | Callable[..., Any], list[Any]]:
+        """Return what gives the value of a node of the tree, a variable or a function of its parts, and these."""
+        match node:
+            case ast.Constant(value):
+                if not is_finite_number(value):
+                    raise ValueError(f"{ast.unparse(node)} is not a number")
+                return lambda: float(value), []
+            case ast.Name(name):
+                if name in self.variables:
+                    return name, []
+                if name not in _CONSTANTS:
+                    known = ", ".join((*self.variables, *_CONSTANTS))
+                    raise ValueError(f"unknown variable {name!r}; known: {known}")
+                return lambda: _CONSTANTS[name], []
+            case ast.BinOp(left, operator, right):
+                return self._operator(node, operator), [left, right]
+            case ast.UnaryOp(operator, operand):
+                return self._operator(node, operator), [operand]
+            case ast.BoolOp(operator, parts):
+                function = self._operator(node, operator)
+                return lambda *values: reduce(function, values), parts
+            case ast.Compare(left, operators, others):
+                functions = [self._operator(node, operator) for operator in operators]
+                return lambda *values: reduce(
+                    np.logical_and, [compare(a, b) for compare, a, b in zip(functions, values, values[1:])]
+                ), [left, *others]
+            case ast.Call(ast.Name(name), parts, keywords):
+                if name not in _FUNCTIONS:
+                    raise ValueError(f"unknown function {name!r}; known: {', '.join(_FUNCTIONS)}")
+                function, wanted = _FUNCTIONS[name]
+                if keywords or (len(parts) != wanted if wanted > 0 else len(parts) < -wanted):
+                    expected = f"{wanted} argument{'s' * (wanted > 1)}" if wanted > 0 else "two or more arguments"
+                    raise ValueError(f"{name} takes {expected}, got {len(parts) + len(keywords)}")
+                return function, parts
+        raise ValueError(f"{ast.unparse(node)!r} is not arithmetic of numbers, variables and known functions")
 
-        Refuse what is not arithmetic of numbers, variables and known functions.
-        """
-        nodes, left = [], [tree]
-        while left:
-            node = left.pop()
-            operators, parts = self._operands(node)
-            nodes.append((node, operators, parts))
-            left += parts
-        return nodes
-
-    def _operands(self, node: ast.AST) -> tuple[list[ast.AST], list[ast.AST]]:
-        if isinstance(node, ast.Constant):
-            if isinstance(node.value, bool) or not isinstance(node.value, int | float) or not _finite(node.value):
-                raise ValueError(f"{ast.unparse(node)} is not a number")
-            return [], []
-        if isinstance(node, ast.Name):
-            if node.id not in self.variables and node.id not in _CONSTANTS:
-                raise ValueError(f"unknown variable {node.id!r}; known: {', '.join((*self.variables, *_CONSTANTS))}")
-            return [], []
-        operators, parts = _parts(node)
-        if not all(type(operator) in _OPERATORS for operator in operators):
-            hint = "; powers are **" if any(isinstance(operator, ast.BitXor) for operator in operators) else ""
+    @staticmethod
+    def _operator(node: ast.AST, operator: ast.AST) -> Callable[..., Any]:
+        if type(operator) not in _OPERATORS:
+            hint = "; powers are **" if isinstance(operator, ast.BitXor) else ""
             raise ValueError(f"{ast.unparse(node)!r}: this operator is not known{hint}")
-        return operators, parts
-
-    def _value(
-        self, node: ast.AST, operators: list[ast.AST], found: list[Any], values: Mapping[str, np.ndarray]
-    ) -> Any:
-        if isinstance(node, ast.Constant):
-            return float(node.value)  # type: ignore[arg-type]
-        if isinstance(node, ast.Name):
-            return values[node.id] if node.id in self.variables else _CONSTANTS[node.id]
-        if isinstance(node, ast.Call):
-            return _FUNCTIONS[node.func.id][0](*found)  # type: ignore[attr-defined]
-        if isinstance(node, ast.Compare):
-            pairs = [_OPERATORS[type(o)](a, b) for o, a, b in zip(operators, found, found[1:])]
-            return _number(reduce(np.logical_and, pairs))
-        if isinstance(node, ast.BoolOp):
-            return _number(reduce(_OPERATORS[type(operators[0])], found))
-        return _number(_OPERATORS[type(operators[0])](*found))
+        return _OPERATORS[type(operator)]
 
 
-def _parts(node: ast.AST) -> tuple[list[ast.AST], list[ast.AST]]:
-    """Return the operators of a part of an expression, and what they are applied to."""
-    if isinstance(node, ast.BinOp):
-        return [node.op], [node.left, node.right]
-    if isinstance(node, ast.UnaryOp):
-        return [node.op], [node.operand]
-    if isinstance(node, ast.BoolOp):
-        return [node.op], list(node.values)
-    if isinstance(node, ast.Compare):
-        return list(node.ops), [node.left, *node.comparators]
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-        name, count = node.func.id, len(node.args)
-        if name not in _FUNCTIONS:
-            raise ValueError(f"unknown function {name!r}; known: {', '.join(_FUNCTIONS)}")
-        wanted = _FUNCTIONS[name][1]
-        if node.keywords or (count != wanted if wanted > 0 else count < -wanted):
-            expected = f"{wanted} argument{'s' * (wanted > 1)}" if wanted > 0 else "two or more arguments"
-            raise ValueError(f"{name} takes {expected}, got {count + len(node.keywords)}")
-        return [], list(node.args)
-    raise ValueError(f"{ast.unparse(node)!r} is not arithmetic of numbers, variables and known functions")
+class MeshField:
+    """A field on a mesh of VTK, such as densities of a topology optimisation, whose file every rank reads at first use.
+
+    Parameters
+    ----------
+    key : of the table of the field, for messages
+    file, array : names
+    scale : metres per unit of length of the file
+    """
+
+    def __init__(self, key: str, file: str, array: str, scale: float) -> None:
+        self._key, self._path, self._array, self._scale = key, Path(file), array, scale
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Return the values (n,) at points (n, 3) [m]: those of the nearest point of the mesh for points outside it.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, or has no such array of numbers.
+        """
+        import pyvista
+
+        if len(points) == 0:
+            return np.empty(0)
+        mesh, array, places = self._mesh, self._array, points / self._scale
+        found = pyvista.PolyData(places).sample(mesh)
+        values = np.array(found.point_data[array], dtype=float)
+        outside = np.flatnonzero(np.asarray(found.point_data["vtkValidPointMask"]) == 0)
+        if len(outside):
+            at_points = mesh if array in mesh.point_data else mesh.cell_data_to_point_data()
+            nearest = [mesh.find_closest_point(place) for place in places[outside]]
+            values[outside] = np.asarray(at_points.point_data[array])[nearest]
+        return values
+
+    @cached_property
+    def _mesh(self) -> pyvista.DataSet:
+        import pyvista
+
+        path, array, where = self._path, self._array, f"{self._key}.file: {self._path}"
+        try:
+            with open(readable_whole(path), "rb"):
+                pass
+            with warnings.catch_warnings(record=True):  # a file that cannot be read has no cells, which is told below
+                mesh = pyvista.read(path)
+        except OSError as error:
+            raise InputError(f"{where}: cannot open: {error.strerror or error}") from None
+        except (ValueError, RuntimeError) as error:
+            raise InputError(f"{where}: cannot be read: {error}") from None
+        if not isinstance(mesh, pyvista.DataSet) or mesh.n_cells == 0:
+            raise InputError(f"{where}: has no cells to take a field from")
+        of_points = array in mesh.point_data
+        data = mesh.point_data if of_points else mesh.cell_data
+        if array not in data or data[array].ndim != 1 or data[array].dtype.kind not in "fiu":
+            known = [name for some in (mesh.point_data, mesh.cell_data) for name in some if some[name].ndim == 1]
+            there = f"; it has {', '.join(known)}" if known else ""
+            raise InputError(f"{self._key}.array = {array!r}: {path} has no such array of single numbers{there}")
+        if of_points and array in mesh.cell_data:
+            del mesh.cell_data[array]
+        return mesh
 
 
-def _number(value: Any) -> Any:
-    """Return 1 and 0 for true and false."""
-    return np.asarray(value, dtype=float)
+class Fields:
+    """The expressions of a lattice, by their keys in ``[mesh]``, and the fields that they use.
 
+    Raises
+    ------
+    ValueError
+        If one is no expression of coordinates and fields; it names the key.
+    """
 
-def _finite(value: float) -> bool:
-    try:
-        return math.isfinite(float(value))
-    except OverflowError:
-        return False
+    def __init__(self, texts: Mapping[str, str], fields: Mapping[str, MeshField]) -> None:
+        self._fields, self._expressions = fields, {}
+        for key, text in texts.items():
+            try:
+                self._expressions[key] = Expression(text, (*COORDINATES, *fields))
+            except ValueError as error:
+                raise ValueError(f"{key} = {text!r}: {error}") from None
+
+    def at(self, points: np.ndarray, key: str) -> np.ndarray:
+        """Return the values (n,) of an expression at points (n, 3) [m].
+
+        Raises
+        ------
+        InputError
+            If the expression has no finite value somewhere.
+        """
+        expression = self._expressions[key]
+        variables = dict(zip(COORDINATES, points.T))
+        variables |= {name: field(points) for name, field in self._fields.items() if name in expression.used}
+        values = expression(variables)
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            where = ", ".join(f"{x:.6g}" for x in points[bad[0]])
+            raise InputError(f"mesh.{key} = {expression.text!r} has no finite value at ({where}) m")
+        return values

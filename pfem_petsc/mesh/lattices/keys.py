@@ -1,4 +1,4 @@
-"""Tables within ``[mesh]`` of a lattice."""
+"""Keys of ``[mesh]`` with ``generator = "lattice"``, and of the tables within it."""
 
 from __future__ import annotations
 
@@ -6,13 +6,20 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from ...case.base import FilePath, Finite, NonNegativeInt, PositiveFloat, StrictModel, listed
-from .cell import UnitCell, cell_of
-from .expressions import Expression
-
-__all__ = ["COORDINATES", "CellKeys", "CurvedKeys", "FieldKeys", "SurfaceKeys", "checked_expression", "grading_factors"]
-
-COORDINATES = ("x", "y", "z")
+from ...case.base import (
+    FilePath,
+    Finite,
+    Name,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInts3,
+    StrictModel,
+    Vector3,
+    is_finite_number,
+    listed,
+)
+from .cells import ANGLE, KINDS, UnitCell, auxetic, cell_of
+from .expressions import COORDINATES, Expression, Fields, MeshField, can_be_variable
 
 Point = Annotated[tuple[Finite, Finite, Finite], listed]
 Strut = Annotated[tuple[int, ...], listed]
@@ -42,15 +49,14 @@ class CellKeys(StrictModel):
         if not self.points or not self.struts:
             raise ValueError("expected at least one point and one strut")
         for number, strut in enumerate(self.struts):
+            where = f"struts[{number}] = {list(strut)}"
             if len(strut) not in (2, 5) or not all(0 <= p < count for p in strut[:2]):
                 raise ValueError(
-                    f"struts[{number}] = {list(strut)}: expected two numbers of points, 0 to {count - 1}, or these and "
-                    "the cell (i, j, k) of the second one"
+                    f"{where}: expected two numbers of points, 0 to {count - 1}, or these and the cell (i, j, k) of "
+                    "the second one"
                 )
             if any(abs(i) > 1 for i in strut[2:]):
-                raise ValueError(
-                    f"struts[{number}] = {list(strut)}: expected -1, 0 or 1 for the cell of the second point"
-                )
+                raise ValueError(f"{where}: expected -1, 0 or 1 for the cell of the second point")
         for name, members in (self.groups or {}).items():
             if wrong := [m for m in members if m >= len(self.struts)]:
                 raise ValueError(
@@ -63,8 +69,7 @@ class CellKeys(StrictModel):
 
     def made(self) -> UnitCell:
         """Return the unit cell."""
-        groups = self.groups if self.groups is not None else {"struts": range(len(self.struts))}
-        return cell_of(self.points, self.struts, groups)
+        return cell_of(self.points, self.struts, self.groups)
 
 
 class SurfaceKeys(StrictModel):
@@ -108,30 +113,109 @@ class CurvedKeys(StrictModel):
         return self
 
 
-def checked_expression(text: Any, variables: tuple[str, ...] = COORDINATES) -> Expression:
-    """Return an expression of coordinates from a key.
+class Parameters(StrictModel):
+    """Keys of ``[mesh]`` with ``generator = "lattice"``."""
 
-    Raises
-    ------
-    ValueError
-        If it is not one.
-    """
-    if not isinstance(text, str):
-        raise ValueError('expected an expression in quotes, like "1e-6*(1 + z/0.1)"')
-    return Expression(text, variables)
+    kind: Literal[
+        "cubic",
+        "octet",
+        "bcc",
+        "bcc_diagonals",
+        "fcc",
+        "kelvin",
+        "diamond",
+        "gyroid",
+        "auxetic",
+        "tetrahedral_octahedral",
+        "cell",
+    ] = "cubic"
+    """``cubic``: edges and both diagonals of every face of the cubes. ``octet``: face-centred nodes, every pair of
+    nearest neighbours. ``bcc``: corners and centres, the eight half diagonals of each cube and the cube edges
+    (without which it would be a mechanism). ``cell``: the unit cell of the key ``cell``. docs/lattices.md has all."""
+    cells: PositiveInts3 | None = None
+    """Number of cubic cells along x, y and z; with ``surface``, default: as many as cover it, from ``origin`` on where
+    ``grading`` is an expression."""
+    pitch: PositiveFloat
+    """Edge of the cubic cell [m]."""
+    angle: Annotated[float, Field(gt=0.0, lt=45.0)] | None = None
+    """Angle of the inclined struts of ``auxetic`` against the x-y plane [degrees]; default: 20."""
+    cell: CellKeys | None = None
+    """The unit cell of the kind ``cell``: ``points``, ``struts``, ``groups``."""
+    grading: Any = None
+    """Three factors on the pitch along x, y and z: numbers, or expressions of one coordinate from ``origin`` [m]."""
+    perturbation: Annotated[float, Field(ge=0.0, lt=0.5)] | None = None
+    """Random displacement of nodes along each axis, at most this fraction of the pitch."""
+    missing: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None
+    """Probability with which a strut is left out."""
+    seed: NonNegativeInt | None = None
+    """Seed of ``perturbation`` and ``missing``; default: 0."""
+    origin: Vector3 | None = None
+    """Where the corner of the first cell goes, after ``curved`` the centre of the shell [m]; default: the origin, with
+    ``surface`` and without ``cells`` the lower corner of the box around it."""
+    surface: SurfaceKeys | None = None
+    """A closed surface that the lattice fills: ``file``, ``scale``, ``cut``, ``shortest``."""
+    dangling: Literal["remove", "keep"] | None = None
+    """Struts that end at a node without another; default: ``remove`` with ``surface``, ``keep`` or
+    ``missing``, else ``keep``."""
+    curved: CurvedKeys | None = None
+    """Map to a curved shell: ``shape``, ``radius``, ``closed``."""
+    fields: dict[Name, FieldKeys] | None = None
+    """Fields on meshes of VTK, by their names in expressions: ``file``, ``array``, ``scale``."""
+    map: Annotated[tuple[str, str, str], listed] | None = None
+    """Three expressions of x, y and z [m] and ``fields``: where each node goes."""
+    keep: str | None = None
+    """Nodes where this expression of x, y and z [m] and ``fields`` is false are left out, with their struts."""
+    bar_fields: dict[Name, str] | None = None
+    """Cell fields of the bars by name, for ``area_field``: expressions of x, y and z of their middles [m], and of
+    ``fields``."""
 
+    @field_validator("grading")
+    @classmethod
+    def _factors(cls, value: Any) -> Any:
+        if value is None:
+            return None
+        if not isinstance(value, list | tuple) or len(value) != 3:
+            raise ValueError('expected three factors on the pitch along x, y and z, like [1, 1, "1 + 2*z"]')
+        for axis, factor in zip(COORDINATES, value):
+            if isinstance(factor, str):
+                Expression(factor, (axis,))
+            elif not is_finite_number(factor) or not 1e-100 < factor < 1e100:
+                raise ValueError(f"expected a factor > 0 or an expression of {axis}, got {factor!r}")
+        return tuple(factor if isinstance(factor, str) else float(factor) for factor in value)
 
-def grading_factors(value: Any) -> tuple[float | str, ...]:
-    """Return three factors, each a number or an expression of its own coordinate."""
-    if not isinstance(value, list | tuple) or len(value) != 3:
-        raise ValueError('expected three factors on the pitch along x, y and z, like [1, 1, "1 + 2*z"]')
-    factors: list[float | str] = []
-    for axis, factor in zip(COORDINATES, value):
-        if isinstance(factor, str):
-            checked_expression(factor, (axis,))
-            factors.append(factor)
-        elif isinstance(factor, bool) or not isinstance(factor, int | float) or not 1e-100 < factor < 1e100:
-            raise ValueError(f"expected a factor > 0 or an expression of {axis}, got {factor!r}")
-        else:
-            factors.append(float(factor))
-    return tuple(factors)
+    @model_validator(mode="after")
+    def _consistent(self) -> Parameters:
+        for name in self.fields or {}:
+            if not can_be_variable(name):
+                raise ValueError(f"fields.{name}: expected a name of letters, digits and underscores")
+        self.expressions()
+        if self.map is not None and self.curved is not None:
+            raise ValueError("map and the table [mesh.curved] exclude each other: give one of them")
+        if self.cells is None and (self.surface is None or self.curved is not None or self.map is not None):
+            raise ValueError("the key cells is missing: number of cells along x, y and z")
+        if (self.kind == "cell") != (self.cell is not None):
+            raise ValueError('kind = "cell" and the table [mesh.cell] with points and struts need each other')
+        if self.angle is not None and self.kind != "auxetic":
+            raise ValueError(f'angle belongs to kind = "auxetic" (default {ANGLE:g}), not to {self.kind!r}')
+        if self.seed is not None and not (self.perturbation or self.missing):
+            raise ValueError("seed needs perturbation or missing")
+        if self.curved is not None and self.curved.closed and self.cells is not None and self.cells[0] < 3:
+            raise ValueError("curved.closed = true needs 3 cells or more along x")
+        return self
+
+    def expressions(self) -> Fields:
+        """Return the expressions ``keep``, ``map[0]`` to ``map[2]``, and those of ``bar_fields``."""
+        texts = {f"bar_fields.{name}": text for name, text in (self.bar_fields or {}).items()}
+        texts |= {"keep": self.keep} if self.keep is not None else {}
+        texts |= {f"map[{axis}]": text for axis, text in enumerate(self.map or ())}
+        fields = {
+            name: MeshField(f"mesh.fields.{name}", keys.file, keys.array, keys.scale)
+            for name, keys in (self.fields or {}).items()
+        }
+        return Fields(texts, fields)
+
+    def unit_cell(self) -> UnitCell:
+        """Return the unit cell."""
+        if self.cell is not None:
+            return self.cell.made()
+        return auxetic(self.angle or ANGLE) if self.kind == "auxetic" else KINDS[self.kind]()

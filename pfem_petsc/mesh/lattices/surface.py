@@ -1,17 +1,23 @@
-"""A closed surface of triangles: what is inside, and where lines pass through it."""
+"""A closed surface of triangles: its file, what is inside, and where lines pass through it."""
 
 from __future__ import annotations
 
+import importlib
+import re
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from vtkmodules.vtkCommonDataModel import vtkPolyData
+from ...errors import InputError
+from ...files import readable_whole
 
-__all__ = ["ON", "Surface", "poly_data"]
+if TYPE_CHECKING:
+    import pyvista
+
+_Triangles = tuple[np.ndarray, np.ndarray]
 
 ON = 1e-6
 """Points nearer to the surface than this fraction of the bar lengths count as inside: those on it are inside."""
@@ -42,8 +48,10 @@ class Surface:
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
     @cached_property
-    def _data(self) -> vtkPolyData:
-        return poly_data(self.points, self.triangles)
+    def _data(self) -> pyvista.PolyData:
+        import pyvista
+
+        return pyvista.PolyData.from_regular_faces(self.points, self.triangles)
 
     @cached_property
     def _distance(self) -> Any:
@@ -153,19 +161,99 @@ class Surface:
         return line, np.clip(along, 0.0, 1.0)
 
 
-def poly_data(points: np.ndarray, triangles: np.ndarray) -> vtkPolyData:
-    """Return points (n, 3) and triangles (m, 3) as an object of VTK."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+_READERS = {
+    ".stl": ("vtkmodules.vtkIOGeometry", "vtkSTLReader"),
+    ".obj": ("vtkmodules.vtkIOGeometry", "vtkOBJReader"),
+    ".ply": ("vtkmodules.vtkIOPLY", "vtkPLYReader"),
+}
+_MERGED = 1e-7
+"""Points of a file closer than this fraction of its diagonal are merged if it is not closed without that."""
 
-    data, nodes, cells = vtkPolyData(), vtkPoints(), vtkCellArray()
-    nodes.SetData(numpy_to_vtk(np.ascontiguousarray(points), deep=True))
-    offsets = np.arange(0, 3 * len(triangles) + 1, 3)
-    cells.SetData(
-        numpy_to_vtkIdTypeArray(offsets, deep=True),
-        numpy_to_vtkIdTypeArray(np.ascontiguousarray(triangles.ravel()), deep=True),
-    )
-    data.SetPoints(nodes)
-    data.SetPolys(cells)
-    return data
+
+def read_surface(path: Path, scale: float) -> Surface:
+    """Read a surface; to be called on one rank.
+
+    Raises
+    ------
+    InputError
+        If the file is not there, is not of triangles, or the surface is open.
+    """
+    import pyvista
+
+    where = f"mesh.surface.file: {path}"
+    if path.suffix.lower() not in _READERS:
+        raise InputError(f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_READERS)}")
+    try:
+        with open(readable_whole(path), "rb"):
+            pass
+    except OSError as error:
+        raise InputError(f"{where}: cannot open: {error.strerror}") from None
+    module, name = _READERS[path.suffix.lower()]
+    reader = getattr(importlib.import_module(module), name)()
+    messages = _observed(reader)
+    reader.SetFileName(str(path))
+    reader.Update()
+    data = pyvista.wrap(reader.GetOutput())
+    points, triangles = _triangles(data)
+    if len(triangles) == 0 or not np.isfinite(points).all():
+        what = f" ({messages[0]})" if messages else ""
+        raise InputError(f"{where}: no surface of triangles could be read from it{what}")
+    count, edge = _open_edges(triangles)
+    if count:
+        points, triangles = _better((points, triangles), _triangles(data, _MERGED))
+        data = pyvista.PolyData.from_regular_faces(points, triangles)
+        turned = data.compute_normals(cell_normals=False, auto_orient_normals=True)
+        points, triangles = _better((points, triangles), _triangles(turned))
+        count, edge = _open_edges(triangles)
+    if count:
+        a, b = (", ".join(f"{x:.6g}" for x in points[node]) for node in edge)
+        raise InputError(
+            f"{where}: the surface is not closed: {count} of its edges have a triangle on one side only, like that "
+            f"from ({a}) to ({b}) in the file; close it in the program that made it (PyVista: mesh.fill_holes(size))"
+        )
+    surface = Surface(scale * points, triangles)
+    size = float(np.prod(surface.bounds[1] - surface.bounds[0]))
+    if not abs(surface.volume) > 1e-9 * size:
+        raise InputError(f"{where}: the surface encloses no volume: {surface.volume:.3g} m3 in a box of {size:.3g} m3")
+    if surface.volume < 0.0:
+        surface = Surface(surface.points, triangles[:, ::-1].copy())
+    return surface
+
+
+def _observed(reader: Any) -> list[str]:
+    """Return a list that gets the messages of a VTK object, which would go to stderr."""
+    messages: list[str] = []
+
+    def note(_reader: object, _event: str, text: str = "") -> None:
+        messages.append(re.sub(r"^\w+: In .*?\): ", "", " ".join(str(text).split()))[:200])
+
+    note.CallDataType = "string0"  # type: ignore[attr-defined]
+    for event in ("ErrorEvent", "WarningEvent"):
+        for source in (reader, reader.GetExecutive()):
+            source.AddObserver(event, note)
+    return messages
+
+
+def _triangles(data: pyvista.PolyData, tolerance: float = 0.0) -> _Triangles:
+    """Return points and triangles; points within the tolerance, in diagonals, are merged, flat triangles left out."""
+    data = data.triangulate()
+    if data.n_cells == 0:
+        return np.empty((0, 3)), np.empty((0, 3), np.int64)
+    data = data.clean(tolerance=tolerance, absolute=False)
+    corners = data.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
+    return data.points.astype(np.float64), corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+
+
+def _open_edges(triangles: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return how many edges are not passed equally often in both directions, and the first of them."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    forward = edges[:, 0] < edges[:, 1]
+    pairs, at = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+    balance = np.bincount(at.ravel(), weights=np.where(forward, 1.0, -1.0), minlength=len(pairs))
+    wrong = np.flatnonzero(balance)
+    return len(wrong), pairs[wrong[0]] if len(wrong) else np.empty(0, np.int64)
+
+
+def _better(one: _Triangles, two: _Triangles) -> _Triangles:
+    """Return the points and triangles with fewer open edges; a surface that has lost all triangles is no better."""
+    return two if len(two[1]) and _open_edges(two[1])[0] < _open_edges(one[1])[0] else one

@@ -1,0 +1,245 @@
+"""The columns of the history, one line each: recorder, files, units, stages, curves and compiled loops read them here.
+
+A rank's share of a row is a vector of sums: :data:`HEAD`, then for cases with walls the changes of the active set and
+one :data:`WALL` per wall, one :data:`PAIR` per table of contact pairs or constraints, and the probes. Compiled loops
+use the positions as integers at module level, which are constants of the machine code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+SUMMED, LASTING = "summed", "lasting"
+
+
+class Column(NamedTuple):
+    """One column; those of walls, pairs and probes without the name of theirs, ``force`` of ``wall/floor/force``.
+
+    Attributes
+    ----------
+    unit : SI unit, empty for a pure number
+    size : numbers of a value: 1, or 3 for a vector
+    kind : type of the numbers in the file
+    source : of an energy, see :func:`energy`
+    side : of an energy, of the balance: stored + lost - supplied is constant; ``part`` of another column
+    parts : columns that a derived energy sums
+    value : its value at the time of a row from a :class:`~pfem_petsc.stepping.stepper.Stepper`, this rank's share if it
+        is summed over ranks; None if the ledger, the contact log or the recorder has it
+    stages : what a stage does with the value of the stage before: it goes on with a ``summed`` one, keeps a ``lasting``
+        one that it does not have itself, and forgets others
+    exists : whether the column is recorded, from a :class:`~pfem_petsc.stepping.model.Model`
+    """
+
+    name: str
+    unit: str = ""
+    size: int = 1
+    kind: type = np.float64
+    source: str = ""
+    side: str = ""
+    parts: tuple[str, ...] = ()
+    value: Callable[[Any], float] | None = None
+    stages: str = ""
+    exists: Callable[[Any], bool] = lambda model: True
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of a value in the file, with the shape of a vector."""
+        return np.dtype((self.kind, (self.size,) if self.size > 1 else ()))
+
+
+def energy(
+    name: str, side: str, source: str, parts: tuple[str, ...] = (), value: Callable[[Any], float] | None = None
+) -> Column:
+    """Return the column of an energy [J].
+
+    Parameters
+    ----------
+    side : ``stored``, ``lost`` or ``supplied``; ``part`` of another column
+    source : ``bars``, sums of the material laws; ``state``, at the time of the row; ``ledger``, sums accumulated over
+        the steps; ``derived``, the sum of other columns
+    parts, value : as of :class:`Column`
+    """
+    stages = SUMMED if source == "ledger" else ""
+    return Column(name, "J", source=source, side=side, parts=parts, value=value, stages=stages)
+
+
+# to add an energy, add one line here
+ENERGIES = (
+    energy("kinetic_energy", "stored", "state"),
+    energy("elastic_energy", "stored", "bars"),
+    energy("wall_kinetic_energy", "stored", "state"),
+    energy("plastic_dissipation", "lost", "derived", parts=("plastic_heat", "hardening_energy")),
+    energy("plastic_heat", "part", "bars"),
+    energy("hardening_energy", "part", "bars"),
+    energy("damage_dissipation", "lost", "bars"),
+    energy("rupture_dissipation", "lost", "bars"),
+    energy("viscous_dissipation", "lost", "bars"),
+    energy("damping_dissipation", "lost", "ledger"),
+    energy("friction_dissipation", "lost", "ledger"),
+    energy("impact_dissipation", "lost", "ledger"),
+    energy("external_work", "supplied", "ledger"),
+    energy("contact_work", "supplied", "ledger"),
+    energy("thermal_work", "supplied", "ledger"),
+    energy("prestress_work", "supplied", "ledger"),
+    energy("numerical_dissipation", "lost", "ledger"),
+    energy("spring_energy", "stored", "bars"),  # of springs to the ground, whose forces are added to those of the bars
+)
+
+STORED, LOST, SUPPLIED = (tuple(e.name for e in ENERGIES if e.side == side) for side in ("stored", "lost", "supplied"))
+
+BAR_ENERGIES = tuple(one.name for one in ENERGIES if one.source == "bars")
+"""Energies whose densities material laws return, in the order of their sums."""
+
+OF_RUN = (
+    Column("time", "s", value=lambda now: now.place),
+    Column("step", kind=np.int64, value=lambda now: now.number),
+    Column("step_size", "s", value=lambda now: now.smallest),
+)
+"""Equal on all ranks."""
+STAGE = Column("stage", kind=np.int64)
+"""Number of the stage, from 0, of cases with stages."""
+OF_ANALYSES = (Column("load_factor", stages=LASTING), Column("pseudo_steps"), Column("residual"))
+"""Those that steppers name in their ``columns``."""
+ITERATIONS = (Column("newton_iterations", kind=np.int64), Column("linear_iterations", kind=np.int64))
+COUNTS = (
+    Column("active_contacts", kind=np.int64, value=lambda now: now.solution.contacts),
+    Column(
+        "slack_bars",
+        kind=np.int64,
+        value=lambda now: now.model.bars.slack_count(),
+        exists=lambda model: model.bars.slackens,
+    ),
+    Column("broken_bars", kind=np.int64, value=lambda now: now.ruptures.count),
+)
+IMBALANCE = Column("energy_imbalance", "J")
+VECTORS = (
+    Column("momentum", "kg m/s", 3),
+    Column("angular_momentum", "kg m²/s", 3),
+    Column("centre_of_mass", "m", 3),  # the sum over ranks is that of mass times position
+    Column("support_force", "N", 3),
+    Column("external_impulse", "N s", 3, stages=SUMMED),
+    Column("support_impulse", "N s", 3, stages=SUMMED),
+    Column("damping_impulse", "N s", 3, stages=SUMMED),
+)
+CHANGES = Column("active_set_changes", kind=np.int64, exists=lambda model: model.contact.any)
+OF_WALLS = (
+    Column("force", "N", 3),
+    Column("moment", size=3),
+    Column("impulse", "N s", 3, stages=SUMMED),
+    Column("jump_impulse", "N s", 3, stages=SUMMED),
+    Column("contacts", kind=np.int64),
+    Column("contact_time", stages=LASTING),
+    Column("releases", kind=np.int64, stages=SUMMED),
+)
+MOTION = (Column("position", "m", 3), Column("velocity", "m/s", 3))
+"""Of walls that move."""
+OF_PAIRS = tuple(column for column in OF_WALLS if column.name in ("force", "impulse", "jump_impulse"))
+PROBED = (*MOTION, Column("acceleration", "m/s²", 3), Column("reaction", "N", 3))
+"""Of each node of a probe."""
+OF_MODES = (Column("frequency", "Hz"), Column("eigenvalue", "1/s²"))
+
+_GROUPS = (OF_RUN, OF_ANALYSES, ITERATIONS, COUNTS, ENERGIES, VECTORS, OF_WALLS, PROBED, OF_MODES)
+DECLARED = {
+    column.name: column for column in (*(column for group in _GROUPS for column in group), STAGE, IMBALANCE, CHANGES)
+}
+"""All columns by the last part of their names."""
+
+
+def declared(name: str) -> Column:
+    """Return the column of a name as it is in the file, ``wall/floor/force``; an unknown one is a pure number."""
+    last = name.rsplit("/", 1)[-1]
+    return DECLARED.get(last) or Column(last)
+
+
+class Layout:
+    """Positions of named numbers and arrays in a vector.
+
+    Parameters
+    ----------
+    columns : name to the type of a value, with its shape; integers are stored as floating-point numbers, exact below
+        2^53
+
+    Attributes
+    ----------
+    columns : as given
+    places : name to (first, end, shape, type of a number)
+    width : length of the vector
+    """
+
+    def __init__(self, columns: Mapping[str, np.dtype]) -> None:
+        self.columns = dict(columns)
+        self.places: dict[str, tuple[int, int, tuple[int, ...], type]] = {}
+        self.width = 0
+        self._alike: Layout | None = None
+        for name, dtype in self.columns.items():
+            end = self.width + int(np.prod(dtype.shape, dtype=np.int64))
+            self.places[name] = (self.width, end, dtype.shape, int if dtype.base.kind in "iu" else float)
+            self.width = end
+
+    def __getitem__(self, name: str) -> slice:
+        """The slice of a name."""
+        return slice(*self.places[name][:2])
+
+    def first(self, name: str) -> int:
+        """Return the position of the first number of a name, the only one of a scalar."""
+        return self.places[name][0]
+
+    def indices(self, names: Iterable[str]) -> np.ndarray:
+        """Return the positions of all numbers of some names, one after the other, int64."""
+        found = [np.arange(*self.places[name][:2]) for name in names]
+        return np.concatenate([np.empty(0, dtype=np.int64), *found])
+
+    def vector(self, row: Mapping[str, Any]) -> np.ndarray:
+        """Return the vector (width,) of a row."""
+        if isinstance(row, Row) and self._is_alike(row.layout):
+            return row.vector
+        if set(row) != set(self.places):
+            raise ValueError(f"a history row has the columns {sorted(self.places)}, got {sorted(row)}")
+        return np.concatenate([np.ravel(row[name]).astype(np.float64) for name in self.places] or [np.empty(0)])
+
+    def _is_alike(self, other: Layout) -> bool:
+        if other is not self._alike and list(other.places.items()) == list(self.places.items()):
+            self._alike = other
+        return other is self._alike
+
+
+class Row(Mapping):
+    """A row of the history: column name to number or array (views of the vector).
+
+    Attributes
+    ----------
+    layout : Layout
+    vector : (width,) float64
+    """
+
+    __slots__ = ("layout", "vector")
+
+    def __init__(self, layout: Layout, vector: np.ndarray) -> None:
+        self.layout = layout
+        self.vector = vector
+
+    def __getitem__(self, name: str) -> Any:
+        first, end, shape, kind = self.layout.places[name]
+        return self.vector[first:end].reshape(shape) if shape else kind(self.vector[first])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.layout.places)
+
+    def __len__(self) -> int:
+        return len(self.layout.places)
+
+    def __repr__(self) -> str:
+        return repr(dict(self))
+
+
+def _layout(*columns: Column) -> Layout:
+    return Layout({column.name: column.dtype for column in columns})
+
+
+HEAD = _layout(*(one for one in ENERGIES if one.source != "derived"), *VECTORS, *COUNTS, Column("alarm"))
+"""Sums of all cases."""
+WALL = _layout(*OF_WALLS)
+PAIR = _layout(*OF_PAIRS)

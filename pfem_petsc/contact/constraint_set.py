@@ -1,0 +1,405 @@
+"""Contact pairs and constraints of a case as one set of rows: forces, explicit steps, start and checkpoints."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import InputError
+from ..integrators.base import Balance, State
+from ..mesh.exchange import Router
+from ..mesh.slab import slab_of
+from ..parallel.agreement import agreed
+from ..parallel.natural import NaturalOrder
+from ..registry import lookup
+from ..tolerances import ON_BOUND
+from .constraints.base import Constraint, ConstraintKeys, SetPart
+from .contact import near_planes
+from .fixed_rows import FixedRows, TwoNodeRows
+from .pairs import find_pairs
+from .projection import project
+from .rows import (
+    Planes,
+    RowSet,
+    free_positions,
+    free_stiffness,
+    last_forces,
+    leaving_nodes,
+    mark_pressed,
+    push_nodes,
+)
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from .contact import Contact
+
+PACKAGE = "pfem_petsc.contact.constraints"
+_ZERO = np.zeros(1)
+
+
+class ConstraintSet:
+    """The rows of contact pairs and constraints, and their forces; False if there are none. Construction is collective.
+
+    Attributes
+    ----------
+    columns : of the tables in the history, like ``pair/NAME``, pairs first
+    rows : RowSet
+    force : (r,) of the rows here in the last step [N]; jacobian : (r, k, 3) gradients along which these act; the same
+        on all ranks that have a row
+    two : TwoNodeRows
+    alone : whether all rows of the model are over two nodes that no other row and no wall stops, with fixed directions
+    walled : whether walls can stop any node of the model's rows
+    """
+
+    def __init__(
+        self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, fixed: np.ndarray, contact: Contact
+    ) -> None:
+        self.source, self.contact = case.source, contact
+        tables = [*case.contact_pair, *case.constraint]
+        self.names = [table.name for table in tables]
+        self.n_pairs = len(case.contact_pair)
+        kinds = ["pair"] * self.n_pairs + ["constraint"] * len(case.constraint)
+        self.columns = [f"{kind}/{name}" for kind, name in zip(kinds, self.names, strict=True)]
+        sources: list[Constraint] = [find_pairs(case, k, nodes, mesh) for k in range(self.n_pairs)]
+        sources += [_source(case.source, keys, nodes, mesh) for keys in case.constraint]
+        self.rows = rows = RowSet(sources, mesh, fixed)
+        self._pairs = rows.source < self.n_pairs
+        self._order = rows.order(np.arange(len(sources)) >= self.n_pairs)
+        self.fixed_jacobian = np.zeros((*rows.ends.shape, 3))
+        if rows.fixed.any():
+            at = np.flatnonzero(rows.fixed)
+            self.fixed_jacobian[at] = rows.gradients(np.zeros((len(rows.numbers), 3)), at)
+        self.two = TwoNodeRows(rows, self.fixed_jacobian)
+        if len(self.two.at) == len(rows.source):
+            rows.pairs = self.two.ends, self.two.normals, self.two.least
+        self._members = rows.gather(contact.members) > 0.0
+        walled = self._members.any(axis=1)
+        self._walled_nodes = np.flatnonzero(walled)
+        places = np.where(walled, np.cumsum(walled) - 1, -1)
+        self._walls = places, np.tile(contact.normals, (len(self._walled_nodes), 1, 1))
+        self._near_walls = bool(self._members.any())
+        self._turning = not rows.fixed.all()
+        walled, shared = mesh.comm.allreduce(np.array([self._near_walls, not self.two.every], dtype=np.int64))
+        self.walled, self.alone = walled > 0, walled + shared == 0
+        self._partial = self.walled and contact.partial  # whose flags travel with positions
+        self._x, self._hard = np.empty((len(rows.numbers), 3)), np.empty(len(rows.numbers))
+        self._blocks: FixedRows | None = None  # for nodes of the stiffness
+        self._blocks_of = np.empty(0)
+        self.release()
+
+    def __bool__(self) -> bool:
+        return bool(self.columns)
+
+    def release(self) -> None:
+        """Set all forces to zero."""
+        self.force, self.jacobian = np.zeros(len(self.rows.source)), self.fixed_jacobian
+
+    @property
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """The forces and the gradients along which they act, which can be set again after a step that is given up."""
+        return self.force, self.jacobian
+
+    @state.setter
+    def state(self, state: tuple[np.ndarray, np.ndarray]) -> None:
+        self.force, self.jacobian = state
+
+    def explicit(
+        self, balance: Balance, state: State, u: np.ndarray, stiffness: np.ndarray, none: np.ndarray, tolerance: float
+    ) -> np.ndarray:
+        """Correct the increments ``u`` (owned, 3) of a step in which each node is solved on its own. Collective.
+
+        ``stiffness`` (owned,) is the force for a displacement of a node [N/m]; as long as its values stay the same, it
+        is the same array, on all ranks. ``tolerance`` [m] is the depth up to which a row counts as satisfied. Returns
+        the forces on nodes (owned, 3) [N], ``none`` if no row acts on a node of this rank.
+
+        Raises
+        ------
+        SimulationFailure
+            If no positions satisfy all rows. Raised at least on this rank, after all collective operations.
+        """
+        if not self:
+            return none
+        contact = np.zeros(u.shape)
+        if self.alone:
+            self.force = self.two.separate(balance.predictor, u, stiffness, contact)
+            return contact if self.force.any() else none
+        rows, x, walls = self.rows, self._x, len(self.contact.walls) if self._partial else 0
+        far = np.empty((0, 7 + walls))
+        if not rows.partners.alone:
+            at, leaving = rows.partners.rows, rows.partners.leaving(far.shape[1])
+            leaving_nodes(at, balance.predictor, u, stiffness, state.position, leaving)
+            if walls:
+                displacements = self.contact.motion.displacements(balance.time)
+                leaving[:, 7:] = self.contact.applicable(at, leaving[:, :3], displacements)
+            far = rows.partners.bring(leaving)
+        free_positions(rows.where, balance.predictor, u, far, x)
+
+        near, pushed = self._near(x, balance.time), x
+        if len(near):
+            pushed, moved = x.copy(), x[near]
+            gaps = self._gaps(near, x, far, balance.time)
+            normals = np.tile(self.contact.normals, (len(near), 1, 1))
+            offsets = np.where(gaps < np.inf, self.contact.plane_offsets(balance.time), -np.inf)
+            project(moved, rows.free[near] == 0.0, normals, offsets, tolerance, np.zeros(gaps.shape))
+            pushed[near] = moved
+
+        def given() -> tuple[np.ndarray, np.ndarray | None, Planes | None]:
+            turns = balance.acting < 1.0 and self._turning
+            start = rows.spread(state.position, far[:, 4:7]) if turns else None
+            free_stiffness(rows.where, stiffness, far, self._hard)
+            if not self._near_walls:
+                return self._hard, start, None
+            return self._hard, start, (*self._walls, self._gaps(self._walled_nodes, x, far, balance.time))
+
+        self.force, self.jacobian = rows.project(x, pushed, tolerance, given, self.fixed_jacobian)
+        if not self.force.any():
+            return none
+        load = rows.forces(self.jacobian, self.force)
+        push_nodes(rows.where, load, rows.free, stiffness, u, contact)
+        return contact if load[rows.mine].any() else none
+
+    def _near(self, x: np.ndarray, time: float) -> np.ndarray:
+        """(m,) nodes at positions (n, 3) beyond a wall."""
+        near = np.zeros(len(x), dtype=bool)
+        if self._near_walls:
+            offsets = self.contact.plane_offsets(time)
+            everywhere = np.zeros(len(offsets), dtype=bool)
+            near_planes(x, self.contact.normals, offsets, everywhere, self._members, _ZERO, near)
+        return np.flatnonzero(near)
+
+    def _gaps(self, nodes: np.ndarray, x: np.ndarray, far: np.ndarray, time: float) -> np.ndarray:
+        """Distances (m, w) of some nodes (m,) at positions x (n, 3) from walls, which are flat, infinite where these do
+        not apply; ``far`` (k, 7...): what other ranks know of their nodes."""
+        contact, at = self.contact, x[nodes]
+        # not a product of matrices: the digits must not depend on how many nodes there are
+        n = contact.normals.T
+        gaps = at[:, :1] * n[0] + at[:, 1:2] * n[1] + at[:, 2:] * n[2] - contact.plane_offsets(time)
+        applicable = self._members[nodes]
+        if self._partial:
+            where = self.rows.where[nodes]
+            own = where >= 0
+            displacements = contact.motion.displacements(time)
+            applicable[own] = contact.applicable(where[own], at[own], displacements)
+            applicable[~own] = far[-1 - where[~own], 7:] > 0.0
+        gaps[~applicable] = np.inf
+        return gaps
+
+    @property
+    def batched(self) -> bool:
+        """Whether batches of steps can solve the rows of this rank; see :meth:`export_rows`."""
+        return self.alone and self.rows.partners.alone
+
+    def export_rows(self, stiffness: np.ndarray) -> FixedRows:
+        """Return the rows with their present forces for a batch of steps.
+
+        ``stiffness`` (owned,) is the force for a displacement of a node [N/m], the same array as long as its values
+        stay the same.
+        """
+        if self._blocks is None or stiffness is not self._blocks_of:
+            self._blocks, self._blocks_of = self.two.of_blocks(stiffness), stiffness
+        rows = self._blocks
+        rows.force[rows.place], rows.closed[rows.place] = self.force, self.two.record.closed
+        return rows
+
+    def import_rows(self, rows: FixedRows) -> None:
+        """Take the forces after the last of the steps from rows that were exported."""
+        self.force = rows.force[rows.place]
+        self.two.record.closed[:] = rows.closed[rows.place]
+
+    def any_pressed(self) -> bool:
+        """Return whether any row of the model has a force. Collective."""
+        return bool(self) and bool(self.rows.mesh.comm.allreduce(bool(self.force.any()), op=MPI.LOR))
+
+    def mark(self, held: np.ndarray) -> None:
+        """Mark owned nodes (owned,) on which rows press."""
+        mark_pressed(self.rows.ends, self.rows.where, self.force, held)
+
+    def count_held(self, nodes: np.ndarray, owned: int) -> int:
+        """How many of the owned nodes are among those (k,) that walls hold, or held by rows."""
+        if not self:
+            return len(nodes)
+        held = np.zeros(owned, dtype=bool)
+        held[nodes] = True
+        self.mark(held)
+        return int(np.count_nonzero(held))
+
+    def totals(self) -> np.ndarray:
+        """This rank's share of the forces (tables, 3) of the rows on their last nodes [N]."""
+        rows, totals = self.rows, np.zeros((len(self.names), 3))
+        if not self:
+            return totals
+        last_forces(rows.counted, rows.source, rows.last, self.jacobian, self.force, totals)
+        return totals
+
+    def tables(self, owned: int) -> np.ndarray:
+        """(owned,) the table whose rows press on an owned node as their last one, -1 for none."""
+        tables, at = np.full(owned, -1), (self.force > 0.0) & self.rows.counted
+        tables[self.rows.last_nodes[at]] = self.rows.source[at]
+        return tables
+
+    def add_forces(self, contact: np.ndarray, factor: float = 1.0) -> None:
+        """Add the forces, times a factor, to those on the nodes (owned, 3) [N]."""
+        contact[self.rows.here] += factor * self.rows.forces(self.jacobian, self.force)[self.rows.mine]
+
+    def check(self, treatment: str, length: float) -> None:
+        """Check that the model is compatible with the rows and that none is violated at the start. Collective.
+
+        Parameters
+        ----------
+        treatment : ``contact.treatment`` of the case
+        length : that tolerances are relative to [m]
+
+        Raises
+        ------
+        InputError
+            On all ranks.
+        """
+        if not self:
+            return
+        rows, walls, comm = self.rows, self.contact, self.rows.mesh.comm
+        if len(self.names) > self.n_pairs and treatment != "scheme":
+            raise InputError(f'{self.source}: constraint: constraints need contact.treatment = "scheme"')
+        if treatment != "scheme" and not self.alone:
+            several = np.bincount(rows.ends[rows.ends >= 0], minlength=len(rows.numbers)) > 1
+            several[self._walled_nodes] = True
+            lowest = int(rows.numbers[several].min(initial=2**62))
+            node = comm.allreduce(lowest, op=MPI.MIN)
+            raise InputError(
+                f"{self.source}: contact_pair: node {node} is in several pairs, or a wall stops it as well, which "
+                'needs contact.treatment = "scheme"'
+            )
+        met = comm.allreduce(walls.members[rows.here].sum(axis=0)) > 0
+        special = walls.special & met
+        if special.any():
+            raise InputError(
+                f"{self.source}: contact_pair, constraint: wall {walls.names[int(special.argmax())]!r} stops nodes of "
+                "pairs or constraints: such a wall must be flat, without mass, friction and restitution, and not tied; "
+                "or give it a node_set without them"
+            )
+        values = rows.values(rows.gather(rows.mesh.points[: rows.mesh.n_owned]))
+        deepest = (np.inf,)
+        if len(values) and not values.min() >= -ON_BOUND * length:
+            row = int(np.argmin(values))
+            numbers = [str(n) for n in rows.numbers[rows.ends[row][rows.ends[row] >= 0]]]
+            deepest = (float(values[row]), int(rows.source[row]), int(rows.ids[row]), numbers)
+        deepest = min(comm.allgather(deepest))
+        if len(deepest) > 1:
+            depth, table, _, numbers = deepest
+            if table < self.n_pairs:
+                raise InputError(
+                    f"{self.source}: contact_pair {self.names[table]!r}: nodes {' and '.join(numbers)} start "
+                    f"{-depth:.6g} m beyond each other; reverse the direction, which points from the first to the "
+                    "second, or move the mesh"
+                )
+            raise InputError(
+                f"{self.source}: constraint {self.names[table]!r}: nodes {', '.join(numbers)} start {-depth:.6g} m "
+                "beyond it; correct its keys, or move the mesh"
+            )
+
+    def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:
+        """Return second time derivatives (r,) [m/s2] at zero acceleration of rows closed within ``slack`` [m] and at
+        rest within ``still`` [m/s] at positions and velocities (owned, 3), infinite for others. Collective."""
+        if not self:
+            return self.force
+        x, v = self.rows.gather(x), self.rows.gather(v)
+        self.jacobian = self.rows.gradients(x)
+        closed = np.abs(self.rows.values(x)) <= slack
+        closed &= np.abs(self.rows.along(self.jacobian, v)) <= still
+        return np.where(closed, self.rows.drift(x, v), np.inf)
+
+    def rest(self, a: np.ndarray, mass: np.ndarray, closed: np.ndarray, on_walls: np.ndarray) -> np.ndarray:
+        """Set the forces of closed rows at accelerations (owned, 3); return them on free components (owned, 3) [N].
+
+        ``closed`` (r,) from :meth:`resting`; ``on_walls`` (owned, walls) bool: nodes that rest on walls. Collective.
+        """
+        rows, contact = self.rows, self.contact
+        state, change = contact.state, np.zeros_like(a)
+        if not self:
+            return change
+        rests = rows.gather(on_walls) > 0.0
+        every, hard = rows.gather(a), rows.gather(mass)
+        normals, _ = contact.planes(rests, rows.gather(state.position), contact.motion.displacements(state.time))
+        pushed, offsets = every.copy(), np.where(rests, 0.0, -np.inf)
+        project(pushed, rows.free == 0.0, normals, offsets, 0.0, np.zeros(offsets.shape))
+        gaps = np.einsum("nwi,ni->nw", normals, every) - offsets
+        values, pushed = (rows.along(self.jacobian, a) + closed for a in (every, pushed))
+        largest = rows.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)
+        place = np.where(rests.any(axis=1), np.arange(len(every)), -1)
+        with agreed(rows.mesh.comm):
+            system = rows.system(self.jacobian, values, hard, (place, normals, gaps))
+            self.force = rows.solve(system, pushed, 1e-13 * largest)
+        change[rows.here] = (rows.forces(self.jacobian, self.force) * rows.free)[rows.mine]
+        return change
+
+    def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
+        """What a checkpoint keeps, name to an order and the rows that this rank owns; the same names on all ranks.
+
+        Pairs are kept at their second nodes (owned, tables), constraints in the order of their rows.
+        """
+        rows, pairs, found = self.rows, self._pairs & self.rows.counted, {}
+        if self.n_pairs:
+            closed = np.zeros(len(self.force), dtype=np.uint8)
+            closed[self.two.at] = self.two.record.closed
+            for name, values in (("pairs.force", self.force), ("pairs.closed", closed)):
+                nodal = np.zeros((rows.mesh.n_owned, self.n_pairs), dtype=values.dtype)
+                nodal[rows.last_nodes[pairs], rows.source[pairs]] = values[pairs]
+                found[name] = rows.mesh.node_order, nodal
+        if self._order.n_global:
+            mine = rows.counted & ~self._pairs
+            found["constraints.force"] = self._order, self.force[mine]
+            found["constraints.gradients"] = self._order, self.jacobian[mine]
+        return found
+
+    def load_state(self, arrays: dict[str, np.ndarray]) -> None:
+        """Take the arrays of :meth:`arrays` back. Collective."""
+        rows, pairs = self.rows, self._pairs
+        self.release()
+        if self.n_pairs:
+            at = rows.ends[pairs, 1], rows.source[pairs]
+            closed = np.zeros(len(self.force), dtype=bool)
+            self.force[pairs] = rows.gather(arrays["pairs.force"])[at]
+            closed[pairs] = rows.gather(arrays["pairs.closed"])[at] > 0.0
+            self.two.record.closed[:] = closed[self.two.at]
+        if self._order.n_global:
+            self.jacobian = self.jacobian.copy()
+            self.force[~pairs] = rows.of_counted(arrays["constraints.force"], ~pairs)
+            self.jacobian[~pairs] = rows.of_counted(arrays["constraints.gradients"], ~pairs)
+
+
+def _source(file: str, parameters: ConstraintKeys, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> Constraint:
+    """The rows that a table makes of this rank's parts of its node sets. Collective."""
+    key = f"{file}: constraint {parameters.name!r}"
+    named = [
+        getattr(parameters, name)
+        for name, field in type(parameters).model_fields.items()
+        if (field.json_schema_extra or {}).get("refers_to") == "node_set"
+    ]
+    parts = {name: _part(mesh, nodes[name]) for name in named if name is not None}
+    with agreed(mesh.comm):
+        try:
+            source = lookup(PACKAGE, parameters.kind, f"{key}: kind").Constraint(parameters, parts.__getitem__)
+        except InputError as error:  # a kind knows its keys, but not the file that they are in
+            raise InputError(f"{key}: {error}") from error
+        source.nodes = np.asarray(source.nodes, dtype=np.int64)
+        if not hasattr(source, "data"):
+            source.data = np.empty((len(source.nodes), 0))
+        same = np.sort(source.nodes, axis=1)
+        if (same[:, 1:] == same[:, :-1]).any():
+            node = same[:, 1:][same[:, 1:] == same[:, :-1]][0]
+            raise InputError(f"{key}: node {node} is constrained with itself; name different nodes")
+    return source
+
+
+def _part(mesh: DistributedMesh, local: np.ndarray) -> SetPart:
+    """This rank's part of a node set, of which it owns nodes (k,). Collective."""
+    comm = mesh.comm
+    to_slab = Router(comm, slab_of(mesh.node_ids[local], mesh.n_nodes, comm.size))
+    numbers, places = to_slab.send(mesh.node_ids[local]), to_slab.send(mesh.points[local])
+    order = np.argsort(numbers)
+    counts = np.array(comm.allgather(len(numbers)))
+    count, first = int(counts.sum()), int(counts[: comm.rank].sum())
+    evenly = Router(comm, slab_of(first + np.arange(len(numbers)), count, comm.size))
+    return SetPart(count, evenly.send(numbers[order]).astype(np.int64), evenly.send(places[order]))

@@ -1,0 +1,272 @@
+"""Checks of the nodes and bars of a truss: parts, chains, overlaps, nodes on bars, bracing.
+
+Mechanisms are not an error in dynamics: chains and cables consist of them. They are reported because unintended ones
+are a common mistake in a truss.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from ..contact.neighbours import NeighbourSearch, Segments
+from ..mechanics.compiled import kernel
+from ..mesh.exchange import Router
+from ..mesh.slab import slab_of
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+
+_ANGLE = 1e-6
+"""Bars that meet at a node at a smaller angle overlap [rad]; a node whose distance from a bar is less than this
+fraction of its length lies on it. Coordinates saved in single precision have this accuracy."""
+
+_STRAIGHT = 1e-4  # angle between two bars that count as collinear [rad]
+_SHOWN = 5
+_WINDOW = 64  # neighbours in the order of directions that are compared with a bar
+_RANK = 1e-9
+
+# A generic direction, to which bars of a mesh are unlikely to be perpendicular.
+_GENERIC = np.array([0.6180339887, 0.4656766723, 0.6335178142])
+
+_LARGEST = 600
+"""Maximum number of unknowns for the global test, a singular value decomposition of a dense matrix."""
+
+
+class Geometry:
+    """The nodes and bars of a model, and what is odd about them. All methods are collective."""
+
+    def __init__(self, model: Model) -> None:
+        self._model, self._mesh, self._comm = model, model.mesh, model.comm
+
+    @cached_property
+    def _held(self) -> np.ndarray:
+        """(owned, 3, 3) Sums of d d^T over the directions d of the bars of each node."""
+        total = np.zeros((self._mesh.n_owned, 3, 3))
+        _add_directions(self._mesh.points, self._mesh.bars, total)
+        return total
+
+    @cached_property
+    def span(self) -> np.ndarray:
+        """Orthonormal directions (r, 3) that the bars span: r = 1 for a rod, 2 for a plane truss."""
+        values, vectors = np.linalg.eigh(self._comm.allreduce(self._held.sum(axis=0)))
+        return vectors[:, values > 1e-12 * values[-1]].T
+
+    def _lowest(self, nodes: np.ndarray) -> tuple[int, int]:
+        """Return how many nodes are marked (owned,) on all ranks, and the lowest of their mesh numbers."""
+        ids = self._mesh.node_ids[: self._mesh.n_owned][nodes]
+        lowest = self._comm.allreduce(int(ids.min(initial=self._mesh.n_nodes)), op=MPI.MIN)
+        return self._comm.allreduce(len(ids)), lowest
+
+    def parts(self) -> tuple[int, int, int]:
+        """Return the number of connected parts, and the size and lowest node number of the smallest one.
+
+        Every node gets the lowest mesh number that it is connected to: within a rank by compiled sweeps, between ranks
+        by the exchange of ghosts, repeated until no rank changes anything.
+        """
+        mesh, comm, owned = self._mesh, self._comm, self._mesh.n_owned
+        label = mesh.node_ids[: mesh.n_local].astype(np.float64).reshape(-1, 1)  # whole numbers, exact to 2^53
+        changed = True
+        while changed:
+            before = label[:owned].copy()
+            _spread(mesh.bars, label[:, 0])
+            mesh.update_ghosts(label)
+            # a ghost may have a lower number, and this rank's own numbers may still have to propagate
+            changed = comm.allreduce(not np.array_equal(before, label[:owned]), op=MPI.LOR)
+        names, sizes = np.unique(label[:owned, 0].astype(np.int64), return_counts=True)
+        # a rank adds up the parts whose lowest node is in its range of the mesh numbers, however many there are
+        router = Router(comm, slab_of(names, mesh.n_nodes, comm.size))
+        own, places = np.unique(router.send(names), return_inverse=True)
+        total = np.bincount(places.ravel(), weights=router.send(sizes), minlength=len(own)).astype(np.int64)
+        smallest = min(zip(total.tolist(), own.tolist()), default=(mesh.n_nodes + 1, -1))
+        return comm.allreduce(len(own)), *min(comm.allgather(smallest))
+
+    def chains(self) -> tuple[int, int]:
+        """Return the number of unsupported nodes with exactly two collinear bars, and the lowest of them.
+
+        A straight rod is excluded: its nodes are intended, so a truss on one line has no such nodes.
+        """
+        mesh, owned = self._mesh, self._mesh.n_owned
+        way = self._directions(slice(None))
+        leaving = np.zeros((mesh.n_local, 3))
+        np.add.at(leaving, mesh.bars[:, 0], way)
+        np.subtract.at(leaving, mesh.bars[:, 1], way)
+        found = np.bincount(mesh.bars.ravel(), minlength=mesh.n_local)[:owned] == 2
+        found &= np.linalg.norm(leaving[:owned], axis=1) < _STRAIGHT
+        found &= ~self._model.supports.spans().any(axis=(1, 2))
+        return self._lowest(found & (len(self.span) > 1))
+
+    def _directions(self, bars: np.ndarray | slice) -> np.ndarray:
+        """Return unit vectors (n, 3) of bars from their first to their second ends."""
+        ends = self._mesh.points[self._mesh.bars[bars]]
+        direction = ends[:, 1] - ends[:, 0]
+        direction /= np.sqrt(np.einsum("ij,ij->i", direction, direction))[:, None]
+        return direction
+
+    def overlaps(self) -> tuple[int, list[str]]:
+        """Return the number of pairs of bars with a common node and direction, and the lowest few as texts.
+
+        A common mistake is a bar from node 0 to node 2 together with bars 0-1 and 1-2 on the same line. The truss is
+        then stiffer and heavier there than intended. The bars of a node are compared in the order of their directions
+        along a generic line: O(n log n) for n bars.
+        """
+        mesh = self._mesh
+        along = self._directions(slice(None)) @ _GENERIC
+        # bar k has the halves 2 k and 2 k + 1 at its ends, the second one reversed
+        nodes = mesh.bars.ravel()
+        half = np.flatnonzero(nodes < mesh.n_owned)
+        half = half[mesh.bar_ids[half // 2] < mesh.n_bars - mesh.n_connectors]  # springs lie where they like
+        # one number sorts by node, then by direction; for 10^7 nodes its last digit is 1e-9
+        key = nodes[half] + 0.25 * np.where(half % 2, -1.0, 1.0) * along[half // 2]
+        order = np.argsort(key)
+        key, half, pairs = key[order], half[order], [np.empty((0, 2), np.intp)]
+        for shift in range(1, min(_WINDOW, len(key))):
+            near = np.flatnonzero(key[shift:] - key[:-shift] < _ANGLE)
+            if len(near) == 0:
+                break
+            a, b = half[near], half[near + shift]
+            sign = np.where(a % 2 == b % 2, 1.0, -1.0)[:, None]
+            apart = self._directions(a // 2) - sign * self._directions(b // 2)
+            same = (np.einsum("ij,ij->i", apart, apart) < _ANGLE**2) & (nodes[a] == nodes[b])
+            pairs.append(np.stack([a, b], axis=1)[same] // 2)
+        found = np.concatenate(pairs)
+        rows = np.concatenate([mesh.bar_ids[found][..., None], mesh.node_ids[mesh.bars[found]]], axis=2)
+        each = sorted(sorted(pair) for pair in rows[np.argsort(rows[:, :, 0].min(axis=1))][:1000].tolist())[:_SHOWN]
+        every = sorted(pair for some in self._comm.allgather(each) for pair in some)
+        shown = [f"{_bar(*one)} and {_bar(*two)}" for one, two in every[:_SHOWN]]
+        return self._comm.allreduce(len(found)), shown
+
+    def nodes_on_bars(self) -> tuple[int, list[str], int, list[str]] | None:
+        """Return the number of nodes on bars between their ends, and of coinciding nodes, each with the lowest few as
+        texts; None if the search would take too long, as lengths of bars differ too much."""
+        mesh, comm = self._mesh, self._comm
+        bars = np.arange(len(mesh.bars))[mesh.counted]
+        bars = bars[mesh.bar_ids[bars] < mesh.n_bars - mesh.n_connectors]
+        ends, ids = mesh.points[mesh.bars[bars]], mesh.node_ids[: mesh.n_owned].astype(np.int64)
+        margin = _ANGLE * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        labels = mesh.node_ids[mesh.bars[bars]].astype(np.int64)
+        own = Segments(mesh.bar_ids[bars].astype(np.int64), labels, ends, margin)
+        at = np.repeat(mesh.points[: mesh.n_owned, None], 2, axis=1)
+        nodes = Segments(ids, np.stack([ids, ids], axis=1), at, np.zeros(len(ids)))
+        search = NeighbourSearch(comm, own, nodes)
+        if search.crowded:
+            return None
+        between, on_bars, twins = 0, [], np.empty((0, 2), np.int64)
+        for pairs in search.pairs():
+            part = pairs.at[:, 0]
+            inner = (part > _ANGLE) & (part < 1.0 - _ANGLE)
+            between += int(inner.sum())
+            rows = np.concatenate([pairs.ids, pairs.labels[:, 0]], axis=1)[inner]
+            on_bars = sorted(on_bars + rows.tolist())[:_SHOWN]
+            end = pairs.labels[np.arange(len(part)), 0, (part > 0.5).astype(np.int64)]
+            met = np.sort(np.stack([end, pairs.ids[:, 1]], axis=1)[~inner], axis=1)
+            twins = np.unique(np.concatenate([twins, met]), axis=0)  # one for each bar of its nodes
+        alike = np.unique(twins)
+        alike = np.unique(Router(comm, slab_of(alike, mesh.n_nodes, comm.size)).send(alike))
+        every = sorted(row for some in comm.allgather(on_bars) for row in some)[:_SHOWN]
+        shown = [f"node {node} on {_bar(bar, a, b)}" for bar, node, a, b in every]
+        together = sorted({tuple(pair) for some in comm.allgather(twins[:_SHOWN].tolist()) for pair in some})
+        twins_shown = [f"nodes {a} and {b}" for a, b in together[:_SHOWN]]
+        return comm.allreduce(between), shown, comm.allreduce(len(alike)), twins_shown
+
+    def unbraced(self) -> tuple[int, int]:
+        """Return the number of nodes that can move freely, to first order, and the lowest of them.
+
+        Only directions within the line or plane of the whole truss count: a plane truss is never braced out of its
+        plane.
+        """
+        span = self.span
+        inside = np.einsum("ri,nij,sj->nrs", span, self._held + self._model.supports.spans(), span)
+        # det / trace^(r-1) is a lower bound of the smallest eigenvalue: well above zero, no more work is needed
+        trace = np.trace(inside, axis1=1, axis2=2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            doubtful = ~(np.linalg.det(inside) / trace ** (len(span) - 1) > _RANK)
+        if doubtful.any():
+            doubtful[doubtful] = np.linalg.eigvalsh(inside[doubtful])[:, 0] < _RANK
+        return self._lowest(doubtful)
+
+    def rigidity(self) -> str:
+        """Return the counts of mechanisms and states of self-stress as text; empty for large models.
+
+        The equilibrium matrix A (free unknowns, bars) maps bar forces to nodal forces. With rank r there are b - r
+        states of self-stress and n - r free motions (Maxwell, Calladine); rigid-body motions of the truss are not
+        mechanisms.
+        """
+        mesh, comm, span = self._mesh, self._comm, self.span
+        n, owned = mesh.n_nodes, mesh.n_owned
+        if 3 * n > _LARGEST:
+            return ""
+        numbered = np.column_stack([mesh.bar_ids, mesh.node_ids[mesh.bars]]).tolist()
+        bars = np.array(sorted({tuple(bar) for some in comm.allgather(numbered) for bar in some}))[:, 1:]
+        points, held = np.zeros((n, 3)), np.zeros((n, 3, 3))
+        points[mesh.node_ids[:owned]] = mesh.points[:owned]
+        held[mesh.node_ids[:owned]] = self._model.supports.spans()
+        points, held = comm.allreduce(points), comm.allreduce(held)
+        direction = points[bars[:, 1]] - points[bars[:, 0]]
+        direction /= np.linalg.norm(direction, axis=1)[:, None]
+        matrix, columns = np.zeros((n, 3, len(bars))), np.arange(len(bars))
+        matrix[bars[:, 0], :, columns], matrix[bars[:, 1], :, columns] = -direction, direction
+        # unknowns: directions within the span that are not prescribed
+        reduced = np.concatenate([_free(span, some) @ rows for some, rows in zip(held, matrix, strict=True)])
+        rank = int(np.linalg.matrix_rank(reduced, tol=_RANK)) if reduced.size else 0
+        rigid = _rigid_motions(points - points.mean(axis=0), held, span)
+        outside = sum(len(_free(np.eye(3), some)) for some in held) - len(reduced)
+        where = {1: " along its line", 2: " in its plane", 3: ""}[len(span)]
+        text = (
+            f"{len(reduced)} free directions{where}, {rigid} rigid motions, {len(reduced) - rank - rigid} "
+            f"mechanisms, {len(bars) - rank} states of self-stress"
+        )
+        return text + (f"; {outside} free directions out of it, which no bar resists" if outside else "")
+
+
+def _bar(number: int, a: int, b: int) -> str:
+    return f"bar {number} (nodes {a} and {b})"
+
+
+def _free(span: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Return orthonormal directions within the span that supports with the projection ``held`` leave free."""
+    _, values, vectors = np.linalg.svd(held @ span.T, full_matrices=True)
+    return vectors[int((values > 1e-12).sum()) :] @ span
+
+
+def _rigid_motions(arms: np.ndarray, held: np.ndarray, span: np.ndarray) -> int:
+    """Return the number of unsupported rigid-body motions within the span."""
+    axes, arms = np.eye(3), arms / max(float(np.abs(arms).max()), np.finfo(float).tiny)
+    turns = np.cross(axes, arms[:, None]).swapaxes(1, 2)
+    motions = np.concatenate([np.broadcast_to(axes, turns.shape), turns], axis=2)
+    stopped = np.concatenate([(axes - span.T @ span) @ motions, held @ motions]).reshape(-1, 6)
+    _, values, vectors = np.linalg.svd(stopped, full_matrices=True)
+    allowed = vectors[int((values > 1e-9).sum()) :].T
+    return int(np.linalg.matrix_rank(motions.reshape(-1, 6) @ allowed, tol=1e-9)) if allowed.size else 0
+
+
+@kernel
+def _add_directions(points, bars, total):
+    for k in range(len(bars)):
+        d = points[bars[k, 1]] - points[bars[k, 0]]
+        d = d / np.sqrt((d * d).sum())
+        for end in bars[k]:
+            if end < len(total):
+                for i in range(3):
+                    for j in range(3):
+                        total[end, i, j] += d[i] * d[j]
+
+
+@kernel
+def _spread(bars, label):
+    """Assign the lower label to both ends of each bar until nothing changes, in forward and backward sweeps."""
+    changed = True
+    while changed:
+        changed = False
+        for sweep in range(2):
+            for i in range(len(bars)):
+                k = i if sweep == 0 else len(bars) - 1 - i
+                a = bars[k, 0]
+                b = bars[k, 1]
+                if label[a] != label[b]:
+                    changed = True
+                    label[a] = min(label[a], label[b])
+                    label[b] = label[a]

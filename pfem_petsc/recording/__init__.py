@@ -1,1 +1,0 @@
-"""Recording of steps: rows of the history, snapshots, checkpoints, progress."""

@@ -1,0 +1,377 @@
+"""What a run watches: divergence, energy produced by contact, and states that the model cannot represent."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..columns import STORED, SUPPLIED
+from ..contact.monitoring import CrossingBars
+from ..errors import SimulationFailure
+
+if TYPE_CHECKING:
+    from ..integrators.base import State
+    from ..stepping.model import Model
+    from ..stepping.plan import Plan
+
+
+# energy created by the integration relative to the input; heavily damped explicit runs begin with up to 8
+_CREATED = 20.0
+# the same once nodes have been in contact: some schemes gain energy in each impact, which has a warning
+_IN_CONTACT = 1e3
+_DIVERGENCE_ROWS = (
+    6  # consecutive rows; after a start from rest, or when a wall first strikes, there is no input to compare with
+)
+_BARS = ("elastic_energy", "spring_energy")
+
+
+class BlowUp:
+    """Checks the history rows of a stage, which are the same on all ranks; collective if it reports.
+
+    What the integration has created is the total energy, with all that is dissipated, less its lowest value so far, as
+    far as the truss still holds it: in large steps, dissipation exceeds the work of the forces that dissipate. It is
+    compared with what could move the truss: the kinetic energy at the start of the stage, the energy that its bars have
+    released since, and the largest rise of each work. The energy of prestressed bars moves nothing while they hold it,
+    and the works of earlier stages are spent. Rows of static stages are not compared: works over their increments are
+    quadratures.
+    """
+
+    def __init__(self, model: Model, inertial: bool = True) -> None:
+        self.model, self.inertial = model, inertial
+        # number of consecutive suspicious rows, energy input, the largest numerical dissipation [J], the factor of the
+        # input up to which rows are not suspicious, energies of the first row, and lowest works
+        self._kept: dict[str, Any] = {"strange": 0, "most": model.rounding * model.length, "lost": 0.0}
+        self._kept |= {"limit": _CREATED, "start": {}, "lowest": {}}
+
+    def kept(self) -> dict[str, Any]:
+        """Return the state for a checkpoint."""
+        return copy.deepcopy(self._kept)
+
+    def load_state(self, kept: dict[str, Any]) -> None:
+        """Restore the state from a checkpoint."""
+        self._kept = copy.deepcopy(kept)
+
+    def check(self, row: dict[str, Any], state: State) -> None:
+        """Check a row.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, if the energy is not finite, or the energy created exceeds the input several times.
+        """
+        held = row["kinetic_energy"] + row["elastic_energy"]
+        when = f"step {row['step']}, t = {row['time']:.6g} s"
+        if not np.isfinite(held) and row["step"] == 0:
+            raise SimulationFailure(
+                f"{when}: the energy is not finite at the start{self._where(state)}: correct loads, velocities and "
+                "material (SI units)"
+            )
+        if not np.isfinite(held):
+            raise SimulationFailure(
+                f"{when}: the energy is not finite: the motion diverged{self._where(state)}; reduce time.step"
+            )
+        if not self.inertial:
+            return
+        kept, lost = self._kept, float(row["numerical_dissipation"])
+        start, lowest = kept["start"], kept["lowest"]
+        if not start:
+            start |= {name: float(row[name]) for name in _BARS}
+            # walls with mass as well: a truss at rest has no other energy than that of what hits it
+            kept["most"] += float(row["kinetic_energy"] + row["wall_kinetic_energy"])
+            kept["lost"] = lost
+        released = sum(start[name] - float(row[name]) for name in _BARS)
+        # rises only: what a force has taken away, as drag does, it need not give back
+        for name in SUPPLIED:
+            lowest[name] = min(lowest.get(name, np.inf), float(row[name]))
+        rises = [float(row[name]) - lowest[name] for name in SUPPLIED]
+        kept["most"] = max(kept["most"], released, *rises)
+        kept["lost"] = max(kept["lost"], lost)
+        held = float(row["kinetic_energy"] + row["wall_kinetic_energy"]) - released
+        created = min(kept["lost"] - lost, held)
+        if row["active_contacts"] > 0:
+            kept["limit"] = _IN_CONTACT
+        kept["strange"] = kept["strange"] + 1 if created > kept["limit"] * kept["most"] else 0
+        if kept["strange"] >= _DIVERGENCE_ROWS:
+            raise SimulationFailure(
+                f"{when}: the integration has created {created:.3g} J, but only {kept['most']:.3g} J were supplied: "
+                f"the motion is unstable and fastest at {self._fastest(state)}; reduce time.step"
+            )
+
+    def _where(self, state: State) -> str:
+        """Return the first node and bar, by mesh number, with positions or velocities that are not finite."""
+        mesh = self.model.mesh
+        bad = ~(np.isfinite(state.position).all(axis=1) & np.isfinite(state.v).all(axis=1))
+        node = min(mesh.node_ids[: mesh.n_owned][bad], default=mesh.n_nodes)
+        lost = ~np.isfinite(state.x).all(axis=1)
+        bar = min(mesh.bar_ids[lost[mesh.bars].any(axis=1)], default=mesh.n_bars)
+        comm = self.model.comm
+        node, bar = min(comm.allgather(int(node))), min(comm.allgather(int(bar)))
+        text = f", first seen at node {node}" if node < mesh.n_nodes else ""
+        return text + (f" and bar {bar}" if bar < mesh.n_bars else "")
+
+    def _fastest(self, state: State) -> str:
+        """Return the fastest node and one of its bars."""
+        mesh = self.model.mesh
+        speed = np.linalg.norm(state.v, axis=1)
+        mine = (-1.0, -1, -1)
+        if len(speed):
+            at = int(np.argmax(speed))
+            bar = int(mesh.bar_ids[(mesh.bars == at).any(axis=1)].min())
+            mine = (float(speed[at]), int(mesh.node_ids[at]), bar)
+        fastest, node, bar = max(self.model.comm.allgather(mine))
+        return f"node {node} (bar {bar}), {fastest:.3g} m/s"
+
+
+_SHARE = 0.02  # of the initial and supplied energy; more than the oscillation of the schemes' own energies
+_GAIN_ROWS = 4  # consecutive rows with a gain without contact; a short peak is not reported
+_AT_END = 2  # the same, where the run ends with them
+
+CAUSES = {
+    "plastic_dissipation": "bars yield",
+    "damage_dissipation": "bars are damaged",
+    "rupture_dissipation": "bars break",
+    "viscous_dissipation": "bars or dashpots are damped",
+    "damping_dissipation": "damping stops nodes",
+}
+"""What dissipates besides friction and impact, and how messages tell it."""
+
+
+class ContactWatch:
+    """Compares the energy with the energy input, after contact of nodes and for implicit steps.
+
+    The stored energy plus the energy dissipated by bars and damping, minus the energy supplied, cannot exceed its
+    initial value: friction, impact and integration only reduce it. In large steps, within which bars yield or damping
+    stops nodes, the work of the forces of the balance is less than the dissipation, and where supports move, their work
+    within a step is not that of the reactions at its ends. The energy of an explicit scheme
+    oscillates near its stability limit even without dissipation: by h^2/8 a.Ma with central differences, which is at
+    most (h w/2)^2 of the elastic energy with the highest frequency w (h times the acceleration by a load is small). A
+    gain up to this amount is accepted, and any gain if nothing dissipates. The rows are the same on all ranks, so all
+    ranks report, or none.
+
+    Parameters
+    ----------
+    model : Model
+    tell : takes the warning
+    plan : Plan
+    """
+
+    def __init__(self, model: Model, tell: Callable[[str], None], plan: Plan) -> None:
+        self.tell = tell
+        self.told = False
+        self.explicit = plan.scheme.explicit
+        self.swing = min((0.5 * plan.step * plan.frequency.upper) ** 2, 1.0)  # of the elastic energy
+        self.rounding = model.rounding * model.length  # of energies [J]: what is at rest has no other
+        self.rows = 0
+        contact, time = model.case.contact, model.case.time
+        self.key = "time.safety" if time.step == "auto" else "time.step"
+        self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
+        self.last, self.moves = plan.steps, model.supports.moves
+        self.start: float | None = None
+        self.scale = 0.0
+        self.touched = False
+
+    def check(self, row: dict[str, Any]) -> None:
+        """Check a row of the history."""
+        if self.told:
+            return
+        given = sum(row[name] for name in SUPPLIED)
+        net = sum(row[name] for name in STORED) + sum(row[name] for name in CAUSES) - given
+        if self.start is None:
+            self.start = net
+        self.scale = max(self.scale, self.rounding, abs(self.start), *(abs(row[name]) for name in SUPPLIED))
+        self.touched = self.touched or row["active_contacts"] > 0
+        gain = net - self.start
+        if self.explicit and not self.touched:
+            gain -= self._swing(row)
+        self.rows = self.rows + 1 if gain > _SHARE * self.scale + self.rounding else 0
+        if not self.rows:
+            return
+        made = f"{gain:.3g} J, {100.0 * gain / self.scale:.2g} % of the energy that the run had or was given"
+        at = f"step {row['step']}, t = {row['time']:.6g} s"
+        if self.touched:
+            self.told = True
+            self.tell(
+                f"{at}: contact has produced {made}: {self.what} gains "
+                "energy in impacts; use another contact.treatment or time.integrator, or a smaller time.step "
+                "(docs/contact.md, phases of an impact)"
+            )
+        elif self.rows >= (_AT_END if row["step"] >= self.last else _GAIN_ROWS):
+            self.told = True
+            self.tell(
+                f"{at}: the total energy, including dissipated energy, has grown by {made}, without contact: the "
+                f"steps are too large for the motion{self._causes(row)}; reduce {self.key}"
+            )
+
+    def _swing(self, row: dict[str, Any]) -> float:
+        """What an explicit scheme's own energy may have gained for a while [J]: all of it where nothing dissipates."""
+        if not any(row[name] > 0.0 for name in CAUSES):
+            return float("inf")
+        return self.swing * (row["elastic_energy"] + row["spring_energy"])
+
+    def _causes(self, row: dict[str, Any]) -> str:
+        """Return what large steps get wrong as part of a sentence."""
+        found = [text for name, text in CAUSES.items() if row[name] > 0.0]
+        found += ["supports move"] if self.moves else []
+        *most, last = found or [""]
+        return f" ({', '.join(most)}{' and ' if most else ''}{last})" if found else ""
+
+
+# Number of bars up to which those that cross are searched at each snapshot, and of searches times bars beyond it after
+# which the interval between searches is longer by one snapshot.
+_FEW, _WORK = 2_500, 20_000
+
+_BUCKLED = "they would buckle, which their law does not describe"
+_BEYOND = "forces are extrapolated there"
+_CROSSED = "bars do not touch bars, and results from then on are doubtful"
+
+
+class Doubts:
+    """Counts of what the model cannot represent. Construction is collective.
+
+    Parameters
+    ----------
+    model : Model
+    warn : receives a warning
+    """
+
+    def __init__(self, model: Model, warn: Callable[[str], None]) -> None:
+        self._model, self._warn = model, warn
+        counted, bars = model.mesh.counted, model.bars
+        euler, shortening = bars.euler_loads(), np.full(len(bars.ends), np.inf)
+        for block in bars.blocks:
+            material = bars.case.material[bars.case.section[block.section].material]
+            shortening[block.start : block.stop] = material.largest_shortening
+            if material.describes_buckling:
+                euler[block.start : block.stop] = np.inf
+        self._ids = model.mesh.bar_ids[counted]
+        self._limits = {"buckling": euler[counted], "shortening": shortening[counted]}
+        self._limits = {
+            kind: limit for kind, limit in self._limits.items() if model.comm.allreduce(bool(np.isfinite(limit).any()))
+        }
+        self._crossing = CrossingBars(model)
+        self._kept: dict[str, dict[str, Any]] = {}
+
+    def kept(self) -> dict[str, Any]:
+        """Return the counts so far, for a checkpoint or the next stage."""
+        return self._kept
+
+    def load_state(self, kept: dict[str, Any]) -> None:
+        """Go on with the counts of :meth:`kept`."""
+        self._kept = {kind: dict(counts) for kind, counts in kept.items()}
+
+    def look(self, x: np.ndarray, place: str, last: bool) -> None:
+        """Examine the state at positions (local, 3) [m], ghosts included, at a place of the run. Collective.
+
+        ``last``: whether it is the last state of a stage.
+        """
+        bars, counted = self._model.bars, self._model.mesh.counted
+        for kind, limit in self._limits.items():
+            if kind == "buckling":
+                values = -bars.fields(x)["axial_force"][counted]
+            else:
+                values = 1.0 - bars.lengths(x)[counted] / bars.rest[counted]
+                if bars.can_break:
+                    values[bars.watched[counted] == 0.0] = 0.0
+            self._exceeded(kind, values / limit, place)
+        if self._crossing.applicable and (self._is_due() or last):
+            self._crossed(x, place)
+
+    def _counts(self, kind: str) -> dict[str, Any]:
+        none = {"looks": 0, "seen": 0, "first": "", "most": 0, "worst": [0.0, -1, ""]}
+        return self._kept.setdefault(kind, none)
+
+    def _seen(self, counts: dict[str, Any], number: int, place: str) -> bool:
+        """Count a snapshot with a number of bars or pairs; return whether it is the first."""
+        counts["seen"] += 1
+        first = not counts["first"]
+        if first:
+            counts["first"] = place
+        counts["most"] = max(counts["most"], number)
+        return first
+
+    def _exceeded(self, kind: str, ratios: np.ndarray, place: str) -> None:
+        """Count bars whose ratio to a limit exceeds one. Collective."""
+        over = np.flatnonzero(ratios > 1.0)
+        worst = min(zip((-ratios[over]).tolist(), self._ids[over].tolist(), strict=True), default=(0.0, -1))
+        parts = self._model.comm.allgather((len(over), worst))
+        number, (ratio, bar) = sum(part[0] for part in parts), min(part[1] for part in parts)
+        counts = self._counts(kind)
+        counts["looks"] += 1
+        if not number:
+            return
+        if -ratio > counts["worst"][0]:
+            counts["worst"] = [-ratio, bar, place]
+        if self._seen(counts, number, place):
+            many = f"{number:,} bars are" if number > 1 else "1 bar is"
+            self._warn(
+                f"{place}: {many} {self._beyond(kind)}, most of all {self._worst(kind, bar, -ratio)}: {_remedy(kind)}"
+            )
+
+    def _beyond(self, kind: str) -> str:
+        return "compressed beyond Euler's load" if kind == "buckling" else "shortened beyond the range of the law"
+
+    def _worst(self, kind: str, bar: int, ratio: float) -> str:
+        if kind == "buckling":
+            return f"bar {bar} with {100.0 * ratio:.0f} % of it"
+        limits = {m.largest_shortening: m.law for m in self._model.case.material.values()}
+        limit, law = min((limit, law) for limit, law in limits.items() if np.isfinite(limit))
+        return f"bar {bar} by {100.0 * (ratio * limit):.0f} %, where law {law!r} describes {100.0 * limit:.0f} %"
+
+    def _is_due(self) -> bool:
+        """Count a snapshot; return whether crossing bars are searched at it.
+
+        A search costs more than a snapshot: the intervals grow with the number of bars and of searches. They do not
+        depend on the motion or on ranks, so that restarts continue them.
+        """
+        counts = self._counts("crossing")
+        counts["wait"] = counts.get("wait", 0) - 1
+        if counts["wait"] >= 0:
+            return False
+        counts["wait"] = max(0, self._model.mesh.n_bars - _FEW) * (counts["looks"] + 1) // _WORK
+        return True
+
+    def _crossed(self, x: np.ndarray, place: str) -> None:
+        """Count bars that pass through each other. Collective."""
+        found, counts = self._crossing.find(x), self._counts("crossing")
+        counts["looks"] += 1
+        if found is None:
+            if not counts.get("unknown"):
+                counts["unknown"] = True
+                self._warn(f"{place}: bars are not searched for passing through each other: they are too crowded")
+            return
+        if not found.pairs:
+            return
+        share = found.bars / (self._model.mesh.n_bars - self._model.mesh.n_connectors)
+        if found.pairs > counts["most"]:
+            counts["worst"] = [share, found.bars, place]
+        if self._seen(counts, found.pairs, place):
+            pairs = f"{found.pairs:,} pairs of bars pass" if found.pairs > 1 else "1 pair of bars passes"
+            some = f"{100.0 * share:.1f} % of all bars, bars {found.lowest[0]} and {found.lowest[1]} among them"
+            self._warn(f"{place}: {pairs} through each other ({some}): {_CROSSED}")
+
+    def summary(self) -> list[str]:
+        """Return sentences for the end of the run."""
+        texts = []
+        for kind, counts in self._kept.items():
+            if not counts["seen"]:
+                continue
+            often = f"in {counts['seen']:,} of {counts['looks']:,} snapshots, first at {counts['first']}"
+            value, bar, place = counts["worst"]
+            if kind == "crossing":
+                texts.append(
+                    f"bars passed through each other {often}: up to {counts['most']:,} pairs ({bar:,} bars, "
+                    f"{100.0 * value:.1f} % of all) at {place}: {_CROSSED}"
+                )
+            else:
+                texts.append(
+                    f"bars were {self._beyond(kind)} {often}: up to {counts['most']:,} at once, most of all "
+                    f"{self._worst(kind, bar, value)}, at {place}: {_remedy(kind)}"
+                )
+        return texts
+
+
+def _remedy(kind: str) -> str:
+    return f'{_BUCKLED}; use law = "strut", or stockier bars' if kind == "buckling" else _BEYOND

@@ -1,0 +1,472 @@
+"""Observers act after steps: history, snapshots, checkpoints, events, ruptures and progress of a run."""
+
+from __future__ import annotations
+
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..analysis import Analysis, Step
+from ..columns import HEAD, Row
+from ..contact.monitoring import Piercing, check_positions
+from ..fields import Fields, Snapshot
+from ..output.checkpoint import write_checkpoint
+from ..output.progress import Progress
+from ..output.vtkhdf import ResultWriter
+from ..restart.state import STATE_VERSION, RunState
+from ..stepping.bar_events import MOST_TOLD
+from ..stepping.ledger import make_ledger
+from ..version import __version__
+from .monitors import BlowUp, ContactWatch, Doubts
+from .recorder import Recorder
+from .stages import Stages
+from .synchroniser import Synchroniser
+
+if TYPE_CHECKING:
+    from ..stepping.stepper import Stepper
+
+
+NEVER = sys.maxsize
+"""Number of steps before an event that never occurs."""
+
+
+class Observer(ABC):
+    """Acts after some steps. All methods are collective, and their results are the same on all ranks.
+
+    Attributes
+    ----------
+    every : due after steps whose number is a multiple of it; 0: never
+    fuses : whether steps after which it is due may be fused into one compiled call
+    needs_agreement : whether the ranks must agree first that none of them has a fault
+    """
+
+    every: int = 0
+    fuses: bool = False
+    needs_agreement: bool = False
+
+    def due(self, step: int) -> bool:
+        """Return whether the observer acts after this step."""
+        return bool(self.every) and step % self.every == 0
+
+    def steps_left(self, step: int) -> int:
+        """Return the number of steps until it must act again; these may be fused into one compiled call."""
+        return NEVER if self.fuses or not self.every else self.every - step % self.every
+
+    @abstractmethod
+    def observe(self, made: Step) -> None:
+        """Act after a step."""
+
+    def complete(self) -> None:
+        """Act after the last step of the run, unless this has been done."""
+
+    def remarks(self) -> list[str]:
+        """Return remarks for the user at the end of the run."""
+        return []
+
+
+class Callback(Observer):
+    """Calls a function with the finished step."""
+
+    def __init__(self, function: Callable[[Step], object], every: int) -> None:
+        self._function, self.every = function, every
+
+    def observe(self, made: Step) -> None:
+        """Call the function."""
+        self._function(made)
+
+
+class History(Observer):
+    """Records and checks rows. Construction is collective, after the start of the stepper.
+
+    The reduction that computes a row also communicates a fault on any rank.
+
+    Parameters
+    ----------
+    stages : Stages
+    synchroniser : Synchroniser
+    warn : receives a warning
+
+    Attributes
+    ----------
+    row : the last row
+    writer : of the result file
+    """
+
+    fuses = True  # rows of fused steps are passed to :meth:`take_sums`
+
+    def __init__(self, stages: Stages, synchroniser: Synchroniser, warn: Callable[[str], None]) -> None:
+        stepper, model = stages.analysis.stepper, stages.model
+        self.every = model.case.output.history_every
+        self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
+        self.ledger = make_ledger(stepper)
+        self.recorder = Recorder(stepper, self.ledger, stages.columns)
+        inertial = stepper.scheme.inertial
+        self.blow_up = BlowUp(model, inertial)
+        # works over the increments of equilibria are quadratures, whose error is no energy that something has made
+        self._contact_watch = ContactWatch(model, warn, stages.analysis.plan) if inertial else None
+        self.row: Mapping[str, Any] | None = None
+        self.writer: ResultWriter | None = None
+        stepper.booking, stepper.bars_removed = self._book, self.ledger.follow_removal
+
+    def begin_stage(self, earlier: History, last: Row, kick: tuple[float, np.ndarray]) -> None:
+        """Go on with the rows of the stage that has ended. Collective.
+
+        ``last``: row of its end; ``kick``: work [J] and momentum (3,) [N s] of the velocities that the stage adds.
+        """
+        self.row, self.writer = last, earlier.writer
+        self._check(self.recorder.begin_stage(earlier.recorder, last, kick))
+
+    def kept(self) -> dict[str, Any]:
+        """Return what a restart goes on with, besides the ledger."""
+        recorder = self.recorder
+        return {
+            "iterations": list(recorder.iterations),
+            "start_energy": recorder.start_energy,
+            "energy_scale": recorder.energy_scale,
+            "blow_up": self.blow_up.kept(),
+            "row": {name: float(self.row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
+        }
+
+    def load_state(self, kept: Mapping[str, Any]) -> None:
+        """Take what :meth:`kept` gave; for a case with stages, under ``stage``, also what :meth:`stage` gave."""
+        recorder = self.recorder
+        recorder.iterations = [int(n) for n in kept["iterations"]]
+        recorder.start_energy, recorder.energy_scale = kept["start_energy"], kept["energy_scale"]
+        self.blow_up.load_state(kept["blow_up"])
+        self.row = dict(kept["row"])
+        start, stage = recorder.start_energy, kept.get("stage")
+        if stage is not None:
+            before = stage["history"]
+            recorder.carried = None if before["carried"] is None else np.array(before["carried"])
+            recorder.rest[:], start = before["rest"], before["watch"]
+        if self._contact_watch is not None:
+            self._contact_watch.start = start
+
+    def stage(self) -> dict[str, Any]:
+        """Return what a checkpoint must hold of the stages before."""
+        carried, watch = self.recorder.carried, self._contact_watch
+        return {
+            "carried": None if carried is None else carried.tolist(),
+            "rest": self.recorder.rest.tolist(),
+            "watch": None if watch is None else watch.start,
+        }
+
+    def _book(self) -> None:
+        """Add energies and iterations of a step, or of each part of a bisected step."""
+        self.ledger.update()
+        self.recorder.count(self._stepper.solution.newton, self._stepper.solution.linear)
+
+    def observe(self, made: Step) -> None:
+        """Record a row."""
+        self.record()
+
+    def record(self) -> None:
+        """Record a row, unless a rank has a fault, which is raised on all ranks."""
+        row = self.recorder.row(alarm=self._synchroniser.alarm)
+        if self.recorder.alarmed:
+            self._synchroniser.synchronise()
+        self.take(row)
+
+    def take_sums(self, sums: np.ndarray) -> bool:
+        """Take the row of this rank's sums (width,) at the state's step and time, unless a rank has a fault; return
+        whether none has. Collective."""
+        total = self.recorder.total(sums)
+        if self._model.comm.size > 1 and total[HEAD.first("alarm")] > 0.0:
+            return False
+        self.take(self.recorder.row_of(total))
+        return True
+
+    def take(self, row: Row) -> None:
+        """Check a row, store it and add it to the history."""
+        self._check(row)
+        self.row = row
+        self.writer.append_history(row if self._model.comm.rank == 0 else None)
+
+    def _check(self, row: Row) -> None:
+        self.blow_up.check(row, self._stepper.state)
+        if self._contact_watch is not None:
+            self._contact_watch.check(row)
+
+    def complete(self) -> None:
+        """Record the row of the last step."""
+        if self.row["step"] != self._stepper.number:
+            self.record()
+
+    @property
+    def drift(self) -> float | None:
+        """Energy imbalance of the last row relative to the largest energy so far; None without energy."""
+        scale = self.recorder.energy_scale
+        return self.row["energy_imbalance"] / scale if scale > 0.0 else None
+
+    def remarks(self) -> list[str]:
+        """Return remarks about walls and pairs without contact, which may be unintended."""
+        contact = self._model.contact
+        times = contact.log.times(self._model.comm)
+        touched = np.array(times["sum"]) > 0.0
+        for flags in times["flags"]:
+            touched |= np.array(flags, dtype=bool)
+        names = np.array(contact.names, dtype=object)[~touched]
+        # impulses are those of inertial schemes, and of several stages together
+        known = self._stepper.scheme.inertial and self.recorder.rest is None
+        pairs = [pair.name for pair in self._model.case.contact_pair if known and not self._pressed(pair.name)]
+        return [
+            *(f"wall {name!r} was never touched by a node" for name in names),
+            *(f"contact pair {name!r} never carried a force" for name in pairs),
+        ]
+
+    def _pressed(self, name: str) -> bool:
+        """Return whether a pair has had a force: its forces have one direction, so that their impulses add up."""
+        return any(bool(np.any(self.row[f"pair/{name}/{kind}"])) for kind in ("impulse", "jump_impulse"))
+
+
+class Snapshots(Observer):
+    """Writes snapshots, including the start and the end of a run. Construction is collective.
+
+    Parameters
+    ----------
+    analysis : Analysis
+    fields : Fields
+    warn : receives a warning
+
+    Attributes
+    ----------
+    last : step of the last snapshot, -1 before the first
+    writer : of the result file
+    """
+
+    needs_agreement = True
+
+    def __init__(self, analysis: Analysis, fields: Fields, warn: Callable[[str], None]) -> None:
+        stepper = analysis.stepper
+        self.every = stepper.model.case.output.fields_every
+        self._analysis, self._stepper, self._fields, self._warn = analysis, stepper, fields, warn
+        self._piercing = Piercing(stepper.model)
+        self._doubts = Doubts(stepper.model, warn)
+        self.last = -1
+        self.writer: ResultWriter | None = None
+
+    def observe(self, made: Step) -> None:
+        """Write a snapshot."""
+        self.write()
+
+    def write(self) -> None:
+        """Check the nodes against the walls, then write a snapshot of the present state."""
+        state, fields = self._stepper.state, self._fields
+        if not self.every and 0 < state.step < self._analysis.last_step:
+            return
+        check_positions(self._stepper)
+        number, place = self._stepper.number, self._stepper.place
+        now = Snapshot(self._stepper.model, state, self._stepper.acceleration)
+        self.writer.write_snapshot(place, number, state.position, fields.at("nodes", now), fields.at("bars", now))
+        self.last = number
+        for text in self._piercing.look(state.x, state.time):
+            self._warn(text)
+        at = f"step {number}, {self._analysis.plan.axis.exact(place)}"
+        self._doubts.look(state.x, at, last=state.step >= self._analysis.last_step)
+
+    def kept(self) -> dict[str, Any]:
+        """Return what a restart and the next stage go on with: the step of the last snapshot, and counts."""
+        return {"snapshot": self.last, "doubts": self._doubts.kept()}
+
+    def load_state(self, kept: Mapping[str, Any]) -> None:
+        """Go on with what :meth:`kept` returned."""
+        self.last = int(kept["snapshot"])
+        self._doubts.load_state(kept.get("doubts", {}))
+
+    def complete(self) -> None:
+        """Write the snapshot of the last step."""
+        if self.last != self._stepper.number:
+            self.write()
+
+    def doubts(self) -> list[str]:
+        """Return what the model could not represent, for the end of the run."""
+        return self._doubts.summary()
+
+    def remarks(self) -> list[str]:
+        """Return remarks about bars across walls."""
+        return self._piercing.summary()
+
+
+class Checkpointing(Observer):
+    """Writes checkpoints at intervals of steps, and when the ranks agree that one is due by wall-clock time.
+
+    Parameters
+    ----------
+    stages : Stages
+    path : the file
+    state : RunState, of the present stage
+    history, snapshots : from which a restart continues
+    synchroniser : Synchroniser
+
+    Attributes
+    ----------
+    last_step : step of the last one, -1 before the first
+    at_end : whether :meth:`complete` writes one: the case requests checkpoints
+    """
+
+    needs_agreement = True
+
+    def __init__(
+        self,
+        stages: Stages,
+        path: Path,
+        state: RunState,
+        history: History,
+        snapshots: Snapshots,
+        synchroniser: Synchroniser,
+    ) -> None:
+        output = stages.case.output
+        self.every = output.checkpoint_every
+        self.at_end = bool(output.checkpoint_every or output.checkpoint_minutes)
+        self.last_step = -1
+        self._stages, self._path, self._state = stages, path, state
+        self._history, self._snapshots, self._synchroniser = history, snapshots, synchroniser
+
+    def due(self, step: int) -> bool:
+        """Return whether a checkpoint is due by the number of the step or by wall-clock time."""
+        return super().due(step) or self._synchroniser.checkpoint_due
+
+    def observe(self, made: Step) -> None:
+        """Write a checkpoint."""
+        self.write()
+
+    def write(self) -> None:
+        """Flush the results, from which a restart continues, then write a checkpoint, unless the step has one.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks; earlier checkpoints are kept.
+        """
+        history, state, case = self._history, self._state, self._stages.case
+        history.writer.flush_history()
+        scalars = state.scalars(history.ledger.kept(), history.kept(), self._snapshots.kept())
+        if case.stage:
+            # the arrays of what the stage starts from are among those of nodes
+            start = self._stages.model.start
+            numbers = None if start is None else start.scalars()
+            scalars["stage"] = {"number": self._stages.number, "history": history.stage(), "start": numbers}
+        if scalars["step"] != self.last_step:
+            attributes = {
+                "state_version": STATE_VERSION,
+                "pfem_petsc": __version__,
+                "name": case.name,
+                "overrides": list(case.overrides),
+                "case": case.to_dict(),
+                "plan": self._stages.plan.record(),
+                "mesh_mark": state.mesh_mark,
+                "external_functions": self._stages.model.external.functions,
+            }
+            write_checkpoint(self._path, self._stages.comm, state.arrays(), scalars, attributes)
+            self.last_step = scalars["step"]
+        self._synchroniser.checkpoint_written()
+
+    def complete(self) -> None:
+        """Write the checkpoint of the last step, if the case requests checkpoints."""
+        if self.at_end:
+            self.write()
+
+
+class ProgressReport(Observer):
+    """Reports each step, the last one of fused steps, to the progress bar, or to the lines that replace it."""
+
+    every, fuses = 1, True
+
+    def __init__(self, progress: Progress, analysis: Analysis, history: History) -> None:
+        self._progress, self._analysis, self._history = progress, analysis, history
+
+    def observe(self, made: Step) -> None:
+        """Report a step."""
+        history = self._history
+        contacts = history.row["active_contacts"]
+        self._progress.update(
+            made.step, made.time, self._analysis.step_size, made.newton, made.linear, contacts, history.drift
+        )
+
+
+class Events(Observer):
+    """Records the ``events`` that a stepper found before its last state, the same on all ranks.
+
+    Parameters
+    ----------
+    stepper : Stepper
+    tell : receives a message
+
+    Attributes
+    ----------
+    writer : of the result file
+    """
+
+    def __init__(self, stepper: Stepper, tell: Callable[[str], None]) -> None:
+        self._stepper, self._tell = stepper, tell
+        self._root = stepper.model.comm.rank == 0
+        self.writer: ResultWriter | None = None
+
+    def due(self, step: int) -> bool:
+        """Return whether the step has events."""
+        return bool(self._stepper.events)
+
+    def observe(self, made: Step) -> None:
+        """Record and report the events."""
+        events, self._stepper.events = self._stepper.events, []
+        for event in events:
+            self.writer.append_event(event.row() if self._root else None)
+            self._tell(str(event))
+
+    def remarks(self) -> list[str]:
+        """Return a remark about the end of the analysis, if it is not known in advance."""
+        return self._stepper.remarks()
+
+
+class RuptureReport(Observer):
+    """Gathers what the ranks know about broken bars when a row of the history shows that there are more of them.
+
+    Parameters
+    ----------
+    stepper : Stepper
+    history : History, whose rows count the broken bars of all ranks
+    tell : receives a message
+    """
+
+    def __init__(self, stepper: Stepper, history: History, tell: Callable[[str], None]) -> None:
+        self._stepper, self._history, self._tell = stepper, history, tell
+        self._comm = stepper.model.comm
+        self._reported = 0  # texts of this stage
+        self._start = self._told = self._comm.allreduce(stepper.ruptures.told) if stepper.model.bars.can_break else 0
+
+    @property
+    def _broken(self) -> int:
+        row = self._history.row
+        return int(row["broken_bars"]) if row is not None and "broken_bars" in row else self._told
+
+    def due(self, step: int) -> bool:
+        """Return whether more bars are broken in the last row than have been reported; the same on all ranks."""
+        return self._broken > self._told
+
+    def observe(self, made: Step) -> None:
+        """Report the bars that broke."""
+        self.complete()
+
+    def complete(self) -> None:
+        """Report the bars of the last row."""
+        if not self.due(0):
+            return
+        self._told = self._broken
+        parts = self._comm.allgather(self._stepper.ruptures.take())
+        breaks = sorted(part for share in parts for part in share)
+        for each in breaks[: max(MOST_TOLD - self._reported, 0)]:
+            self._reported += 1
+            self._tell(each.text)
+
+    def remarks(self) -> list[str]:
+        """Return how many bars have broken in the stage."""
+        count = self._told - self._start
+        if not count:
+            return []
+        listed = f"; the first {self._reported} are listed above" if count > self._reported else ""
+        total = self._stepper.model.mesh.n_bars
+        return [f"{count:,} of {total:,} bars broke{listed}"]

@@ -1,0 +1,336 @@
+"""Rows of the history, with probes, over all stages of a case."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mpi4py import MPI
+
+from ..columns import (
+    BAR_ENERGIES,
+    CHANGES,
+    COUNTS,
+    ENERGIES,
+    HEAD,
+    IMBALANCE,
+    ITERATIONS,
+    LASTING,
+    MOTION,
+    OF_PAIRS,
+    OF_RUN,
+    OF_WALLS,
+    PAIR,
+    PROBED,
+    SUMMED,
+    VECTORS,
+    WALL,
+    Layout,
+    Row,
+    declared,
+)
+
+if TYPE_CHECKING:
+    from ..integrators.base import State
+    from ..stepping.ledger import Ledger
+    from ..stepping.stepper import Stepper
+
+
+_NUMBERS = 3 * len(PROBED)
+
+
+class Probes:
+    """Nodes of all probes. Construction is collective.
+
+    The share of a rank are its nodes, one after the other, with the vectors of :data:`PROBED`. A row has them by probe,
+    by quantity, and by mesh number.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    nodes : name of a probe to its nodes on this rank
+    node_ids : (local nodes,) mesh numbers
+
+    Attributes
+    ----------
+    ids : name to the mesh numbers of its nodes on all ranks, ascending
+    nodes : (m,) int64, nodes of all probes on this rank
+    size : numbers of this rank's share
+    width : numbers of all probes in a row
+    """
+
+    def __init__(self, comm: MPI.Comm, nodes: Mapping[str, np.ndarray], node_ids: np.ndarray) -> None:
+        self._comm = comm
+        self.ids: dict[str, np.ndarray] = {}
+        own = [node_ids[local] for local in nodes.values()]
+        self.nodes = np.concatenate([np.empty(0), *nodes.values()]).astype(np.int64)
+        parts = comm.allgather(own) if nodes else []
+        self._counts = np.array([sum(len(ids) for ids in part) for part in parts], dtype=np.int64)
+        # for each node in the order of the row, its place among those of all ranks in the order of ranks
+        orders = []
+        begins = np.concatenate([[0], np.cumsum(self._counts)]).astype(np.int64)[:-1]
+        for k, name in enumerate(nodes):
+            places = [at + sum(map(len, part[:k])) + np.arange(len(part[k])) for at, part in zip(begins, parts)]
+            ids = np.concatenate([part[k] for part in parts])
+            order = np.argsort(ids, kind="stable")
+            self.ids[name] = ids[order]
+            orders.append(np.concatenate(places)[order])
+        self._orders = orders
+        self.size = _NUMBERS * len(self.nodes)
+        self.width = _NUMBERS * int(self._counts.sum())
+
+    def places(self) -> np.ndarray:
+        """Return where this rank's nodes begin in its share (m,) int64."""
+        return _NUMBERS * np.arange(len(self.nodes), dtype=np.int64)
+
+    def fill(self, share: np.ndarray, state: State, acceleration: np.ndarray, support: np.ndarray) -> None:
+        """Write this rank's share (size,), with acceleration and forces of supports (owned, 3) to record."""
+        values, nodes = share.reshape(-1, len(PROBED), 3), self.nodes
+        values[:, 0], values[:, 1], values[:, 2] = state.x[nodes], state.v[nodes], acceleration[nodes]
+        values[:, 3] = support[nodes] + state.contact[nodes]
+
+    def unite(self, share: np.ndarray, out: np.ndarray) -> None:
+        """Write the numbers of all probes (width,), as a row has them, from the shares (size,). Collective."""
+        if not self._orders:
+            return
+        values = share
+        if self._comm.size > 1:
+            values = np.empty(self.width)
+            self._comm.Allgatherv(np.ascontiguousarray(share), [values, _NUMBERS * self._counts])
+        values, at = values.reshape(-1, len(PROBED), 3), 0
+        for order in self._orders:
+            end = at + _NUMBERS * len(order)
+            out[at:end].reshape(len(PROBED), -1, 3)[:] = values[order].swapaxes(0, 1)
+            at = end
+
+
+_ADDED = [one for one in ENERGIES if one.source != "derived"]
+_SIDES = {one.name: one.side for one in ENERGIES} | {part: one.side for one in ENERGIES for part in one.parts}
+_SIGNS = np.array([{"supplied": -1.0, "part": 0.0}.get(_SIDES[one.name], 1.0) for one in _ADDED])
+_BARS, _ENERGIES = HEAD.indices(BAR_ENERGIES), HEAD.indices(one.name for one in _ADDED)
+_CHANGES = HEAD.width
+_WALLS = HEAD.width + 1
+
+
+class Recorder:
+    """Builds history rows; :meth:`row` is collective and returns the row on all ranks.
+
+    Parameters
+    ----------
+    stepper : Stepper
+    ledger : Ledger; None where only the columns are asked for
+    columns : of all stages of the case, see :attr:`columns`; what this one does not have, such as a wall that is gone,
+        is zero in its rows; sums, contact times and the load factor keep their values. None for a case without stages
+
+    Attributes
+    ----------
+    columns : name to the type of a value, with its shape
+    energy_scale : largest energy of any kind in the rows so far [J]
+    iterations : Newton and linear-solver iterations since the last row
+    alarmed : whether any rank raised a fault flag with the last row
+    carried : (width of a row of this stage,) sums of the stages before, added to its columns; None without
+    rest : (width of a row of all stages,) values of the columns that this stage does not have; None without stages
+    width : number of sums in this rank's share of a row; those of probes are of its own nodes alone
+    probe_nodes : probe name to the mesh numbers of its nodes, ascending, the order of rows in a probe's columns
+    """
+
+    def __init__(
+        self, stepper: Stepper, ledger: Ledger | None = None, columns: Mapping[str, np.dtype] | None = None
+    ) -> None:
+        self.stepper, self.ledger, self.model = stepper, ledger, stepper.model
+        self.start_energy: float | None = None
+        self.energy_scale = 0.0
+        self.alarmed = False
+        self.iterations = [0, 0]
+        self.carried: np.ndarray | None = None
+        model = self.model
+        probes = {probe.name: model.nodes[probe.node_set] for probe in model.case.output.probe}
+        self._probes = Probes(model.comm, probes, model.mesh.node_ids)
+        self.probe_nodes = self._probes.ids
+        self._layout = Layout(self._columns())
+        self.columns = self._layout.columns if columns is None else columns
+        self._whole, self.rest = self._layout, None
+        if columns is not None:
+            self._whole = Layout(columns)
+            self._at = self._whole.indices(self._layout.places)
+            self.rest = np.zeros(self._whole.width)
+            self.rest[self._whole["stage"]] = model.case.number
+        self._place()
+
+    def _columns(self) -> dict[str, np.dtype]:
+        """Return the columns of this stage in the order of a row."""
+        model, contact = self.model, self.model.contact
+        of_analysis = [declared(name) for name in self.stepper.columns]
+        wanted = (*OF_RUN, *of_analysis, *ITERATIONS, *COUNTS, *ENERGIES, IMBALANCE, *VECTORS, CHANGES)
+        found = {column.name: column.dtype for column in wanted if column.exists(model)}
+        for name, moves in zip(contact.names, contact.moving, strict=True):
+            found |= {f"wall/{name}/{one.name}": one.dtype for one in (*OF_WALLS, *(MOTION if moves else ()))}
+        for table in model.links.columns:
+            found |= {f"{table}/{one.name}": one.dtype for one in OF_PAIRS}
+        for name, ids in self.probe_nodes.items():
+            found |= {f"probe/{name}/{one.name}": np.dtype((float, (len(ids), 3))) for one in PROBED}
+        return found
+
+    def _place(self) -> None:
+        """Find where the sums of a share are in a row."""
+        contact, tables, layout = self.model.contact, self.model.links.columns, self._layout
+        walls = [f"wall/{name}/" for name in contact.names]
+        names = [*HEAD.places, *([CHANGES.name] if contact.any else [])]
+        names += [wall + one for wall in walls for one in WALL.places]
+        names += [f"{table}/{one}" for table in tables for one in PAIR.places]
+        sums = Layout({name: declared(name).dtype for name in names})
+        recorded = [name for name in names if name in layout.places]
+        self._from, self._to = sums.indices(recorded), layout.indices(recorded)
+        at_state = [one for one in (*ENERGIES, *VECTORS, *COUNTS) if one.value is not None and one.exists(self.model)]
+        self._state = [(HEAD.first(one.name), one.value) for one in at_state]
+        # where the sums of links and probes begin
+        self._links = sums.width - PAIR.width * len(tables)
+        self._probed = sums.width
+        self.width = sums.width + self._probes.size
+        self._sums = np.zeros(self.width)
+        self._contact_times = layout.indices(wall + "contact_time" for wall in walls)
+        moving = [wall + one.name for wall, moves in zip(walls, contact.moving, strict=True) if moves for one in MOTION]
+        self._motion = layout.indices(moving)
+        self._energies = layout.indices(one.name for one in _ADDED)
+        self._parts = [
+            (layout.first(one.name), [HEAD.first(part) for part in one.parts]) for one in ENERGIES if one.parts
+        ]
+
+    def probed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return this rank's nodes of all probes; where their positions are among its sums of probes; and the distance
+        between the vectors of a node there, over three. Arrays (m,) int64."""
+        return self._probes.nodes, self._probes.places(), np.ones(len(self._probes.nodes), dtype=np.int64)
+
+    def count(self, newton: int, linear: int) -> None:
+        """Add the iterations of a step to those of the next row."""
+        self.iterations[0] += newton
+        self.iterations[1] += linear
+
+    def row(self, alarm: bool = False) -> Row:
+        """Return the history row of the present state. Collective.
+
+        ``alarm``: whether this rank has a fault; :attr:`alarmed` is then true on all ranks.
+        """
+        self._fill(self._sums, alarm)
+        return self.row_of(self.total(self._sums))
+
+    def total(self, sums: np.ndarray) -> np.ndarray:
+        """Return the sums over all ranks from this rank's share (width,), and the probes of all. Collective."""
+        probes = self._probed
+        total = np.empty(probes + self._probes.width)
+        total[:probes] = sums[:probes]
+        if self.model.comm.size > 1:
+            self.model.comm.Allreduce(MPI.IN_PLACE, total[:probes])
+        self._probes.unite(sums[probes:], total[probes:])
+        return total
+
+    def row_of(self, total: np.ndarray) -> Row:
+        """Return the row at the state's step and time from what :meth:`total` gives. Collective."""
+        self.alarmed = total[HEAD.first("alarm")] > 0.0
+        contact = self.model.contact
+        contacts = self._of_walls(total)[:, WALL.first("contacts")] if contact.any else None
+        contact.log.meet(self.model.comm, contacts)
+        vector = self._unpack(total)
+        if self.rest is not None:
+            own, vector = vector, self.rest.copy()
+            vector[self._at] = own
+        return Row(self._whole, vector)
+
+    def _of_walls(self, sums: np.ndarray) -> np.ndarray:
+        return sums[_WALLS : self._links].reshape(-1, WALL.width)
+
+    def _fill(self, sums: np.ndarray, alarm: bool) -> None:
+        """Write this rank's share of a row."""
+        stepper, state, ledger, contact = self.stepper, self.stepper.state, self.ledger, self.model.contact
+        solution = stepper.solution
+        ledger.complete()
+        sums[: HEAD.width] = ledger.sums
+        sums[_BARS] = stepper.energy.energies
+        sums[HEAD.first("alarm")] = alarm
+        for first, value in self._state:
+            sums[first] = value(stepper)
+        if contact.any:
+            sums[_CHANGES], walls = contact.log.changes, self._of_walls(sums)
+            walls[:, WALL["force"]] = solution.walls.force
+            walls[:, WALL["moment"]] = solution.walls.moment
+            walls[:, WALL.first("contacts")] = solution.walls.contacts
+            walls[:, WALL.first("releases")] = contact.log.releases
+            ledger.impulses.fill_walls(walls)
+        ledger.impulses.fill_links(sums[self._links : self._probed].reshape(-1, PAIR.width))
+        held = self.model.supports.any or self.model.bars.springs is not None
+        reacts = held and not stepper.scheme.balance_at_endpoints
+        if self.probe_nodes or reacts:
+            acceleration, support = stepper.recorded()
+            self._probes.fill(sums[self._probed :], state, acceleration, support)
+            if reacts:
+                sums[HEAD["support_force"]] = stepper.support_force(support)
+
+    def _unpack(self, sums: np.ndarray) -> np.ndarray:
+        """Return the values of a row of this stage from the sums over ranks; begin those of the next row."""
+        stepper, contact, layout = self.stepper, self.model.contact, self._layout
+        vector, at = np.empty(layout.width), layout.first
+        vector[self._to] = sums[self._from]
+        vector[layout.width - self._probes.width :] = sums[self._probed :]
+        for column in OF_RUN:
+            vector[at(column.name)] = column.value(stepper)
+        for name in stepper.columns:
+            vector[at(name)] = getattr(stepper, name)
+        vector[at("newton_iterations")], vector[at("linear_iterations")] = self.iterations
+        for first, parts in self._parts:
+            vector[first] = sum(sums[part] for part in parts)
+        vector[layout["centre_of_mass"]] /= self.model.total_mass
+        energies = sums[_ENERGIES]
+        if self.carried is not None:
+            energies = energies + self.carried[self._energies]
+        held = float(_SIGNS @ energies)
+        if self.start_energy is None:
+            self.start_energy = held
+        self.energy_scale = max(self.energy_scale, float(np.abs(energies).max()))
+        vector[at("energy_imbalance")] = held - self.start_energy
+        self.iterations = [0, 0]
+        if contact.any:
+            vector[self._contact_times] = contact.log.time
+            contact.log.changes = 0
+        if len(self._motion):
+            time = stepper.state.time
+            motion = np.hstack([contact.positions(time), contact.motion.rates(time)])
+            vector[self._motion] = motion[np.flatnonzero(contact.moving)].ravel()
+        return vector if self.carried is None else vector + self.carried
+
+    def begin_stage(self, before: Recorder, last: Row, kick: tuple[float, np.ndarray]) -> Row:
+        """Go on after the stage that has ended; return the row of the start. Collective.
+
+        Energies stay balanced, and momentum that of its impulses. Work and momentum of velocities that the stage adds
+        count as external; kinetic energy that is lost, when a static stage or a support stops nodes, as numerical
+        dissipation, what supports that begin to move give as external work, momentum that either changes as impulse of
+        supports. What other temperatures change at once is thermal work, also together with another prestress, which
+        does prestress work.
+
+        Parameters
+        ----------
+        before : of the stage that has ended
+        last : row of its end
+        kick : work [J] and momentum (3,) [N s] of the velocities that the stage adds
+        """
+        first, layout, case = self.row(), self._layout, self.model.case
+        summed = [name for name in layout.places if declared(name).stages == SUMMED]
+        change: dict[str, Any] = {name: np.array(last[name], dtype=float) for name in summed}
+        work, momentum = kick
+        gained = first["kinetic_energy"] - last["kinetic_energy"] - work
+        change["external_work"] += work + max(gained, 0.0) + first["wall_kinetic_energy"] - last["wall_kinetic_energy"]
+        change["numerical_dissipation"] += max(-gained, 0.0)
+        if "temperature" in case.given or case.stressed:
+            # dissipation too: bars may be damaged or break by it at once
+            work_of = "thermal_work" if "temperature" in case.given else "prestress_work"
+            change[work_of] += sum(first[name] - last[name] for name in BAR_ENERGIES)
+        change["external_impulse"] += momentum
+        change["support_impulse"] += first["momentum"] - last["momentum"] - momentum
+        self.carried = np.zeros(layout.width)
+        for name, value in change.items():
+            self.carried[layout[name]] = np.ravel(value)
+        for name in self._whole.places:
+            if declared(name).stages in (SUMMED, LASTING):
+                self.rest[self._whole[name]] = np.ravel(last[name])
+        self.start_energy, self.energy_scale = before.start_energy, before.energy_scale
+        return self.row()

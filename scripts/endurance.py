@@ -1,0 +1,294 @@
+"""Runs that are killed, files that are damaged or wrong, and runs in one folder at once, many times.
+
+    .venv/bin/python scripts/endurance.py kills 200 --ranks 1,2       # --cases 0:400: random cases
+    .venv/bin/python scripts/endurance.py damage 200
+    .venv/bin/python scripts/endurance.py mutants 10000
+    .venv/bin/python scripts/endurance.py together 20
+
+kills     Explicit, implicit, plastic and multistep cases, with and without contact, run in turn on all numbers of
+          ranks. With --cases A:B they are the cases that scripts/random_cases.py draws by these numbers, except those
+          that are refused or fail without a kill. A run is killed by SIGKILL, all ranks or one of them, possibly
+          before its first checkpoint, and restarted, and often killed again, until it is done. After each kill the
+          result file must open in VTK and in open_result; at the end all its values must be bitwise those of the
+          uninterrupted run.
+damage    A bit, a byte or a page of a result file is changed. It may be refused (status 2) or have no effect: the
+          continued results are then those of the undamaged file.
+mutants   Case and mesh files with random mistakes are accepted, or refused with a message. Failures are a traceback, a
+          status other than 0 and 2, a message without the file (or, for a case, without key or line), no answer
+          within a minute, and a process that dies. --seed 1234 with one mutant and --folder DIR reproduces one.
+together  Three starts and two restarts into one folder at once: one run must succeed, the others must be refused with
+          status 2 and a message, and the results must be bitwise those of a single run.
+
+Status 0 if there are no failures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+TESTS = Path(__file__).resolve().parent.parent / "tests"
+sys.path[:0] = [str(TESTS), str(TESTS / "random_cases")]
+
+from helpers import together as at_once  # noqa: E402
+from helpers.kills import KINDS, LEFT_OVER, Kind, VtkReader, assert_readable, differences, killed, run  # noqa: E402
+
+EVERY = (7, 40, 1000)  # steps between checkpoints: many, some, none before the end
+MOST = 4  # kills of a run before it may run to its end
+COUNTED = ("kills", "before 1st checkpoint", "runs", "launcher left", "unreadable", "different", "failed")
+BATCH = 250  # mutants of a process
+MEMORY = 6 << 30  # bytes that a check may use; files that request more must be refused
+SHORT = ["rod_impact", "--quiet", "--set", "time.end=0.6", "output.fields_every=2", "output.checkpoint_every=40"]
+
+
+def main() -> int:
+    """Do what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("test", choices=("kills", "damage", "mutants", "together"))
+    parser.add_argument("number", type=int, help="of kills, damages, mutants or rounds")
+    parser.add_argument("--seed", type=int, help="of what is random; default: another one each time, 0 for mutants")
+    parser.add_argument("--folder", type=Path, help="where to work; default: a temporary one, removed if all is well")
+    parser.add_argument("--ranks", default="1,2", metavar="N,N", help="of kills, in turn (default: 1,2)")
+    parser.add_argument("--python", default=sys.executable, metavar="PATH", help="of killed runs; default: this one")
+    parser.add_argument("--cases", metavar="A:B", help="random cases with these numbers, to be killed")
+    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    folder = arguments.folder or Path(tempfile.mkdtemp(prefix="endurance-"))
+    folder.mkdir(parents=True, exist_ok=True)
+    seed = arguments.seed
+    if seed is None:
+        seed = 0 if arguments.test == "mutants" else random.SystemRandom().randrange(10**6)
+    if arguments.worker:
+        return try_mutants(seed, arguments.number, folder)
+    print(f"seed {seed}", flush=True)
+    if arguments.test == "kills":
+        bad = Kills(arguments, folder, random.Random(seed)).all(arguments.number)
+    elif arguments.test == "mutants":
+        bad = mutants(seed, arguments.number, folder)
+    else:
+        bad = {"damage": damage, "together": together}[arguments.test](arguments.number, folder, random.Random(seed))
+    if arguments.folder is None and not bad:
+        shutil.rmtree(folder)
+    return 1 if bad else 0
+
+
+class Kills:
+    """Runs that are killed, each case and number of ranks as often as the others."""
+
+    def __init__(self, arguments: argparse.Namespace, folder: Path, chance: random.Random) -> None:
+        self.folder, self.chance, self.python = folder, chance, arguments.python
+        self.drawn = arguments.cases is not None
+        ranks = [int(part) for part in arguments.ranks.split(",")]
+        self.kinds = self._random_kinds(arguments.cases) if self.drawn else KINDS
+        # a random case runs on one number of ranks, chosen in turn
+        several = [(name, count) for count in ranks for name in self.kinds]
+        self.turns = list(zip(self.kinds, ranks * len(self.kinds))) if self.drawn else several
+        self.references: dict[tuple[str, int], tuple[Path, float]] = {}
+
+    def all(self, number: int) -> int:
+        """Kill so many runs, print the counts and return the number of failures."""
+        begin, total = time.monotonic(), Counter()
+        counts = {turn: Counter() for turn in self.turns}
+        with VtkReader() as vtk:
+            while counts and total["kills"] < number:
+                # next is the case with the fewest kills, of random cases the one with the fewest runs
+                turn = min(counts, key=lambda each: counts[each]["runs" if self.drawn else "kills"])
+                if turn not in self.references and not self._reference(*turn):
+                    del counts[turn]
+                    continue
+                one = self._one_run(*turn, min(number - total["kills"], MOST), vtk)
+                counts[turn].update(one)
+                total.update(one)
+                if not one["kills"]:  # finished before a kill: the reference run took longer, as when it compiled
+                    whole, seconds = self.references[turn]
+                    self.references[turn] = whole, 0.5 * seconds
+                if one["failed"]:
+                    shutil.copytree(self.folder / "killed", self.folder / f"failed-{total['failed']}")
+                print(f"{total['kills']} kills: {turn[0]} on {turn[1]}: {one['kills']} in this run", flush=True)
+        width = max(len(name) for name, _ in counts)
+        print(f"\n{'case':{width}}  ranks  {'  '.join(COUNTED)}")
+        for (name, ranks), count in [*counts.items(), (("all", ""), total)]:
+            if not self.drawn or name == "all" or count["unreadable"] + count["different"] + count["failed"]:
+                print(f"{name:{width}}  {ranks:5}  {'  '.join(f'{count[what]:{len(what)}}' for what in COUNTED)}")
+        bad = total["unreadable"] + total["different"] + total["failed"]
+        took = f"{time.monotonic() - begin:.0f} s"
+        print(f"{took}; restarts that failed, results that differ or cannot be read: {bad}")
+        return bad
+
+    def _random_kinds(self, numbers: str) -> dict[str, Kind]:
+        """Write the cases that the generator draws by these numbers to files."""
+        from random_trusses.draw import draw_case
+        from random_trusses.running import case_text
+
+        first, _, end = numbers.partition(":")
+        kinds = {}
+        for seed in range(int(first), int(end)):
+            path = self.folder / f"random-{seed}.toml"
+            path.write_text(case_text(draw_case(seed)))
+            kinds[f"random {seed}"] = Kind(str(path), ())
+        return kinds
+
+    def _one_run(self, name: str, ranks: int, most: int, vtk: VtkReader) -> Counter:
+        """Kill a run up to ``most`` times, let it run to its end, and compare; return the counts."""
+        whole, seconds = self.references[name, ranks]
+        kind, count, work = self.kinds[name], Counter(runs=1), self.folder / "killed"
+        every = self.chance.choice(EVERY)
+        for old in self.folder.glob("killed*"):
+            # a run that is killed between its end and the release of its folder leaves the lock
+            old.unlink() if old.is_file() else shutil.rmtree(old)
+        told, restart = [], []
+        while count["kills"] < most:
+            told.append(killed(kind, ranks, work, every, seconds, self.chance, *restart, python=self.python))
+            restart = ["--restart"]
+            if told[-1] == "done before":
+                break
+            count.update({"kills": 1, "launcher left": LEFT_OVER in told[-1]})
+            count["before 1st checkpoint"] += not (work / "checkpoint.h5").exists()
+            for path in self.folder.glob("killed*/result.vtkhdf"):
+                try:
+                    assert_readable(path, vtk)
+                except Exception as error:  # noqa: BLE001 - every way to be unreadable counts
+                    count["unreadable"] += 1
+                    print(f"UNREADABLE {name} on {ranks}: {path}: {type(error).__name__}: {error}", flush=True)
+        done = run(kind, ranks, work, every, "--restart", python=self.python)
+        if done.returncode != 0:
+            count["failed"] += 1
+            print(f"FAILED {name} on {ranks} (every {every}): {told}\n{done.stderr}", flush=True)
+        elif apart := differences(whole, work / "result.vtkhdf"):
+            count["different"] += 1
+            print(f"DIFFERENT {name} on {ranks} (every {every}): {told}: {apart}", flush=True)
+        return count
+
+    def _reference(self, name: str, ranks: int) -> bool:
+        """Run without kills, and keep the result file and the time of its steps [s]; False for a random case that does
+        not run."""
+        place = self.folder / f"{name.replace(' ', '-').replace(',', '')}-{ranks}"
+        for _ in range(1 if self.drawn else 2):  # the first run compiles the loops
+            shutil.rmtree(place, ignore_errors=True)
+            begin = time.time()
+            done = run(self.kinds[name], ranks, place, 0, python=self.python)
+        if done.returncode in (2, 3) and self.drawn:
+            return False
+        if done.returncode != 0:
+            raise SystemExit(f"{name} on {ranks} ranks fails undisturbed:\n{done.stderr}")
+        # the log is opened just before the first step, after the model is set up
+        opened = (place / "log.txt").read_text().splitlines()[0]
+        first = time.mktime(time.strptime(opened[:19], "%Y-%m-%d %H:%M:%S"))
+        seconds = max(0.3, time.time() - max(first, begin) - 0.3)
+        print(f"{name} on {ranks}: {seconds:.1f} s of steps", flush=True)
+        self.references[name, ranks] = place / "result.vtkhdf", seconds
+        return True
+
+
+def damage(number: int, folder: Path, chance: random.Random) -> int:
+    """Damage files, read and restart them, and count the outcomes; return the number of failures."""
+
+    def program(*words: str | Path) -> subprocess.CompletedProcess:
+        return subprocess.run([sys.executable, "-m", "pfem_petsc", *map(str, words)], capture_output=True, text=True)
+
+    counts, bad = Counter(), []
+    first, whole, tried = folder / "first", folder / "whole", folder / "tried"
+    program(*SHORT, "-o", first).check_returncode()
+    shutil.copytree(first, whole)
+    longer = [*SHORT, "time.end=0.8"]
+    program(*longer, "-o", whole, "--restart").check_returncode()
+    for _ in range(number):
+        shutil.rmtree(tried, ignore_errors=True)
+        shutil.copytree(first, tried)
+        what = damaged(tried / "result.vtkhdf", chance)
+        info, done = program("info", tried, "--verify"), program(*longer, "-o", tried, "--restart")
+        for process in (info, done):
+            if process.returncode not in (0, 2) or "internal error" in process.stderr:
+                bad.append(f"{what}: status {process.returncode}: {process.stderr.strip()[:300]}")
+        if done.returncode == 0 and differences(whole / "result.vtkhdf", tried / "result.vtkhdf"):
+            bad.append(f"{what}: went into continued results in silence")
+        outcome = f"{'refused' if done.returncode else 'does not matter'}, info --verify status {info.returncode}"
+        counts[f"{what.split()[0]}: {outcome}"] += 1
+        print(f"{what}: {outcome}", flush=True)
+    for outcome, times in sorted(counts.items()):
+        print(f"{times:5}  {outcome}")
+    print("\n".join(bad) or "none went into results in silence, none crashed")
+    return len(bad)
+
+
+def damaged(file: Path, chance: random.Random) -> str:
+    """Change a bit, a byte or a page of a file, and return a description of it."""
+    content = bytearray(file.read_bytes())
+    kind, at = chance.choice(["bit", "byte", "page"]), chance.randrange(len(content))
+    if kind == "bit":
+        content[at] ^= 1 << chance.randrange(8)
+    elif kind == "byte":
+        content[at] = (content[at] + chance.randrange(1, 256)) % 256
+    else:
+        at -= at % 4096
+        size = len(content[at : at + 4096])
+        content[at : at + 4096] = bytes(size) if chance.random() < 0.5 else chance.randbytes(size)
+    file.write_bytes(content)
+    return f"{kind} at {at}"
+
+
+def mutants(seed: int, number: int, folder: Path) -> int:
+    """Try mutants in separate processes, count what became of them, and return the number of failures."""
+    bad, at, kinds = 0, seed, Counter()
+    while at < seed + number:
+        count = min(BATCH, seed + number - at)
+        line = [sys.executable, __file__, "mutants", str(count), "--seed", str(at), "--folder", str(folder), "--worker"]
+        done = subprocess.run(line, capture_output=True, text=True, errors="replace")
+        tried = [text.split(" ", 2)[2] for text in done.stdout.splitlines() if text.startswith("tried ")]
+        told = [text for text in done.stdout.splitlines() if text.startswith("BAD ")]
+        at += len(tried)
+        if len(tried) < count:
+            told.append(f"BAD {at}: the process ended with status {done.returncode}: {done.stderr[-500:]}")
+            at += 1
+        kinds.update(tried)
+        bad += len(told)
+        print("\n".join([*told, f"{at - seed} mutants, {bad} bad"]), flush=True)
+    for kind, count in sorted(kinds.items()):
+        print(f"{count:6}  {kind}")
+    print(f"{number} mutants from seed {seed}: {bad} bad")
+    return bad
+
+
+def try_mutants(seed: int, count: int, folder: Path) -> int:
+    """Try mutants in this process, which one of them may end."""
+    from helpers.mutations import small_cases, sound_meshes, try_one
+
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    texts, meshes = small_cases(), sound_meshes(folder / "sound")
+    for mutant in range(seed, seed + count):
+        kind, told = try_one(mutant, folder, texts, meshes)
+        if kind == "bad":
+            print(f"BAD {mutant}: {' | '.join(told.split(chr(10)))[:600]}", flush=True)
+        print(f"tried {mutant} {'case' if mutant % 3 < 2 else 'mesh'}: {kind}", flush=True)
+    return 0
+
+
+def together(number: int, folder: Path, chance: random.Random) -> int:
+    """Start runs into one folder at once, in rounds; return the number of rounds that fail."""
+    from pfem_petsc.cli.main import main as program
+
+    starts, restarts, failed = Counter(), Counter(), 0
+    program(at_once.words(folder / "alone", at_once.LATER))
+    for each in range(number):
+        try:
+            found = at_once.play(folder / f"round{each}", folder / "alone" / "result.vtkhdf", chance)
+            starts.update(found[0])
+            restarts.update(found[1])
+            print(f"round {each}: starts {dict(found[0])}, restarts {dict(found[1])}", flush=True)
+        except AssertionError as error:
+            failed += 1
+            print(f"round {each}: {error}", flush=True)
+    print(f"{number} rounds: starts {dict(starts)}, restarts {dict(restarts)}, failed {failed}")
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

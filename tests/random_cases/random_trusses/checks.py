@@ -1,0 +1,331 @@
+"""Properties that the results of any valid case with status 0 must have, and the comparison of two results.
+
+Each check returns faults, (cause, detail). Tolerances:
+
+- positions against walls: 1e-9 of the truss's size (1e-6 with float32); `wilson` keeps walls at t + theta h and not at
+  the end of the step, so that a node may be as far beyond as it moves in (theta - 1) h, twice at most
+- balance of energy: 1e-7 of the largest energy; above 1e-9 it is counted apart
+- gain of energy from contact and the scheme without a warning, in the mean over the last quarter of the run: 0.05 of
+  what was put in (energy at the start, works of loads and temperature; with walls that move, the largest energy).
+  Central differences conserve T + U - h^2/8 a.Ma with velocities in the middle of two half steps: the last term, at
+  most (h w/2)^2 U with the highest frequency w, comes and goes, and is no gain; so with the other explicit schemes
+- dissipations: 1e-9 of the largest energy below zero
+- contact work at walls at rest: with `stick` 1e-3 of the energy input, else 0.05 of it in the last quarter
+- momentum: 1e-9 of the largest momentum or impulse, or four times the solver's tolerance
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from pfem_petsc import open_result
+from pfem_petsc.case.schema import Case
+from pfem_petsc.contact.walls.base import WallKeys
+from pfem_petsc.stepping.model import Model
+from pfem_petsc.stepping.plan import make_plan
+
+from .body import generated
+
+Faults = list[tuple[str, str]]
+_ENDS = ("_energy", "_dissipation", "_work")
+LOSSES = ("numerical_dissipation", "impact_dissipation", "friction_dissipation")
+
+
+class Loaded:
+    """Everything of a result.
+
+    Attributes
+    ----------
+    case : Case
+    history : column to array (rows, ...)
+    steps : (snapshots,)
+    positions : (snapshots, nodes, 3) [m]
+    fields : name to array (snapshots, nodes or bars, ...)
+    """
+
+    def __init__(self, folder: Path) -> None:
+        result = open_result(folder)
+        self.case: Case = result.case
+        self.steps = result.steps
+        count = len(result.times)
+        with h5py.File(result.path, "r", locking=False) as file:
+            rows = result._n_rows
+            self.history = {name: file[f"history/{name}"][:rows] for name in result._columns}
+            vtk = file["VTKHDF"]
+            names = {f"PointData/{name}": result.n_nodes for name in result.point_fields}
+            names |= {f"CellData/{name}": result.n_bars for name in result.cell_fields}
+            self.fields = {name.partition("/")[2]: _by_snapshot(vtk[name], count, n) for name, n in names.items()}
+            self.positions = _by_snapshot(vtk["Points"], count, result.n_nodes)
+
+    @property
+    def size(self) -> float:
+        """Largest extent at the start [m]; 1 without snapshots."""
+        return float(np.ptp(self.positions[0], axis=0).max()) if len(self.steps) else 1.0
+
+
+def _by_snapshot(dataset: h5py.Dataset, count: int, rows: int) -> np.ndarray:
+    return dataset[: count * rows].reshape(count, rows, *dataset.shape[1:])
+
+
+def check_result(folder: Path, warned: list[str]) -> Faults:
+    """Run all checks of a complete result."""
+    result = Loaded(folder)
+    case, history = result.case, result.history
+    faults = _finite(result)
+    if faults:
+        return faults
+    faults += _walls(result, case, history)
+    faults += _energy(case, history, warned, result.size)
+    faults += _momentum(case, history)
+    return faults
+
+
+def energy_scale(history: dict[str, np.ndarray]) -> float:
+    """Return the largest of all energies, works and dissipations of a run [J]."""
+    return max(float(np.abs(column).max()) for name, column in history.items() if name.endswith(_ENDS))
+
+
+def _finite(result: Loaded) -> Faults:
+    for name, values in (result.history | result.fields | {"positions": result.positions}).items():
+        if not np.isfinite(values).all():
+            return [("not finite", name)]
+    return []
+
+
+def _walls(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults:
+    """Check that no node is beyond a wall in a snapshot."""
+    faults: Faults = []
+    if not len(result.steps) or not case.wall:
+        return faults
+    start, size = result.positions[0], result.size
+    tolerance = (1e-6 if case.output.precision == "float32" else 1e-9) * max(size, float(np.abs(start).max()))
+    rows = {int(step): row for row, step in enumerate(history["step"])}
+    # supports that prescribe all components of a node carry it where they say: walls do not count
+    fixed = np.zeros(start.shape, dtype=bool)
+    for support in case.support:
+        if support.fix is None or support.frame is not None:
+            continue  # no wall stops its nodes
+        fixed[np.ix_(_members(case, support.node_set, result), ["xyz".index(c) for c in support.fix])] = True
+    carried = np.flatnonzero(fixed.all(axis=1))
+    for wall in case.wall:
+        members = np.setdiff1d(_members(case, wall.node_set, result), carried)
+        moved = history.get(f"wall/{wall.name}/position")
+        worst = (0.0, "")
+        for i, step in enumerate(result.steps):
+            row = rows.get(int(step))
+            if moved is not None and row is None:
+                continue
+            shift = np.zeros(3) if moved is None else moved[row] - moved[0]
+            at = result.positions[i][members] - shift
+            depth = -_distances(wall, at)
+            if wall.type == "rectangle":
+                depth[~_before_rectangle(wall, result, i, members, at, moved, rows)] = 0.0
+            if len(depth) and depth.max() > worst[0]:
+                worst = (float(depth.max()), f"snapshot {i} of {len(result.steps)}, node {members[depth.argmax()]}")
+        if worst[0] > tolerance + _wilson(case, history, result):
+            faults.append(("node beyond a wall", f"{wall.name} ({wall.type}) by {worst[0]:.3g} m in {worst[1]}"))
+    return faults
+
+
+def _members(case: Case, name: str | None, result: Loaded) -> np.ndarray:
+    """Mesh numbers of the nodes that a wall stops; groups are read from the mesh."""
+    all_nodes = np.arange(result.positions.shape[1])
+    if name is None or case.node_set[name].all:
+        return all_nodes
+    table, points = case.node_set[name], result.positions[0]
+    if table.indices is not None:
+        return np.array(table.indices)
+    if table.group is not None:
+        return generated(case.to_dict()["mesh"]).node_groups[table.group]
+    if table.nearest is not None:
+        return np.array([np.linalg.norm(points - table.nearest, axis=1).argmin()])
+    low, high = np.array(table.box)
+    slack = 1e-6 * np.ptp(points, axis=0).max()
+    return np.flatnonzero(((points >= low + slack) & (points <= high - slack)).all(axis=1))
+
+
+def _distances(wall: WallKeys, x: np.ndarray) -> np.ndarray:
+    """Distance (m,) of points from the surface, negative beyond it."""
+    arm = x - np.array(wall.point)
+    if wall.type in ("plane", "rectangle"):
+        return arm @ np.array(wall.normal) / np.linalg.norm(wall.normal)
+    if wall.type == "cylinder":
+        axis = np.array(wall.axis) / np.linalg.norm(wall.axis)
+        arm = arm - np.multiply.outer(arm @ axis, axis)
+    length = np.linalg.norm(arm, axis=1)
+    return length - wall.radius if wall.side == "outside" else wall.radius - length
+
+
+def _before_rectangle(
+    wall: WallKeys,
+    result: Loaded,
+    i: int,
+    members: np.ndarray,
+    at: np.ndarray,
+    moved: np.ndarray | None,
+    rows: dict[int, int],
+) -> np.ndarray:
+    """Nodes that were before the rectangle in the last snapshot and well inside of its edges then and now."""
+    if i == 0 or result.steps[i] - result.steps[i - 1] > 1:
+        return np.zeros(len(at), dtype=bool)
+    row = rows.get(int(result.steps[i - 1]))
+    if moved is not None and row is None:
+        return np.zeros(len(at), dtype=bool)
+    before = result.positions[i - 1][members] - (0.0 if moved is None else moved[row] - moved[0])
+    normal = np.array(wall.normal) / np.linalg.norm(wall.normal)
+    along = np.array(wall.along) - (np.array(wall.along) @ normal) * normal
+    along /= np.linalg.norm(along)
+    across = np.cross(normal, along)
+    inside = _distances(wall, before) >= 0.0
+    for x in (before, at):
+        arm = x - np.array(wall.point)
+        inside &= (np.abs(arm @ along) < 0.45 * wall.size[0]) & (np.abs(arm @ across) < 0.45 * wall.size[1])
+    return inside
+
+
+def _wilson(case: Case, history: dict[str, np.ndarray], result: Loaded) -> float:
+    if case.time.integrator != "wilson":
+        return 0.0
+    if "velocity" not in result.fields:
+        return np.inf
+    fastest = float(np.abs(result.fields["velocity"]).max())
+    walls = [np.abs(c).max() for n, c in history.items() if n.startswith("wall/") and n.endswith("/velocity")]
+    return 2.0 * (case.time.scheme.theta - 1.0) * float(history["step_size"].max()) * (fastest + sum(walls))
+
+
+def _energy(case: Case, history: dict[str, np.ndarray], warned: list[str], size: float) -> Faults:
+    scale = energy_scale(history)
+    # below: a truss at rest, whose energies are squares of rounding errors
+    if not scale > 1e-24 * _strongest(case) * size:
+        return []
+    faults: Faults = []
+    imbalance = np.abs(history["energy_imbalance"])
+    if imbalance.max() > 1e-9 * scale:
+        at = int(history["step"][np.argmax(imbalance > 1e-9 * scale)])
+        cause = "energy balance open" if imbalance.max() > 1e-7 * scale else "energy balance above 1e-9"
+        faults.append((cause, f"{imbalance.max() / scale:.3g} of the largest energy, first at step {at}"))
+    heat = history["plastic_heat"]
+    # that of the material within rest lengths that change
+    constant = not any(isinstance(getattr(s, s.prestressed or "area"), tuple) for s in case.section.values())
+    if constant and (np.diff(heat) < -1e-9 * scale).any() or heat.min() < -1e-9 * scale:
+        faults.append(("plastic heat falls", f"{np.diff(heat).min() / scale:.3g} of the largest energy"))
+    kinds = ("damping", "friction", "impact", "damage", "rupture")
+    for name in (f"{kind}_dissipation" for kind in kinds):
+        if name in history and history[name].min() < -1e-9 * scale:
+            faults.append((f"{name} negative", f"{history[name].min() / scale:.3g} of the largest energy"))
+    return faults + _gains(case, history, warned, scale)
+
+
+def _strongest(case: Case) -> float:
+    """E A of the stiffest bar [N]."""
+    return max(m.young_modulus for m in case.material.values()) * max(s.area for s in case.section.values())
+
+
+def _gains(case: Case, history: dict[str, np.ndarray], warned: list[str], scale: float) -> Faults:
+    """What contact and the scheme give, beyond what was put in, and is still there in the last quarter of the run.
+
+    A peak that passes is none: velocities of held nodes are those of the scheme's formulas, and overshoot.
+    """
+    if any("energy" in text or "amplifies" in text for text in warned):
+        return []
+    faults: Faults = []
+    moving = any(wall.velocity or wall.motion or wall.mass for wall in case.wall)
+    put_in = history["kinetic_energy"][0] + history["elastic_energy"][0]
+    put_in += np.abs(history["external_work"]).max() + np.abs(history["thermal_work"]).max()
+    put_in += history["spring_energy"][0]
+    put_in += np.abs(history["prestress_work"]).max()
+    reference = scale if moving else min(scale, float(put_in))
+    lost = sum(history[name] for name in LOSSES if name in history)
+    work = history["contact_work"] - (lost - history["numerical_dissipation"])
+    last = slice(-max(len(work) // 4, 1), None)
+    if not moving:
+        treatment = case.contact.treatment
+        most = work.max() if treatment == "stick" else work[last].mean()
+        if most > (1e-3 if treatment == "stick" else 0.05) * reference:
+            faults.append(("contact work positive", f"{treatment}: {most / reference:.3g} of the energy put in"))
+    gain = (-lost if moving else history["contact_work"] - lost)[last]
+    stays = float(gain.mean())
+    plan = make_plan(Model(case, MPI.COMM_SELF)) if stays > 0.05 * reference else None
+    if plan is not None and plan.scheme.explicit:
+        held = history["elastic_energy"][last] + history["spring_energy"][last]
+        swing = (0.5 * history["step_size"][last] * plan.frequency.upper) ** 2 * held
+        stays = min(stays, float((gain - swing).max()))
+    if stays > 0.05 * reference:
+        cause = "energy grows without a warning"
+        faults.append((cause, f"by {stays / reference:.3g} of {'the largest energy' if moving else 'what was put in'}"))
+    return faults
+
+
+def _momentum(case: Case, history: dict[str, np.ndarray]) -> Faults:
+    """Check that momentum is the initial momentum plus all recorded impulses, if the history has them."""
+    if "external_impulse" not in history:
+        return []
+    parts = {"external": history["external_impulse"], "supports": history["support_impulse"]}
+    parts["damping"] = history["damping_impulse"]
+    for wall in case.wall:
+        for what in ("impulse", "jump_impulse"):
+            if f"wall/{wall.name}/{what}" in history:
+                parts[f"{wall.name} {what}"] = history[f"wall/{wall.name}/{what}"]
+    change = history["momentum"] - history["momentum"][0]
+    open_part = np.abs(change - sum(part - part[0] for part in parts.values())).max()
+    mass = _speed_scale(history)
+    scale = max(mass, *(float(np.abs(part).max()) for part in parts.values()))
+    # forces of rounding, over all steps: the impulses of walls that touch a truss at rest add up
+    rounding = 1e-12 * _strongest(case) * float(history["time"][-1])
+    tolerance = max(1e-9, 4.0 * case.solver.rtol)  # what a solver leaves of a balance is a force without an impulse
+    if scale > rounding and open_part > tolerance * scale + rounding:
+        return [("momentum is not that of the impulses", f"{open_part / scale:.3g} of the largest")]
+    return []
+
+
+def _speed_scale(history: dict[str, np.ndarray]) -> float:
+    """Largest momentum of the truss [kg m/s]."""
+    return float(np.linalg.norm(history["momentum"], axis=1).max())
+
+
+def distance(one: Path, other: Path) -> tuple[float, str]:
+    """Return the largest relative difference of two results, and where it is.
+
+    Positions are relative to the size of the truss, energies to the largest energy, momenta to the largest momentum (or
+    that of the displacement of the centre, if they cancel), forces of walls to the largest force.
+    """
+    a, b = Loaded(one), Loaded(other)
+    worst = paths_distance(a, b)
+    history = a.history
+    energy = max(energy_scale(history), 1e-300)
+    speed = np.abs(history["momentum"]).max()
+    size = max(a.size, 1e-300)
+    scales = {"momentum": speed, "angular_momentum": speed * size, "centre_of_mass": size}
+    for name in history:
+        if name.endswith(("_iterations", "releases", "changes", "contact_time", "active_contacts", "contacts")):
+            continue
+        x, y = (np.asarray(run.history[name], dtype=float) for run in (a, b))
+        if x.shape != y.shape:
+            return np.inf, f"{name}: {x.shape} and {y.shape}"
+        if name.endswith(("_energy", "_work", "_dissipation", "_heat", "_imbalance")):
+            scale = energy
+        elif name in scales:
+            scale = max(scales[name], 1e-300)
+        elif name in ("time", "step", "step_size") or name.endswith("/position"):
+            scale = max(np.abs(x).max(), size)
+        else:
+            continue
+        apart = float(np.abs(x - y).max()) / scale
+        if apart > worst[0]:
+            worst = apart, name
+    return worst
+
+
+def paths_distance(a: Loaded, b: Loaded) -> tuple[float, str]:
+    """Largest distance of a node in one result from itself in the other, over the truss's size."""
+    if a.positions.shape != b.positions.shape:
+        return np.inf, f"{len(a.steps)} and {len(b.steps)} snapshots"
+    if not a.positions.size:
+        return 0.0, "nothing"
+    apart = np.abs(a.positions - b.positions).max(axis=(1, 2)) / max(a.size, 1e-300)
+    i = int(apart.argmax())
+    return float(apart[i]), f"positions in snapshot {i} of {len(a.steps)}"

@@ -1,0 +1,319 @@
+"""Copies of a random case whose results follow from those of the case: moved, turned, renumbered and in other units."""
+
+from __future__ import annotations
+
+import copy
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import permutations, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from .body import generated
+from .checks import Loaded, energy_scale
+from .running import case_text, clear, run_case
+
+AGREE, LOOSE, CHAOS = 1e-9, 1e-6, 300.0
+"""As for comparisons between ranks; more chaos, because a copy rounds in every step and not only at the start."""
+
+# exponents of length, mass and time of the numbers in a case; keys that are not here have no unit
+UNITS: dict[str, tuple[int, int, int]] = {
+    **dict.fromkeys(("points", "point", "nearest", "box", "centre", "radius", "size", "gap", "thickness"), (1, 0, 0)),
+    **dict.fromkeys(("diameter",), (1, 0, 0)),
+    **dict.fromkeys(
+        ("young_modulus", "yield_stress", "isotropic_hardening", "kinematic_hardening", "stress", "prestress"),
+        (-1, 1, -2),
+    ),
+    **dict.fromkeys(
+        ("tensile_strength", "compaction_modulus", "proof_stress", "strength_coefficient", "saturation_stress"),
+        (-1, 1, -2),
+    ),
+    "density": (-3, 1, 0),
+    "damping": (-3, 1, -1),
+    "stiffness_damping": (0, 0, 1),
+    "fracture_energy": (0, 1, -2),
+    "rate_reference": (0, 0, -1),
+    "fluidity": (0, 0, -1),
+    "specific_heat": (2, 0, -2),
+    "area": (2, 0, 0),
+    "second_moment": (4, 0, 0),
+    "pretension": (1, 1, -2),
+    "force": (1, 1, -2),
+    "velocity": (1, 0, -1),
+    "angular_velocity": (0, 0, -1),
+    "acceleration": (1, 0, -2),
+    "mass": (0, 1, 0),
+    "stiffness": (0, 1, -2),
+    "coefficient": (0, 1, -1),
+    "step": (0, 0, 1),
+    "end": (0, 0, 1),
+    "time": (0, 0, 1),
+    "duration": (0, 0, 1),
+}
+ROWS = ("pretension", "prestress", "rest_length", "table", "motion", "velocity", "acceleration", "damping_table")
+"""Keys that may have rows whose first number is a time."""
+VECTORS = ("velocity", "angular_velocity", "acceleration", "force", "normal", "axis", "along", "direction")
+
+
+@dataclass
+class Copy:
+    """A changed case, and what its results are in terms of those of the case.
+
+    Attributes
+    ----------
+    back : (nodes, 3) positions of the copy to those of the case
+    energy : energies of the copy over those of the case
+    rounding : relative rounding of the copy's coordinates over that of the case's
+    """
+
+    table: dict[str, Any]
+    back: Callable[[np.ndarray], np.ndarray] = lambda x: x
+    energy: float = 1.0
+    rounding: float = 1.0
+
+
+def _as_arrays(table: dict[str, Any]) -> dict[str, Any]:
+    """Return the case with its mesh as lists, and node sets as lists of nodes."""
+    plain = copy.deepcopy(table)
+    slab = generated(plain["mesh"])
+    points = slab.points
+    for chosen in plain["node_set"].values():
+        if "group" in chosen:
+            members = np.asarray(slab.node_groups[chosen["group"]])
+        elif "nearest" in chosen:
+            members = np.array([np.linalg.norm(points - chosen["nearest"], axis=1).argmin()])
+        elif "box" in chosen:
+            low, high = np.array(chosen["box"])
+            members = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+        else:
+            continue
+        chosen.clear()
+        chosen["indices"] = members.tolist()
+    for kind in ("spring", "dashpot"):
+        plain[kind] = [part for connector in plain.get(kind, ()) for part in _one_by_one(plain, connector, points)]
+        if not plain[kind]:
+            del plain[kind]
+    groups = {name: np.asarray(members).tolist() for name, members in slab.bar_groups.items() if len(members)}
+    plain["mesh"] = {
+        "generator": "arrays",
+        "points": points.tolist(),
+        "bars": np.asarray(slab.bars).tolist(),
+        "bar_groups": groups,
+    }
+    if plain.get("solver", {}).get("linear") == "multigrid":  # of generated lattices only
+        plain["solver"]["linear"] = "auto"
+    return plain
+
+
+def _one_by_one(case: dict[str, Any], connector: dict[str, Any], points: np.ndarray) -> list[dict[str, Any]]:
+    """Return a connector between sets as connectors between nodes: which of several nearest nodes it takes depends on
+    their numbers."""
+    if "between" not in connector:
+        return [connector]
+    first, second = (
+        np.array(case["node_set"][name].get("indices", range(len(points)))) for name in connector["between"]
+    )
+    parts = []
+    for node in second:
+        away = np.where(first == node, np.inf, np.linalg.norm(points[first] - points[node], axis=1))
+        nearest = first[away.argmin()]
+        names = f"node {nearest}", f"node {node}"
+        case["node_set"] |= {name: {"indices": [int(i)]} for name, i in zip(names, (nearest, node), strict=True)}
+        parts.append(connector | {"between": list(names)})
+    return parts
+
+
+def _each(table: Any, change: Callable[[str, Any], Any], key: str = "") -> Any:
+    """Return the table with every value that is no table replaced."""
+    if isinstance(table, dict):
+        return {name: _each(value, change, name) for name, value in table.items()}
+    if isinstance(table, list) and table and isinstance(table[0], dict):
+        return [_each(value, change, key) for value in table]
+    return change(key, table)
+
+
+def _moved(chance: random.Random, table: dict[str, Any], distance: float) -> Copy:
+    shift = np.array([chance.choice((-1.0, 1.0)) * distance * chance.uniform(0.5, 1.0) for _ in range(3)])
+    points = np.array(table["mesh"]["points"])
+    table["mesh"]["points"] = (points + shift).tolist()
+    for wall in table.get("wall", ()):
+        wall["point"] = (np.array(wall["point"]) + shift).tolist()
+    for initial in (table.get("initial", {}), *table.get("initial", {}).get("on", ())):
+        if "centre" in initial:
+            initial["centre"] = (np.array(initial["centre"]) + shift).tolist()
+    size = max(float(np.ptp(points, axis=0).max()), 1e-300)
+    return Copy(table, lambda x: x - shift, rounding=max(1.0, distance / size))
+
+
+def _turned(chance: random.Random, table: dict[str, Any]) -> Copy:
+    """By any angle, or, with supports or springs along axes, by one that maps axes to axes."""
+    along_axes = any("fix" in s and "frame" not in s and s["fix"] != "xyz" for s in table.get("support", ()))
+    if along_axes:
+        turns = [
+            np.eye(3)[list(p)] * np.array(s)[:, None]
+            for p in permutations(range(3))
+            for s in product((1, -1), repeat=3)
+        ]
+        turn = chance.choice([t for t in turns if np.linalg.det(t) > 0.5])
+    else:
+        turn = np.linalg.qr(np.array([[chance.gauss(0, 1) for _ in range(3)] for _ in range(3)]))[0]
+        turn *= np.sign(np.linalg.det(turn))
+
+    def vectors(value: Any, rows: bool) -> Any:
+        values = np.array(value, dtype=float)
+        if rows:
+            return np.column_stack([values[:, 0], values[:, 1:] @ turn.T]).tolist()
+        return (values @ turn.T).tolist()
+
+    def change(key: str, value: Any) -> Any:
+        if key in ("points", "point", "centre", "frame"):
+            return vectors(value, False)
+        if key == "motion" or key in VECTORS:
+            return vectors(value, bool(value) and isinstance(value[0], list))
+        return value
+
+    turned = _each(table, change)
+    for spring in turned.get("spring", ()):
+        if "node_set" in spring and "frame" not in spring:
+            spring["frame"] = turn.T[:2].tolist()
+    if along_axes:
+        for support in turned["support"]:
+            if "fix" in support and "frame" not in support:
+                axes = [int(np.abs(turn[:, "xyz".index(c)]).argmax()) for c in support["fix"]]
+                support["fix"] = "".join("xyz"[a] for a in sorted(axes))
+    return Copy(turned, lambda x: x @ turn)
+
+
+def _renumbered(chance: random.Random, table: dict[str, Any]) -> Copy:
+    mesh = table["mesh"]
+    order, bars = list(range(len(mesh["points"]))), list(range(len(mesh["bars"])))
+    chance.shuffle(order)
+    chance.shuffle(bars)
+    new = np.empty(len(order), dtype=int)
+    new[order] = np.arange(len(order))
+    new_bar = np.empty(len(bars), dtype=int)
+    new_bar[bars] = np.arange(len(bars))
+    mesh["points"] = [mesh["points"][i] for i in order]
+    flipped = [mesh["bars"][i][:: chance.choice((1, -1))] for i in bars]
+    mesh["bars"] = [[int(new[a]), int(new[b])] for a, b in flipped]
+    mesh["bar_groups"] = {name: sorted(new_bar[members].tolist()) for name, members in mesh["bar_groups"].items()}
+    for chosen in table["node_set"].values():
+        if "indices" in chosen:
+            chosen["indices"] = sorted(new[chosen["indices"]].tolist())
+    return Copy(table, lambda x: x[new])
+
+
+def _scaled(chance: random.Random, table: dict[str, Any]) -> Copy:
+    """In units of other size, as if metre, kilogram and second were others."""
+    length, mass, time = (10.0 ** chance.uniform(-2.0, 2.0) for _ in range(3))
+
+    def factor(key: str) -> float:
+        a, b, c = UNITS.get(key, (0, 0, 0))
+        return length**a * mass**b * time**c
+
+    def change(key: str, value: Any) -> Any:
+        if isinstance(value, str | bool) or key in (
+            "indices",
+            "bars",
+            "bar_groups",
+            "normal",
+            "axis",
+            "along",
+            "frame",
+        ):
+            return value
+        if key in ROWS and isinstance(value, list) and value and isinstance(value[0], list):
+            rows = np.array(value, dtype=float)
+            rows[:, 0] *= time
+            rows[:, 1:] *= length if key == "motion" else factor(key)
+            return rows.tolist()
+        if key == "curve":  # strains and stresses
+            return [[a, b * factor("stress")] for a, b in value]
+        if key == "direction":  # of pairs: any length
+            return value
+        if key in UNITS:
+            return (np.array(value, dtype=float) * factor(key)).tolist()
+        return value
+
+    scaled: dict[str, Any] = {}
+    for name, entry in table.items():
+        if name == "mass":  # of nodes
+            entry = [node | {"value": node["value"] * mass} for node in entry]
+        elif name == "wind":
+            entry = _each(entry, change, name) | ({"density": entry["density"] * factor("density")})
+        elif name not in ("title", "output", "solver", "temperature", "contact"):
+            entry = _each(entry, change, name)
+        elif name == "temperature":
+            entry = [_each(heat, lambda key, value: change(key, value) if key == "table" else value) for heat in entry]
+        scaled[name] = entry
+    for _, a, b in _matches(scaled, table):  # time tables of temperatures: only times have been scaled
+        a["value"] = b["value"]
+    return Copy(scaled, lambda x: x / length, energy=mass * length**2 / time**2)
+
+
+def _matches(scaled: dict[str, Any], table: dict[str, Any]) -> list[tuple[str, dict, dict]]:
+    pairs = zip(scaled.get("temperature", ()), table.get("temperature", ()), strict=True)
+    return [("temperature", a, b) for a, b in pairs if "value" in b]
+
+
+KINDS: dict[str, Callable[[random.Random, dict[str, Any]], Copy]] = {
+    "moved by 1 km": lambda chance, table: _moved(chance, table, 1e3),
+    "moved by 1000 km": lambda chance, table: _moved(chance, table, 1e6),
+    "turned": _turned,
+    "renumbered": _renumbered,
+    "scaled": _scaled,
+}
+
+
+def judge_copies(
+    table: dict[str, Any], seed: int, whole: Path, folder: Path, amplified: Callable[[], float]
+) -> list[tuple[str, str]]:
+    """Run the copies of a case on one rank and compare them with its result.
+
+    ``amplified`` gives the effect of a change of the positions by 1e-13 of the size, which tells chaotic runs.
+    """
+    faults: list[tuple[str, str]] = []
+    explicit = "solver" not in table and table["time"].get("mass") != "consistent"
+    tight = explicit or table.get("solver", {}).get("rtol", 1.0) < 1e-10
+    moved: float | None = None
+    for kind, make in KINDS.items():
+        changed = make(random.Random(f"{kind} {seed}"), _as_arrays(table))
+        source = f"random-{seed}-{kind.replace(' ', '-')}.toml"
+        place = folder / "copy"
+        clear(MPI.COMM_SELF, place)
+        outcome = run_case(case_text(changed.table), MPI.COMM_SELF, place, source=source)
+        faults += [(f"{kind}: {cause}", detail) for cause, detail in outcome.faults]
+        if outcome.status != 0:
+            faults.append((f"{kind}: fails", f"status {outcome.status}: {outcome.message[:300]}"))
+            continue
+        apart, where = _distance(Loaded(whole), Loaded(place), changed)
+        if apart <= (AGREE if tight else LOOSE) * changed.rounding:
+            continue
+        moved = amplified() if moved is None else moved
+        detail = f"{apart:.3g} in {where}; a change of the start by 1e-13 makes {moved:.3g}"
+        chaotic = apart <= CHAOS * moved * changed.rounding
+        faults.append((f"chaotic: {kind}" if chaotic else f"{kind}: another result", detail))
+    clear(MPI.COMM_SELF, folder / "copy")
+    return faults
+
+
+def _distance(case: Loaded, other: Loaded, changed: Copy) -> tuple[float, str]:
+    if len(case.steps) != len(other.steps) or case.positions.shape != other.positions.shape:
+        return np.inf, f"{len(case.steps)} and {len(other.steps)} snapshots"
+    worst = 0.0, "nothing"
+    for i, (a, b) in enumerate(zip(case.positions, other.positions, strict=True)):
+        apart = float(np.abs(changed.back(b.astype(float)) - a).max()) / max(case.size, 1e-300)
+        if not apart <= worst[0]:
+            worst = apart, f"positions in snapshot {i} of {len(case.steps)}"
+    scale = max(energy_scale(case.history), 1e-300)
+    for name, values in case.history.items():
+        if name.endswith(("_energy", "_work", "_dissipation")) and name in other.history:
+            its = other.history[name] / changed.energy
+            apart = float(np.abs(its - values).max()) / scale if its.shape == values.shape else np.inf
+            if not apart <= worst[0]:
+                worst = apart, name
+    return worst

@@ -13,7 +13,7 @@ import importlib
 import pkgutil
 import sys
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -24,22 +24,21 @@ from .files import readable_whole
 
 
 class Kind(NamedTuple):
-    """What the modules of a package are: their group of entry points, and what a module defines at its top level."""
+    """What the modules of a package are: their group of entry points, and what each defines at its top level."""
 
     group: str
-    defines: tuple[str, ...]
+    defines: str
 
 
 KINDS = {
-    "pfem_petsc.integrators": Kind("pfem_petsc.integrators", ("Scheme",)),
-    "pfem_petsc.mechanics.materials": Kind("pfem_petsc.laws", ("LAW",)),
-    "pfem_petsc.contact.walls": Kind("pfem_petsc.walls", ("Wall",)),
-    "pfem_petsc.contact.constraints": Kind("pfem_petsc.constraints", ("Constraint",)),
-    "pfem_petsc.contact.treatments": Kind("pfem_petsc.treatments", ("Treatment",)),
-    "pfem_petsc.mesh.generators": Kind("pfem_petsc.generators", ("generate",)),
-    "pfem_petsc.mesh.readers": Kind("pfem_petsc.formats", ("SUFFIXES", "read")),
-    "pfem_petsc.mesh.writers": Kind("pfem_petsc.formats", ("SUFFIXES", "write")),
-    "pfem_petsc.statics.methods": Kind("pfem_petsc.static_methods", ("make_stepper",)),
+    "pfem_petsc.integrators": Kind("pfem_petsc.integrators", "Scheme"),
+    "pfem_petsc.mechanics.materials": Kind("pfem_petsc.laws", "LAW"),
+    "pfem_petsc.contact.walls": Kind("pfem_petsc.walls", "Wall"),
+    "pfem_petsc.contact.constraints": Kind("pfem_petsc.constraints", "Constraint"),
+    "pfem_petsc.contact.treatments": Kind("pfem_petsc.treatments", "Treatment"),
+    "pfem_petsc.mesh.generators": Kind("pfem_petsc.generators", "generate"),
+    "pfem_petsc.formats": Kind("pfem_petsc.formats", "SUFFIXES"),
+    "pfem_petsc.statics.methods": Kind("pfem_petsc.static_methods", "make_stepper"),
 }
 
 _plugins: dict[str, dict[str, ModuleType]] = {package: {} for package in KINDS}
@@ -54,13 +53,15 @@ def _own(package: str) -> tuple[str, ...]:
 
 
 @cache
+def _every_entry_point() -> EntryPoints:
+    return entry_points()
+
+
+@cache
 def _installed(package: str) -> dict[str, EntryPoint]:
     """Entry points of other distributions by name."""
-    kind = KINDS.get(package)
-    found = {point.name: point for point in entry_points(group=kind.group)} if kind is not None else {}
-    if kind is None or len(kind.defines) == 1:
-        return found
-    return {name: point for name, point in found.items() if all(hasattr(point.load(), part) for part in kind.defines)}
+    points = _every_entry_point().select(group=KINDS[package].group) if package in KINDS else ()
+    return {point.name: point for point in points}
 
 
 def choices(package: str) -> list[str]:
@@ -120,7 +121,7 @@ def description(package: str, name: str) -> str:
 
 
 def add_plugin(path: Path | str) -> None:
-    """Add the module of a file under the name of the file, as one of the package whose definitions it has.
+    """Add the module of a file under the name of the file, as one of the first package whose definition it has.
 
     Its relative imports are those of a module of that package.
 
@@ -140,17 +141,16 @@ def add_plugin(path: Path | str) -> None:
             return
         raise InputError(f"this plugin cannot be read: {error}") from error
     defined = {name for node in tree.body for name in _names(node)}
-    packages = [package for package, kind in KINDS.items() if defined.issuperset(kind.defines)]
+    package = next((package for package, kind in KINDS.items() if kind.defines in defined), None)
     name = path.stem
-    if not packages or not name.isidentifier():
-        known = ", ".join(" and ".join(kind.defines) for kind in KINDS.values())
+    if package is None or not name.isidentifier():
+        known = ", ".join(kind.defines for kind in KINDS.values())
         raise InputError(
             f"this is no plugin: expected a file NAME.py that defines one of {known} (CONTRIBUTING.md has examples)"
         )
-    for package in packages:
-        if name in _own(package):
-            raise InputError(f"{package} has a module {name} of its own: give the plugin another name")
-    module_name = f"{packages[0]}.{name}"
+    if name in _own(package):
+        raise InputError(f"{package} has a module {name} of its own: give the plugin another name")
+    module_name = f"{package}.{name}"
     spec: Any = spec_from_file_location(module_name, path)
     module = module_from_spec(spec)
     sys.modules[module_name] = module
@@ -160,8 +160,7 @@ def add_plugin(path: Path | str) -> None:
         del sys.modules[module_name]
         raise InputError(f"this plugin cannot be imported: {type(error).__name__}: {error}") from error
     _sources[path] = source
-    for package in packages:
-        _plugins[package][name] = module
+    _plugins[package][name] = module
 
 
 def has_plugin(path: Path | str) -> bool:

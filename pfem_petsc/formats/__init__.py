@@ -43,10 +43,10 @@ _CONVERT = {
 
 def suffixes(*what: str) -> dict[str, ModuleType]:
     """Return the module of each suffix; ``what`` are functions of which it must have one, as ``write``."""
-    from ..registry import choices, lookup
+    from ..registry import modules
 
-    modules = [lookup(__name__, name, "") for name in choices(__name__)]
-    return {suffix: m for m in modules if any(hasattr(m, name) for name in what) for suffix in m.SUFFIXES}
+    found = modules(__name__).values()
+    return {suffix: m for m in found if any(hasattr(m, name) for name in what) for suffix in m.SUFFIXES}
 
 
 def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:

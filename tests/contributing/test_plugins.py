@@ -81,6 +81,7 @@ def test_installed_packages_add_modules_by_entry_points(tmp_path, monkeypatch):
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: soft_laws\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[pfem_petsc.laws]\nsoft = soft_laws\nbad = no_such_module\n")
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(registry, "_every_entry_point", registry.entry_points)
     registry._installed.cache_clear()
     try:
         laws = "pfem_petsc.mechanics.materials"

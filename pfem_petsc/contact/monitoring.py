@@ -10,12 +10,12 @@ from mpi4py import MPI
 
 from ..errors import SimulationFailure
 from ..fields import STATUS
-from ..mechanics.compiled import inlined, kernel
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..tolerances import BEYOND
 from .contact import Contact
 from .forces import held_by_supports
+from .neighbours import NeighbourSearch, Segments
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -253,12 +253,6 @@ _SKIN = 0.1
 # Coordinate beyond which a node is not searched [m].
 _STRAY = 1e100
 
-# Limits of the work: cells listed and pairs compared, both per bar.
-_CELLS, _PAIRS = 64.0, 2000.0
-
-# Cells of 8 x 8 x 8 belong to one rank, so that most bars are sent to one or two.
-_BLOCK = 8
-
 
 class Crossing(NamedTuple):
     """Pairs of bars that pass through each other, number of bars among them, and the lowest pair of numbers."""
@@ -266,15 +260,6 @@ class Crossing(NamedTuple):
     pairs: int
     bars: int
     lowest: tuple[int, int]
-
-
-class _Segments(NamedTuple):
-    """Bars: numbers (n,), those of their end nodes (n, 2), ends (n, 2, 3) [m] and radii (n,) [m]."""
-
-    ids: np.ndarray
-    nodes: np.ndarray
-    ends: np.ndarray
-    radius: np.ndarray
 
 
 class CrossingBars:
@@ -368,39 +353,29 @@ class CrossingBars:
         fine = (np.abs(x[ends]) < _STRAY).all(axis=(1, 2))
         ends, kept = ends[fine], np.flatnonzero(kept)[fine]
         nodes, points, radius = mesh.node_ids[ends].astype(np.int64), x[ends], factor * self._radius[kept]
-        meeting = (self._meeting[ends] > 0.0).any(axis=1)
         turned = nodes[:, 0] > nodes[:, 1]
         nodes[turned], points[turned] = nodes[turned, ::-1], points[turned, ::-1]
-        segments = _Segments(mesh.bar_ids[chosen[kept]].astype(np.int64), nodes, points, radius)
-        low = np.min(points, axis=(0, 1), initial=np.inf) if len(points) else np.full(3, np.inf)
-        comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+        ids = mesh.bar_ids[chosen[kept]].astype(np.int64)
+        # bars with a common label are not compared: at a node, or both at links
+        links = np.where((self._meeting[ends] > 0.0).any(axis=1), -1, -2 - ids)
         lengths = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
         number, size = comm.allreduce(np.array([len(lengths), float((lengths + 4.0 * radius).sum())]))
         if not number:
             return np.empty(0, np.int64), np.inf
-        skin = _SKIN * size / number
-        cell = 0.5 * size / number
-        while True:
-            cells = (lengths // cell + 1.0) * (2.0 + (2.0 * radius + skin) / cell) ** 3
-            if comm.allreduce(float(cells.sum())) <= _CELLS * number:
-                break
-            cell *= 2.0
-        grid = _Cells(low, cell, comm.size)
-        held = _Held(segments, radius + 0.5 * skin, meeting).sent(comm, grid)
-        buckets = _buckets(*held.cells(comm, grid))
-        counts = np.diff(buckets[0]).astype(float)
-        if comm.allreduce(float((counts * counts).sum())) > 2.0 * _PAIRS * number:
+        gap = skin = _SKIN * size / number
+        segments = Segments(ids, np.column_stack([nodes, links]), points, radius + 0.5 * skin)
+        search = NeighbourSearch(comm, segments)
+        if search.crowded:
             return None, 0.0
-        room = max(1024, len(held.segments.ids))
-        while True:
-            out = np.empty((room, 2), np.int64)
-            found, gap = _compare(buckets, held.segments, held.meeting, grid, skin, out)
-            if found <= room:
-                break
-            room = found
-        one, two = out[:found].min(axis=1), out[:found].max(axis=1)
-        keys = Router(comm, slab_of(one, self._n_bars, comm.size)).send(one * self._n_bars + two)
-        return keys, comm.allreduce(gap, op=MPI.MIN)
+        keys = [np.empty(0, np.int64)]
+        for pairs in search.pairs():
+            apart = pairs.distance - (pairs.reach - skin)
+            gap = min(gap, float(np.abs(apart).min()))
+            one, two = np.sort(pairs.ids[apart < 0.0], axis=1).T
+            keys.append(one * self._n_bars + two)
+        found = np.concatenate(keys)
+        found = Router(comm, slab_of(found // self._n_bars, self._n_bars, comm.size)).send(found)
+        return found, comm.allreduce(gap, op=MPI.MIN)
 
 
 class _Search(NamedTuple):
@@ -411,216 +386,3 @@ class _Search(NamedTuple):
     gap: float
     x: np.ndarray
     intact: np.ndarray
-
-
-class _Cells(NamedTuple):
-    """Cells of space: the corner of the first (3,) and the length of their edges [m], and how many ranks hold them."""
-
-    low: np.ndarray
-    cell: float
-    size: int
-
-
-class _Held(NamedTuple):
-    """Bars of a rank, the distances around them in which others are searched (n,) [m], and which of them are at links
-    (n,) bool."""
-
-    segments: _Segments
-    margin: np.ndarray
-    meeting: np.ndarray
-
-    def sent(self, comm: MPI.Comm, grid: _Cells) -> _Held:
-        """Return the bars that pass cells of this rank. Collective."""
-        if comm.size == 1:
-            return self
-        ends, margin = self.segments.ends, self.margin
-        count = _list_cells(ends, margin, grid, -1, np.empty(0, np.int64), np.empty(0, np.int64))
-        ranks, rows = np.empty(count, np.int64), np.empty(count, np.int64)
-        _list_cells(ends, margin, grid, -1, ranks, rows)
-        each = np.unique(rows * comm.size + ranks)
-        router = Router(comm, each % comm.size, each // comm.size)
-        segments = _Segments(*(router.send(array) for array in self.segments))
-        return _Held(segments, router.send(self.margin), router.send(self.meeting))
-
-    def cells(self, comm: MPI.Comm, grid: _Cells) -> tuple[np.ndarray, np.ndarray]:
-        """Return the cells of this rank that each bar passes: a key of the cell and the row of the bar."""
-        ends, margin = self.segments.ends, self.margin
-        room = 12 * len(margin)
-        while True:
-            keys, rows = np.empty(room, np.int64), np.empty(room, np.int64)
-            count = _list_cells(ends, margin, grid, comm.rank, keys, rows)
-            if count <= room:
-                return keys[:count], rows[:count]
-            room = count
-
-
-@inlined
-def _key(i, j, k):
-    """Return a number of a cell from its numbers along the axes, which wrap around after 2^21 cells."""
-    mask = (1 << 21) - 1
-    return ((i & mask) << 42) | ((j & mask) << 21) | (k & mask)
-
-
-@inlined
-def _mixed(key):
-    """Return a number from 0 to 2^31 - 1 that looks random."""
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    return np.int64(mixed >> np.uint64(33))
-
-
-@inlined
-def _piece(ends, begin, end, margin, grid, span):
-    """Write the first and last cells (2, 3) of the box around a part of a bar (2, 3) and a margin [m]."""
-    for c in range(3):
-        p = ends[0, c] + begin * (ends[1, c] - ends[0, c])
-        q = ends[0, c] + end * (ends[1, c] - ends[0, c])
-        span[0, c] = int(np.floor((min(p, q) - margin - grid.low[c]) / grid.cell))
-        span[1, c] = int(np.floor((max(p, q) + margin - grid.low[c]) / grid.cell))
-
-
-@kernel
-def _list_cells(ends, margins, grid, rank, keys, rows):
-    """List the cells around bars, as far as there is room: the cell and the row of the bar, for cells of ``rank``; with
-    -1, the rank of the cell and the row. Returns the length of the list."""
-    cell, size = grid.cell, grid.size
-    span = np.empty((2, 3), np.int64)
-    first, last = span[0], span[1]
-    before = np.empty((2, 3), np.int64)
-    count = 0
-    for k in range(len(ends)):
-        length = np.sqrt(((ends[k, 1] - ends[k, 0]) ** 2).sum())
-        margin = margins[k] + 1e-9 * (length + cell)
-        pieces = int(length / cell) + 1
-        for piece in range(pieces):
-            _piece(ends[k], piece / pieces, (piece + 1) / pieces, margin, grid, span)
-            for i in range(first[0], last[0] + 1):
-                for j in range(first[1], last[1] + 1):
-                    for m in range(first[2], last[2] + 1):
-                        # pieces follow a line, so that a cell of an earlier piece is also one of the last piece
-                        if (
-                            piece
-                            and before[0, 0] <= i <= before[1, 0]
-                            and before[0, 1] <= j <= before[1, 1]
-                            and before[0, 2] <= m <= before[1, 2]
-                        ):
-                            continue
-                        holder = 0
-                        if size > 1:
-                            holder = _mixed(_key(i // _BLOCK, j // _BLOCK, m // _BLOCK)) % size
-                        if rank >= 0 and holder != rank:
-                            continue
-                        if count < len(keys):
-                            keys[count] = holder if rank < 0 else _key(i, j, m)
-                            rows[count] = k
-                        count += 1
-            before[:] = span
-    return count
-
-
-@kernel
-def _buckets(keys, rows):
-    """Sort a list into buckets of cells: returns the start of each bucket (buckets + 1,), and the sorted list."""
-    size = 1
-    while size < len(keys):
-        size *= 2
-    start = np.zeros(size + 1, np.int64)
-    for key in keys:
-        start[(_mixed(key) & (size - 1)) + 1] += 1
-    for b in range(size):
-        start[b + 1] += start[b]
-    at = start[:size].copy()
-    cells = np.empty_like(keys)
-    bars = np.empty_like(rows)
-    for n in range(len(keys)):
-        b = _mixed(keys[n]) & (size - 1)
-        cells[at[b]] = keys[n]
-        bars[at[b]] = rows[n]
-        at[b] += 1
-    return start, cells, bars
-
-
-@inlined
-def _clip(value):
-    return min(max(value, 0.0), 1.0)
-
-
-@inlined
-def _closest(ends, a, b):
-    """Return the parameters from 0 to 1 of the closest points of the axes of bars ``a`` and ``b``.
-
-    Source: Ericson, Real-time collision detection (2005), 5.1.9.
-    """
-    aa = 0.0
-    bb = 0.0
-    ab = 0.0
-    ar = 0.0
-    br = 0.0
-    for c in range(3):
-        u = ends[a, 1, c] - ends[a, 0, c]
-        v = ends[b, 1, c] - ends[b, 0, c]
-        w = ends[a, 0, c] - ends[b, 0, c]
-        aa += u * u
-        bb += v * v
-        ab += u * v
-        ar += u * w
-        br += v * w
-    if aa <= 0.0:
-        return 0.0, _clip(br / bb) if bb > 0.0 else 0.0
-    if bb <= 0.0:
-        return _clip(-ar / aa), 0.0
-    across = aa * bb - ab * ab
-    s = _clip((ab * br - ar * bb) / across) if across > 1e-14 * aa * bb else 0.0
-    t = (ab * s + br) / bb
-    if t < 0.0:
-        return _clip(-ar / aa), 0.0
-    if t > 1.0:
-        return _clip((ab - ar) / aa), 1.0
-    return s, t
-
-
-@kernel
-def _compare(buckets, segments, meeting, grid, skin, out):
-    """Write the numbers of bars (pairs, 2) that pass through each other, as far as there is room; return how many, and
-    by how much a distance differs at least from the sum of radii, at most ``skin`` [m]."""
-    start, keys, rows = buckets
-    ids, nodes, ends, radius = segments
-    low, cell = grid.low, grid.cell
-    found = 0
-    gap = skin
-    place = np.empty(3, np.int64)
-    for bucket in range(len(start) - 1):
-        for p in range(start[bucket], start[bucket + 1]):
-            for q in range(p + 1, start[bucket + 1]):
-                if keys[p] != keys[q]:
-                    continue
-                # rounding must not depend on the order of the bars, which depends on the ranks
-                a = rows[p] if ids[rows[p]] < ids[rows[q]] else rows[q]
-                b = rows[q] if a == rows[p] else rows[p]
-                if nodes[a, 0] == nodes[b, 0] or nodes[a, 1] == nodes[b, 1]:
-                    continue
-                if nodes[a, 0] == nodes[b, 1] or nodes[a, 1] == nodes[b, 0]:
-                    continue
-                if meeting[a] and meeting[b]:
-                    continue
-                reach = radius[a] + radius[b]
-                apart = False
-                for c in range(3):
-                    apart |= min(ends[a, 0, c], ends[a, 1, c]) - max(ends[b, 0, c], ends[b, 1, c]) > reach + gap
-                    apart |= min(ends[b, 0, c], ends[b, 1, c]) - max(ends[a, 0, c], ends[a, 1, c]) > reach + gap
-                if apart:
-                    continue
-                s, t = _closest(ends, a, b)
-                square = 0.0
-                for c in range(3):
-                    one = ends[a, 0, c] + s * (ends[a, 1, c] - ends[a, 0, c])
-                    two = ends[b, 0, c] + t * (ends[b, 1, c] - ends[b, 0, c])
-                    square += (two - one) * (two - one)
-                    place[c] = int(np.floor((one + (two - one) * (radius[a] / reach) - low[c]) / cell))
-                gap = min(gap, abs(np.sqrt(square) - reach))
-                if square >= reach * reach or _key(place[0], place[1], place[2]) != keys[p]:
-                    continue
-                if found < len(out):
-                    out[found, 0] = ids[a]
-                    out[found, 1] = ids[b]
-                found += 1
-    return found, gap

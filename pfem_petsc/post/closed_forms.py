@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["ClosedForm", "closed_form", "rod_on_wall", "von_mises"]
-
 _ABSENT = ("load", "support", "temperature", "contact_pair", "constraint", "remove", "point_mass", "spring", "dashpot")
 
 

@@ -13,8 +13,6 @@ from .chart import COLOURS, REFERENCE, Chart, Curve, largest, literal
 from .closed_forms import ClosedForm
 from .filters import AS_COMPUTED, Filter, make_filter
 
-__all__ = ["draw_force_displacement", "draw_forces"]
-
 WINDOW = 0.02  # width of the moving average of forces, relative to the run
 
 

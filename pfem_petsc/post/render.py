@@ -150,6 +150,8 @@ class Options:
         if self.bar_width is not None and not 0.0 < self.bar_width <= 500.0:
             raise InputError(f"render: bar_width = {self.bar_width:g} must be positive, and 500 pixels at most")
         assert self.moves  # refuses what makes no film
+        if isinstance(self.frames, Iterable):
+            object.__setattr__(self, "frames", list(self.frames))
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -217,6 +219,7 @@ def render(
             helpers = _helpers(paths, folder, chosen, film.count)
             shares = [slice(k, None, len(helpers) + 1) for k in range(len(helpers) + 1)]
         else:
+            few_threads()
             helpers, shares = [], [slice(comm.rank, None, comm.size)]
         film.write(folder / "frames", shares[0], tell)
         for helper, share in zip(helpers, shares[1:], strict=True):

@@ -22,8 +22,6 @@ from ..output.units import engineering, prefix_for
 from .histories import balance_error
 from .plot import plot
 
-__all__ = ["write_report"]
-
 NAME = "report.html"
 POSTER_FRAMES = 6
 

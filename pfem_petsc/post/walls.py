@@ -12,8 +12,6 @@ from ..contact.walls.base import Surface, slab
 from ..errors import InputError
 from ..registry import lookup
 
-__all__ = ["plane", "wall_shifts", "wall_surfaces", "walls_present"]
-
 
 def plane(wall: Any, bounds: np.ndarray) -> Surface:
     """Return a slab behind a plane wall, as wide as the projection of the structure on it plus a margin.

@@ -55,7 +55,9 @@ def notebook(monkeypatch):
 
     fake = types.ModuleType("IPython.display")
     fake.HTML, fake.display, fake.Image = str, display, lambda data: data
-    monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
+    ipython = types.ModuleType("IPython")
+    ipython.version_info = (9, 0)
+    monkeypatch.setitem(sys.modules, "IPython", ipython)
     monkeypatch.setitem(sys.modules, "IPython.display", fake)
     cell = type("OutStream", (io.StringIO,), {"__module__": "ipykernel.iostream"})()
     return cell, shown

@@ -479,6 +479,8 @@ class CaseModel(StrictModel):
     @field_validator("contact")
     @classmethod
     def _treats(cls, contact: t.ContactSettings, info: ValidationInfo) -> t.ContactSettings:
+        if contact.treatment == "scheme":
+            return contact
         known = ["scheme", *choices(TREATMENTS)]
         if contact.treatment not in known and info.context.lenient:
             info.context.missing.append(f"the treatment {contact.treatment}")

@@ -19,7 +19,7 @@ from integrator_tables import ROWS, radius
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.contact.projection import project
 from pfem_petsc.energies import LOST, STORED, SUPPLIED
-from pfem_petsc.mechanics.conserving import MEASURES
+from pfem_petsc.mechanics.elements import MEASURES
 
 __all__ = ["FOLDER", "bar", "contact", "energies", "integrators", "main", "nearest", "strain", "two_bar_load"]
 

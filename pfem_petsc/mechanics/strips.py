@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from .rows import CHUNK
+from .tuples import CHUNK
 
 LANES = 8
 """Numbers of a vector."""
@@ -152,7 +152,7 @@ class Arguments:
         return self.numbers(k, self.builder.add(node, self.builder.mul(stride, _number(component))))
 
     def row(self, k: int, column: Any, number: int) -> Any:
-        """Return a pointer into a row of array k, whose rows have :data:`~pfem_petsc.mechanics.rows.CHUNK` numbers."""
+        """Return a pointer into a row of a workspace, of :data:`~pfem_petsc.mechanics.tuples.CHUNK` numbers."""
         return self.numbers(k, self.builder.add(column, _number(number * CHUNK)))
 
 

@@ -164,7 +164,7 @@ def inertia_products(nodal, u, out):
 
 @kernel
 def add_products(sweep, far, x, stored, u, out):
-    """Add K u to ``out``, chunk by chunk of a :class:`~pfem_petsc.mechanics.columns.Sweep`."""
+    """Add K u to ``out``, chunk by chunk of a :class:`~pfem_petsc.mechanics.runs.Sweep`."""
     heads, fars, starts, chunks = sweep.heads, sweep.fars, sweep.starts, sweep.chunks
     for chunk in range(len(sweep.diagonal)):
         if not sweep.diagonal[chunk]:

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from ..contact.impact import Impacts
 from ..energies import ENERGIES
 from ..mechanics.bars import StrainEnergy, state_before_rupture
-from ..mechanics.conserving import MEASURES
+from ..mechanics.elements import MEASURES
 from ..mechanics.materials.base import SMALL
 from ..output.sums import HEAD
 from .impulses import Impulses, NoImpulses, wall_shares

@@ -19,9 +19,9 @@ from ..mechanics.compiled import kernel
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia, PointInertia
 from ..mechanics.rest_lengths import RestLengths, Temperatures
-from ..mechanics.rows import bar_value
 from ..mechanics.springs import add_connectors, connected, make_springs, with_connectors
 from ..mechanics.supports import Supports
+from ..mechanics.tuples import bar_value
 from ..mesh import load_slab
 from ..mesh.distribution import distribute
 from ..mesh.node_sets import resolve_node_sets

@@ -9,7 +9,7 @@ from helpers.stopped import everywhere
 
 from pfem_petsc import Simulation, open_result
 from pfem_petsc.case.materials import law_of
-from pfem_petsc.mechanics.conserving import MEASURES
+from pfem_petsc.mechanics.elements import MEASURES
 from pfem_petsc.mechanics.rest_lengths import stretch_of
 
 STRAINS = ["engineering", "green", "logarithmic"]

@@ -15,10 +15,11 @@ from ..energies import BAR_ENERGIES
 from ..errors import InputError
 from ..fields import STATUS
 from ..mesh.node_sets import group_hint
-from .elements import MEASURES, BarData, MatrixRows, bar_lengths, first_inverted, make_loops
+from .elements import MEASURES, BarData, ElementFamily, MatrixRows, bar_lengths, first_inverted, make_loops
 from .materials.base import BarShapes, Law, UnsuitableBarError
 from .runs import Sweep, make_sweep
 from .rupture import breakable, limit_values, make_release
+from .springs import Springs
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from ..mesh.distribution import Block, DistributedMesh
     from ..mesh.slab import MeshSlab
     from ..solvers.matrix import BlockPattern
-    from .springs import Springs
 
 
 def bar_shapes(section: Section, length: np.ndarray, area: np.ndarray) -> BarShapes:
@@ -242,8 +242,6 @@ def _fill_bar_data(mesh: DistributedMesh, case: Case, block: BarBlock, lengths: 
 _LOADING = 1e-8  # relative change of all lengths that distinguishes the tangents of loading and unloading
 _KINK = 1e-6  # relative difference of these tangents above which the bar is at a kink of its law
 
-_OF_SPRINGS = BAR_ENERGIES.index("spring_energy")
-
 
 class StrainEnergy(NamedTuple):
     """Sums over the bars counted on this rank, and its springs, in the order of
@@ -285,16 +283,15 @@ class Bars:
     blocks : bars by section
     viscous : whether bars of the case have a viscous stress, the same on all ranks
     viscous_blocks : those of them on this rank
-    springs : from nodes to the ground, whose forces and stiffness are added to those of the bars; None without
+    families : other elements, whose forces and stiffness are added to those of the bars
     """
-
-    springs: Springs | None = None
 
     def __init__(self, mesh: DistributedMesh, case: Case) -> None:
         self.mesh, self.case = mesh, case
         self.ends = mesh.bars
         self.mesh_lengths = np.empty(len(mesh.bars))
         bar_lengths(mesh.points, mesh.bars, self.mesh_lengths)
+        self.families: list[ElementFamily] = []
         self.rest = self.mesh_lengths
         self.rest_at_start = np.empty(0)
         self.heat = np.empty((2, 0))
@@ -312,6 +309,11 @@ class Bars:
         count = 0 if all(block.sweep.diagonal.all() for block in self.blocks) else len(mesh.bars)
         self.far = np.empty(count, dtype=np.uint32)
         np.maximum(mesh.bars[:count, 0], mesh.bars[:count, 1], out=self.far, casting="unsafe")
+
+    @property
+    def springs(self) -> Springs | None:
+        """Springs from nodes to the ground; None without."""
+        return next((family for family in self.families if isinstance(family, Springs)), None)
 
     @property
     def slackens(self) -> bool:
@@ -376,8 +378,8 @@ class Bars:
             changed += broke
             if failed < 0:
                 failed = at
-        if self.springs is not None:
-            energies[_OF_SPRINGS] = self.springs.add_forces(x, f)
+        for family in self.families:
+            energies[BAR_ENERGIES.index(family.energy)] += family.add_forces(x, f)
         return StrainEnergy(tuple(energies.tolist()), failed, shortened, changed)
 
     def set_rates(self, x0: np.ndarray, x: np.ndarray, v: np.ndarray, eta: float) -> None:
@@ -427,8 +429,8 @@ class Bars:
         for block, m in zip(self.blocks, inertia, strict=True):
             rows = MatrixRows(weight, m, self.mesh_lengths, pattern.ptr, pattern.slots, values)
             block.loops.tangents(x, self.data(block), rows)
-        if self.springs is not None:
-            self.springs.add_tangents(weight, pattern, values)
+        for family in self.families:
+            family.add_tangents(weight, pattern, values)
 
     def linearise(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
         """Fill ``stored`` (5, b) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, for each bar at ``x``;
@@ -463,8 +465,8 @@ class Bars:
         """Compute discrete-gradient forces ``f`` (local nodes, 3) [N] of a step from ``x0`` to ``x``."""
         f[:] = 0.0
         self._for_blocks("step_forces", x, (x0, f))
-        if self.springs is not None:
-            self.springs.add_step_forces(x0, x, f)
+        for family in self.families:
+            family.add_step_forces(x0, x, f)
 
     def step_tangents(
         self,
@@ -479,15 +481,15 @@ class Bars:
         for block, m in zip(self.blocks, inertia, strict=True):
             rows = MatrixRows(weight, m, self.mesh_lengths, pattern.ptr, pattern.slots, values)
             block.loops.step_tangents(x, self.data(block), (x0, rows))
-        if self.springs is not None:  # the force at mid-step
-            self.springs.add_tangents(0.5 * weight, pattern, values)
+        for family in self.families:  # the force at mid-step
+            family.add_tangents(0.5 * weight, pattern, values)
 
     def product(self, x: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
         """Compute ``out`` = K_t(x) u for local arrays (nodes, 3); valid for owned nodes."""
         out[:] = 0.0
         self._for_blocks("product", x, (u, out))
-        if self.springs is not None:
-            self.springs.add_product(1.0, u, out)
+        for family in self.families:
+            family.add_product(1.0, u, out)
 
     def lengths(self, x: np.ndarray) -> np.ndarray:
         """Return the length (b,) of each local bar [m]."""

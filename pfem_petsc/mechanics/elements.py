@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numba.extending import register_jitable
@@ -18,7 +18,8 @@ from numba.extending import register_jitable
 from ..energies import BAR_ENERGIES
 from .compiled import borrowing, inlined, kernel
 from .materials.base import Law
-from .runs import Sweep, add_rows, copy, end_differences, scatter_forces, subtract, subtract_rows
+from .runs import Sweep, copy, end_differences, scatter_forces
+from .strips import add_rows, subtract_rows
 from .tuples import CHUNK, accumulate, bar_value, differ, put, take, take_from
 
 COLLAPSED_STRETCH = 1e-3  # below this fraction of its rest length a bar is crushed, and no truss model applies
@@ -73,6 +74,31 @@ def _logarithmic_ratio(s0: float, s1: float) -> tuple[float, float]:
 
 # L^2 R and L^2 dR/ds1 for the stretches s0 = l0/L, s1 = l1/L
 _RATIOS = {engineering: _engineering_ratio, green: _green_ratio, logarithmic: _logarithmic_ratio}
+
+
+class ElementFamily(Protocol):
+    """Elements besides the bars, such as springs to the ground: what :class:`~pfem_petsc.mechanics.bars.Bars` adds up.
+
+    Stiffness is that at the positions of the last forces. Each rank adds what acts on the nodes that it owns.
+
+    Attributes
+    ----------
+    energy : name of the stored energy, of :data:`~pfem_petsc.energies.BAR_ENERGIES`
+    """
+
+    energy: str
+
+    def add_forces(self, x: np.ndarray, f: np.ndarray) -> float:
+        """Add the internal forces at positions ``x`` to ``f``, both (local, 3); return the stored energy [J]."""
+
+    def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
+        """Add the discrete gradient of a step from ``x0`` to ``x``, whose work is the change of the energy."""
+
+    def add_product(self, weight: float, u: np.ndarray, out: np.ndarray) -> None:
+        """Add ``weight`` times the stiffness times ``u`` to ``out``, with a row for each owned node at least."""
+
+    def add_tangents(self, weight: float, pattern: Any, values: np.ndarray) -> None:
+        """Add ``weight`` times the stiffness to the values of a matrix with a ``BlockPattern``."""
 
 
 class BarData(NamedTuple):
@@ -575,7 +601,7 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
         it may be inverted.
 
         ``x`` (n, 3) positions, which are also in ``bars.planes`` (3 stride,) from node ``base`` on; ``work``
-        (``padded_rows`` CHUNK,): end differences, then forces of a group by components, and its new history.
+        (``padded_rows`` CHUNK,): forces of a group by components, and its new history.
         """
         failed = -1
         shortened = False
@@ -587,16 +613,15 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
             first = starts[group]
             n = starts[group + 1] - first
             head, tail = heads[group] - base, fars[group] - base
-            for c in range(3):
-                at = c * stride
-                subtract(planes[at + tail : at + tail + n], planes[at + head : at + head + n], work[c * CHUNK :])
+            x0, y0, z0 = planes[head:], planes[stride + head :], planes[2 * stride + head :]
+            x1, y1, z1 = planes[tail:], planes[stride + tail :], planes[2 * stride + tail :]
             short = 0
             changed = 0
             for i in range(n):
                 rest = columns.rest[first + i]
                 real = rest > 0.0
                 rest = rest if real else 1.0
-                dx, dy, dz = work[i], work[CHUNK + i], work[2 * CHUNK + i]
+                dx, dy, dz = x1[i] - x0[i], y1[i] - y0[i], z1[i] - z0[i]
                 squared = dx * dx + dy * dy + dz * dz
                 length = math.sqrt(squared if real else 1.0)
                 short += 0 if length / rest >= SHORTENED_STRETCH else 1  # NaN counts
@@ -636,11 +661,11 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
             if columns.close[group]:
                 for run in range(runs[group], runs[group + 1]):
                     at, count = sweep.heads[run] - heads[group], sweep.starts[run + 1] - sweep.starts[run]
-                    subtract_rows(sums, head + at, count, work, at)
-                    add_rows(sums, tail + at, count, work, at)
+                    subtract_rows(sums, stride, head + at, count, work, at)
+                    add_rows(sums, stride, tail + at, count, work, at)
             else:  # nodes that are both ends of bars receive forces by the number of the bar, as in single steps
-                add_rows(sums, tail, n, work, 0)
-                subtract_rows(sums, head, n, work, 0)
+                add_rows(sums, stride, tail, n, work, 0)
+                subtract_rows(sums, stride, head, n, work, 0)
         return failed, shortened
 
     return {"add_padded": add_padded if law.rupture < 0 else add_none, "padded_rows": 3 + n_rows}

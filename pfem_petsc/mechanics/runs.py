@@ -45,34 +45,6 @@ def copy(values, out):
 
 
 @borrowing
-def subtract(one, other, out):
-    """Write ``one`` - ``other`` to the first numbers of ``out``."""
-    for i in range(len(one)):
-        out[i] = one[i] - other[i]
-
-
-@borrowing
-def add_rows(sums, node, n, work, at):
-    """Add ``n`` vectors, in the first three rows of a workspace from ``at`` on, to the nodes of ``sums`` (3 stride,)
-    from ``node`` on."""
-    stride = len(sums) // 3
-    for c in range(3):
-        part, row = sums[c * stride + node : c * stride + node + n], work[c * CHUNK + at : c * CHUNK + at + n]
-        for i in range(len(part)):
-            part[i] += row[i]
-
-
-@borrowing
-def subtract_rows(sums, node, n, work, at):
-    """Subtract what :func:`add_rows` would add."""
-    stride = len(sums) // 3
-    for c in range(3):
-        part, row = sums[c * stride + node : c * stride + node + n], work[c * CHUNK + at : c * CHUNK + at + n]
-        for i in range(len(part)):
-            part[i] -= row[i]
-
-
-@borrowing
 def split_components(x, first, count, planes, stride, base):
     """Write the vectors of ``count`` nodes of ``x`` (n, 3), from ``first`` on, to ``planes`` (3 stride,), which begin
     at node ``base``."""
@@ -144,15 +116,15 @@ def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int
     firsts[-1] = stop
     diagonal = np.empty(len(firsts) - 1, dtype=np.bool_)
     chunks = np.empty(len(firsts), dtype=np.uint32)
-    none = np.empty(0, dtype=np.uint32)
-    runs = _find_runs(bars, firsts, False, diagonal, chunks, none, none, none)
+    none = (np.empty(0, dtype=np.uint32),) * 3
+    runs = _find_runs(bars, firsts, False, diagonal, chunks, none)
     short = np.diff(firsts.astype(np.int64))[~diagonal].sum()
     forced = bool(0 < short <= FEW * (stop - start))
     if forced:  # few bars: the others have faster loops if all chunks are alike
         diagonal[:] = True
-        runs = _find_runs(bars, firsts, True, diagonal, chunks, none, none, none)
+        runs = _find_runs(bars, firsts, True, diagonal, chunks, none)
     heads, fars, starts = (np.empty(n, dtype=np.uint32) for n in (runs, runs, runs + 1))
-    _find_runs(bars, firsts, forced, diagonal, chunks, heads, fars, starts)
+    _find_runs(bars, firsts, forced, diagonal, chunks, (heads, fars, starts))
     starts[runs] = stop
     chunks_counted = int(np.searchsorted(firsts[:-1], counted))
     lower = bars[firsts[:chunks_counted]].min(axis=1) // NODE_BLOCK
@@ -178,9 +150,10 @@ def _cut(bars, start, counted, stop, chunk, firsts):
 
 
 @kernel
-def _find_runs(bars, firsts, forced, diagonal, chunks, heads, fars, starts):
-    """Return the number of runs; write chunks, the first run of each, and the runs unless ``heads`` is empty, and which
-    chunks are ``diagonal``, unless ``forced``."""
+def _find_runs(bars, firsts, forced, diagonal, chunks, runs):
+    """Return the number of runs; write chunks, the first run of each, and the ``runs`` (heads, fars and starts) unless
+    they are empty, and which chunks are ``diagonal``, unless ``forced``."""
+    heads, fars, starts = runs
     count = 0
     for c in range(len(firsts) - 1):
         chunks[c] = count
@@ -341,10 +314,10 @@ def make_columns(sweep: Sweep, rest: np.ndarray, area: float | np.ndarray, rows:
     heads, fars, starts = (np.empty(groups + k, dtype=np.uint32) for k in (0, 0, 1))
     columns = _place_groups(sweep.heads, sweep.fars, sweep.starts, runs, heads, fars, starts)
     spread = aligned(columns)
-    _spread(rest, sweep.heads, sweep.starts, runs, heads, starts, NO_BAR, spread)
+    _spread(rest, sweep, (runs, heads, starts), NO_BAR, spread)
     if isinstance(area, np.ndarray):
         values, area = area, aligned(columns)
-        _spread(values, sweep.heads, sweep.starts, runs, heads, starts, 0.0, area)
+        _spread(values, sweep, (runs, heads, starts), 0.0, area)
     close = (fars - heads) < APART
     parts = np.searchsorted(runs, sweep.chunks[sweep.parts]).astype(np.int64)
     return Columns(heads, fars, starts, runs, close, spread, area, np.zeros((rows, columns)), counted, parts)
@@ -389,15 +362,16 @@ def _place_groups(run_heads, run_fars, run_starts, runs, heads, fars, starts):
 
 
 @kernel
-def _spread(values, run_heads, run_starts, runs, heads, starts, none, spread):
-    """Write the values of bars to their columns, and ``none`` to the others."""
+def _spread(values, sweep, groups, none, spread):
+    """Write the values of bars to their columns, and ``none`` to the others; ``groups``: runs, heads and starts."""
+    runs, heads, starts = groups
     for k in range(len(spread)):
         spread[k] = none
     for g in range(len(heads)):
         for run in range(runs[g], runs[g + 1]):
-            at = starts[g] + run_heads[run] - heads[g]
-            begin = run_starts[run]
-            for k in range(run_starts[run + 1] - begin):
+            at = starts[g] + sweep.heads[run] - heads[g]
+            begin = sweep.starts[run]
+            for k in range(sweep.starts[run + 1] - begin):
                 spread[at + k] = values[begin + k]
 
 

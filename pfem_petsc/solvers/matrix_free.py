@@ -360,8 +360,8 @@ class MatrixFreeHessian:
                 out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
         for block in bars.blocks:
             add_products(block.sweep, bars.far, self.x, self.stored, u, out)
-        if bars.springs is not None:
-            bars.springs.add_product(problem.balance.weight, u, out)
+        for family in bars.families:
+            family.add_product(problem.balance.weight, u, out)
         problem.transform.linear(self._left, u, out)
         if supports.any:
             supports.put(out, held)

@@ -300,8 +300,8 @@ class Law:
     mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p without data of bars, the
         change of stress and the internal variables before and after, (variables, bars), for the work of changing
         temperatures; None for zero
-    mean_of_work : whether ``mean_stress`` is the change of all energies over that of the strain, see :func:`mean_of_work`; it
-        then holds for the work of changing temperatures too
+    mean_of_work : whether ``mean_stress`` is the change of all energies over that of the strain, as by the function
+        :func:`mean_of_work`; it then holds for the work of changing temperatures too
     static_limit : for a law with ``rate``: whether it has a limit at the rate zero, which static analyses use; the
         step is then infinite
     softening : how the law softens by the key ``softening``; None: the key is rejected

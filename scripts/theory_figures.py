@@ -19,7 +19,7 @@ from pages import DOCS, finished
 from pfem_petsc import Case
 from pfem_petsc.columns import LOST, STORED, SUPPLIED
 from pfem_petsc.contact.projection import project
-from pfem_petsc.mechanics.conserving import MEASURES
+from pfem_petsc.mechanics.elements import MEASURES
 
 FOLDER = DOCS / "images" / "theory"
 # Okabe and Ito's colours, which colour-blind readers tell apart

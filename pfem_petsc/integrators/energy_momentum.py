@@ -2,7 +2,7 @@
 
     M (v1 - v0)/h + C (v0 + v1)/2 + f(x0, x1) = f_ext(t0 + h/2),   x1 - x0 = h (v0 + v1)/2,
 
-with f of :mod:`pfem_petsc.mechanics.conserving`. Second order; a free elastic truss conserves energy, linear and
+with f of :mod:`pfem_petsc.mechanics.elements`. Second order; a free elastic truss conserves energy, linear and
 angular momentum exactly (to the tolerance of the solver) at any step. The Hessian is unsymmetric.
 """
 

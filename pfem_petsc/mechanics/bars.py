@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,11 +14,11 @@ from ..columns import BAR_ENERGIES
 from ..errors import InputError
 from ..fields import STATUS
 from ..mesh.node_sets import group_hint
-from .bar_loops import bar_lengths, first_inverted, make_kernels
-from .columns import Sweep, make_sweep
-from .conserving import MEASURES, make_conserving_kernels
+from .elements import MEASURES, BarData, ElementFamily, MatrixRows, bar_lengths, first_inverted, make_loops
 from .materials.base import BarShapes, Law, UnsuitableBarError, internal_variables, law_of
+from .runs import Sweep, make_sweep
 from .rupture import breakable, limit_values, make_release
+from .springs import Springs
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from ..mesh.distribution import Block, DistributedMesh
     from ..mesh.slab import MeshSlab
     from .block_pattern import BlockPattern
-    from .springs import Springs
 
 
 def bar_shapes(section: Section, length: np.ndarray, area: np.ndarray) -> BarShapes:
@@ -162,8 +161,7 @@ class BarBlock:
     modulus: float
     history: np.ndarray
     sweep: Sweep
-    kernels: SimpleNamespace
-    conserving: SimpleNamespace | None
+    loops: SimpleNamespace
     release: Callable | None
 
     @property
@@ -216,8 +214,7 @@ def make_blocks(mesh: DistributedMesh, case: Case, lengths: np.ndarray) -> list[
                 modulus=material.upper_modulus(),
                 history=np.zeros((len(law.rows) + len(law.bar_data), block.stop - block.start)),
                 sweep=make_sweep(mesh.bars, block.start, block.counted, block.stop),
-                kernels=make_kernels(law, measure),
-                conserving=None if law.mean_stress is None else make_conserving_kernels(law, measure),
+                loops=make_loops(law, measure),
                 release=make_release(law_of(material), measure) if law.rupture >= 0 else None,
             )
         )
@@ -243,8 +240,6 @@ def _fill_bar_data(mesh: DistributedMesh, case: Case, block: BarBlock, lengths: 
 
 _LOADING = 1e-8  # relative change of all lengths that distinguishes the tangents of loading and unloading
 _KINK = 1e-6  # relative difference of these tangents above which the bar is at a kink of its law
-
-_OF_SPRINGS = BAR_ENERGIES.index("spring_energy")
 
 
 class StrainEnergy(NamedTuple):
@@ -287,16 +282,15 @@ class Bars:
     blocks : bars by section
     viscous : whether bars of the case have a viscous stress, the same on all ranks
     viscous_blocks : those of them on this rank
-    springs : from nodes to the ground, whose forces and stiffness are added to those of the bars; None without
+    families : other elements, whose forces and stiffness are added to those of the bars
     """
-
-    springs: Springs | None = None
 
     def __init__(self, mesh: DistributedMesh, case: Case) -> None:
         self.mesh, self.case = mesh, case
         self.ends = mesh.bars
         self.mesh_lengths = np.empty(len(mesh.bars))
         bar_lengths(mesh.points, mesh.bars, self.mesh_lengths)
+        self.families: list[ElementFamily] = []
         self.rest = self.mesh_lengths
         self.rest_at_start = np.empty(0)
         self.heat = np.empty((2, 0))
@@ -314,6 +308,11 @@ class Bars:
         count = 0 if all(block.sweep.diagonal.all() for block in self.blocks) else len(mesh.bars)
         self.far = np.empty(count, dtype=np.uint32)
         np.maximum(mesh.bars[:count, 0], mesh.bars[:count, 1], out=self.far, casting="unsafe")
+
+    @property
+    def springs(self) -> Springs | None:
+        """Springs from nodes to the ground; None without."""
+        return next((family for family in self.families if isinstance(family, Springs)), None)
 
     @property
     def slackens(self) -> bool:
@@ -341,9 +340,28 @@ class Bars:
             status[self.rupture() != 0.0] = STATUS.index("broken")
         return status
 
-    def _arguments(self, x: np.ndarray, block: BarBlock) -> tuple:
-        law = (block.parameters, block.area, self.step, block.history)
-        return (x, self.ends, self.rest, self.heat, *law)
+    def data(self, block: BarBlock, history: np.ndarray | None = None) -> BarData:
+        """Return the bars of a block as compiled loops read them; ``history``: instead of the block's own."""
+        return BarData(
+            np.uint64(block.start),
+            np.uint64(block.stop),
+            self.ends,
+            self.far,
+            block.sweep,
+            self.rest,
+            self.heat,
+            self.rest_at_start,
+            self.heat_at_start,
+            block.parameters,
+            block.area,
+            self.step,
+            block.history if history is None else history,
+        )
+
+    def _for_blocks(self, loop: str, x: np.ndarray, out: Any) -> None:
+        """Call a loop over the bars of each block."""
+        for block in self.blocks:
+            getattr(block.loops, loop)(x, self.data(block), out)
 
     def forces(self, x: np.ndarray, f: np.ndarray, commit: bool) -> StrainEnergy:
         """Compute internal forces ``f`` (local nodes, 3) [N] at positions ``x``; valid for owned nodes. Internal
@@ -352,18 +370,15 @@ class Bars:
         energies = np.zeros(len(BAR_ENERGIES))
         failed, shortened, changed = -1, False, 0
         for block in self.blocks:
-            law = (block.parameters, block.area, self.step, block.history)
             part = np.zeros(len(BAR_ENERGIES))
-            at, short, broke = block.kernels.forces(
-                x, block.sweep, self.far, self.rest, self.heat, *law, commit, f, part
-            )
+            at, short, broke = block.loops.forces(x, self.data(block), commit, f, part)
             energies += part
             shortened |= short
             changed += broke
             if failed < 0:
                 failed = at
-        if self.springs is not None:
-            energies[_OF_SPRINGS] = self.springs.add_forces(x, f)
+        for family in self.families:
+            energies[BAR_ENERGIES.index(family.energy)] += family.add_forces(x, f)
         return StrainEnergy(tuple(energies.tolist()), failed, shortened, changed)
 
     def set_rates(self, x0: np.ndarray, x: np.ndarray, v: np.ndarray, eta: float) -> None:
@@ -371,8 +386,7 @@ class Bars:
         strain; all (local nodes, 3), with ghosts, and ``x0`` at the start of the step. ``x`` is held fixed for eta = 0.
         """
         for block in self.viscous_blocks:
-            geometry = (self.ends, self.rest, self.heat)
-            block.kernels.rates(x0, x, v, *geometry, eta, self.step, block.history, block.start, block.stop)
+            block.loops.rates(x, self.data(block), (x0, v, eta))
             if self.step > 0.0:
                 block.parameters = (*block.parameters[:-1], eta * self.step)
 
@@ -412,25 +426,15 @@ class Bars:
     ) -> None:
         """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to the values of a matrix."""
         for block, m in zip(self.blocks, inertia, strict=True):
-            block.kernels.tangents(
-                *self._arguments(x, block),
-                block.start,
-                block.stop,
-                m,
-                self.mesh_lengths,
-                weight,
-                pattern.ptr,
-                pattern.slots,
-                values,
-            )
-        if self.springs is not None:
-            self.springs.add_tangents(weight, pattern, values)
+            rows = MatrixRows(weight, m, self.mesh_lengths, pattern.ptr, pattern.slots, values)
+            block.loops.tangents(x, self.data(block), rows)
+        for family in self.families:
+            family.add_tangents(weight, pattern, values)
 
     def linearise(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
         """Fill ``stored`` (5, b) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, for each bar at ``x``;
         without springs."""
-        for block in self.blocks:
-            block.kernels.linearise(*self._arguments(x, block), block.start, block.stop, weight, stored)
+        self._for_blocks("linearise", x, (weight, stored))
 
     def state_stiffness(self, x: np.ndarray) -> np.ndarray:
         """Return the stiffness of the bars (5, b) in the state at ``x``, as :meth:`linearise`.
@@ -454,17 +458,14 @@ class Bars:
         """Fill ``stored`` (2, b) with c = (dN/dl - N/l)/l^2 [N/m3] and g = N/l [N/m], times ``weight``: the stiffness
         of a bar with end difference d is c d d^T + g I; without springs."""
         for block in self.blocks:
-            law = (block.parameters, block.area, self.step, block.history)
-            block.kernels.stiffnesses(x, block.sweep, self.far, self.rest, self.heat, *law, weight, stored)
+            block.loops.stiffnesses(x, self.data(block), weight, stored)
 
     def step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
         """Compute discrete-gradient forces ``f`` (local nodes, 3) [N] of a step from ``x0`` to ``x``."""
         f[:] = 0.0
-        for block in self.blocks:
-            arguments = self._arguments(x, block)
-            block.conserving.forces(x0, self.heat_at_start, self.rest_at_start, *arguments, block.start, block.stop, f)
-        if self.springs is not None:
-            self.springs.add_step_forces(x0, x, f)
+        self._for_blocks("step_forces", x, (x0, f))
+        for family in self.families:
+            family.add_step_forces(x0, x, f)
 
     def step_tangents(
         self,
@@ -477,19 +478,17 @@ class Bars:
     ) -> None:
         """As :meth:`tangents`, for :meth:`step_forces`."""
         for block, m in zip(self.blocks, inertia, strict=True):
-            start = (x0, self.heat_at_start, self.rest_at_start)
-            arguments = (*start, *self._arguments(x, block), block.start, block.stop)
-            block.conserving.tangents(*arguments, m, self.mesh_lengths, weight, pattern.ptr, pattern.slots, values)
-        if self.springs is not None:  # the force at mid-step
-            self.springs.add_tangents(0.5 * weight, pattern, values)
+            rows = MatrixRows(weight, m, self.mesh_lengths, pattern.ptr, pattern.slots, values)
+            block.loops.step_tangents(x, self.data(block), (x0, rows))
+        for family in self.families:  # the force at mid-step
+            family.add_tangents(0.5 * weight, pattern, values)
 
     def product(self, x: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
         """Compute ``out`` = K_t(x) u for local arrays (nodes, 3); valid for owned nodes."""
         out[:] = 0.0
-        for block in self.blocks:
-            block.kernels.product(*self._arguments(x, block), block.start, block.stop, u, out)
-        if self.springs is not None:
-            self.springs.add_product(1.0, u, out)
+        self._for_blocks("product", x, (u, out))
+        for family in self.families:
+            family.add_product(1.0, u, out)
 
     def lengths(self, x: np.ndarray) -> np.ndarray:
         """Return the length (b,) of each local bar [m]."""
@@ -527,8 +526,7 @@ class Bars:
         out = {name: np.empty(len(self.ends)) for name in ("strain", "stress", "axial_force")}
         out |= {name: np.zeros(len(self.ends)) for name in ("plastic_strain", *self.internal)}
         for block in self.blocks:
-            arguments = (*self._arguments(x, block), block.start, block.stop)
-            block.kernels.fields(*arguments, out["strain"], out["stress"], out["axial_force"])
+            block.loops.fields(x, self.data(block), (out["strain"], out["stress"], out["axial_force"]))
             for name, _, values in block.variables():
                 if name in out:
                     out[name][block.start : block.stop] = values
@@ -537,8 +535,7 @@ class Bars:
     def densities(self, x: np.ndarray) -> np.ndarray:
         """Return stored and dissipated energy per rest volume (b,) [J/m3] at the end of the last step."""
         out = np.zeros(len(self.ends))
-        for block in self.blocks:
-            block.kernels.densities(*self._arguments(x, block), block.start, block.stop, out)
+        self._for_blocks("densities", x, out)
         return out
 
     def history(self) -> np.ndarray:
@@ -589,8 +586,10 @@ def state_before_rupture(bars: Bars, x: np.ndarray, bar: int) -> tuple[BarBlock,
     history = block.history[:, k : k + 1].copy()
     history[block.law.rupture] = 0.0
     strain, stress, force = (np.zeros(bar + 1) for _ in range(3))
-    arguments = (x, bars.ends, bars.rest, bars.heat, block.parameters, block.area, bars.step, history)
-    block.kernels.fields(*arguments, bar, bar + 1, strain, stress, force)
+    one = bars.data(block, history)._replace(start=np.uint64(bar), stop=np.uint64(bar + 1))
+    if not isinstance(block.area, float):
+        one = one._replace(area=block.area[k : k + 1])
+    block.loops.fields(x, one, (strain, stress, force))
     shift = bars.heat[0, bar] if bars.heat.shape[1] else 0.0
     return block, history[:, 0], float(stress[bar]), float(strain[bar] - shift)
 
@@ -602,8 +601,7 @@ def release(bars: Bars, x: np.ndarray, members: np.ndarray, state: float) -> np.
     for block in bars.blocks:
         mine = members[(members >= block.start) & (members < block.stop)].astype(np.int64)
         moved = np.zeros(len(block.law.energies) - 1)
-        law = (block.parameters, block.area, block.history, block.start)
-        block.release(x, bars.ends, bars.rest, bars.heat, *law, mine, state, block.counted, moved)
+        block.release(x, bars.data(block), mine, state, block.counted, moved)
         for name, energy in zip(block.law.energies, moved.tolist(), strict=False):
             change[BAR_ENERGIES.index(name)] -= energy
             change[BAR_ENERGIES.index("rupture_dissipation")] += energy

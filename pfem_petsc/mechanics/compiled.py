@@ -150,7 +150,7 @@ def _warn_once(text: str) -> None:
 def _variant(function: Callable[..., Any]) -> str:
     """Return the names of the functions in modules from which a loop was made: ``elastic.response-strain.green``.
 
-    Functions that a base or private module of laws makes from others add the name of what makes them, ``base.damped``.
+    Laws that are made from others add the name of what makes them, ``base.damped``.
     """
     found: list[str] = []
     seen: set[int] = set()
@@ -163,8 +163,9 @@ def _variant(function: Callable[..., Any]) -> str:
         if inner is not function and "<locals>" not in inner.__qualname__:
             found.append(f"{inner.__module__.rpartition('.')[2]}.{inner.__name__}")
             return
-        module, maker = inner.__module__.rpartition(".")[2], inner.__qualname__.partition(".")[0]
-        if (module == "base" or module.startswith("_")) and f"{module}.{maker}" not in found:
+        package, _, module = inner.__module__.rpartition(".")
+        maker = inner.__qualname__.partition(".")[0]
+        if package.endswith(".materials") and f"{module}.{maker}" not in found:
             found.append(f"{module}.{maker}")
         for cell in inner.__closure__ or ():
             walk(cell.cell_contents)

@@ -14,7 +14,7 @@ import numpy as np
 
 from .compiled import kernel
 from .motion import Table
-from .rows import bar_value
+from .tuples import bar_value
 
 if TYPE_CHECKING:
     from ..case.schema import Case

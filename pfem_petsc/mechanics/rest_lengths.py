@@ -12,8 +12,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.node_sets import group_hint
-from .bar_loops import COLLAPSED_STRETCH, no_variables
-from .conserving import MEASURES
+from .elements import COLLAPSED_STRETCH, MEASURES, virgin
 from .materials.base import law_of
 from .motion import Table
 from .rupture import intact
@@ -174,12 +173,12 @@ def stretch_of(law: Law, measure: Callable, parameters: tuple[float, ...], targe
     if target == 0.0:
         return 1.0
     law, parameters = intact(law, parameters)
-    response, virgin = law.response, no_variables(law)
+    response, start = law.response, virgin(law)
     stretch = kept = 1.0
     best = miss = math.inf
     for _ in range(_ITERATIONS):
         strain, slope, curvature = measure(stretch)
-        stress, modulus, _, _ = response(strain, 0.0, 0.0, 0.0, parameters, virgin)
+        stress, modulus, _, _ = response(strain, 0.0, 0.0, 0.0, parameters, start)
         found, tangent = stress, modulus * slope
         if as_force:
             found, tangent = stress * slope, modulus * slope**2 + stress * curvature
@@ -199,7 +198,7 @@ def stretch_of(law: Law, measure: Callable, parameters: tuple[float, ...], targe
     if not best <= max(1e-9 * abs(target), 4.0 * np.finfo(float).eps * abs(tangent)) and miss != 0.0:
         raise ValueError("the material law does not reach it at any length; give a smaller one")
     strain, _, _ = measure(stretch)
-    _, _, _, densities = response(strain, 0.0, 0.0, 0.0, parameters, virgin)
+    _, _, _, densities = response(strain, 0.0, 0.0, 0.0, parameters, start)
     energies = dict(zip(law.energies, densities, strict=True))
     elastic = energies.pop("elastic_energy", 0.0)
     if any(abs(density) > 1e-12 * abs(elastic) for density in energies.values()):

@@ -26,10 +26,10 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ..columns import STORED
-from .bar_loops import no_bar_data, no_variables
-from .compiled import inlined, kernel
+from .compiled import borrowing, inlined, kernel
+from .elements import end_difference, length_of
 from .materials.base import Law
-from .rows import bar_value, blend, extend, keep_where, put, sum_where, sum_with, take
+from .tuples import bar_value, blend, sum_with, take, take_from, written_out
 
 if TYPE_CHECKING:
     from ..case.tables import Rupture
@@ -99,43 +99,43 @@ def breakable(law: Law) -> Law:
 def make_release(law: Law, measure: Callable[..., Any]) -> Callable[..., Any]:
     """Make the loop that removes a share of bars, for a law that is not breakable itself; see :func:`breakable`.
 
-    Its arguments are those of the loops in :mod:`~pfem_petsc.mechanics.bar_loops`; ``members``, the local bars; the
-    state -r that they are to have, if they have not left further; ``counted``, the end of the bars counted on this
-    rank; and ``moved``, to which the stored energies that are released [J] are added, one for each energy of the law.
+    Its arguments are positions and the bars, as for the loops in :mod:`~pfem_petsc.mechanics.elements`; ``members``,
+    the local bars; the state -r that they are to have, if they have not left further; ``counted``, the end of the bars
+    counted on this rank; and ``moved``, to which the stored energies that are released [J] are added, one for each
+    energy of the law.
     """
-    count, like = len(law.internal), no_variables(law)
-    stored = np.array([name in STORED for name in law.energies])
-    n_energies = len(stored)
-    respond, first, of_law, of_bar = law.response, count + 1, _OF_LAW, no_bar_data(law)
-    n_rows = len(breakable(law).rows)
+    count = len(law.internal)
+    stored = tuple(name in STORED for name in law.energies)
+    n_energies, n_rows = len(stored), len(breakable(law).rows)
+    respond, first, of_law, n_data = law.response, count + 1, _OF_LAW, len(law.bar_data)
+    variables_of, data_of = take(count), take_from(n_data)
+
+    @borrowing
+    def densities_of(x, bars, k, column):
+        strain, _, _ = measure(length_of(end_difference(x, bars, k)) / bars.rest[k])
+        warmth = 0.0
+        if bars.heat.shape[1] > 0:
+            strain -= bars.heat[0, k]
+            warmth = bars.heat[1, k]
+        p = bars.parameters[of_law:]
+        given = p + data_of(bars.history, n_rows, column) if n_data else p
+        _, _, _, densities = respond(strain, 0.0, 0.0, warmth, given, variables_of(bars.history, column))
+        return densities
 
     @kernel
-    def release(x, bars, rest, heat, p, area, history, start, members, state, counted, moved):
-        work = np.zeros((n_energies, 1))
+    def release(x, bars, members, state, counted, moved):
         for k in members:
-            column = k - start
-            now = abs(history[count, column])
+            column = k - np.int64(bars.start)
+            now = abs(bars.history[count, column])
             if now >= state:
                 continue
-            a = bars[k, 0]
-            b = bars[k, 1]
-            dx = x[b, 0] - x[a, 0]
-            dy = x[b, 1] - x[a, 1]
-            dz = x[b, 2] - x[a, 2]
-            strain, _, _ = measure(math.sqrt(dx * dx + dy * dy + dz * dz) / rest[k])
-            warmth = 0.0
-            if heat.shape[1] > 0:
-                strain -= heat[0, k]
-                warmth = heat[1, k]
-            given = extend(p, history, n_rows, column, of_bar)
-            _, _, _, densities = respond(strain, 0.0, 0.0, warmth, given[of_law:], take(history, column, like))
-            put(work, 0, 0, densities)
+            densities = densities_of(x, bars, k, column)
             for j in range(n_energies):
-                lost = (state - now) * work[j, 0]
-                history[first + j, column] += lost
+                lost = (state - now) * densities[j]
+                bars.history[first + j, column] += lost
                 if stored[j] and k < counted:
-                    moved[j] += bar_value(area, column) * rest[k] * lost
-            history[count, column] = -state
+                    moved[j] += bar_value(bars.area, column) * bars.rest[k] * lost
+            bars.history[count, column] = -state
 
     return release
 
@@ -153,8 +153,12 @@ def _response(
     ``plastic``, ``damage``: places of the variables with a limit, or -1; ``stored``: which energies bars store.
     """
     first, of_law = count + 1, _OF_LAW
-    released, dissipated = sum_where(stored), keep_where(tuple(not part for part in stored))
+    parts = [f"values[{j}]" if part else "0.0" for j, part in enumerate(stored)]
+    others = ["0.0" if part else f"values[{j}]" for j, part in enumerate(stored)]
+    released = written_out("def function(values): return " + " + ".join(part for part in parts if part != "0.0"), 0)
+    dissipated = written_out("def function(values): return (" + "".join(f"{part}, " for part in others) + ")", 0)
     none = (0.0,) * len(stored)
+    choose, choose_new, add = blend(len(stored)), blend(count), sum_with(len(stored))
     by_plastic, by_damage = plastic >= 0, damage >= 0
     plastic, damage = max(plastic, 0), max(damage, 0)
 
@@ -173,12 +177,12 @@ def _response(
         after = state + p[6] if breaks else state
         after = 1.0 if after > WHOLE else after
         remaining = 1.0 - abs(after)
-        densities = blend(there, densities, none)
-        kept = sum_with(q[first:], left - remaining, densities)
-        shown = sum_with(dissipated(kept), remaining, densities)
+        densities = choose(there, densities, none)
+        kept = add(q[first:], left - remaining, densities)
+        shown = add(dissipated(kept), remaining, densities)
         stress = left * stress if there else 0.0
         tangent = left * tangent if there else 0.0
-        new = blend(there, new, q[:count])
+        new = choose_new(there, new, q[:count])
         return stress, tangent, new + (after,) + kept, shown + (released(kept),)  # noqa: RUF005 - tuples of Numba
 
     return response

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Springs:
-    """Springs of the nodes that this rank owns.
+    """Springs of the nodes that this rank owns, an :class:`~pfem_petsc.mechanics.elements.ElementFamily`.
 
     Attributes
     ----------
@@ -31,11 +31,13 @@ class Springs:
     anchors : (m, 3) positions without force [m]
     """
 
+    energy = "spring_energy"
+
     def __init__(self, nodes: np.ndarray, stiffness: np.ndarray, anchors: np.ndarray) -> None:
         self.nodes, self.stiffness, self.anchors = nodes, stiffness, anchors
 
     def add_forces(self, x: np.ndarray, f: np.ndarray) -> float:
-        """Add the internal forces at positions ``x`` to ``f``, both (local, 3); return the stored energy [J]."""
+        """Add the internal forces, and return the stored energy [J]."""
         stretch = x[self.nodes] - self.anchors
         force = self._times(stretch)
         f[self.nodes] += force
@@ -46,7 +48,7 @@ class Springs:
         f[self.nodes] += self._times(0.5 * (x0[self.nodes] + x[self.nodes]) - self.anchors)
 
     def add_product(self, weight: float, u: np.ndarray, out: np.ndarray) -> None:
-        """Add ``weight`` times the stiffness times ``u`` to ``out``, with a row for each owned node at least."""
+        """Add ``weight`` times the stiffness times ``u``."""
         out[self.nodes] += weight * self._times(u[self.nodes])
 
     def add_tangents(self, weight: float, pattern: BlockPattern, values: np.ndarray) -> None:

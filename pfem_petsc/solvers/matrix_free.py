@@ -163,7 +163,7 @@ def inertia_products(nodal, u, out):
 
 @kernel
 def add_products(sweep, far, x, stored, u, out):
-    """Add K u to ``out``, chunk by chunk of a :class:`~pfem_petsc.mechanics.columns.Sweep`."""
+    """Add K u to ``out``, chunk by chunk of a :class:`~pfem_petsc.mechanics.runs.Sweep`."""
     heads, fars, starts, chunks = sweep.heads, sweep.fars, sweep.starts, sweep.chunks
     for chunk in range(len(sweep.diagonal)):
         if not sweep.diagonal[chunk]:
@@ -359,8 +359,8 @@ class MatrixFreeHessian:
                 out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
         for block in bars.blocks:
             add_products(block.sweep, bars.far, self.x, self.stored, u, out)
-        if bars.springs is not None:
-            bars.springs.add_product(problem.balance.weight, u, out)
+        for family in bars.families:
+            family.add_product(problem.balance.weight, u, out)
         problem.transform.linear(self._left, u, out)
         if supports.any:
             supports.put(out, held)

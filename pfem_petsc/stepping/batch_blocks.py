@@ -14,8 +14,8 @@ from ..contact.explicit import find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows, solve_rows
 from ..contact.impact import Approach, join_nodes, plane_gaps, stop_nodes, unpressed
 from ..integrators._leapfrog import advance, advance_loaded, centre, kick, move
-from ..mechanics.columns import join_planes, split_planes
 from ..mechanics.compiled import borrowing, kernel
+from ..mechanics.runs import join_components, split_components
 from ..mesh.ordering import NODE_BLOCK
 from .explicit import accelerations, explicit_increments, hold_still
 from .impulses import WALLS, fill_impulses
@@ -60,7 +60,7 @@ def split_block(first, last, x, planes, pulls, base):
     """Write the positions of nodes [first, last) to ``planes`` (3 stride,), which begin at node ``base``, and set their
     forces in ``pulls`` (3 stride,) to zero."""
     stride = len(planes) // 3
-    split_planes(x, first, last - first, planes, stride, base)
+    split_components(x, first, last - first, planes, stride, base)
     for c in range(3):
         part = pulls[c * stride + first - base : c * stride + last - base]
         for i in range(len(part)):
@@ -71,7 +71,7 @@ def split_block(first, last, x, planes, pulls, base):
 def join_block(block, n, pulls, base, f, start):
     """Write the forces of the nodes of a block from ``pulls``."""
     first = NODE_BLOCK * block
-    join_planes(pulls, len(pulls) // 3, base, first, min(NODE_BLOCK, n - first), f, first - start)
+    join_components(pulls, base, first, f[first - start : min(first + NODE_BLOCK, n) - start])
 
 
 @borrowing
@@ -451,7 +451,7 @@ def fill_row(
     if bars.slack >= 0:
         slack = 0.0
         for k in range(bars.counted):
-            slack += bars.history[bars.slack, k]
+            slack += bars.data.history[bars.slack, k]
         row[_SLACK] = slack
     at = _HEAD
     force, moment, contacts, releases = wall_sums

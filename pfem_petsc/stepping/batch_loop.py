@@ -11,10 +11,10 @@ import numpy as np
 from ..columns import HEAD
 from ..contact.forces import compare_contacts
 from ..integrators._leapfrog import centre
-from ..mechanics.bar_loops import first_inverted
-from ..mechanics.columns import Columns, Sweep, gather_history, slide_planes, spread_history
 from ..mechanics.compiled import borrowing, kernel
-from ..mechanics.rows import CHUNK, new_rows
+from ..mechanics.elements import BarData, first_inverted
+from ..mechanics.runs import Columns, exchange_history, new_rows, slide_planes
+from ..mechanics.tuples import CHUNK
 from ..mesh.ordering import NODE_BLOCK
 from .batch_blocks import (
     advance_block,
@@ -54,20 +54,13 @@ from .ledger_loops import (
 
 
 class BarArrays(NamedTuple):
-    """Arguments of the bar loop of a law; see :mod:`~pfem_petsc.mechanics.kernels`. ``slack``: row of the history with
-    the variable of this name, or -1; ``counted``: columns of the history that belong to counted bars; ``reach``: how
+    """The bars of a batch: ``data`` of all of them; ``watched``, see ``Bars``; ``slack``: row of the history with the
+    variable of this name, or -1; ``counted``: columns of the history that belong to counted bars; ``reach``: how
     many blocks of nodes beyond its own the bars of a block reach; ``columns`` of the bars, or none; ``planes`` and
     ``pulls`` (3 stride,): positions and forces by components, of a window of the nodes."""
 
-    ends: np.ndarray
-    sweep: Sweep
-    far: np.ndarray
-    rest: np.ndarray
+    data: BarData
     watched: np.ndarray
-    heat: np.ndarray
-    parameters: tuple
-    area: float | np.ndarray
-    history: np.ndarray
     slack: int
     counted: int
     reach: int
@@ -166,19 +159,19 @@ _IMPACT = HEAD.first("impact_dissipation")
 
 @cache
 def make_fused_loop(
-    forces: Callable,
+    add_forces: Callable,
     sum_energies: Callable,
     clear_energies: Callable,
     work_rows: int,
-    pull_columns: Callable,
-    column_rows: int,
+    add_padded: Callable,
+    padded_rows: int,
 ) -> Callable:
     """Return the fused loop for a law and strain measure.
 
-    ``forces`` is the bar loop over a part of a sweep, with the functions for its energies and the number of its working
-    arrays; ``pull_columns``, with ``column_rows`` working arrays, is the loop over columns, for steps
+    ``add_forces`` is the bar loop over a part of a sweep, with the functions for its energies and the number of its
+    working arrays; ``add_padded``, with ``padded_rows`` working arrays, is the loop over columns, for steps
     whose energies nothing reads; see
-    :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
+    :func:`~pfem_petsc.mechanics.elements.make_loops`.
 
     Its arguments are the maximum number of steps; the step [s]; positions, positions of the previous step, which are
     computed for the last step alone, and velocities at half steps (n, 3); arrays of bars, nodes, walls, rows between
@@ -196,26 +189,19 @@ def make_fused_loop(
     """
 
     @borrowing
-    def pull(x, bars, begun, ended, h, f, work):
+    def pull(x, bars, begun, ended, f, work):
         """Add the forces of some chunks of bars."""
-        law = (bars.parameters, bars.area, h, bars.history)
-        return forces(x, bars.sweep, begun, ended, bars.far, bars.rest, bars.heat, *law, True, f, work)
+        return add_forces(x, bars.data, begun, ended, True, f, work)
 
     @borrowing
-    def pull_light(x, bars, base, begun, ended, h, work):
-        """Add the forces of some groups of columns to the planes."""
-        law = (bars.parameters, h)
-        return pull_columns(x, bars.planes, bars.pulls, base, bars.sweep, bars.columns, begun, ended, *law, work)
-
-    @borrowing
-    def pull_again(x, n, bars, h, f, work, aside):
+    def pull_again(x, n, bars, f, work, aside):
         """Compute all forces in the order of a step."""
         flat = f.reshape(-1)
         for j in range(len(flat)):
             flat[j] = 0.0
         if len(x) > n:
-            pull(x, bars, bars.sweep.counted, len(bars.sweep.diagonal), h, f, aside)
-        pull(x, bars, 0, bars.sweep.counted, h, f, work)
+            pull(x, bars, bars.data.sweep.counted, len(bars.data.sweep.diagonal), f, aside)
+        pull(x, bars, 0, bars.data.sweep.counted, f, work)
 
     @kernel
     def fused_loop(
@@ -260,7 +246,7 @@ def make_fused_loop(
         after = np.empty(len(WORKS))
         numbers, buffers = (h, alpha, eta), (factors, speeds, drag)
         shared = BlockArrays(*numbers, x, half, inverses, *buffers, held, load, support, lanes)
-        work, columns_work = np.empty(work_rows * CHUNK), new_rows(column_rows)
+        work, columns_work = np.empty(work_rows * CHUNK), new_rows(padded_rows)
         pulled = np.empty((NODE_BLOCK, 3))  # forces of a block
         push_u = np.empty(impulses.v.shape)
         near = touched  # nodes with entries in the array of wall forces
@@ -271,7 +257,7 @@ def make_fused_loop(
         for block in range(n_blocks if linked else 0):
             alone[block] = not (damped or rows.near[block])
         # fields that loops over blocks would count references to
-        planes, pulls, parts, chunks = bars.planes, bars.pulls, bars.columns.parts, bars.sweep.parts
+        planes, pulls, parts, chunks = bars.planes, bars.pulls, bars.columns.parts, bars.data.sweep.parts
         room_for, reach = len(planes) // 3, bars.reach
         failed = -1
         turned = -1
@@ -306,14 +292,11 @@ def make_fused_loop(
             # nothing reads the energies of other steps: a failure ends the run
             light = len(parts) > 0 and not (due[step] or step == count - 1)
             if light != spread:
-                if light:
-                    spread_history(bars.sweep, bars.columns, bars.history)
-                else:
-                    gather_history(bars.sweep, bars.columns, bars.history)
+                exchange_history(bars.data.sweep, bars.columns, bars.data.history, spread)
                 spread = light
             # Forces that nothing reads stay in the cache. The check of shortened bars reads them, as the next one is
             # likely to; those of laws with history could not be computed again. Blocks that wait for rows need them.
-            brief = light and not shortened and len(bars.history) == 0 and not linked
+            brief = light and not shortened and len(bars.data.history) == 0 and not linked
             forces = pulled if brief else f
             shortened = False
             if several:
@@ -347,10 +330,10 @@ def make_fused_loop(
                     if light:
                         split_block(n, len(x), x, planes, pulls, base)
                         groups = (bars.columns.counted, len(bars.columns.heads))
-                        at, short = pull_light(x, bars, base, *groups, h, columns_work)
+                        at, short = add_padded(x, bars, base, *groups, columns_work)
                     else:
-                        groups = (bars.sweep.counted, len(bars.sweep.diagonal))
-                        at, short, broke = pull(x, bars, *groups, h, f, aside)
+                        groups = (bars.data.sweep.counted, len(bars.data.sweep.diagonal))
+                        at, short, broke = pull(x, bars, *groups, f, aside)
                     failed = at if at >= 0 else failed
                     shortened = shortened or short
                     changed += broke
@@ -368,12 +351,12 @@ def make_fused_loop(
                 start = NODE_BLOCK * block if brief else 0
                 if light:
                     if block < len(parts) - 1:
-                        at, short = pull_light(x, bars, base, parts[block], parts[block + 1], h, columns_work)
+                        at, short = add_padded(x, bars, base, parts[block], parts[block + 1], columns_work)
                         failed = at if failed < 0 else failed
                         shortened = shortened or short
                     join_block(block, n, pulls, base, forces, start)
                 elif block < len(chunks) - 1:
-                    at, short, broke = pull(x, bars, chunks[block], chunks[block + 1], h, f, work)
+                    at, short, broke = pull(x, bars, chunks[block], chunks[block + 1], f, work)
                     failed = at if failed < 0 else failed
                     shortened = shortened or short
                     changed += broke
@@ -434,16 +417,16 @@ def make_fused_loop(
             if due[step] or shortened or wrong or step == count - 1:
                 turned = -1
                 if brief:
-                    pull_again(x, n, bars, h, f, work, aside)
+                    pull_again(x, n, bars, f, work, aside)
                 complete(n, f, half, nodes, alpha, eta, alone, held, stiffness, u, a, v)
                 if shortened or wrong or step == count - 1:
                     start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
                 if failed < 0 and shortened:
-                    turned = first_inverted(x, before, bars.ends, bars.watched)
+                    turned = first_inverted(x, before, bars.data.ends, bars.watched)
                 wrong = wrong or turned >= 0
             if due[step] or wrong or step == count - 1:
                 if light:
-                    gather_history(bars.sweep, bars.columns, bars.history)
+                    exchange_history(bars.data.sweep, bars.columns, bars.data.history, True)
                     spread = False
                 else:
                     for k in range(len(energies)):

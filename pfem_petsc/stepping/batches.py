@@ -10,9 +10,9 @@ from mpi4py import MPI
 from ..columns import ENERGIES, HEAD, WALL
 from ..contact.forces import WallForces
 from ..errors import SimulationFailure
-from ..mechanics.bar_loops import fused_parts
 from ..mechanics.bars import StrainEnergy
-from ..mechanics.columns import Columns, make_columns, new_planes, no_columns
+from ..mechanics.elements import batch_parts
+from ..mechanics.runs import Columns, make_columns, new_planes, no_columns
 from ..mesh.ordering import NODE_BLOCK
 from ..parallel.heap import return_freed_memory
 from ..tolerances import PROJECTED
@@ -50,15 +50,13 @@ class Batch:
         model = stepper.model
         self.model = model
         block = model.bars.blocks[0]
-        self._loop = make_fused_loop(*fused_parts(block.kernels))
+        self._loop = make_fused_loop(*batch_parts(block.loops))
         bars = model.bars
-        law = (bars.far, bars.rest, bars.watched, bars.heat, block.parameters, block.area, block.history)
         counted = block.counted - block.start
         reach, columns = self._reach(), self._columns()
         self._bars = BarArrays(
-            bars.ends,
-            block.sweep,
-            *law,
+            bars.data(block)._replace(step=stepper.h),
+            bars.watched,
             block.law.slack_row,
             counted,
             reach,

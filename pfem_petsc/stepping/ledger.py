@@ -11,7 +11,7 @@ from mpi4py import MPI
 from ..columns import ENERGIES, HEAD
 from ..contact.impact import Impacts
 from ..mechanics.bars import StrainEnergy, state_before_rupture
-from ..mechanics.conserving import MEASURES
+from ..mechanics.elements import MEASURES
 from ..mechanics.materials.base import SMALL
 from .impulses import Impulses, NoImpulses, wall_shares
 from .ledger_loops import (

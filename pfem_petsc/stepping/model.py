@@ -17,9 +17,9 @@ from ..mechanics.compiled import kernel
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia, PointInertia
 from ..mechanics.rest_lengths import RestLengths, Temperatures
-from ..mechanics.rows import bar_value
 from ..mechanics.springs import add_connectors, connected, make_springs, with_connectors
 from ..mechanics.supports import Supports
+from ..mechanics.tuples import bar_value
 from ..mesh import load_slab
 from ..mesh.distribution import distribute
 from ..mesh.node_sets import resolve_node_sets
@@ -144,7 +144,9 @@ class Model:
             self.warnings.append(f"{adjusted} node{'s' * (adjusted > 1)} that started beyond walls moved onto them")
         with agreed(comm):
             self.bars = Bars(mesh, with_connectors(case))
-        self.bars.springs = make_springs(case, self.nodes, mesh)
+        springs = make_springs(case, self.nodes, mesh)
+        if springs is not None:
+            self.bars.families.append(springs)
         self.inertia = Inertia(mesh, self.bars, case.mass == "consistent", PointInertia(case, self.nodes, mesh))
         if case.time is not None:
             self.inertia.vary(case.time.damping_table)
@@ -237,7 +239,7 @@ class Model:
     @property
     def constant(self) -> bool:
         """Whether supports, loads and bars are constant in time, bars of one section, and walls flat and at rest."""
-        changing = self.supports.moving or self.bars_vary or self.bars.springs is not None or self.inertia.varies
+        changing = self.supports.moving or self.bars_vary or bool(self.bars.families) or self.inertia.varies
         return not changing and len(self.bars.blocks) == 1 and self.external.steady and self.contact.steady
 
     @property

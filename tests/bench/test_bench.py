@@ -52,7 +52,7 @@ def test_a_matrix_moves_more_than_bars():
 def test_bars_of_a_lattice_are_in_runs_and_those_in_random_order_are_not():
     from types import SimpleNamespace
 
-    from pfem_petsc.mechanics.columns import make_sweep
+    from pfem_petsc.mechanics.runs import make_sweep
 
     chain = np.column_stack([np.arange(1000), np.arange(1, 1001)]).astype(np.int32)
     mixed = np.random.default_rng(1).integers(0, 1000, (1000, 2)).astype(np.int32)

@@ -17,7 +17,7 @@ from typing import Any
 
 from pfem_petsc.mechanics import materials
 
-__all__ = ["SIZE", "Complex", "ComplexMath", "derivative", "inner", "patch", "real"]
+__all__ = ["SIZE", "Complex", "ComplexMath", "derivative", "patch", "real"]
 
 SIZE = 1e-60
 """Of the imaginary part of arguments; its square is still a normal number."""
@@ -139,9 +139,3 @@ def derivative(value: Any) -> float:
 def real(value: Any) -> float:
     """Return the real part."""
     return _value(value).real
-
-
-def inner(loop: Any, name: str) -> Callable[..., Any]:
-    """Return the Python function that a compiled loop calls by a name."""
-    function = loop.py_func
-    return function.__closure__[function.__code__.co_freevars.index(name)].cell_contents

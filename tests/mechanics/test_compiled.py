@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.mechanics import strips
-from pfem_petsc.mechanics.bar_loops import fused_parts, make_kernels
+from pfem_petsc.mechanics import elements
 from pfem_petsc.mechanics.compiled import Compilation, _variant, code_digest
-from pfem_petsc.mechanics.conserving import MEASURES, engineering
+from pfem_petsc.mechanics.elements import MEASURES, batch_parts, engineering, make_loops
 from pfem_petsc.mechanics.materials import elastic, elastoplastic
 from pfem_petsc.mechanics.materials.base import LAWS, damped, softened
 from pfem_petsc.mechanics.rupture import breakable
@@ -122,10 +121,11 @@ def test_machine_code_is_never_older_than_what_a_loop_inlines(tmp_path, monkeypa
 
 
 def test_code_that_a_class_generates_is_part_of_the_digest(monkeypatch):
-    before = code_digest(make_kernels(elastic.LAW, engineering).forces.py_func)
-    assert before == code_digest(make_kernels(elastic.LAW, engineering).forces.py_func)
-    monkeypatch.setattr(strips.Strip, "store_nodes", lambda self, vectors, pointer, node: None)
-    assert code_digest(make_kernels(elastic.LAW, engineering).forces.py_func) != before
+    """The record of a bar is a class whose code compiled loops use."""
+    before = code_digest(make_loops(elastic.LAW, engineering).forces.py_func)
+    assert before == code_digest(make_loops(elastic.LAW, engineering).forces.py_func)
+    monkeypatch.setattr(elements.Bar, "_replace", lambda self: None)
+    assert code_digest(make_loops(elastic.LAW, engineering).forces.py_func) != before
 
 
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
@@ -158,12 +158,12 @@ def test_every_process_finds_the_machine_code_of_another():
 def test_every_process_finds_the_fused_loop_of_another():
     """Keys of loops that are made of other loops are the same in all processes: a start must not compile them anew."""
     program = (
-        "from pfem_petsc.mechanics.bar_loops import fused_parts, make_kernels\n"
+        "from pfem_petsc.mechanics.elements import batch_parts, make_loops\n"
         "from pfem_petsc.mechanics.materials.elastic import LAW\n"
-        "from pfem_petsc.mechanics.conserving import engineering\n"
+        "from pfem_petsc.mechanics.elements import engineering\n"
         "from pfem_petsc.stepping.batch_loop import make_fused_loop\n"
-        "kernels = make_kernels(LAW, engineering)\n"
-        "loop = make_fused_loop(*fused_parts(kernels))\n"
+        "loops = make_loops(LAW, engineering)\n"
+        "loop = make_fused_loop(*batch_parts(loops))\n"
         "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
     )
     keys = set()
@@ -181,9 +181,9 @@ def test_loops_of_all_laws_have_names_of_their_own():
         law = lookup(LAWS, name, "").LAW
         for variant in (law, softened(law)) if law.softening is not None else (law,):
             for measure in MEASURES.values():
-                kernels = make_kernels(variant, measure)
-                names.append(_variant(kernels.forces.py_func))
-                fused = make_fused_loop(*fused_parts(kernels))
+                loops = make_loops(variant, measure)
+                names.append(_variant(loops.forces.py_func))
+                fused = make_fused_loop(*batch_parts(loops))
                 longest = fused._cache._cache_file._data_path("x")
                 assert len(Path(longest).name) < 220
     assert len(names) > 40 and len(set(names)) == len(names)
@@ -192,24 +192,25 @@ def test_loops_of_all_laws_have_names_of_their_own():
 def test_loops_of_a_law_with_and_without_damping_have_their_own_files():
     """Otherwise each overwrites the machine code of the other, and both are compiled at each start."""
     laws = [elastic.LAW, damped(elastic.LAW), breakable(elastic.LAW), breakable(damped(elastic.LAW))]
-    found = {make_kernels(law, MEASURES["green"]).forces._cache._cache_file._index_path for law in laws}
+    found = {make_loops(law, MEASURES["green"]).forces._cache._cache_file._index_path for law in laws}
     assert len(found) == len(laws)
 
 
 OF_ONE_LAW = """
 import sys
 import numpy as np
-from pfem_petsc.mechanics.bar_loops import make_kernels
+from pfem_petsc.mechanics.elements import BarData, engineering, make_loops
 from pfem_petsc.mechanics.materials import elastic, elastoplastic
-from pfem_petsc.mechanics.conserving import engineering
-from pfem_petsc.mechanics.columns import make_sweep
+from pfem_petsc.mechanics.runs import make_sweep
 
 def energies(law, p):
     bars = np.array([[0, 1]], dtype=np.int32)
     x, far = np.array([[0.0, 0, 0], [1.5, 0, 0]]), np.array([1], dtype=np.uint32)
     sums = np.zeros(16)
-    given = (np.ones(1), np.empty((2, 0)), p, 1.0, 0.0, np.zeros((len(law.rows), 1)), True, np.zeros((2, 3)), sums)
-    make_kernels(law, engineering).forces(x, make_sweep(bars, 0, 1, 1), far, *given)
+    rest, heat, history = np.ones(1), np.empty((2, 0)), np.zeros((len(law.rows), 1))
+    given = (far, make_sweep(bars, 0, 1, 1), rest, heat, np.empty(0), heat, p, 1.0, 0.0, history)
+    data = BarData(np.uint64(0), np.uint64(1), bars, *given)
+    make_loops(law, engineering).forces(x, data, True, np.zeros((2, 3)), sums)
     return float(sums.sum())
 
 PARAMETERS = {"elastic": (elastic.LAW, (2.0,)), "elastoplastic": (elastoplastic.LAW, (2.0, 0.5, 0.0, 0.0, 0.5))}
@@ -248,9 +249,9 @@ def test_functions_of_one_name_have_the_same_code():
     found = set()
     for law in (elastic.LAW, elastoplastic.LAW, softened(elastic.LAW), softened(elastoplastic.LAW)):
         for measure in MEASURES.values():
-            kernels = make_kernels(law, measure)
-            loops = [value for value in vars(kernels).values() if not isinstance(value, int)]
-            for loop in (*loops, make_fused_loop(*fused_parts(kernels))):
+            loops = make_loops(law, measure)
+            made = [value for value in vars(loops).values() if not isinstance(value, int)]
+            for loop in (*made, make_fused_loop(*batch_parts(loops))):
                 closures(loop, found)
     digests = {}
     for function in found:

@@ -6,14 +6,13 @@ import math
 
 import numpy as np
 import pytest
-from helpers.complex_step import SIZE, Complex, derivative, inner, patch, real
+from helpers.complex_step import SIZE, Complex, derivative, patch, real
 from helpers.laws import KEYS, SOFTENING, cycles, make
 
 from pfem_petsc.case.tables import Section
 from pfem_petsc.mechanics import rupture
-from pfem_petsc.mechanics.bar_loops import make_tangent_kernels
 from pfem_petsc.mechanics.bars import bar_shapes
-from pfem_petsc.mechanics.conserving import MEASURES, make_conserving_kernels
+from pfem_petsc.mechanics.elements import MEASURES, Bar, make_element
 
 REST, AREA = 0.3, 2e-4
 STRUT = {"yield_stress": 200e6}
@@ -72,14 +71,15 @@ def complex_functions(monkeypatch):
 @pytest.mark.parametrize("kind", BARS)
 def test_stiffness_is_the_derivative_of_the_axial_force(complex_functions, kind, measure):
     law, p, young = prepared(kind)
-    stiffness = inner(make_tangent_kernels(law, MEASURES[measure])["tangents"], "stiffness")
+    stiffness = make_element(law, MEASURES[measure]).stiffness
     strain_of, scale = MEASURES[measure], young * AREA / REST
     q, before, tangents = (0.0,) * len(law.internal), 0.0, []
     for length, h in zip(*path(kind), strict=True):
         length, h = float(length), float(h)
         step = h if law.rate else 0.0
-        axial, _, _ = stiffness(length, 0.0, 0.0, REST, 1e-4, WARMTH, p, AREA, step, before, q)
-        varied = stiffness(Complex(length, SIZE), 0.0, 0.0, REST, 1e-4, WARMTH, p, AREA, step, before, q)
+        bar = Bar(REST, 1e-4, WARMTH, AREA, p, before, 0.0, q)
+        axial, _, _ = stiffness((length, 0.0, 0.0), bar, step)
+        varied = stiffness((Complex(length, SIZE), 0.0, 0.0), bar, step)
         force = varied[1] / varied[2]
         assert axial == pytest.approx(derivative(force), rel=1e-12, abs=1e-12 * scale), (length, h, q)
         strain = strain_of(length / REST)[0] - 1e-4
@@ -96,15 +96,15 @@ def test_stiffness_is_the_derivative_of_the_axial_force(complex_functions, kind,
 @pytest.mark.parametrize("kind", [kind for kind in BARS if "softened" not in kind or "elastic" in kind.split()])
 def test_stiffness_of_the_conserving_force(complex_functions, kind, measure):
     law, p, young = prepared(kind)
-    pair = inner(make_conserving_kernels(law, MEASURES[measure]).tangents, "pair")
+    pair = make_element(law, MEASURES[measure]).step_stiffness
     strain_of, scale = MEASURES[measure], young * AREA / REST
     q, before, kept = (0.0,) * len(law.internal), REST, 0.0
     for length, h in zip(*path(kind), strict=True):
         length, h = float(length), float(h)
         step = h if law.rate else 0.0
-        rest = (before, 0.0, 0.0), (0.0, 0.0, REST, REST, 0.0, 0.0, WARMTH, WARMTH, p, AREA, step, kept, q)
-        _, slope, _ = pair(*rest[0], length, *rest[1])
-        varied, _, _ = pair(*rest[0], Complex(length, SIZE), *rest[1])
+        given = (REST, 0.0, WARMTH), Bar(REST, 0.0, WARMTH, AREA, p, 0.0, kept, q), step
+        _, slope, _ = pair((before, 0.0, 0.0), (length, 0.0, 0.0), *given)
+        varied, _, _ = pair((before, 0.0, 0.0), (Complex(length, SIZE), 0.0, 0.0), *given)
         # the mean stress is a quotient by the change of strain
         noise = 1e-12 + 1e-14 * REST / max(abs(length - before), 1e-3 * REST)
         assert slope * REST == pytest.approx(derivative(varied) * REST, rel=noise, abs=noise * scale), (length, h, q)
@@ -114,37 +114,25 @@ def test_stiffness_of_the_conserving_force(complex_functions, kind, measure):
         before = length
 
 
-def tuple_functions(monkeypatch):
-    """Python twins of the functions of tuples that exist in compiled code only."""
-    twins = {
-        "blend": lambda there, one, other: one if there else other,
-        "sum_with": lambda one, factor, other: tuple(a + factor * b for a, b in zip(one, other, strict=True)),
-        "sum_where": lambda mask: lambda values: sum(v for v, m in zip(values, mask, strict=True) if m),
-        "keep_where": lambda mask: lambda values: tuple(v if m else 0.0 for v, m in zip(values, mask, strict=True)),
-    }
-    for name, twin in twins.items():
-        monkeypatch.setattr(rupture, name, twin)
-
-
 @pytest.mark.parametrize("kind", ["elastic", "voce", "perzyna", "damage", "slender strut", "damped damage"])
-def test_stiffness_of_bars_that_break(complex_functions, monkeypatch, kind):
+def test_stiffness_of_bars_that_break(complex_functions, kind):
     """Bars of which a share is left, that lose a part of it in the step, and broken ones."""
-    tuple_functions(monkeypatch)
     law, p, young = prepared(kind)
     law = rupture.breakable.__wrapped__(law)
     limits = (math.inf, 0.003 if "damage" not in kind else 1e-4, *(math.inf,) * 4, 0.25)  # in four steps
-    stiffness = inner(make_tangent_kernels(law, MEASURES["logarithmic"])["tangents"], "stiffness")
+    stiffness = make_element(law, MEASURES["logarithmic"]).stiffness
     q, before, scale, shares = (0.0,) * len(law.internal), 0.0, young * AREA / REST, []
     for length, h in zip(*path(kind), strict=True):
         length, h = float(length), float(h)
         step = h if law.rate else 0.0
-        given = (0.0, 0.0, REST, 0.0, 0.0, (*limits, *p), AREA, step, before, q)
-        axial, _, _ = stiffness(length, *given)
-        _, over, inverse = stiffness(Complex(length, SIZE), *given)
+        numbers = (*limits, *p)
+        bar = Bar(REST, 0.0, 0.0, AREA, numbers, before, 0.0, q)
+        axial, _, _ = stiffness((length, 0.0, 0.0), bar, step)
+        _, over, inverse = stiffness((Complex(length, SIZE), 0.0, 0.0), bar, step)
         force = over / inverse if q[law.rupture] < 1.0 else 0.0
         assert axial == pytest.approx(derivative(force), rel=1e-12, abs=1e-12 * scale), (length, h, q)
         shares.append(q[law.rupture])
         strain = math.log(length / REST)
-        _, _, q, _ = law.response(strain, (strain - before) / h if law.rate else 0.0, step, 0.0, given[5], q)
+        _, _, q, _ = law.response(strain, (strain - before) / h if law.rate else 0.0, step, 0.0, numbers, q)
         before = strain
     assert set(shares) == {0.0, 0.25, 0.5, 0.75, 1.0}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pfem_petsc.mechanics.columns import make_sweep
+from pfem_petsc.mechanics.runs import make_sweep
 from pfem_petsc.mesh.ordering import LEAST_RUN, NODE_BLOCK, bar_order
 
 

@@ -8,7 +8,7 @@ from helpers.runs import run
 from helpers.stopped import everywhere
 
 from pfem_petsc import Simulation, open_result
-from pfem_petsc.mechanics.conserving import MEASURES
+from pfem_petsc.mechanics.elements import MEASURES
 from pfem_petsc.mechanics.materials.base import law_of
 from pfem_petsc.mechanics.rest_lengths import stretch_of
 

@@ -8,7 +8,7 @@ from stepping.test_fused_steps import DAMPED, FLOOR, LATTICE, PLASTIC, case, mad
 
 from pfem_petsc import open_result
 from pfem_petsc.errors import SimulationFailure
-from pfem_petsc.mechanics.columns import NO_BAR, make_columns
+from pfem_petsc.mechanics.runs import NO_BAR, make_columns
 from pfem_petsc.stepping import batches as fused_steps
 
 YIELD = {"yield_stress": 50e6, "isotropic_hardening": 1e9}

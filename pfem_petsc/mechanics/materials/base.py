@@ -301,8 +301,8 @@ class Law:
     mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p without data of bars, the
         change of stress and the internal variables before and after, (variables, bars), for the work of changing
         temperatures; None for zero
-    mean_of_work : whether ``mean_stress`` is the change of all energies over that of the strain, from ``_work.py``; it
-        then holds for the work of changing temperatures too
+    mean_of_work : whether ``mean_stress`` is the change of all energies over that of the strain, as by the function
+        :func:`mean_of_work`; it then holds for the work of changing temperatures too
     static_limit : for a law with ``rate``: whether it has a limit at the rate zero, which static analyses use; the
         step is then infinite
     softening : how the law softens by the key ``softening``; None: the key is rejected
@@ -312,7 +312,7 @@ class Law:
     rupture : index of the internal variable with the fraction of a bar that has left the model, see
         :mod:`~pfem_petsc.mechanics.rupture`; -1 for laws whose bars cannot break
     known_rate : index of the internal variable with the known part of the strain rate of a viscous stress, whose factor
-        is the last packed parameter, see ``_stiffness_damping.py``; -1 for laws without
+        is the last packed parameter, see :func:`damped`; -1 for laws without
     whole : the law of intact bars from which this one is derived, if any
     """
 

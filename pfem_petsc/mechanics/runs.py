@@ -1,20 +1,18 @@
-"""The order of loops over bars: runs of bars whose ends are known from the first one, by blocks and by components."""
+"""Runs of bars whose ends are known from the first one, by blocks of nodes: as they are, and padded to long rows for
+loops over components of positions and forces.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba.core import types
-from numba.extending import intrinsic
 
 from ..mesh.ordering import FEW, LEAST_RUN, NODE_BLOCK
-from .compiled import borrowing, kernel
-from .rows import CHUNK, known_ends
-from .strips import APART, LANES, Arguments, Strip, for_strips, separate, weave
+from .compiled import borrowing, inlined, kernel
+from .strips import APART, LANES, add_strips, differences
+from .tuples import CHUNK
 
-_AXES = range(3)
 _LINE = 8  # numbers in a line of the cache
 
 
@@ -32,131 +30,45 @@ def new_planes(nodes: int) -> tuple[np.ndarray, np.ndarray]:
     return aligned(3 * stride), aligned(3 * stride)
 
 
-@intrinsic
-def address(typingctx, values, index):  # noqa: ANN001, ANN201
-    """Return the address of ``values[index]``."""
-
-    def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
-        given = Arguments(context, builder, signature, arguments)
-        return builder.ptrtoint(given.numbers(0, given.index(1)), ir.IntType(64))
-
-    return types.int64(values, index), generate
+@inlined
+def new_rows(count):
+    """Return ``count`` rows of :data:`CHUNK` numbers in one array, aligned to lines of the cache; not initialised."""
+    room = np.empty(count * CHUNK + _LINE)
+    return room[-(room.ctypes.data // 8) % _LINE :]
 
 
-@intrinsic
-def number_at(typingctx, place, index):  # noqa: ANN001, ANN201
-    """Return number ``index`` behind the address ``place``; see :func:`difference_of_ends`."""
-
-    def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
-        given = Arguments(context, builder, signature, arguments)
-        pointer = builder.inttoptr(arguments[0], ir.DoubleType().as_pointer())
-        load = builder.load(builder.gep(pointer, [given.index(1)]))
-        load.set_metadata("alias.scope", known_ends(builder))
-        return load
-
-    return types.float64(place, index), generate
+@borrowing
+def copy(values, out):
+    """Write the first numbers of ``values`` to all of ``out``."""
+    for i in range(len(out)):
+        out[i] = values[i]
 
 
-@intrinsic
-def difference_of_ends(typingctx, low, high, stride, bar):  # noqa: ANN001, ANN201
-    """Return the end difference (dx, dy, dz) of a bar: that of the numbers ``bar`` behind the addresses ``high`` and
-    ``low``, of planes with ``stride`` numbers.
-
-    Compilers assume that :func:`~pfem_petsc.mechanics.rows.put_apart` does not change these numbers.
-    """
-
-    def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
-        given = Arguments(context, builder, signature, arguments)
-        kind, known, found = ir.DoubleType().as_pointer(), known_ends(builder), []
-        for c in _AXES:
-            at = builder.add(given.index(3), builder.mul(given.index(2), ir.Constant(ir.IntType(64), c)))
-            loads = [builder.load(builder.gep(builder.inttoptr(arguments[k], kind), [at])) for k in (0, 1)]
-            for load in loads:
-                load.set_metadata("alias.scope", known)
-            found.append(builder.fsub(loads[1], loads[0]))
-        return context.make_tuple(builder, signature.return_type, found)
-
-    return types.UniTuple(types.float64, 3)(low, high, stride, bar), generate
-
-
-def _change_planes(sign: str) -> Any:
-    """Make the intrinsic that adds the first three rows of a workspace to planes, or subtracts them."""
-
-    @intrinsic
-    def change(typingctx, f, stride, node, count, work, first):  # noqa: ANN001, ANN202
-        def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
-            given = Arguments(context, builder, signature, values)
-            combine = getattr(builder, sign)
-            ends = [given.plane(0, given.index(2), given.index(1), c) for c in _AXES]
-            rows = [given.row(4, given.index(5), c) for c in _AXES]
-
-            def body(at: Any, strip: Strip) -> None:
-                for end, row in zip(ends, rows, strict=True):
-                    strip.store(combine(strip.load(end, at), strip.load(row, at)), end, at)
-
-            for_strips(builder, given.index(3), body, ends[0])
-            return context.get_dummy_value()
-
-        return types.void(f, stride, node, count, work, first), generate
-
-    return change
-
-
-add_rows, subtract_rows = _change_planes("fadd"), _change_planes("fsub")
-
-
-@intrinsic
-def copy_run(typingctx, values, first, copy, at, count):  # noqa: ANN001, ANN201
-    """Write ``count`` numbers of ``values`` (n,) from ``first`` on to ``copy`` (m,) from ``at`` on."""
-
-    def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
-        given = Arguments(context, builder, signature, arguments)
-        source, target = given.numbers(0, given.index(1)), given.numbers(2, given.index(3))
-        for_strips(builder, given.index(4), lambda place, strip: strip.store(strip.load(source, place), target, place))
-        return context.get_dummy_value()
-
-    return types.void(values, first, copy, at, count), generate
-
-
-@intrinsic
-def split_planes(typingctx, x, first, count, planes, stride, base):  # noqa: ANN001, ANN201
+@borrowing
+def split_components(x, first, count, planes, stride, base):
     """Write the vectors of ``count`` nodes of ``x`` (n, 3), from ``first`` on, to ``planes`` (3 stride,), which begin
     at node ``base``."""
-
-    def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
-        given = Arguments(context, builder, signature, values)
-        first = given.index(1)
-        nodes = given.numbers(0, first, 3)
-        ends = [given.plane(3, builder.sub(first, given.index(5)), given.index(4), c) for c in _AXES]
-
-        def body(at: Any, strip: Strip) -> None:
-            for end, component in zip(ends, separate(builder, strip.load_nodes(nodes, at)), strict=True):
-                strip.store(component, end, at)
-
-        for_strips(builder, given.index(2), body)
-        return context.get_dummy_value()
-
-    return types.void(x, first, count, planes, stride, base), generate
+    nodes = x[first : first + count].reshape(-1)
+    at = first - base
+    xs, ys, zs = planes[at:], planes[at + stride :], planes[at + 2 * stride :]
+    for i in range(count):
+        xs[i] = nodes[3 * i]
+        ys[i] = nodes[3 * i + 1]
+        zs[i] = nodes[3 * i + 2]
 
 
-@intrinsic
-def join_planes(typingctx, planes, stride, base, first, count, f, row):  # noqa: ANN001, ANN201
-    """Write the vectors of ``count`` nodes from ``first`` on in ``planes`` (3 stride,), which begin at node ``base``,
-    to ``f`` (n, 3), from ``row`` on."""
-
-    def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
-        given = Arguments(context, builder, signature, values)
-        first = given.index(3)
-        ends = [given.plane(0, builder.sub(first, given.index(2)), given.index(1), c) for c in _AXES]
-        nodes = given.numbers(5, given.index(6), 3)
-
-        def body(at: Any, strip: Strip) -> None:
-            strip.store_nodes(weave(builder, [strip.load(end, at) for end in ends]), nodes, at)
-
-        for_strips(builder, given.index(4), body)
-        return context.get_dummy_value()
-
-    return types.void(planes, stride, base, first, count, f, row), generate
+@borrowing
+def join_components(planes, base, first, f):
+    """Write the vectors of nodes from ``first`` on in ``planes`` (3 stride,), which begin at node ``base``, to ``f``
+    (n, 3)."""
+    stride = len(planes) // 3
+    at = first - base
+    xs, ys, zs = planes[at:], planes[at + stride :], planes[at + 2 * stride :]
+    nodes = f.reshape(-1)
+    for i in range(len(f)):
+        nodes[3 * i] = xs[i]
+        nodes[3 * i + 1] = ys[i]
+        nodes[3 * i + 2] = zs[i]
 
 
 @borrowing
@@ -204,15 +116,15 @@ def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int
     firsts[-1] = stop
     diagonal = np.empty(len(firsts) - 1, dtype=np.bool_)
     chunks = np.empty(len(firsts), dtype=np.uint32)
-    none = np.empty(0, dtype=np.uint32)
-    runs = _find_runs(bars, firsts, False, diagonal, chunks, none, none, none)
+    none = (np.empty(0, dtype=np.uint32),) * 3
+    runs = _find_runs(bars, firsts, False, diagonal, chunks, none)
     short = np.diff(firsts.astype(np.int64))[~diagonal].sum()
     forced = bool(0 < short <= FEW * (stop - start))
     if forced:  # few bars: the others have faster loops if all chunks are alike
         diagonal[:] = True
-        runs = _find_runs(bars, firsts, True, diagonal, chunks, none, none, none)
+        runs = _find_runs(bars, firsts, True, diagonal, chunks, none)
     heads, fars, starts = (np.empty(n, dtype=np.uint32) for n in (runs, runs, runs + 1))
-    _find_runs(bars, firsts, forced, diagonal, chunks, heads, fars, starts)
+    _find_runs(bars, firsts, forced, diagonal, chunks, (heads, fars, starts))
     starts[runs] = stop
     chunks_counted = int(np.searchsorted(firsts[:-1], counted))
     lower = bars[firsts[:chunks_counted]].min(axis=1) // NODE_BLOCK
@@ -238,9 +150,10 @@ def _cut(bars, start, counted, stop, chunk, firsts):
 
 
 @kernel
-def _find_runs(bars, firsts, forced, diagonal, chunks, heads, fars, starts):
-    """Return the number of runs; write chunks, the first run of each, and the runs unless ``heads`` is empty, and which
-    chunks are ``diagonal``, unless ``forced``."""
+def _find_runs(bars, firsts, forced, diagonal, chunks, runs):
+    """Return the number of runs; write chunks, the first run of each, and the ``runs`` (heads, fars and starts) unless
+    they are empty, and which chunks are ``diagonal``, unless ``forced``."""
+    heads, fars, starts = runs
     count = 0
     for c in range(len(firsts) - 1):
         chunks[c] = count
@@ -271,6 +184,67 @@ def _follows(bars, k):
     """Whether both ends of bar k are the nodes after those of bar k - 1."""
     low = min(bars[k, 0], bars[k, 1]) == min(bars[k - 1, 0], bars[k - 1, 1]) + 1
     return low and max(bars[k, 0], bars[k, 1]) == max(bars[k - 1, 0], bars[k - 1, 1]) + 1
+
+
+@borrowing
+def end_differences(x, sweep, far, chunk, work):
+    """Write the end differences of a chunk of bars at positions ``x`` (n, 3) to the first three rows of a workspace.
+
+    ``far``: upper end of each bar, for fans.
+    """
+    heads, fars, starts = sweep.heads, sweep.fars, sweep.starts
+    xs, ys, zs = work[:CHUNK], work[CHUNK : 2 * CHUNK], work[2 * CHUNK : 3 * CHUNK]
+    first = starts[sweep.chunks[chunk]]
+    for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
+        at = starts[run]
+        if sweep.diagonal[chunk]:
+            differences(x, heads[run], fars[run], starts[run + 1] - at, xs, ys, zs, at - first)
+            continue
+        a = heads[run]
+        ax = x[a, 0]
+        ay = x[a, 1]
+        az = x[a, 2]
+        for k in range(at, starts[run + 1]):
+            b = far[k]
+            i = k - first
+            xs[i] = x[b, 0] - ax
+            ys[i] = x[b, 1] - ay
+            zs[i] = x[b, 2] - az
+
+
+@borrowing
+def scatter_forces(f, sweep, far, chunk, work):
+    """Subtract the forces of a chunk of bars from their lower ends in ``f`` (n, 3), and add them to the upper ones:
+    the first three rows of a workspace times the fourth one."""
+    heads, fars, starts = sweep.heads, sweep.fars, sweep.starts
+    xs, ys, zs = work[:CHUNK], work[CHUNK : 2 * CHUNK], work[2 * CHUNK : 3 * CHUNK]
+    cs = work[3 * CHUNK : 4 * CHUNK]
+    first = starts[sweep.chunks[chunk]]
+    for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
+        at = starts[run]
+        if sweep.diagonal[chunk]:
+            add_strips(f, heads[run], fars[run], starts[run + 1] - at, xs, ys, zs, cs, at - first)
+            continue
+        fx = 0.0
+        fy = 0.0
+        fz = 0.0
+        for k in range(at, starts[run + 1]):
+            b = far[k]
+            i = k - first
+            c = cs[i]
+            gx = c * xs[i]
+            gy = c * ys[i]
+            gz = c * zs[i]
+            fx += gx
+            fy += gy
+            fz += gz
+            f[b, 0] += gx
+            f[b, 1] += gy
+            f[b, 2] += gz
+        a = heads[run]
+        f[a, 0] -= fx
+        f[a, 1] -= fy
+        f[a, 2] -= fz
 
 
 NO_BAR = -1.0
@@ -340,10 +314,10 @@ def make_columns(sweep: Sweep, rest: np.ndarray, area: float | np.ndarray, rows:
     heads, fars, starts = (np.empty(groups + k, dtype=np.uint32) for k in (0, 0, 1))
     columns = _place_groups(sweep.heads, sweep.fars, sweep.starts, runs, heads, fars, starts)
     spread = aligned(columns)
-    _spread(rest, sweep.heads, sweep.starts, runs, heads, starts, NO_BAR, spread)
+    _spread(rest, sweep, (runs, heads, starts), NO_BAR, spread)
     if isinstance(area, np.ndarray):
         values, area = area, aligned(columns)
-        _spread(values, sweep.heads, sweep.starts, runs, heads, starts, 0.0, area)
+        _spread(values, sweep, (runs, heads, starts), 0.0, area)
     close = (fars - heads) < APART
     parts = np.searchsorted(runs, sweep.chunks[sweep.parts]).astype(np.int64)
     return Columns(heads, fars, starts, runs, close, spread, area, np.zeros((rows, columns)), counted, parts)
@@ -388,39 +362,29 @@ def _place_groups(run_heads, run_fars, run_starts, runs, heads, fars, starts):
 
 
 @kernel
-def _spread(values, run_heads, run_starts, runs, heads, starts, none, spread):
-    """Write the values of bars to their columns, and ``none`` to the others."""
+def _spread(values, sweep, groups, none, spread):
+    """Write the values of bars to their columns, and ``none`` to the others; ``groups``: runs, heads and starts."""
+    runs, heads, starts = groups
     for k in range(len(spread)):
         spread[k] = none
     for g in range(len(heads)):
         for run in range(runs[g], runs[g + 1]):
-            at = starts[g] + run_heads[run] - heads[g]
-            begin = run_starts[run]
-            for k in range(run_starts[run + 1] - begin):
+            at = starts[g] + sweep.heads[run] - heads[g]
+            begin = sweep.starts[run]
+            for k in range(sweep.starts[run + 1] - begin):
                 spread[at + k] = values[begin + k]
 
 
 @kernel
-def spread_history(sweep, columns, history):
-    """Write the ``history`` (rows, b) of the bars of a sweep to ``columns.kept``, which loops over columns update."""
-    kept, wide, from_wide = columns.kept.reshape(-1), columns.kept.shape[1], history.shape[1]
-    values = history.reshape(-1)
+def exchange_history(sweep, columns, history, back):
+    """Write the ``history`` (rows, b) of the bars of a sweep to ``columns.kept``, which loops over padded runs update,
+    or ``back``."""
     for group in range(len(columns.heads) if len(history) > 0 else 0):
         for run in range(columns.runs[group], columns.runs[group + 1]):
             begin, count = sweep.starts[run], sweep.starts[run + 1] - sweep.starts[run]
             at = columns.starts[group] + sweep.heads[run] - columns.heads[group]
             for j in range(len(history)):
-                copy_run(values, j * from_wide + begin, kept, j * wide + at, count)
-
-
-@kernel
-def gather_history(sweep, columns, history):
-    """Write ``columns.kept`` back to the ``history`` (rows, b) of the bars of a sweep."""
-    kept, wide, to_wide = columns.kept.reshape(-1), columns.kept.shape[1], history.shape[1]
-    values = history.reshape(-1)
-    for group in range(len(columns.heads) if len(history) > 0 else 0):
-        for run in range(columns.runs[group], columns.runs[group + 1]):
-            begin, count = sweep.starts[run], sweep.starts[run + 1] - sweep.starts[run]
-            at = columns.starts[group] + sweep.heads[run] - columns.heads[group]
-            for j in range(len(history)):
-                copy_run(kept, j * wide + at, values, j * to_wide + begin, count)
+                if back:
+                    copy(columns.kept[j][at : at + count], history[j][begin : begin + count])
+                else:
+                    copy(history[j][begin : begin + count], columns.kept[j][at : at + count])

@@ -1,0 +1,723 @@
+"""The evaluation of a bar, written once over a material law and a strain measure, and all loops that are made from it.
+
+A loop gathers what the law reads of a bar, evaluates it, and scatters the result: forces, tangents, products,
+linearisations, fields, densities, of a state or of a step between two positions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from types import SimpleNamespace
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numba.extending import register_jitable
+
+from ..energies import BAR_ENERGIES
+from .compiled import borrowing, inlined, kernel
+from .materials.base import Law
+from .runs import Sweep, copy, end_differences, scatter_forces
+from .strips import add_rows, subtract_rows
+from .tuples import CHUNK, accumulate, bar_value, differ, put, take, take_from
+
+COLLAPSED_STRETCH = 1e-3  # below this fraction of its rest length a bar is crushed, and no truss model applies
+SHORTENED_STRETCH = math.sqrt(0.8)  # only bars shorter than this are checked for passing through zero length
+
+
+@register_jitable
+def engineering(stretch: float) -> tuple[float, float, float]:
+    """Return the engineering strain l/l0 - 1 and its derivatives."""
+    return stretch - 1.0, 1.0, 0.0
+
+
+@register_jitable
+def green(stretch: float) -> tuple[float, float, float]:
+    """Return Green's strain ((l/l0)^2 - 1)/2 and its derivatives."""
+    return 0.5 * (stretch * stretch - 1.0), stretch, 1.0
+
+
+@register_jitable
+def logarithmic(stretch: float) -> tuple[float, float, float]:
+    """Return the logarithmic strain ln(l/l0) and its derivatives."""
+    return math.log(stretch), 1.0 / stretch, -1.0 / (stretch * stretch)
+
+
+MEASURES = {"engineering": engineering, "green": green, "logarithmic": logarithmic}
+
+
+@register_jitable
+def _engineering_ratio(s0: float, s1: float) -> tuple[float, float]:
+    total = s0 + s1
+    return 2.0 / total, -2.0 / (total * total)
+
+
+@register_jitable
+def _green_ratio(s0: float, s1: float) -> tuple[float, float]:
+    return 1.0, 0.0
+
+
+@register_jitable
+def _logarithmic_ratio(s0: float, s1: float) -> tuple[float, float]:
+    q = s1 / s0 - 1.0
+    if abs(q) < 1e-4:
+        # ln(1+q)/(q (1 + q/2)) = 1 - q + 5/6 q^2 - 2/3 q^3 + ...
+        value = 1.0 - q * (1.0 - q * (5.0 / 6.0 - q * (2.0 / 3.0)))
+        slope = -1.0 + q * (5.0 / 3.0 - 2.0 * q)
+    else:
+        bottom = q * (1.0 + 0.5 * q)
+        value = math.log1p(q) / bottom
+        slope = (1.0 / (1.0 + q) - value * (1.0 + q)) / bottom
+    return value / (s0 * s0), slope / (s0 * s0 * s0)
+
+
+# L^2 R and L^2 dR/ds1 for the stretches s0 = l0/L, s1 = l1/L
+_RATIOS = {engineering: _engineering_ratio, green: _green_ratio, logarithmic: _logarithmic_ratio}
+
+
+class ElementFamily(Protocol):
+    """Elements besides the bars, such as springs to the ground: what :class:`~pfem_petsc.mechanics.bars.Bars` adds up.
+
+    Stiffness is that at the positions of the last forces. Each rank adds what acts on the nodes that it owns.
+
+    Attributes
+    ----------
+    energy : name of the stored energy, of :data:`~pfem_petsc.energies.BAR_ENERGIES`
+    """
+
+    energy: str
+
+    def add_forces(self, x: np.ndarray, f: np.ndarray) -> float:
+        """Add the internal forces at positions ``x`` to ``f``, both (local, 3); return the stored energy [J]."""
+
+    def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
+        """Add the discrete gradient of a step from ``x0`` to ``x``, whose work is the change of the energy."""
+
+    def add_product(self, weight: float, u: np.ndarray, out: np.ndarray) -> None:
+        """Add ``weight`` times the stiffness times ``u`` to ``out``, with a row for each owned node at least."""
+
+    def add_tangents(self, weight: float, pattern: Any, values: np.ndarray) -> None:
+        """Add ``weight`` times the stiffness to the values of a matrix with a ``BlockPattern``."""
+
+
+class BarData(NamedTuple):
+    """Bars [start, stop) of one section, as compiled loops read them.
+
+    ``ends`` (b, 2) local ends; ``far`` (b,) upper end of each bar, (0,) if all bars are in runs; ``sweep`` of the bars;
+    ``rest`` (b,) rest lengths [m]; ``heat`` (2, b) thermal strains and temperatures [K], (2, 0) for none; both at the
+    start of the step, ``rest_at_start`` (0,) if rest lengths are constant; ``parameters`` of the law; ``area`` [m2], a
+    number or (n,); ``step`` from its start to the positions [s]; ``history`` (rows, n) of bar k in column k - start:
+    ``law.rows``, and after them its ``law.bar_data``, which no loop writes.
+    """
+
+    start: np.uint64
+    stop: np.uint64  # unsigned: loops need not handle negative indices
+    ends: np.ndarray
+    far: np.ndarray
+    sweep: Sweep
+    rest: np.ndarray
+    heat: np.ndarray
+    rest_at_start: np.ndarray
+    heat_at_start: np.ndarray
+    parameters: tuple
+    area: float | np.ndarray
+    step: float
+    history: np.ndarray
+
+
+class Bar(NamedTuple):
+    """What a law reads of a bar: rest length [m], thermal strain, temperature [K], area [m2] and its numbers; strain
+    and stress at the end of the last step, for laws with a rate; and its internal variables."""
+
+    rest: float
+    shift: float
+    warmth: float
+    area: float
+    parameters: tuple
+    strain: float
+    stress: float
+    variables: tuple[float, ...]
+
+
+def virgin(law: Law) -> tuple[float, ...]:
+    """Return the internal variables of a law at the start: zeros."""
+    return (0.0,) * len(law.internal)
+
+
+@borrowing
+def end_difference(x, bars, k):
+    """Return the end difference (dx, dy, dz) of a bar."""
+    a = bars.ends[k, 0]
+    b = bars.ends[k, 1]
+    return x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+
+
+@inlined
+def length_of(d):
+    """Return the length of an end difference."""
+    return math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+
+
+@cache
+def make_element(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
+    """Make the functions that read and evaluate a bar: ``read``, ``evaluate``, ``stiffness``, ``step_stiffness``."""
+    response, mean_stress, by_rate, last = law.response, law.mean_stress, law.rate, len(law.internal)
+    can_break, gone, ratio = law.rupture >= 0, max(law.rupture, 0), _RATIOS[measure]
+    n_rows, n_data = len(law.rows), len(law.bar_data)
+    variables_of, data_of = take(len(law.internal)), take_from(n_data)
+
+    @borrowing
+    def read(bars, k):
+        """Return the :class:`Bar` k of :class:`BarData`."""
+        column = k - bars.start
+        shift = 0.0
+        warmth = 0.0
+        if bars.heat.shape[1] > 0:
+            shift = bars.heat[0, k]
+            warmth = bars.heat[1, k]
+        strain = 0.0
+        stress = 0.0
+        if by_rate:
+            strain = bars.history[last, column]
+            stress = bars.history[last + 1, column]
+        area = bar_value(bars.area, column)
+        p = bars.parameters + data_of(bars.history, n_rows, column) if n_data else bars.parameters
+        return Bar(bars.rest[k], shift, warmth, area, p, strain, stress, variables_of(bars.history, column))
+
+    @inlined
+    def evaluate(length, bar, step):
+        """Return strain with its first two derivatives by the stretch, stress [Pa], modulus [Pa], internal variables at
+        the end of the step and energy densities [J/m3] of a bar; the strain includes the thermal one."""
+        strain, slope, curvature = measure(length / bar.rest)
+        rate = 0.0
+        if by_rate and step > 0.0:
+            rate = (strain - bar.shift - bar.strain) / step
+        stress, modulus, new, densities = response(
+            strain - bar.shift, rate, step, bar.warmth, bar.parameters, bar.variables
+        )
+        return strain, slope, curvature, stress, modulus, new, densities
+
+    @inlined
+    def stiffness(d, bar, step):
+        """Return dN/dl [N/m], N/l [N/m] and 1/l of a bar with end difference ``d``."""
+        if can_break:  # noqa: SIM102 - not compiled otherwise
+            if abs(bar.variables[gone]) >= 1.0:
+                return 0.0, 0.0, 0.0
+        length = length_of(d)
+        _, slope, curvature, stress, modulus, _, _ = evaluate(length, bar, step)
+        axial = bar.area * (modulus * slope * slope + stress * curvature) / bar.rest
+        return axial, bar.area * stress * slope / length, 1.0 / length
+
+    @inlined
+    def step_stiffness(d0, d, start, bar, step):
+        """Return the coefficient c = A l0 S R [N/m], dc/dl1 [N/m2] and 1/l1 of the discrete gradient between two end
+        differences; c is NaN for a collapsed bar. Of Simo-Tarnow type: S is the mean stress of the step. ``start``:
+        rest length, thermal strain and temperature then."""
+        if can_break:  # noqa: SIM102 - not compiled otherwise
+            if abs(bar.variables[gone]) >= 1.0:
+                return 0.0, 0.0, 0.0
+        rest0, shift0, warmth0 = start
+        length = length_of(d)
+        length0 = length_of(d0)
+        rest = 0.5 * (rest0 + bar.rest)
+        s0 = length0 / rest
+        s1 = length / rest
+        if not (s1 > COLLAPSED_STRETCH):
+            return math.nan, 0.0, 0.0
+        e0, _, _ = measure(s0)
+        e1, slope, _ = measure(s1)
+        if rest0 != bar.rest:
+            e0, _, _ = measure(length0 / rest0)
+            e1, slope, _ = measure(length / bar.rest)
+            slope *= rest / bar.rest
+        e0 -= shift0
+        e1 -= bar.shift
+        rate = 0.0
+        if by_rate:
+            stress0 = bar.stress * (1.0 - abs(bar.variables[gone])) if can_break else bar.stress
+            if step > 0.0:
+                rate = (e1 - e0) / step
+        else:
+            stress0, _, _, _ = response(e0, 0.0, 0.0, warmth0, bar.parameters, bar.variables)
+        mean, modulus = mean_stress(stress0, e0, e1, rate, step, bar.warmth, bar.parameters, bar.variables)
+        r, dr = ratio(s0, s1)
+        c = bar.area * mean * r / rest
+        dc = bar.area * (modulus * slope * r + mean * dr) / (rest * rest)
+        return c, dc, 1.0 / length
+
+    return SimpleNamespace(read=read, evaluate=evaluate, stiffness=stiffness, step_stiffness=step_stiffness)
+
+
+class MatrixRows(NamedTuple):
+    """Where bars add blocks to a matrix in compressed rows, see :class:`~pfem_petsc.solvers.matrix.BlockPattern`:
+    ``ptr`` (owned + 1,), ``slots`` (b, 4), ``values``; the ``weight`` of the stiffness; and ``inertia`` [kg/(m s2)], a
+    number or (n,), which times the ``lengths`` in the mesh (b,) is added twice on the diagonal, and once off it."""
+
+    weight: float
+    inertia: float | np.ndarray
+    lengths: np.ndarray
+    ptr: np.ndarray
+    slots: np.ndarray
+    values: np.ndarray
+
+
+@borrowing
+def add_blocks(out, bars, k, c, d, n, g):
+    """Add the stiffness c d n^T + g I of a bar, and its inertia, to the rows of its owned ends."""
+    mass = bar_value(out.inertia, k - bars.start) * out.lengths[k]
+    values = out.values
+    for side in range(4):
+        slot = out.slots[k, side]
+        if slot < 0:
+            continue
+        row = bars.ends[k, 0] if side < 2 else bars.ends[k, 1]
+        sign = 1.0 if side % 2 == 0 else -1.0
+        at = 6 * out.ptr[row] + 3 * slot
+        wide = 3 * (out.ptr[row + 1] - out.ptr[row])
+        factor = sign * c
+        diagonal = sign * g + (2.0 * mass if side % 2 == 0 else mass)
+        for i in range(3):
+            for j in range(3):
+                part = factor * d[i] * n[j]
+                values[at + i * wide + j] += part + diagonal if i == j else part
+
+
+@borrowing
+def add_to_ends(f, bars, k, fx, fy, fz):
+    """Subtract a force from the first end of a bar in ``f``, and add it to the second one."""
+    a = bars.ends[k, 0]
+    b = bars.ends[k, 1]
+    f[a, 0] -= fx
+    f[a, 1] -= fy
+    f[a, 2] -= fz
+    f[b, 0] += fx
+    f[b, 1] += fy
+    f[b, 2] += fz
+
+
+def _for_all(name: str, visit: Callable[..., Any]) -> Callable[..., Any]:
+    """Make the loop over all bars of a block that calls ``visit(x, bars, k, out)``."""
+
+    def loop(x, bars, out):
+        for k in range(bars.start, bars.stop):
+            visit(x, bars, k, out)
+
+    loop.__name__ = name
+    return kernel(loop)
+
+
+def _state_loops(law: Law, element: SimpleNamespace, measure: Callable[..., Any]) -> dict[str, Any]:
+    """Make the loops that evaluate each bar by itself at positions x, for what :class:`~pfem_petsc.mechanics.bars.Bars`
+    documents under the same names."""
+    read, evaluate, stiffness = element.read, element.evaluate, element.stiffness
+    by_rate, can_break, gone, known = law.rate, law.rupture >= 0, max(law.rupture, 0), max(law.known_rate, 0)
+
+    @borrowing
+    def tangents(x, bars, k, out):
+        d = end_difference(x, bars, k)
+        axial, geometric, inverse = stiffness(d, read(bars, k), bars.step)
+        n = (d[0] * inverse, d[1] * inverse, d[2] * inverse)
+        add_blocks(out, bars, k, out.weight * (axial - geometric), n, n, out.weight * geometric)
+
+    @borrowing
+    def product(x, bars, k, out):
+        """``out``: vectors u and K u (local nodes, 3)."""
+        u, sums = out
+        d = end_difference(x, bars, k)
+        axial, geometric, inverse = stiffness(d, read(bars, k), bars.step)
+        nx, ny, nz = d[0] * inverse, d[1] * inverse, d[2] * inverse
+        dx, dy, dz = end_difference(u, bars, k)
+        along = (axial - geometric) * (nx * dx + ny * dy + nz * dz)
+        add_to_ends(
+            sums, bars, k, along * nx + geometric * dx, along * ny + geometric * dy, along * nz + geometric * dz
+        )
+
+    @borrowing
+    def linearise(x, bars, k, out):
+        """``out``: weight and (5, b) n, dN/dl - N/l and N/l."""
+        weight, stored = out
+        d = end_difference(x, bars, k)
+        axial, geometric, inverse = stiffness(d, read(bars, k), bars.step)
+        stored[0, k], stored[1, k], stored[2, k] = d[0] * inverse, d[1] * inverse, d[2] * inverse
+        stored[3, k] = weight * (axial - geometric)
+        stored[4, k] = weight * geometric
+
+    @borrowing
+    def fields(x, bars, k, out):
+        """``out``: (b,) total strain, stress [Pa] and axial force [N] at the end of the last step."""
+        strains, stresses, forces = out
+        bar = read(bars, k)
+        length = length_of(end_difference(x, bars, k))
+        if by_rate:
+            strain, slope, _ = measure(length / bar.rest)
+            stress = bar.stress
+            if can_break:
+                stress *= 1.0 - abs(bar.variables[gone])
+        else:
+            strain, slope, _, stress, _, _, _ = evaluate(length, bar, 0.0)
+        strains[k] = strain
+        stresses[k] = stress
+        forces[k] = bar.area * stress * slope
+
+    @borrowing
+    def densities(x, bars, k, out):
+        """``out``: (b,) stored and dissipated energy per rest volume [J/m3], for laws without rate."""
+        _, _, _, _, _, _, found = evaluate(length_of(end_difference(x, bars, k)), read(bars, k), 0.0)
+        for density in found:
+            out[k] += density
+
+    @borrowing
+    def rates(x, bars, k, out):
+        """``out``: positions at the start of the step, velocities at x, and eta; see ``Bars.set_rates``."""
+        x0, v, eta = out
+        bar = read(bars, k)
+        dx, dy, dz = end_difference(x, bars, k)
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        strain, slope, _ = measure(length / bar.rest)
+        vx, vy, vz = end_difference(v, bars, k)
+        along = dx * vx + dy * vy + dz * vz
+        rate = slope * along / (length * bar.rest) if length > 0.0 else 0.0
+        if bars.step > 0.0:
+            begun, _, _ = measure(length_of(end_difference(x0, bars, k)) / bar.rest)
+            # what temperatures and rest lengths change the strain by in the step, and the strain at x
+            rate += (begun - bar.shift - bar.strain) / bars.step + eta * (bar.strain - (strain - bar.shift))
+        bars.history[known, k - bars.start] = rate
+
+    visits = (tangents, product, linearise, fields, densities, rates)
+    return {visit.__name__: _for_all(visit.__name__, visit) for visit in visits}
+
+
+def _step_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
+    """Make the loops of the step between two positions, with ``mean_stress`` of the law: ``step_forces`` and
+    ``step_tangents``, not symmetric, which add to ``out`` = (positions at the start, forces or :class:`MatrixRows`)."""
+    read, step_stiffness = element.read, element.step_stiffness
+
+    @borrowing
+    def both(x0, x, bars, k):
+        d0 = end_difference(x0, bars, k)
+        d = end_difference(x, bars, k)
+        bar = read(bars, k)
+        rest0 = bars.rest_at_start[k] if len(bars.rest_at_start) > 0 else bar.rest
+        shift0 = 0.0
+        warmth0 = 0.0
+        if bars.heat.shape[1] > 0:
+            shift0 = bars.heat_at_start[0, k]
+            warmth0 = bars.heat_at_start[1, k]
+        c, dc, inverse = step_stiffness(d0, d, (rest0, shift0, warmth0), bar, bars.step)
+        middle = (0.5 * (d0[0] + d[0]), 0.5 * (d0[1] + d[1]), 0.5 * (d0[2] + d[2]))
+        return c, dc, middle, (d[0] * inverse, d[1] * inverse, d[2] * inverse)
+
+    @borrowing
+    def step_forces(x, bars, k, out):
+        x0, f = out
+        c, _, middle, _ = both(x0, x, bars, k)
+        add_to_ends(f, bars, k, c * middle[0], c * middle[1], c * middle[2])
+
+    @borrowing
+    def step_tangents(x, bars, k, out):
+        x0, rows = out
+        c, dc, middle, n = both(x0, x, bars, k)
+        add_blocks(rows, bars, k, rows.weight * dc, middle, n, rows.weight * 0.5 * c)
+
+    return {visit.__name__: _for_all(visit.__name__, visit) for visit in (step_forces, step_tangents)}
+
+
+def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
+    """Make the loops that evaluate chunks of runs, several bars at once: ``forces``, with its parts for batches
+    ``add_forces``, ``clear_energies``, ``sum_energies`` and the number ``work_rows`` of rows in their workspace; and
+    ``stiffnesses``."""
+    read, evaluate, stiffness = element.read, element.evaluate, element.stiffness
+    by_rate, last, n_rows = law.rate, len(law.internal), len(law.rows)
+    places = tuple(BAR_ENERGIES.index(name) for name in law.energies)
+    n_energies = len(places)
+    first_new = 4 + n_energies
+    add_energies, put_new, changes = accumulate(n_energies), put(len(law.internal)), differ(len(law.internal))
+    can_break, gone = law.rupture >= 0, max(law.rupture, 0)
+
+    @borrowing
+    def add_forces(x, bars, begun, ended, commit, f, work):
+        """Add the internal forces of the chunks [begun, ended) of the sweep to ``f``; results as those of
+        :func:`forces`.
+
+        ``work`` (work_rows CHUNK,): end differences, force over length, sums of the energies, new history. One sum is
+        kept per position in a chunk, so vector instructions need no reordering.
+        """
+        failed = -1
+        shortened = False
+        broke = 0
+        starts, chunks = bars.sweep.starts, bars.sweep.chunks
+        rest, history, step = bars.rest, bars.history, bars.step
+        xs, ys, zs, cs = work[:CHUNK], work[CHUNK : 2 * CHUNK], work[2 * CHUNK : 3 * CHUNK], work[3 * CHUNK : 4 * CHUNK]
+        lasts = work[(first_new + last) * CHUNK :]
+        stresses = work[(first_new + last + 1) * CHUNK :]
+        for chunk in range(begun, ended):
+            first = starts[chunks[chunk]]
+            n = starts[chunks[chunk + 1]] - first
+            begin = first - bars.start  # column of the history
+            end_differences(x, bars.sweep, bars.far, chunk, work)
+            short = 0
+            changed = 0
+            for i in range(n):
+                bar = read(bars, first + i)
+                length = math.sqrt(xs[i] * xs[i] + ys[i] * ys[i] + zs[i] * zs[i])
+                short += 0 if length / bar.rest >= SHORTENED_STRETCH else 1  # NaN counts
+                strain, slope, _, stress, _, new, densities = evaluate(length, bar, step)
+                add_energies(work, 4 * CHUNK + i, bar.area * bar.rest, densities)
+                if n_rows > 0:
+                    put_new(work, first_new * CHUNK + i, new)
+                    changed += 1 if by_rate or changes(new, bar.variables) else 0
+                    if can_break:
+                        broke += 1 if new[gone] != bar.variables[gone] else 0
+                if by_rate:
+                    lasts[i] = strain - bar.shift
+                    kept = stress
+                    if can_break:  # the stress of what is left of the bar
+                        left = 1.0 - abs(bar.variables[gone])
+                        kept = stress / left if left > 0.0 else 0.0
+                    stresses[i] = kept
+                cs[i] = bar.area * stress * slope / length
+            if n_rows > 0 and commit and changed > 0:
+                for j in range(n_rows):
+                    copy(work[(first_new + j) * CHUNK :], history[j][begin : begin + n])
+            if short > 0:
+                for i in range(n):
+                    stretch = math.sqrt(xs[i] ** 2 + ys[i] ** 2 + zs[i] ** 2) / rest[first + i]
+                    if can_break:  # noqa: SIM102 - not compiled otherwise
+                        if abs(history[gone, begin + i]) >= 1.0:
+                            # it may have no length; one that breaks in this step has its force still
+                            if not (stretch > COLLAPSED_STRETCH):
+                                cs[i] = 0.0
+                            continue
+                    if stretch < SHORTENED_STRETCH:
+                        shortened = True
+                    if not (stretch > COLLAPSED_STRETCH):  # NaN fails this test too
+                        if failed < 0:
+                            failed = np.int64(first + i)  # signed, like -1
+                        # the norms of the solver must detect an inadmissible trial position
+                        cs[i] = 0.0 if commit else math.nan
+            scatter_forces(f, bars.sweep, bars.far, chunk, work)
+        return failed, shortened, broke
+
+    @inlined
+    def sum_energies(work, energies):
+        """Add the sums of ``work`` to ``energies``, see :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]."""
+        for j in range(n_energies):
+            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0  # additions that do not wait for each other
+            for i in range((4 + j) * CHUNK, (5 + j) * CHUNK, 8):
+                s0 += work[i]
+                s1 += work[i + 1]
+                s2 += work[i + 2]
+                s3 += work[i + 3]
+                s4 += work[i + 4]
+                s5 += work[i + 5]
+                s6 += work[i + 6]
+                s7 += work[i + 7]
+            energies[places[j]] += ((s0 + s1) + (s2 + s3)) + ((s4 + s5) + (s6 + s7))
+
+    @inlined
+    def clear_energies(work):
+        """Set the sums of ``work`` to zero."""
+        sums = work[4 * CHUNK :]
+        for i in range(n_energies * CHUNK):  # much faster than an assignment to a slice
+            sums[i] = 0.0
+
+    @kernel
+    def forces(x, bars, commit, f, energies):
+        """Add internal forces to ``f``, and sums over counted bars to ``energies``, see
+        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; return the first failed bar or -1, whether any bar is so short
+        that it may be inverted, and how many bars have changed their state of rupture."""
+        work = np.empty((4 + n_energies + n_rows) * CHUNK)
+        failed = -1
+        shortened = False
+        broke = 0
+        limits = (bars.sweep.counted, len(bars.sweep.diagonal), 0, bars.sweep.counted)
+        for side in range(0, 4, 2):  # first the bars that are counted on other ranks
+            clear_energies(work)
+            at, short, more = add_forces(x, bars, limits[side], limits[side + 1], commit, f, work)
+            failed = at if failed < 0 else failed
+            shortened = shortened or short
+            broke += more
+        sum_energies(work, energies)
+        return failed, shortened, broke
+
+    @borrowing
+    def linearise_chunk(x, bars, chunk, weight, stored, work):
+        starts, chunks = bars.sweep.starts, bars.sweep.chunks
+        first = starts[chunks[chunk]]
+        n = starts[chunks[chunk + 1]] - first
+        end_differences(x, bars.sweep, bars.far, chunk, work)
+        along, across = stored[0, first : first + n], stored[1, first : first + n]
+        for i in range(n):
+            d = (work[i], work[CHUNK + i], work[2 * CHUNK + i])
+            axial, geometric, inverse = stiffness(d, read(bars, first + i), bars.step)
+            along[i] = weight * ((axial - geometric) * inverse * inverse)
+            across[i] = weight * geometric
+
+    @kernel
+    def stiffnesses(x, bars, weight, stored):
+        """Write (dN/dl - N/l)/l^2 and N/l of each bar [N/m3], [N/m] times ``weight`` to ``stored`` (2, b)."""
+        work = np.empty(3 * CHUNK)
+        for chunk in range(len(bars.sweep.diagonal)):
+            linearise_chunk(x, bars, chunk, weight, stored, work)
+
+    return {
+        "forces": forces,
+        "add_forces": add_forces,
+        "clear_energies": clear_energies,
+        "sum_energies": sum_energies,
+        "work_rows": 4 + n_energies + n_rows,
+        "stiffnesses": stiffnesses,
+    }
+
+
+def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
+    """Make ``add_padded``, which adds internal forces of padded runs for batches of steps, and the number
+    ``padded_rows`` of rows in its workspace.
+
+    Laws of bars that can break have no such loop, since a step in which a bar breaks needs the energies: it is replaced
+    by a function that does nothing.
+    """
+    evaluate, by_rate, last, n_rows, n_data = (
+        element.evaluate,
+        law.rate,
+        len(law.internal),
+        len(law.rows),
+        len(law.bar_data),
+    )
+    variables_of, data_of = take(len(law.internal)), take_from(n_data)
+    put_force, put_new, put_last, changes = put(3), put(len(law.internal)), put(2), differ(len(law.internal))
+    keeps = n_rows + n_data > 0
+
+    @borrowing
+    def add_none(x, bars, base, begun, ended, work):
+        """Replace :func:`add_padded` where it does not apply."""
+        return -1, False
+
+    @borrowing
+    def add_padded(x, bars, base, begun, ended, work):
+        """Add the internal forces of the groups [begun, ended) of padded runs to ``bars.pulls`` (3 stride,), and update
+        the history in ``bars.columns.kept``; return the first failed bar, or -1, and whether any bar is so short that
+        it may be inverted.
+
+        ``x`` (n, 3) positions, which are also in ``bars.planes`` (3 stride,) from node ``base`` on; ``work``
+        (``padded_rows`` CHUNK,): forces of a group by components, and its new history.
+        """
+        failed = -1
+        shortened = False
+        data, sweep, columns, planes, sums = bars.data, bars.data.sweep, bars.columns, bars.planes, bars.pulls
+        stride = len(planes) // 3
+        heads, fars, starts, runs = columns.heads, columns.fars, columns.starts, columns.runs
+        kept, step = columns.kept, data.step
+        for group in range(begun, ended):
+            first = starts[group]
+            n = starts[group + 1] - first
+            head, tail = heads[group] - base, fars[group] - base
+            x0, y0, z0 = planes[head:], planes[stride + head :], planes[2 * stride + head :]
+            x1, y1, z1 = planes[tail:], planes[stride + tail :], planes[2 * stride + tail :]
+            short = 0
+            changed = 0
+            for i in range(n):
+                rest = columns.rest[first + i]
+                real = rest > 0.0
+                rest = rest if real else 1.0
+                dx, dy, dz = x1[i] - x0[i], y1[i] - y0[i], z1[i] - z0[i]
+                squared = dx * dx + dy * dy + dz * dz
+                length = math.sqrt(squared if real else 1.0)
+                short += 0 if length / rest >= SHORTENED_STRETCH else 1  # NaN counts
+                q = variables_of(kept, first + i)
+                before = kept[last, first + i] if by_rate else 0.0
+                p = data.parameters + data_of(kept, n_rows, first + i) if n_data else data.parameters
+                area = bar_value(columns.area, first + i) if real else 0.0
+                bar = Bar(rest, 0.0, 0.0, area, p, before, 0.0, q)
+                strain, slope, _, stress, _, new, _ = evaluate(length, bar, step)
+                pull = area * stress * slope / length
+                if keeps:
+                    pull = pull if real else 0.0  # what a column without a bar keeps may be anything
+                put_force(work, i, (pull * dx, pull * dy, pull * dz))
+                if n_rows > 0:
+                    put_new(work, 3 * CHUNK + i, new)
+                    changed += 1 if real and (by_rate or changes(new, q)) else 0
+                if by_rate:
+                    put_last(work, (3 + last) * CHUNK + i, (strain, stress))
+            if n_rows > 0 and changed > 0:
+                for j in range(n_rows):
+                    copy(work[(3 + j) * CHUNK :], kept[j][first : first + n])
+            if short > 0:
+                for run in range(runs[group], runs[group + 1]):
+                    ahead = sweep.heads[run] - heads[group]
+                    for k in range(sweep.starts[run + 1] - sweep.starts[run]):
+                        i = ahead + k
+                        a, b = heads[group] + i, fars[group] + i
+                        dx, dy, dz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+                        stretch = math.sqrt(dx * dx + dy * dy + dz * dz) / columns.rest[first + i]
+                        if stretch < SHORTENED_STRETCH:
+                            shortened = True
+                        if not (stretch > COLLAPSED_STRETCH):  # NaN fails this test too
+                            if failed < 0:
+                                failed = np.int64(sweep.starts[run] + k)  # signed, like -1
+                            for c in range(3):
+                                work[c * CHUNK + i] = 0.0
+            if columns.close[group]:
+                for run in range(runs[group], runs[group + 1]):
+                    at, count = sweep.heads[run] - heads[group], sweep.starts[run + 1] - sweep.starts[run]
+                    subtract_rows(sums, stride, head + at, count, work, at)
+                    add_rows(sums, stride, tail + at, count, work, at)
+            else:  # nodes that are both ends of bars receive forces by the number of the bar, as in single steps
+                add_rows(sums, stride, tail, n, work, 0)
+                subtract_rows(sums, stride, head, n, work, 0)
+        return failed, shortened
+
+    return {"add_padded": add_padded if law.rupture < 0 else add_none, "padded_rows": 3 + n_rows}
+
+
+@cache
+def make_loops(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
+    """Make all loops of a law and a strain measure; those of steps only if the law has a mean stress."""
+    element = make_element(law, measure)
+    found = _state_loops(law, element, measure) | _run_loops(law, element) | _padded_loops(law, element)
+    if law.mean_stress is not None:
+        found |= _step_loops(law, element)
+    return SimpleNamespace(**found)
+
+
+def batch_parts(loops: SimpleNamespace) -> tuple:
+    """Return what :func:`~pfem_petsc.stepping.batch_loop.make_fused_loop` makes its loop from."""
+    return (
+        loops.add_forces,
+        loops.sum_energies,
+        loops.clear_energies,
+        loops.work_rows,
+        loops.add_padded,
+        loops.padded_rows,
+    )
+
+
+@kernel
+def bar_lengths(points, bars, lengths):
+    """Write the lengths (b,) of bars (b, 2) between points (n, 3)."""
+    for k in range(len(bars)):
+        a = bars[k, 0]
+        b = bars[k, 1]
+        dx = points[b, 0] - points[a, 0]
+        dy = points[b, 1] - points[a, 1]
+        dz = points[b, 2] - points[a, 2]
+        lengths[k] = (dx * dx + dy * dy + dz * dz) ** 0.5
+
+
+@kernel
+def first_inverted(x, before, bars, rest):
+    """Return the first shortened bar whose direction has reversed, or -1; those with zero ``rest`` are not checked."""
+    for k in range(len(bars)):
+        a = bars[k, 0]
+        b = bars[k, 1]
+        dx = x[b, 0] - x[a, 0]
+        dy = x[b, 1] - x[a, 1]
+        dz = x[b, 2] - x[a, 2]
+        if dx * dx + dy * dy + dz * dz < 0.8 * rest[k] * rest[k]:
+            back = dx * (before[b, 0] - before[a, 0])
+            back += dy * (before[b, 1] - before[a, 1])
+            back += dz * (before[b, 2] - before[a, 2])
+            if back < 0.0:
+                return k
+    return -1

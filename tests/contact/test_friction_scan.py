@@ -2,10 +2,11 @@
 
 import friction_scan as table
 import pytest
+from pages import DOCS
 
 from pfem_petsc.errors import InputError
 
-TEXT = table.DOCUMENT.read_text(encoding="utf-8").split(table.START)[1].split(table.END)[0]
+TEXT = (DOCS / "contact.md").read_text(encoding="utf-8").split(table.START)[1].split(table.END)[0]
 HEAD, _, *ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in TEXT.split("\n\n")[0].splitlines()]
 
 

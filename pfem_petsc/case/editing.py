@@ -9,15 +9,12 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from ..errors import InputError
 from .base import StrictModel
 from .model import ANALYSES, LISTS, ONE_STAGE, CaseModel, StageOutput, shape_of
 from .toml import DEEPEST, KeyPath, key_text, plain, split_key
-
-if TYPE_CHECKING:
-    from .schema import Case
 
 V = TypeVar("V")
 
@@ -119,7 +116,7 @@ def put(data: dict[str, Any], parts: Sequence[str], value: Any, where: str) -> K
 class Place(NamedTuple):
     """Where a table is: the case that is changed with it, and its key path there."""
 
-    case: Case
+    case: CaseModel
     path: KeyPath
 
     def change(self, key: str | int, value: Any) -> None:
@@ -185,7 +182,7 @@ TABLES = {key: attribute_of(key) for key, field in CaseModel.model_fields.items(
 """Attributes of a case that are tables, by top-level key."""
 
 
-def tables_of(case: Case, given: bool = False) -> dict[str, Any]:
+def tables_of(case: CaseModel, given: bool = False) -> dict[str, Any]:
     """Return the nested tables of a case with all defaults, or as they were given; without absent tables.
 
     Tables over time from files have rows instead.
@@ -196,7 +193,7 @@ def tables_of(case: Case, given: bool = False) -> dict[str, Any]:
     return data
 
 
-def _tables(case: Case, given: bool) -> dict[str, Any]:
+def _tables(case: CaseModel, given: bool) -> dict[str, Any]:
     data: dict[str, Any] = {}
     for key, attribute in TABLES.items():
         content = case.__dict__[attribute]
@@ -213,7 +210,7 @@ def _tables(case: Case, given: bool) -> dict[str, Any]:
     return {key: value for key, value in data.items() if value or key in optional}
 
 
-def _stage(case: Case, stage: Case, given: bool) -> dict[str, Any]:
+def _stage(case: CaseModel, stage: CaseModel, given: bool) -> dict[str, Any]:
     """Return name, analysis and given tables of a stage."""
     tables = _tables(stage, given)
     analysis = "time" if stage.time is not None else "static"
@@ -237,7 +234,7 @@ def _initial(entries: Sequence[Any]) -> dict[str, Any]:
     return {**(everywhere[0] if everywhere else {}), **({"on": on} if on else {})}
 
 
-def changed_data(case: Case, changes: Iterable[tuple[KeyPath, Any]]) -> dict[str, Any]:
+def changed_data(case: CaseModel, changes: Iterable[tuple[KeyPath, Any]]) -> dict[str, Any]:
     """Return the nested tables of a case with changes: values, tables or models at key paths; None removes a key.
 
     Raises
@@ -258,7 +255,7 @@ def changed_data(case: Case, changes: Iterable[tuple[KeyPath, Any]]) -> dict[str
     return data
 
 
-def key_path(case: Case, key: str) -> KeyPath:
+def key_path(case: CaseModel, key: str) -> KeyPath:
     """Return the parts of a dotted key such as ``wall[0].point``; the attribute ``point_mass`` is the key ``mass``.
 
     Raises
@@ -303,7 +300,7 @@ def merge(old: Any, new: Any) -> Any:
     return new
 
 
-def merged_stages(old: tuple[Case, ...], new: tuple[Case, ...]) -> tuple[Case, ...]:
+def merged_stages(old: tuple[CaseModel, ...], new: tuple[CaseModel, ...]) -> tuple[CaseModel, ...]:
     """Return the stages of ``new``, in the objects of ``old`` where their numbers agree."""
     if len(old) != len(new):
         return new
@@ -313,7 +310,7 @@ def merged_stages(old: tuple[Case, ...], new: tuple[Case, ...]) -> tuple[Case, .
     return old
 
 
-def settle(case: Case, attached: bool = True) -> None:
+def settle(case: CaseModel, attached: bool = True) -> None:
     """Give all tables of a case their places in it, or take these away."""
     owner = case if attached else None
     for k, stage in enumerate(case.stage):
@@ -321,7 +318,7 @@ def settle(case: Case, attached: bool = True) -> None:
     _settle(case, owner, lambda key: (key,))
 
 
-def _of_stage(case: Case, k: int, key: str) -> KeyPath:
+def _of_stage(case: CaseModel, k: int, key: str) -> KeyPath:
     """The place of a table that is in force in stage k: in the stage that gives it, or in the case."""
     if key == "section":  # of which a stage gives the prestress alone
         return (key,)
@@ -333,7 +330,7 @@ def _of_stage(case: Case, k: int, key: str) -> KeyPath:
     return ("stage", k, key) if key in ONE_STAGE and k else (key,)
 
 
-def _settle(case: Case, owner: Case | None, place: Callable[[str], KeyPath]) -> None:
+def _settle(case: CaseModel, owner: CaseModel | None, place: Callable[[str], KeyPath]) -> None:
     case.__dict__["editor"] = (case if owner is None else owner), place
     for key, attribute in TABLES.items():
         content = case.__dict__[attribute]

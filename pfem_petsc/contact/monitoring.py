@@ -19,32 +19,26 @@ from .neighbours import NeighbourSearch, Segments
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
-    from ..stepping.stepper import Stepper
     from .walls.base import BaseWall
 
 
-def check_positions(stepper: Stepper) -> None:
+def check_positions(model: Model, x: np.ndarray, time: float, where: str) -> None:
     """Check that no node lies beyond a wall, with one pass over the nodes and one reduction. Collective.
 
     Parameters
     ----------
-    stepper : Stepper
-        At the end of a step.
+    model : Model
+    x : (owned, 3) positions [m] at a time [s] at which contact holds
+    where : the step, for the message
 
     Raises
     ------
     SimulationFailure
         On all ranks, with the wall, its deepest node and depth, the number of nodes, the step, and the remedy.
     """
-    model, state, balance = stepper.model, stepper.state, stepper.balance
     contact, comm = model.contact, model.comm
     if not contact.any:
         return
-    x, time = state.position, state.time
-    if not stepper.scheme.solves_end:
-        if balance is None:  # at the start, or right after a restart: checked before
-            return
-        x, time = balance.predictor + stepper.solution.u, balance.time
     gaps = contact.gaps(x, time)
     gaps[:, [wall.partial for wall in contact.walls]] = np.inf
     tolerance = BEYOND * max(model.size, model.reach)
@@ -59,7 +53,6 @@ def check_positions(stepper: Stepper) -> None:
     depth, node, wall = min(comm.allgather(deepest))
     count = comm.allreduce(int((gaps[:, wall] < -tolerance).sum()))
     carried = comm.allreduce(deepest == (depth, node, wall) and _prescribed(contact, suspects[at], wall, x, time))
-    where = f"step {stepper.number}, t = {stepper.place:.6g} s"
     if carried:
         raise SimulationFailure(_told(where, node, -depth, contact.names[wall], count))
     case = model.case

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from mpi4py import MPI
 
 from ..columns import BAR_ENERGIES
 from ..errors import InputError
@@ -18,7 +19,7 @@ from .elements import MEASURES, BarData, ElementFamily, MatrixRows, bar_lengths,
 from .materials.base import BarShapes, Law, UnsuitableBarError, internal_variables, law_of
 from .runs import Sweep, make_sweep
 from .rupture import breakable, limit_values, make_release
-from .springs import Springs
+from .springs import Springs, connected, connector_modulus
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -606,3 +607,23 @@ def release(bars: Bars, x: np.ndarray, members: np.ndarray, state: float) -> np.
             change[BAR_ENERGIES.index(name)] -= energy
             change[BAR_ENERGIES.index("rupture_dissipation")] += energy
     return change
+
+
+def viscous_rate(case: Case, bars: Bars, mass: np.ndarray, consistent: bool) -> float:
+    """Return an upper bound of the eigenvalues of C over M [1/s] of dashpots between nodes. Collective.
+
+    By Gershgorin's theorem it is the largest sum of 2 c/m at a node; a consistent mass is at least a third of the
+    lumped one.
+    """
+    viscous = {table.key for table in connected(case) if table.viscous}
+    if not viscous:
+        return 0.0
+    sums = np.zeros(bars.mesh.n_local)
+    for block in bars.blocks:
+        if block.section in viscous:
+            part = slice(block.start, block.stop)
+            values = np.asarray(block.area) * connector_modulus(case) / bars.mesh_lengths[part]
+            for end in (0, 1):
+                np.add.at(sums, bars.ends[part, end], 2.0 * values)
+    largest = float((sums[: len(mass)] / mass).max(initial=0.0))
+    return (3.0 if consistent else 1.0) * bars.mesh.comm.allreduce(largest, op=MPI.MAX)

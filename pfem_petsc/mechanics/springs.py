@@ -6,7 +6,6 @@ import copy
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from mpi4py import MPI
 
 from ..case.tables import Section
 from ..errors import InputError
@@ -17,7 +16,6 @@ from .supports import axes_of
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from .bars import Bars
     from .block_pattern import BlockPattern
 
 
@@ -131,7 +129,7 @@ def with_connectors(case: Case) -> Case:
     tables = connected(case)
     if not tables:
         return case
-    scale = _modulus(case)
+    scale = connector_modulus(case)
     made = copy.copy(case)
     materials, sections = dict(case.material), dict(case.section)
     for table in tables:
@@ -142,7 +140,7 @@ def with_connectors(case: Case) -> Case:
     return made
 
 
-def _modulus(case: Case) -> float:
+def connector_modulus(case: Case) -> float:
     """Modulus [Pa], and viscosity [Pa s], of all connectors: that of a bar of the case."""
     return max(material.young_modulus for material in case.material.values())
 
@@ -165,7 +163,7 @@ def add_connectors(
     for k, table in enumerate(connected(case)):
         pairs, lengths = _pairs(f"{case.source}: {table.key}.between", table.between, nodes, mesh)
         ends.append(pairs)
-        areas.append(table.value * lengths / _modulus(case))
+        areas.append(table.value * lengths / connector_modulus(case))
         kinds.append(np.full(len(pairs), len(case.section) + k, dtype=np.int32))
     new = np.concatenate(ends).astype(index_type(slab.n_nodes))
     return with_bars(slab, mesh.comm, new, sections, np.concatenate(kinds), (_AREA, np.concatenate(areas)))
@@ -198,23 +196,3 @@ def _pairs(
             )
         pairs[k], lengths[k] = (first[at], number), away[at]
     return pairs, lengths
-
-
-def viscous_rate(case: Case, bars: Bars, mass: np.ndarray, consistent: bool) -> float:
-    """Return an upper bound of the eigenvalues of C over M [1/s] of dashpots between nodes. Collective.
-
-    By Gershgorin's theorem it is the largest sum of 2 c/m at a node; a consistent mass is at least a third of the
-    lumped one.
-    """
-    viscous = {table.key for table in connected(case) if table.viscous}
-    if not viscous:
-        return 0.0
-    sums = np.zeros(bars.mesh.n_local)
-    for block in bars.blocks:
-        if block.section in viscous:
-            part = slice(block.start, block.stop)
-            values = np.asarray(block.area) * _modulus(case) / bars.mesh_lengths[part]
-            for end in (0, 1):
-                np.add.at(sums, bars.ends[part, end], 2.0 * values)
-    largest = float((sums[: len(mass)] / mass).max(initial=0.0))
-    return (3.0 if consistent else 1.0) * bars.mesh.comm.allreduce(largest, op=MPI.MAX)

@@ -258,8 +258,10 @@ class Snapshots(Observer):
         state, fields = self._stepper.state, self._fields
         if not self.every and 0 < state.step < self._analysis.last_step:
             return
-        check_positions(self._stepper)
         number, place = self._stepper.number, self._stepper.place
+        held = self._stepper.held_by_contact()
+        if held is not None:
+            check_positions(self._stepper.model, *held, f"step {number}, t = {place:.6g} s")
         now = Snapshot(self._stepper.model, state, self._stepper.acceleration)
         self.writer.write_snapshot(place, number, state.position, fields.at("nodes", now), fields.at("bars", now))
         self.last = number

@@ -12,8 +12,8 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from ..integrators.base import Scheme
+from ..mechanics.bars import viscous_rate
 from ..mechanics.materials.base import law_name, law_of
-from ..mechanics.springs import viscous_rate
 from ..output.units import TIME as AXIS
 from ..output.units import Axis, engineering
 from ..registry import lookup

@@ -445,6 +445,15 @@ class Stepper(ABC):
             return a, state.support
         return a, model.supports.part(model.inertia.mass_times(a, np.empty_like(a)) - held)
 
+    def held_by_contact(self) -> tuple[np.ndarray, float] | None:
+        """Return the positions (owned, 3) [m] and the time [s] at which contact holds; None if they are not known, as
+        at the start or right after a restart."""
+        if self.scheme.solves_end:
+            return self.state.position, self.state.time
+        if self.balance is None:
+            return None
+        return self.balance.predictor + self.solution.u, self.balance.time
+
     def totals(self) -> np.ndarray:
         """Return this rank's sums (3, 3) of support, external and damping force [N] at the state."""
         state, inertia = self.state, self.model.inertia

@@ -28,7 +28,7 @@ def test_a_node_beyond_a_wall_is_an_error(scheme, comm, shared_tmp_path):
     where = stepper.state.position if stepper.scheme.solves_end else stepper.balance.predictor
     solved = where if stepper.scheme.solves_end else where + stepper.solution.u
     where[tip, 0] += 1.05 - solved[tip, 0] + 0.5 * BEYOND
-    check_positions(stepper)
+    check_positions(simulation.model, *stepper.held_by_contact(), "here")
     where[tip, 0] += 2e-3
     with pytest.raises(SimulationFailure) as failure:
         simulation.outputs.snapshots.write()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import tomllib
 from pathlib import Path
@@ -53,6 +54,27 @@ def test_every_folder_is_on_its_floor():
     folders = {name for name in (*FLOOR, *PARTS) if "." not in name}
     assert {name for row in rows for name in row} == folders - {"__init__", "__main__"}
     assert all(max(below) < min(above) for above, below in zip(floors, floors[1:], strict=False))
+
+
+def names_in(file: Path) -> set[str]:
+    """Functions and classes of a module, and the methods of these, as ``Class.method``."""
+    found = set()
+    for node in ast.parse(file.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+            found |= {f"{node.name}.{part.name}" for part in node.body if isinstance(part, ast.FunctionDef)}
+    return found
+
+
+def test_stops_of_walks_exist():
+    """Each walk has at most 15 stops, and each stop is a module with a name in it."""
+    walks = (ROOT / "docs" / "architecture.md").read_text().split("## Walks")[1].split("\n## ")[0].split("\n### ")[1:]
+    assert len(walks) == 5
+    for walk in walks:
+        stops = re.findall(r"^\d+\. `([\w/]+\.py)` `([\w.]+)`:", walk, flags=re.MULTILINE)
+        assert 4 <= len(stops) <= 15 and len(stops) == len(re.findall(r"^\d+\. ", walk, flags=re.MULTILINE))
+        for module, name in stops:
+            assert name in names_in(ROOT / "pfem_petsc" / module), (module, name)
 
 
 def test_index_leads_to_every_page():

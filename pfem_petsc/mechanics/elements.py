@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numba.extending import register_jitable
 
-from ..energies import BAR_ENERGIES
+from ..columns import BAR_ENERGIES
 from .compiled import borrowing, inlined, kernel
 from .materials.base import Law
 from .runs import Sweep, copy, end_differences, scatter_forces
@@ -299,7 +299,7 @@ def add_to_ends(f, bars, k, fx, fy, fz):
 def _for_all(name: str, visit: Callable[..., Any]) -> Callable[..., Any]:
     """Make the loop over all bars of a block that calls ``visit(x, bars, k, out)``."""
 
-    def loop(x, bars, out):
+    def loop(x: Any, bars: Any, out: Any) -> None:
         for k in range(bars.start, bars.stop):
             visit(x, bars, k, out)
 

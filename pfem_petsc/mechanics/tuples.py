@@ -80,7 +80,7 @@ def bar_value(values: Any, bar: int) -> float:
 
 
 @overload(bar_value, jit_options={"_nrt": False})
-def _bar_value(values: Any, bar: Any) -> Callable[..., Any] | None:  # noqa: ANN001, ANN202 - Numba's types
+def _bar_value(values, bar):  # noqa: ANN001, ANN202 - Numba's types
     if isinstance(values, types.Array):
         return lambda values, bar: values[bar]
     return lambda values, bar: values

@@ -25,6 +25,7 @@ from .ledger_loops import (
     LANES,
     REACTIONS,
     NodeValues,
+    RowRoom,
     add_drags,
     add_loads,
     add_powers,
@@ -41,14 +42,14 @@ from .ledger_loops import (
 
 
 @borrowing
-def move_block(block, n, x, h, half, f, light, planes, pulls, base):
+def move_block(block, shared, f, light, bars, base):
     """Move the nodes of a block, and set their forces to zero; in ``light`` steps those of :func:`split_block`."""
     first = NODE_BLOCK * block
-    last = min(first + NODE_BLOCK, n)
-    where = x[first:last].reshape(-1)
-    move(where, h, half[first:last].reshape(-1))
+    last = min(first + NODE_BLOCK, len(shared.half))
+    where = shared.x[first:last].reshape(-1)
+    move(where, shared.h, shared.half[first:last].reshape(-1))
     if light:
-        split_block(first, last, x, planes, pulls, base)
+        split_block(first, last, shared.x, bars.planes, bars.pulls, base)
         return
     sums = f[first:last].reshape(-1)
     for j in range(len(sums)):
@@ -86,24 +87,7 @@ def advance_block(block, nodes, shared, f, start):
     here, factor = shared.speeds[: 3 * (last - first)], shared.factors[: 3 * (last - first)]
     forces = f[first - start : last - start]
     spread(shared.inverses[first:last], factor)
-    hold_still(
-        begin,
-        end,
-        first,
-        nodes.support_nodes,
-        components,
-        nodes.support_positions,
-        nodes.mass,
-        nodes.external,
-        forces,
-        shared.x,
-        half,
-        h,
-        alpha,
-        factor,
-        held,
-        support,
-    )
+    hold_still(block, nodes, shared, forces, factor)
     force, ahead = forces.reshape(-1), half[first:last].reshape(-1)
     if len(nodes.external) > 0:
         load = nodes.external[first:last].reshape(-1)
@@ -178,13 +162,16 @@ def finish_block(block, nodes, shared, f, start, contact, u):
 
 
 @borrowing
-def pass_block(block, finished, pressing, rows, alone, nodes, shared, f, u, contact):
+def pass_block(block, counts, rows, alone, nodes, shared, arrays):
     """Solve a block and the rows of its nodes whose other node is in it or in a block before; finish all blocks that
     wait for no other rows.
 
-    ``alone`` (blocks,) bool: whether forces alone determine the increments of a block. ``finished`` blocks were
-    finished before, ``pressing`` rows have a force. Returns both numbers, and that of rows whose force begins or ends.
+    ``alone`` (blocks,) bool: whether forces alone determine the increments of a block; ``counts``: numbers of blocks
+    that are finished, and of rows that have a force; ``arrays``: internal forces, increments, contact forces (n, 3).
+    Returns both numbers, and that of rows whose force begins or ends.
     """
+    finished, pressing = counts
+    f, u, contact = arrays
     n = len(shared.half)
     if not alone[block]:
         first = NODE_BLOCK * block
@@ -234,11 +221,13 @@ def sum_rows(rows, pressing):
 
 
 @kernel
-def finish_rows(rows, changed, slack, x, half, nodes, alpha, eta, u, v, a, contact):
+def finish_rows(rows, changed, slack, nodes, shared, state, u):
     """Return the dissipation [J] of rows that close; ``changed`` rows have a force that begins or ends.
 
-    ``v`` and ``a`` are written at their nodes.
+    Velocities and accelerations of the state are written at their nodes.
     """
+    x, half, alpha, eta = shared.x, shared.half, shared.alpha, shared.eta
+    v, a, contact = state.v, state.a, state.contact
     where, force, closed = rows.where, rows.force, rows.closed
     at, count = np.empty(changed, dtype=np.int64), 0
     ends = np.empty((2, changed, 10))
@@ -303,13 +292,17 @@ def find_pressed(block, walls, free):
 
 
 @kernel
-def press_block(block, m, nodes, walls, free, u, alpha, eta, contact, pressed, count):
-    """Press the ``m`` nodes of a block that :func:`find_pressed` has found, and append them to the ``count`` nodes of
-    ``pressed``; correct their increments in ``u``, and write their forces to ``contact`` (n, 3) [N]. Return the first
-    infeasible node among all of them, or -1.
+def press_block(block, counts, nodes, walls, shared, places_of, out):
+    """Press the nodes of a block that :func:`find_pressed` has found, and append them to those of before; ``counts``:
+    their numbers. Return the first infeasible node among all of them, or -1.
 
-    ``free``, ``u``: positions and increments of the nodes of the block, flat.
+    ``places_of``: positions and increments of the nodes of the block, flat, of which the latter are corrected; ``out``:
+    contact forces (n, 3) [N], and Pressed, to which they are written.
     """
+    m, count = counts
+    alpha, eta = shared.alpha, shared.eta
+    free, u = places_of
+    contact, pressed = out
     first = NODE_BLOCK * block
     damped = len(nodes.damping) > 0
     found = walls.room[:m].copy()
@@ -341,11 +334,13 @@ _CONTACTS, _SLACK = HEAD.first("active_contacts"), HEAD.first("slack_bars")
 
 
 @kernel
-def stop_at_walls(x, half, nodes, walls, alpha, eta, u, v, a, contact, touched, met):
+def stop_at_walls(nodes, walls, shared, state, u, touched, met):
     """Return the dissipation of contacts that close [J], and the nodes that are on walls afterwards.
 
-    ``v`` and ``a`` are written at the nodes that touch walls or have touched them.
+    Velocities and accelerations of the state are written at the nodes that touch walls or have touched them.
     """
+    x, half, alpha, eta = shared.x, shared.half, shared.alpha, shared.eta
+    v, a, contact = state.v, state.a, state.contact
     around = join_nodes(met, touched, walls.present)
     for i in around:
         centre(u[i], eta, half[i], v[i])
@@ -381,9 +376,11 @@ def push_particles(totals, force, links, alpha, h, impulses, u):
 
 
 @kernel
-def complete(n, f, half, nodes, alpha, eta, alone, held, stiffness, u, a, v):
+def complete(nodes, shared, state, alone, stiffness, u):
     """Compute the increments of blocks whose forces ``alone`` (blocks,) determine them, and accelerations and
-    velocities of all nodes; ``held`` (k,): increments of prescribed components of these blocks [m]."""
+    velocities of all nodes; ``stiffness`` (n,) is workspace."""
+    n, f, v, a = len(shared.half), state.f, state.v, state.a
+    half, alpha, eta, held = shared.half, shared.alpha, shared.eta, shared.held
     loaded, nothing = len(nodes.external) > 0, np.empty((0, 3))
     for block in range(len(alone)):
         if not alone[block]:
@@ -401,34 +398,34 @@ def complete(n, f, half, nodes, alpha, eta, alone, held, stiffness, u, a, v):
     accelerations(u.reshape(-1), alpha, a.reshape(-1))
 
 
+class RowSums(NamedTuple):
+    """What a row has besides the state: increments of the particles, see :func:`push_particles`; forces (w, 3),
+    moments, contacts and releases of the walls; forces of the tables of links; number of nodes with contact forces;
+    totals (6, 3) of the balance; and workspace."""
+
+    increments: np.ndarray
+    force: np.ndarray
+    moment: np.ndarray
+    contacts: np.ndarray
+    releases: np.ndarray
+    links: np.ndarray
+    touching: int
+    totals: np.ndarray
+    room: RowRoom
+    ends: np.ndarray
+
+
 @kernel
-def fill_row(
-    x,
-    h,
-    alpha,
-    eta,
-    bars,
-    nodes,
-    probes,
-    state,
-    impulses,
-    push_u,
-    wall_sums,
-    link_sums,
-    touching,
-    powers,
-    room,
-    totals,
-    ends,
-    ledger,
-    row,
-):
+def fill_row(data, sums, row):
     """Fill the ledger's sums and the row of a step whose state is complete; return the kinetic energy [J].
 
-    ``push_u``: see :func:`push_particles`; ``wall_sums``: forces, moments, contacts and releases of the walls;
-    ``link_sums``: forces of the tables of links; ``touching``: number of nodes with contact forces; ``powers``: of the
-    balances before; ``room`` and ``ends`` are workspace.
+    ``data``: :class:`~pfem_petsc.stepping.batch_loop.BatchData`; ``sums``: RowSums.
     """
+    h, x, bars, nodes, probes, state = data.h, data.x, data.bars, data.nodes, data.probes, data.state
+    impulses, powers, ledger = data.impulses, data.powers, data.ledger
+    push_u, link_sums, touching = sums.increments, sums.links, sums.touching
+    totals, room, ends = sums.totals, sums.room, sums.ends
+    alpha, eta = 1.0 / (h * h), 0.5 / h
     n, energies = len(state.v), state.energies
     stored = 0.0
     for k in range(len(energies)):
@@ -454,7 +451,7 @@ def fill_row(
             slack += bars.data.history[bars.slack, k]
         row[_SLACK] = slack
     at = _HEAD
-    force, moment, contacts, releases = wall_sums
+    force, moment, contacts, releases = sums.force, sums.moment, sums.contacts, sums.releases
     if len(force) > 0:
         at = fill_walls(row, _HEAD + 1, force, moment, impulses.v, contacts, releases)
     at = fill_links(row, at, link_sums, impulses.v, WALLS + len(force))

@@ -17,6 +17,7 @@ from ..mechanics.runs import Columns, exchange_history, new_rows, slide_planes
 from ..mechanics.tuples import CHUNK
 from ..mesh.ordering import NODE_BLOCK
 from .batch_blocks import (
+    RowSums,
     advance_block,
     complete,
     fill_row,
@@ -153,6 +154,27 @@ class StateArrays(NamedTuple):
     energies: np.ndarray
 
 
+class BatchData(NamedTuple):
+    """All that a batch reads and writes: the step [s]; positions (local, 3), those of the previous step, which are
+    computed for the last step alone, and velocities at half steps (n, 3); records of arrays; the ledger's sums and its
+    works of balances; and its particles."""
+
+    h: float
+    x: np.ndarray
+    before: np.ndarray
+    half: np.ndarray
+    bars: BarArrays
+    nodes: NodeArrays
+    walls: WallArrays
+    rows: NamedTuple
+    probes: ProbeArrays
+    messages: NamedTuple
+    state: StateArrays
+    ledger: np.ndarray
+    powers: np.ndarray
+    impulses: ImpulseArrays
+
+
 _HEAD, _ALARM = HEAD.width, HEAD.first("alarm")  # constants of the machine code
 _IMPACT = HEAD.first("impact_dissipation")
 
@@ -173,13 +195,10 @@ def make_fused_loop(
     whose energies nothing reads; see
     :func:`~pfem_petsc.mechanics.elements.make_loops`.
 
-    Its arguments are the maximum number of steps; the step [s]; positions, positions of the previous step, which are
-    computed for the last step alone, and velocities at half steps (n, 3); arrays of bars, nodes, walls, rows between
-    nodes, probes, messages, and of the state; nodes (m,) that touch walls; nodes (k,) that have touched walls and not
-    left them; the ledger's sums and its works of balances; its particles; whether a row of the history is ``due``
-    (count,) after each step; and ``sums`` (count, width), which receives the sums of the rows that are due, and for
-    each step the changes of contacts. Velocities, accelerations, momenta and energies are computed only where a row is
-    due, and after the last step.
+    Its arguments are BatchData; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them;
+    whether a row of the history is ``due`` (count,) after each step; and ``sums`` (count, width), which receives the
+    sums of the rows that are due, and for each step the changes of contacts. Velocities, accelerations, momenta and
+    energies are computed only where a row is due, and after the last step.
 
     It returns the number of steps made, and MPI's error code; for the last step, which is the last one too if bars
     change their state of rupture there, the number of these bars, the first bar that collapsed and the first that went
@@ -204,27 +223,17 @@ def make_fused_loop(
         pull(x, bars, 0, bars.data.sweep.counted, f, work)
 
     @kernel
-    def fused_loop(
-        count,
-        h,
-        x,
-        before,
-        half,
-        bars,
-        nodes,
-        walls,
-        rows,
-        probes,
-        messages,
-        state,
-        touched,
-        met,
-        ledger,
-        powers,
-        impulses,
-        due,
-        sums,
-    ):
+    def fused_loop(data, touched, met, due, sums):
+        count, h, x, before, half = len(due), data.h, data.x, data.before, data.half
+        bars, nodes, walls, rows, messages, state = (
+            data.bars,
+            data.nodes,
+            data.walls,
+            data.rows,
+            data.messages,
+            data.state,
+        )
+        ledger, powers, impulses = data.ledger, data.powers, data.impulses
         n = len(half)
         n_walls = len(walls.offsets)
         f, a, v, support, contact = state.f, state.a, state.v, state.support, state.contact
@@ -319,7 +328,7 @@ def make_fused_loop(
             for block in range(n_blocks + 1):
                 if waiting and block == min(bars.meeting, n_blocks):
                     while moved < n_blocks:
-                        move_block(moved, n, x, h, half, f, light, planes, pulls, base)
+                        move_block(moved, shared, f, light, bars, base)
                         moved += 1
                     for i in range(n, len(x)):
                         f[i, 0] = f[i, 1] = f[i, 2] = 0.0
@@ -346,7 +355,7 @@ def make_fused_loop(
                         slide_planes(planes, live - base, NODE_BLOCK * moved - live)
                         slide_planes(pulls, live - base, NODE_BLOCK * moved - live)
                         base = live
-                    move_block(moved, n, x, h, half, f, light, planes, pulls, base)
+                    move_block(moved, shared, f, light, bars, base)
                     moved += 1
                 start = NODE_BLOCK * block if brief else 0
                 if light:
@@ -364,8 +373,9 @@ def make_fused_loop(
                     advance_block(block, nodes, shared, forces, start)
                     continue
                 if linked:
+                    arrays = (f, u, contact)
                     finished, pressing, more = pass_block(
-                        block, finished, pressing, rows, alone, nodes, shared, f, u, contact
+                        block, (finished, pressing), rows, alone, nodes, shared, arrays
                     )
                     altered += more
                     continue
@@ -374,7 +384,8 @@ def make_fused_loop(
                 solve_block(block, nodes, shared, forces, start, free, here)
                 found = find_pressed(block, walls, free) if n_walls > 0 else 0
                 if found > 0:
-                    at = press_block(block, found, nodes, walls, free, here, alpha, eta, contact, pressed, count_near)
+                    counts, out = (found, count_near), (contact, pressed)
+                    at = press_block(block, counts, nodes, walls, shared, (free, here), out)
                     infeasible = at if infeasible < 0 else infeasible
                     count_near += found
                 finish_block(block, nodes, shared, forces, start, contact, here)
@@ -400,9 +411,9 @@ def make_fused_loop(
                 clear_sums(lanes[CONTACT], n)
                 add_sparse_powers(near, contact, v, lanes[CONTACT])
             if len(touched) > 0 or len(met) > 0:
-                impact, met = stop_at_walls(x, half, nodes, walls, alpha, eta, u, v, a, contact, touched, met)
+                impact, met = stop_at_walls(nodes, walls, shared, state, u, touched, met)
             if altered > 0:
-                impact += finish_rows(rows, altered, walls.slack, x, half, nodes, alpha, eta, u, v, a, contact)
+                impact += finish_rows(rows, altered, walls.slack, nodes, shared, state, u)
             sum_rows(rows, pressing)
             touching = len(near) + 2 * pressing
             after[:] = powers
@@ -418,7 +429,7 @@ def make_fused_loop(
                 turned = -1
                 if brief:
                     pull_again(x, n, bars, f, work, aside)
-                complete(n, f, half, nodes, alpha, eta, alone, held, stiffness, u, a, v)
+                complete(nodes, shared, state, alone, stiffness, u)
                 if shortened or wrong or step == count - 1:
                     start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
                 if failed < 0 and shortened:
@@ -432,27 +443,9 @@ def make_fused_loop(
                     for k in range(len(energies)):
                         energies[k] = 0.0
                     sum_energies(work, energies)
-                kinetic = fill_row(
-                    x,
-                    h,
-                    alpha,
-                    eta,
-                    bars,
-                    nodes,
-                    probes,
-                    state,
-                    impulses,
-                    push_u,
-                    (pressed.force, pressed.moment, pressed.contacts, walls.releases),
-                    rows.totals,
-                    touching,
-                    powers,
-                    room,
-                    totals,
-                    ends,
-                    ledger,
-                    row,
-                )
+                of_walls = (pressed.force, pressed.moment, pressed.contacts, walls.releases)
+                row_sums = RowSums(push_u, *of_walls, rows.totals, touching, totals, room, ends)
+                kinetic = fill_row(data, row_sums, row)
                 row[_ALARM] = 1.0 if failed >= 0 or turned >= 0 or infeasible >= 0 else 0.0
             powers[:] = after
             if wrong and not several:

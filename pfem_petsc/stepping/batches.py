@@ -16,7 +16,16 @@ from ..mechanics.runs import Columns, make_columns, new_planes, no_columns
 from ..mesh.ordering import NODE_BLOCK
 from ..parallel.heap import return_freed_memory
 from ..tolerances import PROJECTED
-from .batch_loop import BarArrays, ImpulseArrays, NodeArrays, ProbeArrays, StateArrays, WallArrays, make_fused_loop
+from .batch_loop import (
+    BarArrays,
+    BatchData,
+    ImpulseArrays,
+    NodeArrays,
+    ProbeArrays,
+    StateArrays,
+    WallArrays,
+    make_fused_loop,
+)
 from .ledger import LeapfrogLedger
 from .stepper import Solution
 
@@ -166,26 +175,11 @@ class Batch:
             return_freed_memory()
             self._first = False
         rows = self.model.links.export_rows(self._stiffness)
+        motion = stepper.h, state.x, stepper.before, half
+        constant = self._bars, self._nodes, self._walls, rows, self._probes, self._messages
+        data = BatchData(*motion, *constant, arrays, ledger.sums, ledger.powers, impulses)
         done, lost, changed, failed, turned, infeasible, offsets, kinetic, u, touched, log.last, met, held = self._loop(
-            len(due),
-            stepper.h,
-            state.x,
-            stepper.before,
-            half,
-            self._bars,
-            self._nodes,
-            self._walls,
-            rows,
-            self._probes,
-            self._messages,
-            arrays,
-            log.last,
-            ledger.impacts.met,
-            ledger.sums,
-            ledger.powers,
-            impulses,
-            due,
-            self.sums,
+            data, log.last, ledger.impacts.met, due, self.sums
         )
         self.model.links.import_rows(rows)
         if lost:

@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
 from ..mechanics.compiled import kernel
+from ..mesh.ordering import NODE_BLOCK
 from ..tolerances import BEYOND, PROJECTED
 from .stepper import Solution, Stepper
 
@@ -82,23 +83,23 @@ def hold(supports, predictor, stiffness, u, load):
 
 
 @kernel
-def hold_still(
-    begin, end, origin, nodes, components, positions, mass, external, f, x, half, h, alpha, inverse, held, support
-):
+def hold_still(block, nodes, shared, f, inverse):
     """:func:`hold` and :func:`react` for a leapfrog scheme without damping and contact, before its other components.
 
-    Writes the increments of the prescribed components [begin, end) to ``held`` (k,) and their reactions to ``support``
-    (owned, 3) [N], and sets their inverse stiffness to zero in ``inverse`` (3 m,). This array and the forces ``f`` (m,
-    3) are those of the nodes from ``origin`` on.
+    Writes the increments of the prescribed components of a block of nodes to ``shared.held`` (k,) and their reactions
+    to ``shared.support`` (owned, 3) [N], and sets their inverse stiffness to zero in ``inverse`` (3 m,). This array and
+    the forces ``f`` (m, 3) are those of the block.
     """
-    loaded = len(external) > 0
-    for k in range(begin, end):
-        i, c = nodes[k], components[k]
-        stiffness = alpha * mass[i]
+    components, positions, external = nodes.support_components, nodes.support_positions, nodes.external
+    held, support, x, half = shared.held, shared.support, shared.x, shared.half
+    origin, loaded = NODE_BLOCK * block, len(external) > 0
+    for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
+        i, c = nodes.support_nodes[k], components[k]
+        stiffness = shared.alpha * nodes.mass[i]
         pull = f[i - origin, c]
         force = external[i, c] - pull if loaded else -pull
         free = stiffness * (force * (1.0 / stiffness))
-        held[k] = positions[k] - (x[i, c] + h * half[i, c])
+        held[k] = positions[k] - (x[i, c] + shared.h * half[i, c])
         support[i, c] = stiffness * held[k] - free
         inverse[3 * (i - origin) + c] = 0.0
 

@@ -296,7 +296,8 @@ def start_in_motion(stepper: Stepper) -> None:
         load -= model.inertia.damping_times(state.v, np.zeros_like(load))
     state.a = _acceleration(stepper, load)
     if model.can_touch and model.inertia.redistribution is None:
-        walls = start_at_rest(model, state, partial(_acceleration, stepper), load)
+        accelerate, still = partial(_acceleration, stepper), ON_BOUND * model.wave_speed
+        walls = start_at_rest(model.links, model.inertia, state, accelerate, load, still)
         if walls is not None:
             held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)], len(state.v))
             stepper.solution.walls, stepper.solution.contacts = walls, held

@@ -497,7 +497,7 @@ class ActiveSet:
         self._displacements = self.contact.motion.displacements(balance.time)
         kind = NoStepFriction if self.contact.symmetric else StepFriction
         self.friction = kind(model, state, balance)
-        self.candidates = expected_candidates(model, state, balance, held, self._displacements)
+        self.candidates = expected_candidates(model.contact, state, balance, held, self._displacements)
         move, slack = (balance.time - state.time) * state.v, BEYOND * model.size
         self._all_links = tuple(links)
         self.links = tuple(link for link in links if link.reached(state, move, slack))
@@ -636,34 +636,29 @@ class ActiveSet:
     def _check_links(
         self, trial: Trial, bounds: Bounds, w: np.ndarray, x: np.ndarray, g: np.ndarray, noise: float, slack: float
     ) -> tuple[bool, tuple[RowCoordinates, ...], np.ndarray]:
-        """Return whether links are satisfied at positions (owned, 3), the links of the next solve, and the part of the
-        residual force that walls must balance. Collective."""
-        kept, met, at = True, list(trial.links), trial.frames.nodes
-        turned, g = g, g.copy() if trial.links else g
-        if trial.links:
-            turned = g.copy()
-            turned[at] = np.einsum("nji,nj->ni", trial.frames.inverse, g[at])
-        for link in self._all_links:
-            if link not in trial.links:
-                if link.broken(x, slack):  # it was not expected to close
-                    met.append(link)
-                continue
-            link.solve_forces(w, turned, bounds.arrays[0], noise)
-            link.constraints.add_forces(g, -1.0)
-            kept &= link.satisfied(x, slack)
-        self._link_iterations += not kept
+        """Return whether rows over several nodes are satisfied at positions (owned, 3), those of the next solve, and
+        part of the residual force that walls must balance. Collective."""
+        if not trial.links:
+            unexpected = tuple(rows for rows in self._all_links if rows.broken(x, slack))
+            return not unexpected, unexpected, g
+        (rows,), at = trial.links, trial.frames.nodes
+        turned, g = g.copy(), g.copy()
+        turned[at] = np.einsum("nji,nj->ni", trial.frames.inverse, g[at])
+        rows.solve_forces(w, turned, bounds.arrays[0], noise)
+        rows.constraints.add_forces(g, -1.0)
+        satisfied = rows.satisfied(x, slack)
+        self._link_iterations += not satisfied
         if self._link_iterations >= _ITERATIONS:
             raise NotConverged(f"constraints and positions did not agree in {_ITERATIONS} solves; {self._remedy}")
-        links = tuple(link for link in self._all_links if link in met)
-        return kept and len(links) == len(trial.links), links, g
+        return satisfied, trial.links, g
 
     def forces(self, outcome: Outcome, u: np.ndarray) -> tuple[np.ndarray, WallForces, np.ndarray]:
         """Return contact forces (owned, 3) [N], sums per wall, and the owned nodes in contact, at the solution."""
         total = np.zeros_like(u)
-        for link in self._all_links:
-            if link not in outcome.links:
-                link.constraints.release()
-            link.constraints.add_forces(total)
+        for rows in self._all_links:
+            if not outcome.links:
+                rows.constraints.release()
+            rows.constraints.add_forces(total)
         held = np.zeros(len(u), dtype=bool)
         if not outcome.trial.candidates.anywhere:
             return total, self.contact.nothing, held

@@ -25,7 +25,6 @@ from .wall_motion import WallMotion
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from ..stepping.model import Model
     from .walls.base import WallKeys
 
 
@@ -417,36 +416,35 @@ class Candidates:
 
 
 def expected_candidates(
-    model: Model, state: State, balance: Balance, held: np.ndarray, displacements: np.ndarray
+    contact: Contact, state: State, balance: Balance, held: np.ndarray, displacements: np.ndarray
 ) -> Candidates:
     """Return the owned nodes that may touch a wall in a step, among them those in contact before it. Collective.
 
     ``held`` (owned,) bool : nodes in contact before the step; ``displacements`` (walls, 3) : of the walls at the time
     of the balance [m]
     """
-    contact, walls = model.contact, len(model.contact.walls)
+    walls = len(contact.walls)
     nobody = Candidates(np.empty(0, dtype=np.int64), np.zeros((0, walls), dtype=bool), anywhere=False)
     if not contact.any:
         return nobody
     move = (balance.time - state.time) * state.v
-    reach = 0.5 * np.linalg.norm(move, axis=1) + BEYOND * model.size
+    reach = 0.5 * np.linalg.norm(move, axis=1) + BEYOND * contact.size
     near = held | contact.near(state.position + move, displacements, reach) | contact.ties.held
-    if model.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
+    if contact.mesh.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
         return nobody
     nodes = np.flatnonzero(near)
     return Candidates(
-        nodes, _within_reach(model, state, nodes, (state.position + move)[nodes], displacements, reach[nodes])
+        nodes, _within_reach(contact, state, nodes, (state.position + move)[nodes], displacements, reach[nodes])
     )
 
 
 def _within_reach(
-    model: Model, state: State, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray, reach: np.ndarray
+    contact: Contact, state: State, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray, reach: np.ndarray
 ) -> np.ndarray:
     """Return (m, walls) bool: walls that nodes (m,) moving to (m, 3) touch or come within reach (m,) [m] of."""
-    contact = model.contact
     applicable = contact.applicable(nodes, x, displacements)
     within = np.zeros_like(applicable)
-    starts = state.position[nodes], contact.motion.displacements(state.time), BEYOND * model.size
+    starts = state.position[nodes], contact.motion.displacements(state.time), BEYOND * contact.size
     for place, there, distance in ((x, displacements, reach[:, None]), starts):
         normals, offsets = contact.planes(applicable, place, there)
         within |= np.einsum("mwi,mi->mw", normals, place) - offsets < distance

@@ -24,7 +24,8 @@ from .projection import project
 
 if TYPE_CHECKING:
     from ..integrators.base import State
-    from ..stepping.model import Model
+    from ..mechanics.mass import Inertia
+    from .constraint_set import ConstraintSet
 
 Speeds = tuple[np.ndarray, np.ndarray]
 """Velocities of nodes (m, 3) and walls (w, 3) [m/s]."""
@@ -34,7 +35,12 @@ _FAST = 1e16  # weight of velocities relative to accelerations in the direction 
 
 
 def start_at_rest(
-    model: Model, state: State, accelerate: Callable[[np.ndarray], np.ndarray], load: np.ndarray
+    links: ConstraintSet,
+    inertia: Inertia,
+    state: State,
+    accelerate: Callable[[np.ndarray], np.ndarray],
+    load: np.ndarray,
+    still: float,
 ) -> WallForces | None:
     """Set acceleration and contact forces of resting nodes in the state; return the forces per wall. Collective.
 
@@ -44,36 +50,38 @@ def start_at_rest(
 
     Parameters
     ----------
-    model, state : with ``state.a`` without walls
+    links : ConstraintSet, with the walls of the case
+    inertia : Inertia
+    state : with ``state.a`` without walls
     accelerate : returns the acceleration (owned, 3) with M a = load. Collective
     load : (owned, 3) without walls [N]
+    still : velocity that counts as none [m/s]
 
     Returns
     -------
     WallForces or None
         None if no node of any rank rests on a wall or on another node, or if no contact force is needed.
     """
-    contact, comm, mass = model.contact, model.comm, model.inertia.mass
+    contact, comm, mass = links.contact, links.contact.mesh.comm, inertia.mass
     x, v = state.position, state.v
     displacements, rates = contact.motion.displacements(state.time), contact.motion.rates(state.time, ahead=True)
-    slack = ON_BOUND * model.size
+    slack = ON_BOUND * contact.size
     nodes = np.flatnonzero(contact.near(x, displacements, np.array([slack])))
     applicable = contact.members[nodes]
     normals, offsets = contact.planes(applicable, x[nodes], displacements)
     gaps = np.einsum("mwi,mi->mw", normals, x[nodes]) - offsets
     away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - rates)
-    resting = applicable & (np.abs(gaps) <= slack) & (np.abs(away) <= ON_BOUND * model.wave_speed)
+    resting = applicable & (np.abs(gaps) <= slack) & (np.abs(away) <= still)
     resting[:, [wall.partial for wall in contact.walls]] = False  # the plane of a partial wall extends beyond the wall
     resting[:, contact.motion.bodies.at] = False  # walls with mass are not fixed
     kept = resting.any(axis=1)
     nodes, normals, resting = nodes[kept], normals[kept], resting[kept]
     accelerations = contact.motion.accelerations(state.time)
     planes = np.where(resting, np.einsum("mwi,wi->mw", normals, accelerations), -np.inf)
-    fixed = model.supports.fixed[nodes]
-    share = 0.5 if model.inertia.consistent else 1.0
+    fixed = contact.fixed[nodes]
+    share = 0.5 if inertia.consistent else 1.0
     weight = share * mass[nodes]
-    links = model.links
-    closed = links.resting(x, v, slack, ON_BOUND * model.wave_speed)
+    closed = links.resting(x, v, slack, still)
     held = np.zeros(contact.members.shape, dtype=bool)
     held[nodes] = resting
 
@@ -81,7 +89,7 @@ def start_at_rest(
     strengths = np.zeros(resting.shape)
     drag = np.zeros(normals.shape)
     between = np.zeros_like(load)  # likewise for the links
-    for _ in range(_ROUNDS if model.inertia.consistent else 1):
+    for _ in range(_ROUNDS if inertia.consistent else 1):
         apart = state.a - between / (share * mass[:, None])
         apart[nodes] -= hold / weight[:, None]
         earlier = between
@@ -91,11 +99,10 @@ def start_at_rest(
         moved = free.copy()
         project(moved, fixed, normals, planes, 0.0, strengths)
         if contact.has_friction:
-            slack = ON_BOUND * model.wave_speed
             strengths *= weight[:, None]
             rough = contact.friction, contact.static_friction
             rubbing = Rubbing(v[nodes], accelerations, fixed, normals, planes, *rough, weight)
-            _apply_friction(rubbing, (v[nodes], rates), slack, moved, strengths, drag)
+            _apply_friction(rubbing, (v[nodes], rates), still, moved, strengths, drag)
             strengths /= weight[:, None]
         before, hold = hold, weight[:, None] * (moved - free)
         sizes = [np.abs(part).max(initial=0.0) for part in (hold - before, between - earlier, hold, between)]

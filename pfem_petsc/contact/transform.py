@@ -15,14 +15,12 @@ from petsc4py import PETSc
 from ..errors import NotConverged
 from ..integrators.base import Balance, State
 from ..parallel.agreement import agreed
-from ..solvers.matrix import turn_blocks
 from ..tolerances import FREE_PART, PROJECTED
 from .constraint_set import ConstraintSet
 from .frames import NodalFrames, Sliding
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
-    from ..solvers.matrix import HessianMatrix
 
 BlocksOf = Callable[[np.ndarray], np.ndarray]
 """Returns the diagonal blocks (k, 3, 3) of a Hessian at owned nodes (k,)."""
@@ -454,10 +452,8 @@ class Transform:
         blocks[at] = inverse.transpose(0, 2, 1) @ blocks[at] @ inverse
         return blocks
 
-    def turn(self, matrix: HessianMatrix, values: np.ndarray) -> None:
-        """Transform the values of an assembled Hessian to frame coordinates, without those of links. Collective."""
-        if not self._oblique:
-            return
-        matrix.add_blocks(self.sliding.nodes, self.sliding.stiffness, values)
-        left = self.left()
-        turn_blocks(matrix.pattern.ptr, matrix.local_columns, self._frame_of, left, self._inverse, values)
+    def turns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Matrices that transform the blocks of a Hessian to frame coordinates, without those of rows over several
+        nodes: place of each node (local,) among the frames, -1 for none; :meth:`left`; and inverses (turned, 3, 3) of
+        these and of ghosts. None if no node has a frame."""
+        return (self._frame_of, self.left(), self._inverse) if self._oblique else None

@@ -196,6 +196,13 @@ class HessianMatrix:
             self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
             self._chain.append((link, matrix, self.bounded))
 
+    def turn(self, transform: Coordinates, values: np.ndarray) -> None:
+        """Transform the values to frame coordinates, without those of rows over several nodes."""
+        turns = transform.turns()
+        if turns is not None:
+            self.add_blocks(transform.sliding.nodes, transform.sliding.stiffness, values)
+            turn_blocks(self.pattern.ptr, self.local_columns, *turns, values)
+
     def update(self, problem: Linearisable, w: np.ndarray) -> None:
         """Assemble the Hessian of a problem at ``w``. Collective."""
         self.fill(lambda values: problem.hessian(w, self, values))

@@ -549,7 +549,7 @@ class RelaxationStepper(StaticStepper):
         model, motion = self.model, self.motion
         relaxed = replace(self.state, x=motion.x, v=np.zeros_like(self.state.v))
         displacements = model.contact.motion.displacements(balance.time)
-        return expected_candidates(model, relaxed, balance, self.held, displacements)
+        return expected_candidates(model.contact, relaxed, balance, self.held, displacements)
 
     def destroy(self) -> None:
         super().destroy()

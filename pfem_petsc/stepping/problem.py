@@ -135,7 +135,7 @@ class StepProblem:
                     bars.springs.add_tangents(balance.weight, matrix.pattern, values)
             else:
                 bars.tangents(self.x, *arguments)
-        self.transform.turn(matrix, values)
+        matrix.turn(self.transform, values)
         matrix.constrain(self.scale, values)
 
     def place(self, u: np.ndarray) -> None:

@@ -361,7 +361,8 @@ class Stepper(ABC):
             load -= model.inertia.damping_times(state.v, np.zeros_like(load))
         state.a = self._acceleration_for(load)
         if model.can_touch and model.inertia.redistribution is None:
-            walls = start_at_rest(model, state, self._acceleration_for, load)
+            still = ON_BOUND * model.wave_speed
+            walls = start_at_rest(model.links, model.inertia, state, self._acceleration_for, load, still)
             if walls is not None:
                 held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)], len(state.v))
                 self.solution.walls, self.solution.contacts = walls, held

@@ -304,6 +304,7 @@ def _for_all(name: str, visit: Callable[..., Any]) -> Callable[..., Any]:
             visit(x, bars, k, out)
 
     loop.__name__ = name
+    loop.__qualname__ = f"_for_all.<locals>.{name}"  # each has its own file of machine code
     return kernel(loop)
 
 

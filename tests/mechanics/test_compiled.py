@@ -196,6 +196,13 @@ def test_loops_of_a_law_with_and_without_damping_have_their_own_files():
     assert len(found) == len(laws)
 
 
+def test_each_loop_of_a_law_has_its_own_file():
+    """Loops that one function makes would overwrite each other, and be compiled at each start."""
+    loops = [loop for loop in vars(make_loops(elastic.LAW, MEASURES["green"])).values() if hasattr(loop, "_cache")]
+    found = {loop._cache._cache_file._index_path for loop in loops if hasattr(loop._cache, "_cache_file")}
+    assert len(found) == len(loops) > 5
+
+
 OF_ONE_LAW = """
 import sys
 import numpy as np

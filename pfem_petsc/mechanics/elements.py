@@ -83,7 +83,7 @@ class ElementFamily(Protocol):
 
     Attributes
     ----------
-    energy : name of the stored energy, of :data:`~pfem_petsc.energies.BAR_ENERGIES`
+    energy : name of the stored energy, of :data:`~pfem_petsc.columns.BAR_ENERGIES`
     """
 
     energy: str
@@ -250,7 +250,7 @@ def make_element(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
 
 
 class MatrixRows(NamedTuple):
-    """Where bars add blocks to a matrix in compressed rows, see :class:`~pfem_petsc.solvers.matrix.BlockPattern`:
+    """Where bars add blocks to a matrix in compressed rows, see :class:`~.block_pattern.BlockPattern`:
     ``ptr`` (owned + 1,), ``slots`` (b, 4), ``values``; the ``weight`` of the stiffness; and ``inertia`` [kg/(m s2)], a
     number or (n,), which times the ``lengths`` in the mesh (b,) is added twice on the diagonal, and once off it."""
 
@@ -502,7 +502,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
 
     @inlined
     def sum_energies(work, energies):
-        """Add the sums of ``work`` to ``energies``, see :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]."""
+        """Add the sums of ``work`` to ``energies``, see :data:`~pfem_petsc.columns.BAR_ENERGIES` [J]."""
         for j in range(n_energies):
             s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0  # additions that do not wait for each other
             for i in range((4 + j) * CHUNK, (5 + j) * CHUNK, 8):
@@ -526,7 +526,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     @kernel
     def forces(x, bars, commit, f, energies):
         """Add internal forces to ``f``, and sums over counted bars to ``energies``, see
-        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; return the first failed bar or -1, whether any bar is so short
+        :data:`~pfem_petsc.columns.BAR_ENERGIES` [J]; return the first failed bar or -1, whether any bar is so short
         that it may be inverted, and how many bars have changed their state of rupture."""
         work = np.empty((4 + n_energies + n_rows) * CHUNK)
         failed = -1

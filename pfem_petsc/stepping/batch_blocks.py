@@ -207,7 +207,7 @@ def _add_pushes(block, rows, contact, speeds, sums):
 @kernel
 def sum_rows(rows, pressing):
     """Write the forces on the second nodes of each table to ``rows.totals``, as
-    :func:`~pfem_petsc.contact.constraint_set.last_forces` does; ``pressing`` rows have a force."""
+    :func:`~pfem_petsc.contact.rows.last_forces` does; ``pressing`` rows have a force."""
     force, normals, place = rows.force, rows.normals, rows.place
     for k in range(len(rows.totals)):
         x = y = z = 0.0

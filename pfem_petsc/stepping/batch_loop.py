@@ -86,7 +86,7 @@ class NodeArrays(NamedTuple):
 
 
 class WallArrays(NamedTuple):
-    """Flat walls and their log; see :mod:`~pfem_petsc.contact.flat` and :mod:`~pfem_petsc.contact.log`."""
+    """Flat walls and their log; see :mod:`~pfem_petsc.contact.explicit` and :mod:`~pfem_petsc.contact.forces`."""
 
     fixed: np.ndarray
     normals: np.ndarray
@@ -203,7 +203,7 @@ def make_fused_loop(
     It returns the number of steps made, and MPI's error code; for the last step, which is the last one too if bars
     change their state of rupture there, the number of these bars, the first bar that collapsed and the first that went
     through zero length, or -1, and the infeasible node, or -1, with the offsets of its planes; the kinetic energy [J];
-    increments (n, 3); the results of :func:`~pfem_petsc.contact.flat.press_planes` for nodes and walls; the nodes
+    increments (n, 3); the results of :func:`~pfem_petsc.contact.explicit.press_planes` for nodes and walls; the nodes
     that touch walls, and those that have touched them; and the number of nodes with contact forces.
     """
 

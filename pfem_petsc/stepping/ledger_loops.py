@@ -283,7 +283,7 @@ def fill_works(sums, powers, ends, held) -> None:
     Parameters
     ----------
     sums : (HEAD.width,) of a row; those of impact are complete
-    powers : (5,) of the balances before, see :class:`~pfem_petsc.stepping.leapfrog_ledger.LeapfrogLedger`
+    powers : (5,) of the balances before, see :class:`~pfem_petsc.stepping.ledger.LeapfrogLedger`
     ends : (5,) of the last balance, see :func:`~pfem_petsc.stepping.ledger_loops.book_row`
     held : energies of the bars
     """

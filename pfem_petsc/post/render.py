@@ -529,7 +529,7 @@ def _save(picture: np.ndarray, file: Path) -> Path:
 
     try:
         # fast compression, because a film has hundreds of frames
-        Image.fromarray(picture).save(file, compress_level=3)
+        Image.fromarray(picture).save(file, compress_level=1)
     except OSError as error:
         raise InputError(f"{file}: the picture cannot be written ({error}); give another folder") from error
     return file

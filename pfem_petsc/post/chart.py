@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import itertools
 import os
 import textwrap
@@ -164,14 +163,6 @@ def boxes_allowed() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         yield
-
-
-def png(figure: Any, dpi: float = 100) -> bytes:
-    """Return a figure of matplotlib as PNG, with so many pixels per inch."""
-    made = io.BytesIO()
-    with boxes_allowed():
-        figure.savefig(made, format="png", dpi=dpi)
-    return made.getvalue()
 
 
 def opened(result: Path | str | Any) -> Any:

@@ -445,7 +445,7 @@ class Scene:
         # reduced as plain channels, because they are multiplied by the opacity already; rows are from below
         mode = "RGB" if self._channels == 3 else "CMYK"
         image = Image.frombuffer(mode, (width, height), pyvista.convert_array(made), "raw", mode, 0, -1)
-        return np.asarray(image.reduce(self._factor))
+        return np.array(image.reduce(self._factor))
 
     def view(self, camera: Camera, least: float, fades: bool = False) -> _View:
         """Return what bars see of a camera, with a least radius in pixels."""

@@ -11,7 +11,8 @@ import pfem_petsc.statics.stability
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.solvers.linear import has_mumps
-from pfem_petsc.statics.bordered import BorderedSystem, _nodes
+from pfem_petsc.statics.path_points import BorderedSystem
+from pfem_petsc.statics.stability import _nodes
 
 
 def von_mises(static=None, **tables):

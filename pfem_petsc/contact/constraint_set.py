@@ -406,8 +406,8 @@ class ConstraintSet:
         return found
 
     def orders(self, n_rows: int) -> dict[str, NaturalOrder]:
-        """Return the orders in which :meth:`load_state` takes the arrays of a checkpoint with ``n_rows``: nodes by their
-        owners, rows in slabs. Collective."""
+        """Return the orders in which :meth:`load_state` takes the arrays of a checkpoint with this number of rows:
+        nodes by their owners, rows in slabs. Collective."""
         comm = self._mesh.comm
         slab = NaturalOrder(comm, np.arange(*slab_range(n_rows, comm.rank, comm.size)), n_rows)
         orders = {name: order for name, (order, _) in self.arrays().items() if order is self._mesh.node_order}

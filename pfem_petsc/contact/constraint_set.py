@@ -114,31 +114,28 @@ class ConstraintSet:
     walled : whether walls can stop any node of the model's rows
     """
 
-    def __init__(
-        self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, fixed: np.ndarray, contact: Contact
-    ) -> None:
-        self.source, self.contact = case.source, contact
+    def __init__(self, case: Case, nodes: dict[str, np.ndarray], contact: Contact) -> None:
+        self.source, self.contact, self.mesh = case.source, contact, contact.mesh
         tables = [*case.contact_pair, *case.constraint]
         self.names = [table.name for table in tables]
         self.n_pairs = len(case.contact_pair)
         kinds = ["pair"] * self.n_pairs + ["constraint"] * len(case.constraint)
         self.columns = [f"{kind}/{name}" for kind, name in zip(kinds, self.names, strict=True)]
-        self._mesh, self._fixed = mesh, fixed
-        self._sources: list[Constraint] = [find_pairs(case, k, nodes, mesh) for k in range(self.n_pairs)]
-        self._sources += [_source(case.source, keys, nodes, mesh) for keys in case.constraint]
+        self._sources: list[Constraint] = [find_pairs(case, k, nodes, self.mesh) for k in range(self.n_pairs)]
+        self._sources += [_source(case.source, keys, nodes, self.mesh) for keys in case.constraint]
         self.dynamic = any(source.dynamic for source in self._sources)
         self._make()
 
     def _make(self) -> None:
         """Make everything that depends on which rows there are. Collective."""
-        self.rows = rows = RowSet(self._sources, self._mesh, self._fixed)
+        self.rows = rows = RowSet(self._sources, self.mesh, self.contact.fixed)
         self.two = TwoNodeRows(rows)
         if len(self.two.at) == len(rows.source):
             rows.pairs = self.two.ends, self.two.normals, self.two.least
         self._walls = _WallsAtRows(rows, self.contact)
         self._turning = not rows.fixed.all()
         self.walled = self._walls.everywhere
-        self.alone = not self.walled and self._mesh.comm.allreduce(self.two.every, op=MPI.LAND)
+        self.alone = not self.walled and self.mesh.comm.allreduce(self.two.every, op=MPI.LAND)
         self._x, self._hard = np.empty((len(rows.numbers), 3)), np.empty(len(rows.numbers))
         self._blocks: FixedRows | None = None  # for nodes of the stiffness
         self._blocks_of = np.empty(0)
@@ -165,8 +162,8 @@ class ConstraintSet:
         and go. Rows that stay keep their forces. Collective."""
         if not self.dynamic:
             return
-        numbers = self._mesh.node_ids[: self._mesh.n_owned].astype(np.int64)
-        nodes = ExpectedNodes(self._mesh.comm, numbers, x, reach, time)
+        numbers = self.mesh.node_ids[: self.mesh.n_owned].astype(np.int64)
+        nodes = ExpectedNodes(self.mesh.comm, numbers, x, reach, time)
         found = [source.find(nodes) if source.dynamic else source for source in self._sources]
         if all(one is other for one, other in zip(found, self._sources, strict=True)):
             return
@@ -269,7 +266,7 @@ class ConstraintSet:
 
     def any_pressed(self) -> bool:
         """Return whether any row of the model has a force. Collective."""
-        return bool(self) and bool(self.rows.mesh.comm.allreduce(bool(self.force.any()), op=MPI.LOR))
+        return bool(self) and bool(self.mesh.comm.allreduce(bool(self.force.any()), op=MPI.LOR))
 
     def mark(self, held: np.ndarray) -> None:
         """Mark owned nodes (owned,) on which rows press."""
@@ -317,9 +314,9 @@ class ConstraintSet:
         """
         if not self:
             return
-        points = self._mesh.points[: self._mesh.n_owned]
+        points = self.mesh.points[: self.mesh.n_owned]
         self.find(points, np.zeros(len(points)), 0.0)
-        rows, walls, comm = self.rows, self.contact, self._mesh.comm
+        rows, walls, comm = self.rows, self.contact, self.mesh.comm
         if len(self.names) > self.n_pairs and treatment != "scheme":
             raise InputError(f'{self.source}: constraint: constraints need contact.treatment = "scheme"')
         if treatment != "scheme" and not self.alone:
@@ -386,9 +383,9 @@ class ConstraintSet:
         project(pushed, rows.free == 0.0, normals, offsets, 0.0, np.zeros(offsets.shape))
         gaps = np.einsum("nwi,ni->nw", normals, every) - offsets
         values, pushed = (rows.along(self.jacobian, a) + closed for a in (every, pushed))
-        largest = rows.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)
+        largest = self.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)
         place = np.where(rests.any(axis=1), np.arange(len(every)), -1)
-        with agreed(rows.mesh.comm):
+        with agreed(self.mesh.comm):
             system = rows.system(self.jacobian, values, hard, (place, normals, gaps))
             self.force = rows.solve(system, pushed, 1e-13 * largest)
         change[rows.here] = (rows.forces(self.jacobian, self.force) * rows.free)[rows.mine]
@@ -399,18 +396,23 @@ class ConstraintSet:
         order, found = self.rows.order, {}
         for name, source in zip(self.names, self._sources, strict=True):
             for key, values in source.state().items():
-                found[f"rows.{name}.{key}"] = self._mesh.node_order, values
+                found[f"rows.{name}.{key}"] = self.mesh.node_order, values
         if order.n_global:
             kept = self._of_counted() | ({"rows.table": self.rows.table[self.rows.counted]} if self.dynamic else {})
             found |= {name: (order, values) for name, values in kept.items()}
         return found
 
-    def orders(self, n_rows: int) -> dict[str, NaturalOrder]:
-        """Return the orders in which :meth:`load_state` takes the arrays of a checkpoint with this number of rows:
-        nodes by their owners, rows in slabs. Collective."""
-        comm = self._mesh.comm
+    def numbers(self) -> dict[str, int]:
+        """What a checkpoint keeps besides the arrays. Collective."""
+        return {"rows": self.rows.order.n_global} if self else {}
+
+    def orders(self, n_rows: int | None) -> dict[str, NaturalOrder]:
+        """Return the orders in which :meth:`load_state` takes the arrays of a checkpoint with ``n_rows`` rows (None: as
+        many as there are): nodes by their owners, rows in slabs. Collective."""
+        n_rows = self.rows.order.n_global if n_rows is None else n_rows
+        comm = self.mesh.comm
         slab = NaturalOrder(comm, np.arange(*slab_range(n_rows, comm.rank, comm.size)), n_rows)
-        orders = {name: order for name, (order, _) in self.arrays().items() if order is self._mesh.node_order}
+        orders = {name: order for name, (order, _) in self.arrays().items() if order is self.mesh.node_order}
         names = [*self._of_counted(), *(["rows.table"] if self.dynamic else [])] if n_rows else []
         return orders | dict.fromkeys(names, slab)
 
@@ -434,7 +436,7 @@ class ConstraintSet:
     def take_over(self, earlier: ConstraintSet) -> None:
         """Take the state of the set of an earlier stage, with the same tables. Collective."""
         arrays = {name: (order, values.copy()) for name, (order, values) in earlier.arrays().items()}
-        nodal = self._mesh.node_order
+        nodal = self.mesh.node_order
         own = {name: v if order is nodal else order.to_slab(v) for name, (order, v) in arrays.items()}
         self.load_state(own)
 

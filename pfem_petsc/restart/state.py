@@ -44,7 +44,7 @@ from ..stepping.model import StageStart
 if TYPE_CHECKING:
     from ..stepping.stepper import Stepper
 
-STATE_VERSION = 8
+STATE_VERSION = 7
 """Changed with the meaning of what is saved."""
 
 _MEMORY = "memory."
@@ -98,7 +98,7 @@ class RunState:
             "time": stepper.state.time,
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
             **{name: kept for name, kept in history.items() if name != "row"},
-            "rows": self.model.links.rows.order.n_global,
+            **self.model.links.numbers(),
             "free_walls": self.model.contact.motion.bodies.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
             "row": history["row"],
@@ -143,7 +143,7 @@ class RunState:
         bars = NaturalOrder(self.comm, np.arange(mine.first, mine.first + mine.count), self.mesh.n_bars)
         orders = dict.fromkeys(scalars["node_arrays"], self.mesh.node_order)
         orders |= dict.fromkeys(scalars["bar_arrays"], bars)
-        return orders | self.model.links.orders(scalars["rows"])
+        return orders | self.model.links.orders(scalars.get("rows"))
 
     def _load_state(self, scalars: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         stepper, state, owned = self.stepper, self.stepper.state, self.mesh.n_owned

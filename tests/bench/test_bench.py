@@ -38,16 +38,6 @@ def test_explicit_bytes_by_hand():
     assert Work(100, 10, runs=1.0, plastic=True).bytes() == 100 * 24 + nodes
 
 
-def test_a_matrix_moves_more_than_bars():
-    # a product on the cubic lattice: 9 x (1 + 2 x 8.8)/8.8 entries of 12 B a bar against 20 B, and positions
-    per_product = [
-        Work(8800, 1000, implicit=True, assembled=assembled, linear=1.0).bytes()
-        - Work(8800, 1000, implicit=True, assembled=assembled).bytes()
-        for assembled in (False, True)
-    ]
-    assert per_product[1] - per_product[0] == pytest.approx(9 * (1000 + 2 * 8800) * 12 - 20 * 8800 - 24 * 1000)
-
-
 def test_bars_of_a_lattice_are_in_runs_and_those_in_random_order_are_not():
     from types import SimpleNamespace
 

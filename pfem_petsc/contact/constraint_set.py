@@ -17,7 +17,7 @@ from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, ExpectedNodes, SetPart
 from .fixed_rows import FixedRows, TwoNodeRows
-from .node_walls import near_planes
+from .node_walls import distances_from_planes, near_planes
 from .pairs import find_pairs
 from .projection import project
 from .rows import (
@@ -84,18 +84,14 @@ class _WallsAtRows:
 
     def _gaps(self, nodes: np.ndarray, x: np.ndarray, far: np.ndarray, time: float) -> np.ndarray:
         """Distances (m, w) of some nodes (m,) at positions x (n, 3) from walls, infinite where these do not apply."""
-        contact, at = self._contact, x[nodes]
-        # not a product of matrices: the digits must not depend on how many nodes there are
-        n = contact.normals.T
-        gaps = at[:, :1] * n[0] + at[:, 1:2] * n[1] + at[:, 2:] * n[2] - contact.plane_offsets(time)
-        applicable = self._members[nodes]
+        contact, gaps = self._contact, np.empty((len(nodes), len(self._contact.normals)))
+        distances_from_planes(nodes, x, contact.normals, contact.plane_offsets(time), self._members, gaps)
         if self.flags:
             where = self._rows.where[nodes]
             own = where >= 0
             displacements = contact.motion.displacements(time)
-            applicable[own] = contact.applicable(where[own], at[own], displacements)
-            applicable[~own] = far[-1 - where[~own], 7:] > 0.0
-        gaps[~applicable] = np.inf
+            gaps[own] = np.where(contact.applicable(where[own], x[nodes][own], displacements), gaps[own], np.inf)
+            gaps[~own] = np.where(far[-1 - where[~own], 7:] > 0.0, gaps[~own], np.inf)
         return gaps
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -50,6 +51,18 @@ def near_planes(x, normals, offsets, all_nodes, members, reach, near):
                 count += 1
                 break
     return count
+
+
+@kernel
+def distances_from_planes(nodes, x, normals, offsets, members, gaps):
+    """Write distances (m, w) of nodes (m,) at x (n, 3) from planes (w, 3), (w,) to ``gaps``, infinite for those that
+    are not ``members`` (n, w)."""
+    for j in range(len(nodes)):
+        i = nodes[j]
+        for k in range(len(offsets)):
+            gaps[j, k] = math.inf
+            if members[i, k]:
+                gaps[j, k] = x[i, 0] * normals[k, 0] + x[i, 1] * normals[k, 1] + x[i, 2] * normals[k, 2] - offsets[k]
 
 
 _ZERO = np.zeros(1)

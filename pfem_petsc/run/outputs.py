@@ -22,9 +22,8 @@ from ..output.progress import Progress
 from ..output.units import MODE
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import on_root
+from ..preflight.checks import odd_accelerations, warnings_before
 from ..preflight.forecast import summarise
-from ..preflight.inspection import warnings_before
-from ..preflight.values import odd_accelerations
 from ..restart.checkpoints import RESULT, Restart, prepare_folder
 from ..restart.state import RunState
 from ..signals import early

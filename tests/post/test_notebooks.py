@@ -1,4 +1,4 @@
-"""What notebooks show: tables, progress and curves during a run."""
+"""What notebooks show: tables and curves during a run."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, InputError, LivePlot, Simulation, open_result
-from pfem_petsc.output import bar
-from pfem_petsc.output.progress import Progress
 
 
 @pytest.fixture(scope="module")
@@ -61,22 +59,6 @@ def notebook(monkeypatch):
     monkeypatch.setitem(sys.modules, "IPython.display", fake)
     cell = type("OutStream", (io.StringIO,), {"__module__": "ipykernel.iostream"})()
     return cell, shown
-
-
-def test_progress_in_a_notebook_is_one_bar(notebook):
-    cell, shown = notebook
-    now = [0.0]
-    progress = Progress(MPI.COMM_SELF, "A <rod>", 1000, 1.0, stream=cell, clock=lambda: now[0])
-    assert bar.is_notebook(cell) and not bar.is_notebook(io.StringIO())
-    progress.summary({"nodes": "3"})
-    for step in range(1, 1001):
-        now[0] += 0.05
-        progress.update(step, step / 1000, 1e-3)
-    progress.close()
-    # fifty seconds of the run within a moment: redrawn at its start and its end
-    assert 2 <= len(shown) <= 4 and "100 %" in shown[-1] and "A &lt;rod&gt;" in shown[-1]
-    assert "nodes" not in cell.getvalue() and cell.getvalue().count("\n") == 1
-    assert "done: 1,000 steps" in cell.getvalue()
 
 
 def test_live_plot(notebook, tmp_path, monkeypatch):

@@ -54,7 +54,7 @@ YIELDING = {"yield_stress": 1e7, "isotropic_hardening": 1e8}
         ({"pretension": 1.0, "prestress": 1.0}, {}, "at most one of the keys"),
         ({"rest_length": 0.0}, {}, "expected a factor on the length in the mesh"),
         ({"rest_length": [[0.0, 1.0], [0.0, 0.9]]}, {}, "times must increase"),
-        ({"pretension": "1 kN"}, {}, "expected a finite number"),
+        ({"pretension": "1 kN"}, {}, "expected a number in SI units"),
         ({"pretension": [[0.0, 1.0, 2.0]]}, {}, "or rows"),
         ({"pretension": float("nan")}, {}, "expected a finite number"),
     ],

@@ -19,7 +19,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
@@ -29,6 +30,7 @@ import numpy as np
 from ..errors import InputError
 
 if TYPE_CHECKING:
+    import pyvista
     from mpi4py import MPI
 
     from ..mesh.slab import MeshSlab
@@ -44,7 +46,6 @@ _REFUSED = 3
 """Status of the process for a file without a mesh of bars; the reason is on stdout."""
 _ALL = "*"
 """In the place of names of fields: all of them."""
-_ESCAPED = {'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"}
 
 
 def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
@@ -309,23 +310,51 @@ def write(path: Path, mesh: WholeMesh) -> None:
     """Write the mesh with its bar fields, to the last digit; groups are arrays of ones and zeros."""
     from ..mesh.whole import without_slashes
 
-    hdf = path.suffix.lower() == ".vtkhdf"
-    data: dict[str, dict[str, np.ndarray]] = {"CellData": {}, "PointData": {}}
-    for kind, named, n in (
-        ("CellData", mesh.bar_fields, -1),
-        ("PointData", mesh.node_groups, len(mesh.points)),
-        ("CellData", mesh.bar_groups, len(mesh.bars)),
-    ):
-        for name, values in (without_slashes(named) if hdf else named).items():
-            if n >= 0:
-                mask = np.zeros(n, np.uint8)
-                mask[values] = 1
-                name, values = f"{_MASK}{name}", mask
-            data[kind][name] = np.ascontiguousarray(values)
-    (_write_vtkhdf if hdf else _write_vtu)(path, mesh, data)
+    if path.suffix.lower() == ".vtkhdf":
+        kinds = ("node_groups", "bar_groups", "bar_fields")
+        _write_vtkhdf(path, replace(mesh, **{kind: without_slashes(getattr(mesh, kind)) for kind in kinds}))
+        return
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.SetFileName(str(path))
+    writer.SetInputData(grid_of(mesh, _escaped))
+    if not writer.Write() or not path.is_file():
+        raise InputError(f"{path}: VTK could not write the file; is there room?")
 
 
-def _write_vtkhdf(path: Path, mesh: WholeMesh, data: dict[str, dict[str, np.ndarray]]) -> None:
+def _escaped(name: str) -> str:
+    return escape(name, {'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"})  # VTK writes names as they are
+
+
+def grid_of(mesh: WholeMesh, named: Callable[[str], str] = str) -> pyvista.UnstructuredGrid:
+    """Return a grid of lines with the bar fields; groups are ``group:NAME``, 1 for members; ``named`` gives names."""
+    import pyvista
+
+    cells = np.column_stack([np.full(len(mesh.bars), 2), mesh.bars]).ravel()
+    grid = pyvista.UnstructuredGrid(cells, np.full(len(mesh.bars), _LINE, np.uint8), mesh.points)
+    for kind, arrays in _data(mesh).items():
+        for name, values in arrays.items():
+            getattr(grid, kind)[named(name)] = values
+    return grid
+
+
+def _data(mesh: WholeMesh) -> dict[str, dict[str, np.ndarray]]:
+    """Return arrays of points and cells by name: bar fields, and masks of groups."""
+
+    def masks(groups: Mapping[str, np.ndarray], n: int) -> dict[str, np.ndarray]:
+        found = {f"{_MASK}{name}": np.zeros(n, np.uint8) for name in groups}
+        for mask, members in zip(found.values(), groups.values()):
+            mask[members] = 1
+        return found
+
+    return {
+        "cell_data": mesh.bar_fields | masks(mesh.bar_groups, len(mesh.bars)),
+        "point_data": masks(mesh.node_groups, len(mesh.points)),
+    }
+
+
+def _write_vtkhdf(path: Path, mesh: WholeMesh) -> None:
     """Version 1.0 of the format."""
     import h5py
 
@@ -341,36 +370,11 @@ def _write_vtkhdf(path: Path, mesh: WholeMesh, data: dict[str, dict[str, np.ndar
         root["Connectivity"] = np.asarray(mesh.bars, np.int64).ravel()
         root["Offsets"] = np.arange(0, 2 * n + 1, 2, dtype=np.int64)
         root["Types"] = np.full(n, _LINE, np.uint8)
-        for kind, arrays in data.items():
-            group = root.create_group(kind, track_order=True)  # in the order in which they are given
+        for kind, arrays in _data(mesh).items():
+            # in the order in which they are given
+            group = root.create_group({"cell_data": "CellData", "point_data": "PointData"}[kind], track_order=True)
             for name, values in arrays.items():
                 group[name] = values
-
-
-def _write_vtu(path: Path, mesh: WholeMesh, data: dict[str, dict[str, np.ndarray]]) -> None:
-    """Compressed."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
-    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
-
-    points, cells, grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
-    points.SetData(numpy_to_vtk(np.ascontiguousarray(mesh.points, dtype=np.float64), deep=True))
-    offsets = np.arange(0, 2 * len(mesh.bars) + 1, 2, dtype=np.int64)
-    ends = np.ascontiguousarray(mesh.bars, dtype=np.int64).ravel()
-    cells.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(ends, deep=True))
-    grid.SetPoints(points)
-    grid.SetCells(_LINE, cells)
-    for kind, arrays in data.items():
-        for name, values in arrays.items():
-            array = numpy_to_vtk(values, deep=True)
-            array.SetName(escape(name, _ESCAPED))  # VTK writes names as they are
-            getattr(grid, f"Get{kind}")().AddArray(array)
-    writer = vtkXMLUnstructuredGridWriter()
-    writer.SetFileName(str(path))
-    writer.SetInputData(grid)
-    if not writer.Write() or not path.is_file():
-        raise InputError(f"{path}: VTK could not write the file; is there room?")
 
 
 if __name__ == "__main__":

@@ -44,12 +44,10 @@ _NAMED = ("group", "section")
 _MASK = "group:"
 _REFUSED = 3
 """Status of the process for a file without a mesh of bars; the reason is on stdout."""
-_ALL = "*"
-"""In the place of names of fields: all of them."""
 
 
 def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
-    """Return the mesh in a VTK file, with the named cell fields; None: all.
+    """Return the mesh in a VTK file, with all cell fields.
 
     Raises
     ------
@@ -61,7 +59,6 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder, "mesh.npz")
         command = [sys.executable, "-P", "-m", __name__, str(path.resolve()), str(result)]
-        command += [_ALL] if fields is None else list(fields)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)
         if done.returncode == _REFUSED:
@@ -85,16 +82,15 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
             if arrays["snapshots"] > 1:
                 text = f"has {arrays['snapshots']} snapshots: the mesh and its fields are those of the last one"
                 mesh.warnings.append(f"{path}: {text}")
-            mesh.known_fields = arrays["cell_fields"].tolist()
     return mesh
 
 
 # ---- the process that reads by VTK
 
 
-def _extract(path: str, result: str, *fields: str) -> int:
-    """Read ``path``; write ``points``, ``bars``, ``node_groups/<name>``, ``bar_groups/<name>``, ``bar_fields/<name>``
-    of the named cell fields, and the names of all, ``cell_fields``, to ``result``; of the last of several snapshots."""
+def _extract(path: str, result: str) -> int:
+    """Read ``path``; write ``points``, ``bars``, ``node_groups/NAME``, ``bar_groups/NAME``, ``bar_fields/NAME`` of
+    the last of several snapshots to ``result``."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
     if path.lower().endswith(".vtu"):
@@ -122,7 +118,7 @@ def _extract(path: str, result: str, *fields: str) -> int:
     try:
         if lines:
             raise ValueError(f"cannot be read: {(messages or lines)[0].strip()}")
-        arrays = dict(_arrays(reader.GetOutputDataObject(0), fields))
+        arrays = dict(_arrays(reader.GetOutputDataObject(0)))
     except ValueError as error:
         print(error)
         return _REFUSED
@@ -130,7 +126,7 @@ def _extract(path: str, result: str, *fields: str) -> int:
     return 0
 
 
-def _arrays(grid: Any, fields: tuple[str, ...]) -> Iterator[tuple[str, np.ndarray]]:
+def _arrays(grid: Any) -> Iterator[tuple[str, np.ndarray]]:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     if grid is None or not grid.IsA("vtkUnstructuredGrid"):
@@ -161,11 +157,9 @@ def _arrays(grid: Any, fields: tuple[str, ...]) -> Iterator[tuple[str, np.ndarra
     ):
         for name, members in _groups_of(data, grid.GetFieldData(), kept).items():
             yield f"{kind}/{name}", members
-    known = {name: values for name, values in _numbers(grid.GetCellData()).items() if not name.startswith(_MASK)}
-    yield "cell_fields", np.array(list(known), dtype=str)
-    every = [name for name in known if name not in _NAMED and "/" not in name]
-    for name in every if fields == (_ALL,) else set(fields) & set(known):
-        yield f"bar_fields/{name}", known[name].astype(np.float64)[lines]
+    for name, values in _numbers(grid.GetCellData()).items():
+        if not name.startswith(_MASK) and name not in _NAMED:
+            yield f"bar_fields/{name}", values.astype(np.float64)[lines]
 
 
 def _numbers(data: Any) -> dict[str, np.ndarray]:
@@ -215,15 +209,13 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
     from mpi4py import MPI
 
     from ..mesh.slab import check_memory
-    from ..mesh.whole import missing_field
+    from ..mesh.whole import check_fields
 
     plain = comm.bcast(_plain(path) if comm.rank == 0 and path.suffix.lower() == ".vtkhdf" else None)
     if plain is None:
         return None
     n_nodes, masks, known = plain
-    missing = missing_field(path, fields or {}, known)
-    if missing is not None:
-        raise InputError(missing)
+    check_fields(path, fields, known)
     check_memory(n_nodes, str(path))
     slab, fits = None, True
     try:

@@ -16,8 +16,8 @@ from ..parallel.natural import NaturalOrder
 from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, ExpectedNodes, SetPart
-from .contact import near_planes
 from .fixed_rows import FixedRows, TwoNodeRows
+from .node_walls import near_planes
 from .pairs import find_pairs
 from .projection import project
 from .rows import (

@@ -136,9 +136,7 @@ class Lanczos(_OnOneRank):
             "ncv": min(n, 2 * count + 20),
         }
         try:
-            _, vectors = eigsh(
-                operator(applied), min(count, n - 1), Minv=operator(self._factor.solve), **options
-            )
+            _, vectors = eigsh(operator(applied), min(count, n - 1), Minv=operator(self._factor.solve), **options)
         except ArpackNoConvergence as failure:
             raise SimulationFailure(f"modes: the Lanczos iterations of SciPy did not converge: {failure}") from failure
         return np.ascontiguousarray(complement(vectors).T)

@@ -98,13 +98,10 @@ def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
 
 
 def _read(reader: Any, path: Path, fields: Mapping[str, str] | None) -> WholeMesh:
-    from ..errors import InputError
-    from ..mesh.whole import missing_field
+    from ..mesh.whole import check_fields
 
     whole = reader.read(path, fields)
-    missing = missing_field(path, fields or {}, whole.bar_fields if whole.known_fields is None else whole.known_fields)
-    if missing is not None:
-        raise InputError(missing)
+    check_fields(path, fields, whole.bar_fields)
     if fields is not None:
         whole.bar_fields = {name: whole.bar_fields[name] for name in fields}
     return whole

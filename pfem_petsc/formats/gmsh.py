@@ -23,7 +23,7 @@ from mpi4py import MPI
 from ..errors import InputError
 from ..mesh.exchange import Router
 from ..mesh.slab import MeshSlab, check_memory, index_type, slab_of, slab_range
-from ..mesh.whole import WholeMesh, missing_field
+from ..mesh.whole import WholeMesh, check_fields
 from ..parallel.agreement import on_root
 from ._numbers import numbers_of, shown
 
@@ -87,9 +87,7 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
         parts.add(*piece)
     slab = parts.slab(piece)
     if fields is not None:
-        missing = missing_field(path, fields, {*piece.fields} - ({*fields} - {*slab.bar_fields}))
-        if missing is not None:
-            raise InputError(missing)
+        check_fields(path, fields, {*piece.fields} - ({*fields} - {*slab.bar_fields}))
         slab.bar_fields = {name: slab.bar_fields[name] for name in fields}
     return slab
 

@@ -14,7 +14,7 @@ from ..solvers.matrix import HessianMatrix
 from .equilibrium import problem_at_rest
 
 if TYPE_CHECKING:
-    from ..contact.forces import WallForces
+    from ..contact.node_walls import WallForces
     from ..integrators.base import State
     from ..solvers.lagged import LaggedPreconditioner
     from ..solvers.matrix_free import MatrixFreeHessian

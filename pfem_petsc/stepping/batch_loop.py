@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..columns import HEAD
-from ..contact.forces import compare_contacts
+from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import centre
 from ..mechanics.compiled import borrowing, kernel
 from ..mechanics.elements import BarData, first_inverted
@@ -86,7 +86,7 @@ class NodeArrays(NamedTuple):
 
 
 class WallArrays(NamedTuple):
-    """Flat walls and their log; see :mod:`~pfem_petsc.contact.explicit` and :mod:`~pfem_petsc.contact.forces`."""
+    """Flat walls and their log; see :mod:`~pfem_petsc.contact.explicit` and :mod:`~pfem_petsc.contact.node_walls`."""
 
     fixed: np.ndarray
     normals: np.ndarray

@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..columns import ENERGIES, HEAD, WALL
-from ..contact.forces import WallForces
+from ..contact.node_walls import WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.elements import batch_parts

@@ -1,8 +1,5 @@
 """Forces that a function of time and state returns in each step."""
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 from helpers.kills import differences
@@ -182,15 +179,6 @@ def test_refusals(tmp_path):
         simulation.start()
         with pytest.raises(InputError, match="the run has started"):
             simulation.external_force(on_end)
-
-
-def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch):
-    text = (Path(__file__).parents[2] / "docs" / "loads.md").read_text()
-    code = re.search(r"^```python\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)[1]
-    monkeypatch.chdir(tmp_path)
-    exec(compile(code, "loads.md", "exec"), {})
-    history = open_result(tmp_path / "results" / "rod_impact").history
-    assert history["external_work"][2] == 0.0 > -1e-6 > history["external_work"][-1]
 
 
 @pytest.mark.slow

@@ -29,16 +29,7 @@ from ..restart.state import RunState
 from ..signals import early
 from ..stepping.batches import Batches
 from ..stepping.model import Model
-from .observers import (
-    Callback,
-    Checkpointing,
-    Events,
-    History,
-    Observer,
-    ProgressReport,
-    RuptureReport,
-    Snapshots,
-)
+from .observers import Checkpointing, Events, History, Observer, RuptureReport, Snapshots
 from .stages import Stages
 from .synchroniser import Synchroniser
 
@@ -217,8 +208,8 @@ class Outputs:
         self.checkpointing: Checkpointing | None = None
         self.events: Events | None = None
         self.ruptures: RuptureReport | None = None
-        self._report: ProgressReport | None = None
-        self._callbacks: list[Callback] = []
+        self._observers: tuple[Observer, ...] = ()
+        self._callbacks: list[tuple[Callable[[Step], object], int]] = []
         self._writer: ResultWriter | None = None
         self._continues = False
 
@@ -231,17 +222,9 @@ class Outputs:
         """Whether results are being written."""
         return self._writer is not None
 
-    @property
-    def _recording(self) -> tuple[Observer, ...]:
-        return self.history, self.events, self.ruptures, self.snapshots, self.checkpointing
-
-    @property
-    def _observers(self) -> tuple[Observer, ...]:
-        return *self._recording, self._report, *self._callbacks
-
     def call(self, function: Callable[[Step], object], every: int) -> None:
         """Call a function after each step whose number is a multiple of ``every``."""
-        self._callbacks.append(Callback(function, every))
+        self._callbacks.append((function, every))
 
     def open(self, restart: Restart | None, notes: list[str]) -> None:
         """Initialise the state, or restore it from a checkpoint, and open all outputs. Collective.
@@ -357,7 +340,7 @@ class Outputs:
         self.snapshots = Snapshots(analysis, self.fields, warn)
         saved = self.history, self.snapshots, self._synchroniser
         self.checkpointing = Checkpointing(stages, self._folder / CHECKPOINT, state, *saved)
-        self._report = ProgressReport(self.progress, analysis, self.history)
+        self._observers = self.history, self.events, self.ruptures, self.snapshots, self.checkpointing
 
     def begin_stage(self) -> None:
         """End the current stage with a row and a snapshot, and begin the next. Collective.
@@ -400,7 +383,7 @@ class Outputs:
         """Serve the observers that are due after a step; return the step with its row. Collective."""
         step, synchroniser = made.step, self._synchroniser
         last = self._analysis.state.step == self._analysis.last_step
-        history, *others = self._recording
+        history, *others = self._observers
         recorded = history.due(step)
         if recorded:
             history.observe(made)
@@ -417,14 +400,18 @@ class Outputs:
             self._complete_stage()
         if recorded or last:
             made = made._replace(row=history.row)
-        for observer in (self._report, *self._callbacks):
-            if observer.due(step):
-                observer.observe(made)
+        size, contacts = self._analysis.step_size, history.row["active_contacts"]
+        self.progress.update(step, made.time, size, made.newton, made.linear, contacts, history.drift)
+        for function, every in self._callbacks:
+            if step % every == 0:
+                function(made)
         return made
 
     def steps_left(self, step: int) -> int:
         """Return the number of steps until an observer must act or the ranks synchronise."""
-        return min(self._synchroniser.steps_left(step), *(each.steps_left(step) for each in self._observers))
+        left = [observer.steps_left(step) for observer in self._observers]
+        left += [every - step % every for _, every in self._callbacks]
+        return min(self._synchroniser.steps_left(step), *left)
 
     def advance_together(self, batches: Batches) -> None:
         """Fuse the steps that need only rows of the history, if possible. Collective.

@@ -19,12 +19,13 @@ from ..modes.find import Found, find_modes, weakest_member
 from ..output.checkpoint import NAME as CHECKPOINT
 from ..output.layout import MODE_VALUES, Contents, Kept
 from ..output.progress import Progress, Span
+from ..output.result import RESULT_NAME
 from ..output.units import MODE
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import on_root
 from ..preflight.checks import odd_accelerations, warnings_before
 from ..preflight.forecast import summarise
-from ..restart.checkpoints import RESULT, Restart, prepare_folder
+from ..restart.checkpoints import Restart, prepare_folder
 from ..restart.state import RunState
 from ..signals import early
 from ..stepping.batches import Batches
@@ -241,7 +242,7 @@ class Outputs:
             # before any change to the folder, because the checkpoint may be refused
             state.restore(restart.file, stages.case.source)
             self._continues = restart.continues
-        aside = prepare_folder(model.comm, folder, restart, plan)
+        aside = on_root(model.comm, prepare_folder, folder, restart, plan)
         notes = [*notes, *([] if aside is None else [f"{folder}: earlier results were moved to {aside}"])]
         self.progress = self._compilation.progress = self._open_progress(notes)
         if restart is None:
@@ -249,9 +250,9 @@ class Outputs:
             self._synchroniser.synchronise()
         self._observe(state)
         if restart is not None:
-            self.history.ledger.load_state(state.share(restart.scalars["ranks"])["ledger"])
-            self.history.load_state(restart.scalars)
-            self.snapshots.load_state(restart.scalars)
+            self.history.ledger.load_state(state.share(restart.file.scalars["ranks"])["ledger"])
+            self.history.load_state(restart.file.scalars)
+            self.snapshots.load_state(restart.file.scalars)
             self._tell_restart(restart)
             # the file of modes does not belong to the new end
             on_root(model.comm, (folder / MODES_FILE).unlink, True)
@@ -259,7 +260,7 @@ class Outputs:
         if self._continues:
             self.checkpointing.last_step = restart.step
             kept = Kept(analysis.stepper.number, *restart.last)
-        self._write_to(ResultWriter(folder / RESULT, model.comm, model.mesh, self._contents(), kept))
+        self._write_to(ResultWriter(folder / RESULT_NAME, model.comm, model.mesh, self._contents(), kept))
 
     def _open_progress(self, notes: Iterable[str]) -> Progress:
         """Open the progress report and write summary, warnings and notes. Collective."""
@@ -286,7 +287,7 @@ class Outputs:
         place = f"step {stepper.number}, {self._stages.plan.axis.place(stepper.place)}"
         changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
         self.progress.message(f"restart from {restart.path}: {place}{changes}")
-        before = int(restart.attributes.get("external_functions", 0))
+        before = int(restart.file.attributes.get("external_functions", 0))
         if before != functions:
             self.progress.warning(
                 f"{restart.path}: the run had {before} function{'s' * (before != 1)} for forces, and this one has "

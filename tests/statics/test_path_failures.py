@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.counted import TRUSSES
+from helpers.small_models import TRUSSES
 from mpi4py import MPI
 from petsc4py import PETSc
 

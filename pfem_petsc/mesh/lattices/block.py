@@ -17,7 +17,6 @@ from pydantic import Field, field_validator, model_validator
 
 from ...case.base import (
     FilePath,
-    Finite,
     Name,
     NonNegativeInt,
     PositiveFloat,
@@ -33,7 +32,8 @@ from .cells import ANGLE, KINDS, UnitCell, auxetic, cell_of
 from .expressions import COORDINATES, Expression, Fields, MeshField, can_be_variable
 from .surface import Surface
 
-Point = Annotated[tuple[Finite, Finite, Finite], listed]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Point = Annotated[tuple[Fraction, Fraction, Fraction], listed]
 Strut = Annotated[tuple[int, ...], listed]
 
 
@@ -46,14 +46,6 @@ class CellKeys(StrictModel):
     """points that each strut joins, by numbers from 0: [p, q], or [p, q, i, j, k] if q is i, j, k cells farther on"""
     groups: dict[str, Annotated[tuple[NonNegativeInt, ...], listed]] | None = None
     """bar groups: numbers of struts, from 0, for each name"""
-
-    @field_validator("points")
-    @classmethod
-    def _inside(cls, points: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
-        for number, point in enumerate(points):
-            if not all(0.0 <= x <= 1.0 for x in point):
-                raise ValueError(f"point {number} is outside the cell: expected coordinates from 0 to 1, in cell edges")
-        return points
 
     @model_validator(mode="after")
     def _joined(self) -> CellKeys:

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from helpers.gathered import slab_from
+from helpers.meshes import slab_from
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.whole import check_mesh

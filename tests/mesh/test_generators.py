@@ -2,7 +2,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers.gathered import assert_part_of, stiffness_modes, whole
+from helpers.meshes import assert_part_of, stiffness_modes, whole
 from mpi4py import MPI
 from pydantic import ValidationError
 

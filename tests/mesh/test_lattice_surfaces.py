@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.gathered import assert_part_of
-from helpers.generated import CORNERS, CUBE, degrees, filled, lengths, write_stl
+from helpers.meshes import CORNERS, CUBE, assert_part_of, degrees, filled, lengths, write_stl
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, cases

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.counted import TRUSSES
+from helpers.small_models import TRUSSES
 
 from pfem_petsc import Case, Simulation, Truss
 from pfem_petsc.cli.main import main

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers.runs import run
-from helpers.von_mises import events, von_mises
+from helpers.small_models import events, von_mises
 from mpi4py import MPI
 
 from pfem_petsc import Case

@@ -99,7 +99,7 @@ class Holds:
         rough = (touched & (contact.static_friction > 0.0)).any(axis=1) | tied[nodes]
         everywhere = np.broadcast_to(np.eye(3), (len(nodes), 3, 3))
         held = [
-            touched[:, :, None] * normals,
+            np.where(touched[:, :, None], normals, 0.0),
             rough[:, None, None] * everywhere,
             self.held[nodes][:, :, None] * everywhere,
         ]

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from endurance import damaged
 from helpers.kills import differences
-from helpers.truss import Truss, options, write
+from helpers.synthetic import Truss, options, write
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.output.damage import damages
 from pfem_petsc.output.result import open_result
-from pfem_petsc.output.verify import examine
+from pfem_petsc.output.verify import damages, examine
 from pfem_petsc.output.vtkhdf import ResultWriter
 
 STEPS = 12

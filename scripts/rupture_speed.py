@@ -44,7 +44,7 @@ def main() -> None:
             name: stack.enter_context(Simulation(case_of(folder, limit, arguments), output=folder / name, quiet=True))
             for name, limit in (("whole", 1e30), ("broken", 1e3))
         }
-        steps = {name: run.batches(min_steps=1) for name, run in runs.items()}
+        steps = {name: run.batches() for name, run in runs.items()}
         for number in range(arguments.batches + 2):
             for name, batches in steps.items():
                 begin = time.process_time()

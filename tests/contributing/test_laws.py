@@ -109,7 +109,7 @@ def test_law_in_the_fused_loop(examples, tmp_path):
     case, found = one_bar("central_differences", 2e-3, 200), []
     for together in (False, True):
         with Simulation(case, output=tmp_path / str(together), quiet=True) as simulation:
-            count = len(list(simulation.batches(min_steps=1) if together else simulation))
+            count = len(list(simulation.batches() if together else simulation))
             found.append((count, simulation.state.x.copy(), simulation.model.bars.history()))
     assert found[0][0] == 200 and np.array_equal(found[0][1], found[1][1]) and np.array_equal(found[0][2], found[1][2])
     assert np.abs(found[0][2]).max() > 0.0

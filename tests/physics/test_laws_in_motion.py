@@ -152,7 +152,7 @@ def test_fused_steps_are_single_steps(law, strain, tmp_path):
     for together in (False, True):
         case = row_of_bars(law, strain, THROWN[law, strain])
         with Simulation(case, output=tmp_path / str(together), quiet=True) as simulation:
-            for _ in simulation.batches(min_steps=1) if together else simulation:
+            for _ in simulation.batches() if together else simulation:
                 pass
             assert simulation.state.step == 200
             found.append((simulation.state.x.copy(), simulation.model.bars.history()))

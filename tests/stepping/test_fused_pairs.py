@@ -34,7 +34,7 @@ def case(folder, output=None, **changes):
 
 def made(tables, comm, folder, together):
     simulation = Simulation(Case.from_dict(tables), comm, output=folder, quiet=True)
-    steps = list(simulation.batches(min_steps=1) if together else simulation)
+    steps = list(simulation.batches() if together else simulation)
     return simulation, len(steps)
 
 
@@ -139,11 +139,11 @@ def test_a_stopped_run_with_pairs_goes_on_to_the_same_end(tmp_path):
     whole, _ = made(tables, MPI.COMM_SELF, tmp_path / "one", True)
     simulation = Simulation(Case.from_dict(tables), MPI.COMM_SELF, output=tmp_path / "many", quiet=True)
     with pytest.raises(EarlyStop):
-        for _ in simulation.batches(min_steps=1):
+        for _ in simulation.batches():
             if simulation.model.links.force.any():
                 simulation._synchroniser.stop._signal = 15
     assert 0 < simulation.state.step < 100
     rest = Simulation(Case.from_dict(tables), MPI.COMM_SELF, output=tmp_path / "many", restart=True, quiet=True)
-    for _ in rest.batches(min_steps=1):
+    for _ in rest.batches():
         pass
     compare(whole, rest, tmp_path)

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from .mesh.truss import Truss
     from .output.result import open_result
     from .output.table import Table
-    from .post.live import LivePlot
     from .simulation import Simulation
     from .studies.sweep import sweep
 
@@ -26,7 +25,6 @@ __all__ = [
     "Case",
     "EarlyStop",
     "InputError",
-    "LivePlot",
     "NotConverged",
     "PfemError",
     "Simulation",
@@ -44,7 +42,6 @@ _HOMES = {
     **dict.fromkeys(("EarlyStop", "InputError", "NotConverged", "PfemError", "SimulationFailure"), ".errors"),
     "Truss": ".mesh.truss",
     "Simulation": ".simulation",
-    "LivePlot": ".post.live",
     "Table": ".output.table",
     "open_result": ".output.result",
     "sweep": ".studies.sweep",

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .errors import PfemError
-from .integrators.base import State
+import numpy as np
 
-__all__ = ["Analysis", "Step"]
+from .errors import InputError, PfemError
+from .integrators.base import Scheme, State
+from .tolerances import TIME
+
+if TYPE_CHECKING:
+    from .case.schema import Case
+    from .output.units import Axis
+    from .solvers.linear import LinearChoice
+
+__all__ = ["Analysis", "PlanAtRest", "Step", "refuse_motion"]
 
 
 class Step(NamedTuple):
@@ -87,3 +96,50 @@ class Analysis:
     def close(self) -> None:
         """Free resources that are not freed automatically; the state remains accessible."""
         self.stepper.destroy()
+
+
+@dataclass(frozen=True)
+class PlanAtRest:
+    """The plan of a run without motion, for which nothing is computed before.
+
+    Attributes
+    ----------
+    scheme : the balance without inertia
+    axis : of the times in the results
+    texts : summary for the user before a run, by label
+    step : first increment on the axis
+    end : last place on the axis, None where it is not known before
+    linear : linear solver, None without equations
+    steps : largest number of steps, None where it is not known before
+    """
+
+    scheme: Scheme
+    axis: Axis
+    texts: dict[str, str] = field(default_factory=dict)
+    step: float = 0.0
+    end: float | None = 0.0
+    linear: LinearChoice | None = None
+    steps: int | None = None
+
+    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Return which of the recorded steps and times are beyond the end."""
+        return times > (np.inf if self.end is None else self.end * (1.0 + TIME))
+
+    def entries(self, case: Case) -> dict[str, str]:
+        """Return label and text of a summary for the user before a run."""
+        return self.texts
+
+    def record(self) -> dict[str, Any]:
+        """Return the numbers that a restart must not compute again."""
+        return {}
+
+
+def refuse_motion(case: Case, what: str) -> None:
+    """Refuse initial velocities and treatments of impact, which ``what`` does not have."""
+    if any(any(entry.velocity) or any(entry.angular_velocity) for entry in case.initial):
+        raise InputError(f"{case.source}: initial: {what} has no velocities; remove the table [initial]")
+    if case.contact.treatment != "scheme":
+        raise InputError(
+            f'{case.source}: contact.treatment = "{case.contact.treatment}" treats impacts, and {what} has none; '
+            "remove the key"
+        )

@@ -28,7 +28,7 @@ from .run.outputs import Outputs, ReportedCompilation
 from .run.recorder import Recorder
 from .run.stages import Stages
 from .run.synchroniser import StopRequest, Synchroniser
-from .statics.equations import WithEquations
+from .statics.equilibrium import WithEquations
 from .stepping.model import Model
 from .stepping.stepper import Stepper
 

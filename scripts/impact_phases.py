@@ -1,12 +1,14 @@
-"""The tables of impact phases in docs/contact.md: energy gain by contact for each phase of the impact within a step.
+"""The tables of impact phases: energy gain by contact for each phase of the impact within a step.
 
-    python scripts/impact_phases.py            # rewrites them, in four minutes
+    python scripts/impact_phases.py            # rewrites those of docs/contact.md, in four minutes
     python scripts/impact_phases.py --program  # prints them from runs of the program itself, in an hour
+    python scripts/impact_phases.py --gains    # writes pfem_petsc/contact/impact_gains.npz, in twenty minutes
 
 Every integrator, treatment and mass matrix runs the rod of `rod_impact` against the wall in 14 phases: equal rods, each
 a fourteenth of v h further from the wall than the previous one; a second table has walls with restitution. Both tables
-are computed with the small linear rods that the program itself uses for its check. With --program all rods are one
-mesh, so that one run covers all phases, and the tests compare both. The exact energy ratios and releases are 1.
+are computed with small linear rods (impact_rods.py), and so are the gains that the program warns of before a run. With
+--program all rods are one mesh, so that one run covers all phases, and the tests compare both. The exact energy ratios
+and releases are 1.
 """
 
 from __future__ import annotations
@@ -16,16 +18,33 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import h5py
 import numpy as np
+from impact_rods import scan_impacts
 from mpi4py import MPI
 from pages import insert, markdown
 
 from pfem_petsc import Case
+from pfem_petsc.contact.impact_gains import (
+    BARS,
+    BOUND,
+    CASES,
+    PHASES,
+    RESTITUTIONS,
+    TABLE,
+    RodImpact,
+    impact_gain,
+    overshoots,
+)
+from pfem_petsc.contact.impact_gains import (
+    STEPS as GAIN_STEPS,
+)
 from pfem_petsc.errors import InputError, SimulationFailure
+from pfem_petsc.integrators.base import Scheme
 from pfem_petsc.registry import lookup
-from pfem_petsc.stepping.contact_check import BOUND, Asked, contact_gain, overshoots, scan_impacts
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
 from pfem_petsc.stepping.stepper import Stepper
@@ -33,7 +52,7 @@ from pfem_petsc.stepping.time_stepping import make_stepper
 
 START, END = "<!-- table: scripts/impact_phases.py -->\n", "<!-- end of phases -->"
 START_REBOUNDS, END_REBOUNDS = "<!-- table: scripts/impact_phases.py, restitution -->\n", "<!-- end of rebounds -->"
-PHASES, ELEMENTS = 14, 20
+ELEMENTS = 20
 SPEED = 1e-4  # relative to the wave speed, small enough for linear rods even with large steps
 LIMIT = 1.0 / ELEMENTS  # explicit limit of the step with lumped mass, l/c [s]
 COLUMNS = {
@@ -67,7 +86,7 @@ SCHEMES = (
 
 @dataclass(frozen=True)
 class Impacts:
-    """Results of the impacts; arrays (phases,) as in :class:`pfem_petsc.stepping.contact_check.ImpactScan`.
+    """Results of the impacts; arrays (phases,) as in :class:`impact_rods.ImpactScan`.
 
     ``warned``: whether the program warned about gains before it started.
     """
@@ -201,6 +220,13 @@ def cell(found: Impacts | None) -> str:
     return f"{found.largest.max():.3f}, {found.last.max():.3f}, {max(releases, 0)}, {found.force.max():.2f}{star}"
 
 
+def refused(scheme: Scheme, treatment: str) -> bool:
+    """Return whether a treatment refuses a scheme."""
+    if treatment == "scheme":
+        return False
+    return lookup("pfem_petsc.contact.treatments", treatment, "").Treatment.refuses(scheme) is not None
+
+
 def judged(
     integrator: str, parameters: dict, treatment: str, mass: str, step: float, restitution: float = 0.0
 ) -> Impacts | None:
@@ -208,13 +234,12 @@ def judged(
     module = lookup("pfem_petsc.integrators", integrator, "")
     known = module.Parameters(**parameters)
     scheme = module.Scheme(known)
-    if treatment != "scheme":
-        refuses = lookup("pfem_petsc.contact.treatments", treatment, "").Treatment.refuses
-        if refuses(scheme) is not None:
-            return None
-    asked = Asked(treatment, mass == "consistent", step, restitution)
-    found = scan_impacts(scheme, asked)
-    warned = contact_gain(integrator, known.model_dump_json(), asked) > BOUND or overshoots(integrator, step)
+    if refused(scheme, treatment):
+        return None
+    impact = RodImpact(treatment, mass == "consistent", step, restitution)
+    found = scan_impacts(scheme, impact)
+    gain = impact_gain(integrator, tuple(known.model_dump().values()), impact)
+    warned = gain > BOUND or overshoots(integrator, step)
     return Impacts(found.largest, found.last, found.releases, found.force, warned)
 
 
@@ -231,8 +256,62 @@ def table(of: Callable[..., Impacts | None], columns: dict[str, tuple]) -> str:
     return markdown(["integrator", "step", *columns], rows) + "\n"
 
 
+GAINS = {
+    "central_differences": [{}],
+    "chung_lee": [{"beta": beta} for beta in (1.0, 1.02, 28.0 / 27.0)],
+    "hulbert_chung": [{"rho_b": rho} for rho in (0.0, 0.5, 0.8, 1.0)],
+    "souza_moura": [{}],
+    "newmark": [
+        {"beta": beta, "gamma": gamma}
+        for beta, gamma in (
+            *((0.25, 0.5), (0.3025, 0.6), (0.4, 0.5), (0.4225, 0.8), (0.5, 0.5), (0.5625, 1.0), (0.75, 1.0)),
+            *((1.0, 0.5), (1.0, 1.0), (1.0, 1.5)),
+        )
+    ],
+    "houbolt": [{}],
+    "wilson": [{"theta": theta} for theta in (1.0, 1.4, 1.5, 1.6, 1.8, 2.0, 3.0)],
+    "generalized_alpha": [{"rho_inf": rho} for rho in (0.0, 0.5, 0.8, 0.9, 1.0)],
+    "energy_momentum": [{}],
+}
+"""Integrators of the table of gains, and their parameters."""
+
+
+def write_gains() -> None:
+    """Write the table of gains that the program reads."""
+    arrays = {}
+    for integrator, every in GAINS.items():
+        module = lookup("pfem_petsc.integrators", integrator, "")
+        gains = np.zeros((len(every), len(CASES), len(RESTITUTIONS), len(BARS), len(GAIN_STEPS)), dtype=np.float16)
+        for of_parameters, parameters in zip(gains, every, strict=True):
+            for of_case, (treatment, consistent) in zip(of_parameters, CASES, strict=True):
+                _fill_gains(of_case, module, module.Parameters(**parameters), treatment, consistent)
+        arrays[f"{integrator}.gains"] = gains
+        arrays[f"{integrator}.parameters"] = np.array([list(one.values()) for one in every]).reshape(len(every), -1)
+        print(integrator, flush=True)
+    np.savez_compressed(TABLE, **arrays)
+
+
+def _fill_gains(gains: np.ndarray, module: ModuleType, parameters: Any, treatment: str, consistent: bool) -> None:
+    """Fill the gains (restitutions, bars, steps) of a treatment; only lumped masses bounce, by `scheme` or `stick`."""
+    if refused(module.Scheme(parameters), treatment):
+        return
+    bounces = treatment in ("scheme", "stick") and not consistent
+    for of_bars, restitution in zip(gains, RESTITUTIONS if bounces else RESTITUTIONS[:1], strict=False):
+        for of_steps, bars in zip(of_bars, BARS, strict=True):
+            for k, step in enumerate(GAIN_STEPS):
+                impact = RodImpact(treatment, consistent, step, restitution, bars)
+                gain = scan_impacts(module.Scheme(parameters), impact).gain
+                of_steps[k] = gain if gain < 6e4 else np.inf
+                if module.Scheme.explicit and gain > 100.0:  # beyond the limit of the scheme
+                    of_steps[k:] = np.inf
+                    break
+
+
 def main() -> None:
     """Run everything, and insert the tables between their marks in the document."""
+    if "--gains" in sys.argv[1:]:
+        write_gains()
+        return
     for columns, start, end in ((COLUMNS, START, END), (REBOUNDS, START_REBOUNDS, END_REBOUNDS)):
         if "--program" in sys.argv[1:]:
             print(table(impacts, columns), flush=True)

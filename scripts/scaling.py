@@ -1,10 +1,10 @@
-"""Strong and weak scaling of this program on this machine: tables, plots, and a model of larger machines.
+"""Strong and weak scaling of this program on this machine: tables and plots.
 
 usage: python scripts/scaling.py [--ranks 1 2 4] [--strong 1000000] [--weak 500000] [--jobs explicit matrix_free]
 
 Every point is a run of "bench" under mpirun, stored in results/scaling; an interrupted study continues where it
-stopped, and --again repeats all runs. Files written: scaling.csv, scaling.md, strong.png, weak.png, model.md,
-model.png. On a cluster use --launcher "srun -n {ranks}"; docs/scaling.md has a job script and describes the model.
+stopped, and --again repeats all runs. Files written: scaling.csv, scaling.md, strong.png, weak.png. On a cluster use
+--launcher "srun -n {ranks}"; docs/scaling.md has a job script.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -32,11 +30,6 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
-MODEL_SIZES = [1e6, 1e7, 1e8, 1e9, 1e10]  # bars
-MODEL_RANKS = np.array([1, 2, 8, 32, 128, 512, 1024, 2048, 4096, 10_000])
-MOST_BARS, FEWEST_BARS = 2e8, 500  # of a rank: more do not fit in memory, fewer are not sensible
-NEIGHBOURS = 26
-CROSSING = 5.0  # bars per node of a face between two parts of a cubic lattice
 REPEATS = 1.15
 """Median over best step from which the repeats of a point are noise."""
 BANDWIDTH = 0.8
@@ -65,23 +58,6 @@ class Point(NamedTuple):
         return f"{self.kind}_{self.job}_{self.integrator}_{self.bars}bars_{self.ranks}ranks.json"
 
 
-def points_of(
-    studies: list[str],
-    kinds: list[str],
-    jobs: list[str],
-    sizes: dict[str, list[int]],
-    ranks: list[int],
-    names: Callable[[str], str],
-) -> list[Point]:
-    """All points, smallest first. ``names``: the integrator of a job."""
-    found = [
-        Point(study, kind, job, names(job), size, count)
-        for study in studies
-        for kind, job, size, count in product(kinds, jobs, sizes[study], ranks)
-    ]
-    return sorted(found, key=lambda p: (p.bars, p.ranks))
-
-
 def run_point(point: Point, folder: Path, launcher: str, seconds: float, limit: float) -> str:
     """Run a point unless its file is there. Gives what happened: kept, done or a failure."""
     path = folder / point.file
@@ -96,24 +72,17 @@ def run_point(point: Point, folder: Path, launcher: str, seconds: float, limit: 
     ]
     path_of_package = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     # a group of its own: a launcher that is ended must take its ranks along
-    process = subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-        env={"OMP_NUM_THREADS": "1", **os.environ, "PYTHONPATH": path_of_package},
-    )
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "start_new_session": True}
+    environment = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONPATH": path_of_package}
+    process = subprocess.Popen(command, env=environment, **options)
     try:
         output, _ = process.communicate(timeout=limit)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-        part.unlink(missing_ok=True)
-        return f"failed: more than {limit:.0f} s"
+        process.wait()
+        output = f"more than {limit:.0f} s"
     except BaseException:
         os.killpg(process.pid, signal.SIGTERM)
-        part.unlink(missing_ok=True)
         raise
     if process.returncode != 0 or not part.exists() or part.stat().st_size == 0:
         part.unlink(missing_ok=True)
@@ -219,189 +188,14 @@ def plot_study(rows: list[dict], study: str, path: Path) -> None:
     axes.plot([], [], "ko", markerfacecolor="white", label="noise: see the table")
     axes.plot([], [], "k:", linewidth=1.2, label="as the machine's memory bandwidth grows")
     every = sorted({row["ranks"] for points in series.values() for row in points})
-    _finish(axes, f"{study.capitalize()} scaling")
+    title = f"{study.capitalize()} scaling"
+    axes.set(xscale="log", yscale="log", xlabel="ranks", ylabel="time of a step [s]", title=title)
+    axes.grid(True, alpha=0.3)
     axes.set_xticks(every, [str(r) for r in every])
     axes.minorticks_off()
     figure.legend(loc="outside lower center", ncols=2, fontsize=7)
     figure.savefig(path, dpi=150)
     plt.close(figure)
-
-
-def _finish(axes: plt.Axes, title: str) -> None:
-    axes.set(xscale="log", yscale="log", xlabel="ranks", ylabel="time of a step [s]", title=title)
-    axes.grid(True, alpha=0.3)
-
-
-@dataclass(frozen=True)
-class Parts:
-    """Performance model of a step on many ranks, from measurements on few: loops, halo messages, reductions, Python.
-
-    Assumptions:
-
-    * Explicit steps with a row of history each. The part of a rank is a cube; its loops take the time per bar measured
-      with all cores of a machine busy, independent of the size of the part (parts that fit in a cache are faster).
-    * Bars between two ranks are evaluated on both. A cubic lattice has 5 of them per node of a face, half of which
-      belong to a rank itself.
-    * One exchange per step of 24 B per ghost with at most 26 neighbours, not overlapped with the loops; every message
-      costs the latency, and all share a rank's part of the network.
-    * One reduction over all ranks per row of history, log2(ranks) stages of one latency each, at least as measured.
-    * Python and library calls take the measured time of a step of a tiny model on one rank.
-    * Ranks of a machine share its memory: a bar takes at least its bytes over a rank's part of the machine's bandwidth.
-    * The slowest rank has ``imbalance`` times the mean work; the others wait.
-    * Fields are written every so many steps at the bandwidth of the file system, while nothing else happens.
-    * No noise of the operating system.
-
-    Attributes
-    ----------
-    bar : loops [s a bar and rank], all cores busy
-    overhead : of a step outside the loops [s]
-    latency : of a message [s]
-    bandwidth : of a rank's messages [B/s]
-    reduction : of a sum over the measured ranks [s]
-    nodes_per_bar : of the lattice
-    bytes_per_bar : that the loops move
-    machine_ranks : that share the memory of a machine
-    machine_bandwidth : of that memory [B/s]; infinite: as many times as there are ranks what they have here
-    imbalance : work of the slowest rank over the mean
-    snapshot : bytes of a snapshot a bar
-    fields_every : steps between snapshots; 0: none
-    disk : bandwidth of the file system [B/s]
-    """
-
-    bar: float
-    overhead: float
-    latency: float
-    bandwidth: float
-    reduction: float
-    nodes_per_bar: float
-    bytes_per_bar: float = 0.0
-    machine_ranks: int = 1
-    machine_bandwidth: float = np.inf
-    imbalance: float = 1.0
-    snapshot: float = 0.0
-    fields_every: int = 0
-    disk: float = np.inf
-
-    def bar_on(self, ranks: np.ndarray) -> np.ndarray:
-        """Return the time of the loops [s a bar and rank] where the ranks of a machine share its memory."""
-        sharing = np.minimum(ranks, self.machine_ranks)
-        return np.maximum(self.bar, self.bytes_per_bar * sharing / self.machine_bandwidth)
-
-    @property
-    def needed(self) -> float:
-        """Bandwidth that a machine needs for its ranks to run as fast as measured [B/s]."""
-        return self.machine_ranks * self.bytes_per_bar / self.bar if self.bar > 0.0 else 0.0
-
-
-def step_time(parts: Parts, bars: float, ranks: np.ndarray) -> dict[str, np.ndarray]:
-    """Seconds of a step of a lattice of ``bars`` on ``ranks``, by part and in all."""
-    mine = bars / ranks
-    edge = np.cbrt(mine * parts.nodes_per_bar)
-    alone = ranks == 1
-    ghosts = np.where(alone, 0.0, (edge + 2.0) ** 3 - edge**3)
-    twice = np.where(alone, 0.0, 0.5 * CROSSING * 6.0 * edge**2)
-    neighbours = np.minimum(NEIGHBOURS, ranks - 1)
-    found = {
-        "loops": parts.bar_on(ranks) * parts.imbalance * (mine + twice),
-        "halo": neighbours * parts.latency + 24.0 * ghosts / parts.bandwidth,
-        "sums": np.where(alone, 0.0, np.maximum(parts.reduction, parts.latency * np.ceil(np.log2(ranks)))),
-        "python": np.full(len(ranks), parts.overhead),
-        "output": np.full(len(ranks), parts.snapshot * bars / parts.disk / max(parts.fields_every, 1))
-        * (parts.fields_every > 0),
-    }
-    found["step"] = sum(found.values())
-    return found
-
-
-def parts_from(found: dict, latency: float | None, bandwidth: float | None, **others: float) -> Parts:
-    """Parts from what ``bench`` wrote of an explicit run on all cores; a network's figures replace those measured.
-
-    ``others``: further attributes of :class:`Parts`.
-    """
-    run = max((r for r in found["runs"] if r["job"] == "explicit"), key=lambda r: r["bars"])
-    # the best steps: on a shared machine the others hold waiting as well
-    overhead = next(r["best"] for r in found["overhead"] if r["job"] == "tiny")
-    messages = found["messages"] or {"latency": 1e-6, "bandwidth": 1e10, "reduction": 0.0}
-    # on several ranks a tiny step has an exchange and a sum in it, which are counted apart
-    deferred = messages["reduction"] + messages["latency"] * run["neighbours"] if found["ranks"] > 1 else 0.0
-    overhead = max(overhead - deferred, 0.5 * overhead)
-    return Parts(
-        bar=max(run["best"] - overhead - deferred, 0.0) * found["ranks"] / run["evaluated"],
-        overhead=overhead,
-        latency=latency if latency is not None else messages["latency"],
-        bandwidth=bandwidth if bandwidth is not None else messages["bandwidth"],
-        reduction=messages["reduction"],
-        nodes_per_bar=run["nodes"] / run["bars"],
-        bytes_per_bar=run["traffic"] / run["bars"],
-        # positions, velocities and contact forces of the nodes; stress, strain and plastic strain of the bars
-        snapshot=72.0 * run["nodes"] / run["bars"] + 24.0,
-        **others,
-    )
-
-
-def model_table(parts: Parts) -> str:
-    """Strong scaling of each size by the model."""
-    names = ("loops", "halo", "sums", "python", "output", "step")
-    rows = []
-    for bars in MODEL_SIZES:
-        ranks = MODEL_RANKS[(bars / MODEL_RANKS <= MOST_BARS) & (bars / MODEL_RANKS >= FEWEST_BARS)]
-        times = step_time(parts, bars, ranks)
-        for k, r in enumerate(ranks):
-            efficiency = f"{100 * parts.bar * bars / r / times['step'][k]:.0f} %"
-            cells = (f"{1e3 * times[name][k]:.3g}" for name in names)
-            rows.append([f"{bars:.0e}", f"{r:,}", f"{bars / r:,.0f}", *cells, efficiency])
-    shown = ("loops ms", "halo ms", "sums ms", "Python ms", "output ms", "step ms")
-    return markdown(["bars", "ranks", "bars a rank", *shown, "efficiency"], rows) + "\n"
-
-
-def plot_model(parts: Parts, path: Path) -> None:
-    """Steps over ranks by the model, with ideal lines."""
-    figure, axes = plt.subplots(figsize=(7.5, 5.0), constrained_layout=True)
-    every = np.unique(np.geomspace(1, MODEL_RANKS[-1], 60).astype(int))
-    for number, bars in enumerate(MODEL_SIZES):
-        ranks = every[bars / every <= MOST_BARS]
-        axes.plot(ranks, step_time(parts, bars, ranks)["step"], color=f"C{number}", label=f"{bars:.0e} bars")
-        axes.plot(ranks, parts.bar * bars / ranks, "--", color=f"C{number}", linewidth=0.8)
-    axes.plot([], [], "k--", linewidth=0.8, label="loops alone, ideal")
-    _finish(axes, "Explicit steps by the model")
-    axes.legend(fontsize=8)
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
-
-
-def write_model(points: list[Point], folder: Path, arguments: argparse.Namespace) -> None:
-    """Write the model from the explicit point with most ranks, then most bars, that has run."""
-    known = [p for p in points if p.job == "explicit" and (folder / p.file).exists()]
-    if not known:
-        return
-    point = max(known, key=lambda p: (p.ranks, p.bars))
-    parts = parts_from(
-        json.loads((folder / point.file).read_text(encoding="utf-8")),
-        arguments.latency,
-        arguments.network,
-        machine_ranks=arguments.machine_ranks,
-        machine_bandwidth=arguments.machine_bandwidth or float("inf"),
-        imbalance=arguments.imbalance,
-        fields_every=arguments.fields_every,
-        disk=arguments.disk,
-    )
-    output = f"Snapshots every {parts.fields_every} steps, {parts.snapshot:.0f} B a bar at {parts.disk / 1e9:.1f} GB/s."
-    text = (
-        f"From {point.bars:,} bars on {point.ranks} ranks: {1e9 * parts.bar:.2f} ns a bar and rank, "
-        f"{1e6 * parts.overhead:.0f} us outside the loops, latency {1e6 * parts.latency:.2f} us, "
-        f"{parts.bandwidth / 1e9:.1f} GB/s a rank, sums {1e6 * parts.reduction:.1f} us.\n\n"
-        f"{parts.machine_ranks} ranks that share a memory need {parts.needed / 1e9:.0f} GB/s of it to run as fast as "
-        f"measured; the model gives them {parts.machine_bandwidth / 1e9:.0f} GB/s. The slowest rank has "
-        f"{parts.imbalance:.2f} times the mean work. {output if parts.fields_every else 'No snapshots.'}\n\n"
-        f"{model_table(parts)}"
-    )
-    rows = rows_of([p for p in known if p.kind == point.kind], folder)
-    for row in {(row["bars"], row["ranks"]): row for row in rows}.values():
-        modelled = step_time(parts, row["bars"], np.array([row["ranks"]]))["step"][0]
-        text += f"\n{row['bars']:,} bars on {row['ranks']} ranks: model {1e3 * modelled:.4g} ms, "
-        text += f"measured {1e3 * row['step_s']:.4g} ms"
-    (folder / "model.md").write_text(text + "\n", encoding="utf-8")
-    plot_model(parts, folder / "model.png")
 
 
 def main() -> int:
@@ -424,24 +218,14 @@ def main() -> int:
     parser.add_argument("--launcher", default="mpirun --oversubscribe -n {ranks}", help="starts a run")
     parser.add_argument("--results", type=Path, default=ROOT / "results" / "scaling", help="folder")
     parser.add_argument("--again", action="store_true", help="run points that are there already anew")
-    parser.add_argument("--latency", type=float, help="of the network, for the model [s]; default: as measured")
-    parser.add_argument("--network", type=float, help="bandwidth of a rank's messages, for the model [B/s]")
-    parser.add_argument("--machine-ranks", type=int, default=1, help="that share a memory, for the model")
-    parser.add_argument("--machine-bandwidth", type=float, help="of that memory [B/s]; default: what its ranks need")
-    parser.add_argument("--imbalance", type=float, default=1.0, help="slowest rank over the mean, for the model")
-    parser.add_argument("--fields-every", type=int, default=0, help="steps between snapshots, for the model")
-    parser.add_argument("--disk", type=float, default=1e9, help="bandwidth of the file system, for the model [B/s]")
     arguments = parser.parse_args()
     folder: Path = arguments.results
     folder.mkdir(parents=True, exist_ok=True)
-    points = points_of(
-        arguments.studies,
-        arguments.kinds,
-        arguments.jobs,
-        {"strong": arguments.strong, "weak": arguments.weak},
-        sorted(set(arguments.ranks)),
-        lambda job: arguments.explicit if job.startswith("explicit") else arguments.implicit,
-    )
+    points = []
+    for study, kind, job, ranks in product(arguments.studies, arguments.kinds, arguments.jobs, set(arguments.ranks)):
+        integrator = arguments.explicit if job.startswith("explicit") else arguments.implicit
+        points += [Point(study, kind, job, integrator, size, ranks) for size in getattr(arguments, study)]
+    points.sort(key=lambda point: (point.bars, point.ranks))
     if arguments.again:
         for point in points:
             (folder / point.file).unlink(missing_ok=True)
@@ -462,7 +246,6 @@ def main() -> int:
     print("\n" + text)
     for study in studies:
         plot_study(rows, study, folder / f"{study}.png")
-    write_model(points, folder, arguments)
     print(f"in {folder}: " + ", ".join(sorted(p.name for p in folder.iterdir() if p.suffix in (".csv", ".md", ".png"))))
     return 1 if failed else 0
 

@@ -269,7 +269,7 @@ def time_job(
         running = simulation.batches()  # as in a long run
         next(running)
         first = perf_counter() - ready
-        last = next(running).step  # loads the fused loop
+        last = next(running).step  # loads the loop of batches
         before, cpu_before = perf_counter(), process_time()
         for step in running:
             now = perf_counter()

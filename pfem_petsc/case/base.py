@@ -66,6 +66,21 @@ class StrictModel(BaseModel):
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
 
+    exactly_one: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    """Groups of keys, of each of which the table has exactly one."""
+    at_most_one: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    """Groups of keys, of each of which the table has at most one."""
+
+    @model_validator(mode="after")
+    def _as_many_as_allowed(self) -> StrictModel:
+        for groups, least, many in ((self.exactly_one, 1, "exactly"), (self.at_most_one, 0, "at most")):
+            for keys in groups:
+                given = [key for key in keys if getattr(self, key) is not None]
+                if not least <= len(given) <= 1:
+                    got = " and ".join(given) or "none"
+                    raise ValueError(f"expected {many} one of the keys {', '.join(keys)}, got {got}")
+        return self
+
     def __setattr__(self, key: str, value: Any) -> None:
         place = getattr(self, "_place", None)
         if place is None or key.startswith("_"):

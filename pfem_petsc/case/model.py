@@ -407,15 +407,6 @@ Load = Annotated[
 ]
 
 
-def _varying(constant: type[StrictModel], varying: type[StrictModel], key: str) -> Chosen:
-    """The choice between a constant vector and rows over time."""
-    return Chosen(
-        constant,
-        varying,
-        choose=lambda row: varying if f"{key}_file" in row or t.has_rows(row.get(key)) else constant,
-    )
-
-
 STAGED = Field(json_schema_extra={"staged": True})
 """Annotation of a table that a stage may give."""
 
@@ -435,10 +426,8 @@ class CaseModel(StrictModel):
     spring: list[t.Spring] = []
     dashpot: list[t.Dashpot] = []
     load: Annotated[list[Load], STAGED] = []
-    gravity: Annotated[Annotated[t.Gravity, _varying(t.Gravity, t.VaryingGravity, "acceleration")] | None, STAGED] = (
-        None
-    )
-    wind: Annotated[Annotated[t.Wind, _varying(t.Wind, t.VaryingWind, "velocity")] | None, STAGED] = None
+    gravity: Annotated[t.Gravity | None, STAGED] = None
+    wind: Annotated[t.Wind | None, STAGED] = None
     temperature: Annotated[list[t.Temperature], STAGED] = []
     wall: Annotated[list[Wall], _numbered("wall"), t.distinct("wall"), STAGED] = []
     contact_pair: Annotated[list[t.ContactPair], _numbered("pair"), t.distinct("contact pair")] = []

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, PlainSerializer, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    TypeAdapter,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from ..errors import InputError
 from .base import (
@@ -98,6 +107,8 @@ class MeshKeys(StrictModel):
 class NodeSet(StrictModel):
     """A named set of nodes, selected by exactly one key."""
 
+    exactly_one = (("nearest", "box", "group", "indices", "all"),)
+
     nearest: Vector3 | None = None
     """a point [m]: selects the nearest node"""
     box: Annotated[tuple[Vector3, Vector3], listed] | None = None
@@ -126,14 +137,6 @@ class NodeSet(StrictModel):
         if indices is not None and len(set(indices)) < len(indices):
             raise ValueError("a node number is listed twice")
         return indices
-
-    @model_validator(mode="after")
-    def _exactly_one(self) -> NodeSet:
-        given = [k for k in type(self).model_fields if getattr(self, k) is not None]
-        if len(given) != 1:
-            found = f"got {' and '.join(given)}" if given else "got none"
-            raise ValueError(f"expected exactly one of the keys {', '.join(type(self).model_fields)}, {found}")
-        return self
 
 
 class Rupture(StrictModel):
@@ -164,6 +167,9 @@ class Rupture(StrictModel):
 
 class Section(StrictModel):
     """Cross-section and material of bars."""
+
+    exactly_one = (("area", "area_field"),)
+    at_most_one = (PRESTRESSES,)
 
     area: PositiveFloat | None = None
     """cross-section area [m2]"""
@@ -203,19 +209,6 @@ class Section(StrictModel):
         if info.field_name == "rest_length" and not all(1e-3 < row[1] < 1e3 for row in rows):
             raise ValueError("expected a factor on the length in the mesh, like 0.99, or rows [t, factor]")
         return value
-
-    @model_validator(mode="after")
-    def _one_area(self) -> Section:
-        if (self.area is None) == (self.area_field is None):
-            raise ValueError("expected exactly one of the keys area, area_field")
-        return self
-
-    @model_validator(mode="after")
-    def _one_prestress(self) -> Section:
-        given = [key for key in PRESTRESSES if getattr(self, key) is not None]
-        if len(given) > 1:
-            raise ValueError(f"expected at most one of the keys {', '.join(PRESTRESSES)}; got {' and '.join(given)}")
-        return self
 
     @property
     def prestressed(self) -> str | None:
@@ -266,7 +259,9 @@ def _moves_along(normal: tuple, rows: tuple, velocity: tuple | None) -> None:
 class Support(WithFiles):
     """Fixed or prescribed position components of a node set."""
 
-    alternatives: ClassVar[tuple[str, ...]] = ("velocity",)
+    alternatives = ("velocity",)
+    exactly_one = (("fix", "normal"),)
+    at_most_one = (("motion", "velocity", "acceleration"),)
 
     name: Name | None = None
     """name, by which [[remove]] refers to the support; unique"""
@@ -304,15 +299,8 @@ class Support(WithFiles):
 
     @model_validator(mode="after")
     def _moves_what_it_fixes(self) -> Support:
-        keys = [key for key in ("motion", "velocity", "acceleration") if getattr(self, key) is not None]
-        if len(keys) > 1:
-            raise ValueError(
-                f"expected at most one of the keys motion, velocity, acceleration, acceleration_file; got {keys}"
-            )
         if self.interpolation == "linear" and self.motion is None:
             raise ValueError('interpolation = "linear" requires motion; accelerations are always linear between rows')
-        if (self.fix is None) == (self.normal is None):
-            raise ValueError("expected exactly one of the keys fix, normal")
         if self.frame is not None:
             if self.fix is None:
                 raise ValueError("frame defines the axes of fix; expected the key fix")
@@ -341,16 +329,12 @@ class NodalMass(StrictModel):
 class _GroundOrNodes(StrictModel):
     """From each node of a node set to the ground, or between the nodes of two node sets."""
 
+    exactly_one = (("node_set", "between"),)
+
     node_set: NodeSetName | None = None
     """name of a node set, whose nodes are connected with the ground"""
     between: Annotated[tuple[NodeSetName, NodeSetName], listed] | None = None
     """instead: names of two node sets; each node of the second is connected with the nearest of the first"""
-
-    @model_validator(mode="after")
-    def _one_of_both(self) -> _GroundOrNodes:
-        if (self.node_set is None) == (self.between is None):
-            raise ValueError("expected exactly one of the keys node_set, between")
-        return self
 
 
 class Spring(_GroundOrNodes):
@@ -456,8 +440,24 @@ class LoadFile(StrictModel):
         return self
 
 
-class _Varying(WithFiles):
-    """A vector over time; the rows of its file are added to a constant vector."""
+def has_rows(value: Any) -> bool:
+    """Whether a value of a key that takes a vector is given over time."""
+    return isinstance(value, list | tuple) and any(isinstance(row, list | tuple) for row in value)
+
+
+_VECTOR, _ROWS = TypeAdapter(Vector3), TypeAdapter(Table4)
+
+
+def _vector_or_rows(value: Any) -> Any:
+    return (_ROWS if has_rows(value) else _VECTOR).validate_python(value, strict=True)
+
+
+VectorOrRows = Annotated[Vector3 | Table4, PlainValidator(_vector_or_rows)]
+"""a vector [x, y, z], or rows [t, x, y, z] with increasing times"""
+
+
+class _OverTime(WithFiles):
+    """A vector that may vary over time; the rows of its file are added to a constant vector."""
 
     interpolation: Literal["linear", "smooth"] = "linear"
     """interpolation between the rows: straight lines, or a cubic spline"""
@@ -466,51 +466,39 @@ class _Varying(WithFiles):
     @classmethod
     def _added(cls, data: Any, info: ValidationInfo) -> Any:
         key = next(key for key in cls.COLUMNS if key in cls.model_fields)
-        given = data.get(key)
+        given = data.get(key) if isinstance(data, Mapping) else None
         if given is None or has_rows(given) or f"{key}_file" not in data:
             return data
-        constant = getattr(cls.constant.model_validate({key: given}), key)
+        constant = getattr(cls.model_validate({key: given}), key)
         rest = cls._rows_of_files({name: value for name, value in data.items() if name != key}, info)
         return {**rest, key: [[t, *(a + b for a, b in zip(row, constant, strict=True))] for t, *row in rest[key]]}
 
+    @model_validator(mode="after")
+    def _interpolates(self) -> _OverTime:
+        if self.interpolation == "smooth" and not any(has_rows(value) for value in self.__dict__.values()):
+            raise ValueError('interpolation = "smooth" requires rows over time')
+        return self
 
-def has_rows(value: Any) -> bool:
-    """Whether a value of a key that takes a vector is given over time."""
-    return isinstance(value, list | tuple) and any(isinstance(row, list | tuple) for row in value)
 
-
-class Gravity(WithFiles):
+class Gravity(_OverTime):
     """Uniform acceleration of every mass."""
 
-    acceleration: Vector3
+    acceleration: VectorOrRows
     """acceleration [m/s2]; or rows [t, ax, ay, az] [s, m/s2], constant outside"""
     acceleration_file: FileName | None = None
     """such rows from the columns of a CSV or NPZ file, added to a constant acceleration"""
 
     @property
     def mean(self) -> tuple[float, ...]:
-        """Mean acceleration (3,) [m/s2]."""
-        return self.acceleration
+        """Acceleration, or the mean of its rows (3,) [m/s2]."""
+        rows = np.array(self.acceleration, ndmin=2)
+        return tuple(np.mean(rows[:, -3:], axis=0).tolist())
 
 
-class VaryingGravity(_Varying, Gravity):
-    """Uniform acceleration of every mass that varies over time."""
-
-    constant: ClassVar[type[WithFiles]] = Gravity
-
-    acceleration: Table4
-    """rows [t, ax, ay, az] [s, m/s2], constant outside"""
-
-    @property
-    def mean(self) -> tuple[float, ...]:
-        """Mean of the rows (3,) [m/s2]."""
-        return tuple(np.mean(np.array(self.acceleration)[:, 1:], axis=0).tolist())
-
-
-class Wind(WithFiles):
+class Wind(_OverTime):
     """Wind that drags the bars, the same everywhere."""
 
-    velocity: Vector3
+    velocity: VectorOrRows
     """velocity [m/s]; or rows [t, vx, vy, vz] [s, m/s], constant outside"""
     velocity_file: FileName | None = None
     """such rows from the columns of a CSV or NPZ file, added to a constant velocity"""
@@ -520,19 +508,11 @@ class Wind(WithFiles):
     """drag coefficient C_d of bars whose section has none"""
 
 
-class VaryingWind(_Varying, Wind):
-    """Wind over time."""
-
-    constant: ClassVar[type[WithFiles]] = Wind
-
-    velocity: Table4
-    """rows [t, vx, vy, vz] [s, m/s], constant outside"""
-
-
 class Temperature(WithFiles):
     """Temperature above reference of bars."""
 
-    alternatives: ClassVar[tuple[str, ...]] = ("value",)
+    alternatives = ("value",)
+    exactly_one = (("value", "table", "table_file"),)
 
     bars: str | None = None
     """bar group of the mesh; default: all bars"""
@@ -546,9 +526,7 @@ class Temperature(WithFiles):
     """interpolation of ``table`` between its rows: straight lines, or a cubic spline"""
 
     @model_validator(mode="after")
-    def _exactly_one(self) -> Temperature:
-        if (self.value is None) == (self.table is None):
-            raise ValueError("expected exactly one of the keys value, table, table_file")
+    def _interpolates(self) -> Temperature:
         if self.interpolation == "smooth" and self.table is None:
             raise ValueError('interpolation = "smooth" requires table')
         return self
@@ -572,6 +550,8 @@ class ContactPair(StrictModel):
 class Remove(StrictModel):
     """Bars or supports that are removed, at once or gradually."""
 
+    exactly_one = (("bars", "supports"),)
+
     bars: str | None = None
     """bar group of the mesh"""
     supports: Annotated[str, refers("support", "support")] | None = None
@@ -580,12 +560,6 @@ class Remove(StrictModel):
     """time [s], or load factor, at which the removal begins"""
     duration: NonNegativeFloat = 0.0
     """time [s], or change of the load factor, over which the force is reduced to zero linearly; 0: at once"""
-
-    @model_validator(mode="after")
-    def _exactly_one(self) -> Remove:
-        if (self.bars is None) == (self.supports is None):
-            raise ValueError("expected exactly one of the keys bars, supports")
-        return self
 
 
 class ContactSettings(StrictModel):

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING
 
 from ..bench.cases import JOBS, KINDS, cells_for, jobs, tiny_jobs
 from ..errors import InputError
-from .parser import PROGRAM, start_petsc
+from .parser import PROGRAM, Verb, start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
-
-RANKS = "all"
 
 EXAMPLE = f"""\
 examples:
@@ -125,3 +123,6 @@ def _require_writable(*paths: Path | None) -> None:
             path.open("a").close()
         except OSError as error:
             raise InputError(f"--output {path}: cannot be written: {error.strerror}") from error
+
+
+VERBS = (Verb("bench", str(__doc__), EXAMPLE, "all", add_arguments, run),)

@@ -1,30 +1,37 @@
-"""The command line: finds the verb, runs it on its ranks, and converts errors to messages and exit status."""
+"""The command line: finds the verb, runs it on its ranks, and converts errors to messages and exit status.
+
+One rank prints, and a failure on one rank ends all of them. MPI is not imported before it is needed: ``--help``,
+``list`` and invalid options determine their rank from the environment of the launcher.
+"""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import difflib
+import errno
 import importlib
 import io
+import os
 import sys
+import time
+import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 from ..case.toml import built_in_cases
-from ..errors import InputError
+from ..errors import NUMPY_REMEDY, EarlyStop, InputError, PfemError, SimulationFailure, numpy_is_too_new, printable
 from ..signals import give_back_early
-from .launcher import collectively, launched_rank, on_first_rank, refuse
-from .parser import PROGRAM, Parser, add_debug
+from .parser import PROGRAM, Parser, Verb, add_debug
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-VERBS = ("run", "list", "check", "mesh", "render", "plot", "report", "info", "sweep", "bench", "completion")
-"""Modules of this package: ``EXAMPLE``, ``RANKS``, ``add_arguments(parser)`` and ``run(arguments[, comm])``."""
+HOMES = {"run": "run", "list": "cases", "check": "cases", "mesh": "mesh", "render": "render", "plot": "results"}
+HOMES |= {"report": "results", "info": "results", "sweep": "sweep", "bench": "bench", "completion": "cases"}
+"""Verbs, and the modules of this package whose ``VERBS`` have them."""
 
 EXAMPLES = f"""\
 examples:
@@ -36,6 +43,15 @@ examples:
   mpirun -n 2 {PROGRAM} bench --sizes 100000
 
 CASE alone means run. Everything after -- goes to PETSc. VERB --help shows more."""
+
+
+RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "SLURM_PROCID")
+
+_PETSC_REFUSED = (62, 63, 83, 86)
+"""Codes of PETSc errors: wrong or out of range argument, file cannot be opened, unknown type."""
+
+GRACE = 3.0
+"""Seconds in which all ranks must report the same failure; after that the job is aborted."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -63,13 +79,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             give_back_early()
         return verb.run(arguments, *comm)
 
-    ranks = verb.ranks(arguments) if hasattr(verb, "ranks") else verb.RANKS
-    if ranks == "all":
+    if arguments.ranks == "all":
         return collectively(run_verb, debug)
-    return on_first_rank(run_verb, debug, uses_mpi=ranks == "one")
+    return on_first_rank(run_verb, debug, uses_mpi=arguments.ranks == "one")
 
 
-def _parse(words: Sequence[str], petsc_options: Sequence[str] = ()) -> tuple[argparse.Namespace, ModuleType]:
+def _parse(words: Sequence[str], petsc_options: Sequence[str] = ()) -> tuple[argparse.Namespace, Verb]:
     for word in (*words, *petsc_options):
         try:
             word.encode()
@@ -77,9 +92,9 @@ def _parse(words: Sequence[str], petsc_options: Sequence[str] = ()) -> tuple[arg
             shown = word.encode(errors="surrogateescape").decode(errors="backslashreplace")
             raise InputError(f"{shown}: has bytes that are not UTF-8: rename the file, or give other text") from error
     if not words:
-        raise InputError(f"CASE or a verb is missing: {', '.join(VERBS)}; see {PROGRAM} --help")
-    if words[0] not in (*VERBS, "-h", "--help", "--version"):
-        near = difflib.get_close_matches(words[0], VERBS, n=1, cutoff=0.7)
+        raise InputError(f"CASE or a verb is missing: {', '.join(HOMES)}; see {PROGRAM} --help")
+    if words[0] not in (*HOMES, "-h", "--help", "--version"):
+        near = difflib.get_close_matches(words[0], HOMES, n=1, cutoff=0.7)
         if near and not Path(words[0]).exists() and words[0] not in built_in_cases():
             raise InputError(f"{words[0]}: there is no such verb or case; did you mean '{near[0]}'?")
         words = ["run", *words]
@@ -91,13 +106,14 @@ def _parse(words: Sequence[str], petsc_options: Sequence[str] = ()) -> tuple[arg
     if unknown:
         # the common parser would refer to its own help
         raise InputError(f"unrecognized arguments: {' '.join(unknown)}; see {PROGRAM} {arguments.verb} --help")
-    if petsc_options and verb.RANKS != "all":
+    arguments.ranks = verb.ranks(arguments) if callable(verb.ranks) else verb.ranks
+    if petsc_options and arguments.ranks != "all":
         raise InputError(f"{arguments.verb} takes no PETSc options: {' '.join(petsc_options)}")
     arguments.petsc_options = list(petsc_options)
     return arguments, verb
 
 
-def make_parser() -> tuple[Parser, dict[str, ModuleType]]:
+def make_parser() -> tuple[Parser, dict[str, Verb]]:
     """Return the parser of all verbs, and their modules by name."""
     from .. import __version__
 
@@ -108,12 +124,158 @@ def make_parser() -> tuple[Parser, dict[str, ModuleType]]:
     )
     parser.add_argument("--version", action="version", version=f"pfem_petsc {__version__}")
     subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    verbs = {name: importlib.import_module(f"{__package__}.{name}") for name in VERBS}
-    for name, module in verbs.items():
-        text = (module.__doc__ or "").strip()
+    verbs = {}
+    for name, home in HOMES.items():
+        module = importlib.import_module(f"{__package__}.{home}")
+        verbs[name] = verb = next(each for each in module.VERBS if each.name == name)
         sub = subparsers.add_parser(
-            name, help=text.partition("\n")[0], description=text, epilog=module.EXAMPLE, prog=f"{PROGRAM} {name}"
+            name,
+            help=verb.text.partition("\n")[0],
+            description=verb.text,
+            epilog=verb.example,
+            prog=f"{PROGRAM} {name}",
         )
-        module.add_arguments(sub)
+        verb.add_arguments(sub)
         add_debug(sub)
     return parser, verbs
+
+
+def launched_rank() -> int | None:
+    """Return the rank of this process according to its launcher, None without a launcher."""
+    for variable in RANK_VARIABLES:
+        value = os.environ.get(variable, "")
+        if value.isdigit():
+            return int(value)
+    return None
+
+
+def refuse(error: PfemError, debug: bool) -> int:
+    """Print once an error that every rank has found, and return its exit status."""
+    rank = launched_rank()
+    if not rank:
+        _print(error, debug)
+    if rank is not None:
+        # A launcher kills the other ranks as soon as one exits with an error: wait until it is printed.
+        from mpi4py import MPI
+
+        MPI.COMM_WORLD.Barrier()
+    return error.exit_status
+
+
+def on_first_rank(function: Callable[[], int], debug: bool, uses_mpi: bool) -> int:
+    """Run a function on one process; further ranks, if there are any, do nothing.
+
+    Parameters
+    ----------
+    function : returns the exit status
+    debug : whether a failure prints its traceback
+    uses_mpi : whether imports of the function may start MPI, which must then be started on every rank
+    """
+    rank = launched_rank()
+    if rank is not None and uses_mpi:
+        from mpi4py import MPI
+
+        rank = MPI.COMM_WORLD.rank
+    if rank:
+        return 0
+    try:
+        status = function()
+        sys.stdout.flush()  # errors of writing are reported here, not lost at the end of the process
+    except BrokenPipeError:  # the reader of the output has exited (``list | head``)
+        status = 0
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - whatever it is becomes a message and a status
+        status = _print(error, debug)
+    _let_go_of_closed_streams()
+    return status
+
+
+def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
+    """Run a collective function and return the exit status, equal on all ranks.
+
+    If all ranks fail, the lowest prints its message. If only some fail, the others may wait for them forever: each of
+    the failed ranks prints its message and ends the job.
+    """
+    try:
+        from mpi4py import MPI
+    except ImportError as error:
+        return _print(error, debug)
+
+    comm = MPI.COMM_WORLD
+    # A separate communicator, so that messages do not match those that other ranks wait for.
+    failures = comm.Dup()
+    try:
+        status = function(comm)
+        sys.stdout.flush()
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - whatever it is becomes a message and a status
+        if not _all_arrive(failures):
+            comm.Abort(_print(error, debug, f"rank {comm.rank}: "))
+        status = failures.bcast(_print(error, debug) if comm.rank == 0 else None, root=0)
+    failures.Free()
+    _let_go_of_closed_streams()
+    return status
+
+
+def _all_arrive(comm: MPI.Comm) -> bool:
+    """Return whether every rank arrives within the grace time."""
+    request = comm.Ibarrier()
+    deadline = time.monotonic() + GRACE
+    while not request.Test():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+def _print(error: BaseException, debug: bool, who: str = "") -> int:
+    """Print one message for an error and return its exit status."""
+    status, text = exit_message(error)
+    if debug:
+        text = "".join(traceback.format_exception(error)) + text
+    for stream, shown in ((sys.stdout, ""), (sys.stderr, f"{who}{printable(text)}\n")):
+        with contextlib.suppress(OSError):
+            stream.write(shown)
+            stream.flush()
+    _let_go_of_closed_streams()
+    return status
+
+
+def _let_go_of_closed_streams() -> None:
+    """Redirect streams whose terminal is closed or disk is full: Python flushes both at exit, and a failure there
+    is exit status 120."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            number = stream.fileno()
+        except (OSError, ValueError):  # not a file: captured, or closed
+            continue
+        try:
+            stream.flush()
+            os.write(number, b"")  # writing to a closed terminal fails even without data
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+
+
+def exit_message(error: BaseException) -> tuple[int, str]:
+    """Return the exit status of an error and its message, with the remedy."""
+    reason = " ".join(str(error).split())
+    match error:
+        case EarlyStop():
+            return error.exit_status, f"stopped: {error}"
+        case PfemError():
+            return error.exit_status, f"error: {error}"
+        case KeyboardInterrupt():
+            return SimulationFailure.exit_status, "stopped: interrupted; no checkpoint was written"
+        case MemoryError():
+            return SimulationFailure.exit_status, f"error: out of memory: {error}; use more machines or a smaller mesh"
+        case ModuleNotFoundError() if not str(error.name).startswith(__package__.partition(".")[0]):
+            way = "scripts/setup.sh makes an environment that has it: source .venv/bin/activate"
+            return InputError.exit_status, f"error: {error}; {way}"
+        case _ if numpy_is_too_new(error):
+            return InputError.exit_status, f"error: {NUMPY_REMEDY}"
+        case OSError(errno=errno.ENOSPC | errno.EDQUOT | errno.EIO):
+            where = f"{error.filename}: " if error.filename else "standard output, or a file that is being written: "
+            return SimulationFailure.exit_status, f"error: {where}{error.strerror}; make room, or write elsewhere"
+        case _ if type(error).__module__ == "petsc4py.PETSc" and getattr(error, "ierr", 0) in _PETSC_REFUSED:
+            check = "check what follows -- (docs/linear_solvers.md)"
+            return InputError.exit_status, f"error: PETSc rejects an option: {reason}; {check}"
+    detail = f"{type(error).__name__}: {(reason or 'no message')[:500]}"
+    return SimulationFailure.exit_status, f"internal error: {detail}; run with --debug to see where"

@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, printable
-from .parser import PROGRAM, add_debug
+from .parser import PROGRAM, Verb, add_debug, add_set
 
 if TYPE_CHECKING:
     from ..mesh.whole import WholeMesh
-
-RANKS = "one"
 
 EXAMPLE = f"""\
 examples:
@@ -42,15 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     generate = add("generate", "Write the mesh of a generator or a case.")
     generate.add_argument("what", metavar="GENERATOR|CASE", help="name of a generator (see list), or a case")
     generate.add_argument("output", metavar="OUTPUT", type=Path)
-    generate.add_argument(
-        "--set",
-        dest="overrides",
-        metavar="KEY=VALUE",
-        nargs="+",
-        action="extend",
-        default=[],
-        help="keys of the generator, kind=octet pitch=0.01, or of the case, mesh.pitch=0.01",
-    )
+    add_set(generate, "keys of the generator, kind=octet pitch=0.01, or of the case, mesh.pitch=0.01")
     convert = add("convert", "Write a mesh file in another format.", "INPUT", "OUTPUT")
     refine = add("refine", "Divide each bar into several.", "INPUT", "OUTPUT")
     refine.add_argument("--parts", metavar="N", type=int, default=2, help="number of bars that replace one; default: 2")
@@ -228,16 +218,19 @@ def _info(arguments: argparse.Namespace) -> None:
 
 
 def _picture(arguments: argparse.Namespace) -> None:
-    from ..post.mesh_picture import draw
+    from ..post.page import mesh_page
 
     output = arguments.output or arguments.input.with_suffix(".png")
     mesh = _read(arguments.input, arguments.scale)
     if output.suffix.lower() != ".png":
         raise InputError(f"{output}: a picture is written as .png")
-    data = draw(mesh, arguments.size, arguments.view)
+    data = mesh_page(mesh, arguments.size, arguments.view)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_bytes(data)
     except OSError as error:
         raise InputError(f"{output}: cannot be written: {error.strerror}") from error
     _tell([str(output)])
+
+
+VERBS = (Verb("mesh", str(__doc__), EXAMPLE, "one", add_arguments, run),)

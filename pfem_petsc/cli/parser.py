@@ -6,9 +6,9 @@ import argparse
 import difflib
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 from ..errors import InputError
 
@@ -19,6 +19,27 @@ PREFIXES = ("pfem_contact_", "pfem_assembled_", "pfem_coarse_", "pfem_mass_", "p
 
 _SOLVER = ("snes_", "ksp_", "pc_", "mg_", "sub_", "mat_mumps_", "esteig_", "linesearch_")
 _FILES = ("-options_file", "-options_file_yaml")
+
+
+class Verb(NamedTuple):
+    """A verb of the command line.
+
+    Attributes
+    ----------
+    name : on the command line
+    text : of its help; the first line is in the list of verbs
+    example : below its help
+    ranks : ``all`` run it together; ``one`` runs it, with MPI or ``one, without MPI``; or a function of the arguments
+    add_arguments : to its parser
+    run : function of the arguments, and of the communicator for ``all``, that returns the exit status
+    """
+
+    name: str
+    text: str
+    example: str
+    ranks: str | Callable[[argparse.Namespace], str]
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[..., int]
 
 
 class Parser(argparse.ArgumentParser):
@@ -41,15 +62,13 @@ def add_case(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     parser.add_argument(
         "case", metavar="CASE", nargs="?" if optional else None, help="TOML file, or name of a built-in case (see list)"
     )
-    parser.add_argument(
-        "--set",
-        dest="overrides",
-        metavar="KEY=VALUE",
-        nargs="+",
-        action="extend",
-        default=[],
-        help="values that replace those of the case: time.step=1e-5 wall.0.point=[1,0,0]; KEY= removes a key",
-    )
+    add_set(parser, "values that replace those of the case: time.step=1e-5 wall.0.point=[1,0,0]; KEY= removes a key")
+
+
+def add_set(parser: argparse.ArgumentParser, text: str) -> None:
+    """Add --set with its help."""
+    options = {"dest": "overrides", "metavar": "KEY=VALUE", "nargs": "+", "action": "extend", "default": []}
+    parser.add_argument("--set", help=text, **options)
 
 
 def add_plugins(parser: argparse.ArgumentParser) -> None:
@@ -63,11 +82,6 @@ def add_plugins(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="files with laws, integrators, walls and so on of your own, as the key plugins of a case",
     )
-
-
-def add_result(parser: argparse.ArgumentParser) -> None:
-    """Add RESULT."""
-    parser.add_argument("result", metavar="RESULT", help="result file, or its folder")
 
 
 def surviving(result: str, deep: bool | None = None, refuse: bool = False) -> Path:

@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from .parser import PROGRAM, surviving
+from .parser import PROGRAM, Verb, surviving
 
 if TYPE_CHECKING:
     from mpi4py import MPI
-
-RANKS = "all"
 
 EXAMPLE = f"""\
 examples:
@@ -248,3 +246,6 @@ def _size(text: str) -> tuple[int, int]:
             f"{text!r} is not a size in pixels like 1280x720, or one of {', '.join(SIZES)}"
         )
     return int(width), int(height)
+
+
+VERBS = (Verb("render", str(__doc__), EXAMPLE, "all", add_arguments, run),)

@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EarlyStop, SimulationFailure
-from .parser import PROGRAM, add_case, add_plugins, seconds, start_petsc
+from .parser import PROGRAM, Verb, add_case, add_plugins, seconds, start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
     from ..case.schema import Case
-
-RANKS = "all"
 
 EXAMPLE = f"""\
 examples:
@@ -112,3 +110,6 @@ def _command(arguments: argparse.Namespace, case: Case, ranks: int) -> str:
     words += ["--restart"]
     words += ["--", *arguments.petsc_options] if arguments.petsc_options else []
     return shlex.join(words)
+
+
+VERBS = (Verb("run", str(__doc__), EXAMPLE, "all", add_arguments, run),)

@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, printable
-from .parser import PROGRAM, add_case, seconds
-
-RANKS = "one"
+from .parser import PROGRAM, Verb, add_case, seconds
 
 EXAMPLE = f"""\
 examples:
@@ -95,3 +93,6 @@ def _toml(text: str) -> Any:
     except (ValueError, RecursionError):  # also that of several keys
         return None
     return value
+
+
+VERBS = (Verb("sweep", str(__doc__), EXAMPLE, "one", add_arguments, run),)

@@ -141,40 +141,6 @@ def is_off_surface(
     return False
 
 
-class NoStepFriction:
-    """Null object for :class:`~pfem_petsc.contact.active_set.StepFriction` if no wall has friction."""
-
-    def __init__(self, model: Model, state: State, balance: Balance) -> None:
-        self.unsettled = np.empty(0, dtype=np.int64)
-
-    def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
-        """Do nothing: no node sticks or slips."""
-
-    def check(
-        self,
-        frames: NodalFrames,
-        x: np.ndarray,
-        reaction: np.ndarray,
-        strengths: np.ndarray,
-        noise: float,
-        tolerance: float,
-    ) -> np.ndarray:
-        """Return the normal forces unchanged."""
-        return strengths
-
-    def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
-        """Return no messages."""
-        return []
-
-    def relax(self) -> bool:
-        """Return False: there is nothing to simplify."""
-        return False
-
-    def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
-        """Add no force; return zero energy."""
-        return 0.0
-
-
 # Weight of the known direction relative to the one solved for, multiplied by ten after each failure. 0.01 saves a fifth
 # of the solves at first, but fails if nodes slip by micrometres.
 _FIRM = 0.1
@@ -209,6 +175,7 @@ class StepFriction:
         self._inertial = balance.alpha * inertia.mass + balance.eta * inertia.damping
         self._stiffness = self._inertial + balance.weight * model.nodal_stiffness
         owned, walls = self.contact.members.shape
+        owned *= self.contact.has_friction  # without friction no node sticks or slips
         self._guessed = np.zeros(owned, dtype=bool)
         self._sticks = np.full(owned, -1)  # the wall that a node sticks to, -1 for none
         self._directions = np.zeros((owned, walls, 3))  # d a of slipping nodes
@@ -233,6 +200,8 @@ class StepFriction:
 
     def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
         """Fix the sticking nodes of the frames and apply friction to the slipping ones, at a guess (owned, 3)."""
+        if not self.contact.has_friction:
+            return
         nodes = frames.nodes
         has_friction = self._has_friction(frames)
         fresh = has_friction & ~self._guessed[nodes]
@@ -267,8 +236,10 @@ class StepFriction:
         tolerance : of the forces [N]
         """
         nodes, contact = frames.nodes, self.contact
-        strengths = strengths.copy()
         self.drag = np.zeros((*strengths.shape, 3))
+        if not contact.has_friction:
+            return strengths
+        strengths = strengths.copy()
         at = np.flatnonzero(self._has_friction(frames))
         slipping = self._sticks[nodes[at]] < 0
         own = self._local(frames, at, x[at], reaction[at], slipping)
@@ -495,8 +466,7 @@ class ActiveSet:
         self.balance = balance
         self._iterations = self._link_iterations = 0
         self._displacements = self.contact.motion.displacements(balance.time)
-        kind = NoStepFriction if self.contact.symmetric else StepFriction
-        self.friction = kind(model, state, balance)
+        self.friction = StepFriction(model, state, balance)
         self.candidates = expected_candidates(model.contact, state, balance, held, self._displacements)
         move, slack = (balance.time - state.time) * state.v, BEYOND * model.size
         self._all_links = tuple(links)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -10,14 +10,14 @@ from mpi4py import MPI
 from ..errors import InputError
 from ..integrators.base import Balance, State
 from ..mesh.exchange import Router
-from ..mesh.slab import slab_of
+from ..mesh.slab import slab_of, slab_range
 from ..parallel.agreement import agreed
 from ..parallel.natural import NaturalOrder
 from ..registry import lookup
-from ..tolerances import ON_BOUND
-from .constraints.base import Constraint, ConstraintKeys, SetPart
-from .contact import near_planes
+from ..tolerances import BEYOND, ON_BOUND
+from .constraints.base import Constraint, ConstraintKeys, ExpectedNodes, SetPart
 from .fixed_rows import FixedRows, TwoNodeRows
+from .node_walls import near_planes
 from .pairs import find_pairs
 from .projection import project
 from .rows import (
@@ -40,13 +40,73 @@ PACKAGE = "pfem_petsc.contact.constraints"
 _ZERO = np.zeros(1)
 
 
+class _WallsAtRows:
+    """The walls, which are flat, that can stop nodes of rows.
+
+    Attributes
+    ----------
+    any : whether there are any on this rank; everywhere : on any rank
+    flags : how many flags of walls travel with the positions of nodes
+    nodes : (m,) nodes of the rows that walls can stop
+    """
+
+    def __init__(self, rows: RowSet, contact: Contact) -> None:
+        self._rows, self._contact = rows, contact
+        self._members = rows.gather(contact.members) > 0.0
+        met = self._members.any(axis=1)
+        self.nodes, self.any = np.flatnonzero(met), bool(met.any())
+        self.everywhere = bool(rows.mesh.comm.allreduce(self.any, op=MPI.LOR))
+        self.flags = len(contact.walls) if self.everywhere and contact.partial else 0
+        self._places = np.where(met, np.cumsum(met) - 1, -1)
+        self._normals = np.tile(contact.normals, (len(self.nodes), 1, 1))
+
+    def planes(self, x: np.ndarray, far: np.ndarray, time: float) -> Planes:
+        """The planes at the nodes at x (n, 3), with ``far`` (k, 7...): what other ranks know of their nodes."""
+        return self._places, self._normals, self._gaps(self.nodes, x, far, time)
+
+    def pushed(self, x: np.ndarray, far: np.ndarray, time: float, tolerance: float) -> np.ndarray:
+        """Return the positions (n, 3) to which walls alone push the nodes at x (n, 3), x itself if they push none."""
+        if not self.any:
+            return x
+        near, offsets = np.zeros(len(x), dtype=bool), self._contact.plane_offsets(time)
+        everywhere = np.zeros(len(offsets), dtype=bool)
+        near_planes(x, self._contact.normals, offsets, everywhere, self._members, _ZERO, near)
+        at = np.flatnonzero(near)
+        if len(at) == 0:
+            return x
+        pushed, moved = x.copy(), x[at]
+        gaps = self._gaps(at, x, far, time)
+        normals = np.tile(self._contact.normals, (len(at), 1, 1))
+        offsets = np.where(gaps < np.inf, offsets, -np.inf)
+        project(moved, self._rows.free[at] == 0.0, normals, offsets, tolerance, np.zeros(gaps.shape))
+        pushed[at] = moved
+        return pushed
+
+    def _gaps(self, nodes: np.ndarray, x: np.ndarray, far: np.ndarray, time: float) -> np.ndarray:
+        """Distances (m, w) of some nodes (m,) at positions x (n, 3) from walls, infinite where these do not apply."""
+        contact, at = self._contact, x[nodes]
+        # not a product of matrices: the digits must not depend on how many nodes there are
+        n = contact.normals.T
+        gaps = at[:, :1] * n[0] + at[:, 1:2] * n[1] + at[:, 2:] * n[2] - contact.plane_offsets(time)
+        applicable = self._members[nodes]
+        if self.flags:
+            where = self._rows.where[nodes]
+            own = where >= 0
+            displacements = contact.motion.displacements(time)
+            applicable[own] = contact.applicable(where[own], at[own], displacements)
+            applicable[~own] = far[-1 - where[~own], 7:] > 0.0
+        gaps[~applicable] = np.inf
+        return gaps
+
+
 class ConstraintSet:
     """The rows of contact pairs and constraints, and their forces; False if there are none. Construction is collective.
 
     Attributes
     ----------
     columns : of the tables in the history, like ``pair/NAME``, pairs first
-    rows : RowSet
+    dynamic : whether rows of any table come and go, see :meth:`find`
+    rows : RowSet, another one whenever the rows change
     force : (r,) of the rows here in the last step [N]; jacobian : (r, k, 3) gradients along which these act; the same
         on all ranks that have a row
     two : TwoNodeRows
@@ -54,37 +114,28 @@ class ConstraintSet:
     walled : whether walls can stop any node of the model's rows
     """
 
-    def __init__(
-        self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, fixed: np.ndarray, contact: Contact
-    ) -> None:
-        self.source, self.contact = case.source, contact
+    def __init__(self, case: Case, nodes: dict[str, np.ndarray], contact: Contact) -> None:
+        self.source, self.contact, self.mesh = case.source, contact, contact.mesh
         tables = [*case.contact_pair, *case.constraint]
         self.names = [table.name for table in tables]
         self.n_pairs = len(case.contact_pair)
         kinds = ["pair"] * self.n_pairs + ["constraint"] * len(case.constraint)
         self.columns = [f"{kind}/{name}" for kind, name in zip(kinds, self.names, strict=True)]
-        sources: list[Constraint] = [find_pairs(case, k, nodes, mesh) for k in range(self.n_pairs)]
-        sources += [_source(case.source, keys, nodes, mesh) for keys in case.constraint]
-        self.rows = rows = RowSet(sources, mesh, fixed)
-        self._pairs = rows.source < self.n_pairs
-        self._order = rows.order(np.arange(len(sources)) >= self.n_pairs)
-        self.fixed_jacobian = np.zeros((*rows.ends.shape, 3))
-        if rows.fixed.any():
-            at = np.flatnonzero(rows.fixed)
-            self.fixed_jacobian[at] = rows.gradients(np.zeros((len(rows.numbers), 3)), at)
-        self.two = TwoNodeRows(rows, self.fixed_jacobian)
+        self._sources: list[Constraint] = [find_pairs(case, k, nodes, self.mesh) for k in range(self.n_pairs)]
+        self._sources += [_source(case.source, keys, nodes, self.mesh) for keys in case.constraint]
+        self.dynamic = any(source.dynamic for source in self._sources)
+        self._make()
+
+    def _make(self) -> None:
+        """Make everything that depends on which rows there are. Collective."""
+        self.rows = rows = RowSet(self._sources, self.mesh, self.contact.fixed)
+        self.two = TwoNodeRows(rows)
         if len(self.two.at) == len(rows.source):
             rows.pairs = self.two.ends, self.two.normals, self.two.least
-        self._members = rows.gather(contact.members) > 0.0
-        walled = self._members.any(axis=1)
-        self._walled_nodes = np.flatnonzero(walled)
-        places = np.where(walled, np.cumsum(walled) - 1, -1)
-        self._walls = places, np.tile(contact.normals, (len(self._walled_nodes), 1, 1))
-        self._near_walls = bool(self._members.any())
+        self._walls = _WallsAtRows(rows, self.contact)
         self._turning = not rows.fixed.all()
-        walled, shared = mesh.comm.allreduce(np.array([self._near_walls, not self.two.every], dtype=np.int64))
-        self.walled, self.alone = walled > 0, walled + shared == 0
-        self._partial = self.walled and contact.partial  # whose flags travel with positions
+        self.walled = self._walls.everywhere
+        self.alone = not self.walled and self.mesh.comm.allreduce(self.two.every, op=MPI.LAND)
         self._x, self._hard = np.empty((len(rows.numbers), 3)), np.empty(len(rows.numbers))
         self._blocks: FixedRows | None = None  # for nodes of the stiffness
         self._blocks_of = np.empty(0)
@@ -95,16 +146,54 @@ class ConstraintSet:
 
     def release(self) -> None:
         """Set all forces to zero."""
-        self.force, self.jacobian = np.zeros(len(self.rows.source)), self.fixed_jacobian
+        self.force, self.jacobian = np.zeros(len(self.rows.source)), self.rows.fixed_jacobian
 
     @property
-    def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """The forces and the gradients along which they act, which can be set again after a step that is given up."""
-        return self.force, self.jacobian
+    def state(self) -> dict[str, Any]:
+        """The rows, the forces and the gradients along which they act, for a step that is given up."""
+        return dict(vars(self))
 
     @state.setter
-    def state(self, state: tuple[np.ndarray, np.ndarray]) -> None:
-        self.force, self.jacobian = state
+    def state(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+
+    def find(self, x: np.ndarray, reach: np.ndarray, time: float) -> None:
+        """Find the rows of a step whose nodes end within ``reach`` (owned,) of positions (owned, 3) [m], if any come
+        and go. Rows that stay keep their forces. Collective."""
+        if not self.dynamic:
+            return
+        numbers = self.mesh.node_ids[: self.mesh.n_owned].astype(np.int64)
+        nodes = ExpectedNodes(self.mesh.comm, numbers, x, reach, time)
+        found = [source.find(nodes) if source.dynamic else source for source in self._sources]
+        if all(one is other for one, other in zip(found, self._sources, strict=True)):
+            return
+        self._sources, before, counted = found, self.rows, self._of_counted()
+        self._make()
+        self._take(counted, before)
+        before.partners.close()
+
+    def expect(self, state: State, balance: Balance) -> None:
+        """Find the rows of an implicit step. Collective."""
+        move = (balance.time - state.time) * state.v
+        reach = 0.5 * np.linalg.norm(move, axis=1) + BEYOND * self.contact.size
+        self.find(state.position + move, reach, balance.time)
+
+    def _of_counted(self) -> dict[str, np.ndarray]:
+        """Return what is kept of the rows that this rank counts."""
+        closed = np.zeros(len(self.force), dtype=np.uint8)
+        closed[self.two.at] = self.two.record.closed
+        counted = self.rows.counted
+        return {
+            "rows.force": self.force[counted],
+            "rows.gradients": self.jacobian[counted],
+            "rows.closed": closed[counted],
+        }
+
+    def _take(self, counted: dict[str, np.ndarray], rows: RowSet) -> None:
+        """Set the forces of all rows here from those of the rows counted in a set. Collective."""
+        self.force, jacobian, closed = (self.rows.of_counted(values, rows) for values in counted.values())
+        self.jacobian = np.where(self.rows.fixed[:, None, None], self.rows.fixed_jacobian, jacobian)
+        self.two.record.closed[:] = closed[self.two.at] > 0
 
     def explicit(
         self, balance: Balance, state: State, u: np.ndarray, stiffness: np.ndarray, none: np.ndarray, tolerance: float
@@ -122,75 +211,41 @@ class ConstraintSet:
         """
         if not self:
             return none
+        if self.dynamic:
+            self.find(balance.predictor + u, np.zeros(len(u)), balance.time)
         contact = np.zeros(u.shape)
         if self.alone:
             self.force = self.two.separate(balance.predictor, u, stiffness, contact)
             return contact if self.force.any() else none
-        rows, x, walls = self.rows, self._x, len(self.contact.walls) if self._partial else 0
-        far = np.empty((0, 7 + walls))
+        rows, x, walls = self.rows, self._x, self._walls
+        far = np.empty((0, 7 + walls.flags))
         if not rows.partners.alone:
             at, leaving = rows.partners.rows, rows.partners.leaving(far.shape[1])
             leaving_nodes(at, balance.predictor, u, stiffness, state.position, leaving)
-            if walls:
+            if walls.flags:
                 displacements = self.contact.motion.displacements(balance.time)
                 leaving[:, 7:] = self.contact.applicable(at, leaving[:, :3], displacements)
             far = rows.partners.bring(leaving)
         free_positions(rows.where, balance.predictor, u, far, x)
-
-        near, pushed = self._near(x, balance.time), x
-        if len(near):
-            pushed, moved = x.copy(), x[near]
-            gaps = self._gaps(near, x, far, balance.time)
-            normals = np.tile(self.contact.normals, (len(near), 1, 1))
-            offsets = np.where(gaps < np.inf, self.contact.plane_offsets(balance.time), -np.inf)
-            project(moved, rows.free[near] == 0.0, normals, offsets, tolerance, np.zeros(gaps.shape))
-            pushed[near] = moved
+        pushed = walls.pushed(x, far, balance.time, tolerance)
 
         def given() -> tuple[np.ndarray, np.ndarray | None, Planes | None]:
             turns = balance.acting < 1.0 and self._turning
             start = rows.spread(state.position, far[:, 4:7]) if turns else None
             free_stiffness(rows.where, stiffness, far, self._hard)
-            if not self._near_walls:
-                return self._hard, start, None
-            return self._hard, start, (*self._walls, self._gaps(self._walled_nodes, x, far, balance.time))
+            return self._hard, start, walls.planes(x, far, balance.time) if walls.any else None
 
-        self.force, self.jacobian = rows.project(x, pushed, tolerance, given, self.fixed_jacobian)
+        self.force, self.jacobian = rows.project(x, pushed, tolerance, given)
         if not self.force.any():
             return none
         load = rows.forces(self.jacobian, self.force)
         push_nodes(rows.where, load, rows.free, stiffness, u, contact)
         return contact if load[rows.mine].any() else none
 
-    def _near(self, x: np.ndarray, time: float) -> np.ndarray:
-        """(m,) nodes at positions (n, 3) beyond a wall."""
-        near = np.zeros(len(x), dtype=bool)
-        if self._near_walls:
-            offsets = self.contact.plane_offsets(time)
-            everywhere = np.zeros(len(offsets), dtype=bool)
-            near_planes(x, self.contact.normals, offsets, everywhere, self._members, _ZERO, near)
-        return np.flatnonzero(near)
-
-    def _gaps(self, nodes: np.ndarray, x: np.ndarray, far: np.ndarray, time: float) -> np.ndarray:
-        """Distances (m, w) of some nodes (m,) at positions x (n, 3) from walls, which are flat, infinite where these do
-        not apply; ``far`` (k, 7...): what other ranks know of their nodes."""
-        contact, at = self.contact, x[nodes]
-        # not a product of matrices: the digits must not depend on how many nodes there are
-        n = contact.normals.T
-        gaps = at[:, :1] * n[0] + at[:, 1:2] * n[1] + at[:, 2:] * n[2] - contact.plane_offsets(time)
-        applicable = self._members[nodes]
-        if self._partial:
-            where = self.rows.where[nodes]
-            own = where >= 0
-            displacements = contact.motion.displacements(time)
-            applicable[own] = contact.applicable(where[own], at[own], displacements)
-            applicable[~own] = far[-1 - where[~own], 7:] > 0.0
-        gaps[~applicable] = np.inf
-        return gaps
-
     @property
     def batched(self) -> bool:
         """Whether batches of steps can solve the rows of this rank; see :meth:`export_rows`."""
-        return self.alone and self.rows.partners.alone
+        return self.alone and self.rows.partners.alone and not self.dynamic
 
     def export_rows(self, stiffness: np.ndarray) -> FixedRows:
         """Return the rows with their present forces for a batch of steps.
@@ -211,7 +266,7 @@ class ConstraintSet:
 
     def any_pressed(self) -> bool:
         """Return whether any row of the model has a force. Collective."""
-        return bool(self) and bool(self.rows.mesh.comm.allreduce(bool(self.force.any()), op=MPI.LOR))
+        return bool(self) and bool(self.mesh.comm.allreduce(bool(self.force.any()), op=MPI.LOR))
 
     def mark(self, held: np.ndarray) -> None:
         """Mark owned nodes (owned,) on which rows press."""
@@ -259,12 +314,14 @@ class ConstraintSet:
         """
         if not self:
             return
-        rows, walls, comm = self.rows, self.contact, self.rows.mesh.comm
+        points = self.mesh.points[: self.mesh.n_owned]
+        self.find(points, np.zeros(len(points)), 0.0)
+        rows, walls, comm = self.rows, self.contact, self.mesh.comm
         if len(self.names) > self.n_pairs and treatment != "scheme":
             raise InputError(f'{self.source}: constraint: constraints need contact.treatment = "scheme"')
         if treatment != "scheme" and not self.alone:
             several = np.bincount(rows.ends[rows.ends >= 0], minlength=len(rows.numbers)) > 1
-            several[self._walled_nodes] = True
+            several[self._walls.nodes] = True
             lowest = int(rows.numbers[several].min(initial=2**62))
             node = comm.allreduce(lowest, op=MPI.MIN)
             raise InputError(
@@ -279,7 +336,7 @@ class ConstraintSet:
                 "pairs or constraints: such a wall must be flat, without mass, friction and restitution, and not tied; "
                 "or give it a node_set without them"
             )
-        values = rows.values(rows.gather(rows.mesh.points[: rows.mesh.n_owned]))
+        values = rows.values(rows.gather(points))
         deepest = (np.inf,)
         if len(values) and not values.min() >= -ON_BOUND * length:
             row = int(np.argmin(values))
@@ -326,47 +383,62 @@ class ConstraintSet:
         project(pushed, rows.free == 0.0, normals, offsets, 0.0, np.zeros(offsets.shape))
         gaps = np.einsum("nwi,ni->nw", normals, every) - offsets
         values, pushed = (rows.along(self.jacobian, a) + closed for a in (every, pushed))
-        largest = rows.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)
+        largest = self.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)
         place = np.where(rests.any(axis=1), np.arange(len(every)), -1)
-        with agreed(rows.mesh.comm):
+        with agreed(self.mesh.comm):
             system = rows.system(self.jacobian, values, hard, (place, normals, gaps))
             self.force = rows.solve(system, pushed, 1e-13 * largest)
         change[rows.here] = (rows.forces(self.jacobian, self.force) * rows.free)[rows.mine]
         return change
 
     def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
-        """What a checkpoint keeps, name to an order and the rows that this rank owns; the same names on all ranks.
-
-        Pairs are kept at their second nodes (owned, tables), constraints in the order of their rows.
-        """
-        rows, pairs, found = self.rows, self._pairs & self.rows.counted, {}
-        if self.n_pairs:
-            closed = np.zeros(len(self.force), dtype=np.uint8)
-            closed[self.two.at] = self.two.record.closed
-            for name, values in (("pairs.force", self.force), ("pairs.closed", closed)):
-                nodal = np.zeros((rows.mesh.n_owned, self.n_pairs), dtype=values.dtype)
-                nodal[rows.last_nodes[pairs], rows.source[pairs]] = values[pairs]
-                found[name] = rows.mesh.node_order, nodal
-        if self._order.n_global:
-            mine = rows.counted & ~self._pairs
-            found["constraints.force"] = self._order, self.force[mine]
-            found["constraints.gradients"] = self._order, self.jacobian[mine]
+        """What a checkpoint keeps, name to an order and this rank's part; the same names on all ranks. Collective."""
+        order, found = self.rows.order, {}
+        for name, source in zip(self.names, self._sources, strict=True):
+            for key, values in source.state().items():
+                found[f"rows.{name}.{key}"] = self.mesh.node_order, values
+        if order.n_global:
+            kept = self._of_counted() | ({"rows.table": self.rows.table[self.rows.counted]} if self.dynamic else {})
+            found |= {name: (order, values) for name, values in kept.items()}
         return found
 
+    def numbers(self) -> dict[str, int]:
+        """What a checkpoint keeps besides the arrays. Collective."""
+        return {"rows": self.rows.order.n_global} if self else {}
+
+    def orders(self, n_rows: int | None) -> dict[str, NaturalOrder]:
+        """Return the orders in which :meth:`load_state` takes the arrays of a checkpoint with ``n_rows`` rows (None: as
+        many as there are): nodes by their owners, rows in slabs. Collective."""
+        n_rows = self.rows.order.n_global if n_rows is None else n_rows
+        comm = self.mesh.comm
+        slab = NaturalOrder(comm, np.arange(*slab_range(n_rows, comm.rank, comm.size)), n_rows)
+        orders = {name: order for name, (order, _) in self.arrays().items() if order is self.mesh.node_order}
+        names = [*self._of_counted(), *(["rows.table"] if self.dynamic else [])] if n_rows else []
+        return orders | dict.fromkeys(names, slab)
+
     def load_state(self, arrays: dict[str, np.ndarray]) -> None:
-        """Take the arrays of :meth:`arrays` back. Collective."""
-        rows, pairs = self.rows, self._pairs
+        """Take the arrays of :meth:`arrays` back, in the orders of :meth:`orders`. Collective."""
+        for name, source in zip(self.names, self._sources, strict=True):
+            source.load_state({key: arrays[f"rows.{name}.{key}"] for key in source.state()})
+        if self.dynamic:
+            width = self.rows.ends.shape[1]
+            table = arrays.get("rows.table", np.empty((0, self.rows.table.shape[1]), dtype=np.int64))
+            self._sources = [
+                source.of_table(table[table[:, 0] == s], width) if source.dynamic else source
+                for s, source in enumerate(self._sources)
+            ]
+            self._make()
         self.release()
-        if self.n_pairs:
-            at = rows.ends[pairs, 1], rows.source[pairs]
-            closed = np.zeros(len(self.force), dtype=bool)
-            self.force[pairs] = rows.gather(arrays["pairs.force"])[at]
-            closed[pairs] = rows.gather(arrays["pairs.closed"])[at] > 0.0
-            self.two.record.closed[:] = closed[self.two.at]
-        if self._order.n_global:
-            self.jacobian = self.jacobian.copy()
-            self.force[~pairs] = rows.of_counted(arrays["constraints.force"], ~pairs)
-            self.jacobian[~pairs] = rows.of_counted(arrays["constraints.gradients"], ~pairs)
+        if "rows.force" in arrays:
+            order = self.rows.order
+            self._take({name: order.from_slab(arrays[name]) for name in self._of_counted()}, self.rows)
+
+    def take_over(self, earlier: ConstraintSet) -> None:
+        """Take the state of the set of an earlier stage, with the same tables. Collective."""
+        arrays = {name: (order, values.copy()) for name, (order, values) in earlier.arrays().items()}
+        nodal = self.mesh.node_order
+        own = {name: v if order is nodal else order.to_slab(v) for name, (order, v) in arrays.items()}
+        self.load_state(own)
 
 
 def _source(file: str, parameters: ConstraintKeys, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> Constraint:

@@ -5,6 +5,7 @@ restitution.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -14,10 +15,14 @@ from ..mechanics.compiled import borrowing, inlined, kernel
 from ..mesh.ordering import NODE_BLOCK
 from ..tolerances import FIXED_POINT, FREE_PART, PROJECTED, RANK
 from .forces import WallForces, free_squares
+from .node_walls import NodeWalls
 from .projection import project
+from .tied import Ties
 
 if TYPE_CHECKING:
-    from .contact import Contact
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from .walls.base import WallKeys
 
 
 class FlatWalls(NamedTuple):
@@ -164,12 +169,12 @@ def press_planes(predictor, u, walls, stiffness, sums):
     return nodes, infeasible, all_offsets, total, touching, places
 
 
-def jam(contact: Contact, node: int, normals: np.ndarray) -> str:
+def jam(contact: NodeWalls, node: int, normals: np.ndarray) -> str:
     """Return why the friction of an owned node has no solution, and the remedy; empty if the node is not jammed.
 
     Parameters
     ----------
-    contact : Contact
+    contact : NodeWalls
     normals : (w, 3) of the walls at the node
     """
     fixed = contact.fixed[node]
@@ -177,7 +182,7 @@ def jam(contact: Contact, node: int, normals: np.ndarray) -> str:
         return ""
     square = free_squares(fixed, normals)
     least = np.sqrt(square / np.maximum(1.0 - square, 1e-300))
-    jams = contact.members[node] & (square > FREE_PART) & (contact.static_friction >= least)
+    jams = contact.members[node] & (square > FREE_PART) & (contact.static_friction >= np.maximum(least, 1e-300))
     if not jams.any():
         return ""
     wall = int(np.flatnonzero(jams)[0])
@@ -420,33 +425,54 @@ def add_friction(rubbing, x, normal_forces, drag):
 _CURVED_ROUNDS = 100  # projections of a step until tangent planes and positions agree
 
 
-class ExplicitContact:
-    """Projects free positions onto the region that the walls of a :class:`~pfem_petsc.contact.contact.Contact` allow.
+class ExplicitContact(NodeWalls):
+    """Walls that project free positions onto the region that they allow.
 
     Attributes
     ----------
+    ties : Ties
     plain : infinite flat walls without friction, restitution or ties: one compiled pass handles them
     """
 
-    def __init__(self, contact: Contact) -> None:
-        self.contact = contact
-        plain = contact.flat.all() and not (contact.has_friction or contact.partial or contact.ties.any)
-        self.plain = bool(plain and not contact.restitution.any())
-        self._part = 1.0  # see Contact.acting
-        self._room = np.empty(len(contact.members) if plain else 0, dtype=np.int64)
+    def __init__(
+        self,
+        case: Case,
+        nodes: dict[str, np.ndarray],
+        mesh: DistributedMesh,
+        fixed: np.ndarray,
+        parameters: Sequence[WallKeys] | None = None,
+    ) -> None:
+        super().__init__(case, nodes, mesh, fixed, parameters)
+        self.ties = Ties(self, case.wall if parameters is None else parameters)
+        plain = self.flat.all() and not (self.has_friction or self.partial or self.ties.any)
+        self.plain = bool(plain and not self.restitution.any())
+        self._part = 1.0  # see :meth:`acting`
+        self._room = np.empty(len(self.members) if plain else 0, dtype=np.int64)
 
-    def press(
+    def explicit(
         self,
         predictor: np.ndarray,
         u: np.ndarray,
         stiffness: np.ndarray,
         time: float,
         tolerance: float,
-        part: float,
+        part: float = 1.0,
     ) -> tuple[np.ndarray, np.ndarray, WallForces]:
-        """See :meth:`~pfem_petsc.contact.contact.Contact.explicit`."""
-        contact, self._part = self.contact, part
-        if contact.motion.bodies.any:
+        """Correct increments ``u`` (owned, 3), in place, so that the positions predictor + u satisfy the walls.
+
+        Parameters
+        ----------
+        predictor, u : (owned, 3); their sum is the position at ``time`` without walls [m]
+        stiffness : (owned,) alpha m + eta c: force for a displacement of the node [N/m]
+        tolerance : [m]
+        part : see :meth:`acting`; other parts than 1 need the state
+
+        Returns
+        -------
+        (nodes (m,), force (m, 3) [N] by the walls, WallForces)
+        """
+        self._part = part
+        if self.motion.bodies.any:
             self.push_walls(predictor + u, stiffness, time, tolerance)
         if self.plain:
             return self._press_planes(predictor, u, stiffness, time, tolerance)
@@ -457,20 +483,20 @@ class ExplicitContact:
     def _press_planes(
         self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
     ) -> tuple:
-        contact, w = self.contact, len(self.contact.walls)
-        planes = contact.normals, contact.plane_offsets(time), contact.all_nodes, contact.members
-        walls = FlatWalls(contact.fixed, *planes, tolerance, self._room)
+        w = len(self.walls)
+        planes = self.normals, self.plane_offsets(time), self.all_nodes, self.members
+        walls = FlatWalls(self.fixed, *planes, tolerance, self._room)
         sums = WallSums(np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3)))
         nodes, infeasible, offsets, force, touching, places = press_planes(predictor, u, walls, stiffness, sums)
         if infeasible >= 0:
-            raise SimulationFailure(contact.infeasible_message(nodes[infeasible], offsets[infeasible]))
+            raise SimulationFailure(self.infeasible_message(nodes[infeasible], offsets[infeasible]))
         if len(nodes) == 0:
-            return nodes, force, contact.nothing
+            return nodes, force, self.nothing
         return nodes, force, WallForces(*sums, nodes, touching, places)
 
     def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
         """Find the final positions of walls with mass in an explicit step. Collective."""
-        free = self.contact.motion.bodies
+        free = self.motion.bodies
         failure: SimulationFailure | None = None
 
         def forces() -> tuple[np.ndarray, np.ndarray]:
@@ -481,17 +507,26 @@ class ExplicitContact:
                 failure = failure or met
                 return np.zeros((len(free.at), 3)), np.zeros((len(free.at), 3, 3))
             slope = self._slope(nodes, x[nodes], correction, stiffness[nodes], walls, time)
-            if self.contact.ties.any:
-                tied, at = self.contact.ties.nodes()
-                gives = stiffness[tied, None] * ~self.contact.fixed[tied]
+            if self.ties.any:
+                tied, at = self.ties.nodes()
+                gives = stiffness[tied, None] * ~self.fixed[tied]
                 np.add.at(slope, at, gives[:, :, None] * np.eye(3))
             return walls.force[free.at], slope[free.at]
 
-        found = free.solve(forces, FIXED_POINT * self.contact.size)
+        found = free.solve(forces, FIXED_POINT * self.size)
         if failure is not None:
             raise failure
         if not found:
-            raise SimulationFailure(self.contact.unsettled_message())
+            raise SimulationFailure(self.unsettled_message())
+
+    def unsettled_message(self) -> str:
+        """Return the message about walls with mass for which no position balances the forces on them."""
+        names = ", ".join(repr(self.names[k]) for k in self.motion.bodies.at)
+        return (
+            f"walls with mass ({names}) have no position at which the forces of the nodes balance: nodes alternate "
+            "between walls that push them the same way; reduce time.step, remove one of these walls, or limit it by "
+            "'node_set'"
+        )
 
     def _slope(
         self,
@@ -508,30 +543,30 @@ class ExplicitContact:
         that slips drags it by mu times itself against the slip, which turns with the wall; one that sticks follows the
         wall in all directions. Exact for nodes at one wall.
         """
-        contact, touching = self.contact, walls.touching
-        displacements = contact.motion.displacements(time)
-        acting = contact.acting(nodes, free, displacements, self._part)
-        normals, _ = contact.planes(touching, walls.places, displacements, acting)
-        if contact.ties.any:
-            touching = touching & ~contact.ties.held[nodes][:, None]
-        held = touching[:, :, None] & ~contact.fixed[nodes][:, None, :]
+        touching = walls.touching
+        displacements = self.motion.displacements(time)
+        acting = self.acting(nodes, free, displacements, self._part)
+        normals, _ = self.planes(touching, walls.places, displacements, acting)
+        if self.ties.any:
+            touching = touching & ~self.ties.held[nodes][:, None]
+        held = touching[:, :, None] & ~self.fixed[nodes][:, None, :]
         active = np.where(held, normals, 0.0)
-        inverse = np.linalg.pinv(active, rcond=RANK) if len(nodes) else np.zeros((0, 3, len(contact.walls)))
+        inverse = np.linalg.pinv(active, rcond=RANK) if len(nodes) else np.zeros((0, 3, len(self.walls)))
         weight = stiffness[:, None] * (inverse * inverse).sum(axis=1)  # the diagonal of k (N N^T)^-1
         weight = np.where(touching, weight, 0.0)
         slope = np.einsum("mw,mwi,mwj->wij", weight, normals, normals)
-        if not contact.has_friction:
+        if not self.has_friction:
             return slope
-        way = displacements - contact.motion.displacements(contact.state.time)
-        slip = (walls.places - contact.state.position[nodes])[:, None, :] - way
+        way = displacements - self.motion.displacements(self.state.time)
+        slip = (walls.places - self.state.position[nodes])[:, None, :] - way
         slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
         size = np.linalg.norm(slip, axis=2)
-        slips = size > PROJECTED * contact.size
+        slips = size > PROJECTED * self.size
         slip /= np.where(slips, size, np.inf)[:, :, None]
-        rough = np.where(touching, contact.friction, 0.0)
+        rough = np.where(touching, self.friction, 0.0)
         slope -= np.einsum("mw,mwi,mwj->wij", rough * weight, slip, normals)
         drag = rough * np.maximum(np.einsum("mwi,mi->mw", normals, correction), 0.0)  # over k
-        turning = np.where(slips, drag / np.where(slips, size + drag, 1.0), contact.static_friction > 0.0)
+        turning = np.where(slips, drag / np.where(slips, size + drag, 1.0), self.static_friction > 0.0)
         sideways = (
             np.eye(3) - normals[:, :, :, None] * normals[:, :, None, :] - slip[:, :, :, None] * slip[:, :, None, :]
         )
@@ -545,54 +580,54 @@ class ExplicitContact:
         ``booked`` : whether the step is final and not a trial. Returns the nodes (m,), their corrections (m, 3) [m],
         the forces on them (m, 3) [N], and the sums per wall.
         """
-        contact, ties = self.contact, self.contact.ties
+        ties = self.ties
         nodes, moved, force, touching, friction = self._press(x, stiffness, time, tolerance, booked)
         if ties.any:
             tied, walls, places, pull = ties.hold(x, stiffness, time)
-            every = np.zeros((len(tied), len(contact.walls), 3))
+            every = np.zeros((len(tied), len(self.walls), 3))
             every[np.arange(len(tied)), walls] = pull
             own = np.zeros(every.shape[:2], dtype=bool)
             own[np.arange(len(tied)), walls] = True
             nodes, moved = np.append(nodes, tied), np.vstack([moved, places])
             force, touching = np.vstack([force, every]), np.vstack([touching, own])
         if len(nodes) == 0:
-            return nodes, moved, np.empty((0, 3)), contact.nothing
+            return nodes, moved, np.empty((0, 3)), self.nothing
         correction = moved - x[nodes]
         x[nodes] = moved
-        return nodes, correction, force.sum(axis=1), contact.sums(nodes, force, moved, touching, friction)
+        return nodes, correction, force.sum(axis=1), self.sums(nodes, force, moved, touching, friction)
 
     def _press(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool) -> tuple:
         """Return nodes (m,) near walls that are not tied to them, positions (m, 3), forces (m, w, 3), touching (m, w),
         and the energy that friction dissipates [J]."""
-        displacements = self.contact.motion.displacements(time)
-        near = self.contact.near(x, displacements)
-        if self.contact.rebounds:
+        displacements = self.motion.displacements(time)
+        near = self.near(x, displacements)
+        if self.rebounds:
             near |= self._returning()
-        if self.contact.ties.any:
-            near &= ~self.contact.ties.held
+        if self.ties.any:
+            near &= ~self.ties.held
         nodes = np.flatnonzero(near)
         if len(nodes) == 0:
-            walls = len(self.contact.walls)
+            walls = len(self.walls)
             return nodes, np.empty((0, 3)), np.empty((0, walls, 3)), np.empty((0, walls), dtype=bool), 0.0
         free = x[nodes]
-        applicable = self.contact.applicable(nodes, free, displacements)
+        applicable = self.applicable(nodes, free, displacements)
         at = free
-        rebounds = self._returning()[nodes] if self.contact.rebounds else np.zeros(len(nodes), dtype=bool)
-        pull = self._pull(nodes, free, time) if self.contact.rebounds else free
-        acting = self.contact.acting(nodes, free, displacements, self._part)
+        rebounds = self._returning()[nodes] if self.rebounds else np.zeros(len(nodes), dtype=bool)
+        pull = self._pull(nodes, free, time) if self.rebounds else free
+        acting = self.acting(nodes, free, displacements, self._part)
         for _ in range(_CURVED_ROUNDS):
-            normals, offsets = self.contact.planes(applicable, at, displacements, acting)
+            normals, offsets = self.planes(applicable, at, displacements, acting)
             if rebounds.any():
                 offsets[rebounds] += self._rebound(nodes[rebounds], normals[rebounds], pull[rebounds])
             moved, multipliers = free.copy(), np.zeros(offsets.shape)
-            infeasible = project(moved, self.contact.fixed[nodes], normals, offsets, tolerance, multipliers)
+            infeasible = project(moved, self.fixed[nodes], normals, offsets, tolerance, multipliers)
             if infeasible >= 0:
-                raise SimulationFailure(self.contact.infeasible_message(nodes[infeasible], offsets[infeasible]))
-            if self.contact.flat.all() or np.abs(moved - at).max() <= tolerance:
+                raise SimulationFailure(self.infeasible_message(nodes[infeasible], offsets[infeasible]))
+            if self.flat.all() or np.abs(moved - at).max() <= tolerance:
                 break
             at = moved
         else:
-            node = self.contact.mesh.node_ids[nodes[np.argmax(np.abs(moved - at).max(axis=1))]]
+            node = self.mesh.node_ids[nodes[np.argmax(np.abs(moved - at).max(axis=1))]]
             raise SimulationFailure(
                 f"the position of node {node} on curved walls did not converge in {_CURVED_ROUNDS} "
                 "iterations: walls and supports may be infeasible together; move the walls apart, free the node, or "
@@ -601,31 +636,31 @@ class ExplicitContact:
         strength = multipliers * stiffness[nodes][:, None]
         force = strength[:, :, None] * normals
         friction = 0.0
-        if self.contact.has_friction:
+        if self.has_friction:
             moved, force, friction = self._apply_friction(
                 nodes, free, displacements, (normals, offsets, acting), stiffness[nodes], moved, strength
             )
-        if booked and self.contact.rebounds:
+        if booked and self.rebounds:
             self._remember_impacts(nodes, free, moved, pull, displacements, normals, strength)
         return nodes, moved, force, np.einsum("mwi,mwi->mw", force, normals) > 0.0, friction
 
     def _returning(self) -> np.ndarray:
         """Return (owned,) bool: nodes that hit a wall with restitution in the last step."""
-        squares = self.contact.state.memory.get("rebound")
-        return (squares > 0.0).any(axis=1) if squares is not None else np.zeros(len(self.contact.members), dtype=bool)
+        squares = self.state.memory.get("rebound")
+        return (squares > 0.0).any(axis=1) if squares is not None else np.zeros(len(self.members), dtype=bool)
 
     def _pull(self, nodes: np.ndarray, free: np.ndarray, time: float) -> np.ndarray:
         """Return the part (m, 3) of the nodes' displacements without walls that is due to forces [m]."""
-        state = self.contact.state
+        state = self.state
         as_before = state.memory["half_velocity"][nodes] * (time - state.time)
         return free - state.position[nodes] - as_before
 
     def _rebound(self, nodes: np.ndarray, normals: np.ndarray, pull: np.ndarray) -> np.ndarray:
         """Return the distances (m, walls) [m] that nodes reach in this step from walls they hit in the last one."""
-        memory = self.contact.state.memory
+        memory = self.state.memory
         squares, arrivals = memory["rebound"][nodes], memory["arrival"][nodes]
         towards = -np.einsum("mwi,mi->mw", normals, pull)
-        way = rebound_way(self.contact.restitution, squares, arrivals, towards) - 0.5 * towards
+        way = rebound_way(self.restitution, squares, arrivals, towards) - 0.5 * towards
         return np.where(squares > 0.0, np.maximum(way, 0.0), 0.0)
 
     def _remember_impacts(
@@ -639,19 +674,19 @@ class ExplicitContact:
         strength: np.ndarray,
     ) -> None:
         """Record which nodes hit a wall with restitution in this step; see :mod:`~pfem_petsc.contact.explicit`."""
-        state = self.contact.state
-        shape = len(self.contact.members), len(self.contact.walls)
+        state = self.state
+        shape = len(self.members), len(self.walls)
         squares, arrivals = (state.memory.setdefault(name, np.zeros(shape)) for name in ("rebound", "arrival"))
-        way = displacements - self.contact.motion.displacements(state.time)
+        way = displacements - self.motion.displacements(state.time)
         unpushed = way.copy()
-        bodies = self.contact.motion.bodies
+        bodies = self.motion.bodies
         if bodies.any:  # use the motion without the recoil of the wall
             unpushed[bodies.at] = bodies.unpushed() - bodies.state.x
         start = state.position[nodes]
         approach = -np.einsum("mwi,mwi->mw", normals, (free - start)[:, None, :] - unpushed)
         arrival = -np.einsum("mwi,mwi->mw", normals, (moved - start)[:, None, :] - way)
         towards = -np.einsum("mwi,mi->mw", normals, pull)
-        fresh = (strength > 0.0) & ~self.contact.log.touching[nodes] & (self.contact.restitution > 0.0)
+        fresh = (strength > 0.0) & ~self.log.touching[nodes] & (self.restitution > 0.0)
         squares[:], arrivals[:] = 0.0, 0.0
         squares[nodes] = np.where(fresh, impact_square(approach, arrival, towards), 0.0)
         arrivals[nodes] = np.where(fresh, arrival, 0.0)
@@ -670,26 +705,26 @@ class ExplicitContact:
 
         Curved walls are represented by planes at the result, along the directions of ``acting``.
         """
-        contact, state = self.contact, self.contact.state
-        way = displacements - self.contact.motion.displacements(state.time)
-        before, fixed = state.position[nodes], self.contact.fixed[nodes]
+        state = self.state
+        way = displacements - self.motion.displacements(state.time)
+        before, fixed = state.position[nodes], self.fixed[nodes]
         normals, offsets, acting = planes
         applicable = offsets > -np.inf
-        tolerance = PROJECTED * self.contact.size
+        tolerance = PROJECTED * self.size
         for _ in range(_CURVED_ROUNDS):
             at, normal_forces, drag = moved.copy(), strength.copy(), np.zeros(normals.shape)
-            rough = contact.friction, contact.static_friction
+            rough = self.friction, self.static_friction
             rubbing = Rubbing(before, way, fixed, normals, offsets, *rough, stiffness)
             unsettled = add_friction(rubbing, at, normal_forces, drag)
             if unsettled >= 0:
                 raise SimulationFailure(
-                    jam(contact, nodes[unsettled], normals[unsettled])
-                    or f"the friction of node {contact.mesh.node_ids[nodes[unsettled]]} on several walls did not "
+                    jam(self, nodes[unsettled], normals[unsettled])
+                    or f"the friction of node {self.mesh.node_ids[nodes[unsettled]]} on several walls did not "
                     "converge; reduce time.step"
                 )
-            if self.contact.flat.all():
+            if self.flat.all():
                 break
-            there, distances = self.contact.planes(applicable, at, displacements, acting)
+            there, distances = self.planes(applicable, at, displacements, acting)
             apart = np.abs(distances[applicable] - offsets[applicable]).max(initial=0.0)
             if np.abs(there - normals).max() <= 1e-14 and apart <= tolerance:
                 break

@@ -133,8 +133,8 @@ class TwoNodeRows:
     record : FixedRows, in the order of the set, without blocks
     """
 
-    def __init__(self, rows: RowSet, gradients: np.ndarray) -> None:
-        self.rows = rows
+    def __init__(self, rows: RowSet) -> None:
+        self.rows, gradients = rows, rows.fixed_jacobian
         opposite = (gradients[:, 0] == -gradients[:, 1]).all(axis=1)
         self.at = np.flatnonzero(rows.fixed & (rows.last == 1) & opposite)
         self.every = len(self.at) == len(rows.source) and len(rows.numbers) == 2 * len(self.at)

@@ -343,7 +343,8 @@ class CrossingBars:
         kept = self._intact()
         ends = mesh.bars[chosen[kept]]
         # stray nodes may be anywhere, and squares of distances must be finite; a NaN has its own message elsewhere
-        fine = (np.abs(x[ends]) < _STRAY).all(axis=(1, 2))
+        near = (np.abs(x) < _STRAY).all(axis=1)
+        fine = near[ends[:, 0]] & near[ends[:, 1]]
         ends, kept = ends[fine], np.flatnonzero(kept)[fine]
         nodes, points, radius = mesh.node_ids[ends].astype(np.int64), x[ends], factor * self._radius[kept]
         turned = nodes[:, 0] > nodes[:, 1]

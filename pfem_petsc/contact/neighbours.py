@@ -1,8 +1,9 @@
 """Pairs of line segments that are close to each other, among segments of all ranks.
 
-Space is divided into cells of about half a segment. Each rank holds the segments in the cells that a hash assigns to
-it, and compares those that share a cell. A pair belongs to the cell of a point between the two where they are closest,
-so that it is found once, by one rank. Points are segments whose ends coincide.
+Space is divided into cells of about a segment. Each rank holds the segments in the cells that a hash assigns to
+it, and compares those that share a cell. A pair belongs to the first cell that both have, or, if one is longer than a
+cell, to that of a point between the two where they are closest, so that it is found once, by one rank. Points are
+segments whose ends coincide.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ _CELLS, _PAIRS = 64.0, 2000.0
 _BLOCK = 8
 
 _CHUNK = 1 << 18  # pairs found at a time
+_LONG = 1 << 40  # number of a cell where there is none
 _SECOND = 1 << 62  # added to the numbers of the second set of segments
 
 
@@ -71,14 +73,15 @@ class NeighbourSearch:
             two = two._replace(ids=two.ids + _SECOND)
             one = Segments(*(np.concatenate(arrays) for arrays in zip(one, two)))
         lengths = np.linalg.norm(one.ends[:, 1] - one.ends[:, 0], axis=1)
-        low, high = one.ends.min(axis=(0, 1), initial=np.inf), one.ends.max(axis=(0, 1), initial=-np.inf)
+        points = one.ends.reshape(-1, 3).T.copy()  # minima along rows are many times faster
+        low, high = points.min(axis=1, initial=np.inf), points.max(axis=1, initial=-np.inf)
         comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
         comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
         sizes = lengths + 2.0 * one.margin
         number, long, size = comm.allreduce(np.array([len(lengths), np.count_nonzero(lengths), sizes.sum()]))
-        self._low, self._cell, self.crowded = low, 0.7 * size / max(long, 1.0), False
+        self._low, self._cell, self.crowded = low, size / max(long, 1.0), False
         self._held, self._start, change = one, np.zeros(1, np.int64), 1.0
-        self._keys, self._rows = np.empty(0, np.int64), np.empty(0, np.int32)
+        self._keys, self._rows, self._corners = np.empty(0, np.int64), np.empty(0, np.int32), np.empty((0, 3), np.int64)
         while number:
             cells = ((lengths // self._cell + 1.0) * (2.0 + 2.0 * one.margin / self._cell) ** 3).sum()
             fits = comm.allreduce(float(cells)) <= _CELLS * number and (high - low).max() < 2.0**60 * self._cell
@@ -95,16 +98,17 @@ class NeighbourSearch:
 
     def _hold(self, comm: MPI.Comm, own: Segments) -> None:
         """Send segments to the ranks of their cells, and sort the cells that are held by this one. Collective."""
-        none, no_rows = np.empty(0, np.int64), np.empty(0, np.int32)
+        none, no_rows, corners = np.empty(0, np.int64), np.empty(0, np.int32), np.empty((len(own.ids), 3), np.int64)
         if comm.size > 1:
-            cells = own.ends, own.margin, self._low, self._cell
+            cells = own.ends, own.margin, self._low, self._cell, corners
             count = _list_cells(*cells, (comm.size, -1), none, (none, no_rows))
             ranks, rows = np.empty(count, np.int64), np.empty(count, np.int32)
             _list_cells(*cells, (comm.size, -1), none, (ranks, rows))
             each = np.unique(rows.astype(np.int64) * comm.size + ranks)
             router = Router(comm, each % comm.size, each // comm.size)
             own = Segments(*(router.send(array) for array in own))
-        cells = own.ends, own.margin, self._low, self._cell
+        self._corners = np.empty((len(own.ids), 3), np.int64)
+        cells = own.ends, own.margin, self._low, self._cell, self._corners
         counts = np.zeros(1 << (2 * len(own.ids)).bit_length(), np.int64)
         count = _list_cells(*cells, (comm.size, comm.rank), counts, (none, no_rows))
         self._start = np.append(0, np.cumsum(counts))
@@ -115,7 +119,7 @@ class NeighbourSearch:
         """Yield the pairs that this rank finds, a limited number at a time; each is found by one rank."""
         room = max(_CHUNK, int(np.diff(self._start).max(initial=0)))
         found_rows, at, distance = np.empty((room, 2), np.int64), np.empty((room, 2)), np.empty(room)
-        buckets, grid = (self._start, self._keys, self._rows), (self._low, self._cell, self._between)
+        buckets, grid = (self._start, self._keys, self._rows, self._corners), (self._low, self._cell, self._between)
         state = np.zeros(2, np.int64)
         while state[0] < len(self._start) - 1:
             found = slice(0, _compare(state, buckets, self._held, grid, (found_rows, at, distance)))
@@ -141,10 +145,11 @@ def _mixed(key):
 
 
 @kernel
-def _list_cells(ends, margins, low, cell, ranks, buckets, listed):
+def _list_cells(ends, margins, low, cell, corners, ranks, buckets, listed):
     """List the cells around segments: the key of the cell and the row of the segment, for cells of ``ranks[1]`` of
     ``ranks[0]``; with -1, the rank of the cell and the row. Each goes to the place that its bucket, if there are any,
-    is at, which moves on; without arrays for the list they are counted. Returns the length of the list."""
+    is at, which moves on; without arrays for the list they are counted. ``corners`` (n, 3) are set to
+    the first cell of each segment, or far away for those longer than a cell. Returns the length of the list."""
     keys, rows = listed
     size, rank = ranks
     first = np.empty(3, np.int64)
@@ -162,6 +167,10 @@ def _list_cells(ends, margins, low, cell, ranks, buckets, listed):
                 q = ends[n, 0, c] + (piece + 1) / pieces * way[c]
                 first[c] = int(np.floor((min(p, q) - margin - low[c]) / cell))
                 last[c] = int(np.floor((max(p, q) + margin - low[c]) / cell))
+            if piece == 0:
+                corners[n] = first
+            else:
+                corners[n, 0] = _LONG
             for i in range(first[0], last[0] + 1):
                 for j in range(first[1], last[1] + 1):
                     for k in range(first[2], last[2] + 1):
@@ -238,7 +247,7 @@ def _compare(state, buckets, held, grid, out):
 
     Starts at a place of a bucket, ``state`` (2,), and leaves there where it goes on after the arrays are full.
     """
-    start, keys, rows = buckets
+    start, keys, rows, corners = buckets
     ids, labels, ends, margin = held
     low, cell, between = grid
     found_rows, found_at, found_distance = out
@@ -250,19 +259,28 @@ def _compare(state, buckets, held, grid, out):
                 state[0] = bucket
                 state[1] = p
                 return found
+            key, one = keys[p], rows[p]
             for q in range(p + 1, start[bucket + 1]):
-                if keys[p] != keys[q]:
+                if keys[q] != key:
+                    continue
+                two = rows[q]
+                i = max(corners[one, 0], corners[two, 0])
+                if (
+                    i < _LONG
+                    and _key(i, max(corners[one, 1], corners[two, 1]), max(corners[one, 2], corners[two, 2])) != key
+                ):
                     continue
                 # rounding must not depend on the order of the segments, which depends on the ranks
-                a = rows[p] if ids[rows[p]] < ids[rows[q]] else rows[q]
-                b = rows[q] if a == rows[p] else rows[p]
+                a, b = (one, two) if ids[one] < ids[two] else (two, one)
                 if between and (ids[a] >= _SECOND or ids[b] < _SECOND):
                     continue
-                reach = margin[a] + margin[b]
                 apart = False
-                for i in range(labels.shape[1]):
-                    for j in range(labels.shape[1]):
-                        apart |= labels[a, i] == labels[b, j]
+                for m in range(labels.shape[1]):
+                    for n in range(labels.shape[1]):
+                        apart |= labels[a, m] == labels[b, n]
+                if apart:
+                    continue
+                reach = margin[a] + margin[b]
                 for c in range(3):
                     apart |= min(ends[a, 0, c], ends[a, 1, c]) - max(ends[b, 0, c], ends[b, 1, c]) > reach
                     apart |= min(ends[b, 0, c], ends[b, 1, c]) - max(ends[a, 0, c], ends[a, 1, c]) > reach
@@ -272,11 +290,11 @@ def _compare(state, buckets, held, grid, out):
                 part = margin[a] / reach if reach > 0.0 else 0.5
                 square = 0.0
                 for c in range(3):
-                    one = ends[a, 0, c] + s * (ends[a, 1, c] - ends[a, 0, c])
-                    two = ends[b, 0, c] + t * (ends[b, 1, c] - ends[b, 0, c])
-                    square += (two - one) * (two - one)
-                    place[c] = int(np.floor((one + (two - one) * part - low[c]) / cell))
-                if square > reach * reach or _key(place[0], place[1], place[2]) != keys[p]:
+                    here = ends[a, 0, c] + s * (ends[a, 1, c] - ends[a, 0, c])
+                    there = ends[b, 0, c] + t * (ends[b, 1, c] - ends[b, 0, c])
+                    square += (there - here) * (there - here)
+                    place[c] = int(np.floor((here + (there - here) * part - low[c]) / cell))
+                if square > reach * reach or (i == _LONG and _key(place[0], place[1], place[2]) != key):
                     continue
                 found_rows[found, 0] = a
                 found_rows[found, 1] = b

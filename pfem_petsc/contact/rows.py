@@ -320,6 +320,8 @@ class RowSet:
     mine, here : (n,) bool, nodes that this rank owns, and their local indices (m,)
     partners : GhostExchange for values at nodes that other ranks own
     counted : (r,) bool, rows whose last node this rank owns
+    fixed_jacobian : (r, k, 3) gradients of fixed rows, zero for others
+    table : (r, 2 + k + m) int64: source, number, mesh numbers of the nodes, and the source's data as integers
     free : (n, 3) 1.0 where a component may move, 0.0 where a support prescribes it
     groups : Groups; group_of_row, group_of_node : (r,), (n,)
     pairs : nodes (2, r), directions (r, 3) and bounds (r,) if these are all that the rows depend on, else None
@@ -340,6 +342,12 @@ class RowSet:
         every = np.arange(len(self.ends))
         self.counted = self.mine[self.ends[every, self.last]]
         self.last_nodes = self.where[self.ends[every, self.last]]
+        self._last_owners = self.owners[every, self.last]
+        self._keys = self.ids * max(len(self.sources), 1) + self.source
+        self.fixed_jacobian = np.zeros((*self.ends.shape, 3))
+        if self.fixed.any():
+            at = np.flatnonzero(self.fixed)
+            self.fixed_jacobian[at] = self.gradients(np.zeros((len(self.numbers), 3)), at)
 
     def _find(self, sources: Sequence[Constraint]) -> None:
         """Send the rows of all sources to the ranks of their nodes."""
@@ -367,6 +375,7 @@ class RowSet:
         starts, columns = owner_starts(mesh), range(2, 2 + k)
         rows = with_groups(to_owners(np.concatenate(tables), columns, starts, comm), columns, starts, comm)
         self.source, self.ids = rows[:, 0].copy(), rows[:, 1].copy()
+        self.table = np.delete(rows, slice(2, 2 + k), axis=1)
         self.last = self._widths[self.source] - 1
         at, number = rows[:, 2 : 2 + k], rows[:, 2 + k : 2 + 2 * k]
         some = at >= 0
@@ -401,13 +410,17 @@ class RowSet:
         turning[self.group_of_row[~self.fixed]] = True
         self._turning = turning
 
-    def order(self, some: np.ndarray) -> NaturalOrder:
-        """Return the order over all ranks of counted rows of sources ``some`` (sources,) bool, whose numbers have no
-        gaps. Collective."""
-        which = self.counted & some[self.source]
-        counts = self.mesh.comm.allreduce(np.bincount(self.source[which], minlength=len(self.sources)))
-        numbers = (np.cumsum(counts) - counts)[self.source] + self.ids
-        return NaturalOrder(self.mesh.comm, numbers[which], int(counts.sum()))
+    @cached_property
+    def order(self) -> NaturalOrder:
+        """The order of the counted rows over all ranks, by their numbers and sources. Collective at first use."""
+        comm, keys = self.mesh.comm, self._keys[self.counted]
+        end = comm.allreduce(int(keys.max(initial=0)), op=MPI.MAX) + 1
+        router = Router(comm, slab_of(keys, end, comm.size))
+        asked = router.send(keys)
+        place = np.empty(len(asked), dtype=np.int64)
+        place[np.argsort(asked)] = np.arange(len(asked))
+        counts = comm.allgather(len(asked))
+        return NaturalOrder(comm, router.reply(sum(counts[: comm.rank]) + place), sum(counts))
 
     @cached_property
     def alike(self) -> list[Alike]:
@@ -442,13 +455,20 @@ class RowSet:
             every[self._away] = far[self._far]
         return every
 
-    def of_counted(self, values: np.ndarray, some: np.ndarray) -> np.ndarray:
-        """Return values (m, ...) of the rows ``some`` (r,) bool from those of the counted ones (c, ...). Collective."""
-        asking = Router(self.mesh.comm, self.owners[np.arange(len(self.last)), self.last][some])
-        keys = self.source * (1 << 40) + self.ids
-        asked = asking.send(keys[some])
-        own = keys[self.counted & some]
-        return asking.reply(values[np.searchsorted(own, asked)].reshape(len(asked), *values.shape[1:]))
+    def of_counted(self, values: np.ndarray, other: RowSet | None = None) -> np.ndarray:
+        """Return values (r, ...) of the rows here from those of the counted rows (c, ...) of this set or of an earlier
+        one, zero for rows that it does not have. Collective."""
+        other = self if other is None else other
+        known = other._keys[other.counted]
+        order = np.argsort(known)
+        asking = Router(self.mesh.comm, self._last_owners)
+        asked = asking.send(self._keys)
+        at = np.searchsorted(known[order], asked)
+        there = at < len(known)
+        there[there] = known[order[at[there]]] == asked[there]
+        answer = np.zeros((len(asked), *values.shape[1:]), dtype=values.dtype)
+        answer[there] = values[order[at[there]]]
+        return asking.reply(answer)
 
     def _each(self, rows: np.ndarray | None, method: str, *arrays: np.ndarray) -> list[np.ndarray]:
         """Return the results of a method of each source for arrays (n, 3), for some rows, ascending, or all."""
@@ -561,7 +581,7 @@ class RowSet:
         return ", ".join(str(number) for number in self.numbers[nodes[starts[group] : starts[group + 1]]][:6])
 
     def project(
-        self, x: np.ndarray, pushed: np.ndarray, tolerance: float, given: Given, jacobian: np.ndarray
+        self, x: np.ndarray, pushed: np.ndarray, tolerance: float, given: Given
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return forces (r,) [N] that satisfy the rows, and the gradients (r, k, 3) along which they act.
 
@@ -571,14 +591,13 @@ class RowSet:
         tolerance : [m]
         given : asked if groups are to be solved; gives the stiffness (n,) of the nodes [N/m], positions (n, 3) where
             the forces act, None: at the solution, and planes
-        jacobian : (r, k, 3) gradients of fixed rows
 
         Raises
         ------
         SimulationFailure
             On ranks with rows that are infeasible.
         """
-        values = self.values(pushed)
+        values, jacobian = self.values(pushed), self.fixed_jacobian
         force = np.zeros(len(values))
         groups, tolerances = self._broken(values, x, tolerance)
         if len(groups) == 0:

@@ -20,8 +20,8 @@ from ..tolerances import BEYOND
 from .forces import held_by_supports
 
 if TYPE_CHECKING:
-    from .contact import Contact
     from .frames import NodalFrames
+    from .node_walls import NodeWalls
     from .walls.base import WallKeys
 
 FreshTies = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -40,7 +40,7 @@ class Ties:
 
     nobody: FreshTies = (np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
 
-    def __init__(self, contact: Contact, walls: Sequence[WallKeys]) -> None:
+    def __init__(self, contact: NodeWalls, walls: Sequence[WallKeys]) -> None:
         self.contact = contact
         self.tying = np.array([wall.tied for wall in walls], dtype=bool)
         self.any = bool(self.tying.any())

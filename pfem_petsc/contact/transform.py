@@ -164,7 +164,7 @@ class RowCoordinates:
         start = self._start if self._part == 0.0 else None
         with agreed(self.comm):
             given = k, start, None
-            force, jacobian = rows.project(x, x, tolerance, lambda: given, self.constraints.fixed_jacobian)
+            force, jacobian = rows.project(x, x, tolerance, lambda: given)
         u[here] += (rows.forces(jacobian, force) * rows.free / k[:, None])[rows.mine]
 
     def forward(self, w: np.ndarray) -> None:

@@ -12,13 +12,14 @@ from __future__ import annotations
 import codecs
 import math
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..files import readable_whole
@@ -31,10 +32,6 @@ _MADE = "_section_"
 """Beginning of the names of element sets that the writer makes for areas."""
 _REFUSED = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "PARAMETER", "SUBSTRUCTURE GENERATE")
 _CONSTRAINTS = ("TIE", "EQUATION", "MPC", "COUPLING", "RIGID BODY", "EMBEDDED ELEMENT", "MULTIPLE POINT CONSTRAINT")
-_CONDITIONS = ("BOUNDARY", "CLOAD", "DLOAD")
-_MATERIAL = {"ELASTIC": (3, 1), "DENSITY": (2, 1), "EXPANSION": (2, 1), "PLASTIC": (3, 1), "DAMPING": (0, 0)}
-"""Keywords of a material: number of values with the temperature, and how many there must be."""
-_SECTIONS = ("SOLID SECTION", "BEAM SECTION", "BEAM GENERAL SECTION")
 _PROCEDURES = (
     *("STATIC", "DYNAMIC", "FREQUENCY", "BUCKLE", "VISCO", "GEOSTATIC", "SOILS", "ANNEAL", "HEAT TRANSFER"),
     *("COUPLED TEMPERATURE-DISPLACEMENT", "DYNAMIC TEMPERATURE-DISPLACEMENT", "MODAL DYNAMIC", "DIRECT CYCLIC"),
@@ -58,8 +55,8 @@ _BARS = (
     ),
 )
 """Types of elements that are bars, their numbers of nodes, and what is to be said about them."""
-_BETWEEN = 0.3
-"""Largest distance of the third node of an element from the middle of its ends, over their distance."""
+_ASSEMBLY = "*ASSEMBLY"
+"""Key of the assembly among instances."""
 _WHAT = {"NSET": "node", "ELSET": "element"}
 
 
@@ -268,28 +265,33 @@ def _included(block: _Block, path: Path, above: tuple[Path, ...]) -> Path:
 # ---- the model: parts, instances and sets, as one mesh
 
 
-class _Entry(NamedTuple):
-    """Members of a set: ``what`` are labels (n,), or the name of a set."""
+class _Labels(NamedTuple):
+    """Members of a set: labels (n,), or first, last and step of labels, of which not all need exist."""
 
-    block: _Block
-    what: np.ndarray | str
-    instance: str = ""
-    """Whose labels they are; empty: those of the place of the set."""
+    labels: np.ndarray
     generated: bool = False
-    """Whether ``what`` is first, last and step of labels, of which not all need exist."""
-    of_elements: bool = False
-    """Whether ``what`` is an element set, whose nodes they are."""
+    instance: str = ""
+    """Whose labels they are, in capitals; empty: those of the place of the set."""
+
+    def within(self, known: np.ndarray) -> np.ndarray:
+        """Return which of some labels (n,) are members."""
+        if not self.generated:
+            return np.isin(known, self.labels)
+        first, last, step = self.labels.tolist()
+        return (known >= first) & (known <= last) & ((known - first) % step == 0)
 
 
 @dataclass
 class _Set:
-    """A set of nodes or elements: its entries are resolved when all is read."""
+    """A set of nodes or elements."""
 
     name: str
-    entries: list[_Entry] = field(default_factory=list)
+    entries: list[_Labels] = field(default_factory=list)
+    internal: bool = True
+    """Whether the file says of all its parts that a program has made them."""
 
 
-_NOTHING = np.empty(0, np.int64), np.empty(0, np.int64)
+_NOTHING = np.empty(0, np.int64)
 
 
 @dataclass
@@ -302,29 +304,31 @@ class _Scope:
     elements: list[tuple[_Block, np.ndarray, np.ndarray]] = field(default_factory=list)
     """Where, labels (n,), labels of the nodes (n, 2 or 3)."""
     sets: dict[str, dict[str, _Set]] = field(default_factory=lambda: {"NSET": {}, "ELSET": {}})
+    """By names in capitals."""
     sections: list[tuple[_Block, str]] = field(default_factory=list)
     """Where, and the element set."""
-    at: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=lambda: {"NSET": _NOTHING, "ELSET": _NOTHING})
+    place: np.ndarray = field(default_factory=lambda: np.eye(4, 3))
+    at: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     """Labels of nodes and bars, ascending, and their numbers in the mesh."""
 
-    def add(self, kind: str, name: str, entry: _Entry) -> None:
+    def instance(self, name: str, place: np.ndarray) -> _Scope:
+        """Return an instance of a part, to which content of its own can be added."""
+        sets = {
+            kind: {upper: replace(one, entries=list(one.entries)) for upper, one in found.items()}
+            for kind, found in self.sets.items()
+        }
+        return _Scope(name, list(self.nodes), list(self.elements), sets, list(self.sections), place)
+
+    def add(self, kind: str, name: str, block: _Block, entries: Iterable[_Labels]) -> None:
         """Add members to a set."""
-        self.sets[kind].setdefault(name.upper(), _Set(name)).entries.append(entry)
+        members = list(entries)  # which may name this set as it is so far
+        found = self.sets[kind].setdefault(name.upper(), _Set(name))
+        found.entries += members
+        found.internal &= "INTERNAL" in block.parameters
 
-    def with_part(self, part: _Scope) -> _Scope:
-        """Return an instance with the content of its part."""
-        return replace(
-            self,
-            nodes=part.nodes + self.nodes,
-            elements=part.elements + self.elements,
-            sets={kind: {**part.sets[kind], **self.sets[kind]} for kind in part.sets},
-            sections=part.sections + self.sections,
-            at=dict(self.at),
-        )
-
-    def placed(self, path: Path, place: np.ndarray, n_nodes: int, n_bars: int) -> tuple[np.ndarray, ...]:
+    def placed(self, path: Path, n_nodes: int, n_bars: int) -> tuple[np.ndarray, ...]:
         """Number nodes and bars from ``n_nodes`` and ``n_bars``; return labels and points of nodes, and bars (n, 2)."""
-        labels = np.concatenate([_NOTHING[0], *(own for own, _ in self.nodes)])
+        labels = np.concatenate([_NOTHING, *(own for own, _ in self.nodes)])
         points = np.concatenate([np.empty((0, 3)), *(own for _, own in self.nodes)])
         known, first, at = np.unique(labels, return_index=True, return_inverse=True)
         if len(known) < len(labels):
@@ -343,15 +347,15 @@ class _Scope:
                 element, side = np.argwhere(~there)[0]
                 text = f"node {wanted[element, side]} of element {own[element]} is not defined"
                 raise InputError(f"{block.where}: {text}")
-            ends.append(_ends(order[found], points, own, block))
-        bars = np.concatenate([_NOTHING[0], *(own for _, own, _ in self.elements)])
+            ends.append(_ends(order[found], points))
+        bars = np.concatenate([_NOTHING, *(own for _, own, _ in self.elements)])
         sequence = np.argsort(bars, kind="stable")
         twice = np.flatnonzero(np.diff(bars[sequence]) == 0)
         if len(twice):
             raise InputError(f"{path}: *ELEMENT: element {bars[sequence[twice[0]]]} is listed more than once")
         self.at = {"NSET": (known, order + n_nodes), "ELSET": (bars[sequence], sequence + n_bars)}
-        if not np.array_equal(place, np.eye(4, 3)):
-            points = points @ place[:3] + place[3]
+        if not np.array_equal(self.place, np.eye(4, 3)):
+            points = points @ self.place[:3] + self.place[3]
         return labels, points, np.concatenate(ends) + n_nodes
 
 
@@ -361,19 +365,13 @@ def _found(known: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return place, known[place] == wanted if len(known) else np.zeros(wanted.shape, bool)
 
 
-def _ends(nodes: np.ndarray, points: np.ndarray, labels: np.ndarray, block: _Block) -> np.ndarray:
-    """Return the nodes at the ends (n, 2) of elements with nodes (n, 2 or 3); the third is that between the others."""
+def _ends(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the ends (n, 2) of elements with nodes (n, 2 or 3): of three nodes, those that are farthest apart."""
     if nodes.shape[1] == 2:
         return nodes
-    pairs = np.array([[1, 2], [0, 2], [0, 1]])  # without each of the three
-    a, b = points[nodes[:, pairs[:, 0]]], points[nodes[:, pairs[:, 1]]]
-    span = np.linalg.norm(b - a, axis=2)
-    off = np.linalg.norm(points[nodes] - 0.5 * (a + b), axis=2) / np.maximum(span, 1e-300)
-    middle = off.argmin(axis=1)
-    far = np.flatnonzero(~(off.min(axis=1) < _BETWEEN))
-    if len(far):
-        raise InputError(f"{block.where}: no node of element {labels[far[0]]} is between the other two")
-    return np.take_along_axis(nodes, pairs[middle], axis=1)
+    pairs = np.array([[1, 2], [0, 2], [0, 1]])
+    span = np.linalg.norm(points[nodes[:, pairs[:, 1]]] - points[nodes[:, pairs[:, 0]]], axis=2)
+    return np.take_along_axis(nodes, pairs[span.argmax(axis=1)], axis=1)
 
 
 def _labels(values: np.ndarray, block: _Block, what: str) -> np.ndarray:
@@ -388,7 +386,7 @@ def _union(parts: list[np.ndarray]) -> np.ndarray:
     """Return the members (n,) of sets, ascending; files with a set for each bar have very many of one member."""
     if len(parts) == 1 and len(parts[0]) == 1:
         return parts[0]
-    return np.unique(np.concatenate([_NOTHING[0], *parts]))
+    return np.unique(np.concatenate([_NOTHING, *parts]))
 
 
 def _placing(block: _Block) -> np.ndarray:
@@ -401,14 +399,10 @@ def _placing(block: _Block) -> np.ndarray:
     move = rows[0, :3] if len(rows) else np.zeros(3)
     if len(rows) < 2:
         return np.vstack([np.eye(3), move])
-    start, end, angle = rows[1, :3], rows[1, 3:6], np.radians(rows[1, 6])
-    axis = end - start
-    length = np.linalg.norm(axis)
-    if not length > 0.0:
+    start, axis = rows[1, :3], rows[1, 3:6] - rows[1, :3]
+    if not axis.any():
         raise InputError(f"{block.where}: the axis of the rotation has no length")
-    x, y, z = axis / length
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turn = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)  # Rodrigues
+    turn = Rotation.from_rotvec(np.radians(rows[1, 6]) * axis / np.linalg.norm(axis)).as_matrix()
     return np.vstack([turn.T, (move - start) @ turn.T + start])
 
 
@@ -417,11 +411,13 @@ class _Deck:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.root, self.assembly, self.parts = _Scope(), _Scope(), {}
-        self.instances: list[tuple[_Scope, _Block, np.ndarray]] = []
+        self.parts: dict[str, _Scope] = {}
+        self.scopes = {"": _Scope()}
+        """What has nodes and elements: outside of parts, instances by their names in capitals, and the assembly."""
+        self.assembly = _Scope()
         self.conditions: list[_Block] = []
         self.warnings: list[str] = []
-        self._scope = self._outer = self.root
+        self._scope = self._outer = self.scopes[""]
         self._in_step = self._ended = False
         self._procedure = self._beyond = None
         self._notes: dict[str, int] = {}
@@ -436,7 +432,7 @@ class _Deck:
         keyword = block.keyword
         if self._ended:
             self._beyond = block if keyword == "STEP" else None
-        elif keyword in _CONDITIONS:
+        elif keyword in ("BOUNDARY", "CLOAD", "DLOAD"):
             self.conditions.append(block)
         elif keyword == "STEP":
             self._in_step = True
@@ -456,32 +452,20 @@ class _Deck:
 
     def _add_to_model(self, block: _Block) -> None:
         match block.keyword:
-            case "PART" | "INSTANCE":
-                self._outer = self._scope if block.keyword == "INSTANCE" else self.root
-                name = block.required("NAME")
-                self._scope = _Scope(name)
-                if block.keyword == "INSTANCE":
-                    block.required("PART")
-                    self.instances.append((self._scope, block, _placing(block)))
-                elif self.parts.setdefault(name.upper(), self._scope) is not self._scope:
-                    raise InputError(f"{block.where}: there are two parts of the name {name}")
-            case "ASSEMBLY":
-                self._scope = self.assembly
-            case "END PART" | "END ASSEMBLY" | "END INSTANCE":
-                self._scope = self._outer if block.keyword == "END INSTANCE" else self.root
+            case "PART" | "INSTANCE" | "ASSEMBLY" | "END PART" | "END INSTANCE" | "END ASSEMBLY":
+                self._open_scope(block)
             case "NODE":
                 self._add_nodes(block)
             case "ELEMENT":
                 self._add_elements(block)
             case "NSET" | "ELSET" as kind:
-                for entry in _entries(kind, block):
-                    self._scope.add(kind, block.required(kind), entry)
-            case keyword if keyword in _SECTIONS:
+                self._scope.add(kind, block.required(kind), block, self._entries(kind, block))
+            case "SOLID SECTION" | "BEAM SECTION" | "BEAM GENERAL SECTION":
                 self._scope.sections.append((block, block.required("ELSET")))
             case "MATERIAL":
                 name = block.required("NAME")
                 _, self._material = self._materials.setdefault(name.upper(), (name, {}))
-            case keyword if keyword in _MATERIAL:
+            case "ELASTIC" | "DENSITY" | "EXPANSION" | "PLASTIC" | "DAMPING":
                 told = _material_value(block, self._material)
                 self.warnings += [f"{block.where}: {told}"] if told else []
             case keyword if keyword in _CONSTRAINTS:
@@ -494,6 +478,28 @@ class _Deck:
             case keyword:
                 self._leave_out(keyword)
 
+    def _open_scope(self, block: _Block) -> None:
+        """Make what follows the content of a part, an instance or the assembly, or of what is around it."""
+        name, scope = block.get("NAME"), self._scope
+        match block.keyword:
+            case "PART":
+                self._scope = _Scope(block.required("NAME"))
+                if self.parts.setdefault(name.upper(), self._scope) is not self._scope:
+                    raise InputError(f"{block.where}: there are two parts of the name {name}")
+            case "INSTANCE":
+                part = self.parts.get(block.required("PART").upper())
+                if part is None:
+                    raise InputError(f"{block.where}: there is no part {block.get('PART')}")
+                self._outer, self._scope = scope, part.instance(block.required("NAME"), _placing(block))
+                if self.scopes.setdefault(name.upper(), self._scope) is not self._scope:
+                    raise InputError(f"{block.where}: there are two instances of the name {name}")
+            case "ASSEMBLY":
+                self._scope = self.assembly
+            case "END INSTANCE":
+                self._scope = self._outer
+            case _:
+                self._scope = self.scopes[""]
+
     def _add_nodes(self, block: _Block) -> None:
         system = block.get("SYSTEM", "R").upper()
         if system != "R":
@@ -502,7 +508,7 @@ class _Deck:
         labels = _labels(rows[:, 0], block, "node")
         self._scope.nodes.append((labels, np.nan_to_num(rows[:, 1:], posinf=np.inf, neginf=-np.inf)))
         if block.get("NSET"):
-            self._scope.add("NSET", block.get("NSET"), _Entry(block, labels))
+            self._scope.add("NSET", block.get("NSET"), block, [_Labels(labels)])
 
     def _add_elements(self, block: _Block) -> None:
         kind = block.required("TYPE").upper()
@@ -517,37 +523,71 @@ class _Deck:
         if note:
             self._notes[f"{kind}: {note}"] = self._notes.get(f"{kind}: {note}", 0) + len(rows)
         if block.get("ELSET"):
-            self._scope.add("ELSET", block.get("ELSET"), _Entry(block, labels))
+            self._scope.add("ELSET", block.get("ELSET"), block, [_Labels(labels)])
+
+    def _entries(self, kind: str, block: _Block) -> Iterator[_Labels]:
+        """Yield the members that ``*NSET`` or ``*ELSET`` names."""
+        instance = block.get("INSTANCE").upper()
+        if instance and instance not in self.scopes:
+            raise InputError(f"{block.where}: there is no instance {instance}")
+        numbers = None
+        if kind == "NSET" and block.get("ELSET"):
+            for entry in self._named("ELSET", block, block.get("ELSET"), self._scope, instance):
+                elements = (self.scopes[entry.instance] if entry.instance else self._scope).elements
+                of_set = [nodes[entry.within(labels)].ravel() for _, labels, nodes in elements]
+                yield _Labels(_union(of_set), instance=entry.instance)
+        elif "GENERATE" in block.parameters:
+            rows = block.rows(3, 2)
+            for row in _labels(np.where(np.isnan(rows), 1.0, rows).ravel(), block, "member").reshape(-1, 3):
+                if row[1] < row[0]:
+                    raise InputError(f"{block.where}: {row[0]}, {row[1]}, {row[2]} are not first, last and step")
+                yield _Labels(row, True, instance)
+        elif (numbers := block.numbers()) is not None:
+            yield _Labels(_labels(numbers, block, "member"), instance=instance)
+        else:
+            for word in (word for _, words in block.lines() for word in words if word):
+                yield from self._named(kind, block, word, self._scope, instance)
+
+    def _named(self, kind: str, block: _Block, word: str, scope: _Scope, instance: str = "") -> list[_Labels]:
+        """Return the members of a set that is named as NAME or INSTANCE.NAME, or of LABEL or INSTANCE.LABEL."""
+        name = word.strip('"')
+        first, dot, rest = name.partition(".")
+        if dot and first.upper() in self.scopes:
+            instance, name = first.upper(), rest
+        if name.isdecimal():
+            return [_Labels(_labels(np.array([float(name)]), block, "member"), instance=instance)]
+        found = (self.scopes[instance] if instance else scope).sets[kind].get(name.upper())
+        if found is None:
+            raise InputError(f"{block.where}: {name!r} is neither a number nor an existing {_WHAT[kind]} set")
+        return [entry._replace(instance=entry.instance or instance) for entry in found.entries]
 
     def mesh(self) -> WholeMesh:
         """Return nodes and bars of all instances in their order, without nodes where no bar ends, and their groups."""
         told = [f"{self.path}: {n} elements {note}" for note, n in self._notes.items()]
         if self._other_types:
             told.append(f"{self.path}: left out elements of the types {', '.join(sorted(self._other_types))}")
-        self._scopes: dict[str, _Scope] = {}
-        labels, points, bars = [_NOTHING[0]], [np.empty((0, 3))], [np.empty((0, 2), np.int64)]
-        for key, scope, place in self._content():
-            self._scopes[key] = scope
-            parts = scope.placed(self.path, place, sum(map(len, points)), sum(map(len, bars)))
+        self.scopes[_ASSEMBLY] = self.assembly
+        labels, points, bars = [_NOTHING], [np.empty((0, 3))], [np.empty((0, 2), np.int64)]
+        for scope in self.scopes.values():
+            parts = scope.placed(self.path, sum(map(len, points)), sum(map(len, bars)))
             for whole, part in zip((labels, points, bars), parts):
                 whole.append(part)
-        all_points, self.bars = np.concatenate(points), np.concatenate(bars)
+        all_points, all_bars = np.concatenate(points), np.concatenate(bars)
         used = np.zeros(len(all_points), bool)
-        used[self.bars] = True
+        used[all_bars] = True
         self.labels_left_out = np.concatenate(labels)[~used].tolist()
         number = np.where(used, np.cumsum(used) - 1, -1)
-        self.bars = number[self.bars]
-        for scope in self._scopes.values():
+        for scope in self.scopes.values():
             known, at = scope.at["NSET"]
             scope.at["NSET"] = known, number[at]
-        self._lost: dict[int, int] = {}
         self.groups = {}
         for kind, what in _WHAT.items():
+            self._lost: dict[int, int] = {}  # a set that another one names counts once
             self.groups[kind] = self._groups(kind)
-            lost, self._lost = sum(self._lost.values()), {}
-            if lost:
+            lost = sum(self._lost.values())
+            if lost and (kind == "NSET" or not self._other_types):
                 told.append(f"{self.path}: {lost} members of {what} sets are not there, and are left out")
-        mesh = WholeMesh(all_points[used], self.bars, self.groups["NSET"], dict(self.groups["ELSET"]))
+        mesh = WholeMesh(all_points[used], number[all_bars], self.groups["NSET"], dict(self.groups["ELSET"]))
         mesh.warnings = told + self.warnings
         if self._constraints:
             text = "nodes that they connect are joined by `mesh clean` if they are at the same place"
@@ -556,89 +596,42 @@ class _Deck:
             mesh.tables["material"] = {name: _material_keys(values) for name, values in self._materials.values()}
         return mesh
 
-    def _content(self) -> Iterator[tuple[str, _Scope, np.ndarray]]:
-        """Yield what has nodes and elements, with its name in capitals and its place."""
-        still = np.eye(4, 3)
-        yield "", self.root, still
-        for own, block, place in self.instances:
-            part = block.get("PART")
-            if part.upper() not in self.parts:
-                raise InputError(f"{block.where}: there is no part {part}")
-            if own.name.upper() in self._scopes:
-                raise InputError(f"{block.where}: there are two instances of the name {own.name}")
-            yield own.name.upper(), own.with_part(self.parts[part.upper()]), place
-        yield "*ASSEMBLY", self.assembly, still
-
     def _groups(self, kind: str) -> dict[str, np.ndarray]:
         """Return the node sets (``NSET``) or element sets (``ELSET``) as groups.
 
         A set of a part has its own name where no other set has it, and INSTANCE.NAME otherwise; with several instances
         NAME is the set of all of them.
         """
-        found: dict[str, np.ndarray] = {}
+        found = {one.name: self._members(kind, _ASSEMBLY, one.entries) for one in self.assembly.sets[kind].values()}
         common: dict[str, tuple[str, list[np.ndarray]]] = {}
-        for table in self.assembly.sets[kind].values():
-            found[table.name] = self._members(kind, "*ASSEMBLY", table)
         taken = {name.upper() for name in found}
-        for key, scope in self._scopes.items():
-            for upper, table in scope.sets[kind].items() if key != "*ASSEMBLY" else ():
-                members = self._members(kind, key, table)
-                common.setdefault(upper, (table.name, []))[1].append(members)
-                if key and (upper in taken or len(self.instances) > 1):
-                    found[f"{scope.name}.{table.name}"] = members
+        for key, scope in self.scopes.items():
+            for upper, one in scope.sets[kind].items() if key != _ASSEMBLY else ():
+                members = self._members(kind, key, one.entries)
+                common.setdefault(upper, (one.name, []))[1].append(members)
+                if key and (upper in taken or len(self.scopes) > 3):
+                    found[f"{scope.name}.{one.name}"] = members
         found |= {name: _union(parts) for upper, (name, parts) in common.items() if upper not in taken}
         return {name.replace("/", "_"): members for name, members in found.items()}
 
     def members_of(self, kind: str, block: _Block, target: str) -> np.ndarray:
         """Return the members (n,) of a set, or that of a label, which a keyword outside of parts names."""
-        key = "*ASSEMBLY" if self.instances else ""
-        entry = _Entry(block, target.strip('"'))
-        if target.isdecimal() and len(target) < 16:
-            return self._labelled(kind, key, entry._replace(what=np.array([int(target)])))
-        return self._named(kind, key, entry, ())
+        key = _ASSEMBLY if len(self.scopes) > 2 else ""
+        return self._members(kind, key, self._named(kind, block, target, self.scopes[key]))
 
-    def _members(self, kind: str, key: str, table: _Set, above: tuple[str, ...] = ()) -> np.ndarray:
+    def _members(self, kind: str, key: str, entries: list[_Labels]) -> np.ndarray:
         """Return the members of a set in the mesh, ascending."""
         parts: list[np.ndarray] = []
-        for entry in table.entries:
-            here = entry.instance.upper() or key
-            if entry.of_elements:
-                parts.append(np.unique(self.bars[self._named("ELSET", here, entry, ())]))
-            elif isinstance(entry.what, str):
-                parts.append(self._named(kind, here, entry, (*above, f"{key}.{table.name.upper()}")))
-            elif entry.what.size:
-                parts.append(self._labelled(kind, here, entry))
+        for entry in entries:
+            known, at = self.scopes[entry.instance or key].at[kind]
+            if entry.generated:
+                members = at[entry.within(known)]
+            else:
+                place, there = _found(known, entry.labels)
+                members = at[place[there]]
+                self._lost[id(entry.labels)] = len(entry.labels) - len(members)
+            parts.append(members[members >= 0])  # without nodes where no bar ends
         return _union(parts)
-
-    def _labelled(self, kind: str, key: str, entry: _Entry) -> np.ndarray:
-        if key not in self._scopes:
-            raise InputError(f"{entry.block.where}: there is no instance {key}")
-        known, at = self._scopes[key].at[kind]
-        labels = entry.what
-        if entry.generated:
-            first, last, step = labels.tolist()  # type: ignore[union-attr]
-            labels = known[(known >= first) & (known <= last) & ((known - first) % step == 0)]
-        place, there = _found(known, labels)  # type: ignore[arg-type]
-        if kind == "NSET" or not self._other_types:
-            self._lost[id(entry)] = int((~there).sum())
-        members = at[place[there]]
-        return members[members >= 0]  # without nodes where no bar ends
-
-    def _named(self, kind: str, key: str, entry: _Entry, above: tuple[str, ...]) -> np.ndarray:
-        """Members of a set that is named in another one, as NAME or INSTANCE.NAME, or of INSTANCE.LABEL."""
-        name = str(entry.what)
-        instance, dot, rest = name.partition(".")
-        if dot and instance.upper() in self._scopes:
-            key, name = instance.upper(), rest
-            if name.isdecimal() and len(name) < 16:
-                return self._labelled(kind, key, entry._replace(what=np.array([int(name)]), generated=False))
-        table = self._scopes[key].sets[kind].get(name.upper()) if key in self._scopes else None
-        if table is None:
-            text = f"{name!r} is neither a number nor an existing {_WHAT[kind]} set"
-            raise InputError(f"{entry.block.where}: {text}")
-        if f"{key}.{name.upper()}" in above:
-            raise InputError(f"{entry.block.where}: set {name} includes itself")
-        return self._members(kind, key, table, above)
 
     # ---- sections
 
@@ -675,31 +668,25 @@ class _Deck:
         groups = self.groups["ELSET"]
         names = {name.upper(): name for name in groups}
         found: dict[int, tuple[_Block, str, list[tuple[str, np.ndarray]]]] = {}
-        for key, scope in self._scopes.items():
+        for key, scope in self.scopes.items():
             for block, name in scope.sections:
-                table = scope.sets["ELSET"].get(name.upper())
-                if table is None:
+                if name.upper() not in scope.sets["ELSET"]:
                     raise InputError(f"{block.where}: there is no element set {name}")
                 full = f"{scope.name}.{name}".upper().replace("/", "_")
-                members = self._members("ELSET", key, table)
+                members = self._members("ELSET", key, scope.sets["ELSET"][name.upper()].entries)
                 found.setdefault(id(block), (block, name, []))[2].append((full, members))
         for block, name, parts in found.values():
             short = names.get(name.upper().replace("/", "_"))
             if short is not None and np.array_equal(groups[short], _union([members for _, members in parts])):
-                parts = [(short.upper(), groups[short])]
-            yield from ((block, names.get(full, short or name), members) for full, members in parts)
+                yield block, short, groups[short]
+            else:
+                yield from ((block, names.get(full, short or name), members) for full, members in parts)
 
     def _without_made(self, mesh: WholeMesh, sections: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
         """Return one section with the areas of the field in the place of those whose sets the writer has made for
         areas, which are no groups then."""
-        own = self.root.sets["ELSET"]
-        made = [
-            name
-            for name in sections
-            if name.startswith(_MADE)
-            and name.upper() in own
-            and all("INTERNAL" in entry.block.parameters for entry in own[name.upper()].entries)
-        ]
+        own = self.scopes[""].sets["ELSET"]
+        made = [name for name in sections if name.startswith(_MADE) and own.get(name.upper(), _Set("")).internal]
         materials = {sections[name].get("material") for name in made}
         if len(materials) != 1:
             return sections
@@ -717,64 +704,40 @@ class _Deck:
             mesh.warnings.append(f"{self.path}: left out {', '.join(self._unread)}: keywords that are not read")
         if self._beyond is not None:
             mesh.warnings.append(f"{self._beyond.where}: left out with all that follows: only the first step is read")
-        block = self._procedure
-        if block is None:
+        if self._procedure is None:
             return
-        try:
-            tables, told = _analysis(block)
-        except InputError as error:
-            tables, told = {}, str(error).partition(f"*{block.keyword}: ")[2]
+        tables, told = _analysis(self._procedure)
         if tables:
             mesh.tables["analysis"] = tables
         if told:
-            mesh.warnings.append(f"{block.where}: {told}")
-
-
-def _entries(kind: str, block: _Block) -> Iterator[_Entry]:
-    """Yield the entries of ``*NSET`` or ``*ELSET``."""
-    instance = block.get("INSTANCE")
-    numbers = None
-    if kind == "NSET" and block.get("ELSET"):
-        yield _Entry(block, block.get("ELSET"), instance, of_elements=True)
-    elif "GENERATE" in block.parameters:
-        rows = block.rows(3, 2)
-        for row in _labels(np.where(np.isnan(rows), 1.0, rows).ravel(), block, "member").reshape(-1, 3):
-            if row[2] < 1 or row[1] < row[0]:
-                raise InputError(f"{block.where}: {row[0]}, {row[1]}, {row[2]} are not first, last and step")
-            yield _Entry(block, row, instance, generated=True)
-    elif (numbers := block.numbers()) is not None:
-        yield _Entry(block, _labels(numbers, block, "member"), instance)
-    else:
-        for _, words in block.lines():
-            whole = np.array([float(word) for word in words if word.isdecimal()])
-            yield _Entry(block, _labels(whole, block, "member"), instance)
-            yield from (_Entry(block, w.strip('"'), instance) for w in words if w and not w.isdecimal())
+            mesh.warnings.append(f"{self._procedure.where}: {told}")
 
 
 # ---- materials and sections
 
+_PROPERTIES = {"ELASTIC": ("young_modulus", 2), "DENSITY": ("density", 1), "EXPANSION": ("thermal_expansion", 1)}
+"""Keys of keywords with one value, and the column of the temperature."""
+
 
 def _material_value(block: _Block, material: dict[str, Any]) -> str:
     """Read what belongs to a material; return what is to be said about it."""
-    keyword = block.keyword
-    if keyword == "DAMPING":
+    if block.keyword == "DAMPING":
         for name, key in (("ALPHA", "alpha"), ("BETA", "stiffness_damping")):
-            material[key] = number_of(block.get(name, "0")) if name in block.parameters else material.get(key, 0.0)
+            material[key] = number_of(block.get(name)) if name in block.parameters else material.get(key, 0.0)
             if np.isnan(material[key]):
                 material[key] = 0.0
                 return f"{block.get(name)!r} is not a number: left out"
         return ""
     if block.get("TYPE", "ISOTROPIC").upper() not in ("ISOTROPIC", "ISO"):
         return f"TYPE={block.get('TYPE')}: left out"
-    width, least = _MATERIAL[keyword]
-    rows = block.rows(8, least)
+    key, column = _PROPERTIES.get(block.keyword, ("plastic", 2))
+    rows = block.rows(8, 1)
     if len(rows) == 0 or not np.isfinite(rows[0, 0]):
         return "no values: left out"
-    first = rows[:, width - 1]
-    cold = np.isnan(first) | (first == first[0]) if keyword == "PLASTIC" else np.arange(len(rows)) == 0
+    first = rows[:, column]
+    cold = np.isnan(first) | (first == first[0]) if key == "plastic" else np.arange(len(rows)) == 0
     told = "" if cold.all() else f"values at {first[0]:g} degrees are taken for all temperatures"
-    if keyword != "PLASTIC":
-        key = {"ELASTIC": "young_modulus", "DENSITY": "density", "EXPANSION": "thermal_expansion"}[keyword]
+    if key != "plastic":
         material[key] = float(rows[0, 0])
         return told
     hardening = block.get("HARDENING", "ISOTROPIC").upper()
@@ -898,15 +861,13 @@ class _Conditions:
         if not axes:
             first = _value(words, 1)
             last = _value(words, 2) or first
-            if not (1.0 <= first <= last < 100.0):
+            if not 1.0 <= first <= last < 100.0:
                 return "expected degrees of freedom"
             if _value(words, 3) != 0.0:
                 return "prescribed displacements are those of the case"
-            axes = "xyz"[int(first) - 1 : int(last)]
-            if not axes:
-                return "" if first <= 6.0 else "expected degrees of freedom"  # bars have no rotations
+            axes = "xyz"[int(first) - 1 : int(last)]  # bars have no rotations
         name = self._group(block, words[0])
-        if name:
+        if name and axes:
             self._fixed[name] = self._fixed.get(name, "") + axes
         return "" if name else "it names no node"
 
@@ -936,60 +897,42 @@ def _value(words: list[str], at: int) -> float:
 
 def _analysis(block: _Block) -> tuple[dict[str, dict[str, Any]], str]:
     """Return the tables of a case for a procedure, and what is to be said; none for one that the program lacks."""
-    if block.keyword == "STATIC":
-        return _static(block)
-    if block.keyword == "DYNAMIC":
-        return _dynamic(block)
-    if block.keyword in ("FREQUENCY", "BUCKLE"):
-        return _modes(block)
+    words = next((words for _, words in block.lines()), [])
+    first, period, least, most, end = (value if (value := _value(words, k)) > 0.0 else 0.0 for k in range(5))
+    match block.keyword:
+        case "STATIC":
+            return _static(block, first / (period or 1.0), least / (period or 1.0), most / (period or 1.0), end)
+        case "DYNAMIC" if not period:
+            return {}, "the period is missing: the first step is left out"
+        case "DYNAMIC" if "EXPLICIT" in block.parameters:
+            step: float | str = _short(first) if first and "DIRECT USER CONTROL" in block.parameters else "auto"
+            return {"time": {"integrator": "central_differences", "step": step, "end": period}}, ""
+        case "DYNAMIC":
+            step = _short(first or period / 100)
+            told = f"step = {step:g} s is {'the first increment' if first else 'a hundredth of the period'}"
+            return {"time": {"integrator": "generalized_alpha", "step": step, "end": period}}, f"{told}, for all steps"
+        case "FREQUENCY" | "BUCKLE" as keyword:
+            told = "" if first else "a limit of the frequencies is not supported: modes.count = 10"
+            modes = {"count": int(first) or 10, "kind": "vibration" if keyword == "FREQUENCY" else "buckling"}
+            # buckling factors are those of the loads of the step, which a static analysis applies
+            return ({"static": {"step": 1.0}} if keyword == "BUCKLE" else {}) | {"modes": modes}, told
     return {}, f"the first step is left out: the program has no *{block.keyword}"
 
 
-def _values(block: _Block, width: int) -> list[float]:
-    """Return the first numbers of the first data line; 0 for those that are missing."""
-    rows = block.rows(16, 1)
-    row = rows[0] if len(rows) else np.full(16, np.nan)
-    return [float(value) if np.isfinite(value) and value > 0.0 else 0.0 for value in row[:width]]
-
-
-def _static(block: _Block) -> tuple[dict[str, dict[str, Any]], str]:
+def _static(
+    block: _Block, first: float, least: float, most: float, end: float
+) -> tuple[dict[str, dict[str, Any]], str]:
     """Increments over the period are those of the load factor, which goes from 0 to 1."""
-    first, period, least, most = _values(block, 4)
-    period = period or 1.0
-    step = min(first / period, 1.0) if first else 1.0
-    keys: dict[str, Any] = {"step": _short(step)}
+    keys: dict[str, Any] = {"step": _short(min(first or 1.0, 1.0))}
     if "RIKS" in block.parameters:
-        end = _values(block, 5)[4]
         told = "" if end else "end = 1 of the load factor is not in the file: *STATIC, RIKS may end at a displacement"
         return {"static": {"method": "arc_length", **keys, "end": end or 1.0}}, told
-    if "DIRECT" not in block.parameters and step < 1.0:
-        keys["max_step"] = _short(min(most / period, 1.0)) if most else 1.0
-        keys |= {"min_step": _short(least / period)} if 0.0 < least < first else {}
-    told = "STABILIZE is left out; see the key static.stabilise" if "STABILIZE" in block.parameters else ""
-    return {"static": keys}, told
-
-
-def _dynamic(block: _Block) -> tuple[dict[str, dict[str, Any]], str]:
-    explicit = "EXPLICIT" in block.parameters
-    first, period = _values(block, 2)
-    if not period:
-        raise InputError(f"{block.where}: the period is missing: the first step is left out")
-    if explicit:
-        own: float | str = _short(first) if first and "DIRECT USER CONTROL" in block.parameters else "auto"
-        return {"time": {"integrator": "central_differences", "step": own, "end": period}}, ""
-    step = _short(first) if first else period / 100
-    told = f"step = {step:g} s is {'the first increment' if first else 'a hundredth of the period'}, for all steps"
-    return {"time": {"integrator": "generalized_alpha", "step": step, "end": period}}, told
-
-
-def _modes(block: _Block) -> tuple[dict[str, dict[str, Any]], str]:
-    """Buckling factors are those of the loads of the step, which a static analysis applies."""
-    count = _values(block, 1)[0]
-    keys: dict[str, Any] = {"count": int(count) if count else 10}
-    told = "" if count else "a limit of the frequencies is not supported: modes.count = 10"
-    if block.keyword == "FREQUENCY":
-        return {"modes": {**keys, "kind": "vibration"}}, told
-    return {"static": {"step": 1.0}, "modes": {**keys, "kind": "buckling"}}, told
+    if "DIRECT" not in block.parameters and keys["step"] < 1.0:
+        keys["max_step"] = _short(min(most or 1.0, 1.0))
+        keys |= {"min_step": _short(least)} if 0.0 < least < first else {}
+    return {
+        "static": keys
+    }, "STABILIZE is left out; see the key static.stabilise" if "STABILIZE" in block.parameters else ""
 
 
 def _short(value: float) -> float:

@@ -3,18 +3,19 @@
 Two-node lines (element type 1) are the bars, in file order; points (type 15) with a physical group define node groups;
 surfaces and volumes are left out with a warning. Nodes are numbered from 0 in file order. Data of elements
 ($ElementData) with one component and a value for every line are bar fields. Rank 0 parses the file in pieces, each of
-which goes to all ranks: no rank has the whole mesh.
+which goes to all ranks: no rank has the whole mesh, but for the lines of version 2, which rank 0 has at once.
 """
 
 from __future__ import annotations
 
 import codecs
+import mmap
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -23,6 +24,7 @@ from ..errors import InputError
 from ..mesh.exchange import Router
 from ..mesh.slab import MeshSlab, check_memory, index_type, slab_of, slab_range
 from ..mesh.whole import WholeMesh, missing_field
+from ..parallel.agreement import on_root
 from ._numbers import numbers_of, shown
 
 SUFFIXES = (".msh",)
@@ -31,7 +33,7 @@ PIECE = 1 << 14
 """Number of rows that are parsed and sent at a time."""
 
 BYTES = 1 << 18
-"""Bytes of a file that are read at a time."""
+"""Bytes of a text that are parsed at a time."""
 
 _ORDERED = b"bars in the order of their tags"
 """In $Comments of a file whose elements are sorted by groups: the bars are numbered by their tags."""
@@ -59,8 +61,6 @@ class _Head:
     """Of physical groups, by dimension and tag."""
     ordered: bool
     """Whether bars are numbered by the tags of the lines."""
-    repeated: bool
-    """Whether a line is listed once for each of its groups, as in version 2."""
     n_others: int = 0
     """Elements that are neither lines nor points."""
     groups: dict[tuple[int, tuple[int, ...]], int] = field(default_factory=dict)
@@ -82,12 +82,9 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
     InputError
         On all ranks, naming the section, for any content that is not a mesh of bars.
     """
-    pieces = _pieces(path, fields) if comm.rank == 0 else iter(())
-    parts = _Parts(comm, str(path))
-    while not isinstance(piece := comm.bcast(next(pieces, None)), _Head | InputError):
+    pieces, parts = _pieces(path, fields), _Parts(comm, str(path))
+    while not isinstance(piece := on_root(comm, next, pieces), _Head):
         parts.add(*piece)
-    if isinstance(piece, InputError):
-        raise piece
     slab = parts.slab(piece)
     if fields is not None:
         missing = missing_field(path, fields, {*piece.fields} - ({*fields} - {*slab.bar_fields}))
@@ -103,7 +100,7 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
 class _Layout(NamedTuple):
     """Content of the section $MeshFormat; ``size_type`` is the NumPy type of C's size_t in a binary file."""
 
-    version: str
+    old: bool
     binary: bool
     order: str
     size_type: str
@@ -115,9 +112,7 @@ def _layout(path: Path, payload: bytes) -> _Layout:
     where = f"{path}: section $MeshFormat"
     if len(words) != 3 or words[1] not in (b"0", b"1") or words[2] not in (b"4", b"8"):
         raise InputError(f"{where}: {shown(first)!r} is not 'version file-type data-size', such as '4.1 0 8'")
-    # versions 2 to 2.2 differ in nothing that is read here
-    version = {**dict.fromkeys((b"2", b"2.0", b"2.1", b"2.2"), "2.2"), b"4.1": "4.1"}.get(words[0])
-    if version is None:
+    if words[0] not in (b"2", b"2.0", b"2.1", b"2.2", b"4.1"):
         raise InputError(
             f"{where}: version {shown(words[0])} is not read; save the mesh as version 4.1 or 2.2 "
             "(in Gmsh: Mesh.MshFileVersion)"
@@ -125,149 +120,107 @@ def _layout(path: Path, payload: bytes) -> _Layout:
     binary = words[1] == b"1"
     if binary and rest[:4] not in (b"\x01\0\0\0", b"\0\0\0\x01"):
         raise InputError(f"{where}: the binary number 1 that shows the byte order is missing")
-    return _Layout(version, binary, ">" if binary and rest[:1] == b"\0" else "<", "u" + words[2].decode())
+    # versions 2 to 2.2 differ in nothing that is read here
+    return _Layout(words[0] != b"4.1", binary, ">" if rest[:1] == b"\0" else "<", "u" + words[2].decode())
 
 
 class _Section:
-    """Numbers of one section of a file, from byte ``begin`` to ``end``, read and parsed in pieces.
+    """Numbers of one section of a file, from byte ``begin`` to ``end``, parsed in pieces.
 
     Every method raises InputError if the section ends early or has other content than requested.
     """
 
-    def __init__(self, where: str, file: IO[bytes], place: tuple[int, int], layout: _Layout) -> None:
-        self._where, self._file, self._layout = where, file, layout
-        self._next, self._stop = place
-        self._have: Any = b"" if layout.binary else np.empty(0)  # bytes, or numbers
-        self._at = 0
-        self._rest, self._line = b"", 1  # of text: a word that may go on, number of the line
+    def __init__(self, where: str, content: mmap.mmap, place: tuple[int, int], layout: _Layout) -> None:
+        self._where, self._content, self._layout = where, content, layout
+        self._begin, self._stop = place
+        self._at = self._begin  # the next byte
+        self._ahead = np.empty(0)  # numbers of a text that were parsed and not taken
 
     def count(self) -> int:
         """Return the count at the start of a section of version 2.2, which is text in a binary file too."""
         if not self._layout.binary:
             return int(self.sizes(1)[0])
-        self._file.seek(self._next)
-        line = self._file.readline(200)
-        self._next += len(line)
-        found = self._parsed(line)
-        if len(found) != 1:
+        self._content.seek(self._at)
+        line = self._content.readline()
+        self._at += len(line)
+        if not line.strip().isdigit():
             raise InputError(f"{self._where}: {shown(line)!r} is not a count")
-        return int(self._whole(found)[0])
+        return int(line)
 
     def ints(self, n: int) -> np.ndarray:
         """Return the next ``n`` integers (C's int)."""
-        return self._take(n, "i4").astype(np.int64) if self._layout.binary else self._whole(self._take(n))
+        return self._whole(self._take(n, "i4"))
 
     def sizes(self, n: int) -> np.ndarray:
         """Return the next ``n`` counts or tags (C's size_t), as int64."""
-        values = self._take(n, self._layout.size_type) if self._layout.binary else self._whole(self._take(n))
+        values = self._take(n, self._layout.size_type)
         if n and (values.min() < 0 or values.max() > _NONE):
-            raise InputError(f"{self._where}: {values.min()} ... {values.max()} are not counts or tags")
-        return values.astype(np.int64)
+            raise InputError(
+                f"{self._where}: {float(values.min()):g} ... {float(values.max()):g} are not counts or tags"
+            )
+        return self._whole(values)
 
     def reals(self, n: int) -> np.ndarray:
         """Return the next ``n`` floating-point numbers."""
-        return self._take(n).astype(np.float64)
+        return self._take(n, "f8").astype(np.float64)
 
     def rows(self, n: int, n_reals: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Return the next ``n`` rows of an integer and ``n_reals`` floating-point numbers, in pieces."""
-        row = f"i4,({n_reals},)f8" if self._layout.binary else ""
-        self.require(n if row else n * (1 + n_reals), row)
         for some in _steps(n):
-            if row:
-                rows = self._take(some, row)
-                yield rows["f0"].astype(np.int64), rows["f1"].astype(np.float64)
+            if self._layout.binary:
+                rows = self._take(some, f"i4,({n_reals},)f8")
+                yield self._whole(rows["f0"]), rows["f1"].astype(np.float64)
             else:
                 rows = self._take(some * (1 + n_reals)).reshape(some, 1 + n_reals)
                 yield self._whole(rows[:, 0]), rows[:, 1:]
 
     def peek(self, n: int) -> np.ndarray:
-        """Return at most the next ``n`` numbers of an ASCII section without consuming them."""
-        self._fill(n)
-        return self._have[self._at : self._at + n]
+        """Return at most the next ``n`` numbers of a text without taking them."""
+        while len(self._ahead) < n and self._at < self._stop:
+            end = min(self._at + BYTES, self._stop)
+            if end < self._stop:  # not within a number
+                cut = max(self._content.rfind(b"\n", self._at, end), self._content.rfind(b" ", self._at, end)) + 1
+                end = cut or end
+            self._ahead = np.concatenate([self._ahead, self._parsed(self._content[self._at : end])])
+            self._at = end
+        return self._ahead[:n]
 
     def end(self) -> None:
         """Refuse surplus numbers."""
-        self._fill(100)
-        left = self._have[self._at :]
-        if len(left.strip() if self._layout.binary else left):
-            what = "bytes" if self._layout.binary else "numbers"
-            raise InputError(f"{self._where}: {self._left()} {what} more than its counts declare")
+        if len(self.peek(1)) if not self._layout.binary else self._content[self._at : self._stop].strip():
+            raise InputError(f"{self._where}: has more numbers than its counts declare")
 
-    def require(self, n: int, kind: str = "") -> None:
-        """Refuse a count that is more than the bytes of the section can have: a number and a blank have two or more."""
-        n *= self._type(kind).itemsize if self._layout.binary else 1
-        bytes_left = self._stop - self._next + len(self._rest)
-        most = len(self._have) - self._at + (bytes_left if self._layout.binary else (bytes_left + 1) // 2)
-        if not 0 <= n <= most:
-            what = "bytes" if self._layout.binary else "numbers"
-            left = self._left()
-            raise InputError(f"{self._where}: its counts declare {n} {what} where {left} are left; is it truncated?")
-
-    def _type(self, kind: str) -> np.dtype:
-        return np.dtype(kind or "f8").newbyteorder(self._layout.order)
-
-    def _take(self, n: int, kind: str = "") -> np.ndarray:
-        self.require(n, kind)
-        size = n * self._type(kind).itemsize if self._layout.binary else n
-        self._fill(size)
-        if len(self._have) - self._at < size:
-            self._next, self._rest = self._stop, b""
-            self.require(n, kind)  # which fails now
-        start, self._at = self._at, self._at + size
+    def _take(self, n: int, kind: str = "f8") -> np.ndarray:
         if self._layout.binary:
-            return np.frombuffer(self._have, self._type(kind), n, start)
-        return self._have[start : self._at]
-
-    def _fill(self, n: int) -> None:
-        """Have at least n numbers, or bytes of a binary file, in memory, as far as there are so many."""
-        left = len(self._have) - self._at
-        if left >= n or self._next >= self._stop:
-            return
-        parts = [self._have[self._at :]]
-        while left < n and self._next < self._stop:
-            parts.append(self._read())
-            left += len(parts[-1])
-        self._at = 0
-        self._have = b"".join(parts) if self._layout.binary else np.concatenate(parts)
-
-    def _read(self) -> Any:
-        self._file.seek(self._next)
-        text = self._file.read(min(BYTES, self._stop - self._next))
-        self._next = self._next + len(text) if text else self._stop
-        if self._layout.binary:
-            return text
-        text = self._rest + text
-        cut = max(text.rfind(b"\n"), text.rfind(b" ")) + 1 if self._next < self._stop else len(text)
-        text, self._rest = text[:cut], text[cut:]
-        if len(self._rest) > max(BYTES, 1000):
-            raise InputError(f"{self._where}, line {self._line}: {shown(self._rest)!r} is not a number")
-        return self._parsed(text)
-
-    def _left(self) -> int:
-        """Return how many numbers or bytes are left, which are read."""
-        left = len(self._have) - self._at
-        while self._next < self._stop:
-            left += len(self._read())
-        return left
+            dtype = np.dtype(kind).newbyteorder(self._layout.order)
+            start, self._at = self._at, self._at + n * dtype.itemsize
+            short = not start <= self._at <= self._stop
+        else:
+            found = self.peek(n)
+            self._ahead = self._ahead[n:]
+            short = len(found) < n
+        if short:
+            raise InputError(f"{self._where}: its counts declare more numbers than it has; is it truncated?")
+        return np.frombuffer(self._content, dtype, n, start) if self._layout.binary else found
 
     def _parsed(self, text: bytes) -> np.ndarray:
         try:
-            found = numbers_of(text)
+            return numbers_of(text)
         except ValueError:
-            for number, line in enumerate(text.split(b"\n"), self._line):
-                for word in line.split():
+            line = self._content[self._begin : self._at].count(b"\n") + 1
+            for number, words in enumerate(text.split(b"\n"), line):
+                for word in words.split():
                     try:
                         float(word)
                     except ValueError:
                         raise InputError(f"{self._where}, line {number}: {shown(word)!r} is not a number") from None
             raise InputError(f"{self._where}: contains text other than numbers") from None
-        self._line += text.count(b"\n")
-        return found
 
     def _whole(self, values: np.ndarray) -> np.ndarray:
-        wrong = values[~((np.abs(values) < 2.0**53) & (values == np.rint(values)))]
-        if wrong.size:
-            raise InputError(f"{self._where}: {wrong.flat[0]:g} is not a count or a tag: a whole number")
+        if values.dtype.kind == "f":
+            wrong = values[~((np.abs(values) < 2.0**53) & (values == np.rint(values)))]
+            if wrong.size:
+                raise InputError(f"{self._where}: {wrong.flat[0]:g} is not a count or a tag: a whole number")
         return values.astype(np.int64)
 
 
@@ -277,62 +230,45 @@ def _steps(n: int) -> Iterator[int]:
         yield min(PIECE, n - start)
 
 
-def _sections(path: Path, file: IO[bytes]) -> dict[str, list[tuple[int, int]]]:
-    """Return where in a file the payloads of its sections begin and end, by name, without reading it whole."""
+def _sections(path: Path, content: mmap.mmap) -> dict[str, list[tuple[int, int]]]:
+    """Return where in a file the payloads of its sections begin and end, by name."""
     # editors on Windows insert a byte order mark
-    if not file.read(1000).removeprefix(codecs.BOM_UTF8).lstrip().startswith(b"$MeshFormat"):
+    if not content[:1000].removeprefix(codecs.BOM_UTF8).lstrip().startswith(b"$MeshFormat"):
         raise InputError(f"{path}: does not start with $MeshFormat: not a Gmsh mesh of version 2.2 or 4.1")
     found: dict[str, list[tuple[int, int]]] = {}
     at = 0
-    while (at := _find(file, b"$", at)) >= 0:
-        file.seek(at + 1)
-        line = file.readline(200)
+    while (at := content.find(b"$", at)) >= 0:
+        content.seek(at + 1)
+        line = content.readline()
         name = line.strip()
         if not name.isalnum() or not line.endswith(b"\n"):
             raise InputError(f"{path}: {shown(name)!r} is not the name of a section")
-        end = _find(file, b"$End" + name, at + len(line))
+        end = content.find(b"$End" + name, at + len(line))
         if end < 0:
-            raise InputError(f"{path}: section ${name.decode()} has no end; the file is truncated")
+            raise InputError(f"{path}: section ${shown(name)} has no end; the file is truncated")
         found.setdefault(name.decode(), []).append((at + 1 + len(line), end))
         at = end + 4 + len(name)
     return found
 
 
-def _find(file: IO[bytes], text: bytes, at: int) -> int:
-    """Return the first place of a text in a file from ``at`` on, -1 if there is none."""
-    file.seek(at)
-    rest = b""
-    while block := file.read(1 << 20):
-        place = (rest + block).find(text)
-        if place >= 0:
-            return at - len(rest) + place
-        at += len(block)
-        rest = (rest + block)[-(len(text) - 1) :] if len(text) > 1 else b""
-    return -1
-
-
-def _pieces(path: Path, fields: Mapping[str, str] | None) -> Iterator[tuple[Any, Any] | _Head | InputError]:
-    """Yield the number of nodes, pieces of rows, and at the end what there is to know about them, or what is wrong."""
+def _pieces(path: Path, fields: Mapping[str, str] | None) -> Iterator[tuple[Any, Any] | _Head]:
+    """Yield the number of nodes, pieces of rows, and at the end what there is to know about them."""
     try:
         with open(path, "rb") as file:
-            yield from _parsed(path, file, fields)
-    except InputError as error:
-        yield error
+            # an empty file cannot be mapped
+            content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if file.read(1) else mmap.mmap(-1, 1)
+        yield from _parsed(path, content, fields)
     except MemoryError:
-        yield InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks")
+        raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
     except OSError as error:
-        yield InputError(f"{path}: cannot be read: {error.strerror}")
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _parsed(path: Path, file: IO[bytes], fields: Mapping[str, str] | None) -> Iterator[tuple[Any, Any] | _Head]:
-    places = _sections(path, file)
+def _parsed(path: Path, content: mmap.mmap, fields: Mapping[str, str] | None) -> Iterator[tuple[Any, Any] | _Head]:
+    places = _sections(path, content)
 
     def text(name: str) -> bytes:
-        found = b""
-        for begin, end in places.get(name, []):
-            file.seek(begin)
-            found += file.read(end - begin)
-        return found
+        return b"".join(content[begin:end] for begin, end in places.get(name, []))
 
     layout = _layout(path, text("MeshFormat"))
     if "PartitionedEntities" in places:
@@ -342,28 +278,27 @@ def _parsed(path: Path, file: IO[bytes], fields: Mapping[str, str] | None) -> It
             raise InputError(f"{path}: has no section ${name}")
 
     def section(name: str) -> _Section:
-        return _Section(f"{path}: section ${name}", file, places[name][0], layout)
+        return _Section(f"{path}: section ${name}", content, places[name][0], layout)
 
-    old = layout.version == "2.2"
-    head = _Head(_physical_names(path, text("PhysicalNames") or b"0"), _ORDERED in text("Comments"), old)
+    head = _Head(_physical_names(path, text("PhysicalNames")), _ORDERED in text("Comments"))
     numbers = section("Nodes")
-    n_blocks, n_nodes = (0, numbers.count()) if old else numbers.sizes(4)[:2].tolist()
+    n_blocks, n_nodes = (0, numbers.count()) if layout.old else numbers.sizes(4)[:2].tolist()
     yield "nodes", n_nodes
-    yield from _batched(_nodes_2(numbers, n_nodes) if old else _nodes_4(path, numbers, n_blocks, n_nodes))
+    yield from _batched(_nodes_2(numbers, n_nodes) if layout.old else _nodes_4(path, numbers, n_blocks, n_nodes))
     numbers.end()
     numbers = section("Elements")
-    if old:
-        yield from _batched(_elements_2(path, numbers, layout.binary, head))
+    if layout.old:
+        yield from _joined(_elements_2(path, numbers, layout.binary, head), head)
     else:
         groups = _entities(section("Entities")) if "Entities" in places else {}
         yield from _batched(_elements_4(path, numbers, groups, head))
     numbers.end()
-    for k, place in enumerate(places.get("ElementData", [])):
+    for k, (begin, end) in enumerate(places.get("ElementData", [])):
         where = f"{path}: section $ElementData"
-        file.seek(place[0])
-        name, n = _data_head(where, file, head)
+        content.seek(begin)
+        name, n = _data_head(where, content, head)
         if n is not None and (fields is None or name in fields):
-            numbers = _Section(f"{where} {name!r}", file, (min(file.tell(), place[1]), place[1]), layout)
+            numbers = _Section(f"{where} {name!r}", content, (min(content.tell(), end), end), layout)
             yield from _batched((("field", k, name), np.column_stack(rows)) for rows in numbers.rows(n, 1))
             numbers.end()
     yield head
@@ -383,24 +318,44 @@ def _batched(rows: Rows) -> Rows:
         yield kind, np.concatenate(parts)
 
 
+def _joined(rows: Rows, head: _Head) -> Rows:
+    """Join the copies of a line, which version 2 lists once for each of its groups, and yield pieces."""
+    parts: dict[str, list[np.ndarray]] = {"lines": [np.empty((0, 4), np.int64)], "marked": []}
+    for kind, some in rows:
+        parts[kind].append(some)
+    lines = np.concatenate(parts["lines"])
+    grouped = np.array([bool(tags) for _, tags in head.groups] or [False])[lines[:, 3]]
+    if grouped.any():
+        _, ends = np.unique(lines[:, 1:3], return_inverse=True)
+        ends = ends.reshape(-1, 2)
+        _, first, leader = np.unique(ends[:, 0] * (ends.max() + 1) + ends[:, 1], return_index=True, return_inverse=True)
+        leader = first[leader.ravel()]
+        # two lines of the same group are no copies
+        pairs, times = np.unique(np.column_stack([leader, lines[:, 3]])[grouped], axis=0, return_counts=True)
+        copy = (leader != np.arange(len(lines))) & grouped & grouped[leader]
+        copy &= ~np.isin(leader, pairs[times > 1, 0])
+        waiting = np.flatnonzero(copy)
+        while len(waiting):  # one more copy of each line at a time
+            line, at = np.unique(leader[waiting], return_index=True)
+            pairs, which = np.unique(lines[np.stack([line, waiting[at]]), 3].T, axis=0, return_inverse=True)
+            tags = [tags for _, tags in head.groups]
+            lines[line, 3] = np.array([head.place(1, tags[a] + tags[b]) for a, b in pairs.tolist()])[which.ravel()]
+            waiting = np.delete(waiting, at)
+        lines = lines[~copy]
+    for kind, found in (("lines", [lines]), ("marked", parts["marked"])):
+        yield from ((kind, part[k : k + PIECE]) for part in found for k in range(0, len(part), PIECE))
+
+
 def _physical_names(path: Path, payload: bytes) -> dict[tuple[int, int], str]:
     """Return names by dimension and tag; this section is text even in binary files."""
-    lines = payload.decode("utf-8", "replace").splitlines() or [""]
-    names = {}
-    for number, line in enumerate(lines[1:], 2):
-        if not line.strip():
-            continue
-        where = f"{path}: section $PhysicalNames, line {number}"
-        words = line.split(None, 2)
-        if len(words) != 3 or len(words[2].strip()) < 3 or not words[2].strip().startswith('"'):
-            raise InputError(f"{where}: {line[:60]!r} is not 'dimension tag \"name\"'")
-        try:
-            names[int(words[0]), int(words[1])] = words[2].strip().strip('"')
-        except ValueError:
-            raise InputError(f"{where}: dimension and tag must be whole numbers, not {line[:60]!r}") from None
-    if lines[0].strip() != str(len(names)):
-        raise InputError(f"{path}: section $PhysicalNames declares {lines[0][:20]!r} names and has {len(names)}")
-    return names
+    count, *lines = payload.decode("utf-8", "replace").split("\n") if payload.strip() else ["0"]
+    found = [re.fullmatch(r'\s*(-?\d+)\s+(-?\d+)\s+"(.+?)"+\s*', line) for line in lines if line.strip()]
+    if None in found or count.strip() != str(len(found)):
+        raise InputError(
+            f"{path}: section $PhysicalNames: its {len(found)} lines after the first are not the {count[:20].strip()} "
+            "lines 'dimension tag \"name\"' that it declares"
+        )
+    return {(int(match[1]), int(match[2])): match[3] for match in found}
 
 
 def _entities(numbers: _Section) -> dict[tuple[int, int], list[int]]:
@@ -430,7 +385,6 @@ def _nodes_4(path: Path, numbers: _Section, n_blocks: int, n_nodes: int) -> Rows
         if dimension not in (0, 1, 2, 3):
             raise InputError(f"{path}: section $Nodes: a block of entities of dimension {dimension}")
         n = int(numbers.sizes(1)[0])
-        numbers.require(n)
         done += n
         if done > n_nodes:
             break
@@ -448,7 +402,6 @@ def _elements_4(path: Path, numbers: _Section, groups: dict[tuple[int, int], lis
     for _ in range(n_blocks):
         dimension, entity, kind = numbers.ints(3).tolist()
         n, nodes = int(numbers.sizes(1)[0]), _nodes_of(path, kind)
-        numbers.require(n * (1 + nodes))
         done += n
         place = head.place(int(kind == _LINE), groups.get((dimension, entity), ()))
         for some in _steps(n):
@@ -462,22 +415,21 @@ def _elements_2(path: Path, numbers: _Section, binary: bool, head: _Head) -> Row
     """Elements follow one another in runs of the same type and number of tags: in text, these are searched for."""
     declared, done, left, run = numbers.count(), 0, 0, 1
     while done < declared:
-        if binary and left == 0:
-            kind, left, n_tags = numbers.ints(3).tolist()
-        elif not binary:
+        if not binary:
             words = numbers.peek(3)
-            _, kind, n_tags = (
-                words.astype(np.int64).tolist() if len(words) == 3 and (abs(words) < 1e9).all() else [0] * 3
-            )
+            known = len(words) == 3 and (abs(words) < 1e9).all()
+            kind, n_tags = words[1:].astype(np.int64).tolist() if known else (0, 0)
+        elif left == 0:
+            kind, left, n_tags = numbers.ints(3).tolist()
         nodes = _nodes_of(path, kind)
+        first = 1 if binary else 3
+        width = first + n_tags + nodes
         if not 0 <= n_tags < 1000:
             raise InputError(f"{path}: section $Elements: {n_tags} tags of element {done} of {declared}")
         if binary:
-            width, first = 1 + n_tags + nodes, 1
             n = min(left, PIECE)
             left -= n
         else:
-            width, first = 3 + n_tags + nodes, 3
             ahead = numbers.peek(min(run, declared - done, PIECE) * width)
             ahead = ahead[: len(ahead) // width * width].reshape(-1, width)
             alike = (ahead[:, 1] == kind) & (ahead[:, 2] == n_tags)
@@ -510,16 +462,16 @@ def _kept(kind: int, rows: np.ndarray, places: np.ndarray, head: _Head) -> Rows:
         head.n_others += len(rows)
 
 
-def _data_head(where: str, file: IO[bytes], head: _Head) -> tuple[str, int | None]:
+def _data_head(where: str, content: mmap.mmap, head: _Head) -> tuple[str, int | None]:
     """Return name and number of rows of a section $ElementData, None if it is left out; its head is always text."""
     words: list[list[bytes]] = []
     for _ in range(3):  # texts, real numbers, whole numbers
-        count = file.readline(200)
-        if not count.strip().isdigit() or int(count) > 100:
-            raise InputError(f"{where}: {shown(count.rstrip())!r} is not the number of its tags")
-        words.append([file.readline(1000).strip() for _ in range(int(count))])
+        count = content.readline().strip()
+        if not count.isdigit() or int(count) > 100:
+            raise InputError(f"{where}: {shown(count)!r} is not the number of its tags")
+        words.append([content.readline().strip() for _ in range(int(count))])
     name = words[0][0].decode("utf-8", "replace").strip('"') if words[0] else ""
-    if len(words[2]) < 3 or not all(word.lstrip(b"-").isdigit() for word in words[2][:3]):
+    if len(words[2]) < 3 or not all(word.isdigit() for word in words[2][:3]):
         raise InputError(f"{where} {name!r}: expected three whole numbers: time step, components, number of elements")
     if int(words[2][1]) != 1 or not name or "/" in name:
         head.warnings.append(f"{where} {name!r} is left out: a bar field has a name without slash and one component")
@@ -588,7 +540,7 @@ class _Parts:
         small = kind == "lines" and part.size and part.max() < 1 << 31 and part.min() >= 0
         self._rows.setdefault(kind, []).append((start + first, part.astype(np.int32) if small else part.copy()))
 
-    def _joined(self, kind: Any, none: np.ndarray) -> np.ndarray:
+    def _all(self, kind: Any, none: np.ndarray) -> np.ndarray:
         return np.concatenate([none, *(rows for _, rows in self._rows.pop(kind, []))])
 
     def _refuse(self, tag: int, text: str) -> None:
@@ -606,52 +558,47 @@ class _Parts:
         comm, n_nodes, n_bars = self._comm, self._n_nodes, self._count.get("lines", 0)
         check_memory(n_nodes, self._source)
         first_node, _ = slab_range(n_nodes, comm.rank, comm.size)
-        tags = self._joined("tags", np.empty(0, np.int64))
+        first_bar, last_bar = slab_range(n_bars, comm.rank, comm.size)
+        tags = self._all("tags", np.empty(0, np.int64))
         nodes = _Directory(comm, tags, np.arange(first_node, first_node + len(tags)))
         self._refuse(nodes.twice, "$Nodes: node {} is listed more than once")
-        bars = self._bars(head, nodes, n_bars)
-        marked = self._joined("marked", np.empty((0, 2), np.int64))
+        slab = MeshSlab(
+            n_nodes=n_nodes,
+            n_bars=n_bars,
+            first_node=first_node,
+            points=self._all("points", np.empty((0, 3))),
+            first_bar=first_bar,
+            bars=np.empty((last_bar - first_bar, 2), index_type(n_nodes)),
+            source=self._source,
+            warnings=head.warnings,
+        )
+        lines, places = self._take_bars(slab, head, nodes)
+        marked = self._all("marked", np.empty((0, 2), np.int64))
         own = nodes.find(marked[:, 0], -1)
         self._refuse(_lowest(comm, marked[own < 0, 0]), "$Elements: node {} is not in $Nodes")
         router = Router(comm, slab_of(own, n_nodes, comm.size))
-        first_bar, _ = slab_range(bars.n, comm.rank, comm.size)
-        node_groups = _groups(
-            (0, first_node, len(tags)), head, router.send(own) - first_node, router.send(marked[:, 1])
-        )
-        bar_groups = _groups((1, first_bar, len(bars.ends)), head, bars.rows, bars.places)
-        bar_fields = {}
+        own, marks = router.send(own), router.send(marked[:, 1])
+        slab.node_groups = _groups(0, head, (first_node, len(tags)), own, marks)
+        slab.bar_groups = _groups(1, head, (first_bar, len(places)), np.arange(first_bar, last_bar), places)
         for kind in sorted(key for key in self._count if isinstance(key, tuple)):
-            rows = self._joined(kind, np.empty((0, 2)))
-            values = _Directory(comm, rows[:, 0].astype(np.int64), rows[:, 1]).find(bars.tags, np.nan)
+            rows = self._all(kind, np.empty((0, 2)))
+            values = _Directory(comm, rows[:, 0].astype(np.int64), rows[:, 1]).find(lines, np.nan)
             if comm.allreduce(bool(np.isnan(values).any()), op=MPI.LOR):
                 text = f"{kind[2]!r} is left out: it does not have a value for each line"
                 head.warnings.append(f"{self._source}: section $ElementData {text}")
             else:
-                bar_fields[kind[2]] = values
+                slab.bar_fields[kind[2]] = values
         if head.n_others:
             text = f"left out {head.n_others} elements that are neither lines nor points"
             head.warnings.insert(0, f"{self._source}: {text}")
-        return MeshSlab(
-            n_nodes=n_nodes,
-            n_bars=bars.n,
-            first_node=first_node,
-            points=self._joined("points", np.empty((0, 3))),
-            first_bar=first_bar,
-            bars=bars.ends,
-            node_groups=node_groups,
-            bar_groups=bar_groups,
-            bar_fields=bar_fields,
-            source=self._source,
-            warnings=head.warnings,
-        )
+        return slab
 
-    def _bars(self, head: _Head, nodes: _Directory, n: int) -> _Bars:
-        """Return the lines of this rank's range, piece by piece, with numbers of nodes in the place of tags."""
-        comm = self._comm
-        first, last = slab_range(n, comm.rank, comm.size)
-        ends = np.empty((last - first, 2), index_type(self._n_nodes))
-        places = np.full(last - first, -1, np.int32)
-        tags = np.empty(last - first if head.repeated or head.fields else 0, np.int64)
+    def _take_bars(self, slab: MeshSlab, head: _Head, nodes: _Directory) -> tuple[np.ndarray, np.ndarray]:
+        """Put the ends of this rank's range of lines into a slab, piece by piece; return their tags (none without
+        fields), and the places of their groups."""
+        comm, n = self._comm, slab.n_bars
+        places = np.full(len(slab.bars), -1, np.int32)
+        tags = np.empty(len(slab.bars) if head.fields else 0, np.int64)
         pieces = self._rows.pop("lines", [])
         lowest = min((_lowest(comm, rows[:, 0]) for _, rows in pieces), default=_NONE) if head.ordered else 0
         lost = _NONE
@@ -662,77 +609,31 @@ class _Parts:
             if head.ordered:  # a number that is too large leaves another one without a line
                 number = np.where(rows[:, 0] - lowest < n, rows[:, 0] - lowest, 0)
             router = Router(comm, slab_of(number, n, comm.size))
-            number, rows = router.send(number) - first, router.send(rows)
+            number, rows = router.send(number) - slab.first_bar, router.send(rows)
             found = nodes.find(rows[:, 1:3], -1)
             lost = min(lost, int(rows[:, 1:3][found < 0].min(initial=_NONE)))
-            ends[number], places[number] = found, rows[:, 3]
-            if len(tags):
+            slab.bars[number], places[number] = found, rows[:, 3]
+            if head.fields:
                 tags[number] = rows[:, 0]
         self._refuse(comm.allreduce(lost, op=MPI.MIN), "$Elements: node {} is not in $Nodes")
         if head.ordered and not comm.allreduce(bool((places >= 0).all()), op=MPI.LAND):
             text = "the tags of the lines do not follow one another, as $Comments says: remove that section"
             raise InputError(f"{self._source}: section $Elements: {text}")
-        bars = _Bars(n, ends, tags, np.arange(last - first, dtype=np.int32), places)
-        return bars.joined(comm, head, self._n_nodes) if head.repeated else bars
+        return tags, places
 
 
-class _Bars(NamedTuple):
-    """Bars of this rank's range: ends (m, 2), tags (m,) of their lines (none if nobody needs them); and their groups,
-    ``rows`` of bars and the ``places`` of groups that they have, perhaps several times."""
-
-    n: int
-    ends: np.ndarray
-    tags: np.ndarray
-    rows: np.ndarray
-    places: np.ndarray
-
-    def joined(self, comm: MPI.Comm, head: _Head, n_nodes: int) -> _Bars:
-        """Join the copies of a bar, which version 2 lists once for each of its groups. Collective."""
-        # copies meet where the first node is, in the order of their numbers
-        meet = Router(comm, slab_of(self.ends[:, 0], n_nodes, comm.size))
-        first, last = slab_range(self.n, comm.rank, comm.size)
-        own = (self.ends, self.tags, np.arange(first, last), self.places)
-        ends, tags, number, places = (meet.send(each) for each in own)
-        order = np.lexsort((number, ends[:, 1], ends[:, 0]))
-        ends, tags, number, places = ends[order], tags[order], number[order], places[order]
-        begins = np.ones(len(ends), bool)
-        begins[1:] = (ends[1:] != ends[:-1]).any(axis=1)
-        leader = np.flatnonzero(begins)[np.cumsum(begins) - 1]
-        grouped = np.array([bool(tags) for _, tags in head.groups] or [False])[places]
-        # two lines of the same group are no copies
-        pairs, times = np.unique(np.column_stack([leader, places])[grouped], axis=0, return_counts=True)
-        copy = ~begins & grouped & grouped[leader] & ~np.isin(leader, pairs[times > 1, 0])
-        if not comm.allreduce(bool(copy.any()), op=MPI.LOR):
-            return self
-        # those that are kept are numbered anew, in their order
-        kept = np.where(copy, number[leader], number)
-        ask = Router(comm, slab_of(kept, self.n, comm.size))
-        stays = np.zeros(last - first, bool)
-        at = ask.send(kept) - first
-        stays[at] = True
-        counts = comm.allgather(int(stays.sum()))
-        number = ask.reply((np.cumsum(stays) - 1 + sum(counts[: comm.rank]))[at])
-        n = sum(counts)
-        first, last = slab_range(n, comm.rank, comm.size)
-        home = Router(comm, slab_of(number, n, comm.size))
-        number, places = home.send(number), home.send(places)
-        of_bars, rows = ~home.send(copy), number - first
-        new_ends, new_tags = np.empty((last - first, 2), ends.dtype), np.empty(last - first, np.int64)
-        new_ends[rows[of_bars]], new_tags[rows[of_bars]] = home.send(ends)[of_bars], home.send(tags)[of_bars]
-        return _Bars(n, new_ends, new_tags, rows, places)
-
-
-def _groups(of: tuple[int, int, int], head: _Head, rows: np.ndarray, places: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the members on this rank of groups by name, the same names on all ranks; ``of`` are the dimension, and the
-    first and the count of this rank's nodes or bars, of which ``rows`` have groups."""
-    dimension, first, n = of
-    names = [name for (own, _), name in head.names.items() if own == dimension]
+def _groups(
+    dimension: int, head: _Head, here: tuple[int, int], members: np.ndarray, places: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the members on this rank of groups by name, the same names on all ranks; ``here`` are the first and the
+    count of this rank's nodes or bars, of which ``members`` (n,) have groups at ``places`` (n,)."""
+    first, n = here
+    names = {tag: name for (own, tag), name in head.names.items() if own == dimension}
     tags = sorted({tag for own, tags in head.groups if own == dimension for tag in tags})
     masks: dict[str, np.ndarray] = {}
-    for tag in tags:
-        has = np.array([tag in tags for _, tags in head.groups], bool)[places]
-        masks.setdefault(head.names.get((dimension, tag), f"group_{tag}"), np.zeros(n, bool))[rows[has]] = True
-    masks |= {name: np.zeros(n, bool) for name in names if name not in masks}
+    for tag in [*tags, *names]:
+        has = np.array([own == dimension and tag in some for own, some in head.groups] or [False])[places]
+        masks.setdefault(names.get(tag, f"group_{tag}"), np.zeros(n, bool))[members[has] - first] = True
     return {name: first + np.flatnonzero(mask) for name, mask in masks.items()}
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
+from xml.etree import ElementTree
 from xml.parsers import expat
 from xml.sax.saxutils import escape, quoteattr
 
@@ -21,7 +22,6 @@ import numpy as np
 from ..errors import InputError
 from ..mesh.slab import check_memory
 from ..mesh.whole import WholeMesh
-from ._numbers import numbers_of
 
 SUFFIXES = (".3mf",)
 
@@ -44,211 +44,183 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     Raises
     ------
     InputError
-        Naming the line of the model, if the file is not 3MF, or has no beam lattice.
+        Naming the object, if the file is not 3MF, or has no beam lattice.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             name = _model_name(path, archive)
-            model = _Model(f"{path}: {name}")
-            with archive.open(name) as stream:
-                model.parse(stream)
+            with _part(path, archive, name) as stream:
+                model = _Model(f"{path}: {name}", stream)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
         raise InputError(f"{path}: is not 3MF, or damaged ({error}): write it again") from None
+    except (
+        ElementTree.ParseError,
+        expat.ExpatError,
+        LookupError,
+        ValueError,
+    ) as error:  # the last two for unknown encodings
+        raise InputError(f"{path}: {error}: the file is damaged: write it again") from None
     return _assembled(path, model)
 
 
 def _model_name(path: Path, archive: zipfile.ZipFile) -> str:
-    """Return the name of the model from the relationships of the package, in which no part is mostly blanks."""
-    found = ["3D/3dmodel.model"]
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        if tag.rpartition(":")[2] == "Relationship" and attributes.get("Type") == _MODEL:
-            found.insert(-1, attributes.get("Target", "").lstrip("/"))
-
-    def checked(name: str) -> str:
-        part = archive.getinfo(name)
-        if part.file_size > max(_SMALL, _COMPRESSED * part.compress_size):
-            raise InputError(
-                f"{path}: {name} has {part.file_size:,} bytes in {part.compress_size:,} compressed ones, as no "
-                "lattice has: the file is damaged: write it again"
-            )
-        return name
-
+    """Return the name of the model from the relationships of the package."""
     names = archive.namelist()
+    found = []
     if "_rels/.rels" in names:
-        parser = expat.ParserCreate()
-        parser.StartElementHandler = start
-        try:
-            parser.Parse(archive.read(checked("_rels/.rels")), True)
-        except (expat.ExpatError, LookupError, ValueError) as error:
-            raise InputError(f"{path}: _rels/.rels: {error}") from None
-    for name in found:
+        with _part(path, archive, "_rels/.rels") as stream:
+            found = [
+                e.get("Target", "").lstrip("/") for e in ElementTree.parse(stream).iter() if e.get("Type") == _MODEL
+            ]
+    for name in (*found, "3D/3dmodel.model"):
         if name in names:
-            return checked(name)
+            return name
     raise InputError(f"{path}: has no model (3D/3dmodel.model): it is not 3MF")
 
 
+def _part(path: Path, archive: zipfile.ZipFile, name: str) -> IO[bytes]:
+    """Open a part of the package, in which no part is mostly blanks."""
+    part = archive.getinfo(name)
+    if part.file_size > max(_SMALL, _COMPRESSED * part.compress_size):
+        raise InputError(
+            f"{path}: {name} has {part.file_size:,} bytes in {part.compress_size:,} compressed ones, as no lattice "
+            "has: the file is damaged: write it again"
+        )
+    return archive.open(name)
+
+
+Placed = tuple[str, np.ndarray]
+"""An object of a component or item, and its transform (4, 3), applied to rows [x, y, z, 1] from the right."""
+
+
 @dataclass
-class _Object:
-    """What an object of the model has: texts of the file, and arrays of them after :meth:`finish`."""
+class _Texts:
+    """Attributes of the elements of an object, as they are in the file; None for those that are missing."""
 
     name: str = ""
-    vertices: list[str] = field(default_factory=list)
-    beams: list[tuple[str, str, str, str]] = field(default_factory=list)
-    radius: str = ""
-    lists: list[tuple[str, list[str]]] = field(default_factory=list)
-    components: list[tuple[str, np.ndarray]] = field(default_factory=list)
+    vertices: list[tuple[str | None, ...]] = field(default_factory=list)
+    beams: list[tuple[str | None, ...]] = field(default_factory=list)
+    radius: str | None = None
+    sets: list[tuple[str, list[str | None]]] = field(default_factory=list)
+    components: list[Placed] = field(default_factory=list)
 
-    def finish(self, where: str) -> None:
-        """Convert texts to arrays: ``points`` (n, 3), ``ends`` (n, 2), ``radii`` (n, 2), ``sets`` by name, and whether
-        vertices (n,) are ``used``, as ends of beams."""
-        self.points = _numbers(self.vertices, f"{where}: a vertex", 3).reshape(-1, 3)
-        radius = self.radius or "nan"
-        texts = [f"{a} {b} {one or radius} {two or one or radius}" for a, b, one, two in self.beams]
-        table = _numbers(texts, f"{where}: a beam", 4).reshape(-1, 4)
+
+class _Object:
+    """An object: ``points`` (n, 3), ``ends`` (m, 2) and ``radii`` (m, 2) of beams, ``sets`` of beams by name,
+    ``components``, and which points are ``used`` (n,), as ends of beams."""
+
+    def __init__(self, where: str, texts: _Texts) -> None:
+        self.name, self.components = texts.name, texts.components
+        self.points = _numbers(texts.vertices, f"{where}: a vertex", 3)
+        table = _numbers(texts.beams, f"{where}: a beam", 4)
         self.ends, self.radii = _whole(table[:, :2], len(self.points), f"{where}: beams: vertex"), table[:, 2:]
+        default = _numbers([texts.radius], f"{where}: radius").ravel()
+        for radius in self.radii.T:  # the second radius of a beam is the first one where it is not given
+            radius[:] = np.where(np.isnan(radius), default, radius)
+            default = radius
         bad = np.flatnonzero(~(self.radii >= 0.0).all(axis=1))
         if len(bad):
             text = f"beam {bad[0]} has no radius (r1, or radius of the beamlattice) that is positive"
             raise InputError(f"{where}: {text}")
-        self.sets: dict[str, np.ndarray] = {}
-        for name, numbers in self.lists:
-            members = _numbers(numbers, f"{where}: beamset {name}")
-            self.sets[name.replace("/", "_")] = _whole(members, len(self.ends), f"{where}: beamset {name}: beam")
+        self.sets = {}
+        for group, numbers in texts.sets:
+            members = _numbers(numbers, f"{where}: beamset {group}").ravel()
+            self.sets[group.replace("/", "_")] = _whole(members, len(self.ends), f"{where}: beamset {group}: beam")
         self.used = np.zeros(len(self.points), bool)
         self.used[self.ends] = True
-        self.vertices, self.beams, self.lists = [], [], []
 
 
 class _Model:
-    """The model of a package, as the XML is read: objects, what is built of them, and metres in the unit of the file.
+    """The model of a package: objects, what is built of them, and metres in the unit of the file.
 
     ``not_read`` are the namespaces of required extensions that are not read, ``node_groups`` the numbers of vertices.
     """
 
-    def __init__(self, where: str) -> None:
+    def __init__(self, where: str, stream: IO[bytes]) -> None:
         self.where = where
         self.objects: dict[str, _Object] = {}
-        self.items: list[tuple[str, np.ndarray]] = []
+        self.items: list[Placed] = []
         self.scale, self.triangles = 1e-3, 0
         self.not_read: list[str] = []
         self.node_groups: dict[str, np.ndarray] = {}
-        self._current = _Object()
-        self._metadata: list[list[str]] = []
-        self._in_metadata = False
-        self._namespaces: dict[str, str] = {}
         self._counts: dict[str, tuple[int, int]] = {}
-
-    def parse(self, stream: IO[bytes]) -> None:
-        """Read the XML.
-
-        Raises
-        ------
-        InputError
-            Naming the line, for any content that is not a model.
-        """
-        parser = expat.ParserCreate(namespace_separator=" ")
-        parser.buffer_text = True
-        parser.StartElementHandler, parser.EndElementHandler = self._start, self._end
-        parser.CharacterDataHandler = self._characters
-        parser.StartNamespaceDeclHandler = lambda prefix, uri: self._namespaces.update({prefix or "": uri})
-        parser.StartDoctypeDeclHandler = self._refuse_doctype
-        self._line = lambda: f"{self.where}: line {parser.CurrentLineNumber}"
-        try:
-            parser.ParseFile(stream)
-        except KeyError as error:
-            raise InputError(f"{self._line()}: the attribute {error} is missing") from None
-        except (expat.ExpatError, LookupError, ValueError) as error:  # the last two for unknown encodings
-            raise InputError(f"{self.where}: {error}: the file is damaged: write it again") from None
-        for number, found in self.objects.items():
-            found.finish(f"{self.where}: object {number}")
-        for texts in self._metadata:
-            name, _, numbers = "".join(texts).partition("\n")
-            members = _numbers(numbers.split(), f"{self.where}: node group {name}")
-            self.node_groups[name] = _whole(members, 2**53, f"{self.where}: node group {name}: node")
-
-    def _refuse_doctype(self, *_: Any) -> None:
-        raise InputError(f"{self._line()}: a document type, which 3MF does not allow")
+        self._texts: dict[str, _Texts] = {}
+        self._current = _Texts()
+        self._metadata: list[list[str]] = []
+        self._namespaces: dict[str, str] = {}
+        self._parser = expat.ParserCreate(namespace_separator=" ")
+        self._parser.buffer_text = True
+        self._parser.StartElementHandler = self._start
+        self._parser.StartNamespaceDeclHandler = lambda prefix, uri: self._namespaces.update({prefix or "": uri})
+        self._parser.ParseFile(stream)
+        for number, texts in self._texts.items():
+            self.objects[number] = _Object(f"{where}: object {number}", texts)
+        for parts in self._metadata:
+            name, _, numbers = "".join(parts).partition("\n")
+            found = _numbers(numbers.split(), f"{where}: node group {name}").ravel()
+            self.node_groups[name] = _whole(found, 2**53, f"{where}: node group {name}: node")
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
-        get = attributes.get
+        get, current = attributes.get, self._current
         match tag.rpartition(" ")[2]:
             case "vertex":
-                self._current.vertices.append(f"{attributes['x']} {attributes['y']} {attributes['z']}")
+                current.vertices.append((get("x"), get("y"), get("z")))
             case "beam":
-                self._current.beams.append((attributes["v1"], attributes["v2"], get("r1", ""), get("r2", "")))
+                current.beams.append((get("v1"), get("v2"), get("r1"), get("r2")))
             case "triangle":
                 self.triangles += 1
-            case "ref" if self._current.lists:
-                self._current.lists[-1][1].append(attributes["index"])
-            case "object":
-                self._current = self.objects[attributes["id"]] = _Object(get("name", ""))
-            case "beamlattice":
-                self._current.radius = get("radius", "")
+            case "ref" if current.sets:
+                current.sets[-1][1].append(get("index"))
             case "beamset":
-                name = get("name") or get("identifier") or f"beamset_{len(self._current.lists)}"
-                self._current.lists.append((name, []))
+                current.sets.append((get("name") or get("identifier") or f"beamset_{len(current.sets)}", []))
+            case "beamlattice":
+                current.radius = get("radius")
             case "component":
-                self._current.components.append(self._placed(attributes))
+                current.components.append(self._placed(attributes))
+            case "object":
+                self._current = self._texts[get("id", "")] = _Texts(get("name", ""))
             case "item":
                 self.items.append(self._placed(attributes))
-            case "metadata" if get("name", "").partition(":")[2].startswith(_GROUP):
-                self._metadata.append([])
-                self._in_metadata = True
+            case "metadata":  # whose text goes on up to the next one, or to the resources
+                parts: list[str] = []
+                self._parser.CharacterDataHandler = parts.append
+                if get("name", "").partition(":")[2].startswith(_GROUP):
+                    self._metadata.append(parts)
+            case "resources":
+                self._parser.CharacterDataHandler = None
             case "model":
                 unit = get("unit", "millimeter")
                 if unit not in _UNITS:
-                    raise InputError(f"{self._line()}: unit {unit!r}; known: {', '.join(_UNITS)}")
+                    raise InputError(f"{self.where}: unit {unit!r}; known: {', '.join(_UNITS)}")
                 self.scale = _UNITS[unit]
                 required = [self._namespaces.get(prefix, prefix) for prefix in get("requiredextensions", "").split()]
                 self.not_read = [uri for uri in required if not uri.startswith(_LATTICES)]
 
-    def _end(self, tag: str) -> None:
-        self._in_metadata = False
-
-    def _characters(self, text: str) -> None:
-        if self._in_metadata:
-            self._metadata[-1].append(text)
-
-    def _placed(self, attributes: dict[str, str]) -> tuple[str, np.ndarray]:
-        """Return the object of a component or item, and its transform (4, 3): applied to rows [x, y, z, 1] from the
-        right."""
+    def _placed(self, attributes: dict[str, str]) -> Placed:
+        number = attributes.get("objectid", "")
         if any(key.rpartition(" ")[2] == "path" for key in attributes):
             raise InputError(
-                f"{self._line()}: an object in another part of the file (production extension), "
-                "which is not read: export without it"
+                f"{self.where}: object {number} is in another part of the file (production extension), which is not "
+                "read: export without it"
             )
-        text = attributes.get("transform")
-        if text is None:
-            return attributes["objectid"], np.eye(4, 3)
-        return attributes["objectid"], _numbers([text], f"{self._line()}: transform", 12).reshape(4, 3)
+        numbers = attributes.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
+        return number, _numbers([tuple(numbers)], f"{self.where}: transform of object {number}", 12).reshape(4, 3)
 
-    def check_instances(self) -> int:
-        """Return the number of vertices of all objects of the build where beams end, after their number was checked.
+    def count(self, number: str, depth: int = 0) -> tuple[int, int]:
+        """Return how many objects and components an object consists of, and their number of vertices with beams.
 
         Raises
         ------
         InputError
-            If a component or item has no object, or has itself as a component; or if there are too many of them.
+            If a component or item has no object, or has itself as a component.
         """
-        counts = [self._count(number, 0) for number, _ in self.items]
-        instances = sum(count for count, _ in counts)
-        if instances > _INSTANCES:
-            raise InputError(
-                f"{self.where}: the build places {instances:,} objects and components, and at most {_INSTANCES:,} are "
-                "read: write the lattice as fewer, larger objects"
-            )
-        return sum(nodes for _, nodes in counts)
-
-    def _count(self, number: str, depth: int) -> tuple[int, int]:
-        """Return how many objects and components an object consists of, and their number of vertices with beams."""
         if number not in self.objects:
             raise InputError(f"{self.where}: there is no object {number}, which the build or a component names")
         if depth > _DEEPEST:
             raise InputError(f"{self.where}: object {number} is a component of itself")
         if number not in self._counts:
             found = self.objects[number]
-            parts = [self._count(other, depth + 1) for other, _ in found.components]
+            parts = [self.count(other, depth + 1) for other, _ in found.components]
             nodes = int(found.used.sum()) + sum(part[1] for part in parts)
             self._counts[number] = 1 + sum(part[0] for part in parts), nodes
         return self._counts[number]
@@ -262,24 +234,12 @@ class _Model:
             yield from self.placed(other, np.vstack([inner[:3] @ place[:3], inner[3] @ place[:3] + place[3]]))
 
 
-def _numbers(texts: list[str], what: str, width: int = 0) -> np.ndarray:
-    """Return the numbers of texts, each with ``width`` of them; 0: any number."""
+def _numbers(rows: Sequence[str | tuple[str | None, ...] | None], what: str, width: int = 1) -> np.ndarray:
+    """Return texts as numbers (n, width): NaN for those that are missing."""
     try:
-        values = numbers_of(" ".join(texts).encode())
-        if not width or len(values) == width * len(texts):
-            return values
-    except ValueError:
-        pass
-    wrong = next((text for text in texts if not _are_numbers(text, width)), "")
-    raise InputError(f"{what}: {wrong[:60]!r} are not {f'{width} ' if width else ''}numbers")
-
-
-def _are_numbers(text: str, width: int) -> bool:
-    try:
-        found = len([float(word) for word in text.split()])
-    except ValueError:
-        return False
-    return found == width if width else found > 0
+        return np.array(rows, dtype=np.float64).reshape(-1, width)
+    except ValueError as error:
+        raise InputError(f"{what}: {error}; expected {width} number{'s' * (width > 1)}") from None
 
 
 def _whole(values: np.ndarray, n: int, what: str) -> np.ndarray:
@@ -291,7 +251,14 @@ def _whole(values: np.ndarray, n: int, what: str) -> np.ndarray:
 
 def _assembled(path: Path, model: _Model) -> WholeMesh:
     """Return the lattices of all items of the build as one mesh."""
-    check_memory(model.check_instances(), str(path))
+    counts = [model.count(number) for number, _ in model.items]
+    instances = sum(count for count, _ in counts)
+    if instances > _INSTANCES:
+        raise InputError(
+            f"{model.where}: the build places {instances:,} objects and components, and at most {_INSTANCES:,} are "
+            "read: write the lattice as fewer, larger objects"
+        )
+    check_memory(sum(nodes for _, nodes in counts), str(path))
     placed = [each for item in model.items for each in model.placed(*item)]
     if not placed:
         raise InputError(f"{path}: has no beam lattice; a surface of triangles is read from STL")

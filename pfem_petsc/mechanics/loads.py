@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from ..case.files import Forces, read_forces
-from ..case.tables import LoadFile, VaryingGravity, VaryingWind
+from ..case.tables import LoadFile, has_rows
 from ..errors import InputError
 from ..parallel.agreement import on_root
 from ..registry import nearest
@@ -239,7 +239,7 @@ class Wind:
         self.held: np.ndarray | None = None
         self._holds = case.holds("wind")
         self._table, self._constant = None, np.zeros(3)
-        if isinstance(wind, VaryingWind):
+        if has_rows(wind.velocity):
             self._table = Table(wind.velocity, wind.interpolation == "smooth")
         else:
             self._constant = np.array(wind.velocity, dtype=np.float64)
@@ -314,7 +314,7 @@ class ExternalForce:
             self.state_forces.append(self.wind)
         self._keeps = case.holds("load"), case.holds("gravity")
         self._loads = None if self._keeps[0] else NodalLoads(case, nodes, inertia.mesh)
-        varies = isinstance(case.gravity, VaryingGravity)
+        varies = case.gravity is not None and has_rows(case.gravity.acceleration)
         gravity = case.gravity.acceleration if case.gravity is not None and not varies else (0.0, 0.0, 0.0)
         self.gravity = np.array(gravity, dtype=np.float64)
         self._gravity_table: Table | None = None

@@ -105,14 +105,6 @@ class DistributedMesh:
         """Return messages sent and received, and bytes sent and received, by :meth:`update_ghosts` of an array."""
         return self._exchange.traffic(array.dtype.itemsize * array.size // max(len(array), 1))
 
-    def begin_update(self, array: np.ndarray) -> None:
-        """Start :meth:`update_ghosts`; do not change owned rows or read ghosts before :meth:`end_update`."""
-        self._exchange.begin(array)
-
-    def end_update(self, array: np.ndarray) -> None:
-        """Finish the update that :meth:`begin_update` started on the same array."""
-        self._exchange.end(array)
-
     def messages(self) -> Messages | None:
         """Return the messages that update ghosts of positions, for compiled loops; None if loops cannot call MPI."""
         return self._exchange.messages()

@@ -138,6 +138,10 @@ class GhostExchange:
         Numbers of this rank's ghosts, ascending, so that those of one owner are contiguous.
     tag : int
         First of a hundred tags of its messages, which must differ between exchanges in progress at the same time.
+
+    Attributes
+    ----------
+    rows : owned rows that are ghosts on other ranks, in the order in which they are sent, repeated for each rank
     """
 
     def __init__(self, comm: MPI.Comm, starts: np.ndarray, ghosts: np.ndarray, tag: int = _TAG) -> None:
@@ -148,25 +152,19 @@ class GhostExchange:
         owners = np.searchsorted(starts, ghosts, side="right") - 1
         router = Router(comm, owners)
         asked = router.send(np.asarray(ghosts, dtype=np.int64))
-        self._rows = (asked - starts[comm.rank]).astype(np.intp)
+        self.rows = (asked - starts[comm.rank]).astype(np.intp)
         self._leaving = _neighbours(router._arriving)
         self._arriving = _neighbours(router._counts)
         self._buffers: dict[int, _Buffers] = {}
-        self._busy: set[int] = set()
 
     @property
     def n_neighbours(self) -> int:
         """Number of ranks that send rows to this rank or receive rows from it."""
         return len({rank for rank, _, _ in self._leaving} | {rank for rank, _, _ in self._arriving})
 
-    @property
-    def rows(self) -> np.ndarray:
-        """Owned rows that are ghosts on other ranks, in the order in which they are sent, repeated for each rank."""
-        return self._rows
-
     def traffic(self, row: int) -> tuple[int, int, int, int]:
         """Return messages sent and received, and bytes sent and received, by an update of rows of ``row`` bytes."""
-        return len(self._leaving), len(self._arriving), row * len(self._rows), row * self._n_ghosts
+        return len(self._leaving), len(self._arriving), row * len(self.rows), row * self._n_ghosts
 
     @property
     def alone(self) -> bool:
@@ -175,9 +173,7 @@ class GhostExchange:
 
     def leaving(self, width: int) -> np.ndarray:
         """Return the buffer (rows, width) for the values of :attr:`rows`, to be passed to :meth:`bring`."""
-        if width not in self._buffers:
-            self._prepare(width)
-        return self._buffers[width].leaving
+        return self._of(width).leaving
 
     def bring(self, leaving: np.ndarray) -> np.ndarray:
         """Send values (rows, k) float64 of :attr:`rows` to their ghosts; return those of own ghosts (ghosts, k).
@@ -186,21 +182,12 @@ class GhostExchange:
         """
         if self.alone:
             return np.empty((0, leaving.shape[1]))
-        buffers = self._begin(leaving.shape[1])
+        buffers = self._of(leaving.shape[1])
         if leaving is not buffers.leaving:
             buffers.leaving[:] = leaving
         MPI.Prequest.Startall(buffers.requests)
         MPI.Request.Waitall(buffers.requests)
-        self._busy.discard(leaving.shape[1])
         return buffers.arriving
-
-    def _begin(self, width: int) -> _Buffers:
-        if width in self._busy:
-            raise RuntimeError(f"an update of ghosts with {width} columns is already in progress: end it first")
-        self._busy.add(width)
-        if width not in self._buffers:
-            self._prepare(width)
-        return self._buffers[width]
 
     def messages(self) -> Messages | None:
         """Return the messages of arrays with three columns for compiled loops, valid until :meth:`close`.
@@ -210,42 +197,25 @@ class GhostExchange:
         addresses = (0, 0) if self._comm.size == 1 else _addresses()
         if addresses is None:
             return None
-        if 3 not in self._buffers:
-            self._prepare(3)
-        buffers = self._buffers[3]
+        buffers = self._of(3)
         handle, status = MPI._sizeof(MPI.Request), MPI._sizeof(MPI.Status)
         handles = [ctypes.string_at(MPI._addressof(request), handle) for request in buffers.requests]
         requests = np.frombuffer(b"".join(handles), dtype=np.uint8).copy()
         statuses = np.zeros(max(len(handles), 1) * status, dtype=np.uint8)
-        rows = self._rows.astype(np.int64)
+        rows = self.rows.astype(np.int64)
         return Messages(rows, buffers.leaving, buffers.arriving, len(handles), requests, statuses, *addresses)
 
-    def begin(self, array: np.ndarray) -> None:
-        """Start sending the owned rows of ``array`` (n_local, k) float64 to their ghosts on other ranks."""
+    def update(self, array: np.ndarray) -> None:
+        """Send the owned rows of ``array`` (n_local, k) float64 to their ghosts on other ranks."""
         if self.alone:
             return
         width = array.size // array.shape[0]
         if width not in self._buffers:
             self._check(array)
-        buffers = self._begin(width)
+        rows, leaving = array.reshape(-1, width), self.leaving(width)
         # mode="clip" avoids the temporary array of NumPy's default; the rows are known to be in range
-        np.take(array.reshape(-1, width), self._rows, axis=0, out=buffers.leaving, mode="clip")
-        MPI.Prequest.Startall(buffers.requests)
-
-    def end(self, array: np.ndarray) -> None:
-        """Complete the update that :meth:`begin` started, and fill the ghost rows of ``array``."""
-        if self.alone:
-            return
-        width = array.size // array.shape[0]
-        buffers = self._buffers[width]
-        MPI.Request.Waitall(buffers.requests)
-        self._busy.discard(width)
-        array.reshape(-1, width)[self._n_owned :] = buffers.arriving
-
-    def update(self, array: np.ndarray) -> None:
-        """Send the owned rows of ``array`` (n_local, k) float64 to their ghosts on other ranks."""
-        self.begin(array)
-        self.end(array)
+        np.take(rows, self.rows, axis=0, out=leaving, mode="clip")
+        rows[self._n_owned :] = self.bring(leaving)
 
     def close(self) -> None:
         """Free the requests; no update may be in progress."""
@@ -261,13 +231,15 @@ class GhostExchange:
                 f"not in {array.dtype} {array.shape}"
             )
 
-    def _prepare(self, width: int) -> None:
-        leaving = np.empty((len(self._rows), width))
-        arriving = np.empty((self._n_ghosts, width))
-        tag = self._tag + width
-        requests = [self._comm.Recv_init(arriving[a:b], rank, tag) for rank, a, b in self._arriving]
-        requests += [self._comm.Send_init(leaving[a:b], rank, tag) for rank, a, b in self._leaving]
-        self._buffers[width] = _Buffers(leaving, arriving, requests)
+    def _of(self, width: int) -> _Buffers:
+        if width not in self._buffers:
+            leaving = np.empty((len(self.rows), width))
+            arriving = np.empty((self._n_ghosts, width))
+            tag = self._tag + width
+            requests = [self._comm.Recv_init(arriving[a:b], rank, tag) for rank, a, b in self._arriving]
+            requests += [self._comm.Send_init(leaving[a:b], rank, tag) for rank, a, b in self._leaving]
+            self._buffers[width] = _Buffers(leaving, arriving, requests)
+        return self._buffers[width]
 
 
 def swap(comm: MPI.Comm, ranks: np.ndarray, rows: np.ndarray) -> np.ndarray:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from ..errors import InputError
 from .whole import WholeMesh
@@ -42,15 +44,10 @@ def tolerance_of(mesh: WholeMesh) -> float:
 
 def components(n: int, pairs: np.ndarray) -> np.ndarray:
     """Return for each of n items the lowest number (n,) of those that pairs (m, 2) connect it with."""
-    root = np.arange(n)
-    while True:
-        ends = root[pairs]
-        ends = ends[ends[:, 0] != ends[:, 1]]
-        if len(ends) == 0:
-            return root
-        np.minimum.at(root, ends.max(axis=1), ends.min(axis=1))
-        while not np.array_equal(root, root[root]):
-            root = root[root]
+    graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), (n, n))
+    _, part = connected_components(graph, directed=False)
+    _, first = np.unique(part, return_index=True)
+    return first[part]
 
 
 def coincident(points: np.ndarray, tolerance: float) -> np.ndarray:
@@ -67,24 +64,7 @@ def coincident(points: np.ndarray, tolerance: float) -> np.ndarray:
     if tolerance <= 0.0:
         _, first, place = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
         return first[place.ravel()]
-    found = [np.empty((0, 2), np.int64)]
-    low = points.min(axis=0) if len(points) else np.zeros(3)
-    # two nodes that are near share a cell of twice the tolerance in one of eight grids
-    for shift in product((0.0, 0.5), repeat=3):
-        cells = np.floor((points - low) / (2.0 * tolerance) + shift).astype(np.int64).astype(np.uint64)
-        key = cells[:, 0] * np.uint64(0x9E3779B97F4A7C15)
-        key ^= cells[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F) + (key >> np.uint64(29))
-        key ^= cells[:, 2] * np.uint64(0x165667B19E3779F9) + (key >> np.uint64(31))
-        order = np.argsort(key, kind="stable")
-        key = key[order]
-        for ahead in range(1, len(points)):
-            here = np.flatnonzero(key[ahead:] == key[:-ahead])
-            if len(here) == 0:
-                break
-            pairs = np.stack([order[here], order[here + ahead]], axis=1)
-            apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
-            found.append(pairs[apart <= tolerance])
-    return components(len(points), np.concatenate(found))
+    return components(len(points), KDTree(points).query_pairs(tolerance, output_type="ndarray"))
 
 
 def copies(bars: np.ndarray) -> np.ndarray:

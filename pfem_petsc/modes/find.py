@@ -8,20 +8,18 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from types import ModuleType
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..errors import InputError, SimulationFailure
-from ..registry import lookup
 from .pencil import Holds, Pencil, StateMatrices, buckling_bars, join
+from .solvers import SOLVERS, Dense, Lanczos, Slepc
 
 if TYPE_CHECKING:
     from ..case.tables import Modes
-    from ..case.tables import Modes as Settings
     from ..integrators.base import State
     from ..stepping.model import Model
 
@@ -129,22 +127,20 @@ def _without(vector: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
     return vector
 
 
-SOLVERS = "pfem_petsc.modes.eigen"
-LIBRARIES = {"slepc": "slepc4py.SLEPc", "scipy": "scipy.sparse.linalg"}
 DENSE_UP_TO = 600
-"""Maximum number of components for which NumPy computes all eigenvalues, faster than an iteration."""
+"""Maximum number of components for which LAPACK computes all eigenvalues, faster than an iteration."""
 DENSE_AT_MOST = 6_000
-"""Maximum number of components for NumPy without a library for sparse matrices: about 2 minutes and 1 GB."""
+"""Maximum number of components of dense matrices: about 2 minutes and 1 GB."""
 _PART = 0.2  # of all modes, from which on computing all of them takes less time than iterations
 GATHERED_AT_MOST = 300_000
 """Maximum number of components for which matrices are gathered on one rank for SciPy."""
 
 
 @cache
-def available(package: str) -> bool:
-    """Return whether a library is installed and can be loaded; PETSc must be initialised before."""
+def has_slepc() -> bool:
+    """Return whether slepc4py is installed and can be loaded; PETSc must be initialised before."""
     try:
-        importlib.import_module(package)
+        importlib.import_module("slepc4py.SLEPc")
     except ImportError:
         return False
     return True
@@ -186,32 +182,22 @@ def choose(settings: Modes, free: int, source: str) -> str:
     if asked == "auto":
         if free <= DENSE_UP_TO or (free <= DENSE_AT_MOST and most > _PART * free):
             return "dense"
-        if available(LIBRARIES["slepc"]):
-            return "slepc"
-        if free <= GATHERED_AT_MOST and available(LIBRARIES["scipy"]):
-            return "scipy"
-        if free <= DENSE_AT_MOST:
-            return "dense"
+        if has_slepc() or free <= GATHERED_AT_MOST:
+            return "slepc" if has_slepc() else "scipy"
         raise InputError(
             f"{source}: modes: {free:,} free components need slepc4py, which is not installed (Debian, Ubuntu: "
-            "python3-slepc4py-real and the version of PETSc; scripts/setup.sh installs it), or up to "
-            f"{GATHERED_AT_MOST:,} of them scipy (pip install scipy)"
+            "python3-slepc4py-real and the version of PETSc; scripts/setup.sh installs it); SciPy serves up to "
+            f"{GATHERED_AT_MOST:,} of them"
         )
-    limits = {"dense": DENSE_AT_MOST, "scipy": GATHERED_AT_MOST}
-    if asked in limits and free > limits[asked]:
+    limit = {"dense": DENSE_AT_MOST, "scipy": GATHERED_AT_MOST}.get(asked, free)
+    if free > limit:
         raise InputError(
-            f'{source}: modes.solver = "{asked}": {free:,} free components exceed its limit of '
-            f'{limits[asked]:,}; use "slepc" or "auto"'
+            f'{source}: modes.solver = "{asked}": {free:,} free components exceed its limit of {limit:,}; use "slepc" '
+            'or "auto"'
         )
-    if asked in LIBRARIES and not available(LIBRARIES[asked]):
-        package = LIBRARIES[asked].partition(".")[0]
-        raise InputError(f'{source}: modes.solver = "{asked}": {package} is not installed; install it, or use "auto"')
+    if asked == "slepc" and not has_slepc():
+        raise InputError(f'{source}: modes.solver = "slepc": slepc4py is not installed; install it, or use "auto"')
     return asked
-
-
-def solver_module(name: str) -> ModuleType:
-    """Return the module of a solver, with ``largest(problem, count, start)`` and ``definite(problem)``."""
-    return lookup(SOLVERS, name, "modes.solver")
 
 
 _SHIFT = 1e-3  # distance of the shift below zero, relative to the squared frequency wave speed / length
@@ -221,7 +207,7 @@ _AGAIN = 3  # modes requested in a search for missed ones
 _SEARCHES = 40
 _NOTHING = 1e-10  # relative to the largest theta: smaller ones belong to directions in which A is zero
 _DEPENDENT = 1e-10  # eigenvalue of a Gram matrix of unit vectors below which they are dependent
-_NO_LOAD = 1e-9  # relative to the axial stiffness: smaller axial forces count as zero
+_NO_LOAD = 1e-12  # relative to the axial stiffness: smaller axial forces over the length count as zero
 
 
 @dataclass(frozen=True)
@@ -235,7 +221,6 @@ class Found:
     shapes : (k, owned, 3): of vibrations [kg^-1/2], with x^T M x = 1; of buckling with a largest component of 1
     negative : number of negative eigenvalues of vibrations
     solver : description
-    iterations : number of restarts (SLEPc) or solves (SciPy); 0 without iterations
     at_walls : number of nodes in contact with walls
     """
 
@@ -244,7 +229,6 @@ class Found:
     shapes: np.ndarray
     negative: int
     solver: str
-    iterations: int
     at_walls: int
 
     @property
@@ -255,28 +239,7 @@ class Found:
         return np.sign(self.eigenvalues) * np.sqrt(np.abs(self.eigenvalues)) / (2.0 * np.pi)
 
 
-class _Solver(Protocol):
-    """See :mod:`pfem_petsc.modes.eigen`."""
-
-    name: str
-    finds_all: bool
-    definite: bool | None
-    iterations: int
-
-    def largest(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray: ...
-
-    def destroy(self) -> None: ...
-
-
-class _Scale(NamedTuple):
-    """Eigenvalues of theta, the magnitude up to which they are zero, and that of theta over the largest."""
-
-    values: Callable[[np.ndarray], np.ndarray]
-    zero: float
-    nothing: float = 0.0
-
-
-def find_modes(model: Model, state: State, settings: Settings, consistent: bool) -> Found:
+def find_modes(model: Model, state: State, settings: Modes, consistent: bool) -> Found:
     """Compute the lowest modes of a state. Collective.
 
     Parameters
@@ -291,149 +254,139 @@ def find_modes(model: Model, state: State, settings: Settings, consistent: bool)
     InputError, SimulationFailure
         On all ranks, if there is no solver, no free component, unsupported contact, or no axial force for buckling.
     """
-    holds = Holds(model, state)
-    free = 3 * model.mesh.n_nodes - holds.number
-    if free == 0:
-        raise SimulationFailure(f"{model.case.source}: modes: supports and walls hold all nodes: nothing can move")
-    matrices = StateMatrices(model, holds, consistent)
-    name = choose(settings, free, model.case.source)
-    count = min(settings.count, free)
-    if settings.kind == "buckling":
-        return _buckling(model, state, holds, matrices, name, count, free)
-    return _vibration(model, state, holds, matrices, name, count, free)
+    search = _Search(model, state, settings)
+    matrices = StateMatrices(model, search.holds, consistent)
+    return search.buckling(matrices) if settings.kind == "buckling" else search.vibration(matrices)
 
 
-def _vibration(
-    model: Model, state: State, holds: Holds, matrices: StateMatrices, name: str, count: int, free: int
-) -> Found:
-    bars = model.bars.state_stiffness(state.x)
-    low, high = matrices.bounds(bars, holds.curvature)
-    top = 2.0 * high + abs(low)
-    stiffness = matrices.stiffness(bars, top * matrices.inertia.mass, holds.curvature)
-    mass = matrices.mass()
-    zero = _ROUNDING * top
-    small = max(_SHIFT * (model.wave_speed / model.length) ** 2, 10.0 * zero)
-    # a shift near zero if that is below all eigenvalues, else a rigorous lower bound
-    shifts = [-small] if low == 0.0 else [-small, low - small]
-    for shift in shifts:
-        pencil = Pencil(mass, join(stiffness, -shift, mass), state.position, holds.held, free)
-        solver = solver_module(name).Solver(pencil)
-        if solver.definite or shift == shifts[-1]:
-            break
-        solver.destroy()
-        pencil.b.destroy()
-    basis = _basis(model, state)
+class _Search:
+    """The search for the modes of a state. Methods are collective."""
 
-    try:
-        scale = _Scale(lambda theta: shift + 1.0 / theta, zero)
-        theta, shapes = _lowest(model, holds, pencil, solver, basis, count, scale)
-    finally:
-        solver.destroy()
-        pencil.destroy()
-        stiffness.destroy()
-    values = scale.values(theta)
-    values[np.abs(values) <= zero] = 0.0
-    shapes /= np.sqrt(theta)[:, None, None]
-    negative = int((values < 0.0).sum())
-    return Found("vibration", values, shapes, negative, solver.name, solver.iterations, holds.at_walls)
+    def __init__(self, model: Model, state: State, settings: Modes) -> None:
+        self.model, self.state, self.holds = model, state, Holds(model, state)
+        self.source = model.case.source
+        self.free = 3 * model.mesh.n_nodes - self.holds.number
+        if self.free == 0:
+            raise SimulationFailure(f"{self.source}: modes: supports and walls hold all nodes: nothing can move")
+        self.count = min(settings.count, self.free)
+        self._make = SOLVERS[choose(settings, self.free, self.source)]
 
+    def vibration(self, matrices: StateMatrices) -> Found:
+        """Return the natural vibrations: theta = 1/(lambda - shift) of M x = theta (K - shift M) x."""
+        model, holds = self.model, self.holds
+        bars = model.bars.state_stiffness(self.state.x)
+        low, high = matrices.bounds(bars, holds.curvature)
+        top = 2.0 * high + abs(low)
+        stiffness = matrices.stiffness(bars, top * matrices.inertia.mass, holds.curvature)
+        mass = matrices.mass()
+        zero = _ROUNDING * top
+        small = max(_SHIFT * (model.wave_speed / model.length) ** 2, 10.0 * zero)
+        # a shift near zero if that is below all eigenvalues, else a rigorous lower bound
+        shifts = [-small] if low == 0.0 else [-small, low - small]
+        for shift in shifts:
+            pencil = Pencil(mass, join(stiffness, -shift, mass), self.state.position, holds.held)
+            solver = self._make(pencil)
+            if solver.definite or shift == shifts[-1]:
+                break
+            solver.destroy()
+            pencil.b.destroy()
+        try:
+            theta, shapes = self._lowest(pencil, solver, lambda theta: shift + 1.0 / theta, zero)
+        finally:
+            solver.destroy()
+            pencil.destroy()
+            stiffness.destroy()
+        values = shift + 1.0 / theta
+        values[np.abs(values) <= zero] = 0.0
+        shapes /= np.sqrt(theta)[:, None, None]
+        return Found("vibration", values, shapes, int((values < 0.0).sum()), solver.name, holds.at_walls)
 
-def _buckling(
-    model: Model, state: State, holds: Holds, matrices: StateMatrices, name: str, count: int, free: int
-) -> Found:
-    source = model.case.source
-    material, geometric = buckling_bars(model, state.x)
-    largest = np.array([np.abs(geometric[4]).max(initial=0.0), np.abs(material[3]).max(initial=0.0)])
-    model.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-    if largest[0] <= _NO_LOAD * 1e-3 * largest[1]:
-        raise SimulationFailure(
-            f'{source}: modes: kind = "buckling" uses the axial forces of the state as the reference load, and the '
-            "state has none: give the case an analysis that loads the truss ([static] with a small load)"
-        )
-    geometric[3:] *= -1.0
-    pencil = Pencil(
-        matrices.stiffness(geometric, 0.0, springs=False),
-        matrices.stiffness(material, float(largest[1])),
-        state.position,
-        holds.held,
-        free,
-    )
-    solver = solver_module(name).Solver(pencil)
-    try:
-        if solver.definite is False:
+    def buckling(self, matrices: StateMatrices) -> Found:
+        """Return the buckling modes: theta = 1/lambda of -Kg x = theta K0 x."""
+        comm, holds = self.model.comm, self.holds
+        material, geometric = buckling_bars(self.model, self.state.x)
+        largest = np.array([np.abs(geometric[4]).max(initial=0.0), np.abs(material[3]).max(initial=0.0)])
+        comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+        if largest[0] <= _NO_LOAD * largest[1]:
             raise SimulationFailure(
-                f'{source}: modes: kind = "buckling": the unstressed truss is a mechanism or is not held: its '
-                "stiffness is singular, and no factor of the load is defined; brace and support it, or use "
-                'kind = "vibration", whose eigenvalues include the stresses of the state'
+                f'{self.source}: modes: kind = "buckling" uses the axial forces of the state as the reference load, '
+                "and the state has none: give the case an analysis that loads the truss ([static] with a small load)"
             )
-        scale = _Scale(np.reciprocal, 0.0, _NOTHING)
-        theta, shapes = _lowest(model, holds, pencil, solver, _basis(model, state), count, scale)
-    finally:
-        solver.destroy()
-        pencil.destroy()
-    if not len(theta):
-        raise SimulationFailure(
-            f"{source}: modes: no positive factor of the state's axial forces makes the truss buckle: it is in tension"
-        )
-    peaks = np.abs(shapes).max(axis=(1, 2), initial=0.0)
-    model.comm.Allreduce(MPI.IN_PLACE, peaks, op=MPI.MAX)
-    shapes /= peaks[:, None, None]
-    return Found("buckling", 1.0 / theta, shapes, 0, solver.name, solver.iterations, holds.at_walls)
+        geometric[3:] *= -1.0
+        a = matrices.stiffness(geometric, 0.0, springs=False)
+        pencil = Pencil(a, matrices.stiffness(material, float(largest[1])), self.state.position, holds.held)
+        solver = self._make(pencil)
+        try:
+            if solver.definite is False:
+                raise SimulationFailure(
+                    f'{self.source}: modes: kind = "buckling": the unstressed truss is a mechanism or is not held: its '
+                    "stiffness is singular, and no factor of the load is defined; brace and support it, or use "
+                    'kind = "vibration", whose eigenvalues include the stresses of the state'
+                )
+            theta, shapes = self._lowest(pencil, solver, np.reciprocal, 0.0, _NOTHING)
+        finally:
+            solver.destroy()
+            pencil.destroy()
+        if not len(theta):
+            raise SimulationFailure(
+                f"{self.source}: modes: no positive factor of the state's axial forces makes the truss buckle: it is "
+                "in tension"
+            )
+        peaks = np.abs(shapes).max(axis=(1, 2), initial=0.0)
+        comm.Allreduce(MPI.IN_PLACE, peaks, op=MPI.MAX)
+        shapes /= peaks[:, None, None]
+        return Found("buckling", 1.0 / theta, shapes, 0, solver.name, holds.at_walls)
 
+    def _lowest(
+        self,
+        pencil: Pencil,
+        solver: Dense | Lanczos | Slepc,
+        values_of: Callable[[np.ndarray], np.ndarray],
+        zero: float,
+        nothing: float = 0.0,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ``count`` largest theta (k,), and unique vectors (k, owned, 3), x^T B x = 1.
 
-def _basis(model: Model, state: State) -> Basis:
-    owned = model.mesh.n_owned
-    return Basis(model.comm, model.mesh.node_ids[:owned], state.position, model.inertia.mass)
+        An iteration may miss copies of a repeated eigenvalue, so searches are repeated in the complement of the vectors
+        found, until one finds nothing new. ``values_of`` theta are eigenvalues, which up to ``zero`` count as zero, as
+        does theta up to ``nothing`` of the largest.
+        """
+        model, holds, count = self.model, self.holds, self.count
+        wanted = min(count + _MORE, self.free)
+        theta, known = np.empty(0), np.empty((0, 3 * model.mesh.n_owned))
+        for search in range(_SEARCHES):
+            before = theta[:wanted]
+            ask = min(max(wanted - len(known), _AGAIN), self.free - len(known))
+            if ask > 0:
+                found = solver.largest(ask, self._start(search), known)
+                found = np.where(holds.held.ravel(), 0.0, found[:ask])
+                theta, known = _ritz(model.comm, pencil, np.concatenate([known, found]))
+                positive = theta > nothing * np.abs(theta).max(initial=0.0)
+                theta, known = theta[positive], known[positive]
+            now = theta[:wanted]
+            if not (solver.finds_all or (len(now) == len(before) and np.allclose(now, before, rtol=1e-9, atol=0.0))):
+                continue
+            values = values_of(now)
+            cut = len(now) == wanted < self.free and same(values[-1], values[min(count, wanted) - 1], zero)
+            if not cut or wanted > count + 8 * _MORE:
+                break
+            wanted = min(wanted + 2 * _MORE, self.free)
+        else:
+            raise SimulationFailure(
+                f"modes: after {_SEARCHES} searches more repeated eigenvalues are still found ({solver.name}); ask for "
+                "fewer modes (modes.count)"
+            )
+        owned = model.mesh.n_owned
+        shapes = holds.to_axes(known[: len(now)].reshape(len(now), owned, 3))
+        basis = Basis(model.comm, model.mesh.node_ids[:owned], self.state.position, model.inertia.mass)
+        return now[:count].copy(), basis.unique(values, shapes, zero)[:count]
 
-
-def _lowest(
-    model: Model,
-    holds: Holds,
-    pencil: Pencil,
-    solver: _Solver,
-    basis: Basis,
-    count: int,
-    scale: _Scale,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ``count`` largest positive theta (k,), and unique vectors (k, owned, 3), x^T B x = 1. Collective.
-
-    An iteration may miss copies of a repeated eigenvalue, so searches are repeated in the complement of the vectors
-    found, until one finds nothing new.
-    """
-    wanted = min(count + _MORE, pencil.free)
-    theta, known = np.empty(0), np.empty((0, 3 * model.mesh.n_owned))
-    for search in range(_SEARCHES):
-        before = theta[:wanted]
-        ask = min(max(wanted - len(known), _AGAIN), pencil.free - len(known))
-        if ask > 0:
-            found = solver.largest(ask, _start(model, holds, search), known)
-            found = np.where(holds.held.ravel(), 0.0, found[:ask])
-            theta, known = _ritz(model.comm, pencil, np.concatenate([known, found]))
-            positive = theta > scale.nothing * np.abs(theta).max(initial=0.0)
-            theta, known = theta[positive], known[positive]
-        now = theta[:wanted]
-        if not (solver.finds_all or (len(now) == len(before) and np.allclose(now, before, rtol=1e-9, atol=0.0))):
-            continue
-        values = scale.values(now)
-        cut = len(now) == wanted < pencil.free and same(values[-1], values[min(count, wanted) - 1], scale.zero)
-        if not cut or wanted > count + 8 * _MORE:
-            break
-        wanted = min(wanted + 2 * _MORE, pencil.free)
-    else:
-        raise SimulationFailure(
-            f"modes: after {_SEARCHES} searches more repeated eigenvalues are still found ({solver.name}); ask for "
-            "fewer modes (modes.count)"
-        )
-    shapes = holds.to_axes(known[: len(now)].reshape(len(now), model.mesh.n_owned, 3))
-    shapes = basis.unique(scale.values(now), shapes, scale.zero)
-    return now[:count].copy(), shapes[:count]
-
-
-def _start(model: Model, holds: Holds, search: int) -> np.ndarray:
-    """Return a start vector (3 owned,) that depends only on the mesh and the number of the search. Collective."""
-    numbers = model.mesh.node_ids[: model.mesh.n_owned].astype(np.float64)[:, None] * 3.0 + np.arange(3)
-    start = np.sin(12.9898 * (numbers + 1.0) + 78.233 * (search + 1.0) + 0.37 * np.sqrt(numbers * (search + 2.0)))
-    return holds.to_own(start[None])[0].ravel()
+    def _start(self, search: int) -> np.ndarray:
+        """Return a start vector (3 owned,) that depends only on the mesh and the number of the search."""
+        mesh = self.model.mesh
+        numbers = mesh.node_ids[: mesh.n_owned].astype(np.float64)[:, None] * 3.0 + np.arange(3)
+        start = np.sin(12.9898 * (numbers + 1.0) + 78.233 * (search + 1.0) + 0.37 * np.sqrt(numbers * (search + 2.0)))
+        return self.holds.to_own(start[None])[0].ravel()
 
 
 def _ritz(comm: MPI.Comm, pencil: Pencil, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

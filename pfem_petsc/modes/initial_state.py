@@ -1,32 +1,26 @@
-"""The state of a case without an analysis: the initial mesh at time zero."""
+"""The state of a case without an analysis: the initial mesh at time zero, whose modes are wanted."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..analysis import Analysis, Step
-from ..errors import InputError
+from ..analysis import Analysis, PlanAtRest, Step, refuse_motion
 from ..integrators.base import Balance, NoParameters, Scheme, State
-from ..output.units import TIME, Axis
+from ..output.units import TIME
 from ..stepping.stepper import NoRates, Solution, Stepper
 
 if TYPE_CHECKING:
-    from ..case.schema import Case
     from ..stepping.model import Model
 
-__all__ = ["InitialState", "InitialStatePlan"]
+__all__ = ["InitialState"]
 
 
 class _Nothing(Scheme):
     """A scheme that makes no steps."""
 
     inertial = False
-
-    def __init__(self) -> None:
-        super().__init__(NoParameters())
 
     def balance(self, state: State, h: float) -> Balance:
         raise NotImplementedError
@@ -39,7 +33,7 @@ class _InitialStepper(Stepper):
     """Initialises internal forces, loads and supports at time zero; makes no steps."""
 
     def __init__(self, model: Model) -> None:
-        super().__init__(model, _Nothing(), 0.0)
+        super().__init__(model, _Nothing(NoParameters()), 0.0)
         self.prescribed = NoRates(self)
 
     def start(self) -> None:
@@ -51,35 +45,6 @@ class _InitialStepper(Stepper):
 
     def solve(self, balance: Balance) -> Solution:
         raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class InitialStatePlan:
-    """The plan of a run without an analysis, which has no steps.
-
-    Attributes
-    ----------
-    scheme, step, end, steps, linear, axis : as of other plans
-    """
-
-    scheme: Scheme = field(default_factory=_Nothing)
-    step: float = 0.0
-    end: float = 0.0
-    steps: int = 0
-    linear: None = None
-    axis: Axis = TIME
-
-    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Return which of the recorded steps and times are beyond the end."""
-        return steps > 0
-
-    def entries(self, case: Case) -> dict[str, str]:
-        """Return label and text of a summary for the user before a run."""
-        return {"analysis": "none: modes of the initial state"}
-
-    def record(self) -> dict[str, Any]:
-        """Return the numbers that a restart must not compute again."""
-        return {}
 
 
 class InitialState(Analysis):
@@ -99,20 +64,11 @@ class InitialState(Analysis):
     step_size = 0.0
 
     def __init__(self, model: Model) -> None:
-        case = model.case
-        if any(any(entry.velocity) or any(entry.angular_velocity) for entry in case.initial):
-            raise InputError(
-                f"{case.source}: initial: a case with [modes] alone has no velocities; remove the table [initial], or "
-                "give the case a table [time]"
-            )
-        if case.contact.treatment != "scheme":
-            raise InputError(
-                f'{case.source}: contact.treatment = "{case.contact.treatment}" treats impacts, and a case with '
-                "[modes] alone has none; remove the key"
-            )
+        refuse_motion(model.case, "a case with [modes] alone")
         self.model = model
-        self.plan = InitialStatePlan()
         self.stepper = _InitialStepper(model)
+        texts = {"analysis": "none: modes of the initial state"}
+        self.plan = PlanAtRest(self.stepper.scheme, TIME, texts, steps=0)
 
     def advance(self) -> Step:
         raise NotImplementedError("the initial state has no steps")

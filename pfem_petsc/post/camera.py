@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -214,8 +213,10 @@ class Moves:
             return [fit(points, (towards, up, parallel), aspect).zoomed(self.zoom)] * count
         ways, zooms = [(towards, up, parallel)] * count, np.full(count, self.zoom)
         if self.orbit:
-            angles = np.radians(self.orbit) * np.linspace(0.0, 1.0, count)
-            ways = [(_turned(towards, up, angle), up, parallel) for angle in angles]
+            from scipy.spatial.transform import Rotation
+
+            turns = np.linspace(0.0, np.radians(self.orbit), count)[:, None] * up / np.linalg.norm(up)
+            ways = [(each, up, parallel) for each in Rotation.from_rotvec(turns).apply(towards)]
         if self.path is not None:
             azimuths, elevations, factors = (_smooth(motion.times, self.path[:, 0], self.path[:, k]) for k in (1, 2, 3))
             angles = zip(np.radians(azimuths), np.radians(elevations), strict=True)
@@ -240,24 +241,15 @@ def camera_path(file: Path | str) -> np.ndarray:
     InputError
         If the file cannot be read, or a line is not four numbers.
     """
-    rows: list[list[float]] = []
     try:
-        lines = list(csv.reader(Path(file).read_text().splitlines()))
-    except (OSError, UnicodeDecodeError) as error:
+        lines = [line for line in Path(file).read_text().splitlines() if line.strip() and not line.startswith("#")]
+        names = any(letter.isalpha() for letter in lines[0].lower().replace("e", "")) if lines else False
+        path = np.loadtxt(lines[names:], delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
         raise InputError(f"{file}: the camera's path cannot be read ({error})") from error
-    for number, words in enumerate(lines, start=1):
-        if not words or words[0].lstrip().startswith("#"):
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            if number == 1:
-                continue
-            row = []
-        if len(row) != 4:
-            raise InputError(f"{file}: line {number} is not four numbers: time, azimuth, elevation, zoom")
-        rows.append(row)
-    return np.array(rows).reshape(-1, 4)
+    if path.shape[1] != 4:
+        raise InputError(f"{file}: the camera's path takes four numbers a line: time, azimuth, elevation, zoom")
+    return path
 
 
 def at_one_scale(films: list[list[Camera]]) -> list[list[Camera]]:
@@ -265,12 +257,6 @@ def at_one_scale(films: list[list[Camera]]) -> list[list[Camera]]:
     every = [camera for film in films for camera in film]
     half, distance = max(camera.half_height for camera in every), max(camera.distance for camera in every)
     return [[replace(camera, half_height=half, distance=distance) for camera in film] for film in films]
-
-
-def _turned(vector: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
-    axis = axis / np.linalg.norm(axis)
-    along = (vector @ axis) * axis
-    return along + np.cos(angle) * (vector - along) + np.sin(angle) * np.cross(axis, vector)
 
 
 def _towards(azimuth: float, elevation: float, up: np.ndarray) -> np.ndarray:

@@ -1,15 +1,15 @@
-"""The style of curves, and utilities for charts over time."""
+"""Charts of curves: panels over a common axis, their style, and their tables."""
 
 from __future__ import annotations
 
 import csv
-import io
 import itertools
 import os
 import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -64,19 +64,60 @@ _POINTS = 3000  # approximate maximum number of points of a curve, more than a p
 
 
 class Curve(NamedTuple):
-    """A curve (n,) of a panel: its name in the legend, its style, and its name in tables if that is another one."""
+    """A curve of a panel.
+
+    Attributes
+    ----------
+    name : in the legend
+    values : (n,) in the unit of the panel; of a band the lowest and highest ones (n, 2)
+    style : of its line
+    key : its name in tables, if that is another one
+    place : (n,) on the axis of the panel; None: the times of the chart
+    source : of the places, in tables, where curves of a panel have different ones
+    kind : ``line``; ``area``, on top of the areas before it; ``band``; ``steps`` of integers, or ``steps before``,
+        which hold up to the place
+    """
 
     name: str
     values: np.ndarray
     style: Mapping[str, Any] = MappingProxyType({})
     key: str = ""
+    place: np.ndarray | None = None
+    source: str = ""
+    kind: str = "line"
 
 
-def legend_beside(axes: Any, **options: Any) -> None:
-    """Put the legend to the right of a panel."""
-    if axes.get_legend_handles_labels()[0]:
-        place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}
-        axes.legend(**place, **{"handlelength": 1.4, **options})
+@dataclass
+class Panel:
+    """What one pair of axes shows. All panels of a chart that have the same unit have the same prefix.
+
+    Attributes
+    ----------
+    label : of the vertical axis
+    unit : of the values
+    curves : what is drawn
+    title : above the panel
+    height : relative to others
+    over : name and unit of the horizontal axis; None: that of the chart
+    scale : factor and unit of the vertical axis; None: by the values
+    legend : ``above`` or ``beside`` the panel, or ``none``
+    log : whether the vertical axis is logarithmic
+    """
+
+    label: str
+    unit: str
+    curves: Sequence[Curve]
+    title: str = ""
+    height: float = 1.0
+    over: tuple[str, str] | None = None
+    scale: tuple[float, str] | None = None
+    legend: str = "above"
+    log: bool = False
+
+    @property
+    def size(self) -> float:
+        """The largest number."""
+        return max((largest(curve.values) for curve in self.curves), default=0.0)
 
 
 def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tuple[np.ndarray, np.ndarray]:
@@ -93,6 +134,16 @@ def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tupl
     last = whole * stretch - 1 + np.array([np.argmin(rest), np.argmax(rest)])
     picked = np.unique(np.concatenate([picked.ravel(), last, [0, len(time) - 1]]))
     return time[picked], values[picked]
+
+
+def _fill_steps(axes: Any, place: np.ndarray, counts: np.ndarray, side: str, style: Mapping[str, Any]) -> None:
+    """Draw integers as steps, with the area below them."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.plot(place, counts, **style, linewidth=1.0, drawstyle=f"steps-{side}")
+    axes.fill_between(place, counts, step=side, color=style["color"], alpha=0.15, linewidth=0)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
+    axes.set_ylim(0, max(1.0, 1.08 * float(counts.max(initial=0.0))))
 
 
 def largest(values: np.ndarray) -> float:
@@ -112,14 +163,6 @@ def boxes_allowed() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         yield
-
-
-def png(figure: Any, dpi: float = 100) -> bytes:
-    """Return a figure of matplotlib as PNG, with so many pixels per inch."""
-    made = io.BytesIO()
-    with boxes_allowed():
-        figure.savefig(made, format="png", dpi=dpi)
-    return made.getvalue()
 
 
 def opened(result: Path | str | Any) -> Any:
@@ -151,124 +194,125 @@ def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
 
 
 class Chart:
-    """Panels over a common axis, mostly of time, one below the other or in columns.
+    """Panels row by row in a grid, over a common axis unless they have one of their own.
 
     What is drawn is kept in SI units, with all points, and can be written as a table.
 
     Parameters
     ----------
-    time : (n,) [s], or in the unit of the axis
+    panels : None leaves a place empty
     title : of the figure
-    rows, columns : of panels
-    heights : relative heights of the rows
+    time : (n,) [s], or in the unit of the axis
     axis : what the times are
-    sharex : whether all panels have the times as their axis
+    columns : of the grid
+    note : text below the panels
     """
 
     def __init__(
         self,
-        time: np.ndarray,
+        panels: Sequence[Panel | None],
         title: str,
-        rows: int,
-        columns: int = 1,
-        heights: Sequence[float] | None = None,
+        time: np.ndarray,
         axis: Axis = TIME,
-        sharex: bool = True,
+        columns: int = 1,
+        note: str = "",
     ) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        relative = list(heights or [1.0] * rows)
-        size = (_WIDTHS.get(columns, 4.4 * columns), 0.9 + 2.5 * sum(relative))
+        drawn = [panel for panel in panels if panel]
+        heights = [max(p.height for p in panels[k : k + columns] if p) for k in range(0, len(panels), columns)]
+        size = (_WIDTHS.get(columns, 4.4 * columns), 0.9 + 2.5 * sum(heights))
         self.figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(self.figure)
-        self.axes = self.figure.subplots(rows, columns, sharex=sharex, squeeze=False, height_ratios=relative)
+        own = any(panel.over for panel in drawn)
+        grid = self.figure.subplots(
+            len(heights), columns, sharex=False if own else "col", squeeze=False, height_ratios=heights
+        )
+        self.axes = [axes for axes, panel in zip(grid.flat, panels, strict=True) if panel]
         self.figure.suptitle(literal(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color="#1f242c")
-        self.time = np.asarray(time, dtype=float)
-        self.factor, self.unit = prefix_for(float(np.abs(self.time).max()) if self.time.size else 0.0, axis.unit)
-        self._over = axis.label(axis.unit)
+        if note:
+            lines = textwrap.fill(note, int((size[0] - 0.3) / _LETTER))
+            self.figure.supxlabel(literal(lines), x=0.01, ha="left", fontsize=9, color="#5b6472")
+        self.time, self._axis = np.asarray(time, dtype=float), axis
         self._columns: list[tuple[str, np.ndarray, str, np.ndarray]] = []
-        self._scales: dict[str, tuple[float, str]] = {}
-        self._label = axis.label(self.unit)
-        if sharex:
-            for axes in self.axes[-1]:
-                axes.set_xlabel(self._label)
+        sizes: dict[str, list[float]] = {}
+        for panel in drawn:
+            sizes.setdefault(panel.unit, []).append(panel.size)
+            for curve in panel.curves if panel.over else ():
+                sizes.setdefault(panel.over[1], []).append(largest(curve.place))
+        self._scales = {unit: common_prefix(found, unit) for unit, found in sizes.items()}
+        for number, (axes, panel) in enumerate(zip(grid.flat, panels, strict=True)):
+            if panel is None:
+                axes.remove()
+            else:
+                self._draw(axes, panel, lowest=not any(panels[number + columns :: columns]))
 
-    def share(self, quantity: str, unit: str, magnitudes: Iterable[float]) -> None:
-        """Have one unit for a quantity in panels whose largest numbers are the magnitudes."""
-        self._scales[quantity] = common_prefix(magnitudes, unit)
-
-    def scale(self, quantity: str) -> tuple[float, str]:
-        """Return the factor and the unit that panels of a quantity :meth:`share`."""
-        return self._scales[quantity]
-
-    def note(self, text: str) -> None:
-        """Write a text below the panels."""
-        width = int((self.figure.get_figwidth() - 0.3) / _LETTER)
-        lines = "\n".join(textwrap.wrap(text, width))
-        self.figure.supxlabel(literal(lines), x=0.01, ha="left", fontsize=9, color="#5b6472")
-
-    def leave_out(self, places: Iterable[tuple[int, int]]) -> None:
-        """Remove the panels at these places (row, column); the lowest that is left in a column has its numbers."""
-        for place in places:
-            self.axes[place].remove()
-        gone = set(places)
-        for column in range(self.axes.shape[1]):
-            left = [row for row in range(self.axes.shape[0]) if (row, column) not in gone]
-            lowest = self.axes[left[-1], column]
-            lowest.tick_params(labelbottom=True)
-            lowest.set_xlabel(self._label)
-
-    def legend_above(self, axes: Any) -> None:
-        """Put the legend above a panel, beside the title if there is room, so that it hides no curve."""
-        texts = [line.get_label() for line in axes.get_lines() if not line.get_label().startswith("_")]
-        if not texts:
+    def _draw(self, axes: Any, panel: Panel, lowest: bool) -> None:
+        """Draw a panel; only the lowest one of a column has a label of the common axis."""
+        if panel.over is None:
+            along, places = prefix_for(largest(self.time), self._axis.unit), self._axis.label(self._axis.unit)
+            label = self._axis.label(along[1])
+        else:
+            name, unit = panel.over
+            along, places = self._scales[unit], f"{name} [{unit}]" if unit else name
+            label = f"{name.replace('_', ' ')} [{along[1]}]" if unit else name.replace("_", " ")
+        factor, shown = panel.scale or self._scales[panel.unit]
+        above = below = 0.0
+        for number, curve in enumerate(panel.curves):
+            place = self.time if curve.place is None else np.asarray(curve.place, dtype=float)
+            values = np.asarray(curve.values, dtype=float)
+            style = {"color": COLOURS[number % len(COLOURS)], "label": literal(curve.name), **curve.style}
+            if curve.kind in ("area", "band"):
+                every = max(1, len(place) // _POINTS)
+                x, y = place[::every] * along[0], values[::every] * factor
+                style = {"linewidth": 0, **style}
+                if curve.kind == "band":
+                    axes.fill_between(x, y[:, 0], y[:, 1], **style)
+                    continue
+                axes.fill_between(x, above, above := above + np.maximum(y, 0.0), **style)
+                if (y < 0.0).any():
+                    style["label"] = None
+                    axes.fill_between(x, below, below := below + np.minimum(y, 0.0), **style)
+            else:
+                ordered = bool(np.all(np.diff(place) >= 0.0))
+                x, y = thinned(place, values) if ordered else (place, values)
+                style |= {"marker": "o"} if len(x) == 1 else {}  # a line needs two points
+                if curve.kind.startswith("steps"):
+                    _fill_steps(axes, x * along[0], y, "pre" if curve.kind == "steps before" else "post", style)
+                else:
+                    axes.plot(x * along[0], y * factor, **style)
+            heading = f"{curve.key or curve.name} [{panel.unit}]" if panel.unit else curve.key or curve.name
+            over = f"{places}: {curve.source}" if curve.source else places
+            if not any(heading == other and over == before for before, _, other, _ in self._columns):
+                known = np.isfinite(values) if panel.over else slice(None)
+                self._columns.append((over, place[known], heading, np.asarray(curve.values)[known]))
+        axes.set_ylabel(f"{panel.label} [{shown}]" if shown else panel.label)
+        axes.set_title(literal(panel.title))
+        axes.margins(x=0.02 if panel.over else 0.0)
+        if panel.log:
+            axes.set_yscale("log")
+        if lowest or panel.over:
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel(label)
+        if panel.legend == "none" or not axes.get_legend_handles_labels()[0]:
             return
-        title, columns = axes.get_title(loc="left"), self.axes.shape[1]
-        taken = 1.4 * len(title) + sum(len(text) + 5.0 for text in texts)
-        if title and taken * _LETTER > self.figure.get_figwidth() / columns - 0.9:
+        if panel.legend == "beside":
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, handlelength=1.8)
+        else:
+            self._legend_above(axes)
+
+    def scale(self, unit: str) -> tuple[float, str]:
+        """Return the factor and the prefixed unit of all numbers of a unit."""
+        return self._scales[unit]
+
+    def _legend_above(self, axes: Any) -> None:
+        """Put the legend above a panel, beside the title if there is room, so that it hides no curve."""
+        texts = axes.get_legend_handles_labels()[1]
+        title, width = axes.get_title(loc="left"), self.figure.get_figwidth() / self.axes[0].get_gridspec().ncols
+        if title and (1.4 * len(title) + sum(len(text) + 5.0 for text in texts)) * _LETTER > width - 0.9:
             axes.set_title(f"{title}\n")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(texts), handlelength=1.4, borderaxespad=0.1)
-
-    def curves(
-        self, axes: Any, label: str, unit: str, curves: Sequence[Curve], title: str = "", quantity: str = ""
-    ) -> tuple[float, str]:
-        """Draw curves of one unit into a panel, with their legend above; return the factor and unit of its axis.
-
-        The unit is that which panels of the quantity :meth:`share`, or else suits these curves.
-        """
-        sizes = (largest(np.asarray(curve.values)) for curve in curves)
-        factor, shown = self._scales.get(quantity) or prefix_for(max(sizes, default=0.0), unit)
-        for number, curve in enumerate(curves):
-            time, thin = thinned(self.time, np.asarray(curve.values, dtype=float) * factor)
-            options = {"color": COLOURS[number % len(COLOURS)], **curve.style}
-            options |= {"marker": "o"} if len(time) == 1 else {}  # a line needs two points
-            axes.plot(time * self.factor, thin, label=literal(curve.name), **options)
-            self.record(curve.key or curve.name, curve.values, unit)
-        axes.set_ylabel(f"{label} [{shown}]" if shown else label)
-        axes.set_title(literal(title))
-        self.legend_above(axes)
-        return factor, shown
-
-    def counts(self, axes: Any, label: str, values: np.ndarray, colour: str = COLOURS[0], before: bool = False) -> None:
-        """Draw integers (n,) as steps into a panel; those of an interval (``before``) up to its end."""
-        from matplotlib.ticker import MaxNLocator
-
-        time, thin = thinned(self.time, np.asarray(values, dtype=float))
-        self.record(" ".join(label.split()), np.asarray(values))
-        side = "pre" if before else "post"
-        axes.plot(time * self.factor, thin, color=colour, linewidth=1.0, drawstyle=f"steps-{side}")
-        axes.fill_between(time * self.factor, thin, step=side, color=colour, alpha=0.15, linewidth=0)
-        axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
-        axes.set_ylim(0, max(1.0, 1.08 * float(thin.max(initial=0.0))))
-        axes.set_ylabel(label)
-
-    def record(self, name: str, values: np.ndarray, unit: str = "", over: tuple[str, np.ndarray] | None = None) -> None:
-        """Add a column (n,) to the table of the picture, over the times or over other named values (n,)."""
-        along, places = over or (self._over, self.time)
-        heading = f"{name} [{unit}]" if unit else name
-        if not any(heading == other and along == before for before, _, other, _ in self._columns):
-            self._columns.append((along, places, heading, np.asarray(values)))
 
     def save(self, file: Path, formats: Iterable[str] = ("png",)) -> list[Path]:
         """Write the picture, or its table, in formats of :data:`FORMATS`; return the files.

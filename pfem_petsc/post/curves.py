@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.units import TIME, prefix_for, unit_of
+from ..output.units import TIME, unit_of
 from ..registry import nearest
-from .chart import COLOURS, REFERENCE, Chart, largest, legend_beside, literal, thinned
-from .closed_forms import closed_form
+from .chart import COLOURS, REFERENCE, Chart, Curve, Panel, largest
+from .closed_forms import ClosedForm, closed_form
 from .filters import AS_COMPUTED, Filter, amplitude_spectrum
 
 History = Mapping[str, np.ndarray]
 
-_DISPLACEMENT = "/displacement"  # of probes, whose columns have positions
+_DISPLACEMENT = "/displacement"  # of probes, and of the centre of mass
 
 _PEAKS = 5  # of a spectrum, at most, that are told
 
@@ -35,19 +35,12 @@ def words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def make_chart(
-    history: History, title: str, rows: int, columns: int = 1, heights: Sequence[float] | None = None
-) -> Chart:
-    """Return a chart over the times of a history."""
-    axis = getattr(history, "axis", TIME)
-    return Chart(read(history, "time"), title, rows, columns, heights, axis)
-
-
 def column(history: History, name: str) -> dict[str, np.ndarray]:
     """Return the curves (n,) of a name: a column, or ``.x``, ``.y``, ``.z``, ``.norm`` of one.
 
     Columns of nodes are the mean over the nodes, of reactions the sum. A vector without component gives those that are
-    not zero up to rounding. ``probe/NAME/displacement`` is the position relative to that of the first row.
+    not zero up to rounding. ``probe/NAME/displacement`` is the position relative to that of the first row, and
+    ``centre_of_mass/displacement`` that of the centre of mass.
 
     Raises
     ------
@@ -80,9 +73,21 @@ def column(history: History, name: str) -> dict[str, np.ndarray]:
 
 
 def _position(name: str) -> str:
-    """Return the name of the positions that displacements of a probe are made of; others as they are."""
-    is_displacement = name.startswith("probe/") and name.endswith(_DISPLACEMENT)
-    return name.removesuffix(_DISPLACEMENT) + "/position" if is_displacement else name
+    """Return the name of the positions that displacements are made of; others as they are."""
+    if not name.endswith(_DISPLACEMENT):
+        return name
+    return name.removesuffix(_DISPLACEMENT) + ("/position" if name.startswith("probe/") else "")
+
+
+def exact_curves(exact: ClosedForm | None, names: Sequence[str], place: np.ndarray | None = None) -> list[Curve]:
+    """Return the closed forms of curves of :func:`column`, where they are known."""
+    curves: list[Curve] = []
+    for name in names:
+        whole = name if exact is None or name in exact.columns else name.rpartition(".")[0] or name
+        if exact is not None and _position(whole) in exact.columns:
+            values = column(exact.columns, name)[name]
+            curves.append(Curve("" if curves else exact.name, values, REFERENCE, f"{name} closed form", place))
+    return curves
 
 
 def usual_curves(results: Sequence[Any]) -> list[str]:
@@ -97,18 +102,15 @@ def usual_curves(results: Sequence[Any]) -> list[str]:
     for name in common:
         if name.startswith("probe/") and name.endswith("/position"):
             moved = name.removesuffix("/position") + _DISPLACEMENT
-            chosen += [moved] if any(largest_of(column(r.history, moved)) > 0.0 for r in results) else []
+            chosen += (
+                [moved] if any(np.any(np.concatenate([*column(r.history, moved).values()])) for r in results) else []
+            )
     # over load factors, the load factor is a straight line; it is a curve over the points of a path
     paths = "load_factor" in common and results[0].axis is not TIME
     chosen += ["load_factor"] if paths and not all(_is_axis(r.history, "load_factor") for r in results) else []
     if not chosen:
         raise InputError("plot: the results have no columns in common that change; name some as curves")
     return chosen
-
-
-def largest_of(curves: Mapping[str, np.ndarray]) -> float:
-    """Return the largest magnitude of all curves."""
-    return max((largest(values) for values in curves.values()), default=0.0)
 
 
 def _is_axis(history: History, name: str) -> bool:
@@ -132,102 +134,45 @@ def draw_curves(
     chosen : filter of the curves
     closed_forms : whether to draw the closed form of the first result
     """
-    first = results[0]
+    first, labels = results[0], labels_of(results)
     if not names:
         raise InputError("plot: no curves named; columns: " + ", ".join(first.history))
     if len({result.axis for result in results}) > 1 and against is None:
         raise InputError("plot: the results are over different axes: " + ", ".join({r.axis.symbol for r in results}))
-    title, labels = first.case.title or first.case.name, labels_of(results)
     exact = closed_form(first) if closed_forms and against is None else None
-    chart = Chart(
-        np.concatenate([read(result.history, "time") for result in results]),
-        title,
-        len(names),
-        heights=[0.9] * len(names),
-        axis=first.axis,
-    )
-    if against is not None:
-        places = [_single(result.history, against) for result in results]
-        unit = unit_of_curve(against)
-        chart.factor, shown = prefix_for(max(float(np.nanmax(np.abs(p), initial=0.0)) for p in places), unit)
-        over = f"{against} [{unit}]" if unit else against
-        chart.axes[-1, 0].set_xlabel(f"{words(against)} [{shown}]" if shown else words(against))
-    else:
-        places = [read(result.history, "time") for result in results]
-        over = first.axis.label(first.axis.unit)
-    sources = [_Source(*each) for each in zip(results, labels, places, strict=True)]
-    every = [[column(result.history, name) for result in results] for name in names]
-    sizes: dict[str, list[float]] = {}
-    for name, found in zip(names, every, strict=True):
-        sizes.setdefault(unit_of_curve(name), []).append(max(largest_of(curves) for curves in found))
-    for unit, magnitudes in sizes.items():
-        chart.share(unit, unit, magnitudes)
-    for axes, name, found in zip(chart.axes[:, 0], names, every, strict=True):
-        _panel(chart, axes, name, found, sources, over, chosen)
-        if exact is not None:
-            _draw_exact(chart, axes, exact, found[0], places[0])
-        axes.margins(x=0.0 if against is None else 0.02)
-        if len(axes.lines) > 1:
-            legend_beside(axes, handlelength=2.2)
-    return chart
-
-
-class _Source(NamedTuple):
-    """A result, its label, and the places of its rows on the axis (n,)."""
-
-    result: Any
-    label: str
-    place: np.ndarray
+    times = [read(result.history, "time") for result in results]
+    places = times if against is None else [_single(result.history, against) for result in results]
+    shared = all(np.array_equal(place, places[0]) for place in places)
+    over = None if against is None else (against, unit_of_curve(against))
+    panels = []
+    for name in names:
+        found = [column(result.history, name) for result in results]
+        parts = list(dict.fromkeys(part for curves in found for part in curves))
+        curves = []
+        for number, (each, label, time, place) in enumerate(zip(found, labels, times, places, strict=True)):
+            for part, values in each.items():
+                touch = part.startswith(("wall/", "pair/", "constraint/")) and "/force" in part  # zero before the run
+                shown = chosen.apply(time, values, touch) if chosen is not None else values
+                k = number * len(parts) + parts.index(part)
+                style = {"color": COLOURS[k % len(COLOURS)], "linestyle": DASHES[number % len(DASHES)]}
+                words_of = (label if len(found) > 1 else "", part if len(parts) > 1 else "")
+                key = f"{part}: {label}" if len(found) > 1 else part
+                text = " ".join(word for word in words_of if word) or part
+                curves.append(Curve(text, shown, style, key, place, "" if shared else label))
+        curves += exact_curves(exact, list(found[0]), places[0])
+        title = parts[0] if len(parts) == 1 else name  # which component it is
+        title = title if chosen is None or chosen.name == AS_COMPUTED else f"{title}: {chosen.name}"
+        legend = "beside" if len(curves) > 1 else "none"
+        panels.append(
+            Panel(words(name.rsplit("/", 1)[-1]), unit_of_curve(name), curves, title, 0.9, over, None, legend)
+        )
+    return Chart(panels, first.case.title or first.case.name, np.concatenate(times), first.axis)
 
 
 def unit_of_curve(name: str) -> str:
     """Return the SI unit of a column or a component of one."""
-    name = name.replace(_DISPLACEMENT, "/position")
-    return unit_of(name.rpartition(".")[0] or name) or unit_of(name)
-
-
-def _panel(
-    chart: Chart,
-    axes: Any,
-    name: str,
-    found: Sequence[dict[str, np.ndarray]],
-    sources: Sequence[_Source],
-    over: str,
-    chosen: Filter | None,
-) -> None:
-    unit = unit_of_curve(name)
-    axes.pfem_factor, shown = chart.scale(unit)
-    parts = list(dict.fromkeys(part for curves in found for part in curves))
-    several = len(found) > 1
-    shared = all(np.array_equal(source.place, sources[0].place) for source in sources)
-    for number, (curves, (result, label, place)) in enumerate(zip(found, sources, strict=True)):
-        time = read(result.history, "time")
-        for part, values in curves.items():
-            touch = part.startswith(("wall/", "pair/", "constraint/")) and "/force" in part  # zero before the run
-            filtered = chosen.apply(time, values, touch) if chosen is not None else values
-            k = number * len(parts) + parts.index(part)
-            text = " ".join(word for word in (label if several else "", part if len(parts) > 1 else "") if word)
-            x, y = (place, filtered) if over[:4] != "time" else thinned(place, filtered)
-            style = {"color": COLOURS[k % len(COLOURS)], "linestyle": DASHES[number % len(DASHES)]}
-            axes.plot(x * chart.factor, y * axes.pfem_factor, label=literal(text or part), **style)
-            along = over if shared else f"{over}: {label}"
-            chart.record(f"{part}: {label}" if several else part, filtered, unit, (along, place))
-    label = words(name.rsplit("/", 1)[-1])
-    axes.set_ylabel(f"{label} [{shown}]" if shown else label)
-    name = parts[0] if len(parts) == 1 else name  # which component it is
-    axes.set_title(literal(name if chosen is None or chosen.name == AS_COMPUTED else f"{name}: {chosen.name}"))
-
-
-def _draw_exact(chart: Chart, axes: Any, exact: Any, found: dict[str, np.ndarray], place: np.ndarray) -> None:
-    """Add the closed form of the curves of a panel."""
-    for part in found:
-        whole, _, component = part.rpartition(".")
-        values = exact.columns.get(part, exact.columns.get(_position(whole)))
-        if values is None:
-            continue
-        values = column({_position(whole) or part: values}, part)[part]
-        axes.plot(place * chart.factor, values * axes.pfem_factor, label="closed form", **REFERENCE)
-        chart.record(f"{part} closed form", values, unit_of(whole or part), (chart._over, place))
+    whole, _, part = name.rpartition(".")
+    return unit_of(_position(whole if part in ("x", "y", "z", "norm") else name))
 
 
 def _single(history: History, name: str) -> np.ndarray:
@@ -269,43 +214,34 @@ def draw_spectra(
     for result in results:
         if result.axis is not TIME:
             raise InputError(f"{result.path}: spectra need a run over time, not a static analysis")
-    found = []
+    panels = []
     for name in names:
-        curves = {}
+        unit = unit_of_curve(name)
+        curves = []
         for label, result in zip(labels_of(results), results, strict=True):
-            time = read(result.history, "time")
             for part, values in column(result.history, name).items():
                 key = f"{part}: {label}" if len(results) > 1 else part
-                curves[key] = amplitude_spectrum(time, values, window)
-        found.append(curves)
-    end = highest or max(frequency[-1] for curves in found for frequency, _ in curves.values())
+                frequency, amplitude = amplitude_spectrum(read(result.history, "time"), values, window)
+                curves.append(Curve(key, amplitude, place=frequency))
+        label = f"amplitude of\n{words(name.rsplit('/', 1)[-1])}"
+        legend = "beside" if len(curves) > 1 else "none"
+        title = f"{name}, window: {window}"
+        panels.append(Panel(label, unit, curves, title, 1.1, ("frequency", "Hz"), (1.0, unit), legend, log=True))
     title = first.case.title or first.case.name
-    chart = Chart(np.array([0.0, end]), title, len(names), heights=[1.1] * len(names))
-    chart.factor, shown = (1e-3, "kHz") if end >= 2e3 else (1.0, "Hz")
-    chart.axes[-1, 0].set_xlabel(f"frequency [{shown}]")
-    for axes, name, curves in zip(chart.axes[:, 0], names, found, strict=True):
-        unit = unit_of_curve(name)
-        top = 0.0
-        for k, (key, (frequency, amplitude)) in enumerate(curves.items()):
-            inside = (frequency > 0.0) & (frequency <= end)
-            axes.semilogy(
-                frequency[inside] * chart.factor, amplitude[inside], label=literal(key), color=COLOURS[k % len(COLOURS)]
-            )
-            chart.record(key, amplitude, unit, ("frequency [Hz]", frequency))
-            top = max(top, float(amplitude[inside].max(initial=0.0)))
-            if len(curves) == 1:
-                _tell_peaks(axes, frequency[inside], amplitude[inside], chart.factor, shown)
+    chart = Chart(panels, title, np.zeros(1))
+    factor, shown = chart.scale("Hz")
+    for axes, panel in zip(chart.axes, panels, strict=True):
+        end = highest or max(curve.place[-1] for curve in panel.curves)
+        inside = [(curve.place > 0.0) & (curve.place <= end) for curve in panel.curves]
+        top = max(largest(curve.values[part]) for curve, part in zip(panel.curves, inside, strict=True))
+        if len(panel.curves) == 1:
+            _tell_peaks(axes, panel.curves[0].place[inside[0]], panel.curves[0].values[inside[0]], factor, shown)
         if top > 0.0:
             axes.set_ylim(1e-6 * top, 4.0 * top)
-        axes.set_xlim(0.0, end * chart.factor)
+        axes.set_xlim(0.0, end * factor)
         for value in _natural(first):
             if 0.0 < value <= end:
-                axes.axvline(value * chart.factor, color="#6b7280", linewidth=0.8, linestyle=":", zorder=0)
-        label = words(name.rsplit("/", 1)[-1])
-        axes.set_ylabel(f"amplitude of\n{label} [{unit}]" if unit else f"amplitude of\n{label}")
-        axes.set_title(literal(f"{name}, window: {window}"))
-        if len(curves) > 1:
-            legend_beside(axes)
+                axes.axvline(value * factor, color="#6b7280", linewidth=0.8, linestyle=":", zorder=0)
     return chart
 
 

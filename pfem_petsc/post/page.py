@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import math
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..errors import InputError
 from ..output.units import prefix_for, unit_of
-from .camera import Camera
+from .camera import Camera, direction, fit
 from .chart import STYLE, boxes_allowed, largest, literal, thinned
 from .colours import ColourScale, Mark
 from .curves import column
+from .scene import Scene, Style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from PIL import Image
 
+    from ..mesh.whole import WholeMesh
+
 INK, PALE = "#1f242c", "#5b6472"
+_GROUPS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442")
+"""Okabe and Ito: apart for all kinds of colour vision."""
+_OTHERS = "#7a7a7a"
+_COLUMN, _ROW = 3.1, 0.33
+"""Width of a column and height of a row of the legend [inch]."""
+_LETTERS = 16
 _CURVE, _MARKER = "#2563b0", (217, 72, 43)
 
 
@@ -306,32 +318,32 @@ class Inset:
         return np.asarray(image)
 
 
-def inset_room(tile: tuple[int, int], cover: Any, several: bool) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the size of an inset in a tile, and the corner (x, y) where it covers least of what is drawn.
+def inset_room(drawings: Sequence[np.ndarray], several: bool) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the size of an inset, and the corner (x, y) where it covers least of what is drawn.
 
     Parameters
     ----------
-    tile : width and height in pixels
-    cover : function of a corner and a size that returns how much is covered
-    several : whether there are several tiles
+    drawings : some frames of the film
+    several : whether there are several results
 
     Raises
     ------
     InputError
-        If the tile is too narrow.
+        If the frames are too narrow.
     """
-    least = 220
-    if several and tile[0] < least:
+    least, (height, width) = 220, drawings[0].shape[:2]
+    if several and width < least:
         raise InputError(
-            f"render: inset needs tiles of {least} pixels or more, and these have {tile[0]}: give a larger size, or "
+            f"render: inset needs tiles of {least} pixels or more, and these have {width}: give a larger size, or "
             "fewer results"
         )
+    ink = np.mean([(each != each[0, 0]).any(axis=2) for each in drawings], axis=0)
     found = []
     for share in (0.28, 0.25):
-        wide = max(share * tile[0], min((0.5 if several else 1.0) * tile[0], least))
+        wide = max(share * width, min((0.5 if several else 1.0) * width, least))
         room = round(wide), round(0.62 * wide)
-        corners = [(x, y) for y in (0, tile[1] - room[1]) for x in (0, tile[0] - room[0])]
-        found += [(cover(corner, room), room, corner) for corner in corners]
+        for x, y in itertools.product((0, width - room[0]), (0, height - room[1])):
+            found.append((float(ink[y : y + room[1], x : x + room[0]].sum()), room, (x, y)))
     _, room, corner = min(found, key=lambda each: each[0])
     return room, corner
 
@@ -345,3 +357,54 @@ def grid(count: int, aspect: float, room: tuple[int, int]) -> tuple[int, int]:
 
     columns = max(range(1, count + 1), key=lambda columns: (round(drawn_width(columns), 3), -columns))
     return columns, -(-count // columns)
+
+
+def mesh_page(mesh: WholeMesh, size: tuple[int, int] = (1280, 720), view: str = "auto") -> bytes:
+    """Return a picture of a mesh as PNG, with a legend of up to seven bar groups and the size of the mesh.
+
+    Parameters
+    ----------
+    size : in pixels
+    view : ``xy``, ``xz``, ``yz``, ``iso`` or ``auto``
+
+    Raises
+    ------
+    InputError
+        For a mesh without bars, and for an unknown view.
+    """
+    from matplotlib.colors import to_rgb
+    from matplotlib.figure import Figure
+
+    points = mesh.points
+    if len(mesh.bars) == 0 or not np.isfinite(points).all():
+        raise InputError(f"{mesh.source}: {len(mesh.bars)} bars, or coordinates that are not finite: nothing to draw")
+    group = np.full(len(mesh.bars), len(_GROUPS))  # the first one of each bar, the last number for others
+    for k, members in reversed(list(enumerate(mesh.bar_groups.values()))[: len(_GROUPS)]):
+        group[members] = k
+    shown = np.unique(group).tolist() if mesh.bar_groups else []
+    dpi = 100.0 * min(size) / 720.0
+    columns = max(1, round(size[0] / dpi / _COLUMN))
+    legend = round(_ROW * -(-len(shown) // columns) * dpi)
+    room = size[0], max(round(0.9 * size[1]) - legend, 16)
+    bounds = np.array([points.min(axis=0), points.max(axis=0)])
+    camera = fit(points, direction(view, bounds, [], (0.0, 0.0, 1.0)), room[0] / room[1])
+    motion = SimpleNamespace(start=points, bars=mesh.bars, bounds=bounds)
+    palette = np.array([to_rgb(colour) for colour in (*_GROUPS, _OTHERS)])
+    scene = Scene(motion, camera, room, Style(tubes=False, shaded=False), unit=dpi / 100.0)
+    picture = scene.draw(points, (255.0 * palette[group]).astype(np.uint8), camera)
+    scene.close()
+    figure = Figure(figsize=(size[0] / dpi, size[1] / dpi), dpi=dpi, facecolor="white")
+    figure.figimage(picture, 0, round(0.09 * size[1]), origin="upper")
+    span = " x ".join(f"{x:.4g}" for x in bounds[1] - bounds[0])
+    figure.text(0.02, 0.03, f"{len(points):,} nodes, {len(mesh.bars):,} bars, {span} m", fontsize=15, color="#222222")
+    if shown:
+        from matplotlib.lines import Line2D
+
+        names = [n if len(n) <= _LETTERS else f"{n[: _LETTERS - 1]}…" for n in list(mesh.bar_groups)[: len(_GROUPS)]]
+        texts = [names[number] if number < len(names) else "other bars" for number in shown]
+        handles = [Line2D([], [], color=palette[number], linewidth=4) for number in shown]
+        figure.legend(handles, texts, loc="upper center", ncols=columns, fontsize=15, frameon=False)
+    made = io.BytesIO()
+    with boxes_allowed():
+        figure.savefig(made, format="png", dpi=dpi)
+    return made.getvalue()

@@ -1,4 +1,4 @@
-"""Curves of a result's history."""
+"""Curves of a result's history: the usual pictures, or those of named columns."""
 
 from __future__ import annotations
 
@@ -9,14 +9,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.units import TIME
-from .chart import STYLE, Chart, check_formats, opened
-from .closed_forms import closed_form
-from .curves import History, draw_curves, draw_spectra, usual_curves
-from .filters import WINDOWS, Filter, make_filter
-from .forces import draw_force_displacement, draw_forces
-from .histories import draw_energies, draw_momentum, draw_probes, draw_solver
+from ..output.units import TIME, engineering, unit_of
+from .chart import COLOURS, REFERENCE, STYLE, Chart, Curve, Panel, check_formats, largest, opened
+from .closed_forms import ClosedForm, closed_form
+from .curves import History, column, draw_curves, draw_spectra, exact_curves, read, usual_curves, words
+from .filters import AS_COMPUTED, WINDOWS, Filter, make_filter
+
+WINDOW = 0.02  # width of the moving average of forces, relative to the run
+
+_ROUNDING = 1e-9
+"""Change of a curve below which it is constant, relative to the largest number of its unit in the picture."""
+
+_QUANTITIES = ("displacement", "velocity", "reaction")
+"""Of probes that have panels; accelerations in impacts are mostly noise."""
 
 
 @dataclass(frozen=True)
@@ -121,21 +130,25 @@ def _usual(
     result: Any, folder: Path, suffixes: tuple[str, ...], chosen: Filter | None, closed_forms: bool
 ) -> list[Path]:
     """The pictures of a single result."""
-    history: History = result.history
-    case = result.case
-    title = case.title or case.name
+    history, title = result.history, result.case.title or result.case.name
     exact = closed_form(result) if closed_forms else None
-    drawn: dict[str, Chart | None] = {
-        "energies": draw_energies(history, title, exact),
-        "momentum": draw_momentum(history, title, exact) if result.axis is TIME else None,
-        "probes": draw_probes(history, title, exact),
-        "walls": draw_forces(history, "wall", case.every_wall, title, chosen, exact),
-        "pairs": draw_forces(history, "pair", (), title, chosen),
-        "constraints": draw_forces(history, "constraint", (), title, chosen),
-        "force_displacement": draw_force_displacement(result, title, chosen, exact),
-        "solver": draw_solver(history, title),
+    forces = chosen or _usual_filter(history)
+    drawn = {
+        "energies": energies(history, exact),
+        "momentum": momentum(history, exact) if result.axis is TIME else [],
+        "probes": probes(history, exact),
+        "walls": force_panels(result, "wall", forces, exact),
+        "pairs": force_panels(result, "pair", forces),
+        "constraints": force_panels(result, "constraint", forces),
+        "force_displacement": force_displacement(result, forces, exact),
+        "solver": solver(history),
     }
-    written = [path for name, chart in drawn.items() if chart for path in chart.save(folder / name, suffixes)]
+    written = []
+    for name, picture in drawn.items():
+        panels, note, columns = picture if isinstance(picture, tuple) else (picture, "", 1)
+        if panels:
+            chart = Chart(panels, title, read(history, "time"), result.axis, columns, note)
+            written += chart.save(folder / name, suffixes)
     if "csv" in suffixes and hasattr(result, "table"):
         written.append(result.table().to_csv(folder / "history.csv"))
     return written
@@ -146,3 +159,281 @@ def _free(file: Path, suffixes: Sequence[str]) -> Path:
     numbered = (file.with_name(f"{file.name}_{k}") for k in itertools.count(2))
     free = (p for p in itertools.chain([file], numbered) if not any(Path(f"{p}.{s}").exists() for s in suffixes))
     return next(free)
+
+
+def balance_error(history: History) -> np.ndarray | None:
+    """Return the imbalance of stored, lost and supplied energies since the first row, (n,) [J]; None without them."""
+    signs = {**dict.fromkeys((*STORED, *LOST), 1.0), **dict.fromkeys(SUPPLIED, -1.0)}
+    parts = [sign * read(history, name) for name, sign in signs.items() if name in history]
+    if not parts:
+        return None
+    total = np.sum(parts, axis=0)
+    return total - total[0]
+
+
+def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
+    """Stacked stored and lost energies with what was supplied, the terms one by one, and the balance.
+
+    Each picture is panels, and may have a note below them and a number of columns.
+    """
+    error = balance_error(history)
+    if error is None:
+        return [], "", 1
+    held = {name: read(history, name) for name in (*STORED, *LOST, *SUPPLIED) if name in history}
+    most = max(float(np.nanmax(np.abs(values))) for values in held.values())
+    moving = {name: values for name, values in held.items() if np.abs(values).max() > 1e-12 * most}
+    still = [words(name) for name in held if name not in moving]
+    colours = {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(moving)}
+    # supplied energies have no area; negative parts hang below zero
+    areas = [
+        Curve(words(name), values, {"color": colours[name], "alpha": 0.85}, name, kind="area")
+        for name, values in moving.items()
+        if name not in SUPPLIED
+    ]
+    stored = np.sum([values for name, values in held.items() if name not in SUPPLIED], axis=0)
+    supplied = np.sum([np.zeros_like(error), *(held[name] for name in SUPPLIED if name in held)], axis=0)
+    label = "at the start + supplied" if np.any(supplied) else "at the start"
+    ink = {"color": "#1f242c", "linewidth": 1.2}
+    available = Curve(label, stored[0] + supplied - supplied[0], {**ink, "linestyle": (0, (4, 2))})
+    sums = [Curve("_", stored, {**ink, "linewidth": 0.6}, "stored and lost")]
+    sums.append(available._replace(key="at the start and supplied"))
+    lines = [Curve(words(name), values, {"color": colours[name]}, name) for name, values in moving.items()]
+    lines += exact_curves(exact, list(moving))
+    # a share of the largest energy, so that neither a prefix nor a unit hides how small it is
+    worst = float(np.nanmax(np.abs(error))) / (most or 1.0)
+    told = f"at most {worst:.1e}\nof {engineering(most, 'J')}" if worst > 0.0 else "zero"
+    share = (1.0 / most, "") if most > 0.0 else (1.0, "J")
+    balance = Curve(told, error, {"color": COLOURS[1]}, "balance error")
+    panels = [
+        Panel("stored and lost,\nstacked", "J", [*areas, *sums], "", 1.3, legend="beside"),
+        Panel("energy", "J", lines, "", 1.3, legend="beside"),
+        Panel("balance error,\nshare of largest", "J", [balance], "", 0.7, scale=share, legend="beside"),
+    ]
+    return panels, f"Zero throughout: {', '.join(still)}." if still else "", 1
+
+
+def momentum(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
+    """Momentum, angular momentum and the displacement of the centre of mass, without those that do not change."""
+    names = {"momentum": "momentum", "angular_momentum": "angular_momentum"}
+    names["centre_of_mass"] = "centre_of_mass/displacement"
+    panels = {}
+    for source, name in names.items():
+        if source in history:
+            label = "centre of mass,\nmoved by" if name != source else words(name)
+            panels[label] = _vector(history, name, label, exact)
+    scales = {}
+    if len(panels) == 3:
+        arm = np.linalg.norm(read(history, "centre_of_mass"), axis=1)
+        scales["angular momentum"] = largest(arm * np.linalg.norm(read(history, "momentum"), axis=1))
+    shown, note = _moving(panels, scales)
+    return (shown if any(panel.size > 0.0 for panel in shown) else []), note, 1
+
+
+def probes(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel | None], str, int]:
+    """Displacement, velocity and reaction of each probe, a row each, without those that do not change."""
+    found = {name.removeprefix("probe/").rpartition("/")[0]: None for name in history if name.startswith("probe/")}
+    panels, scales = {}, {}
+    for probe, quantity in itertools.product(found, _QUANTITIES):
+        source = f"probe/{probe}/{'position' if quantity == 'displacement' else quantity}"
+        if source not in history:
+            continue
+        key, values = f"{quantity} of {probe}", read(history, source)
+        count = values.shape[1]
+        panel = _vector(history, f"probe/{probe}/{quantity}", quantity, exact)
+        panel.title = f"{probe}, {'sum' if quantity == 'reaction' else 'mean'} of {count} nodes" if count > 1 else probe
+        if quantity == "displacement":
+            scales[key] = 1e-3 * largest(values)
+            values = values - values[:1]
+        if count > 1 and quantity != "reaction":
+            for curve in list(panel.curves)[: len(column(history, f"probe/{probe}/{quantity}"))]:
+                part = values[:, :, "xyz".index(curve.name)]
+                bounds = np.stack([part.min(axis=1), part.max(axis=1)], axis=1)
+                panel.curves.append(Curve("", bounds, {"color": curve.style["color"], "alpha": 0.15}, kind="band"))
+        panels[key] = panel
+    shown, note = _moving(panels, scales)
+    if any(curve.kind == "band" for panel in shown for curve in panel.curves):
+        note = f"Shaded: the range of the nodes. {note}".strip()
+    if len(found) < 2 or len(shown) < 3:
+        return shown, note, 1
+    keys = {(panel.title.partition(",")[0], panel.label): panel for panel in shown}
+    rows, columns = (list(dict.fromkeys(names)) for names in zip(*keys, strict=True))
+    return [keys.get(place) for place in itertools.product(rows, columns)], note, len(columns)
+
+
+def _vector(history: History, name: str, label: str, exact: ClosedForm | None) -> Panel:
+    """Return the panel of the components of a column that are not zero."""
+    curves = []
+    for part, values in column(history, name).items():
+        curves.append(Curve(part[-1], values, {"color": COLOURS["xyz".index(part[-1])]}, part))
+    curves += exact_curves(exact, [curve.key for curve in curves])
+    return Panel(label, unit_of("position" if "displacement" in name else name), curves)
+
+
+def _moving(panels: dict[str, Panel], scales: dict[str, float]) -> tuple[list[Panel], str]:
+    """Return the panels whose curves change, or all if none does, and a note that names the others.
+
+    Rounding is relative to the largest number of the unit, or to the ``scales`` of numbers that values are
+    differences of.
+    """
+    shown, still = [], []
+    for name, panel in panels.items():
+        scale = max([scales.get(name, 0.0), *(other.size for other in panels.values() if other.unit == panel.unit)])
+        curves = [np.nan_to_num(curve.values) for curve in panel.curves]
+        if max(float(np.ptp(values, axis=0).max()) for values in curves) > _ROUNDING * scale:
+            shown.append(panel)
+        else:
+            means = {curve.name: float(np.mean(curve.values)) for curve in panel.curves if curve.name in tuple("xyz")}
+            parts = ", ".join(f"{part} = {mean:.4g}" for part, mean in means.items() if abs(mean) > _ROUNDING * scale)
+            still.append(f"{name} ({parts} {panel.unit})" if parts else f"{name} (zero)")
+    if not shown:
+        return list(panels.values()), ""
+    return shown, f"Constant: {', '.join(still)}." if still else ""
+
+
+def solver(history: History) -> list[Panel]:
+    """The iterations of the steps, and the nodes in contact where no other picture has them."""
+    labels = {"newton_iterations": "Newton\niterations", "linear_iterations": "linear\niterations"}
+    labels["active_contacts"] = "nodes in\ncontact"
+    names = [name for name in labels if name in history]
+    # without iterations (explicit schemes) or without walls these panels would be empty
+    contacts = [name for name in history if name.startswith("wall/") and name.endswith("/contacts")]
+    names = [name for name in names if (contacts and name == "active_contacts") or np.any(history[name])]
+    single = len(contacts) == 1 and np.array_equal(history[contacts[0]], history["active_contacts"])
+    if names == ["active_contacts"] and single:  # which is in the picture of the walls
+        return []
+    panels = []
+    for name in names:
+        kind = "steps before" if name.endswith("_iterations") else "steps"
+        curve = Curve("", history[name], {"color": COLOURS[len(panels)]}, " ".join(labels[name].split()), kind=kind)
+        panels.append(Panel(labels[name], "", [curve], height=0.7, legend="none"))
+    return panels
+
+
+def force_panels(
+    result: Any, source: str, smoothing: Filter, exact: ClosedForm | None = None
+) -> tuple[list[Panel], str, int]:
+    """The forces of all walls, or of all pairs or constraints, and the nodes in contact where they are counted.
+
+    Forces are drawn as computed and filtered; before the run, they are zero. Those of none have a panel only if all do.
+    """
+    history, panels = result.history, []
+    names = [name.removeprefix(f"{source}/").removesuffix("/force") for name in history if name.endswith("/force")]
+    names = [name for name in names if f"{source}/{name}/force" in history]
+    felt = [name for name in names if np.any(history[f"{source}/{name}/force"])]
+    normals = {wall.name: wall.normal for wall in result.case.every_wall if hasattr(wall, "normal")}
+    for name in felt or names:
+        key, heading = f"{source}/{name}/force", f"{source.capitalize()} '{name}'"
+        # pairs and constraints may have the name of a wall
+        normal = normals.get(name) if source == "wall" else None
+        values, label = _pressing(read(history, key), normal)
+        forms = {AS_COMPUTED: (values, 0.9)}
+        if felt:
+            forms.setdefault(smoothing.name, (smoothing.apply(read(history, "time"), values, True), 1.6))
+        for form, (drawn, width) in forms.items():
+            curves = [Curve(form, drawn, {"linewidth": width}, f"{key} {label}, {form}")]
+            if exact is not None and key in exact.columns:
+                known = _pressing(exact.columns[key], normal)[0]
+                curves.append(Curve(exact.name, known, REFERENCE, f"{key} closed form"))
+            panels.append(Panel(label, "N", curves, heading, 0.9))
+            heading = ""
+        if felt and f"{source}/{name}/contacts" in history:
+            counts = history[f"{source}/{name}/contacts"]
+            curve = Curve("", counts, {"color": COLOURS[1]}, f"{source}/{name}/contacts", kind="steps")
+            panels.append(Panel("nodes in\ncontact", "", [curve], height=0.5, legend="none"))
+    silent = [f"'{name}'" for name in names if felt and name not in felt]
+    return panels, f"No force throughout: {', '.join(silent)}." if silent else "", 1
+
+
+def force_displacement(result: Any, smoothing: Filter, exact: ClosedForm | None = None) -> list[Panel]:
+    """What resists over how far it was pressed.
+
+    A static analysis: the load factor over the displacement of each probe along the direction in which it moved
+    farthest. Each wall with a normal and a force, while it is touched: the normal force over the displacement, since
+    the first contact, of the wall along its normal, or, of a wall at rest, of the centre of mass towards it. Both have
+    passed the filter, so that neither is late.
+    """
+    panels = []
+    if "load_factor" in result.history and result.axis is not TIME:
+        panels += _load_paths(result.history, exact)
+    for wall in result.case.every_wall:
+        if hasattr(wall, "normal") and np.any(result.history.get(f"wall/{wall.name}/force", 0.0)):
+            panels += _wall_path(result.history, wall, smoothing, exact)
+    return panels
+
+
+def _path(curves: list[Curve], label: str, unit: str, heading: str, over: str) -> Panel:
+    few = {"marker": "o", "markersize": 3} if len(curves[0].place) < 80 else {}
+    curves[0] = curves[0]._replace(style={"color": COLOURS[0], **few}, key=f"{heading} {label}, {curves[0].name}")
+    for k, curve in enumerate(curves[1:], start=1):
+        curves[k] = curve._replace(style=REFERENCE, key=f"{heading} {label}, closed form", source="closed form")
+    return Panel(label, unit, curves, heading, over=(over, "m"))
+
+
+def _load_paths(history: History, exact: ClosedForm | None) -> list[Panel]:
+    panels = []
+    for name in history:
+        if name.startswith("probe/") and name.endswith("/position"):
+            moved = read(history, name).mean(axis=1)
+            moved = moved - moved[0]
+            k = int(np.argmax(np.abs(moved).max(axis=0)))
+            sign = -1.0 if moved[np.argmax(np.abs(moved[:, k])), k] < 0.0 else 1.0
+            if not np.any(moved[:, k]):
+                continue
+            curves = [Curve(AS_COMPUTED, read(history, "load_factor"), place=sign * moved[:, k])]
+            if exact is not None and exact.path is not None:
+                curves.append(Curve(exact.name, exact.path[1], place=exact.path[0]))
+            heading = f"Probe '{name.removeprefix('probe/').removesuffix('/position')}'"
+            over = f"displacement along {'−' if sign < 0 else ''}{'xyz'[k]}"
+            panels.append(_path(curves, "load factor", "", heading, over))
+    return panels
+
+
+def _wall_path(history: History, wall: Any, smoothing: Filter, exact: ClosedForm | None) -> list[Panel]:
+    key, place = f"wall/{wall.name}/force", f"wall/{wall.name}/position"
+    normal, time = np.asarray(wall.normal, dtype=float) / np.linalg.norm(wall.normal), read(history, "time")
+    force, sign, over = read(history, key) @ normal, 1.0, "displacement of the wall since contact"
+    if place not in history or not np.any(np.ptp(read(history, place), axis=0) > 0.0):
+        place, sign, over = "centre_of_mass", -1.0, "displacement of the centre of mass since contact"
+    if place not in history:
+        return []
+    moved = smoothing.apply(time, sign * read(history, place) @ normal)
+    smooth = smoothing.apply(time, force, True)
+    shown, begin = _touching(force, smooth)
+    values = np.where(_near(force, smooth), smooth, np.nan)[shown]
+    curves = [Curve(smoothing.name, values, place=(moved - moved[begin])[shown])]
+    if exact is not None and sign < 0.0 and {key, place} <= set(exact.columns):
+        force, moved = exact.columns[key] @ normal, -exact.columns[place] @ normal
+        shown, begin = _touching(force, force)
+        curves.append(Curve(exact.name, force[shown], place=(moved - moved[begin])[shown]))
+    return [_path(curves, "normal force", "N", f"Wall '{wall.name}'", over)]
+
+
+def _near(force: np.ndarray, smooth: np.ndarray) -> np.ndarray:
+    """Return which rows (n,) bool have a force as computed or filtered, or are beside such a row."""
+    felt = (force != 0.0) | (np.abs(smooth) > 1e-3 * largest(smooth))
+    near = felt.copy()
+    near[:-1] |= felt[1:]
+    near[1:] |= felt[:-1]
+    return near
+
+
+def _touching(force: np.ndarray, smooth: np.ndarray) -> tuple[slice, int]:
+    """Return the rows from before the first force to after the last one, and the last row before the first force."""
+    near = np.flatnonzero(_near(force, smooth))
+    return slice(near[0], near[-1] + 1), max(0, int(np.flatnonzero(force)[0]) - 1)
+
+
+def _usual_filter(history: History) -> Filter:
+    time = read(history, "time")
+    # of a window shorter than the interval of the rows, nothing would be left of a spike
+    width = max(WINDOW * float(time[-1] - time[0]), float(np.diff(time).max(initial=0.0)))
+    if getattr(history, "axis", TIME) is not TIME or width <= 0.0:
+        return make_filter("none")
+    return make_filter(f"mean:{width!r}")
+
+
+def _pressing(force: np.ndarray, normal: Sequence[float] | None) -> tuple[np.ndarray, str]:
+    """Return the force (n,) along a normal, or its length, and what it is."""
+    if normal is None:
+        return np.linalg.norm(force, axis=1), "force"
+    return force @ np.asarray(normal, dtype=float) / np.linalg.norm(normal), "normal force"

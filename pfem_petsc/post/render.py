@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..parallel.agreement import agreed
-from .camera import Camera, Moves, at_one_scale
+from .camera import Moves, at_one_scale
 from .chart import opened
 from .colours import MARKS, ColourField, ColourScale, limits_of
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_times
@@ -344,7 +344,12 @@ class Film:
         self._prepare(size, tile)
         self._insets: list[Inset] = []
         if self.options.inset is not None:
-            room, self._corner = inset_room(tile, lambda corner, room: self._covered(tile, corner, room), several)
+            shown = [
+                self._draw(k, number)
+                for k in range(len(self.motions))
+                for number in {0, self.count // 2, self.count - 1}
+            ]
+            room, self._corner = inset_room(shown, several)
             results = [motion.result for motion in self.motions]
             self._insets = [Inset(results, k, self.options.inset, room) for k in range(len(results))]
 
@@ -413,25 +418,6 @@ class Film:
         look, points = self.options.moves.cameras(motion, 1.0)[0], motion.surroundings
         across, along = (float(np.ptp(points @ way)) for way in (look.right, look.up))
         return across / max(along, 1e-3 * across, 1e-300)
-
-    def _covered(self, tile: tuple[int, int], corner: tuple[int, int], room: tuple[int, int]) -> float:
-        """Return how much of the bars is in a part of a tile over the film, and a little for each wall that is."""
-
-        def places(points: np.ndarray, camera: Camera) -> np.ndarray:
-            return np.stack(camera.project(points, tile)[:2], axis=1)
-
-        low, high, covered = np.array(corner), np.add(corner, room), 0.0
-        for motion, cameras in zip(self.motions, self._cameras, strict=True):
-            for number in np.unique(np.linspace(0, self.count - 1, 7).astype(int)):
-                frame = motion.frames[number]
-                ends = motion.positions(frame)[motion.bars]
-                along = [ends[:, 0] + part * (ends[:, 1] - ends[:, 0]) for part in (0.0, 0.3, 0.6)]
-                bars = places(np.concatenate(along), cameras[number])
-                covered += float(((bars > low) & (bars < high)).all(axis=1).mean())
-                for surface in motion.surfaces[frame]:
-                    wall = places(np.asarray(surface.points), cameras[number])
-                    covered += 1e-3 * bool(((wall.min(axis=0) < high) & (wall.max(axis=0) > low)).all())
-        return covered
 
 
 def _nothing(text: str) -> None:
@@ -529,7 +515,7 @@ def _save(picture: np.ndarray, file: Path) -> Path:
 
     try:
         # fast compression, because a film has hundreds of frames
-        Image.fromarray(picture).save(file, compress_level=3)
+        Image.fromarray(picture).save(file, compress_level=1)
     except OSError as error:
         raise InputError(f"{file}: the picture cannot be written ({error}); give another folder") from error
     return file

@@ -19,8 +19,7 @@ from ..errors import InputError
 from ..output.layout import EVENT, MODE_VALUES
 from ..output.result import peak_force, touch_impulse
 from ..output.units import engineering, prefix_for
-from .histories import balance_error
-from .plot import plot
+from .plot import balance_error, plot
 
 NAME = "report.html"
 POSTER_FRAMES = 6

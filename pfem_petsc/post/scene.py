@@ -27,6 +27,7 @@ VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 
 _LIGHT = np.array([-0.4, 0.7, 1.0]) / np.linalg.norm([-0.4, 0.7, 1.0])  # right, up, to the eye
 _AMBIENT, _DIFFUSE, _SPECULAR = 0.42, 0.66, 0.35
+_GL_BLEND = 0x0BE2
 _ROUND = 2.5  # pixels: radius from which a bar has a round surface; thinner ones are flat, with a shade across
 _MOST_PIXELS = (1.5e6, 1e7)  # up to which 3 x 3 (small models) and 2 x 2 pixels are averaged to one
 
@@ -90,7 +91,7 @@ def require_rendering() -> None:
 
 def few_threads() -> None:
     """Have the software renderer use one thread in this process and those that it starts, if no window is open yet."""
-    os.environ.setdefault("LP_NUM_THREADS", "1")
+    os.environ.setdefault("LP_NUM_THREADS", "0")  # in the thread that draws
 
 
 class _Mesh(NamedTuple):
@@ -349,6 +350,8 @@ class Scene:
         self._light = pyvista.Light(light_type="scene light")
         self._plotter.add_light(self._light)
         self._plotter.renderer.SetUseOIT(False)  # walls are drawn in their order
+        # a third of the time of a frame is blending, which only walls need; they are drawn last
+        self._plotter.renderer.AddObserver("StartEvent", self._without_blending)
         self._plotter.background_color = "black" if transparent else "white"
         self._channels = 4 if transparent else 3
         if transparent:  # colours over nothing are multiplied by their opacity
@@ -381,6 +384,9 @@ class Scene:
             np.maximum.at(radius, self._bars[:, end], self._radius)
         kind = "round" if len(used) <= FEW else "rough"
         return Segments(self._plotter, np.stack([used, used], axis=1), kind, False), used, 1.2 * radius[used]
+
+    def _without_blending(self, *_: Any) -> None:
+        self._plotter.render_window.GetState().vtkglDisable(_GL_BLEND)
 
     def close(self) -> None:
         """Give the window back."""
@@ -436,9 +442,9 @@ class Scene:
         made = vtkUnsignedCharArray()
         read = window.GetPixelData if self._channels == 3 else window.GetRGBACharPixelData
         read(0, 0, width - 1, height - 1, 0, made, 0)
-        picture = pyvista.convert_array(made).reshape(height, width, self._channels)[::-1]
-        # reduced as plain channels, because they are multiplied by the opacity already
-        image = Image.fromarray(np.ascontiguousarray(picture), "RGB" if self._channels == 3 else "CMYK")
+        # reduced as plain channels, because they are multiplied by the opacity already; rows are from below
+        mode = "RGB" if self._channels == 3 else "CMYK"
+        image = Image.frombuffer(mode, (width, height), pyvista.convert_array(made), "raw", mode, 0, -1)
         return np.array(image.reduce(self._factor))
 
     def view(self, camera: Camera, least: float, fades: bool = False) -> _View:
@@ -503,6 +509,7 @@ def add_wall(plotter: Any, surface: Surface, points: np.ndarray, strength: int, 
     towards : (3,), the direction to the eye: polygons are drawn from the farthest to the nearest
     """
     import pyvista
+    from vtkmodules.vtkRenderingCore import vtkPolyDataMapper
 
     faces = np.asarray(surface.faces)
     order = np.argsort((points @ towards)[faces].mean(axis=1), kind="stable")
@@ -512,6 +519,12 @@ def add_wall(plotter: Any, surface: Surface, points: np.ndarray, strength: int, 
     options: dict[str, Any] = {"reset_camera": False, "render": False, "lighting": False}
     actor = plotter.add_mesh(mesh, scalars="shade", rgb=True, preference="point", **options)
     actor.ForceTranslucentOn()
+    state = plotter.render_window.GetState()
+    mapper = vtkPolyDataMapper()  # that of pyvista passes no events on
+    mapper.ShallowCopy(actor.mapper)
+    mapper.SetInputData(mesh)
+    mapper.AddObserver("UpdateShaderEvent", lambda *_: state.vtkglEnable(_GL_BLEND))
+    actor.SetMapper(mapper)
     return actor
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..statics.bordered import names_motions
+from ..statics.stability import names_motions
 from .forecast import memory_warning
 from .geometry import Geometry
 from .values import far_points, odd_numbers

@@ -13,8 +13,8 @@ Where the data are stored:
 - Arrays of the stepper: contacts with walls, nodes in contact in the last step, positions of the lagged preconditioner.
 - Numbers of the stepper: level of bisection, part and smallest part of the step, counts of the lagged preconditioner.
 - Arrays of the bars: data of the laws, thermal strains, rest lengths, history of the lagged preconditioner.
-- ``free_walls``: walls with mass, including their last increment. Forces of constraints: arrays of their rows. Forces
-  of pairs and which of them are closed: arrays at their second nodes.
+- ``free_walls``: walls with mass, including their last increment. Forces of pairs and
+  constraints, and which of them are closed: arrays of their rows; with rows that come and go, the rows themselves.
 - ``ranks``: works and energies. Recorder: energy at the start, largest energy, iterations since the last row.
   ``blow_up``: suspicious rows, energy input, energies of the first row. Contact log: contact times and impulses.
 - Attributes (plan): time step and linear solver.
@@ -98,6 +98,7 @@ class RunState:
             "time": stepper.state.time,
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
             **{name: kept for name, kept in history.items() if name != "row"},
+            **self.model.links.numbers(),
             "free_walls": self.model.contact.motion.bodies.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
             "row": history["row"],
@@ -142,7 +143,7 @@ class RunState:
         bars = NaturalOrder(self.comm, np.arange(mine.first, mine.first + mine.count), self.mesh.n_bars)
         orders = dict.fromkeys(scalars["node_arrays"], self.mesh.node_order)
         orders |= dict.fromkeys(scalars["bar_arrays"], bars)
-        return orders | {name: order for name, (order, _) in self.model.links.arrays().items()}
+        return orders | self.model.links.orders(scalars.get("rows"))
 
     def _load_state(self, scalars: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         stepper, state, owned = self.stepper, self.stepper.state, self.mesh.n_owned

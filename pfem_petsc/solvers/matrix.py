@@ -187,7 +187,9 @@ class HessianMatrix:
         return self.mat
 
     def couple(self, links: Iterable) -> None:
-        """Set the coordinates of links (``contact.transform.RowCoordinates``) for steps with bounds. Collective."""
+        """Set the coordinates of links (``contact.transform.RowCoordinates``) for steps with bounds, instead of those
+        set before. Collective."""
+        self._free_chain()
         for link in links:
             matrix = link.matrix()
             if not self._chain:
@@ -278,11 +280,16 @@ class HessianMatrix:
         _constrain_rows(p.ptr, p.diagonal, held, scale, values)
         _constrain_columns(p.ptr, self.local_columns, p.diagonal, held, values)
 
-    def destroy(self) -> None:
-        """Free the PETSc matrices."""
+    def _free_chain(self) -> None:
         for _, matrix, product in self._chain:
             product.destroy()
             matrix.destroy()
+        self._chain.clear()
+        self.bounded = self.mat
+
+    def destroy(self) -> None:
+        """Free the PETSc matrices."""
+        self._free_chain()
         self.mat.destroy()
 
 

@@ -186,6 +186,12 @@ class NewtonSolver:
             words = re.split(r"\[\d+\]", str(error))[-1].strip()
             raise InputError(f"options after --: PETSc rejects an option of the solvers: {words}") from error
 
+    def forget_bounded(self) -> None:
+        """Free the solvers of steps with bounds, whose matrix has changed; the next step creates others. Collective."""
+        for key in [key for key in self._solvers if key[0]]:
+            self._solvers.pop(key).destroy()
+            self._ours.pop(key, None)
+
     def destroy(self) -> None:
         """Free the PETSc objects."""
         for snes in self._solvers.values():

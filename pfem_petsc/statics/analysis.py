@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..analysis import Analysis
+from ..analysis import Analysis, PlanAtRest, refuse_motion
 from ..errors import InputError
-from ..integrators.base import Scheme
 from ..mechanics.materials.base import law_name, law_of
-from ..output.units import LOAD_FACTOR, POINT, Axis
+from ..output.units import LOAD_FACTOR, POINT
 from ..registry import lookup
 from ..solvers.background_grid import fills_block
 from ..solvers.linear import Demand, LinearChoice, choose_linear
-from ..tolerances import TIME
 
 if TYPE_CHECKING:
-    from ..case.schema import Case
     from ..stepping.model import Model
 
-__all__ = ["METHODS", "StaticAnalysis", "StaticPlan"]
+__all__ = ["METHODS", "StaticAnalysis"]
 
 METHODS = "pfem_petsc.statics.methods"
 NEVER = 2**62
@@ -30,42 +27,6 @@ NEVER = 2**62
 _DIRECT_UP_TO = 30_000  # unknowns; beyond, multigrid takes less time and memory than a factorisation
 # 101,376 octet bars that yield: up to 300 conjugate gradient iterations a Newton step, and none that converges at 2 %
 _DIRECT_YIELDING_UP_TO = 200_000
-
-
-@dataclass(frozen=True)
-class StaticPlan:
-    """The plan of a static run.
-
-    Attributes
-    ----------
-    scheme : the balance without inertia
-    step : first increment of the load factor
-    end : last load factor, or largest number of points
-    linear : linear solver
-    steps : largest number of steps, None where it is not known before
-    axis : of the times in the results
-    """
-
-    scheme: Scheme
-    step: float
-    end: float | None
-    linear: LinearChoice
-    steps: int | None = None
-    axis: Axis = LOAD_FACTOR
-
-    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Return which of the recorded steps and times are beyond the end."""
-        return times > (np.inf if self.end is None else self.end * (1.0 + TIME))
-
-    def entries(self, case: Case) -> dict[str, str]:
-        """Return label and text of a summary for the user before a run."""
-        given = case.static.parameters.model_dump(exclude_none=True)
-        words = ", ".join(f"{key} = {value}" for key, value in given.items())
-        return {"static analysis": f"{case.static.method} ({words})"}
-
-    def record(self) -> dict[str, Any]:
-        """Return the numbers that a restart must not compute again."""
-        return {}
 
 
 class StaticAnalysis(Analysis):
@@ -90,10 +51,17 @@ class StaticAnalysis(Analysis):
         choice = _linear(model)
         self.step_size = parameters.step
         self.stepper = lookup(METHODS, case.static.method, "static.method").make_stepper(model, parameters, choice)
-        scheme, end = self.stepper.scheme, self.stepper.end
         points = getattr(parameters, "max_points", None)
-        axis = LOAD_FACTOR if points is None else POINT
-        self.plan = StaticPlan(scheme, parameters.step, end, choice, points, axis)
+        words = ", ".join(f"{key} = {value}" for key, value in parameters.model_dump(exclude_none=True).items())
+        self.plan = PlanAtRest(
+            self.stepper.scheme,
+            LOAD_FACTOR if points is None else POINT,
+            {"static analysis": f"{case.static.method} ({words})"},
+            parameters.step,
+            self.stepper.end,
+            choice,
+            points,
+        )
 
     @property
     def last_step(self) -> int:
@@ -127,13 +95,7 @@ def _check(model: Model) -> None:
     """Refuse features that need time."""
     case = model.case
     source = case.source
-    if any(any(entry.velocity) or any(entry.angular_velocity) for entry in case.initial):
-        raise InputError(f"{source}: initial: a static analysis has no velocities; remove the table [initial]")
-    if case.contact.treatment != "scheme":
-        raise InputError(
-            f'{source}: contact.treatment = "{case.contact.treatment}" treats impacts, and a static analysis has none; '
-            "remove the key"
-        )
+    refuse_motion(case, "a static analysis")
     if model.bars.springs is not None and case.static.method != "newton":
         raise InputError(
             f'{source}: spring: static.method = "{case.static.method}" does not support springs to the ground; '

@@ -7,9 +7,9 @@ located by regula falsi with bisection over the length from the last point; each
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -17,8 +17,7 @@ import numpy as np
 from ..errors import NotConverged
 
 if TYPE_CHECKING:
-    from ..integrators.base import State
-    from .path_points import Constraint, Direction, Metric, Point, PointSolver
+    from .path_points import ArcControl, Point, PointSolver
 
 KINDS = {"limit": 0, "bifurcation": 1}
 EVENTS: dict[str, Any] = {
@@ -68,27 +67,6 @@ class Event:
         return f"{what} at load factor {self.load_factor:.9g}{where}, before point {self.step}"
 
 
-class Path(Protocol):
-    """What the search needs of a path, see :class:`~pfem_petsc.statics.path_stepper.PathStepper`."""
-
-    state: State
-    slope: float
-    negatives: int
-    number: int
-    bifurcations: int
-    metric: Metric
-    direction: Direction | None
-    points: PointSolver
-
-    def constraint(self, size: float) -> Constraint: ...
-
-    def measure(self, point: Point) -> float: ...
-
-    def rate(self, point: Point) -> float: ...
-
-    def turns_at(self, number: int, point: Point, multiplicity: int) -> bool: ...
-
-
 class _End(NamedTuple):
     """An end of an interval: length, slope, and number of negative eigenvalues."""
 
@@ -113,46 +91,54 @@ class _Interval(NamedTuple):
         return self.second.negatives - self.first.negatives if known else 0
 
 
+class Critical(NamedTuple):
+    """A critical point that was located: its kind, and the number of eigenvalues that change sign."""
+
+    kind: str
+    point: Point
+    multiplicity: int
+
+
 class CriticalPoints:
-    """The critical points between the state of a path and a point, in order. Construction is collective.
+    """The search for critical points between two points of a path. Methods are collective.
 
-    Attributes
+    Parameters
     ----------
-    events : what was found
-    turn : the point at which the path branches off, None if it does not
-
-    Raises
-    ------
-    NotConverged
-        On all ranks, if one cannot be located between state and point: the point may lie on another path.
+    points : PointSolver, begun at the first point
+    control : by which points are asked for
+    first, last : the points
     """
 
-    def __init__(self, stepper: Path, last: Point) -> None:
-        self.stepper, self.last = stepper, last
-        self.size = stepper.measure(last)
-        tangent, slope = stepper.state.memory["tangent"], stepper.slope
-        here = stepper.state.time
-        self._start = replace(last, u=np.zeros_like(last.u), load_factor=here, tangent=tangent, slope=slope)
-        self.events: list[Event] = []
-        self.turn: Point | None = None
-        start = _End(0.0, slope, stepper.negatives)
-        self._look(_Interval(start, _End(self.size, last.slope, last.negatives)), 0)
+    def __init__(self, points: PointSolver, control: ArcControl, first: Point, last: Point) -> None:
+        self.points, self.control, self.first, self.last = points, control, first, last
+        self.size = control.measure(last)
 
-    def _look(self, interval: _Interval, depth: int) -> None:
-        """Find the critical points of an interval, starting from its first end."""
-        if self.turn is not None or not (interval.turned or interval.change):
+    def __iter__(self) -> Iterator[Critical]:
+        """Locate the critical points in their order.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks, if one cannot be located between the points: the last may lie on another path.
+        """
+        ends = (_End(0.0, self.first.slope, self.first.negatives), self._end(self.last))
+        yield from self._look(_Interval(*ends), 0)
+
+    def _look(self, interval: _Interval, depth: int) -> Iterator[Critical]:
+        """Locate the critical points of an interval, starting from its first end."""
+        if not (interval.turned or interval.change):
             return
         first, second = interval
         limit = abs(interval.change) == 1 or first.negatives < 0
         if interval.turned and (limit or depth == _DEPTH):
             # the load factor turns without a change of sign of an eigenvalue where two paths meet
             point = self._locate(interval, lambda point: point.slope, _FLAT)
-            self._note("limit" if limit else "bifurcation", point, max(abs(interval.change), 1))
+            yield Critical("limit" if limit else "bifurcation", point, max(abs(interval.change), 1))
             return
         if interval.turned:
             middle = self._end(self._at(0.5 * (first.size + second.size)))
-            self._look(_Interval(first, middle), depth + 1)
-            self._look(_Interval(middle, second), depth + 1)
+            yield from self._look(_Interval(first, middle), depth + 1)
+            yield from self._look(_Interval(middle, second), depth + 1)
             return
         before = first.negatives
 
@@ -161,15 +147,15 @@ class CriticalPoints:
 
         tried: list[tuple[float, float]] = []
         try:
-            size = self.stepper.measure(self._locate(interval, distance, 0.0, tried))
+            size = self.control.measure(self._locate(interval, distance, 0.0, tried))
         except NotConverged:
             size = self._between(interval, distance, tried)
         beyond = self._at(size + _BESIDE * self.size)
         many = abs(beyond.negatives - before) or 1
-        self._note("bifurcation", self._crossing(size, beyond), many)
+        yield Critical("bifurcation", self._crossing(size, beyond), many)
         end = self._end(beyond)._replace(negatives=before + (many if second.negatives > before else -many))
         if end.size < second.size:
-            self._look(_Interval(end, second), depth + 1)
+            yield from self._look(_Interval(end, second), depth + 1)
 
     def _between(self, interval: _Interval, value: Callable[[Point], float], tried: list[tuple[float, float]]) -> float:
         """Return the zero of a value by inverse interpolation of trials (length, value).
@@ -201,34 +187,22 @@ class CriticalPoints:
         At the bifurcation itself, neither the position along the mode nor the tangent of the path is well determined.
         """
         low = size - _BESIDE * self.size
-        before = self._at(low) if low > _BESIDE * self.size else self._start
-        low = max(low, 0.0) if before is not self._start else 0.0
-        u, load_factor, tangent, slope = self._cubic(before, low, beyond, self.stepper.measure(beyond), size)
-        length = self.stepper.metric.length(tangent, slope)
+        before = self._at(low) if low > _BESIDE * self.size else self.first
+        low = max(low, 0.0) if before is not self.first else 0.0
+        u, load_factor, tangent, slope = self._cubic(before, low, beyond, self.control.measure(beyond), size)
+        length = self.points.metric.length(tangent, slope)
         return replace(beyond, u=u, load_factor=load_factor, tangent=tangent / length, slope=slope / length)
 
-    def _note(self, kind: str, point: Point, multiplicity: int) -> None:
-        stepper = self.stepper
-        displacement = np.nan
-        if stepper.direction is not None:
-            displacement = stepper.direction.at(stepper.state.position + point.u)
-        self.events.append(Event(kind, float(point.load_factor), stepper.number + 1, float(displacement), multiplicity))
-        if kind == "bifurcation":
-            number = stepper.bifurcations + sum(event.kind == kind for event in self.events)
-            if stepper.turns_at(number, point, multiplicity):
-                self.turn = point
-
     def _end(self, point: Point) -> _End:
-        return _End(self.stepper.measure(point), point.slope, point.negatives)
+        return _End(self.control.measure(point), point.slope, point.negatives)
 
     def _at(self, size: float) -> Point:
         """Return the point at a length; the guess is the cubic through both ends with their tangents.
 
         Trials in between are closer, but near a bifurcation rounding destroys their tangents.
         """
-        stepper = self.stepper
-        u, load_factor, _, _ = self._cubic(self._start, 0.0, self.last, self.size, size)
-        return stepper.points.find(stepper.constraint(size), u, load_factor)
+        u, load_factor, _, _ = self._cubic(self.first, 0.0, self.last, self.size, size)
+        return self.points.find(self.control.constraint(size), u, load_factor)
 
     def _cubic(
         self, first: Point, low: float, second: Point, high: float, size: float
@@ -244,7 +218,7 @@ class CriticalPoints:
         )
         rates = 6.0 * t * (t - 1.0) / h, 6.0 * t * (1.0 - t) / h, (1.0 - t) * (1.0 - 3.0 * t), t * (3.0 * t - 2.0)
         # lengths are not measured along the path: that of an arc is a chord
-        speeds = [self.stepper.rate(point) for point in (first, second)]
+        speeds = [self.control.rate(point) for point in (first, second)]
         u = np.stack([first.u, second.u, first.tangent / speeds[0], second.tangent / speeds[1]])
         slopes = [first.slope / speeds[0], second.slope / speeds[1]]
         loads = np.array([first.load_factor, second.load_factor, *slopes])
@@ -273,15 +247,14 @@ class CriticalPoints:
                     raise
                 break  # the linear solver gets no closer
             f = value(point)
-            size = self.stepper.measure(point)
+            size = self.control.measure(point)
             if tried is not None:
                 tried.append((size, f))
             if abs(f) <= zero or (previous is not None and abs(size - previous) <= _LOCATED * self.size):
                 break
             previous = size
-            below = self._on_first_side(interval, point, f)
             width = b - a
-            if below:
+            if f * (interval.first.slope if interval.turned else 1.0) > 0.0:  # before the critical point
                 a, fa = size, f
                 fb = 0.5 * fb if side == -1 and fb is not None else fb
                 side = -1
@@ -294,13 +267,6 @@ class CriticalPoints:
             if fa is not None and fb is not None and not slow:
                 size = (a * fb - b * fa) / (fb - fa)
         return point
-
-    @staticmethod
-    def _on_first_side(interval: _Interval, point: Point, f: float) -> bool:
-        """Return whether a trial lies before the critical point."""
-        if interval.turned:
-            return f * interval.first.slope > 0.0
-        return f > 0.0
 
     def _tried(self, size: float, a: float, b: float) -> Point:
         """Return the point at a length, or close to it where the stiffness is singular to rounding."""

@@ -2,27 +2,229 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
 
-from ..errors import NotConverged
+from ..contact.transform import Transform
+from ..errors import NotConverged, SimulationFailure
+from ..solvers.linear import LinearChoice, configure, is_failed_factorisation, linear_reason
 from ..solvers.matrix import HessianMatrix
+from ..solvers.matrix_free import at_exit
 from ..solvers.newton import STAGNATION, Tolerance
+from ..stepping.problem import StepProblem
 from .stability import Stability
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
-
     from ..integrators.base import State
+    from ..solvers.lagged import LaggedPreconditioner
+    from ..solvers.matrix_free import MatrixFreeHessian
     from ..stepping.model import Model
-    from .bordered import BorderedSystem
+    from .equilibrium import Equilibrium
 
 
 def dot(comm: MPI.Comm, a: np.ndarray, b: np.ndarray) -> float:
     """Return the sum over all ranks of the products of owned numbers. Collective."""
     return comm.allreduce(float((a * b).sum()))
+
+
+_PREFIX = "pfem_path_"
+_RTOL = 1e-8  # of iterative solves: tangents locate limit points and are not corrected afterwards
+_USABLE = 1e-4  # relative residual at which an iterative solve that has not converged is accepted
+_SHARE = 1e-5  # step of differences by the load factor, relative to it; exact for loads that are linear in it
+
+
+class BorderedSystem:
+    """Residual, response to the load, and solves with the tangent stiffness. Created once for a run.
+
+    Options: prefix ``pfem_path_``.
+
+    Parameters
+    ----------
+    model : Model
+    hessian : of the stepper, assembled or matrix-free
+    choice : of the linear solver
+    lagged : preconditioner that is reused over steps, None if PETSc builds one from the matrix
+    scheme : defines the balance
+    unit : lower bound of the load factor in the step of differences
+
+    Attributes
+    ----------
+    problem : StepProblem at the start of the present step
+    linear : number of iterations of the linear solver
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        hessian: HessianMatrix | MatrixFreeHessian,
+        choice: LinearChoice,
+        lagged: LaggedPreconditioner | None,
+        scheme: Equilibrium,
+        unit: float,
+    ) -> None:
+        self.model, self.hessian, self.lagged, self.scheme = model, hessian, lagged, scheme
+        self._unit = unit
+        self._transform = Transform(model.mesh)
+        self.direct = choice.krylov == "preonly"
+        self.linear = 0
+        mesh = model.mesh
+        self._b = PETSc.Vec().createMPI((3 * mesh.n_owned, 3 * mesh.n_nodes), bsize=3, comm=mesh.comm)
+        self._x = self._b.duplicate()
+        # beyond a critical point the stiffness is indefinite
+        self._choice = choice if self.direct else LinearChoice("gmres", choice.preconditioner, "indefinite")
+        self._ksp = self._solver()
+        self.problem: StepProblem | None = None
+
+    def _solver(self) -> PETSc.KSP:
+        ksp = PETSc.KSP().create(self.model.mesh.comm)
+        ksp.setOptionsPrefix(_PREFIX)
+        configure(ksp, self._choice, False, None if self.lagged is None else _Preconditioning(self))
+        if not self.direct:
+            ksp.setTolerances(rtol=_RTOL, max_it=2000)
+        ksp.setOperators(self.hessian.mat, self.hessian.mat)
+        ksp.setFromOptions()
+        at_exit(_let_go, ksp)
+        return ksp
+
+    def begin(self, state: State) -> None:
+        """Start a step: displacements are relative to the positions of a state. Collective."""
+        balance = self.scheme.balance(state, 0.0)
+        self.problem = StepProblem(self.model, state, balance, state.external, self._transform)
+
+    def external(self, load_factor: float) -> np.ndarray:
+        """Return the external forces (owned, 3) [N]."""
+        out = np.zeros_like(self.problem.u)
+        return self.model.external.at(load_factor, out) if self.model.external.active else out
+
+    def prescribe(self, u: np.ndarray, load_factor: float) -> None:
+        """Set the prescribed components of displacements (owned, 3)."""
+        supports = self.model.supports
+        if supports.any:
+            values = supports.lacking(self.problem.balance.predictor, load_factor)
+            supports.put(u, values)
+            if self.problem.target is not None:
+                self.problem.target = values
+
+    def imbalance(self, u: np.ndarray, load_factor: float, g: np.ndarray) -> None:
+        """Compute g = f_int - f_ext (owned, 3) [N], including reactions of supports. Collective."""
+        if self.model.bars_vary:
+            self.model.change_bars(load_factor)
+        self.problem.known = -self.external(load_factor)
+        self.problem.imbalance(u, g)
+
+    def residual(self, u: np.ndarray, load_factor: float, g: np.ndarray) -> None:
+        """Compute :meth:`imbalance` with zeros at prescribed components. Collective."""
+        self.imbalance(u, load_factor, g)
+        if self.model.supports.any:
+            self.model.supports.clear(g)
+
+    def rate(self, u: np.ndarray, load_factor: float) -> np.ndarray:
+        """Return -dg/d(load factor) (owned, 3) [N] at free components, by central differences. Collective."""
+        h = _SHARE * max(abs(load_factor), self._unit)
+        model = self.model
+        if not (model.bars_vary or model.supports.moves):
+            q = (self.external(load_factor + h) - self.external(load_factor - h)) / (2.0 * h)
+            model.supports.clear(q)
+            return q
+        ends = []
+        for end in (load_factor + h, load_factor - h):
+            there, g = u.copy(), np.empty_like(u)
+            self.prescribe(there, end)
+            self.residual(there, end, g)
+            ends.append(g)
+        self.prescribe(u.copy(), load_factor)
+        if model.bars_vary:
+            model.change_bars(load_factor)
+        return (ends[1] - ends[0]) / (2.0 * h)
+
+    def linearise(self, u: np.ndarray) -> None:
+        """Evaluate the tangent stiffness at a displacement (owned, 3). Collective."""
+        self.hessian.update(self.problem, u)
+        self._ksp.setOperators(self.hessian.mat, self.hessian.mat)
+
+    def solve(self, b: np.ndarray) -> np.ndarray:
+        """Return K^-1 b (owned, 3), zero at prescribed components. Collective.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks, if K is singular or the linear solver does not converge.
+        """
+        self._b.array[:] = b.ravel()
+        if self.model.supports.any:
+            self.model.supports.clear(self._b.array.reshape(-1, 3))
+        reason = self._attempt()
+        if reason < 0 and self.lagged is not None and self.lagged.carried:
+            self.lagged.drop()
+            self._ksp.setOperators(self.hessian.mat, self.hessian.mat)
+            reason = self._attempt()
+        x = self._x.array.reshape(b.shape).copy()
+        finite = self.model.comm.allreduce(int(np.isfinite(x).all()), op=MPI.MIN)
+        if reason < 0 or not finite:
+            why = linear_reason(reason) if reason < 0 else "the solution is not finite"
+            raise NotConverged(f"the linear system of the tangent stiffness cannot be solved ({why})")
+        return x
+
+    def response(self, u: np.ndarray, load_factor: float) -> np.ndarray:
+        """Return du/d(load factor) (owned, 3) with the last stiffness, including moving supports. Collective."""
+        v = self.solve(self.rate(u, load_factor))
+        supports = self.model.supports
+        if supports.moves:
+            h = _SHARE * max(abs(load_factor), self._unit)
+            supports.put(v, (supports.positions(load_factor + h) - supports.positions(load_factor - h)) / (2.0 * h))
+        return v
+
+    def _attempt(self) -> int:
+        try:
+            self._ksp.solve(self._b, self._x)
+        except PETSc.Error as error:
+            if not is_failed_factorisation(error):
+                raise
+            self._ksp.destroy()
+            self._ksp = self._solver()
+            return PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
+        self.linear += self._ksp.getIterationNumber()
+        reason = self._ksp.getConvergedReason()
+        if reason < 0 and not self.direct and self._ksp.getResidualNorm() <= _USABLE * self._b.norm():
+            return 1  # close to a critical point the residual stagnates; Newton's method corrects the error
+        return reason
+
+    def destroy(self) -> None:
+        """Free the PETSc objects."""
+        for thing in (self._ksp, self._b, self._x):
+            thing.destroy()
+
+
+def _let_go(reference: weakref.ref) -> None:
+    """Detach Python objects from a solver that outlives the interpreter, because PETSc would call them."""
+    ksp = reference()
+    if ksp:
+        ksp.getPC().setType("none")
+        for matrix in ksp.getOperators():
+            if matrix and matrix.getType() == "python":
+                matrix.incRef()
+
+
+class _Preconditioning:
+    """Callbacks of PETSc for the preconditioner that is reused over steps."""
+
+    def __init__(self, system: BorderedSystem) -> None:
+        self._system = weakref.ref(system)
+
+    def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
+        """Update the preconditioner after a change of the stiffness; called by PETSc."""
+        system = self._system()
+        if system.problem is not None:
+            system.lagged.renew(system.problem, None)
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Compute y = P x; called by PETSc."""
+        self._system().lagged.apply(x, y)
 
 
 class Terms(NamedTuple):
@@ -31,15 +233,6 @@ class Terms(NamedTuple):
     value: float
     by_u: np.ndarray
     by_load: float
-
-
-class Constraint(Protocol):
-    """The constraint of a point; its value is small or large compared with the length ``size``."""
-
-    size: float
-
-    def terms(self, u: np.ndarray, change: float) -> Terms:
-        """Return value and derivatives. Collective."""
 
 
 @dataclass
@@ -74,7 +267,7 @@ class Arc:
         self.metric, self.size = metric, size
 
     def terms(self, u: np.ndarray, change: float) -> Terms:
-        """See :class:`Constraint`."""
+        """Return value and derivatives. Collective."""
         metric, s = self.metric, self.size
         value = (metric.product(u, change, u, change) - s * s) / (2.0 * s)
         share = 0.5 if metric.spherical else 1.0
@@ -134,12 +327,12 @@ class Linear:
     by_load: float = 0.0
 
     def terms(self, u: np.ndarray, change: float) -> Terms:
-        """See :class:`Constraint`."""
+        """Return value and derivatives. Collective."""
         value = (dot(self.comm, self.weights, u) + self.by_load * change - self.target) / self.scale
         return Terms(value, self.weights / self.scale, self.by_load)
 
 
-_MOST = 20  # Newton iterations of a point: more are no sign of a path
+_ITERATIONS = 20  # Newton iterations of a point: more are no sign of a path
 _CLOSE = 1e-10  # value of the constraint, over the length of the step
 _NEAR = 1e-6  # the same, where it no longer falls
 
@@ -151,7 +344,7 @@ class Point:
     Attributes
     ----------
     u : (owned, 3) displacement from the last point [m]
-    load_factor : at the point
+    load_factor : at the point; ``start`` at the last one
     tangent, slope : unit tangent of the path: displacement part (owned, 3) [m] and change of the load factor
     negatives : number of negative eigenvalues of the stiffness, -1 if not computed
     nearest : magnitude of the eigenvalue nearest to zero [N/m]
@@ -160,11 +353,94 @@ class Point:
 
     u: np.ndarray
     load_factor: float
+    start: float
     tangent: np.ndarray
     slope: float
     negatives: int
     nearest: float
     newton: int
+
+    @property
+    def change(self) -> float:
+        """Change of the load factor from the last point."""
+        return self.load_factor - self.start
+
+
+_LEAST = 1e-9  # displacement along the direction per length of the path, below which it decreases
+
+
+class ArcControl:
+    """Points at a distance from the last one in a metric, the chord of the arc.
+
+    Attributes
+    ----------
+    scale : of a prescribed displacement [m]; zero with arc lengths, and before the first point
+    """
+
+    def __init__(self, metric: Metric) -> None:
+        self.metric, self.scale = metric, 0.0
+
+    def constraint(self, size: float) -> Arc | Linear:
+        """Return the constraint of the point at a measure."""
+        return Arc(self.metric, size)
+
+    def measure(self, point: Point) -> float:
+        """Return the measure of a point. Collective."""
+        return self.metric.length(point.u, point.change)
+
+    def rate(self, point: Point) -> float:
+        """Return the derivative of the measure along the tangent at a point. Collective."""
+        length = self.metric.length(point.u, point.change)
+        return self.metric.product(point.u, point.change, point.tangent, point.slope) / length if length else 1.0
+
+    def length(self, size: float, tangent: np.ndarray) -> float:
+        """Return the length along the tangent at the state that reaches a measure. Collective."""
+        return size
+
+    def gradient(self, tangent: np.ndarray) -> np.ndarray:
+        """Return the gradient (owned, 3) [1/m] of the displacement that is held where bars have broken."""
+        return self.metric.weight * tangent
+
+    def orient(self, response: np.ndarray, size: float) -> float:
+        """Return the sign of load factors that increase the measure, from the first response (owned, 3) [m] and its
+        2-norm. Collective."""
+        return 1.0
+
+
+class DisplacementControl(ArcControl):
+    """Points at displacements along a direction, relative to that of the first response to a unit of load."""
+
+    def __init__(self, metric: Metric, direction: Direction) -> None:
+        super().__init__(metric)
+        self.direction = direction
+
+    def constraint(self, size: float) -> Arc | Linear:
+        return self.direction.constraint(size * self.scale, self.scale)
+
+    def measure(self, point: Point) -> float:
+        return self.direction.of(point.u) / self.scale
+
+    def rate(self, point: Point) -> float:
+        return self.direction.of(point.tangent) / self.scale
+
+    def length(self, size: float, tangent: np.ndarray) -> float:
+        along = self.direction.of(tangent) / self.scale
+        if not along > _LEAST:
+            raise NotConverged("the displacement along static.direction does not increase any more along the path")
+        return size / along
+
+    def gradient(self, tangent: np.ndarray) -> np.ndarray:
+        return self.direction.weights / self.scale
+
+    def orient(self, response: np.ndarray, size: float) -> float:
+        along = self.direction.of(response)
+        if not abs(along) > 1e-12 * size:
+            raise SimulationFailure(
+                "static.direction: the load does not move the nodes of static.node_set along it at the start of "
+                'the path; use another direction, or static.method = "arc_length"'
+            )
+        self.scale = abs(along)
+        return float(np.sign(along))
 
 
 class PointSolver:
@@ -172,9 +448,8 @@ class PointSolver:
 
     Parameters
     ----------
-    model : Model
     state : State
-    system : BorderedSystem, begun at the state
+    system : BorderedSystem, begun at the state; destroyed with this
     metric : Metric
     looks : whether critical points are looked for
 
@@ -183,14 +458,13 @@ class PointSolver:
     stability : Stability, None where critical points are not looked for
     """
 
-    def __init__(self, model: Model, state: State, system: BorderedSystem, metric: Metric, looks: bool) -> None:
-        self.model, self.state, self.system, self.metric = model, state, system, metric
+    def __init__(self, state: State, system: BorderedSystem, metric: Metric, looks: bool) -> None:
+        self.model, self.state, self.system, self.metric = system.model, state, system, metric
         self.stability: Stability | None = None
-        self._own: HessianMatrix | None = None
         if looks:
-            if not isinstance(system.hessian, HessianMatrix):
-                self._own = HessianMatrix(model.mesh, model.supports)
-            self.stability = Stability(model, self._own or system.hessian)
+            self.stability = Stability(
+                self.model, system.hessian if isinstance(system.hessian, HessianMatrix) else None
+            )
 
     @property
     def place(self) -> str:
@@ -199,11 +473,11 @@ class PointSolver:
 
     def destroy(self) -> None:
         """Free the PETSc objects."""
-        for thing in (self.stability, self._own):
-            if thing is not None:
-                thing.destroy()
+        self.system.destroy()
+        if self.stability is not None:
+            self.stability.destroy()
 
-    def find(self, constraint: Constraint, u: np.ndarray, load_factor: float) -> Point:
+    def find(self, constraint: Arc | Linear, u: np.ndarray, load_factor: float) -> Point:
         """Return the point that satisfies a constraint, with its tangent, from a guess. Collective.
 
         Raises
@@ -217,11 +491,11 @@ class PointSolver:
         if self.metric.product(u, load_factor - start, tangent, slope) < 0.0:
             tangent, slope = -tangent, -slope
         negatives, nearest = self.spectrum(u)
-        return Point(u, load_factor, tangent, slope, negatives, nearest, newton)
+        return Point(u, load_factor, start, tangent, slope, negatives, nearest, newton)
 
-    def newton(self, constraint: Constraint, u: np.ndarray, load_factor: float) -> tuple[np.ndarray, float, int]:
+    def newton(self, constraint: Arc | Linear, u: np.ndarray, load_factor: float) -> tuple[np.ndarray, float, int]:
         system, start = self.system, self.state.time
-        most = min(self.model.case.solver.max_newton, _MOST)
+        most = min(self.model.case.solver.max_newton, _ITERATIONS)
         comm = self.model.comm
         system.prescribe(u, load_factor)
         g, previous, before = np.empty_like(u), np.inf, np.inf
@@ -278,8 +552,8 @@ class PointSolver:
         """Return the number of negative eigenvalues of the last stiffness, or -1, and the one nearest to zero."""
         if self.stability is None or self.stability.refusal is not None:
             return -1, np.inf
-        if self._own is not None:
-            self._own.update(self.system.problem, u)
+        if self.stability.matrix is not self.system.hessian:
+            self.stability.matrix.update(self.system.problem, u)
         return self.stability.look()
 
     def modes(self, point: Point, count: int) -> list[np.ndarray]:
@@ -287,7 +561,7 @@ class PointSolver:
 
         They are orthogonal to the path. Paths of symmetric trusses branch off along either.
         """
-        (self._own or self.system.hessian).update(self.system.problem, point.u)
+        self.stability.matrix.update(self.system.problem, point.u)
         found = []
         for mode in self.stability.modes(count):
             along = self.metric.product(mode, 0.0, point.tangent, 0.0)

@@ -13,10 +13,21 @@ from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
 from ..stepping.stepper import Solution
 from ..tolerances import TIME
-from .bordered import BorderedSystem, free_motions
 from .critical import EVENTS, CriticalPoints, Event
-from .path_points import Arc, Constraint, Direction, Linear, Metric, Point, PointSolver, dot
-from .scheme import PathEquilibrium
+from .equilibrium import PathEquilibrium
+from .path_points import (
+    Arc,
+    ArcControl,
+    BorderedSystem,
+    Direction,
+    DisplacementControl,
+    Linear,
+    Metric,
+    Point,
+    PointSolver,
+    dot,
+)
+from .stability import free_motions
 from .stepper import StaticStepper
 
 if TYPE_CHECKING:
@@ -27,20 +38,18 @@ if TYPE_CHECKING:
 _UNRESOLVED = 2.0**-6  # of the first length, down to which a step is halved if a critical point is not located
 _TURN = 0.5  # cosine between tangents of successive points, below which the step is halved if possible
 _FACTORS = 0.5, 1.5  # of the length from point to point
-_LEAST = 1e-9  # displacement along the direction per length of the path, below which it decreases
 PARTED = "no remaining bar carries the load"
 
 
 class PathStepper(StaticStepper):
     """Advances from point to point by a predictor along the tangent and Newton's method with a constraint.
 
-    The measure of a point is its distance from the last one in a metric, the chord of the arc.
-
     Parameters
     ----------
     model : Model
     choice : LinearChoice
     keys : of the method
+    by_displacement : whether points are asked for by their displacement along the direction, not by an arc length
 
     Attributes
     ----------
@@ -49,7 +58,7 @@ class PathStepper(StaticStepper):
     negatives : number of negative eigenvalues at the state, -1 if unknown
     events : found with the last point and not recorded yet
     outcome : why the path ended; empty before
-    scale : of a prescribed displacement [m]; zero with arc lengths, and before the first point
+    control : by which points are asked for
     """
 
     kept_numbers = (
@@ -67,7 +76,7 @@ class PathStepper(StaticStepper):
     event_columns = EVENTS
     remedy = "reduce static.max_step or static.step; if such jumps are intended, set solver.guard = false"
 
-    def __init__(self, model: Model, choice: LinearChoice, keys: PathKeys) -> None:
+    def __init__(self, model: Model, choice: LinearChoice, keys: PathKeys, by_displacement: bool = False) -> None:
         _check_path(model, keys)
         super().__init__(model, choice, keys)
         self.keys = keys
@@ -77,9 +86,8 @@ class PathStepper(StaticStepper):
         self.direction = None
         if keys.node_set is not None:
             self.direction = Direction(model, keys.node_set, keys.direction)
-        self.scale = 0.0
-        self._choice = choice
-        self._make_system()
+        self.control = DisplacementControl(self.metric, self.direction) if by_displacement else ArcControl(self.metric)
+        self._make_points()
         self.arc, self.slope, self.negatives = keys.step, 0.0, -1
         self.weight = 0.0  # of the metric; zero before the first point
         self.ended, self.outcome = 0, ""
@@ -92,49 +100,30 @@ class PathStepper(StaticStepper):
             refusal = self.points.stability.refusal
             self.scheme.notice = f"bifurcations are not searched for, only limit points: {refusal}"
 
-    def _make_system(self) -> None:
+    def _make_points(self) -> None:
         """Create what solves for points, for the supports as they are. Collective."""
         self.system = BorderedSystem(self.model, self.hessian, self._choice, self.lagged, self.scheme, self.keys.step)
-        self.points = PointSolver(self.model, self.state, self.system, self.metric, self.keys.critical_points)
+        self.points = PointSolver(self.state, self.system, self.metric, self.keys.critical_points)
 
     def supports_changed(self) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
-        self.system.destroy()
         self.points.destroy()
         super().supports_changed()
-        self._make_system()
+        self._make_points()
 
     @property
     def clock(self) -> float:
         """Number of the point, as the load factor need not increase."""
         return float(self.state.step)
 
-    def constraint(self, size: float) -> Constraint:
-        """Return the constraint of the point at a measure."""
-        return Arc(self.metric, size)
+    @property
+    def scale(self) -> float:
+        """See :class:`~pfem_petsc.statics.path_points.ArcControl`."""
+        return self.control.scale
 
-    def measure(self, point: Point) -> float:
-        """Return the measure of a point. Collective."""
-        return self.metric.length(point.u, point.load_factor - self.state.time)
-
-    def rate(self, point: Point) -> float:
-        """Return the derivative of the measure along the tangent at a point. Collective."""
-        change = point.load_factor - self.state.time
-        length = self.metric.length(point.u, change)
-        return self.metric.product(point.u, change, point.tangent, point.slope) / length if length else 1.0
-
-    def _length(self, size: float) -> float:
-        """Return the length along the tangent at the state that reaches a measure. Collective."""
-        return size
-
-    def _held_gradient(self) -> np.ndarray:
-        """Return the gradient (owned, 3) [1/m] of the displacement that is held where bars have broken."""
-        return self.metric.weight * self.state.memory["tangent"]
-
-    def _orient(self, response: np.ndarray, size: float) -> float:
-        """Return the sign of load factors that increase the measure, from the first response (owned, 3) [m] and its
-        2-norm. Collective."""
-        return 1.0
+    @scale.setter
+    def scale(self, value: float) -> None:
+        self.control.scale = value
 
     @property
     def done(self) -> bool:
@@ -209,7 +198,6 @@ class PathStepper(StaticStepper):
     def destroy(self) -> None:
         """Free the PETSc objects."""
         super().destroy()
-        self.system.destroy()
         self.points.destroy()
 
     def solve(self, balance: Balance) -> Solution:
@@ -218,16 +206,14 @@ class PathStepper(StaticStepper):
         g = np.empty_like(point.u)
         self.system.imbalance(point.u, point.load_factor, g)
         self.state.support = self.model.supports.part(g)
-        self._note(point, g - self.state.support)
-        walls = self.model.contact.nothing
-        return Solution(point.u, self.system.problem.f, walls, point.newton, self.system.linear)
-
-    def _note(self, point: Point, g: np.ndarray) -> None:
-        """Take account of what rounding leaves of the residual (owned, 3) [N] at a point. Collective."""
-        sums = np.array([(array**2).sum() for array in (g, self.system.external(point.load_factor))])
+        # take account of what rounding leaves of the residual
+        external = self.system.external(point.load_factor)
+        sums = np.array([(array**2).sum() for array in (g - self.state.support, external)])
         norm, force = np.sqrt(self.model.comm.allreduce(sums))
         required = self.points.tolerance(point.u, point.load_factor, 0.0).residual
         self.resolution.note(self.model, self.system.problem.x, float(force), float(norm), required)
+        walls = self.model.contact.nothing
+        return Solution(point.u, self.system.problem.f, walls, point.newton, self.system.linear)
 
     def _begin_path(self) -> bool:
         """Take the first point; return whether a step was made, because the start was not in equilibrium."""
@@ -261,15 +247,15 @@ class PathStepper(StaticStepper):
     def keep(self, point: Point) -> None:
         """Store the tangent at a point and the signs of its eigenvalues."""
         self.state.memory["tangent"] = point.tangent
-        self.slope, self.negatives = float(point.slope), int(point.negatives)
+        self.slope, self.negatives = float(point.slope), point.negatives
 
-    def turns_at(self, number: int, point: Point, multiplicity: int) -> bool:
-        """Return whether the path branches off at a bifurcation, counted from 1, and store the mode. Collective."""
+    def _turns_at(self, point: Point, events: list[Event]) -> bool:
+        """Return whether the path branches off at a bifurcation, the last event, and store its mode. Collective."""
+        number = self.bifurcations + sum(event.kind == "bifurcation" for event in events)
         wanted = [turn for turn in self.keys.branch_at if abs(turn) == number]
         if not wanted:
             return False
-        choices = self.points.modes(point, max(multiplicity, 1))
-        chosen = self.keys.branch_mode
+        choices, chosen = self.points.modes(point, max(events[-1].multiplicity, 1)), self.keys.branch_mode
         if chosen > len(choices):
             many = f"{len(choices)} mode" + "s" * (len(choices) > 1)
             self.message(f"bifurcation {number} has only {many}: static.branch_mode = 1 is used")
@@ -319,11 +305,10 @@ class PathStepper(StaticStepper):
                 "on supports only, or tables are constant there"
             )
         self.weight = self.metric.weight = 1.0 / size**2
-        sign = self._orient(response, size)
+        sign = self.control.orient(response, size)
         length = self.metric.length(response, 1.0)
         tangent, slope = sign * response / length, sign / length
-        negatives, nearest = points.spectrum(u)
-        return Point(u, state.time, tangent, slope, negatives, nearest, newton), moved
+        return Point(u, state.time, state.time, tangent, slope, *points.spectrum(u), newton), moved
 
     def _next_point(self, size: float) -> tuple[Point, list[Event], str]:
         """Return the point at a length or at a limit before it, the critical points on the way, and the limit reached.
@@ -341,26 +326,30 @@ class PathStepper(StaticStepper):
             point = self.points.find(along, guess, load_factor)
         else:
             tangent = state.memory["tangent"]
-            length = self._length(size)
+            length = self.control.length(size, tangent)
             guess, load_factor = length * tangent, state.time + length * self.slope
-            point = self.points.find(self.constraint(size), guess, load_factor)
+            point = self.points.find(self.control.constraint(size), guess, load_factor)
         self._suspect(point, guess)
         if not self.turning:
             self._refuse_turn(point, size)
         point, reached = self._end_at_limit(point)
         if self.turning or self.points.stability is None:
             return point, [], reached
+        events: list[Event] = []
+        start = replace(point, u=self.zero, load_factor=state.time, tangent=tangent, slope=self.slope)
+        start.negatives = self.negatives
         try:
-            critical = CriticalPoints(self, point)
-            events, turn = critical.events, critical.turn
+            for kind, found, multiplicity in CriticalPoints(self.points, self.control, start, point):
+                way = np.nan if self.direction is None else self.direction.at(state.position + found.u)
+                events.append(Event(kind, float(found.load_factor), self.number + 1, float(way), multiplicity))
+                if kind == "bifurcation" and self._turns_at(found, events):
+                    return found, events, ""
         except NotConverged as failure:
             # close to an imperfect bifurcation the point may lie on a path that does not pass through it
             if size > _UNRESOLVED * self.arc and 0.5 * size >= self.keys.smallest:
                 raise
             self.message(f"a critical point was not located: {failure}")
-            events, turn = [], None
-        if turn is not None:
-            point, reached = turn, ""
+            events = []
         return point, events, reached
 
     def _refuse_turn(self, point: Point, size: float) -> None:
@@ -416,14 +405,14 @@ class PathStepper(StaticStepper):
         change = share * (point.load_factor - time)
         return self.points.find(constraint, share * point.u, time + change), reached
 
-    def _load_factor(self, change: float, size: float) -> Constraint:
+    def _load_factor(self, change: float, size: float) -> Linear:
         """Return the constraint of the point at a change of the load factor."""
         return Linear(self.metric.comm, self.zero, change, size, by_load=1.0)
 
-    def _exceeded(self, point: Point) -> list[tuple[float, Constraint, str]]:
+    def _exceeded(self, point: Point) -> list[tuple[float, Arc | Linear, str]]:
         """Return the limits that a point exceeds: share of the step up to them, constraint, and text. Collective."""
         state, keys, direction = self.state, self.keys, self.direction
-        limits: list[tuple[float, Constraint, str]] = []
+        limits: list[tuple[float, Arc | Linear, str]] = []
         change = point.load_factor - state.time
         if keys.end is not None and point.load_factor >= keys.end * (1.0 - TIME):
             left = keys.end - state.time
@@ -470,49 +459,17 @@ class PathStepper(StaticStepper):
         system.begin(state)
         zero = np.zeros_like(state.position)
         system.linearise(zero)
-        gradient = self._held_gradient()
+        gradient = self.control.gradient(state.memory["tangent"])
         response = system.response(zero, state.time)
         size = float(np.sqrt(dot(comm, gradient, gradient) * dot(comm, response, response)))
         along = dot(comm, gradient, response)
         if not abs(along) > 1e-12 * size:
             u, load_factor, newton = points.newton(self._load_factor(-state.time, self.arc), zero, state.time)
-            return Point(u, load_factor, state.memory["tangent"], self.slope, *points.spectrum(u), newton), PARTED
+            tangent, slope = state.memory["tangent"], self.slope
+            return Point(u, load_factor, state.time, tangent, slope, *points.spectrum(u), newton), PARTED
         point = points.find(Linear(comm, gradient, 0.0, self.arc), zero, state.time)
         sign = np.sign(dot(comm, gradient, point.tangent))
         return replace(point, tangent=sign * point.tangent, slope=float(sign * point.slope)), ""
-
-
-class ComponentStepper(PathStepper):
-    """The same with points at displacements along a direction, relative to that of the first response to a unit of
-    load."""
-
-    def constraint(self, size: float) -> Constraint:
-        return self.direction.constraint(size * self.scale, self.scale)
-
-    def measure(self, point: Point) -> float:
-        return self.direction.of(point.u) / self.scale
-
-    def rate(self, point: Point) -> float:
-        return self.direction.of(point.tangent) / self.scale
-
-    def _length(self, size: float) -> float:
-        along = self.direction.of(self.state.memory["tangent"]) / self.scale
-        if not along > _LEAST:
-            raise NotConverged("the displacement along static.direction does not increase any more along the path")
-        return size / along
-
-    def _held_gradient(self) -> np.ndarray:
-        return self.direction.weights / self.scale
-
-    def _orient(self, response: np.ndarray, size: float) -> float:
-        along = self.direction.of(response)
-        if not abs(along) > 1e-12 * size:
-            raise SimulationFailure(
-                "static.direction: the load does not move the nodes of static.node_set along it at the start of "
-                'the path; use another direction, or static.method = "arc_length"'
-            )
-        self.scale = abs(along)
-        return float(np.sign(along))
 
 
 def _check_path(model: Model, keys: PathKeys) -> None:

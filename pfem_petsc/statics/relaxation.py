@@ -18,7 +18,7 @@ from ..parallel.agreement import agreed
 from ..solvers.newton import Tolerance
 from ..stepping.stepper import Solution
 from ..tolerances import PROJECTED, TIME
-from .stability import MinimumCheck
+from .stability import LARGEST, Stability
 from .stepper import StaticStepper
 
 if TYPE_CHECKING:
@@ -427,7 +427,7 @@ class RelaxationStepper(StaticStepper):
         self.parameters = parameters
         self.guard = None  # relaxation allows large rotations
         self.motion = PseudoMotion(model, parameters.damping)
-        self.minimum = MinimumCheck(model) if parameters.newton else None
+        self.minimum = Stability(model, largest=LARGEST) if parameters.newton else None
         self.pseudo_steps, self.residual = 0, 0.0
 
     def step(self) -> None:
@@ -457,7 +457,7 @@ class RelaxationStepper(StaticStepper):
         super().supports_changed()
         if self.minimum is not None:
             self.minimum.destroy()
-            self.minimum = MinimumCheck(self.model)
+            self.minimum = Stability(self.model, largest=LARGEST)
 
     def settle(self) -> None:
         """See :class:`StaticStepper`. Collective."""

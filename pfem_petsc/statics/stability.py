@@ -1,4 +1,4 @@
-"""Negative eigenvalues of the tangent stiffness, and whether an equilibrium is a minimum of the potential."""
+"""Eigenvalues of the tangent stiffness: whether an equilibrium is a minimum of the potential; motions that are free."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..errors import NotConverged
 from ..solvers.linear import has_mumps
 from ..solvers.matrix import HessianMatrix
+from .equilibrium import problem_at_rest
 
 if TYPE_CHECKING:
     from ..contact.forces import WallForces
+    from ..integrators.base import State
     from ..solvers.lagged import LaggedPreconditioner
     from ..solvers.matrix_free import MatrixFreeHessian
     from ..stepping.model import Model
@@ -24,6 +27,11 @@ LARGEST = 30_000
 """Unknowns up to which PETSc's own factorisation is used, and checks that are not asked for are made."""
 LARGEST_WITH_MUMPS = 400_000
 """Unknowns up to which MUMPS factorises the stiffness: of an octet block in 20 s, with 4 GB."""
+_RIGID_MOTION = 1e-10  # of the largest nodal stiffness: eigenvalues down to minus this are zero, those of free motions
+_RIGID = 1e3  # of the largest nodal stiffness: what walls have along the normals of nodes that they push
+_ITERATIONS = 500  # of conjugate gradients that look for a negative curvature, about those of a linear solve
+_RTOL = 1e-6  # a mode of negative curvature cannot remain hidden while the residual of a random load falls this far
+_NOISE = 1e-12  # of the largest nodal stiffness: curvatures down to minus this are rounding
 _SWEEPS = 6  # of inverse iteration; where its result matters, the eigenvalue is far nearer to zero than the next
 _ALIKE = 1e-6
 _PREFIX = "pfem_inertia_"
@@ -36,35 +44,42 @@ class Spectrum(NamedTuple):
     nearest: float
 
 
+def stiffest(model: Model) -> float:
+    """Return the largest stiffness of a node [N/m]. Collective."""
+    return model.comm.allreduce(float(model.nodal_stiffness.max(initial=0.0)), op=MPI.MAX)
+
+
 class Stability:
-    """Looks at the stiffness that a matrix holds. Collective.
+    """Looks at the stiffness that a matrix holds. Methods are collective.
 
     Parameters
     ----------
     model : Model
-    matrix : HessianMatrix that is filled before each look
+    matrix : HessianMatrix that is filled before each look; None for one of its own
+    largest : number of unknowns up to which it looks; default: what can be factorised
 
     Attributes
     ----------
+    matrix : None if it cannot look and has none of its own
     refusal : why it cannot look, None where it can
     """
 
-    def __init__(self, model: Model, matrix: HessianMatrix) -> None:
-        self.mesh, self.comm, self._mat = model.mesh, model.comm, matrix.mat
-        self._supports, self._fixed = model.supports, model.supports.fixed
+    def __init__(self, model: Model, matrix: HessianMatrix | None = None, largest: int | None = None) -> None:
+        self.model, self.mesh, self.comm, self._supports = model, model.mesh, model.comm, model.supports
         unknowns = 3 * self.mesh.n_nodes
         self.dense = unknowns <= DENSE
-        self.refusal: str | None = None
-        self._factor: PETSc.PC | None = None
         self._mumps = not self.dense and has_mumps()
-        if self.dense:
-            return
-        largest = LARGEST_WITH_MUMPS if self._mumps else LARGEST
-        if unknowns > largest:
+        self._factor: PETSc.PC | None = None
+        most = LARGEST_WITH_MUMPS if self._mumps or self.dense else LARGEST
+        most = most if largest is None else min(most, largest)
+        self.refusal: str | None = None
+        if unknowns > most:
             why = "" if self._mumps else ", and this PETSc does not have MUMPS"
-            self.refusal = f"the model has {unknowns:,} unknowns, more than {largest:,}{why}"
-        elif self.comm.size > 1 and not self._mumps:
+            self.refusal = f"the model has {unknowns:,} unknowns, more than {most:,}{why}"
+        elif self.comm.size > 1 and not self._mumps and not self.dense:
             self.refusal = "on several ranks it requires MUMPS, which this PETSc does not have"
+        self._owns = matrix is None and self.refusal is None
+        self.matrix = HessianMatrix(self.mesh, self._supports) if self._owns else matrix
 
     def look(self) -> Spectrum:
         """Count at the stiffness that the matrix holds now."""
@@ -92,7 +107,7 @@ class Stability:
         if self.dense:
             return self._eigen_near(count)
         if shift:
-            self._mat.shift(shift)
+            self.matrix.mat.shift(shift)
         self._factorise()
         unknowns = 3 * self.mesh.n_nodes - self.comm.allreduce(self._supports.number)
         values, vectors = self._near(min(count, unknowns))
@@ -115,28 +130,64 @@ class Stability:
             vectors = np.einsum("jk,knc->jnc", basis, vectors)
         return found
 
+    def falling(self, x: np.ndarray, walls: WallForces, time: float, bars: np.ndarray | None = None) -> int:
+        """Number of directions in which the potential falls at positions (local, 3), without those that walls prevent.
+
+        It is -1 where the stiffness cannot be factorised.
+
+        ``walls`` says which nodes walls push, ``time`` where the walls are; ``bars`` (5, b) is their stiffness if not
+        the tangent, see ``Bars.linearise``. Collective.
+        """
+        nodes, blocks = self._held(walls, time)
+        model, matrix, scale = self.model, self.matrix, stiffest(self.model)
+
+        def add(values: np.ndarray) -> None:
+            matrix.add_lumped(np.full(model.mesh.n_owned, _RIGID_MOTION * scale), values)
+            if bars is None:
+                model.bars.tangents(x, 1.0, model.inertia.coefficients(0.0, 0.0), matrix.pattern, values)
+            else:
+                matrix.add_bars(bars, values)
+                if model.bars.springs is not None:
+                    model.bars.springs.add_tangents(1.0, matrix.pattern, values)
+            matrix.add_blocks(nodes, _RIGID * scale * blocks, values)
+            matrix.constrain(scale, values)
+
+        matrix.fill(add)
+        try:
+            return self.look().negatives
+        except PETSc.Error:
+            return -1
+
+    def _held(self, walls: WallForces, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes (k,) that walls hold, and the projections (k, 3, 3) on their directions, summed."""
+        contact = self.model.contact
+        blocks = np.zeros((self.model.mesh.n_owned, 3, 3))
+        if len(walls.nodes):
+            normals, _ = contact.planes(walls.touching, walls.places, contact.motion.displacements(time))
+            blocks[walls.nodes] += np.einsum("mw,mwi,mwj->mij", walls.touching.astype(float), normals, normals)
+        blocks[held_nodes(self.model, walls)] += np.eye(3)
+        nodes = np.flatnonzero(blocks.any(axis=(1, 2)))
+        return nodes, blocks[nodes]
+
     def destroy(self) -> None:
         """Free the PETSc objects."""
         if self._factor is not None:
             self._factor.destroy()
+        if self._owns:
+            self.matrix.destroy()
 
     def _eigen(self) -> tuple[np.ndarray, np.ndarray]:
         """Eigenvalues and vectors (components, eigenvalues) of the free components, in mesh order."""
-        pointers, columns, values = self._mat.getValuesCSR()
-        rows = 3 * self.mesh.first_node + np.repeat(np.arange(len(pointers) - 1), np.diff(pointers))
-        first, owned = self.mesh.first_node, self.mesh.n_owned
-        ids = np.column_stack([first + np.arange(owned), self.mesh.node_ids[:owned]])
-        numbers = np.empty(self.mesh.n_nodes, dtype=np.int64)
-        fixed = np.zeros((self.mesh.n_nodes, 3), dtype=bool)
-        matrix = np.zeros((3 * self.mesh.n_nodes,) * 2)
-        parts = self.comm.allgather((ids, self._fixed))
-        for pairs, some in parts:
-            numbers[pairs[:, 0]] = pairs[:, 1]
-            fixed[pairs[:, 1]] = some
-        for row, column, value in self.comm.allgather((rows, columns, values)):
-            matrix[3 * numbers[row // 3] + row % 3, 3 * numbers[column // 3] + column % 3] = value
-        self._free = np.flatnonzero(~fixed.ravel())
-        return np.linalg.eigh(matrix[np.ix_(self._free, self._free)])
+        owned, n_nodes = self.mesh.n_owned, self.mesh.n_nodes
+        pointers, columns, values = self.matrix.mat.getValuesCSR()
+        rows = np.zeros((3 * owned, 3 * n_nodes))
+        rows[np.repeat(np.arange(3 * owned), np.diff(pointers)), columns] = values
+        parts = self.comm.allgather((self.mesh.node_ids[:owned], self._supports.fixed, rows))
+        ids, fixed, whole = (np.concatenate(each) for each in zip(*parts, strict=True))
+        order = np.argsort(ids)
+        self._free = np.flatnonzero(~fixed[order].ravel())
+        at = (3 * order[:, None] + np.arange(3)).ravel()[self._free]
+        return np.linalg.eigh(whole[np.ix_(at, at)])
 
     def _eigen_near(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         values, vectors = self._eigen()
@@ -150,7 +201,7 @@ class Stability:
             self._factor.destroy()
         self._factor = PETSc.PC().create(self.comm)
         self._factor.setOptionsPrefix(_PREFIX)
-        self._factor.setOperators(self._mat)
+        self._factor.setOperators(self.matrix.mat)
         self._factor.setType("cholesky")
         if self._mumps:
             self._factor.setFactorSolverType("mumps")
@@ -166,7 +217,7 @@ class Stability:
         block = np.stack([np.cos((k + 1.0) * (ids + 0.5) ** 1.5) for k in range(count)])
         for vectors in block:
             self._supports.clear(vectors)
-        b, x = self._mat.createVecs()
+        b, x = self.matrix.mat.createVecs()
         values = np.zeros(count)
         for _ in range(_SWEEPS):
             block = self._orthonormal(block)
@@ -189,13 +240,6 @@ class Stability:
         scale = 1.0 / np.sqrt(np.diag(gram))
         lower = np.linalg.cholesky(gram * np.outer(scale, scale))
         return np.einsum("ij,jnc->inc", np.linalg.inv(lower), block * scale[:, None, None])
-
-
-_ZERO = 1e-10  # of the largest nodal stiffness: eigenvalues down to minus this are zero, those of free motions
-_RIGID = 1e3  # of the largest nodal stiffness: what walls have along the normals of nodes that they push
-_ITERATIONS = 500  # of conjugate gradients that look for a negative curvature, about those of a linear solve
-_RTOL = 1e-6  # a mode of negative curvature cannot remain hidden while the residual of a random load falls this far
-_NOISE = 1e-12  # of the largest nodal stiffness: curvatures down to minus this are rounding
 
 
 def held_nodes(model: Model, walls: WallForces) -> np.ndarray:
@@ -224,7 +268,7 @@ def is_indefinite(
     A curvature that is found is a proof. The load is random: that of the truss may be orthogonal to the mode.
     ``held`` (owned,) : nodes that do not move. Collective.
     """
-    noise = _NOISE * max(model.comm.allgather(float(model.nodal_stiffness.max(initial=0.0))))
+    noise = _NOISE * stiffest(model)
     b, diagonal = hessian.mat.createVecs()
     z, p, w = b.duplicate(), b.duplicate(), b.duplicate()
 
@@ -264,69 +308,86 @@ def is_indefinite(
     return found
 
 
-class MinimumCheck:
-    """Counts directions in which the potential falls, without those that walls prevent. Collective.
+ZERO = 1e-11
+"""Of the largest stiffness of a node: eigenvalues below are zero. Near limit points they are 1e-6 and more."""
+_MOTIONS = 8  # motions that are looked at
+_TOLD = 3
+_NAMED = 4  # nodes besides the one that moves most
+_MOVES = 0.3  # of the largest displacement of a motion, above which a node is named
 
-    Parameters
-    ----------
-    model : Model
-    largest : number of unknowns up to which it factorises the stiffness
 
-    Attributes
-    ----------
-    refusal : why it cannot, None where it can
+def names_motions(model: Model) -> bool:
+    """Whether motions are looked at: in models without walls and links, of at most 30,000 unknowns."""
+    return not model.can_touch and 3 * model.mesh.n_nodes <= LARGEST
+
+
+def free_motions(model: Model, state: State) -> str:
+    """What to add to a message about a stiffness that may be singular; empty where no motion is free. Collective.
+
+    Models for which :func:`names_motions` is False get no answer.
     """
+    if not names_motions(model):
+        return ""
+    stability, zero, free = Stability(model), ZERO * stiffest(model), []
+    try:
+        if stability.refusal is None:
+            stability.matrix.update(problem_at_rest(model, state, state.external), np.zeros_like(state.position))
+            values, motions = stability.nearest(_MOTIONS, 0.1 * zero)
+            free = stability.combined(motions[: int((np.abs(values) < zero).sum())])
+    except (NotConverged, np.linalg.LinAlgError):
+        free = []
+    finally:
+        stability.destroy()
+    return _text(model, state, free)
 
-    def __init__(self, model: Model, largest: int = LARGEST) -> None:
-        self.model = model
-        self._matrix: HessianMatrix | None = None
-        self._stability: Stability | None = None
-        self.refusal: str | None = f"the model has more than {largest:,} unknowns"
-        if 3 * model.mesh.n_nodes <= largest:
-            self._matrix = HessianMatrix(model.mesh, model.supports)
-            self._stability = Stability(model, self._matrix)
-            self.refusal = self._stability.refusal
-        self._scale = max(model.comm.allgather(float(model.nodal_stiffness.max(initial=0.0))))
 
-    def falling(self, x: np.ndarray, walls: WallForces, time: float, bars: np.ndarray | None = None) -> int:
-        """Number of negative eigenvalues of the stiffness at positions (local, 3), -1 where it cannot be factorised.
+def _text(model: Model, state: State, free: list[np.ndarray]) -> str:
+    """Rigid-body motions first, then mechanisms."""
+    if not free:
+        return ""
+    rigid = _rigid(model, state, free)
+    many = f"{len(free)}{' or more' * (len(free) == _MOTIONS)}"
+    text = f". The stiffness leaves {many} motion{'s' * (len(free) > 1)} free"
+    if rigid == len(free):
+        text += ", of the truss as a rigid body"
+    elif rigid:
+        text += f", {rigid} of them of the truss as a rigid body"
+    told = "; ".join(_nodes(model, motion) for motion in free[:_TOLD])
+    return f"{text}: {told}. Add supports or bars that prevent them"
 
-        ``walls`` says which nodes walls push, ``time`` where the walls are; ``bars`` (5, b) is their stiffness if not
-        the tangent, see ``Bars.linearise``. Collective.
-        """
-        nodes, blocks = self._held(walls, time)
-        model, matrix = self.model, self._matrix
 
-        def add(values: np.ndarray) -> None:
-            matrix.add_lumped(np.full(model.mesh.n_owned, _ZERO * self._scale), values)
-            if bars is None:
-                model.bars.tangents(x, 1.0, model.inertia.coefficients(0.0, 0.0), matrix.pattern, values)
-            else:
-                matrix.add_bars(bars, values)
-                if model.bars.springs is not None:
-                    model.bars.springs.add_tangents(1.0, matrix.pattern, values)
-            matrix.add_blocks(nodes, _RIGID * self._scale * blocks, values)
-            matrix.constrain(self._scale, values)
+def _rigid(model: Model, state: State, free: list[np.ndarray]) -> int:
+    """How many rigid-body motions are combinations of free ones. Collective."""
+    x = state.position
+    centre = model.comm.allreduce(x.sum(axis=0)) / model.mesh.n_nodes
+    arms = (x - centre) / model.length
+    motions = [np.broadcast_to(axis, x.shape) for axis in np.eye(3)] + [np.cross(axis, arms) for axis in np.eye(3)]
+    rigid = np.stack(motions)
+    gram = model.comm.allreduce(np.einsum("inc,jnc->ij", rigid, rigid))
+    values, vectors = np.linalg.eigh(gram)
+    # a straight rod has five
+    keep = values > 1e-12 * values[-1]
+    basis = np.einsum("ij,inc->jnc", vectors[:, keep] / np.sqrt(values[keep]), rigid)
+    shares = model.comm.allreduce(np.einsum("inc,jnc->ij", basis, np.stack(free)))
+    return int((np.linalg.svd(shares, compute_uv=False) > 1.0 - 1e-6).sum())
 
-        matrix.fill(add)
-        try:
-            return self._stability.look().negatives
-        except PETSc.Error:
-            return -1
 
-    def _held(self, walls: WallForces, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes (k,) that walls hold, and the projections (k, 3, 3) on their directions, summed."""
-        contact = self.model.contact
-        blocks = np.zeros((self.model.mesh.n_owned, 3, 3))
-        if len(walls.nodes):
-            normals, _ = contact.planes(walls.touching, walls.places, contact.motion.displacements(time))
-            blocks[walls.nodes] += np.einsum("mw,mwi,mwj->mij", walls.touching.astype(float), normals, normals)
-        blocks[held_nodes(self.model, walls)] += np.eye(3)
-        nodes = np.flatnonzero(blocks.any(axis=(1, 2)))
-        return nodes, blocks[nodes]
-
-    def destroy(self) -> None:
-        """Free the PETSc objects. Collective."""
-        for owner in (self._stability, self._matrix):
-            if owner is not None:
-                owner.destroy()
+def _nodes(model: Model, motion: np.ndarray) -> str:
+    """The nodes that a motion moves most, and where to. Collective."""
+    size = np.linalg.norm(motion, axis=1)
+    largest = max(model.comm.allgather(float(size.max(initial=0.0))))
+    at = np.flatnonzero(size > _MOVES * largest)
+    ids = model.mesh.node_ids[at]
+    # the node that moves most, and the lowest ones of those that are named; a motion may move all nodes
+    most = at[np.lexsort((ids, -size[at].round(9)))][:1]
+    mine = [(-float(size[k].round(9)), int(model.mesh.node_ids[k]), motion[k] / size[k]) for k in most]
+    moved = sorted((entry[:2], entry[2]) for part in model.comm.allgather(mine) for entry in part)
+    (_, first), direction = moved[0]
+    lowest = sorted(node for part in model.comm.allgather(np.sort(ids)[: _NAMED + 1].tolist()) for node in part)
+    others = [node for node in lowest if node != first][:_NAMED]
+    more = model.comm.allreduce(len(at)) - 1 - len(others)
+    way = "(" + ", ".join(f"{part:.2g}" for part in direction.round(3) + 0.0) + ")"
+    text = f"node {first} along {way}"
+    if others:
+        text += f", with node{'s' * (len(others) > 1)} " + ", ".join(map(str, others))
+    return text + (f" and {more} more" if more else "")

@@ -7,19 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 
-from ..contact.transform import Transform
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import DIRECT, LinearChoice
 from ..solvers.newton import Tolerance
 from ..stepping.implicit import ImplicitStepper
-from ..stepping.problem import StepProblem
 from ..stepping.stepper import NoRates, Solution
 from ..tolerances import TIME
-from .bordered import free_motions, next_equilibrium
-from .scheme import Equilibrium
-from .stability import LARGEST, LARGEST_WITH_MUMPS, MinimumCheck, held_nodes, is_indefinite
+from .equilibrium import Equilibrium, problem_at_rest
+from .path_points import BorderedSystem
+from .stability import LARGEST, LARGEST_WITH_MUMPS, ZERO, Stability, free_motions, held_nodes, is_indefinite, stiffest
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -36,6 +35,7 @@ _RELEASES = 20  # attempts to find the equilibrium at the end
 UNCOUNTED = -2
 """Of negative eigenvalues: there are some, whose number is unknown."""
 _RESISTANCE = 1e-3  # viscosity over stiffness with which a truss that nothing holds yet is moved against walls
+_AHEAD = 2.0, 0.5, 0.1, 0.02  # of an increment: near a limit point the response to a whole one is too large
 _EXCEEDED = (
     "nodes moved far without load, as in a snap-through, and forces from there on contain the viscous force; compare "
     "with a smaller static.stabilise, or use a dynamic stage"
@@ -221,7 +221,7 @@ class StaticStepper(ImplicitStepper):
         """
         model, state, walls = self.model, self.state, self.solution.walls
         direct, bars = self._choice.krylov == "preonly", model.bars.state_stiffness(state.x)
-        check = MinimumCheck(model, LARGEST_WITH_MUMPS if direct else LARGEST)
+        check = Stability(model, largest=LARGEST_WITH_MUMPS if direct else LARGEST)
         try:
             if check.refusal is None:
                 return check.falling(state.x, walls, state.time, bars)
@@ -229,9 +229,7 @@ class StaticStepper(ImplicitStepper):
             check.destroy()
         if direct:
             return -1
-        balance = Equilibrium().balance(state, 0.0)
-        problem = StepProblem(model, state, balance, state.external, Transform(model.mesh))
-        self.hessian.put(problem, bars)
+        self.hessian.put(problem_at_rest(model, state, state.external), bars)
         held = held_nodes(model, walls)
         held[walls.nodes[walls.touching.any(axis=1)]] = True
         return UNCOUNTED if is_indefinite(model, self.hessian, self.lagged, held) else -1
@@ -406,7 +404,7 @@ class StaticStepper(ImplicitStepper):
         )
         model, smallest = self.model, self.limits.smallest
         free = free_motions(model, self.state)
-        cause = "part of the truss is a mechanism" if free else next_equilibrium(model, self.state, 2.0 * smallest)
+        cause = "part of the truss is a mechanism" if free else self._limit_point(2.0 * smallest)
         if model.can_touch:
             cause += ", or part of the truss is a mechanism"
             others = "static.stabilise, or supports that move the truss instead of loads, pass a limit point"
@@ -418,6 +416,42 @@ class StaticStepper(ImplicitStepper):
             f"no equilibrium found beyond load factor {self.state.time:.6g} with increments down to {smallest:.3g}: "
             f"{cause}; {others}. The last attempt: {failure}{free}"
         )
+
+    def _limit_point(self, size: float) -> str:
+        """What the tangent stiffness shows about the load factors up to ``size`` beyond the equilibrium. Collective.
+
+        The response to the load becomes infinite at a limit point. If one is nearer than an increment, twice this
+        increment times the response is a displacement to states beyond it, where eigenvalues are negative, or zero in
+        plastic mechanisms.
+        """
+        model, state = self.model, self.state
+        if model.can_touch:
+            return "it may be a limit point, which is not examined where contact is possible"
+        stability = Stability(model, largest=LARGEST)
+        if stability.refusal is not None:
+            return f"it may be a limit point, which is not examined: {stability.refusal}"
+        choice = LinearChoice("preonly", DIRECT[not stability.dense], "of the response")
+        system = BorderedSystem(model, stability.matrix, choice, None, Equilibrium(), size)
+        try:
+            system.begin(state)
+            rest = np.zeros_like(state.position)
+            system.linearise(rest)
+            here = stability.look().negatives
+            if here:
+                many = f"{here} negative eigenvalue{'s' * (here > 1)}"
+                return f"the equilibrium is unstable there, with {many} of the stiffness"
+            move, zero = size * system.response(rest, state.time), ZERO * stiffest(model)
+            for part in _AHEAD:
+                stability.matrix.update(system.problem, part * move)
+                there = stability.look()
+                if there.negatives or there.nearest < zero:
+                    return "it is a limit point: the stiffness becomes singular there"
+        except (NotConverged, np.linalg.LinAlgError, PETSc.Error):
+            return "it may be a limit point: the stiffness cannot be factorised there"
+        finally:
+            system.destroy()
+            stability.destroy()
+        return "the stiffness shows no limit point: a smaller static.min_step or a larger solver.max_newton may help"
 
     def _guess(self, balance: Balance) -> np.ndarray:
         """Return the increment proportional to the last one, with prescribed components at exact positions."""

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from ..columns import ENERGIES
 from ..contact.forces import WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
@@ -133,7 +132,6 @@ class Batch:
             and (alone or not model.bars.can_break)
             and model.mesh.messages() is not None
             and model.steady
-            and all(energy.value is None for energy in ENERGIES)
         )
         return model.comm.allreduce(serves, op=MPI.LAND)
 

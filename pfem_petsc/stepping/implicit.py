@@ -144,15 +144,20 @@ class ImplicitStepper(HalvedSteps):
             self.lagged = LaggedPreconditioner(
                 model, choice.preconditioner, symmetric, self.scheme.symmetric, choice.matrix_free
             )
-        self.links = [RowCoordinates(model.links)] if model.links else []
-        self.hessian.couple(self.links)
-        if self.lagged is not None:
-            self.lagged.inner.couple(self.links)
         bounded = choice if model.contact.symmetric else unsymmetric(choice)
         most = model.case.solver.max_newton
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.size, self.lagged)
+        self._couple_rows()
         self.newton.prepare(model.can_touch)
         self._mass: MassSolver | None = None
+
+    def _couple_rows(self) -> None:
+        """Give matrices and solvers the coordinates of the rows that there are. Collective."""
+        self.links = [RowCoordinates(self.model.links)] if self.model.links else []
+        self.newton.forget_bounded()
+        self.hessian.couple(self.links)
+        if self.lagged is not None:
+            self.lagged.inner.couple(self.links)
 
     def supports_changed(self) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
@@ -286,6 +291,9 @@ class ImplicitStepper(HalvedSteps):
         scale = force_scale(model, state, self.part)
         tolerance = self.accuracy * residual_tolerance(model, balance, scale)
         ends = self._tolerance(tolerance)
+        model.links.expect(state, balance)
+        if self.links and self.links[0].rows is not model.links.rows:
+            self._couple_rows()
         active_set = ActiveSet(model, self.state, balance, self.held, self.links, self.remedy)
         candidates, links = self._candidates(active_set, balance), active_set.links
         newton = linear = 0

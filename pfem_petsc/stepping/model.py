@@ -156,7 +156,7 @@ class Model:
             self.temperatures = Temperatures(case, mesh, self.bars)
             self.rest_lengths = RestLengths(case, self.bars)
         self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
-        self.links = ConstraintSet(case, self.nodes, mesh, self.supports.fixed, self.contact)
+        self.links = ConstraintSet(case, self.nodes, self.contact)
         self.can_touch = self.contact.any or bool(self.links)
         if self.supports.inclined is not None:
             refuse_inclined(case.source, mesh, self.supports.inclined.nodes, self.contact, self.links)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .model import Model, StageStart
+from .model import StageStart
 
 if TYPE_CHECKING:
     from .stepper import Stepper
@@ -47,13 +47,8 @@ def hand_over(old: Stepper, new: Stepper) -> None:
     new.ruptures.begin()
     new.model.temperatures.hold(old.model.bars.heat)
     new.model.rest_lengths.hold(old.model.bars.rest)
-    _hand_over_links(old.model, new.model)
+    new.model.links.take_over(old.model.links)
     _hand_over_contact(old, new)
-
-
-def _hand_over_links(old: Model, new: Model) -> None:
-    new.links.load_state({name: values.copy() for name, (_, values) in old.links.arrays().items()})
-    new.links.state = old.links.state
 
 
 def _hand_over_contact(old: Stepper, new: Stepper) -> None:

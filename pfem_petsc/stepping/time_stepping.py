@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..analysis import Analysis
+from ..contact.impact_gains import warn_of_gain
 from ..contact.treatments.base import Restitution, Treatment
 from ..contact.wall_motion import FreeWalls
 from ..errors import InputError
 from ..registry import choices, lookup
-from .contact_check import warn_of_gain
 from .explicit import ExplicitStepper, RedistributedStepper
 from .implicit import ImplicitStepper
 from .plan import Plan, dashpot_rate

@@ -1,4 +1,4 @@
-"""The scaling study's model and resumption, and the lattice and the bare loop of the comparison with peers."""
+"""The scaling study's resumption, and the lattice and the bare loop of the comparison with peers."""
 
 import json
 import subprocess
@@ -8,7 +8,7 @@ from pathlib import Path
 import model as peers
 import numpy as np
 import pytest
-from scaling import Parts, Point, noise_of, points_of, rows_of, run_point, step_time
+from scaling import Point, noise_of, rows_of, run_point
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
@@ -58,41 +58,6 @@ def test_static_solvers_agree():
     assert tops[0] < 0.0  # the edges bulge outwards
 
 
-def test_model_of_one_rank_and_of_many():
-    parts = Parts(bar=1e-8, overhead=5e-5, latency=1e-6, bandwidth=1e10, reduction=4e-6, nodes_per_bar=0.125)
-    alone = step_time(parts, 1e6, np.array([1]))
-    assert alone["step"][0] == pytest.approx(1e-2 + 5e-5)
-    # 1,000 ranks with 8,000 bars, a cube of 10 nodes: 600 nodes on its faces, 12^3 - 10^3 ghosts
-    many = step_time(parts, 8e6, np.array([1000]))
-    assert many["loops"][0] == pytest.approx(1e-8 * (8000 + 0.5 * 5 * 600))
-    assert many["halo"][0] == pytest.approx(26 * 1e-6 + 24 * 728 / 1e10)
-    assert many["sums"][0] == pytest.approx(10e-6)
-    assert many["step"][0] == pytest.approx(sum(many[name][0] for name in ("loops", "halo", "sums", "python")))
-
-
-def test_model_of_ranks_that_share_a_memory_with_imbalance_and_output():
-    parts = Parts(
-        bar=4e-9,
-        overhead=0.0,
-        latency=0.0,
-        bandwidth=1e10,
-        reduction=0.0,
-        nodes_per_bar=0.125,
-        bytes_per_bar=32.0,
-        machine_ranks=64,
-        machine_bandwidth=256e9,
-        imbalance=1.1,
-        snapshot=40.0,
-        fields_every=100,
-        disk=1e10,
-    )
-    assert parts.needed == pytest.approx(512e9)  # 64 ranks at 8 GB/s
-    one, many = step_time(parts, 8e6, np.array([1])), step_time(parts, 8e6, np.array([1000]))
-    assert one["loops"][0] == pytest.approx(1.1 * 4e-9 * 8e6)  # alone on the machine
-    assert many["loops"][0] == pytest.approx(1.1 * 8e-9 * (8000 + 0.5 * 5 * 600))  # half of what they need
-    assert many["output"][0] == pytest.approx(40.0 * 8e6 / 1e10 / 100)
-
-
 def test_points_with_other_programs_beside_them_are_marked():
     quiet = {"step_s": 1.0, "best_s": 0.95, "bandwidth_alone": 1e10, "bandwidth_ratio": 1.3, "ranks": 2}
     assert noise_of(quiet, 1.1e10) == ""
@@ -103,11 +68,9 @@ def test_points_with_other_programs_beside_them_are_marked():
 
 
 def test_points_of_both_studies_share_runs():
-    sizes = {"strong": [1000], "weak": [500]}
-    points = points_of(["strong", "weak"], ["cubic"], ["explicit"], sizes, [1, 2], lambda job: "central_differences")
-    files = [(p.study, p.ranks, p.file) for p in points]
-    assert len(files) == 4
-    assert len({name for _, _, name in files}) == 3
+    whole, part = (Point(study, "cubic", "explicit", "newmark", 1000, 1) for study in ("strong", "weak"))
+    assert whole.file == part.file
+    assert part._replace(ranks=2).file == whole._replace(size=2000, ranks=2).file != whole._replace(ranks=2).file
 
 
 @pytest.mark.thorough

@@ -7,13 +7,14 @@ import pytest
 
 from pfem_petsc import __version__
 from pfem_petsc.case.toml import built_in_cases
-from pfem_petsc.cli.list import KINDS
-from pfem_petsc.cli.main import VERBS, main
+from pfem_petsc.cli.cases import KINDS
+from pfem_petsc.cli.main import HOMES as HOMES
+from pfem_petsc.cli.main import main
 from pfem_petsc.cli.parser import seconds
 from pfem_petsc.registry import choices
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", HOMES)
 def test_help_has_an_example(verb, capsys):
     assert main([verb, "--help"]) == 0
     printed = capsys.readouterr().out
@@ -24,7 +25,7 @@ def test_help_has_an_example(verb, capsys):
 def test_help_and_version(capsys):
     assert main(["--help"]) == 0
     printed = capsys.readouterr().out
-    assert set(VERBS) <= {line.split()[0] for line in printed.splitlines() if line.startswith("    ")}
+    assert set(HOMES) <= {line.split()[0] for line in printed.splitlines() if line.startswith("    ")}
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"pfem_petsc {__version__}\n"
 

@@ -13,9 +13,9 @@ import pfem_petsc
 from pfem_petsc import InputError
 from pfem_petsc.case.schema import Case
 from pfem_petsc.case.toml import built_in_cases
-from pfem_petsc.cli import environment, launcher
+from pfem_petsc.cli import environment
 from pfem_petsc.cli.environment import Finding, inspect_environment, report
-from pfem_petsc.cli.main import VERBS, main
+from pfem_petsc.cli.main import HOMES, exit_message, main
 
 HERE = {
     "version('": "99.0",
@@ -182,8 +182,8 @@ def test_a_numpy_that_is_too_new_has_its_remedy(tmp_path, monkeypatch):
     monkeypatch.setitem(pfem_petsc._HOMES, "Bound", "binding_of_a_test")
     with pytest.raises(InputError, match=r'python -m pip install "numpy<2"') as caught:
         pfem_petsc.Bound  # noqa: B018 - imported at its first use
-    assert launcher.exit_message(caught.value.__cause__) == (2, f"error: {caught.value}")
-    assert launcher.exit_message(ValueError("numpy is here"))[1].startswith("internal error: ValueError")
+    assert exit_message(caught.value.__cause__) == (2, f"error: {caught.value}")
+    assert exit_message(ValueError("numpy is here"))[1].startswith("internal error: ValueError")
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +239,7 @@ def test_keys_that_are_completed_exist(script):
 def test_scripts_are_valid_and_have_the_words(shell, capsys, tmp_path):
     assert main(["completion", shell]) == 0
     text = capsys.readouterr().out
-    assert all(verb in text for verb in VERBS) and "rod_impact" in text and "time.step=" in text
+    assert all(verb in text for verb in HOMES) and "rod_impact" in text and "time.step=" in text
     if which(shell) is not None:
         (tmp_path / "script").write_text(text)
         subprocess.run([shell, "-n", tmp_path / "script"], check=True)

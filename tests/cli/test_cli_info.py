@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from pfem_petsc.cli.info import describe
+from pfem_petsc.cli.results import describe
 from pfem_petsc.output.units import TIME
 
 

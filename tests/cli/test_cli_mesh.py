@@ -91,7 +91,7 @@ def test_pictures_have_the_colours_of_groups():
 
     from matplotlib.image import imread
 
-    from pfem_petsc.post.mesh_picture import draw
+    from pfem_petsc.post.page import mesh_page as draw
 
     image = imread(io.BytesIO(draw(read_whole(MESHES / "mast.vtu"), (640, 360), "xz")))
     assert image.shape[:2] == (360, 640)

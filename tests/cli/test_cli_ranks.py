@@ -9,7 +9,7 @@ def run_collectively(on_ranks, tmp_path, ranks, body, timeout=240.0, debug=False
     lines = "\n".join(f"    {line}" for line in body.splitlines())
     script.write_text(
         "import sys\n"
-        "from pfem_petsc.cli.launcher import collectively\n"
+        "from pfem_petsc.cli.main import collectively\n"
         "from pfem_petsc.errors import *\n"
         f"def verb(comm):\n{lines}\n"
         f"sys.exit(collectively(verb, {debug}))\n"

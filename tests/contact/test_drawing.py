@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc.contact.walls import cylinder, rectangle, sphere
-from pfem_petsc.post.walls import wall_surfaces
+from pfem_petsc.post.motion import wall_surfaces
 
 WALLS = [
     sphere.Parameters(name="w", type="sphere", point=(0.1, 0.2, 0.3), radius=0.5),

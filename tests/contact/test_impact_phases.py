@@ -7,11 +7,12 @@ import impact_phases as table
 import numpy as np
 import pages
 import pytest
+from impact_rods import SWING, scan_impacts
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
+from pfem_petsc.contact.impact_gains import BOUND, STEPS, RodImpact, impact_gain, overshoots, warn_of_gain
 from pfem_petsc.registry import lookup
-from pfem_petsc.stepping.contact_check import BOUND, SWING, Asked, contact_gain, overshoots, scan_impacts, warn_of_gain
 
 ROOT = Path(__file__).parents[2]
 
@@ -21,6 +22,11 @@ TRAPEZOID = {"beta": 0.25, "gamma": 0.5}
 def scheme(integrator, parameters):
     module = lookup("pfem_petsc.integrators", integrator, "")
     return module.Scheme(module.Parameters(**parameters))
+
+
+def known_parameters(integrator, parameters):
+    module = lookup("pfem_petsc.integrators", integrator, "")
+    return tuple(module.Parameters(**parameters).model_dump().values())
 
 
 @pytest.mark.parametrize(
@@ -50,7 +56,9 @@ def scheme(integrator, parameters):
 def test_small_rod_and_program_agree(integrator, parameters, treatment, mass, step, restitution):
     """A linear rod with dense matrices, written for itself, does in all phases what the program does."""
     found = table.impacts(integrator, parameters, treatment, mass, step, restitution)
-    expected = scan_impacts(scheme(integrator, parameters), Asked(treatment, mass == "consistent", step, restitution))
+    expected = scan_impacts(
+        scheme(integrator, parameters), RodImpact(treatment, mass == "consistent", step, restitution)
+    )
     np.testing.assert_allclose(found.largest, expected.largest, rtol=1e-9)
     np.testing.assert_allclose(found.last, expected.last, rtol=1e-9)
     np.testing.assert_allclose(found.force, expected.force, rtol=1e-9)
@@ -108,7 +116,7 @@ def test_restitution_takes_no_energy_from_bars(integrator, parameters, restituti
 def test_explicit_rebound_gives_no_energy(integrator, parameters, bound):
     """With e = 1 the rods end with what they had, to second order; gains of 4 to 14 % before, at any small step."""
     known = scheme(integrator, parameters)
-    found = [scan_impacts(known, Asked("scheme", False, step, 1.0)) for step in (0.2, 0.05)]
+    found = [scan_impacts(known, RodImpact("scheme", False, step, 1.0)) for step in (0.2, 0.05)]
     for scan, part in zip(found, (1.0, 0.25), strict=True):
         assert scan.largest.max() <= 1.0 + part * bound
         assert scan.last.max() <= 1.0 + 0.25 * part * bound
@@ -121,27 +129,40 @@ def test_explicit_rebound_gives_no_energy(integrator, parameters, bound):
 @pytest.mark.parametrize("elements", [1, 2])
 def test_stick_does_no_work_when_it_lets_go(elements):
     """The trapezoidal rule books half of the last force as work on a node that leaves: gains of 29 % and 5 % before."""
-    asked = Asked("stick", False, 3.0, elements=elements)
+    asked = RodImpact("stick", False, 3.0, bars=elements)
     assert scan_impacts(scheme("newmark", TRAPEZOID), asked).largest.max() < 1.01
 
 
 @pytest.mark.parametrize(
     ("integrator", "parameters", "asked"),
     [
-        ("wilson", {"theta": 1.5}, Asked("scheme", False, 0.2)),
-        ("wilson", {"theta": 1.4}, Asked("scheme", True, 0.2)),
-        ("wilson", {"theta": 1.5}, Asked("stick", False, 5.0)),
-        ("newmark", TRAPEZOID, Asked("scheme", False, 1.0)),
-        ("newmark", TRAPEZOID, Asked("mass_redistribution", False, 20.0)),
-        ("houbolt", {}, Asked("conserving", False, 5.0)),
-        ("hulbert_chung", {"rho_b": 1.0}, Asked("scheme", False, 0.2)),
-        ("central_differences", {}, Asked("scheme", False, 0.9, 1.0)),
-        ("chung_lee", {}, Asked("stick", False, 0.9, 0.5)),
+        ("wilson", {"theta": 1.5}, RodImpact("scheme", False, 0.2)),
+        ("wilson", {"theta": 1.4}, RodImpact("scheme", True, 0.2)),
+        ("wilson", {"theta": 1.5}, RodImpact("stick", False, 5.0)),
+        ("newmark", TRAPEZOID, RodImpact("scheme", False, 1.0)),
+        ("newmark", TRAPEZOID, RodImpact("mass_redistribution", False, 20.0)),
+        ("houbolt", {}, RodImpact("conserving", False, 5.0)),
+        ("hulbert_chung", {"rho_b": 1.0}, RodImpact("scheme", False, 0.2)),
+        ("central_differences", {}, RodImpact("scheme", False, 0.9, 1.0)),
+        ("chung_lee", {}, RodImpact("stick", False, 0.9, 0.5)),
     ],
 )
 def test_gains_that_are_warned_of(integrator, parameters, asked):
-    module = lookup("pfem_petsc.integrators", integrator, "")
-    assert contact_gain(integrator, module.Parameters(**parameters).model_dump_json(), asked) > BOUND
+    assert impact_gain(integrator, known_parameters(integrator, parameters), asked) > BOUND
+
+
+@pytest.mark.parametrize(("integrator", "parameters"), [("newmark", TRAPEZOID), ("houbolt", {}), ("souza_moura", {})])
+def test_table_has_what_the_rods_gain(integrator, parameters):
+    """At its own steps and restitutions, and at the nearest ones for others."""
+    values = known_parameters(integrator, parameters)
+    for treatment, consistent, restitution in (("scheme", False, 0.0), ("scheme", False, 0.8), ("stick", False, 0.0)):
+        for step, bars in ((STEPS[2], 20), (0.5 if integrator == "souza_moura" else 5.0, 7)):
+            impact = RodImpact(treatment, consistent, step, restitution, bars)
+            gain = scan_impacts(scheme(integrator, parameters), impact).gain
+            quarter = min(STEPS, key=lambda size, step=step: abs(size - 0.25 * step))
+            gain = max(gain, scan_impacts(scheme(integrator, parameters), replace(impact, step=quarter)).gain)
+            for near in (impact, replace(impact, step=1.01 * step, restitution=1.02 * restitution)):
+                assert impact_gain(integrator, values, near) == pytest.approx(gain, rel=1e-3, abs=1e-7)
 
 
 @pytest.mark.parametrize("treatment", ["scheme", "stick"])
@@ -162,7 +183,6 @@ def test_wilson_beyond_the_explicit_limit_is_always_warned_of(treatment):
 @pytest.mark.parametrize(("integrator", "parameters"), table.SCHEMES)
 def test_no_combination_gains_without_a_warning(integrator, parameters):
     """Every treatment and mass, restitution too, rods of 5 and 40 bars, other phases than those that are judged by."""
-    known = lookup("pfem_petsc.integrators", integrator, "").Parameters(**parameters)
     explicit = scheme(integrator, parameters).explicit
     silent = 0
     for treatment, mass, restitution in [*table.COLUMNS.values(), ("scheme", "lumped", 0.95)]:
@@ -173,12 +193,12 @@ def test_no_combination_gains_without_a_warning(integrator, parameters):
             continue
         for step in steps:
             for elements in (5, 40):
-                asked = Asked(treatment, mass == "consistent", step, restitution, min(elements, 20))
-                gain = contact_gain(integrator, known.model_dump_json(), asked)
+                asked = RodImpact(treatment, mass == "consistent", step, restitution, min(elements, 20))
+                gain = impact_gain(integrator, known_parameters(integrator, parameters), asked)
                 if gain > BOUND or overshoots(integrator, step):
                     continue
                 silent += 1
-                found = scan_impacts(scheme(integrator, parameters), replace(asked, elements=elements), phases=29)
+                found = scan_impacts(scheme(integrator, parameters), replace(asked, bars=elements), phases=29)
                 assert found.gain <= 0.02, (asked, elements)
     assert silent >= (1 if integrator == "wilson" else 4)
 

@@ -4,14 +4,13 @@ import time
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
-from pfem_petsc.contact.pairs import across, nearest_among_ranks
+from pfem_petsc.contact.pairs import across, nearest_points
 
 
 def nearest(points, queries, normal):
-    """The indices of the nearest points on one rank."""
-    return nearest_among_ranks(MPI.COMM_SELF, np.arange(len(points))[:, None], points, queries, normal)[:, 0]
+    """The indices of the nearest points, seen along a direction."""
+    return nearest_points(across(points, normal), across(queries, normal))
 
 
 def looking_at_all(points, queries, normal):
@@ -62,28 +61,3 @@ def test_across_is_across():
     flat = across(points, normal)
     np.testing.assert_allclose(flat @ normal, 0.0, atol=1e-15)
     np.testing.assert_allclose(np.cross(points - flat, normal), 0.0, atol=1e-15)
-
-
-@pytest.mark.parallel
-@pytest.mark.parametrize("kind", ["scattered", "ties", "line", "one place", "far away"])
-def test_ranks_find_what_one_finds(kind, comm):
-    """Points and queries strewn over the ranks, all on one of them, and fewer points than ranks."""
-    rng = np.random.default_rng(5)
-    for trial in range(12):
-        normal = rng.normal(size=3) if trial % 2 else np.eye(3)[trial % 3]
-        normal = normal / np.linalg.norm(normal)
-        n, m = (1, 7) if trial == 3 else rng.integers(1, 150, size=2)
-        points, queries = cloud(kind, rng, normal, n, m)
-        ids, owners, askers = (
-            rng.permutation(3 * n)[:n],
-            rng.integers(comm.size, size=n),
-            rng.integers(comm.size, size=m),
-        )
-        if trial == 5:
-            owners[:] = comm.size - 1
-        mine, asking = owners == comm.rank, askers == comm.rank
-        keys = np.column_stack([ids, 7 * ids])
-        found = nearest_among_ranks(comm, keys[mine], points[mine], queries[asking], normal)
-        order = np.argsort(ids)
-        expected = keys[order][looking_at_all(points[order], queries[asking], normal)].reshape(-1, 2)
-        np.testing.assert_array_equal(found, expected)

@@ -156,7 +156,7 @@ def test_matrix_adjoint_inverse_and_both_operators(model, comm):
         np.testing.assert_allclose(closed[model.supports.fixed], 0.0, atol=1e-16)
     # the residual of forces of rows gives these forces, whatever walls and supports do
     expected, g = 1.0 + link.rows.ids, np.zeros((owned, 3))
-    model.links.state = expected, link.jacobian
+    model.links.force, model.links.jacobian = expected, link.jacobian
     model.links.add_forces(g)
     if frames is not None:
         g[frames.nodes] = np.einsum("nji,nj->ni", frames.inverse, g[frames.nodes])

@@ -58,21 +58,6 @@ def test_pendulum_on_a_tether(integrator, error, examples, comm, shared_tmp_path
     assert (errors[1] < 0.3 * errors[0] + 1e-6).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parallel
-@pytest.mark.parametrize("integrator", ["energy_momentum", "generalized_alpha"])
-def test_pendulum_keeps_its_energy_by_gradients_within_the_step(integrator, examples, comm, shared_tmp_path):
-    """Forces act along the tether in the middle of the step, where it does no work, or at the place of the balance."""
-    errors = []
-    for steps in (25, 50):
-        run(pendulum(integrator, steps), comm, shared_tmp_path / str(steps))
-        history = history_of(shared_tmp_path / str(steps))
-        lost = (history["kinetic_energy"] - history["external_work"])[-1] / 4.905
-        errors.append(abs(lost))
-    assert errors[1] < max(0.3 * errors[0], 1e-9)
-    assert errors[1] < 1e-3
-
-
 def two_rods(integrator: str, rope: str, *keys: str) -> Case:
     """Two rods of 1 m fly apart, askew, between their ends 0.1 m of room and a tether."""
     own = ["mesh.length=1.0", "mesh.elements=3", "mesh.gap=0.1", 'node_set.tip={group="first_end"}', "wall=[]", rope]

@@ -16,7 +16,7 @@ from helpers.contributed import EXAMPLES, PACKAGES, TEXT, run
 from pfem_petsc import Case, Simulation, fields, open_result
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.walls import wall_surfaces
+from pfem_petsc.post.motion import wall_surfaces
 
 
 def test_one_example_of_each_kind():

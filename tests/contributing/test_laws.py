@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from document_laws import text_of, undocumented
 from helpers.contributed import run
-from PIL import Image
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.cli.main import main
@@ -157,22 +156,6 @@ def test_law_in_every_scheme(examples, comm, tmp_path):
         assert error < 1e-3, (integrator, error)
 
 
-@pytest.mark.slow
-def test_law_in_pictures(examples, tmp_path):
-    """A picture coloured by an internal variable of the law, and the reader's list of fields."""
-    from pfem_petsc.post.render import render
-
-    with Simulation(one_bar("central_differences", 2e-3, 40), output=tmp_path / "bar", quiet=True) as simulation:
-        simulation.run()
-    result = open_result(tmp_path / "bar")
-    assert set(VARIABLES) <= set(result.cell_fields)
-    written = render(tmp_path / "bar", field="back_stress", size=(480, 270), video="none", note=print)
-    frames = [np.asarray(Image.open(path).convert("RGB")).astype(int) for path in written if path.suffix == ".png"]
-    assert len(frames) >= 2
-    coloured = [(np.ptp(frame, axis=2) > 60).sum() for frame in frames]
-    assert min(coloured) > 50 and np.abs(frames[1] - frames[-1]).max() > 60  # its colour changes as it yields
-
-
 def test_law_without_mean_stress_is_refused_by_the_energy_momentum_scheme(examples, monkeypatch, tmp_path, capsys):
     module = importlib.import_module("pfem_petsc.mechanics.materials.viscoplastic")
     monkeypatch.setattr(module, "LAW", dataclasses.replace(module.LAW, mean_stress=None))
@@ -206,14 +189,3 @@ def test_law_without_a_static_limit_or_softening_is_refused(examples, tmp_path, 
     path.write_text(Case.from_dict(static | {"static": {"method": "newton"}}).to_toml())
     assert main(["run", str(path), "-o", str(tmp_path / "out")]) == 2
     assert "depends on the rate of strain, and a static analysis has no time" in capsys.readouterr().err
-
-
-def test_unknown_law_and_keys_of_another_are_refused(examples):
-    table = one_bar("newmark", 2e-3, 10).to_dict()
-    for changes, words in (
-        ({"law": "viscoplastik"}, ["material.it.law", "unknown value", "did you mean 'viscoplastic'?"]),
-        ({"law": "elastoplastic"}, ["material.it.hardening", "a key of viscoplastic, not of the law elastoplastic"]),
-    ):
-        with pytest.raises(InputError) as error:
-            Case.from_dict(table | {"material": {"it": LAW | changes}})
-        assert all(word in str(error.value) for word in words), str(error.value)

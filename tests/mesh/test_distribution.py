@@ -115,19 +115,6 @@ def test_ghosts_take_the_owners_values(case, columns):
         np.testing.assert_array_equal(values, wanted + offset)
 
 
-def test_updates_of_different_width_may_overlap(case):
-    _, _, mesh = case
-    one, three = np.zeros(mesh.n_local), np.zeros((mesh.n_local, 3))
-    one[: mesh.n_owned] = mesh.node_ids[: mesh.n_owned]
-    three[: mesh.n_owned] = mesh.points[: mesh.n_owned]
-    mesh.begin_update(three)
-    mesh.begin_update(one)
-    mesh.end_update(three)
-    mesh.end_update(one)
-    np.testing.assert_array_equal(one, mesh.node_ids)
-    np.testing.assert_array_equal(three, mesh.points)
-
-
 def test_arrays_that_cannot_be_updated_are_refused(case):
     _, _, mesh = case
     if mesh.n_neighbours:

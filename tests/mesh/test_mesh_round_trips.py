@@ -179,7 +179,7 @@ def test_bars_of_several_groups_in_gmsh_2(tmp_path):
     [
         ('1\n"area"', 'x\n"area"', r"section \$ElementData: 'x' is not the number of its tags"),
         ("3\n0\n1\n4", "3\n0\nmany\n4", r"section \$ElementData 'area': expected three whole numbers"),
-        ("3\n0\n1\n4", "3\n0\n1\n400", r"\$ElementData 'area': its counts declare 800 numbers where 8"),
+        ("3\n0\n1\n4", "3\n0\n1\n400", r"\$ElementData 'area': its counts declare more numbers than it has"),
     ],
 )
 def test_gmsh_data_with_one_thing_wrong(tmp_path, old, new, text):

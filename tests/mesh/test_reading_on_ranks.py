@@ -186,7 +186,7 @@ def test_gmsh_with_tags_far_apart_and_in_any_order_is_read_in_parts(comm, shared
         ("\n900\n", "\n3\n", "section $Nodes: node 3 is listed more than once"),
         ("1 3 900", "1 3 901", "section $Elements: node 901 is not in $Nodes"),
         ("0 0 0", "0 zero 0", "section $Nodes, line 8: 'zero' is not a number"),
-        ("$EndElements", "7\n$EndElements", "section $Elements: 1 numbers more than its counts declare"),
+        ("$EndElements", "7\n$EndElements", "section $Elements: has more numbers than its counts declare"),
         ("$Nodes", "$Comments\nbars in the order of their tags\n$EndComments\n$Nodes", "do not follow one another"),
     ],
 )

@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.cli.main import main
-from pfem_petsc.errors import EarlyStop, InputError, SimulationFailure
+from pfem_petsc.errors import EarlyStop, InputError
 from pfem_petsc.modes import find as choice
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.verify import examine
@@ -82,16 +82,11 @@ def test_damage_is_found(tmp_path):
     assert examine(path, deep=True) == [f"mode {k} does not match its checksum" for k in (3, 8)]
 
 
-def test_a_result_without_modes(tmp_path):
-    case = arch_of(tmp_path, MPI.COMM_SELF, press(0.5))
-    run(case, tmp_path / "out")
-    result = open_result(tmp_path / "out")
-    assert result.n_modes == 0
+def test_results_without_modes_or_frequencies(tmp_path):
+    run(arch_of(tmp_path, MPI.COMM_SELF, press(0.5)), tmp_path / "none")
+    assert open_result(tmp_path / "none").n_modes == 0
     with pytest.raises(InputError, match="has no modes"):
-        _ = result.modes
-
-
-def test_buckling_has_no_frequency(tmp_path):
+        _ = open_result(tmp_path / "none").modes
     run(arch_of(tmp_path, MPI.COMM_SELF, press(0.5), modes={"kind": "buckling"}), tmp_path / "out")
     modes = open_result(tmp_path / "out").modes
     assert len(modes) == 1 and modes.label(0).startswith("mode 1: load factor ")
@@ -118,26 +113,6 @@ def test_restart_of_a_finished_run(tmp_path):
     assert result.modes.frequency < first
     assert examine(result.path, deep=True) == []
     run(arch_of(tmp_path, MPI.COMM_SELF, tables), out, restart=True)
-
-
-@pytest.mark.slow
-def test_restart_after_modes_were_not_reached(tmp_path, monkeypatch):
-    """A run that ended between its last step and its modes gets them by a restart."""
-    from pfem_petsc.run import outputs
-
-    tables = press(0.5) | {"output": {"checkpoint_every": 1}}
-    case = arch_of(tmp_path, MPI.COMM_SELF, tables, modes={"count": 1})
-
-    def fail(*_):
-        raise SimulationFailure("modes: ended here")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(outputs, "record_modes", fail)
-        with pytest.raises(SimulationFailure, match="ended here"):
-            Simulation(case, MPI.COMM_SELF, output=tmp_path / "out", quiet=True).run()
-    assert open_result(tmp_path / "out").n_modes == 0
-    run(case, tmp_path / "out", restart=True)
-    assert open_result(tmp_path / "out").n_modes == 1
 
 
 @pytest.mark.slow
@@ -182,31 +157,17 @@ def test_modes_at_the_end_of_time_stepping(tmp_path):
     assert found[6:] == pytest.approx(rest[6:], rel=1e-8)
 
 
-class TestNoLibrary:
-    """Where neither SLEPc nor SciPy can be loaded."""
-
-    @pytest.fixture(autouse=True)
-    def _without(self, monkeypatch):
-        monkeypatch.setattr(choice, "available", lambda package: False)
-
-    def test_small_models_are_solved_by_numpy(self, tmp_path):
-        run(block(), tmp_path)
-        assert len(open_result(tmp_path).modes) == 8
-
-    def test_large_ones_are_refused_before_the_run(self, tmp_path, monkeypatch, capsys):
-        monkeypatch.setattr(choice, "DENSE_UP_TO", 50)
-        monkeypatch.setattr(choice, "DENSE_AT_MOST", 60)
-        case = block()
-        (tmp_path / "block.toml").write_text(case.to_toml())
-        assert main(["run", str(tmp_path / "block.toml"), "-o", str(tmp_path / "out")]) == 2
-        error = capsys.readouterr().err
-        assert "free components need slepc4py" in error and "pip install scipy" in error
-        assert not (tmp_path / "out").exists()
-
-    @pytest.mark.parametrize(("solver", "package"), [("slepc", "slepc4py"), ("scipy", "scipy")])
-    def test_what_is_asked_for_and_not_there(self, solver, package):
-        with pytest.raises(InputError, match=f'modes.solver = "{solver}": {package} is not installed'):
-            Simulation(block(solver=solver), MPI.COMM_SELF, check_only=True)
+def test_where_slepc_is_not_there(monkeypatch):
+    """SciPy takes its place up to a size, beyond which the case is refused before the run."""
+    monkeypatch.setattr(choice, "has_slepc", lambda: False)
+    monkeypatch.setattr(choice, "DENSE_UP_TO", 50)
+    with Simulation(block(), MPI.COMM_SELF, check_only=True) as simulation:
+        assert choice.describe_modes(simulation.model)["modes"].endswith("solver scipy")
+    monkeypatch.setattr(choice, "GATHERED_AT_MOST", 60)
+    with pytest.raises(InputError, match="free components need slepc4py"):
+        Simulation(block(), MPI.COMM_SELF, check_only=True)
+    with pytest.raises(InputError, match='modes.solver = "slepc": slepc4py is not installed'):
+        Simulation(block(solver="slepc"), MPI.COMM_SELF, check_only=True)
 
 
 def test_check_and_info_tell_of_modes(tmp_path, capsys):

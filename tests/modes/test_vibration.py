@@ -10,6 +10,7 @@ from helpers.statics import ARCH_AREA, ARCH_YOUNG, arch_of, press
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import SimulationFailure
+from pfem_petsc.modes import solvers
 from pfem_petsc.output.result import open_result
 
 pytestmark = pytest.mark.parallel
@@ -162,13 +163,11 @@ def test_state_under_load(shared_tmp_path, comm):
 def test_multigrid_in_place_of_a_factorisation(held, shared_tmp_path, comm, monkeypatch):
     """As for models that are too large to be factorised; the numbers are those of dense matrices."""
     pytest.importorskip("slepc4py")
-    from pfem_petsc.modes.eigen import slepc
-
     data = block("dense", count=8).to_dict()
     if held:
         data |= {"node_set": {"feet": {"group": "bottom"}}, "support": [{"node_set": "feet", "fix": "xyz"}]}
     expected = modes_of(Case.from_dict(data), shared_tmp_path / "dense", comm)
-    monkeypatch.setattr(slepc, "DIRECT_UP_TO", 0)
+    monkeypatch.setattr(solvers, "DIRECT_UP_TO", 0)
     data["modes"]["solver"] = "slepc"
     found = modes_of(Case.from_dict(data), shared_tmp_path / "multigrid", comm)
     assert found[0] == pytest.approx(expected[0], rel=1e-8)

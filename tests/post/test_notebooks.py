@@ -1,4 +1,4 @@
-"""What notebooks show: tables, progress and curves during a run."""
+"""What notebooks show: tables and progress."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import types
 import pytest
 from mpi4py import MPI
 
-from pfem_petsc import Case, InputError, LivePlot, Simulation, open_result
+from pfem_petsc import Case, InputError, Simulation, open_result
 from pfem_petsc.output import bar
 from pfem_petsc.output.progress import Progress
 
@@ -54,7 +54,7 @@ def notebook(monkeypatch):
         return Handle(shown)
 
     fake = types.ModuleType("IPython.display")
-    fake.HTML, fake.display, fake.Image = str, display, lambda data: data
+    fake.HTML, fake.display = str, display
     ipython = types.ModuleType("IPython")
     ipython.version_info = (9, 0)
     monkeypatch.setitem(sys.modules, "IPython", ipython)
@@ -77,24 +77,3 @@ def test_progress_in_a_notebook_is_one_bar(notebook):
     assert 2 <= len(shown) <= 4 and "100 %" in shown[-1] and "A &lt;rod&gt;" in shown[-1]
     assert "nodes" not in cell.getvalue() and cell.getvalue().count("\n") == 1
     assert "done: 1,000 steps" in cell.getvalue()
-
-
-def test_live_plot(notebook, tmp_path, monkeypatch):
-    cell, shown = notebook
-    monkeypatch.setattr(sys, "stdout", cell)
-    case = Case.load("rod_impact", ["time.end=0.3"])
-    plot = LivePlot("kinetic_energy", "momentum", interval=0.0, file=tmp_path / "live.png")
-    with Simulation(case, MPI.COMM_SELF, output=tmp_path / "out", quiet=True) as simulation:
-        simulation.on_step(plot, every=10)
-        simulation.run()
-    assert plot.times == pytest.approx([0.1, 0.2, 0.3]) and len(shown) == 3
-    history = open_result(tmp_path / "out").history
-    assert plot.columns["kinetic_energy"] == history["kinetic_energy"][[10, 20, 30]].tolist()
-    assert list(plot.columns) == ["kinetic_energy", "momentum.x", "momentum.y", "momentum.z"]
-    assert (tmp_path / "live.png").read_bytes() == shown[-1] == plot._repr_png_()
-    with (
-        Simulation(case, MPI.COMM_SELF, output=tmp_path / "bad", quiet=True) as simulation,
-        pytest.raises(InputError, match="LivePlot: the history has no column kinetic_enrgy, did you mean"),
-    ):
-        simulation.on_step(LivePlot("kinetic_enrgy"))
-        simulation.run()

@@ -11,9 +11,9 @@ from helpers.synthetic import SyntheticResult, ring
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.colours import ColourField, ColourScale
+from pfem_petsc.post.motion import plane, wall_surfaces
 from pfem_petsc.post.page import grid
 from pfem_petsc.post.render import instants
-from pfem_petsc.post.walls import plane, wall_surfaces
 
 BOX = np.array([[0.0, 0.0, 0.0], [2.0, 1.0, 1.0]])
 

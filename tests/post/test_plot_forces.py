@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +17,6 @@ from pfem_petsc.errors import InputError
 from pfem_petsc.output.units import common_prefix
 from pfem_petsc.post.closed_forms import closed_form
 from pfem_petsc.post.filters import cfc
-from pfem_petsc.post.forces import draw_forces
 from pfem_petsc.post.plot import plot
 
 
@@ -96,13 +96,14 @@ def test_closed_form_of_the_rod(tmp_path):
         assert closed_form(moved) is None
 
 
-def test_forces_of_a_picture_have_one_unit(result):
+def test_forces_of_a_picture_have_one_unit(tmp_path, result):
     """1.6 kN as computed, less than 1 kN filtered, and a second wall with 40 N."""
     result.history["wall/wall/force"] = result.history["wall/wall/force"] * (1600.0 / 54e3)
     result.history["wall/far/force"] = result.history["wall/wall/force"] / 40.0
-    chart = draw_forces(result.history, "wall", result.case.wall, "")
-    labels = {axes.get_ylabel() for axes in chart.axes.flat} - {"nodes in\ncontact"}
-    assert labels == {"normal force [kN]", "force [kN]"}
+    written = {path.name: path for path in plot(result, tmp_path, formats=["svg"])}
+    assert set(re.findall(r">([a-z ]*force \[\w+\])<", written["walls.svg"].read_text())) == {
+        *("normal force [kN]", "force [kN]"),
+    }
     assert common_prefix([2e6, 30.0], "N") == (1e-3, "kN")
     assert common_prefix([2e6, 1e-8, 0.0], "N") == (1e-6, "MN")
     assert common_prefix([0.02, np.nan], "m") == (1e3, "mm")

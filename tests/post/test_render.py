@@ -17,9 +17,9 @@ from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.contact.walls.plane import Parameters
 from pfem_petsc.errors import InputError
 from pfem_petsc.post import scene
+from pfem_petsc.post.motion import walls_present
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.render import render, render_modes
-from pfem_petsc.post.walls import walls_present
 
 SMALL = (480, 270)
 

@@ -147,7 +147,7 @@ def test_path_files(tmp_path):
     file.write_text("time,azimuth,elevation,zoom\n0,0,10,1\n# closer\n1,90,20,2\n")
     assert camera_path(file).tolist() == [[0, 0, 10, 1], [1, 90, 20, 2]]
     file.write_text("0,0,10,1\n1,90,20\n")
-    with pytest.raises(InputError, match="line 2 is not four numbers"):
+    with pytest.raises(InputError, match="at row 2"):
         camera_path(file)
     with pytest.raises(InputError, match="cannot be read"):
         camera_path(tmp_path / "none.csv")

@@ -1,11 +1,5 @@
 """Paths under what depends on the load factor: forces, supports, temperatures; bars that yield and unload."""
 
-import atexit
-import shutil
-import tempfile
-from pathlib import Path
-
-import h5py
 import numpy as np
 import pytest
 from helpers.runs import run
@@ -18,13 +12,9 @@ COMM = MPI.COMM_SELF
 
 def case_of(points, bars, material, area, support, static, **tables):
     """A truss of few nodes, in any consistent units; the node sets are n0, n1, ..."""
-    folder = Path(tempfile.mkdtemp(prefix="pfem-test-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    with h5py.File(folder / "mesh.h5", "w") as file:
-        file["points"], file["bars"] = np.array(points, dtype=float), np.array(bars)
     return Case.from_dict(
         {
-            "mesh": {"file": "mesh.h5"},
+            "mesh": {"generator": "arrays", "points": points, "bars": bars},
             "node_set": {f"n{k}": {"indices": [k]} for k in range(len(points))},
             "material": {"it": {"density": 1.0, **material}},
             "section": {"it": {"area": area, "material": "it"}},
@@ -35,8 +25,7 @@ def case_of(points, bars, material, area, support, static, **tables):
                 "probe": [{"name": f"n{k}", "node_set": f"n{k}"} for k in range(len(points))],
             },
             **tables,
-        },
-        folder=folder,
+        }
     )
 
 

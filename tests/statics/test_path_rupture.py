@@ -98,62 +98,6 @@ def test_three_bar_truss(method, steps, comm, tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-10 * history["external_work"].max()
 
 
-def test_the_same_by_supports_that_move(comm, tmp_path):
-    """Load steps of ``newton`` whose load is a displacement: reactions of the bars that are left."""
-    support = [
-        {"node_set": "feet", "fix": "xyz"},
-        {"node_set": "joint", "fix": "xyz", "motion": [[0.0, 0, 0, 0], [1.0, 0.1, 0, 0]], "interpolation": "linear"},
-    ]
-    limits = [{"stress": 0.031 * YOUNG}, {"strain": 1.0}, {"strain": 1.0}]
-    static = {"step": 0.05, "max_step": 0.05, "end": 1.0}
-    case = truss(tmp_path, comm, THREE, limits, static, support=support, load=[])
-    history = run(case, tmp_path / "out", comm)
-    moved = history["probe/joint/position"][:, 0, 0]
-    np.testing.assert_allclose(moved, 0.1 * history["load_factor"], atol=1e-15)
-    normal, load = forces(THREE, moved)
-    broken = normal[0] >= 0.031 * EA
-    assert history["broken_bars"].tolist() == broken.tolist() and 2 < broken.sum() < len(broken) - 2
-    found = np.array([open_result(tmp_path / "out").field("axial_force", k) for k in range(len(moved))]).T
-    np.testing.assert_allclose(found, np.where([broken, broken & False, broken & False], 0.0, normal), atol=1e-9 * EA)
-    assert np.abs(history["energy_imbalance"]).max() < 1e-10 * history["elastic_energy"].max()
-
-
-def test_a_cascade(comm, tmp_path):
-    """All in the end: the load is zero where nothing is left."""
-    limits = [{"strain": 0.031}, {"strain": 0.04}, {"strain": 0.04}]
-    static = {"method": "displacement", "step": 50.0, "max_step": 50.0, "displacement": 0.2, **WAY}
-    case = truss(tmp_path, comm, THREE, limits, static)
-    history = run(case, tmp_path / "out", comm)
-    assert history["broken_bars"][-1] == 3 and history["load_factor"][-1] == pytest.approx(0.0, abs=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-def test_restart_is_bitwise(comm, shared_tmp_path):
-    """Before and after the break; on several ranks MUMPS repeats to rounding only."""
-    folder = shared_tmp_path
-    static = {"method": "displacement", "step": 100.0, "max_step": 100.0, "displacement": 0.1, **WAY}
-    limits = [{"stress": 0.031 * YOUNG}, {"strain": 1.0}, {"strain": 1.0}]
-    output = {"fields_every": 1, "checkpoint_every": 1, "probe": [{"name": "joint", "node_set": "joint"}]}
-    case = truss(folder, comm, THREE, limits, static, output=output)
-    assert Simulation(case, comm, output=folder / "whole", quiet=True).run() == 0
-    broke = int(np.argmax(open_result(folder / "whole").history["broken_bars"] > 0))
-    for stop in (broke - 1, broke):
-        with Simulation(case, comm, output=folder / f"at{stop}", quiet=True) as simulation:
-            for made in simulation:
-                if made.step == stop:
-                    break
-        assert Simulation(case, comm, output=folder / f"at{stop}", restart=True, quiet=True).run() == 0
-        if comm.rank == 0:
-            files = [folder / name / "result.vtkhdf" for name in ("whole", f"at{stop}")]
-            if comm.size == 1:
-                assert differences(*files) == {}
-            one, other = (open_result(file).history for file in files)
-            for column in ("load_factor", "broken_bars", "elastic_energy", "rupture_dissipation", "step_size"):
-                np.testing.assert_allclose(other[column], one[column], rtol=1e-10, atol=1e-12)
-        comm.Barrier()
-
-
 def test_a_mechanism_ends_the_path_with_the_reason(comm, tmp_path):
     """Two bars in a row carry the load from the joint; without the second, the first turns about the joint's guide."""
     points = [[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [-2.0, 0.0, 0.0]]

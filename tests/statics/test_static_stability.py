@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.contact.transform import Transform
-from pfem_petsc.statics.scheme import Equilibrium
+from pfem_petsc.statics.equilibrium import problem_at_rest
 from pfem_petsc.statics.stability import is_indefinite
-from pfem_petsc.stepping.problem import StepProblem
 
 UNSTABLE = "the equilibrium is unstable, with"
 STIFFNESS, SIDE, SHORT, LONG = 100.0, 4.0, 0.5, 1.0
@@ -100,8 +98,7 @@ def test_conjugate_gradients_find_the_negative_curvature(comm, shared_tmp_path, 
         simulation.run()
         stepper = simulation.stepper
         model, state = stepper.model, stepper.state
-        balance = Equilibrium().balance(state, 0.0)
-        problem = StepProblem(model, state, balance, state.external, Transform(model.mesh))
+        problem = problem_at_rest(model, state, state.external)
         stepper.hessian.put(problem, model.bars.state_stiffness(state.x))
         free = np.zeros(model.mesh.n_owned, dtype=bool)
         assert is_indefinite(model, stepper.hessian, stepper.lagged, free) == (share > 1.0)

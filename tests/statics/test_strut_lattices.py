@@ -59,14 +59,6 @@ def test_strength_of_an_octet_cell_follows_yield_and_euler(comm, shared_tmp_path
     assert forces[0] / euler == pytest.approx(forces[2] / (200e6 * areas[2]), rel=0.03)
 
 
-@pytest.mark.thorough
-def test_strength_of_octet_cells_at_many_areas(comm, shared_tmp_path):
-    areas = 4.5e-8 * 2.0 ** np.linspace(0.0, 4.0, 9)
-    forces = np.array([octet_strength(area, [1, 1, 1], comm, shared_tmp_path / "out") for area in areas])
-    slopes = np.diff(np.log(forces)) / np.diff(np.log(areas))
-    assert slopes[:4] == pytest.approx(2.0, abs=0.1) and slopes[4:] == pytest.approx(1.0, abs=0.1)
-
-
 def crush(comm, folder, viscosity, strain, **keys):
     """Peak force [N] of a clamped octet cell that is pressed by a strain, in increments of 0.25 % strain."""
     case = Case.from_dict(

@@ -1,7 +1,8 @@
 """Base class of constraints: rows r(x) >= 0 over a few nodes each, with their gradients.
 
 A module of this package is a kind of constraint: a class ``Parameters`` with the keys of a ``[[constraint]]`` table,
-and a class ``Constraint``. Explicit and implicit steps, history and checkpoints follow from the rows.
+and a class ``Constraint``. Explicit and implicit steps, history and checkpoints follow from the rows, which may be the
+same in all steps or be found in each of them (``dynamic``).
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from collections.abc import Callable
 from typing import NamedTuple, Self
 
 import numpy as np
+from mpi4py import MPI
 
 from ...case.base import ConstraintKeys, NodeSetName
 
-__all__ = ["Constraint", "ConstraintKeys", "NodeSetName", "NodesOf", "SetPart"]
+__all__ = ["Constraint", "ConstraintKeys", "ExpectedNodes", "NodeSetName", "NodesOf", "SetPart"]
 
 
 class SetPart(NamedTuple):
@@ -36,6 +38,24 @@ NodesOf = Callable[[str], SetPart]
 """Function from the name of a node set (a key of type ``NodeSetName``) to this rank's part of it."""
 
 
+class ExpectedNodes(NamedTuple):
+    """This rank's nodes in a step whose rows are to be found.
+
+    Attributes
+    ----------
+    comm : MPI.Comm
+    numbers : (n,) mesh numbers of the nodes that this rank owns
+    x : (n, 3) positions at the end of the step without the rows [m]; reach : (n,) how far from there they may end [m]
+    time : at the end of the step [s]
+    """
+
+    comm: MPI.Comm
+    numbers: np.ndarray
+    x: np.ndarray
+    reach: np.ndarray
+    time: float
+
+
 class Constraint(ABC):
     """The rows of one table.
 
@@ -49,12 +69,14 @@ class Constraint(ABC):
     nodes : (r, k) mesh numbers of the nodes of each row; k is the same on all ranks
     data : (r, m) float64, numbers of each row, such as a length; m is the same on all ranks, zero by default
     fixed : whether gradients never turn, so that rows are linear
-    ids : (r,) number of each row in its table; None: counted over ranks
+    dynamic : whether rows come and go: :meth:`find` is then called in each step, before it is solved
+    ids : (r,) number of each row in its table, by which a row is the same in another step; None: counted over ranks
     """
 
     nodes: np.ndarray
     data: np.ndarray
     fixed = False
+    dynamic = False
     ids: np.ndarray | None = None
 
     def of(self, nodes: np.ndarray, data: np.ndarray) -> Self:
@@ -62,6 +84,41 @@ class Constraint(ABC):
         other = copy.copy(self)
         other.nodes, other.data = nodes, data
         return other
+
+    def find(self, nodes: ExpectedNodes) -> Self:
+        """Return the constraint with the rows of a step, itself if they are those of the last one. Collective.
+
+        Rows may be made on any rank; :meth:`with_rows` does the rest. What a search keeps from step to step belongs to
+        the constraint returned, because a step that does not converge is repeated from the one before. ``ids`` must
+        be given, and a row that stays must keep its last node.
+        """
+        return self
+
+    def with_rows(self, comm: MPI.Comm, nodes: np.ndarray, data: np.ndarray, ids: np.ndarray) -> Self:
+        """Return the constraint with other rows of this rank (r, k), (r, m), and their numbers (r,); itself if they are
+        the same on all ranks. Collective."""
+        pairs = ((self.nodes, nodes), (self.data, data), (self.ids, ids))
+        if comm.allreduce(all(np.array_equal(one, other) for one, other in pairs), op=MPI.LAND):
+            return self
+        other = self.of(nodes, data)
+        other.ids = ids
+        return other
+
+    def of_table(self, table: np.ndarray, width: int) -> Self:
+        """Return the constraint with rows of a :class:`~pfem_petsc.contact.rows.RowSet`'s table whose rows have up to
+        ``width`` nodes."""
+        data = table[:, 2 + width : 2 + width + self.data.shape[1]].copy().view(np.float64)
+        other = self.of(table[:, 2 : 2 + self.nodes.shape[1]].copy(), data)
+        other.ids = table[:, 1].copy()
+        return other
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return what :meth:`find` needs after a restart besides the rows: name to an array (n, ...) of the nodes that
+        this rank owns, nothing by default; the same names on all ranks and from the start."""
+        return {}
+
+    def load_state(self, arrays: dict[str, np.ndarray]) -> None:
+        """Take the arrays of :meth:`state` back."""
 
     @abstractmethod
     def values(self, x: np.ndarray) -> np.ndarray:

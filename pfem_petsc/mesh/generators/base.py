@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
-from ...case.base import StrictModel
-from ..slab import MeshSlab, check_length, index_type, slab_of_whole, slab_range
+from ..slab import MeshSlab, check_size, index_type, slab_of_whole, slab_range
+
+Length = Annotated[float, Field(gt=1e-150, lt=1e150)]
+"""A length [m] whose square neither overflows nor underflows."""
 
 
 class Part:
@@ -16,9 +20,15 @@ class Part:
     Attributes
     ----------
     nodes, bars : (n,) int64 numbers in the mesh
+
+    Raises
+    ------
+    InputError
+        If the mesh is too large; it names ``key``.
     """
 
-    def __init__(self, n_nodes: int, n_bars: int, rank: int, size: int) -> None:
+    def __init__(self, n_nodes: int, n_bars: int, rank: int, size: int, key: str) -> None:
+        check_size(n_nodes, f"mesh.{key}", n_bars)
         self.n_nodes, self.n_bars = n_nodes, n_bars
         self.nodes = np.arange(*slab_range(n_nodes, rank, size))
         self.bars = np.arange(*slab_range(n_bars, rank, size))
@@ -53,18 +63,6 @@ class Part:
             source=f"generator {source}",
             structured=True,
         )
-
-
-def check_lengths(parameters: StrictModel, *names: str) -> None:
-    """Refuse lengths of some keys whose square overflows or underflows.
-
-    Raises
-    ------
-    InputError
-        If a length is outside 1e-150 to 1e150.
-    """
-    for name in names:
-        check_length(getattr(parameters, name), f"mesh.{name}")
 
 
 def circle(radius: float, angles: np.ndarray) -> np.ndarray:

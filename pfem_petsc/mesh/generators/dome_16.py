@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...case.base import PositiveFloat, StrictModel
+from ...case.base import StrictModel
 from ..slab import MeshSlab
-from .base import check_lengths, dome
+from .base import Length, dome
 
 
 class Parameters(StrictModel):
     """Keys of ``[mesh]`` with ``generator = "dome_16"``; the defaults are the dome of Hrinda 2010."""
 
-    apex_height: PositiveFloat = 0.1016
+    apex_height: Length = 0.1016
     """Height of the apex over the feet [m]."""
-    ring_height: PositiveFloat = 0.0508
+    ring_height: Length = 0.0508
     """Height of the square over the feet [m]."""
-    half_side: PositiveFloat = 0.127
+    half_side: Length = 0.127
     """Half a side of the square [m]."""
-    base_radius: PositiveFloat = 0.254
+    base_radius: Length = 0.254
     """Distance of the feet from the axis [m]."""
 
 
@@ -30,7 +30,6 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
 
     Source of geometry: Hrinda, Snap-through instability patterns in truss structures, AIAA 2010-2611.
     """
-    check_lengths(parameters, "apex_height", "ring_height", "half_side", "base_radius")
     a, z, base = parameters.half_side, parameters.ring_height, parameters.base_radius
     points = [[0.0, 0.0, parameters.apex_height], [a, a, z], [-a, a, z], [-a, -a, z], [a, -a, z]]
     points += [[base, 0.0, 0.0], [0.0, base, 0.0], [-base, 0.0, 0.0], [0.0, -base, 0.0]]

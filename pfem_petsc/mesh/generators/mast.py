@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...case.base import PositiveFloat, PositiveInt, StrictModel
+from ...case.base import PositiveInt, StrictModel
 from ...errors import InputError
-from ..slab import MeshSlab, check_length, check_size
-from .base import Part
+from ..slab import MeshSlab
+from .base import Length, Part
 
 
 class Parameters(StrictModel):
     """Keys of ``[mesh]`` with ``generator = "mast"``."""
 
-    height: PositiveFloat
+    height: Length
     """Height of the mast [m]."""
-    width: PositiveFloat
+    width: Length
     """Distance of its legs [m]."""
     bays: PositiveInt
     """Number of bays over the height."""
-    radius: PositiveFloat
+    radius: Length
     """Distance of the guys' anchors from the axis [m]."""
     levels: PositiveInt = 1
     """Number of heights at which guys are attached, evenly spread up to the top."""
@@ -41,11 +41,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     guys, inner = 3 * p.levels, p.elements - 1
     mast_nodes, mast_bars = 3 * (n + 1), 9 * n + 3
     n_nodes, n_bars = mast_nodes + 3 + guys * inner, mast_bars + guys * p.elements
-    check_size(n_nodes, "mesh.bays")
-    check_length(p.height / n, "mesh.height (over mesh.bays)")
-    check_length(p.width, "mesh.width")
-    check_length(p.radius / p.elements, "mesh.radius (over mesh.elements)")
-    part = Part(n_nodes, n_bars, rank, size)
+    part = Part(n_nodes, n_bars, rank, size, "bays")
     numbers = part.nodes
 
     def place(nodes: np.ndarray) -> np.ndarray:

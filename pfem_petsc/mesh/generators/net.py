@@ -6,15 +6,15 @@ from typing import Annotated
 
 import numpy as np
 
-from ...case.base import PositiveFloat, PositiveInt, StrictModel, listed
-from ..slab import MeshSlab, check_length, check_size
-from .base import Part
+from ...case.base import PositiveInt, StrictModel, listed
+from ..slab import MeshSlab
+from .base import Length, Part
 
 
 class Parameters(StrictModel):
     """Keys of ``[mesh]`` with ``generator = "net"``."""
 
-    size: Annotated[tuple[PositiveFloat, PositiveFloat], listed]
+    size: Annotated[tuple[Length, Length], listed]
     """Extents along x and y [m]."""
     cells: Annotated[tuple[PositiveInt, PositiveInt], listed]
     """Number of meshes along x and y."""
@@ -30,10 +30,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     nx, ny = parameters.cells
     across, along = nx + 1, nx * (ny + 1)
     n_nodes, n_bars = across * (ny + 1), along + across * ny
-    check_size(n_nodes, "mesh.cells")
-    for length, cells in zip(parameters.size, parameters.cells, strict=True):
-        check_length(length / cells, "mesh.size (over mesh.cells)")
-    part = Part(n_nodes, n_bars, rank, size)
+    part = Part(n_nodes, n_bars, rank, size, "cells")
     numbers, bars = part.nodes, part.bars
     j, i = np.divmod(numbers, across)
     points = np.zeros((len(numbers), 3))

@@ -7,17 +7,17 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from ...case.base import Finite, PositiveFloat, StrictModel
-from ..slab import MeshSlab, check_length, check_size
-from .base import Part
+from ...case.base import Finite, StrictModel
+from ..slab import MeshSlab
+from .base import Length, Part
 
 
 class Parameters(StrictModel):
     """Keys of ``[mesh]`` with ``generator = "prism"``."""
 
-    radius: PositiveFloat
+    radius: Length
     """Distance of the corners from the axis [m]."""
-    height: PositiveFloat
+    height: Length
     """Distance of the polygons [m]."""
     sides: Annotated[int, Field(ge=3, lt=2**63)] = 3
     """Number of struts, and of corners of each polygon."""
@@ -35,11 +35,8 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     in this order.
     """
     n = parameters.sides
-    check_size(2 * n, "mesh.sides")
-    check_length(2.0 * parameters.radius * np.sin(np.pi / n), "mesh.radius (with mesh.sides)")
-    check_length(parameters.height, "mesh.height")
     twist = 90.0 + 180.0 / n if parameters.twist is None else parameters.twist
-    part = Part(2 * n, 4 * n, rank, size)
+    part = Part(2 * n, 4 * n, rank, size, "sides")
     top, corner = np.divmod(part.nodes, n)
     angles = np.deg2rad(360.0 * corner / n - 180.0 / n - 90.0 + twist * top)
     points = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1) * parameters.radius

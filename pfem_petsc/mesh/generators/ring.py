@@ -2,36 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import field_validator
+from pydantic import Field, field_validator
 
-from ...case.base import PositiveFloat, StrictModel
-from ..slab import MeshSlab, check_length, check_size
-from .base import Part
+from ...case.base import StrictModel
+from ..slab import MeshSlab
+from .base import Length, Part
 
 
 class Parameters(StrictModel):
     """Keys of ``[mesh]`` with ``generator = "ring"``."""
 
-    outer_radius: PositiveFloat
+    outer_radius: Length
     """Radius through the outer nodes [m]."""
-    inner_radius: PositiveFloat
+    inner_radius: Length
     """Radius through the inner nodes [m]."""
-    bays: int
+    bays: Annotated[int, Field(ge=3)]
     """Number of bays around the ring, 3 or more."""
     bracing: Literal["x", "single"] = "x"
     """``x``: both diagonals in every bay; ``single``: one, from the outer node to the next inner node."""
     orientation: Literal["vertex", "flat"] = "vertex"
     """``vertex``: an outer node at (+outer_radius, 0, 0); ``flat``: an outer chord across the +x axis."""
-
-    @field_validator("bays")
-    @classmethod
-    def _enough_bays(cls, bays: int) -> int:
-        if bays < 3:
-            raise ValueError("a ring needs at least 3 bays")
-        return bays
 
     @field_validator("inner_radius")
     @classmethod
@@ -52,12 +45,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     """
     n = parameters.bays
     n_bars = (5 if parameters.bracing == "x" else 4) * n
-    check_size(2 * n, "mesh.bays")
-    check_length(parameters.outer_radius, "mesh.outer_radius")
-    check_length(parameters.outer_radius - parameters.inner_radius, "mesh.outer_radius - mesh.inner_radius")
-    check_length(parameters.inner_radius / n, "mesh.inner_radius / mesh.bays")
-
-    part = Part(2 * n, n_bars, rank, size)
+    part = Part(2 * n, n_bars, rank, size, "bays")
     family, bay = np.divmod(part.bars, n)
     after = (bay + 1) % n
     start = np.choose(family, [bay, n + bay, bay, bay, n + bay])

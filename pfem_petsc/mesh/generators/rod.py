@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...case.base import PositiveFloat, PositiveInt, StrictModel
-from ..slab import MeshSlab, check_length, check_size
-from .base import Part
+from ...case.base import PositiveInt, StrictModel
+from ..slab import MeshSlab
+from .base import Length, Part
 
 
 class Parameters(StrictModel):
     """Keys of ``[mesh]`` with ``generator = "rod"``."""
 
-    length: PositiveFloat
+    length: Length
     """Length of the rod [m]."""
     elements: PositiveInt
     """Number of bars."""
@@ -24,9 +24,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     Node groups ``start`` and ``end``; bar group ``rod`` (all).
     """
     n = parameters.elements
-    check_size(n + 1, "mesh.elements")
-    check_length(parameters.length / n, "mesh.length (over mesh.elements)")
-    part = Part(n + 1, n, rank, size)
+    part = Part(n + 1, n, rank, size, "elements")
     points = np.zeros((len(part.nodes), 3))
     points[:, 0] = parameters.length * part.nodes / n
     ends = {"start": part.nodes == 0, "end": part.nodes == n}

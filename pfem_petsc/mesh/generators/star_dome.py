@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...case.base import PositiveFloat, StrictModel
+from ...case.base import StrictModel
 from ..slab import MeshSlab
-from .base import check_lengths, circle, dome
+from .base import Length, circle, dome
 
 
 class Parameters(StrictModel):
     """Keys of ``[mesh]`` with ``generator = "star_dome"``; the defaults are the dome of the literature."""
 
-    apex_height: PositiveFloat = 0.08216
+    apex_height: Length = 0.08216
     """Height of the apex over the feet [m]."""
-    ring_height: PositiveFloat = 0.06216
+    ring_height: Length = 0.06216
     """Height of the hexagon over the feet [m]."""
-    ring_radius: PositiveFloat = 0.25
+    ring_radius: Length = 0.25
     """Radius of the hexagon [m]."""
-    base_radius: PositiveFloat = 0.5
+    base_radius: Length = 0.5
     """Radius of the circle of feet [m]."""
 
 
@@ -30,7 +30,6 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
 
     Source of geometry: Levy and Spillers, Analysis of Geometrically Nonlinear Structures, section 2.4.2.
     """
-    check_lengths(parameters, "apex_height", "ring_height", "ring_radius", "base_radius")
     angles = 60.0 * np.arange(6)
     ring = circle(parameters.ring_radius, np.radians(angles))
     ring[:, 2] = parameters.ring_height

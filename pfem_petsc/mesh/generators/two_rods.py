@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...case.base import PositiveFloat, PositiveInt, StrictModel
-from ..slab import MeshSlab, check_length, check_size
-from .base import Part
+from ...case.base import PositiveInt, StrictModel
+from ..slab import MeshSlab
+from .base import Length, Part
 
 
 class Parameters(StrictModel):
     """Keys of ``[mesh]`` with ``generator = "two_rods"``."""
 
-    length: PositiveFloat
+    length: Length
     """Length of each rod [m]."""
     elements: PositiveInt
     """Number of bars of each rod."""
-    gap: PositiveFloat
+    gap: Length
     """Distance between the rods [m]."""
 
 
@@ -26,9 +26,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     Node groups ``start``, ``first_end``, ``second_start``, ``end``; bar groups ``first`` and ``second``.
     """
     n = parameters.elements
-    check_size(2 * (n + 1), "mesh.elements")
-    check_length(parameters.length / n, "mesh.length (over mesh.elements)")
-    part = Part(2 * (n + 1), 2 * n, rank, size)
+    part = Part(2 * (n + 1), 2 * n, rank, size, "elements")
     rod, place = np.divmod(part.nodes, n + 1)
     points = np.zeros((len(part.nodes), 3))
     points[:, 0] = parameters.length * place / n + rod * (parameters.length + parameters.gap)

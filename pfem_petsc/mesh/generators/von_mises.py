@@ -7,17 +7,17 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from ...case.base import PositiveFloat, StrictModel
+from ...case.base import StrictModel
 from ..slab import MeshSlab, slab_of_whole
-from .base import check_lengths, circle
+from .base import Length, circle
 
 
 class Parameters(StrictModel):
     """Keys of ``[mesh]`` with ``generator = "von_mises"``."""
 
-    half_span: PositiveFloat
+    half_span: Length
     """Radius of the circle of feet [m]."""
-    rise: PositiveFloat
+    rise: Length
     """Height of the apex over the feet [m]."""
     legs: Annotated[int, Field(ge=2, le=10_000)] = 2
     """Number of bars, at equal angles from the x axis."""
@@ -29,7 +29,6 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     Node groups ``apex`` and ``feet``; bar group ``legs`` (all).
     """
     n = parameters.legs
-    check_lengths(parameters, "half_span", "rise")
     numbers = np.arange(1, n + 1)
     return slab_of_whole(
         np.vstack([[0.0, 0.0, parameters.rise], circle(parameters.half_span, 2.0 * np.pi * np.arange(n) / n)]),

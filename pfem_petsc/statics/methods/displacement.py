@@ -12,7 +12,7 @@ from ..keys import PathKeys
 if TYPE_CHECKING:
     from ...solvers.linear import LinearChoice
     from ...stepping.model import Model
-    from ..path_stepper import ComponentStepper
+    from ..path_stepper import PathStepper
 
 __all__ = ["Parameters", "make_stepper"]
 
@@ -27,8 +27,8 @@ class Parameters(PathKeys):
         return self
 
 
-def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> ComponentStepper:
+def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> PathStepper:
     """The stepper of a case. Collective."""
-    from ..path_stepper import ComponentStepper
+    from ..path_stepper import PathStepper
 
-    return ComponentStepper(model, choice, parameters)
+    return PathStepper(model, choice, parameters, by_displacement=True)

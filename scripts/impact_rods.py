@@ -1,28 +1,18 @@
-"""Check before the first step whether contact gains energy with the settings of a case, by impacts of an elastic
-rod.
+"""Small linear rods that hit a wall at different phases of a step, with all integrators and treatments of impact.
+
+They are written for themselves, with dense matrices; tests compare them with the program.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..contact.explicit import impact_square, rebound_way
-from ..integrators.base import Balance, Scheme, State
-from ..registry import lookup
+from pfem_petsc.contact.explicit import impact_square, rebound_way
+from pfem_petsc.contact.impact_gains import PHASES, RodImpact
+from pfem_petsc.integrators.base import Balance, Scheme, State
 
-if TYPE_CHECKING:
-    from ..case.model import Time
-    from ..case.schema import Case
-
-
-KNOWN = ("scheme", "stick", "conserving", "mass_redistribution")
-"""Treatments that the rods implement; there is no prediction for others."""
-
-PHASES = 14
 SWING = 0.05
 """Allowed relative oscillation of the energy of a scheme without impact; it is large near explicit stability limits."""
 _START = 3  # steps of free flight before the earliest impact, so that multistep schemes have their history
@@ -57,37 +47,17 @@ class ImpactScan:
         return max(worst - 1.0, 0.0) if np.isfinite(worst) else np.inf
 
 
-@dataclass(frozen=True)
-class Asked:
-    """Parameters of the scan, as a case specifies them.
-
-    Attributes
-    ----------
-    treatment : ``contact.treatment``
-    consistent : whether the mass matrix is consistent; else lumped
-    step : relative to the explicit limit of the lumped rod, l/c
-    restitution : of the wall
-    elements : bars along a rod
-    """
-
-    treatment: str
-    consistent: bool
-    step: float
-    restitution: float = 0.0
-    elements: int = 20
-
-
 class _Rods:
     """Rods of unit spring constant and inner mass, so that the explicit limit of the step (lumped mass) is one.
 
     The arrays of a state have one row per node, rod after rod, and one column.
     """
 
-    def __init__(self, scheme: Scheme, asked: Asked, phases: int, held: bool = False) -> None:
-        self.scheme, self.treatment, self.h, self.held = scheme, asked.treatment, asked.step, held
-        consistent, step = asked.consistent, asked.step
-        self.restitution = 0.0 if held else asked.restitution
-        nodes = asked.elements + 1
+    def __init__(self, scheme: Scheme, impact: RodImpact, phases: int, held: bool = False) -> None:
+        self.scheme, self.treatment, self.h, self.held = scheme, impact.treatment, impact.step, held
+        consistent, step = impact.consistent, impact.step
+        self.restitution = 0.0 if held else impact.restitution
+        nodes = impact.bars + 1
         self.shape = (phases, nodes)
         k = 2.0 * np.eye(nodes) - np.eye(nodes, k=1) - np.eye(nodes, k=-1)
         k[0, 0] = k[-1, -1] = 1.0
@@ -95,7 +65,7 @@ class _Rods:
         mass[0, 0] = mass[-1, -1] = 0.5
         if consistent:
             mass = mass - k / 6.0
-        self.massless = asked.treatment == "mass_redistribution" and not held
+        self.massless = impact.treatment == "mass_redistribution" and not held
         if self.massless:
             mass[-2, -2] += mass[-1, -1]
             mass[-1, -1] = 0.0
@@ -261,15 +231,15 @@ class _Rods:
 
 
 @np.errstate(all="ignore")
-def scan_impacts(scheme: Scheme, asked: Asked, phases: int = PHASES) -> ImpactScan:
+def scan_impacts(scheme: Scheme, impact: RodImpact, phases: int = PHASES) -> ImpactScan:
     """Integrate rods that hit a wall at different phases of a step until they have left it in the exact solution.
 
     ``phases`` : number of rods.
     """
     # omega = 2 is the highest frequency of unit springs and masses, so h = 1 is the limit of central differences
-    steps = int(np.ceil(2.5 * asked.elements / asked.step)) + 2 * _START + 2
-    swing = _swing(scheme, asked, steps) if scheme.explicit else 1.0
-    rods = _Rods(scheme, asked, phases)
+    steps = int(np.ceil(2.5 * impact.bars / impact.step)) + 2 * _START + 2
+    swing = _swing(scheme, impact, steps) if scheme.explicit else 1.0
+    rods = _Rods(scheme, impact, phases)
     largest, force, releases = np.ones(phases), np.zeros(phases), np.zeros(phases, dtype=int)
     for _ in range(steps):
         touched = rods.touching
@@ -283,9 +253,9 @@ def scan_impacts(scheme: Scheme, asked: Asked, phases: int = PHASES) -> ImpactSc
     return ImpactScan(largest, energy, releases, force, swing)
 
 
-def _swing(scheme: Scheme, asked: Asked, steps: int) -> float:
+def _swing(scheme: Scheme, impact: RodImpact, steps: int) -> float:
     """See :class:`ImpactScan`."""
-    rod = _Rods(scheme, replace(asked, treatment="scheme"), 1, held=True)
+    rod = _Rods(scheme, replace(impact, treatment="scheme"), 1, held=True)
     swing = 1.0
     for _ in range(steps):
         rod.step()
@@ -293,102 +263,3 @@ def _swing(scheme: Scheme, asked: Asked, steps: int) -> float:
         if swing > 1.0 + SWING:
             break
     return swing
-
-
-BOUND = 0.005
-"""Relative energy gain in impacts of the small rod above which a warning is given."""
-
-_RODS = 1, 20
-"""Smallest and largest number of bars of the rods: in some trusses a wave passes within a step, as in short rods."""
-_STEPS = 0.1, 50.0  # relative to the explicit limit; smaller and larger steps behave like these
-
-
-@cache
-def contact_gain(integrator: str, parameters: str, asked: Asked) -> float:
-    """Return the largest relative energy gain of impacts over all phases, at this step and at a quarter of it.
-
-    The smaller step represents nodes that are slower than the fastest one, because chatter depends on the step.
-    ``parameters`` are those of the integrator as JSON.
-    """
-    module = lookup("pfem_petsc.integrators", integrator, "time.integrator")
-    scheme = module.Scheme(module.Parameters.model_validate_json(parameters))
-    low, high = _STEPS
-    sizes = sorted({min(max(size, low), high) for size in (asked.step, 0.25 * asked.step)})
-    return max(scan_impacts(scheme, replace(asked, step=size)).gain for size in sizes)
-
-
-def overshoots(integrator: str, step: float) -> bool:
-    """Return whether impacts may gain energy by an overshoot that the small rod does not show.
-
-    ``wilson`` treats the force that stops a node at t + theta h as an acceleration that grows linearly up to that time.
-    Beyond the explicit limit the first steps after such a jump overshoot for any theta, and more so for larger steps;
-    whether a truss gains energy depends on the motion of its nodes in these steps.
-    """
-    return integrator == "wilson" and step > 1.0
-
-
-def warn_of_gain(case: Case, step: float, across: float = np.inf) -> str:
-    """Return the warning about a case whose contact gains energy beyond :data:`BOUND`; empty if it does not, and for
-    treatments that the small rods do not implement.
-
-    ``step`` : relative to the limit of central differences with lumped mass; ``across`` : time in which a wave crosses
-    the truss, in units of that limit.
-    """
-    if case.contact.treatment not in KNOWN:
-        return ""
-    time = case.time
-    step = float(f"{step:.2g}")  # rounded, so that similar cases share one scan
-    elements = int(np.clip(np.round(across), *_RODS))
-    gains = {}
-    for restitution in sorted({0.0, *(float(f"{wall.restitution:.2g}") for wall in case.wall)}):
-        asked = Asked(case.contact.treatment, time.mass == "consistent", step, restitution, elements)
-        gains[contact_gain(time.integrator, time.scheme.model_dump_json(), asked)] = asked
-    gain = max(gains)
-    asked = gains[gain]
-    if gain <= BOUND and not overshoots(time.integrator, step):
-        return ""
-    named = ", ".join(f"{name} = {value:.4g}" for name, value in time.scheme.model_dump().items())
-    size = f"by {100.0 * gain:.2g} % of the energy" if gain < 10.0 else "by more than ten times the energy"
-    restitution = f"restitution {asked.restitution:g}, " if asked.restitution else ""
-    if gain <= BOUND:
-        return (
-            f"contact: wilson{f' ({named})' if named else ''} with contact and steps of {step:.2g} times the explicit "
-            "limit gains energy in impacts: its first steps after a node is stopped overshoot, by more the larger the "
-            f"step, at any theta; use {_remedies(time, asked)}"
-        )
-    return (
-        f'contact: {time.integrator}{f" ({named})" if named else ""} with contact.treatment = "{asked.treatment}", '
-        f'{restitution}time.mass = "{time.mass}" and steps of {step:.2g} times the explicit limit gains energy in '
-        f"impacts: {size} in the worst of {PHASES} phases of a step at which a rod meets a wall; use "
-        f"{_remedies(time, asked)}"
-    )
-
-
-def _remedies(time: Time, asked: Asked) -> str:
-    """Return at most two settings that do not gain energy, closest to the case first."""
-    parameters = time.scheme.model_dump_json()
-    tries = []
-    for other in ("stick", "scheme"):
-        if other != asked.treatment and not asked.restitution:
-            lumped = other == "stick" and asked.consistent
-            text = f'contact.treatment = "{other}"' + (' and time.mass = "lumped"' if lumped else "")
-            changed = replace(asked, treatment=other, consistent=asked.consistent and not lumped)
-            tries.append((text, time.integrator, parameters, changed))
-    if time.integrator == "wilson":
-        tries.append(("time.theta = 2", "wilson", '{"theta": 2.0}', asked))
-    for size in (1.0, 0.2):
-        if asked.step > size:
-            text = f"a time.step of at most {size:g} times the explicit limit"
-            tries.append((text, time.integrator, parameters, replace(asked, step=size)))
-    newmark = 'time.integrator = "newmark" with its default parameters'
-    tries.append((newmark, "newmark", "{}", asked))
-    if asked.restitution:
-        tries.append(('time.integrator = "energy_momentum"', "energy_momentum", "{}", asked))
-        for less in (0.9, 0.5):
-            if asked.restitution > less:
-                text = f"a restitution of at most {less:g}"
-                tries.append((text, time.integrator, parameters, replace(asked, restitution=less)))
-    found = [text for text, *what in tries if contact_gain(*what) <= BOUND and not overshoots(what[0], what[2].step)]
-    smaller = [text for text in found if text.startswith("a time.step")]
-    found = [text for text in found if text not in smaller[1:]]  # of several step sizes keep the largest
-    return ", or ".join(found[:2]) if found else newmark

@@ -1,0 +1,219 @@
+"""Verbs about results: what is in them, curves of their history, and reports."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..columns import LOST, STORED, SUPPLIED
+from ..errors import printable
+from .parser import PROGRAM, Verb, surviving
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..output.result import Modes, Result
+
+INFO = f"""\
+examples:
+  {PROGRAM} info results/rod_impact
+  {PROGRAM} info results/rod_impact --verify"""
+
+PLOT = f"""\
+examples:
+  {PROGRAM} plot results/rod_impact
+  {PROGRAM} plot results/rod_impact --format png svg pdf csv --filter cfc:60
+  {PROGRAM} plot results/rod_impact --curves wall/wall/force probe/tip/velocity
+  {PROGRAM} plot results/rod_impact --curves wall/wall/force.x --against centre_of_mass.x
+  {PROGRAM} plot results/rod_impact --spectrum probe/tip/velocity.x --window flattop
+  {PROGRAM} plot results/coarse results/fine"""
+
+REPORT = f"""\
+examples:
+  {PROGRAM} report results/rod_impact
+  {PROGRAM} report results/ring_impact -o ring.html --filter cfc:180"""
+
+
+def _add_info(parser: argparse.ArgumentParser) -> None:
+    """Options of the verb."""
+    parser.add_argument("result", metavar="RESULT", help="result file, or its folder")
+    parser.add_argument(
+        "--verify", action="store_true", help="compare all values with their checksums; status 2 if one differs"
+    )
+
+
+def info(arguments: argparse.Namespace) -> int:
+    """Print the summary of a result."""
+    path = surviving(arguments.result, deep=arguments.verify or None, refuse=arguments.verify)
+    from ..output.result import open_result
+
+    with open_result(path) as result:
+        print("\n".join(printable(line) for line in describe(result)))
+    if arguments.verify:
+        print("All values match their checksums.")
+    return 0
+
+
+def describe(result: Result) -> list[str]:
+    """Return a description of a result, as lines."""
+    rows = {"file": str(result.path), "mesh": f"{result.n_nodes:,} nodes, {result.n_bars:,} bars"}
+    rows |= {key: str(value) for key, value in result.attributes.items() if value not in ("", {}, [])}
+    times, axis, history = result.times, result.axis, result.history
+    names = list(history)
+    time = history["time"] if "time" in names else ()
+    rows["snapshots"] = f"{len(times)}: {axis.span(times[0], times[-1])}" if len(times) else "0"
+    rows["history"] = f"{len(time)} rows: {axis.span(time[0], time[-1])}" if len(time) else "0 rows"
+    width = max(map(len, rows))
+    lines = [result.case.title, *(f"  {label:{width}}  {text}" for label, text in rows.items())]
+    lines += _modes(result.modes) if result.n_modes else []
+    lines += ["history columns:", "  " + " ".join(names)]
+    if len(time):
+        lines += _energies(history, [name for name in (*STORED, *LOST, *SUPPLIED) if name in names])
+    broken = history["broken_bars"] if len(time) and "broken_bars" in names else [0]
+    if broken[-1]:
+        first = axis.place(float(time[(broken > 0).argmax()]))
+        lines.append(f"{int(broken[-1]):,} of {result.n_bars:,} bars broke, the first at {first}")
+    return lines
+
+
+def _modes(modes: Modes) -> list[str]:
+    """The frequencies or load factors, some in a line."""
+    from ..output.layout import MODE_VALUES
+
+    name, unit = MODE_VALUES[modes.kind]
+    values = [f"{value:.6g}" for value in modes.values]
+    heading = f"modes of {modes.kind}, {name.replace('_', ' ')}{f' [{unit}]' if unit else ''}:"
+    return [heading, *("  " + "  ".join(values[k : k + 8]) for k in range(0, len(values), 8))]
+
+
+def _energies(history: Mapping[str, np.ndarray], present: list[str]) -> list[str]:
+    """Return energies [J] at start and end and their imbalance, also relative to the largest energy in between."""
+    from ..output.units import engineering
+
+    if not present:
+        return []
+    width = max(map(len, (*present, "balance error")))
+    lines, error = [f"{'energy':{width + 2}}  {'start':>12}  {'end':>12}"], 0.0
+    for name in present:
+        start, end = float(history[name][0]), float(history[name][-1])
+        error += (start - end) if name in SUPPLIED else (end - start)
+        lines.append(f"  {name:{width}}  {engineering(start, 'J'):>12}  {engineering(end, 'J'):>12}")
+    scale = max(float(abs(history[name]).max()) for name in present)
+    relative = f" ({error / scale:.1e} of the largest)" if scale > 0.0 else ""
+    return [*lines, f"  {'balance error':{width}}  {engineering(error, 'J'):>26}{relative}"]
+
+
+def _add_plot(parser: argparse.ArgumentParser) -> None:
+    """Options of the verb."""
+    parser.add_argument(
+        "results", metavar="RESULT", nargs="+", help="result file, or its folder; several are drawn in one picture"
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: that of the first result"
+    )
+    parser.add_argument(
+        "--curves",
+        metavar="NAME",
+        nargs="+",
+        action="extend",
+        help="columns of the history to plot in one picture (info lists them), or components: probe/tip/velocity.x, "
+        "momentum.norm; default: the usual pictures",
+    )
+    parser.add_argument(
+        "--against", metavar="NAME", help="column or component over which the curves are drawn; default: time"
+    )
+    parser.add_argument(
+        "--spectrum", metavar="NAME", nargs="+", action="extend", help="columns whose amplitude spectra are drawn"
+    )
+    parser.add_argument(
+        "--window",
+        default="hann",
+        help="window of spectra: hann, flattop, hamming, blackman, rectangular; default: %(default)s",
+    )
+    parser.add_argument("--highest", metavar="HZ", type=float, help="frequency at which the spectra end")
+    parser.add_argument(
+        "--filter",
+        dest="force_filter",
+        metavar="FILTER",
+        help="filter of forces and of --curves: cfc:CLASS (SAE J211), butterworth:HZ[:ORDER], mean:SECONDS, none; "
+        "default: forces by the mean of 2 %% of the run",
+    )
+    parser.add_argument(
+        "--format",
+        dest="formats",
+        metavar="FORMAT",
+        nargs="+",
+        action="extend",
+        help="png, svg, pdf; csv writes what the pictures show as tables; default: png",
+    )
+    parser.add_argument("--no-closed-form", dest="closed_forms", action="store_false", help="do not draw closed forms")
+
+
+def plot_history(arguments: argparse.Namespace) -> int:
+    """Plot, and print the names of the files written."""
+    from ..post.plot import plot
+
+    paths = [surviving(result) for result in arguments.results]
+    names = ("curves", "against", "spectrum", "window", "highest", "force_filter", "closed_forms")
+    options = {name: getattr(arguments, name) for name in names}
+    for path in plot(paths, arguments.output, formats=arguments.formats or ("png",), **options):
+        print(path)
+    return 0
+
+
+def _add_report(parser: argparse.ArgumentParser) -> None:
+    """Options of the verb."""
+    parser.add_argument("result", metavar="RESULT", help="result file, or its folder")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        type=Path,
+        help="file name; default: report.html in the folder of the result",
+    )
+    parser.add_argument(
+        "--no-pictures", dest="pictures", action="store_false", help="do not draw the truss, which takes some seconds"
+    )
+    parser.add_argument("--field", default="stress", help="field that colours the bars; default: %(default)s")
+    parser.add_argument(
+        "--filter", dest="force_filter", metavar="FILTER", help="filter of forces, like cfc:180: see plot --help"
+    )
+
+
+def report(arguments: argparse.Namespace) -> int:
+    """Write the report, and print its name."""
+    from ..post.report import write_report
+
+    options = {name: getattr(arguments, name) for name in ("pictures", "field", "force_filter")}
+    print(write_report(surviving(arguments.result), arguments.output, **options))
+    return 0
+
+
+VERBS = (
+    Verb(
+        "info",
+        "Show the content of a result: case, versions, snapshots, history and energy balance.",
+        INFO,
+        "one",
+        _add_info,
+        info,
+    ),
+    Verb(
+        "plot",
+        "Plot the history of results: energies, momentum, probes, walls, force-displacement, spectra, comparisons.",
+        PLOT,
+        "one",
+        _add_plot,
+        plot_history,
+    ),
+    Verb(
+        "report",
+        "Write a report of a run, one HTML file: case, summary, warnings, pictures, curves, energies, cost.",
+        REPORT,
+        "one",
+        _add_report,
+        report,
+    ),
+)

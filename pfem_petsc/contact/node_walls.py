@@ -1,0 +1,238 @@
+"""The walls of a case and the nodes of a rank: distances, tangent planes, which walls can stop which nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from ..mechanics.compiled import kernel
+from ..registry import lookup
+from ..tolerances import BEYOND, resolvable
+from .forces import ContactLog, WallForces
+from .wall_motion import WallMotion
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from .walls.base import WallKeys
+
+
+@kernel
+def near_planes(x, normals, offsets, all_nodes, members, reach, near):
+    """Mark nodes within reach of a plane.
+
+    Parameters
+    ----------
+    x : (n, 3) positions [m]
+    normals : (w, 3); offsets : (w,) [m]: planes n . x = d
+    all_nodes : (w,) bool, whether a plane applies to all nodes
+    members : (n, w) bool, nodes to which a plane applies otherwise
+    reach : (n,) or (1,) distance below which a node counts as near [m]
+    near : (n,) bool, updated
+
+    Returns
+    -------
+    int
+        Number of nodes marked here.
+    """
+    count = 0
+    per_node = len(reach) > 1
+    for i in range(len(x)):
+        limit = reach[i] if per_node else reach[0]
+        for k in range(len(offsets)):
+            gap = normals[k, 0] * x[i, 0] + normals[k, 1] * x[i, 1] + normals[k, 2] * x[i, 2] - offsets[k]
+            if gap < limit and (all_nodes[k] or members[i, k]):
+                near[i] = True
+                count += 1
+                break
+    return count
+
+
+_ZERO = np.zeros(1)
+_TURN = 0.8  # cosine between normals in a step, below which forces act along that at the new position
+
+
+class NodeWalls:
+    """All walls of a case and this rank's nodes.
+
+    Attributes
+    ----------
+    names : of the walls, in the order of the case
+    any : whether the case has walls
+    moving : (walls,) bool
+    normals : (walls, 3) of flat walls, zero for the others
+    log : ContactLog
+    restitution, friction, static_friction : (walls,); has_friction : whether any wall has friction
+    size : length that tolerances are relative to [m], see :mod:`~pfem_petsc.tolerances`
+    rebounds : whether restitution is a bound on the next position, for schemes that solve for the next position
+    state : of the nodes, for walls that need their previous positions; set by the stepper
+    """
+
+    def __init__(
+        self,
+        case: Case,
+        nodes: dict[str, np.ndarray],
+        mesh: DistributedMesh,
+        fixed: np.ndarray,
+        parameters: Sequence[WallKeys] | None = None,
+    ) -> None:
+        walls = list(case.wall) if parameters is None else parameters
+        self.source = case.source
+        self.mesh = mesh
+        self.fixed = fixed
+        self.state = None
+        self.names = [wall.name for wall in walls]
+        self.any = bool(walls)
+        self.walls = [
+            lookup("pfem_petsc.contact.walls", wall.type, f"{case.source}: wall.type").Wall(wall) for wall in walls
+        ]
+        self.motion = WallMotion(walls, case.holds("wall"))
+        self.moving = self.motion.moving
+        self.all_nodes = np.array([wall.node_set is None for wall in walls], dtype=bool)
+        self.members = np.ones((mesh.n_owned, len(walls)), dtype=bool)
+        for k, wall in enumerate(walls):
+            if wall.node_set is not None:
+                self.members[:, k] = False
+                self.members[nodes[wall.node_set], k] = True
+        self.log = ContactLog(mesh.n_owned, len(walls))
+        self.friction = np.array([wall.friction for wall in walls], dtype=np.float64)
+        static = [wall.friction if wall.static_friction is None else wall.static_friction for wall in walls]
+        self.static_friction = np.array(static, dtype=np.float64)
+        self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)
+        self.rebounds = False
+        self.has_friction = bool(self.static_friction.any())
+        self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
+        self.partial = any(wall.partial for wall in self.walls)
+        self.normals = np.zeros((len(walls), 3))
+        self._offsets = np.zeros(len(walls))
+        for k in np.flatnonzero(self.flat):
+            self.normals[k], self._offsets[k] = self.walls[k].normal, self.walls[k].offset
+        ends = np.stack([-mesh.points.min(axis=0, initial=np.inf), mesh.points.max(axis=0, initial=-np.inf)])
+        mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+        centres = np.array([wall.centre for wall in self.walls])
+        coordinates = float(np.abs(ends).max()), float(np.abs(centres).max(initial=0.0))
+        self.size = resolvable(float(ends.sum(axis=0).max()), *coordinates)
+
+    @cached_property
+    def nothing(self) -> WallForces:
+        """Zero contact forces; read-only."""
+        return WallForces.none(len(self.walls))
+
+    def positions(self, time: float) -> np.ndarray:
+        """Return the positions of the walls' centres (walls, 3) [m]."""
+        return np.array([wall.centre for wall in self.walls]).reshape(-1, 3) + self.motion.displacements(time)
+
+    def gaps(self, x: np.ndarray, time: float, nodes: np.ndarray | None = None) -> np.ndarray:
+        """Return distances (m, walls) [m] of owned nodes at (m, 3) from walls, infinite where a wall does not apply.
+
+        ``nodes`` (m,) : indices of these nodes; default: all owned nodes.
+        """
+        members = self.members if nodes is None else self.members[nodes]
+        displacements = self.motion.displacements(time)
+        gaps = np.full((len(x), len(self.walls)), np.inf)
+        for k in range(len(self.walls)):
+            gaps[:, k] = self.gap(k, x, displacements)
+            if not self.all_nodes[k]:
+                gaps[~members[:, k], k] = np.inf
+        return gaps
+
+    def gap(self, k: int, x: np.ndarray, displacements: np.ndarray) -> np.ndarray:
+        """Return distances (m,) [m] of positions (m, 3) from wall k."""
+        return self.walls[k].gaps(x - displacements[k])
+
+    def plane_offsets(self, time: float) -> np.ndarray:
+        """Return offsets (w,) [m] of the planes n . x = d of flat walls at a time [s]."""
+        if not self.moving.any():
+            return self._offsets
+        return self._offsets + np.einsum("ij,ij->i", self.normals, self.motion.displacements(time))
+
+    def near(self, x: np.ndarray, displacements: np.ndarray, reach: np.ndarray = _ZERO) -> np.ndarray:
+        """Return (owned,) bool: nodes at positions (owned, 3) within ``reach``, (owned,) or (1,) [m], of a wall.
+
+        With a reach of zero these are the nodes beyond a wall.
+        """
+        near = np.zeros(len(x), dtype=bool)
+        if self.flat.any():
+            at = self.flat
+            offsets = self._offsets[at] + np.einsum("ij,ij->i", self.normals[at], displacements[at])
+            members = self.members if self.flat.all() else np.ascontiguousarray(self.members[:, at])
+            near_planes(x, self.normals[at], offsets, self.all_nodes[at], members, reach, near)
+        for k in np.flatnonzero(~self.flat):
+            near |= (self.gap(k, x, displacements) < reach) & self.members[:, k]
+        return near
+
+    def applicable(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> np.ndarray:
+        """Return (m, walls) bool: walls that can stop nodes that move to positions (m, 3)."""
+        applicable = self.members[nodes]
+        if self.partial and self.state is not None:
+            state = self.state
+            before = state.position[nodes]
+            earlier = self.motion.displacements(state.time)
+            for k, wall in enumerate(self.walls):
+                if wall.partial:
+                    # a node in contact may lie beyond the wall, because the balance need not hold at its position
+                    held = state.contact[nodes] @ wall.normal > 0.0
+                    slack = np.where(held, 0.1 * wall.half.min(), BEYOND * self.size)
+                    applicable[:, k] &= wall.stops(before - earlier[k], x - displacements[k], slack)
+        return applicable
+
+    def planes(
+        self, applicable: np.ndarray, x: np.ndarray, displacements: np.ndarray, acting: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return planes (m, w, 3), (m, w) at positions (m, 3), with offset -inf for walls that do not apply.
+
+        ``acting`` : result of :meth:`acting`. Planes of curved walls then have these normals, at the same distance.
+        """
+        normals = np.empty((len(x), len(self.walls), 3))
+        offsets = np.empty((len(x), len(self.walls)))
+        for k, wall in enumerate(self.walls):
+            normals[:, k], offsets[:, k] = wall.planes(x - displacements[k])
+            offsets[:, k] += normals[:, k] @ displacements[k]
+            if not wall.flat:
+                if acting is not None:
+                    other = acting[:, k].any(axis=1)
+                    normals[other, k] = acting[other, k]
+                offsets[:, k] = np.einsum("mi,mi->m", normals[:, k], x) - self.gap(k, x, displacements)
+        offsets[~applicable] = -np.inf
+        return normals, offsets
+
+    def acting(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray, part: float) -> np.ndarray | None:
+        """Return the directions (m, w, 3) in which curved walls push nodes (m,) that move to (m, 3) in a step.
+
+        These are the normals where the forces of the step's balance act, at the fraction ``part`` of the way
+        (:attr:`~pfem_petsc.integrators.base.Balance.acting`). None: all are the normals at the end. So are those that
+        are zero in the result: of flat walls, and where the normal turns by more than 37 degrees on the way, because a
+        force along the earlier normal may not reach the surface.
+
+        ``displacements`` (w, 3) : of the walls at the end [m]
+        """
+        if part == 1.0 or self.flat.all():
+            return None
+        earlier, start = self.motion.displacements(self.state.time), self.state.position[nodes]
+        acting = np.zeros((len(x), len(self.walls), 3))
+        for k in np.flatnonzero(~self.flat):
+            end, before = x - displacements[k], start - earlier[k]
+            there, _ = self.walls[k].planes(before + part * (end - before))
+            turn = np.einsum("mi,mi->m", there, self.walls[k].planes(end)[0])
+            acting[:, k] = np.where((turn > _TURN)[:, None], there, 0.0)
+        return acting
+
+    def sums(
+        self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray, friction: float = 0.0
+    ) -> WallForces:
+        """Return sums of forces (m, w, 3) on nodes at (m, 3); ``friction``: energy dissipated in the step [J]."""
+        moment = np.cross(x[:, None, :], force).sum(axis=0)
+        return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching, x, friction)
+
+    def infeasible_message(self, node: int, offsets: np.ndarray) -> str:
+        """Return the message about a node (owned index) whose planes are infeasible together."""
+        touched = [name for name, offset in zip(self.names, offsets, strict=True) if offset > -np.inf]
+        return (
+            f"no position of node {self.mesh.node_ids[node]} satisfies all walls "
+            f"({', '.join(touched)}) and its supports: they are infeasible together; move the "
+            "walls apart, or free the node"
+        )

@@ -103,7 +103,7 @@ def test_law_is_integrated_as_by_itself(integrator, operator, examples, comm, sh
 
 
 @pytest.mark.slow
-def test_law_in_the_fused_loop(examples, tmp_path):
+def test_law_in_batches(examples, tmp_path):
     """Many steps in one call are the single steps to the last bit."""
     case, found = one_bar("central_differences", 2e-3, 200), []
     for together in (False, True):

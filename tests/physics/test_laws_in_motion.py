@@ -147,7 +147,7 @@ THROWN |= {("compaction", "engineering"): -4.0}
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "strain"), THROWN)
-def test_fused_steps_are_single_steps(law, strain, tmp_path):
+def test_batches_are_single_steps(law, strain, tmp_path):
     found = []
     for together in (False, True):
         case = row_of_bars(law, strain, THROWN[law, strain])

@@ -114,7 +114,7 @@ def case(changes, **time):
 
 
 def made(case, folder, how, comm=None):
-    """Run a case in ``batches``, by ``single`` steps, or by the ``general`` stepper, as a function of loads needs it."""
+    """Run a case in ``batches``, by ``single`` steps, or by the ``general`` stepper, as functions of loads need it."""
     simulation = Simulation(case, comm, output=folder / how, quiet=True)
     if how == "general":
         simulation.external_force(lambda time, state: np.zeros((len(simulation.state.v), 3)))

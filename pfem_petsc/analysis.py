@@ -137,7 +137,7 @@ class PlanAtRest:
 def refuse_motion(case: Case, what: str) -> None:
     """Refuse initial velocities and treatments of impact, which ``what`` does not have."""
     if any(any(entry.velocity) or any(entry.angular_velocity) for entry in case.initial):
-        raise InputError(f"{case.source}: initial: {what} has no velocities; remove the table [initial]")
+        raise InputError(f"{case.source}: initial: {what} has no velocities; remove the table [initial], or use [time]")
     if case.contact.treatment != "scheme":
         raise InputError(
             f'{case.source}: contact.treatment = "{case.contact.treatment}" treats impacts, and {what} has none; '

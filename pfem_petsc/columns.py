@@ -127,11 +127,11 @@ VECTORS = (
 CHANGES = Column("active_set_changes", kind=np.int64, exists=lambda model: model.contact.any)
 OF_WALLS = (
     Column("force", "N", 3),
-    Column("moment", size=3),
+    Column("moment", "N m", 3),
     Column("impulse", "N s", 3, stages=SUMMED),
     Column("jump_impulse", "N s", 3, stages=SUMMED),
     Column("contacts", kind=np.int64),
-    Column("contact_time", stages=LASTING),
+    Column("contact_time", "s", stages=LASTING),
     Column("releases", kind=np.int64, stages=SUMMED),
 )
 MOTION = (Column("position", "m", 3), Column("velocity", "m/s", 3))

@@ -20,9 +20,8 @@ from .output.lock import FolderLock
 from .parallel.agreement import on_root
 from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
+from .preflight.checks import inspect, odd_accelerations, warnings_before
 from .preflight.forecast import forecast, summarise
-from .preflight.inspection import inspect, warnings_before
-from .preflight.values import odd_accelerations
 from .restart.checkpoints import find_restart, finished, finished_message
 from .run.outputs import Outputs, ReportedCompilation
 from .run.recorder import Recorder

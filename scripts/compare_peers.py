@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-from pfem_petsc.bench.cases import KINDS, cells_for
+from pfem_petsc.bench.measure import KINDS, cells_for
 
 ROOT = Path(__file__).resolve().parent.parent
 DRIVERS = ROOT / "scripts" / "peers"

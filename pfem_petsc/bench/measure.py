@@ -1,4 +1,6 @@
-"""Times and memory of the steps of a job, and the memory traffic that bounds them.
+"""Times and memory of the steps of jobs, and the memory traffic that bounds them.
+
+A job is a block of cubic, octet or body-centred cells that flies, or hits a floor.
 
 The bytes of a step are those that the loops move if they find nodes in the cache while they process their bars. As in
 STREAM, an array that is overwritten counts as written only. Arrays are float64 (8 B), ends of bars 32-bit; where bars
@@ -9,8 +11,8 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import functools
 import gc
+import math
 import re
 import shutil
 import tempfile
@@ -23,13 +25,135 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..parallel.petsc_log import OF_BALANCE, OF_FORCE, OF_PRODUCT
-from .cases import CROSSING, KINDS, Job, make_case
-from .machine import Bandwidth
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
+    from ..case.schema import Case
     from ..mechanics.bars import Bars
+
+YOUNG_MODULUS = 110e9  # [Pa] titanium
+DENSITY = 4500.0  # [kg/m3]
+AREA = 1e-6  # [m2]
+PITCH = 0.01  # [m]
+YIELD_STRESS = 200e6  # [Pa]
+HARDENING = 1e9  # [Pa]
+WAVE_SPEED = math.sqrt(YOUNG_MODULUS / DENSITY)  # [m/s]
+CROSSING = PITCH / WAVE_SPEED  # [s] of a wave along the edge of a cell
+SPEED = 20.0  # [m/s] of the impact, and of the corners of a lattice that spins
+
+KINDS = {
+    "cubic": lambda n: 3 * n * (n + 1) * (3 * n + 1),
+    "octet": lambda n: 12 * n * n * (n + 1) + 12 * n**3,
+    "bcc": lambda n: 3 * n * (n + 1) ** 2 + 8 * n**3,
+}
+"""Bars of n x n x n cells."""
+
+JOBS: dict[str, dict[str, Any]] = {
+    "explicit": {"step": 0.1 * CROSSING},
+    # short steps: thousands of them before the lattice leaves the floor
+    "explicit_contact": {"step": 0.02 * CROSSING, "contact": True},
+    "matrix_free": {"step": 2.0 * CROSSING, "operator": "matrix_free", "linear": "cg"},
+    "assembled": {"step": 2.0 * CROSSING, "operator": "assembled", "linear": "cg"},
+    "implicit_contact": {"step": 2.0 * CROSSING, "operator": "matrix_free", "contact": True},
+}
+"""The measurements by name, as attributes of :class:`Job`."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A measurement.
+
+    Attributes
+    ----------
+    name : in the tables
+    integrator : name of a time integration scheme
+    step : time step [s]
+    operator : of an implicit scheme: ``matrix_free`` or ``assembled``
+    linear : linear solver of an implicit scheme
+    contact : the foot of the lattice presses on a floor in every step; else the lattice flies and spins
+    plastic : bars can yield
+    mass : ``lumped`` or ``consistent``
+    history_every : steps between rows of the history
+    """
+
+    name: str
+    integrator: str
+    step: float
+    operator: str = "auto"
+    linear: str = "auto"
+    contact: bool = False
+    plastic: bool = False
+    mass: str = "lumped"
+    history_every: int = 1
+
+
+def jobs(
+    names: list[str], explicit: str, implicit: str, mass: str, plastic: bool | None, history_every: int
+) -> list[Job]:
+    """Return the jobs of these names.
+
+    Parameters
+    ----------
+    names : of :data:`JOBS`
+    explicit, implicit : integrators
+    mass : ``lumped`` or ``consistent``
+    plastic : whether bars can yield; None: in the explicit impact only
+    history_every : steps between rows of the history
+    """
+    return [
+        Job(
+            name,
+            explicit if name.startswith("explicit") else implicit,
+            plastic=name == "explicit_contact" if plastic is None else plastic,
+            mass=mass,
+            history_every=history_every,
+            **JOBS[name],
+        )
+        for name in names
+    ]
+
+
+def tiny_jobs(explicit: str) -> list[Job]:
+    """Return jobs with so few bars that the measured time is the cost of a step outside the loops over bars."""
+    step = 0.02 * CROSSING
+    return [
+        Job("tiny", explicit, step),
+        Job("tiny, history every 10", explicit, step, history_every=10),
+        Job("tiny, contact", explicit, 0.1 * step, contact=True),
+    ]
+
+
+def cells_for(kind: str, bars: int) -> int:
+    """Return the cells along an edge of the lattice whose number of bars is nearest to ``bars``."""
+    most = 2 + math.ceil(bars ** (1.0 / 3.0))  # every kind has more than n^3 bars
+    return min(range(1, most), key=lambda n: abs(KINDS[kind](n) - bars))
+
+
+def make_case(job: Job, kind: str, cells: int, steps: int) -> Case:
+    """Return the case of a job on a lattice, with ``steps`` steps and a history but no fields."""
+    from ..case.schema import Case
+
+    material: dict[str, Any] = {"young_modulus": YOUNG_MODULUS, "density": DENSITY}
+    if job.plastic:
+        material |= {"yield_stress": YIELD_STRESS, "isotropic_hardening": HARDENING}
+    table: dict[str, Any] = {
+        "title": f"{job.name}: {kind} lattice of {KINDS[kind](cells):,} bars",
+        "mesh": {"generator": "lattice", "kind": kind, "cells": [cells, cells, cells], "pitch": PITCH},
+        "material": {"strut": material},
+        "section": {"strut": {"area": AREA, "material": "strut"}},
+        "time": {"integrator": job.integrator, "step": job.step, "end": steps * job.step, "mass": job.mass},
+        "output": {"fields_every": 0, "fields": [], "history_every": job.history_every},
+        "solver": {"operator": job.operator, "linear": job.linear},
+    }
+    if job.contact:
+        table["initial"] = {"velocity": [0.0, 0.0, -SPEED]}
+        table["wall"] = [{"name": "floor", "type": "plane", "point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}]
+    else:
+        # a spin with the same speed at the corners, which strains and rotates bars
+        table["initial"] = {"angular_velocity": [2.0 * SPEED / (cells * PITCH), 0.0, 0.0]}
+    return Case.from_dict(table, source="bench", folder=Path.cwd())
+
 
 _FEWEST = 4  # minimum number of timed steps, even if each takes longer than the given time
 _VECTOR = 24  # B per node: three components
@@ -61,16 +185,6 @@ OPERATIONS = {
     "conjugate gradients node": 36,  # three sums of vectors, two products, the diagonal
 }
 """Floating-point operations per item, of linear elastic bars."""
-
-PARTS = {
-    "mesh": "mesh",
-    "state": "state",
-    "bars": "model.bars",
-    "model": "model",
-    "stepper": "stepper",
-    "output": "outputs",
-}
-"""Part to the object of a simulation that makes it up; an array that several hold belongs to the first part."""
 
 
 class Work(NamedTuple):
@@ -173,33 +287,6 @@ class PeakMemory:
         return 1024.0 * float(found[1])
 
 
-def held_by_parts(simulation: Any) -> dict[str, float]:
-    """Return part to the bytes of its arrays on this rank; those of PETSc are not among them.
-
-    Counted are the arrays with memory of their own that an object holds, directly or through others, each once.
-    """
-    seen: set[int] = set()
-    found = dict.fromkeys(PARTS, 0.0)
-    for part, path in PARTS.items():
-        waiting = [functools.reduce(lambda held, name: getattr(held, name, None), path.split("."), simulation)]
-        while waiting:
-            held = waiting.pop()
-            while isinstance(held, np.ndarray) and isinstance(held.base, np.ndarray):
-                held = held.base
-            if id(held) in seen:
-                continue
-            seen.add(id(held))
-            if isinstance(held, np.ndarray):
-                found[part] += held.nbytes if held.base is None else 0.0
-            elif isinstance(held, dict):
-                waiting += held.values()
-            elif isinstance(held, list | tuple | set):
-                waiting += held
-            elif type(held).__module__.startswith("pfem_petsc") and not isinstance(held, type):
-                waiting += getattr(held, "__dict__", {}).values()
-    return found
-
-
 @dataclass(frozen=True)
 class Record:
     """Measurements of a job on a lattice. Times in seconds, over steps after the first; memory in bytes.
@@ -213,7 +300,6 @@ class Record:
     traffic : number of bytes that a step moves
     share : percent of the bandwidth of all ranks that this traffic needs at the median
     memory : maximum growth of resident memory, all ranks together
-    held : bytes of the arrays that each part of the simulation holds at the end, all ranks together
     operations : floating-point operations of a step
     runs : share of the bars that go by runs of constant offset
     ghosts, neighbours : maximum number of ghosts, and of neighbouring ranks, over all ranks
@@ -236,7 +322,6 @@ class Record:
     traffic: float
     share: float
     memory: float
-    held: dict[str, float]
     operations: float
     runs: float
     ghosts: int
@@ -251,9 +336,9 @@ class Record:
 
 
 def time_job(
-    job: Job, kind: str, cells: int, comm: MPI.Comm, bandwidth: Bandwidth | None, seconds: float, most: int = 100_000
+    job: Job, kind: str, cells: int, comm: MPI.Comm, bandwidth: float | None, seconds: float, most: int = 100_000
 ) -> Record:
-    """Run a job for about ``seconds``, at most ``most`` steps. Collective."""
+    """Run a job for about ``seconds``, at most ``most`` steps, with the bandwidth of all ranks [B/s]. Collective."""
     from ..simulation import Simulation
 
     # the foot stays on the floor until the elastic wave has run to the far side and back
@@ -285,7 +370,6 @@ def time_job(
         cpu = (process_time() - cpu_before) / len(times)
         running.close()
         grown = comm.allreduce(memory.growth())
-        held = {part: comm.allreduce(size) for part, size in held_by_parts(simulation).items()}
         plan, mesh = simulation.plan, simulation.mesh
         if hasattr(simulation.stepper, "destroy"):
             simulation.stepper.destroy()
@@ -321,9 +405,8 @@ def time_job(
         newton=work.newton,
         linear=work.linear,
         traffic=work.bytes(),
-        share=100.0 * work.bytes() / bandwidth.together / middle if bandwidth else 0.0,
+        share=100.0 * work.bytes() / bandwidth / middle if bandwidth else 0.0,
         memory=grown,
-        held=held,
         operations=work.operations(),
         runs=work.runs,
         ghosts=max(comm.allgather(mesh.n_local - mesh.n_owned)),

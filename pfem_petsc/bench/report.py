@@ -1,21 +1,112 @@
-"""The table of the bench, its JSON, and its roofline."""
+"""What a machine can do (memory bandwidth, operations of a core), and tables, JSON and roofline of the bench."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
+import re
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from time import perf_counter, sleep
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .machine import BYTES_PER_ELEMENT, Bandwidth, Messages, processor
+from ..mechanics.compiled import kernel
 from .measure import ASSUMED, OPERATIONS, Record
 
 if TYPE_CHECKING:
     from mpi4py import MPI
+
+BYTES_PER_ELEMENT = 24
+"""As STREAM counts: two reads and a write of 8 B. Cache lines read before they are overwritten are not counted."""
+
+_ELEMENTS = 8_000_000  # 64 MB per array and process, larger than the share of a core in any current cache
+_CACHED, _TERMS = 2048, 32  # elements in the cache, and polynomials of each
+
+
+class Bandwidth(NamedTuple):
+    """STREAM triad [B/s], best of several: of one process alone, and of all ranks at once."""
+
+    alone: float
+    together: float
+    ranks: int
+
+    @property
+    def ratio(self) -> float:
+        """Bandwidth of all ranks relative to one: the maximum speed-up of memory-bound work."""
+        return self.together / self.alone
+
+
+@kernel
+def _triad(a, b, c, scalar):
+    for i in range(len(a)):
+        a[i] = b[i] + scalar * c[i]
+
+
+@kernel
+def _polynomial(x, y, terms):
+    for i in range(len(x)):
+        y[i] = 1.0
+    for _ in range(terms):
+        for i in range(len(x)):
+            value = y[i]
+            for _ in range(7):
+                value = value * x[i] + 0.5
+            y[i] = value
+
+
+def measure_bandwidth(comm: MPI.Comm, repeats: int = 10) -> Bandwidth:
+    """Measure both. Collective; the other ranks sleep while one is measured."""
+    a, b, c = np.zeros(_ELEMENTS), np.full(_ELEMENTS, 1.0), np.full(_ELEMENTS, 2.0)
+    size = BYTES_PER_ELEMENT * _ELEMENTS
+
+    def triad() -> None:
+        _triad(a, b, c, 3.0)
+
+    triad()  # compile, and touch every page
+    alone = size / _seconds(triad, repeats).min() if comm.rank == 0 else 0.0
+    waiting = comm.Ibarrier()
+    while not waiting.Test():
+        sleep(0.01)
+    alone = together = comm.bcast(alone)
+    if comm.size > 1:
+        # the slowest of a round, because all share the memory until it has finished
+        slowest = np.max(comm.allgather(_seconds(triad, repeats, comm.Barrier)), axis=0)
+        together = comm.size * size / slowest.min()
+    return Bandwidth(float(alone), float(together), comm.size)
+
+
+def measure_operations(comm: MPI.Comm, repeats: int = 50) -> float:
+    """Return the products and sums a second [1/s] of a compiled loop over arrays in the cache, of all ranks at once.
+    Collective."""
+    x, y = np.full(_CACHED, 1e-3), np.empty(_CACHED)
+    _polynomial(x, y, _TERMS)
+    best = _seconds(lambda: _polynomial(x, y, _TERMS), repeats, comm.Barrier).min()
+    return comm.allreduce(14.0 * _CACHED * _TERMS / best)
+
+
+def processor() -> str:
+    """Return the name of the processor."""
+    with contextlib.suppress(OSError):
+        if found := re.search(r"^model name\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            return found[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _seconds(work: Callable[[], object], repeats: int, before: Callable[[], object] = lambda: None) -> np.ndarray:
+    """Return the time of each of some calls [s]; ``before`` is called before each and not timed."""
+    times = np.empty(repeats)
+    for k in range(repeats):
+        before()
+        start = perf_counter()
+        work()
+        times[k] = perf_counter() - start
+    return times
+
 
 _FORMAT = "{:18} {:>11} {:>9} {:>9} {:>9} {:>8} {:>6} {:>6} {:>6} {:>7} {:>6} {:>6}"
 _NAMES = (
@@ -48,14 +139,11 @@ def line(record: Record) -> str:
     )
 
 
-def machine_lines(bandwidth: Bandwidth, messages: Messages | None) -> str:
-    """Describe the bandwidth, and the cost of messages."""
+def machine_lines(bandwidth: Bandwidth) -> str:
+    """Describe the bandwidth."""
     text = f"STREAM triad ({BYTES_PER_ELEMENT} B an element): one process {bandwidth.alone / 1e9:.1f} GB/s"
     if bandwidth.ranks > 1:
         text += f", {bandwidth.ranks} at once {bandwidth.together / 1e9:.1f} GB/s ({bandwidth.ratio:.2f} x)"
-    if messages is not None:
-        text += f"\nmessages: latency {1e6 * messages.latency:.1f} us, {messages.bandwidth / 1e9:.1f} GB/s, "
-        text += f"a sum over all ranks {1e6 * messages.reduction:.1f} us"
     return text + "\n"
 
 
@@ -69,20 +157,9 @@ def memory_slopes(records: list[Record]) -> dict[str, float]:
     return slopes
 
 
-def memory_parts(record: Record) -> str:
-    """Describe what the parts of a simulation hold, in bytes a bar."""
-    held = {part: size / record.bars for part, size in record.held.items()}
-    texts = ", ".join(f"{part} {size:.1f}" for part, size in held.items() if size >= 0.05)
-    return (
-        f"memory of {record.job}, {record.bars:,} bars: arrays {sum(held.values()):.0f} B a bar ({texts}), "
-        f"growth at most {record.memory / record.bars:.0f}"
-    )
-
-
 def document(
     comm: MPI.Comm,
     bandwidth: Bandwidth,
-    messages: Messages | None,
     records: list[Record],
     tiny: list[Record],
     operations: float | None,
@@ -100,7 +177,6 @@ def document(
             "ratio": bandwidth.ratio,
             "bytes_per_element": BYTES_PER_ELEMENT,
         },
-        "messages": messages._asdict() if messages is not None else None,
         "bytes_assumed": ASSUMED,
         "operations_assumed": OPERATIONS,
         "operations_a_second": operations,

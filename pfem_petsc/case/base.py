@@ -8,25 +8,21 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Protocol, TypeVar
 
-import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
-    BeforeValidator,
     ConfigDict,
     Field,
     PlainValidator,
     TypeAdapter,
     ValidationError,
     ValidationInfo,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
     model_validator,
 )
+from pydantic.types import Strict
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from ..registry import nearest
@@ -113,12 +109,7 @@ class StrictModel(BaseModel):
         self.__pydantic_fields_set__.update(values)
 
 
-def _tuple_from_list(value: Any) -> Any:
-    """Convert TOML lists to the tuples of the models; anything else is left to the strict check."""
-    return tuple(value) if isinstance(value, list) else value
-
-
-listed = BeforeValidator(_tuple_from_list)
+listed = Strict(False)
 """Annotation of a tuple type that accepts TOML lists: ``Annotated[tuple[float, float], listed]``."""
 
 
@@ -127,19 +118,6 @@ def is_finite_number(value: Any) -> bool:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return abs(value) <= sys.float_info.max  # whole numbers may be too large to be converted
-
-
-def number_or_rows(value: Any) -> float | tuple[tuple[float, float], ...]:
-    """Return a finite number, or rows of two, of a key that takes both; for validators."""
-    expected = "expected a number in SI units, without quotes and unit, or rows [t, value]"
-    rows = value if isinstance(value, list | tuple) else [[0.0, value]]
-    if not rows or not all(isinstance(row, list | tuple) and len(row) == 2 for row in rows):
-        raise ValueError(expected)
-    if not all(is_finite_number(number) for row in rows for number in row):
-        raise ValueError(expected)
-    if rows is value:
-        return tuple((float(t), float(number)) for t, number in rows)
-    return float(value)
 
 
 def _no_path_of_its_own(name: str) -> str:
@@ -200,20 +178,6 @@ Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
 Rows = TypeVar("Rows", bound=Sequence[Sequence[float]])
 
 
-def _numbers(width: int) -> WrapValidator:
-    """Accept lists of rows of finite numbers at once, which takes a tenth of the time of row by row; leave all else."""
-
-    def read(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
-        even = isinstance(value, list) and set(map(type, value)) <= {list, tuple} and set(map(len, value)) == {width}
-        if even and set(map(type, chain.from_iterable(value))) <= {float, int}:
-            rows = np.array(value)
-            if rows.dtype.kind in "fi" and np.isfinite(rows).all():
-                return tuple(map(tuple, rows.astype(np.float64).tolist()))
-        return handler(value)
-
-    return WrapValidator(read)
-
-
 def increasing(rows: Rows) -> Rows:
     """Return the rows of a table over time; reject it if it is empty or its times do not increase."""
     if not rows:
@@ -224,10 +188,27 @@ def increasing(rows: Rows) -> Rows:
     return rows
 
 
-Table2 = Annotated[tuple[Row2, ...], listed, _numbers(2), AfterValidator(increasing)]
+Table2 = Annotated[tuple[Row2, ...], listed, AfterValidator(increasing)]
 """rows [t, value] with increasing times"""
-Table4 = Annotated[tuple[Row4, ...], listed, _numbers(4), AfterValidator(increasing)]
+Table4 = Annotated[tuple[Row4, ...], listed, AfterValidator(increasing)]
 """rows [t, x, y, z] with increasing times"""
+
+
+def has_rows(value: Any) -> bool:
+    """Whether a value of a key that takes rows over time as well is given as such."""
+    return isinstance(value, list | tuple) and any(isinstance(row, list | tuple) for row in value)
+
+
+def _or_rows(constant: Any, rows: Any) -> Any:
+    """The type of a key that takes a constant, or rows over time."""
+    readers = [TypeAdapter(each, config=ConfigDict(strict=True)) for each in (constant, rows)]
+    return Annotated[constant | rows, PlainValidator(lambda value: readers[has_rows(value)].validate_python(value))]
+
+
+NumberOrRows = _or_rows(Finite, Table2)
+"""a number, or rows [t, value] with increasing times"""
+VectorOrRows = _or_rows(Vector3, Table4)
+"""a vector [x, y, z], or rows [t, x, y, z] with increasing times"""
 
 
 def _rows(given: tuple[Any, tuple[str, ...]], info: ValidationInfo) -> list[list[float]]:

@@ -329,37 +329,43 @@ def _from_arrays(arrays: dict[str, np.ndarray]) -> Forces:
         if not names:
             raise InputError("expected the arrays time, nodes, force, or time and one array (n, 3) for each node set")
         times = _times(arrays)
-        for name in names:
-            _shape(name, arrays[name], (len(times), 3))
-        return _histories(times, [_target(name) for name in names], np.stack([arrays[n] for n in names], axis=1))
+        force = np.stack([_array(arrays, name, (len(times), 3)) for name in names], axis=1)
+        return _histories(times, [_target(name) for name in names], force)
     for name in ("force", "nodes"):
         if name not in arrays:
             raise InputError(f"there is no array {name!r}; the file has {', '.join(arrays)}")
     unknown = [name for name in arrays if name not in ("time", "nodes", "force", "factor")]
     if unknown:
         raise InputError(f"there is an unknown array {unknown[0]!r}; expected time, nodes, force, factor")
-    nodes, force = arrays["nodes"], np.asarray(arrays["force"], dtype=np.float64)
+    nodes = arrays["nodes"]
     if nodes.ndim != 1 or nodes.dtype.kind not in "iu" or not len(nodes):
         raise InputError("array 'nodes': expected node numbers (m,)")
     if len(np.unique(nodes)) < len(nodes):
         raise InputError("array 'nodes': a node number is listed twice")
-    if force.ndim == 3:
+    every, targets = np.arange(len(nodes)), nodes.tolist()
+    if arrays["force"].ndim == 3:
         if "factor" in arrays:
             raise InputError("array 'factor' requires forces (m, 3)")
         times = _times(arrays)
-        _shape("force", force, (len(times), len(nodes), 3))
-        return _histories(times, nodes.tolist(), force)
-    _shape("force", force, (len(nodes), 3))
-    _check_finite(force, "array 'force'")
-    every = np.arange(len(nodes))
-    if "factor" not in arrays:
-        if "time" in arrays:
-            raise InputError("array 'time' needs forces (n, m, 3), or an array factor (n, m)")
-        return Forces(np.zeros(1), nodes.tolist(), np.ones((1, 1)), np.zeros_like(every), every, force)
-    times, factor = _times(arrays), np.asarray(arrays["factor"], dtype=np.float64)
-    _shape("factor", factor, (len(times), len(nodes)))
-    _check_finite(factor, "array 'factor'")
-    return Forces(times, nodes.tolist(), factor, every, every, force)
+        return _histories(times, targets, _array(arrays, "force", (len(times), len(nodes), 3)))
+    force = _array(arrays, "force", (len(nodes), 3))
+    if "factor" in arrays:
+        times = _times(arrays)
+        return Forces(times, targets, _array(arrays, "factor", (len(times), len(nodes))), every, every, force)
+    if "time" in arrays:
+        raise InputError("array 'time' needs forces (n, m, 3), or an array factor (n, m)")
+    return Forces(np.zeros(1), targets, np.ones((1, 1)), np.zeros_like(every), every, force)
+
+
+def _array(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an array of finite numbers of a shape."""
+    array = np.asarray(arrays[name], dtype=np.float64)
+    if array.shape != shape:
+        raise InputError(f"array {name!r} has the shape {array.shape}: expected {shape}")
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        raise InputError(f"array {name!r}: entry {bad[0].tolist()} is not finite")
+    return array
 
 
 def _from_text(path: Path) -> Forces:
@@ -396,13 +402,8 @@ def _target(name: str) -> int | str:
 def _histories(times: np.ndarray, targets: list[int | str], force: np.ndarray) -> Forces:
     """Forces (n, m, 3), each component a column."""
     m = len(targets)
-    values = np.asarray(force, dtype=np.float64).reshape(len(times), 3 * m)
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-    if len(bad):
-        member = int(np.flatnonzero(~np.isfinite(values[bad[0]]))[0]) // 3
-        raise InputError(f"row {bad[0]}: the force on {targets[member]!r} is not finite")
     every = np.arange(3 * m)
-    return Forces(times, targets, values, every, every // 3, np.tile(np.eye(3), (m, 1)))
+    return Forces(times, targets, force.reshape(-1, 3 * m), every, every // 3, np.tile(np.eye(3), (m, 1)))
 
 
 def _times(arrays: dict[str, np.ndarray]) -> np.ndarray:
@@ -424,14 +425,3 @@ def _checked_times(times: np.ndarray, where: Callable[[int], str]) -> np.ndarray
             f"{where(k + 1)}: times must increase, but {times[k + 1].item()!r} follows {times[k].item()!r}"
         )
     return times
-
-
-def _shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
-    if array.shape != shape:
-        raise InputError(f"array {name!r} has the shape {array.shape}: expected {shape}")
-
-
-def _check_finite(array: np.ndarray, what: str) -> None:
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
-        raise InputError(f"{what}: entry {bad[0].tolist()} is not finite")

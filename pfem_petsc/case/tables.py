@@ -12,8 +12,6 @@ from pydantic import (
     AfterValidator,
     Field,
     PlainSerializer,
-    PlainValidator,
-    TypeAdapter,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -27,17 +25,18 @@ from .base import (
     NodeSetName,
     NonNegativeFloat,
     NonNegativeInt,
+    NumberOrRows,
     PositiveFloat,
     PositiveInt,
     StrictModel,
     Table2,
     Table4,
     Vector3,
+    VectorOrRows,
     WithFiles,
-    increasing,
+    has_rows,
     is_finite_number,
     listed,
-    number_or_rows,
     refers,
     refusal,
 )
@@ -191,22 +190,18 @@ class Section(StrictModel):
     """diameter in wind [m]; default: that of the shape, or of a round bar of this area"""
     drag_coefficient: NonNegativeFloat | None = None
     """drag coefficient in wind; default: that of [wind]"""
-    pretension: Any = None
+    pretension: NumberOrRows | None = None
     """axial force in the mesh [N], or rows [t, force] [s, N]: linear between rows, constant outside"""
-    prestress: Any = None
+    prestress: NumberOrRows | None = None
     """stress in the mesh [Pa], or rows [t, stress] [s, Pa]"""
-    rest_length: Any = None
+    rest_length: NumberOrRows | None = None
     """rest length over the length in the mesh, or rows [t, factor] [s, -]"""
 
-    @field_validator("pretension", "prestress", "rest_length")
+    @field_validator("rest_length")
     @classmethod
-    def _number_or_rows(cls, value: Any, info: ValidationInfo) -> Any:
-        if value is None:
-            return None
-        value = number_or_rows(value)
-        rows = ((0.0, value),) if isinstance(value, float) else value
-        increasing(rows)
-        if info.field_name == "rest_length" and not all(1e-3 < row[1] < 1e3 for row in rows):
+    def _factor(cls, value: Any) -> Any:
+        rows = value if has_rows(value) else [[0.0, value]] if value is not None else []
+        if not all(1e-3 < row[1] < 1e3 for row in rows):
             raise ValueError("expected a factor on the length in the mesh, like 0.99, or rows [t, factor]")
         return value
 
@@ -438,22 +433,6 @@ class LoadFile(StrictModel):
                 raise refusal((("file",), str(error), self.file)) from error
             self._take(file=str(path), digest=digest)
         return self
-
-
-def has_rows(value: Any) -> bool:
-    """Whether a value of a key that takes a vector is given over time."""
-    return isinstance(value, list | tuple) and any(isinstance(row, list | tuple) for row in value)
-
-
-_VECTOR, _ROWS = TypeAdapter(Vector3), TypeAdapter(Table4)
-
-
-def _vector_or_rows(value: Any) -> Any:
-    return (_ROWS if has_rows(value) else _VECTOR).validate_python(value, strict=True)
-
-
-VectorOrRows = Annotated[Vector3 | Table4, PlainValidator(_vector_or_rows)]
-"""a vector [x, y, z], or rows [t, x, y, z] with increasing times"""
 
 
 class _OverTime(WithFiles):

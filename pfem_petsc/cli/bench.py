@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..bench.cases import JOBS, KINDS, cells_for, jobs, tiny_jobs
+from ..bench.measure import JOBS, KINDS, cells_for, jobs, tiny_jobs
 from ..errors import InputError
 from .parser import PROGRAM, Verb, start_petsc
 
@@ -59,9 +59,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     """Measure and print. Collective."""
     start_petsc(arguments.petsc_options, comm.rank)
-    from ..bench.machine import measure_bandwidth, measure_messages, measure_operations, processor
+    from ..bench import report
     from ..bench.measure import time_job
-    from ..bench.report import HEADER, document, draw_roofline, line, machine_lines, memory_parts, memory_slopes
     from ..parallel.agreement import on_root
 
     if not 0.0 < arguments.seconds < float("inf"):
@@ -83,29 +82,28 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
         time_job(tiny_jobs(explicit)[0], "cubic", 2, comm, None, 0.0, 3000)
         say(f"loops for this machine are compiled: {time.perf_counter() - begin:.1f} s")
         return 0
-    title = f"{processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {kind} lattices"
+    title = f"{report.processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {kind} lattices"
     say(title)
-    bandwidth, messages = measure_bandwidth(comm), measure_messages(comm)
-    say(machine_lines(bandwidth, messages))
-    say(HEADER)
+    bandwidth = report.measure_bandwidth(comm)
+    say(report.machine_lines(bandwidth))
+    say(report.HEADER)
     records = []
     for size in sorted(arguments.sizes):
         for job in chosen:
-            records.append(time_job(job, kind, cells_for(kind, size), comm, bandwidth, seconds))
-            say(line(records[-1]))
+            records.append(time_job(job, kind, cells_for(kind, size), comm, bandwidth.together, seconds))
+            say(report.line(records[-1]))
     say("")
-    for job in chosen:
-        say(memory_parts(max((r for r in records if r.job == job.name), key=lambda r: r.bars)))
-    for name, slope in memory_slopes(records).items():
+    for name, slope in report.memory_slopes(records).items():
         say(f"memory of {name}: {slope:.0f} B per additional bar")
     tiny = [time_job(job, "cubic", 2, comm, None, seconds, 3000) for job in tiny_jobs(explicit)]
     for record in tiny:
         say(f"outside the loops over bars and nodes: {1e6 * record.median:.0f} us a step ({record.job})")
-    operations = measure_operations(comm) if arguments.roofline else None
+    operations = report.measure_operations(comm) if arguments.roofline else None
     if arguments.roofline and comm.rank == 0:
-        draw_roofline(arguments.roofline, bandwidth, operations, records, title)
+        report.draw_roofline(arguments.roofline, bandwidth, operations, records, title)
     if arguments.output and comm.rank == 0:
-        arguments.output.write_text(document(comm, bandwidth, messages, records, tiny, operations), encoding="utf-8")
+        text = report.document(comm, bandwidth, records, tiny, operations)
+        arguments.output.write_text(text, encoding="utf-8")
     return 0
 
 

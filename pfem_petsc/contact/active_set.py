@@ -16,8 +16,8 @@ from ..integrators.base import Balance, State
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .contact import Candidates, expected_candidates
 from .explicit import LocalSolution, Rubbing, jam, solve_locally
-from .forces import WallForces, held_by_supports
 from .frames import MIN_VOLUME, NodalFrames, Sliding
+from .node_walls import WallForces, held_by_supports
 from .projection import project
 from .transform import RowCoordinates, Transform
 

@@ -17,8 +17,7 @@ from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, ExpectedNodes, SetPart
 from .fixed_rows import FixedRows, TwoNodeRows
-from .node_walls import near_planes
-from .pairs import find_pairs
+from .node_walls import distances_from_planes, near_planes
 from .projection import project
 from .rows import (
     Planes,
@@ -33,11 +32,37 @@ from .rows import (
 
 if TYPE_CHECKING:
     from ..case.schema import Case
+    from ..case.tables import ContactPair
     from ..mesh.distribution import DistributedMesh
     from .contact import Contact
 
 PACKAGE = "pfem_petsc.contact.constraints"
 _ZERO = np.zeros(1)
+
+
+class PairRows(Constraint):
+    """The pairs of a table: n . (x_2 - x_1) >= gap.
+
+    Parameters
+    ----------
+    pair : ContactPair
+    nodes : (r, 2) mesh numbers of the first and second nodes; the second ones are different from each other
+    """
+
+    fixed = True
+
+    def __init__(self, pair: ContactPair, nodes: np.ndarray) -> None:
+        self.nodes, self.data = nodes, np.empty((len(nodes), 0))
+        self.ids = nodes[:, 1]
+        self.normal = np.array(pair.direction) / np.linalg.norm(pair.direction)
+        self.gap = float(pair.gap)
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        n, apart = self.normal, x[:, 1] - x[:, 0]
+        return n[0] * apart[:, 0] + n[1] * apart[:, 1] + n[2] * apart[:, 2] - self.gap
+
+    def gradients(self, x: np.ndarray) -> np.ndarray:
+        return np.tile(np.stack([-self.normal, self.normal]), (len(x), 1, 1))
 
 
 class _WallsAtRows:
@@ -84,18 +109,14 @@ class _WallsAtRows:
 
     def _gaps(self, nodes: np.ndarray, x: np.ndarray, far: np.ndarray, time: float) -> np.ndarray:
         """Distances (m, w) of some nodes (m,) at positions x (n, 3) from walls, infinite where these do not apply."""
-        contact, at = self._contact, x[nodes]
-        # not a product of matrices: the digits must not depend on how many nodes there are
-        n = contact.normals.T
-        gaps = at[:, :1] * n[0] + at[:, 1:2] * n[1] + at[:, 2:] * n[2] - contact.plane_offsets(time)
-        applicable = self._members[nodes]
+        contact, gaps = self._contact, np.empty((len(nodes), len(self._contact.normals)))
+        distances_from_planes(nodes, x, contact.normals, contact.plane_offsets(time), self._members, gaps)
         if self.flags:
             where = self._rows.where[nodes]
             own = where >= 0
             displacements = contact.motion.displacements(time)
-            applicable[own] = contact.applicable(where[own], at[own], displacements)
-            applicable[~own] = far[-1 - where[~own], 7:] > 0.0
-        gaps[~applicable] = np.inf
+            gaps[own] = np.where(contact.applicable(where[own], x[nodes][own], displacements), gaps[own], np.inf)
+            gaps[~own] = np.where(far[-1 - where[~own], 7:] > 0.0, gaps[~own], np.inf)
         return gaps
 
 
@@ -121,7 +142,7 @@ class ConstraintSet:
         self.n_pairs = len(case.contact_pair)
         kinds = ["pair"] * self.n_pairs + ["constraint"] * len(case.constraint)
         self.columns = [f"{kind}/{name}" for kind, name in zip(kinds, self.names, strict=True)]
-        self._sources: list[Constraint] = [find_pairs(case, k, nodes, self.mesh) for k in range(self.n_pairs)]
+        self._sources: list[Constraint] = [_find_pairs(case, k, nodes, self.mesh) for k in range(self.n_pairs)]
         self._sources += [_source(case.source, keys, nodes, self.mesh) for keys in case.constraint]
         self.dynamic = any(source.dynamic for source in self._sources)
         self._make()
@@ -475,3 +496,57 @@ def _part(mesh: DistributedMesh, local: np.ndarray) -> SetPart:
     count, first = int(counts.sum()), int(counts[: comm.rank].sum())
     evenly = Router(comm, slab_of(first + np.arange(len(numbers)), count, comm.size))
     return SetPart(count, evenly.send(numbers[order]).astype(np.int64), evenly.send(places[order]))
+
+
+def _find_pairs(case: Case, index: int, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> PairRows:
+    """Match the nodes of a table of a case. Collective.
+
+    ``nodes``: owned local indices of each node set.
+
+    Raises
+    ------
+    InputError
+        On all ranks, for sets of unequal size, a node paired with itself, or two nodes paired with the same node.
+    """
+    pair, comm = case.contact_pair[index], mesh.comm
+    key = f"{case.source}: contact_pair {pair.name!r}"
+    normal = np.array(pair.direction) / np.linalg.norm(pair.direction)
+    first, second = nodes[pair.first], nodes[pair.second]
+    counts = comm.allreduce(np.array([len(first), len(second)]))
+    if counts[0] != counts[1]:
+        raise InputError(f"{key}: first has {counts[0]} nodes and second {counts[1]}: they cannot be paired")
+    numbers = mesh.node_ids[second].astype(np.int64)
+    if counts[0] == 0:
+        return PairRows(pair, np.empty((0, 2), dtype=np.int64))
+    # the nodes of a set lie on a surface, few enough for each rank to have those of all
+    known = np.concatenate(comm.allgather(mesh.node_ids[first].astype(np.int64)))
+    points, order = np.concatenate(comm.allgather(mesh.points[first])), np.argsort(known)
+    at = nearest_points(across(points[order], normal), across(mesh.points[second], normal))
+    nearest = known[order[at]]
+    met = np.sort(Router(comm, slab_of(nearest, mesh.n_nodes, comm.size)).send(nearest))
+    if comm.allreduce(bool((np.diff(met) == 0).any()), op=MPI.LOR):
+        raise InputError(f"{key}: two nodes of second are nearest to the same node of first, seen along the direction")
+    lowest = comm.allreduce(int(nearest[nearest == numbers].min(initial=mesh.n_nodes)), op=MPI.MIN)
+    if lowest < mesh.n_nodes:
+        raise InputError(f"{case.source}: contact_pair: node {lowest} is paired with itself")
+    return PairRows(pair, np.column_stack([nearest, numbers]))
+
+
+def across(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Return points (n, 3) minus their part along a unit vector, bitwise independent of their index in the array."""
+    along = points[:, 0] * normal[0] + points[:, 1] * normal[1] + points[:, 2] * normal[2]
+    return points - along[:, None] * normal
+
+
+def nearest_points(points: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """Return the indices (m,) of the points (n, 3) nearest to queries (m, 3), the first of several at bitwise the same
+    distance; n > 0."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points)
+    distance, at = tree.query(queries, k=[1, 2])  # a second one that does not exist is at infinity
+    radius, nearest = distance[:, 0] * (1.0 + 1e-9), at[:, 0]
+    for k in np.flatnonzero(distance[:, 1] <= radius):
+        equal = np.sort(tree.query_ball_point(queries[k], radius[k]))
+        nearest[k] = equal[np.argmin(((points[equal] - queries[k]) ** 2).sum(axis=1))]
+    return nearest

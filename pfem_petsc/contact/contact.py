@@ -13,8 +13,8 @@ from ..integrators.base import Balance, State
 from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .explicit import ExplicitContact
-from .forces import WallForces
 from .frames import MIN_VOLUME, NodalFrames, Planes, build_frames
+from .node_walls import WallForces
 from .tied import FreshTies
 
 if TYPE_CHECKING:

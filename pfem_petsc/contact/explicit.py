@@ -14,8 +14,7 @@ from ..errors import SimulationFailure
 from ..mechanics.compiled import borrowing, inlined, kernel
 from ..mesh.ordering import NODE_BLOCK
 from ..tolerances import FIXED_POINT, FREE_PART, PROJECTED, RANK
-from .forces import WallForces, free_squares
-from .node_walls import NodeWalls
+from .node_walls import NodeWalls, WallForces, free_squares
 from .projection import project
 from .tied import Ties
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..tolerances import ON_BOUND
 from .explicit import Rubbing
-from .forces import WallForces
+from .node_walls import WallForces
 from .projection import project
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..tolerances import BEYOND
 from .contact import Contact
-from .forces import held_by_supports
 from .neighbours import NeighbourSearch, Segments
+from .node_walls import held_by_supports
 
 if TYPE_CHECKING:
     from ..stepping.model import Model

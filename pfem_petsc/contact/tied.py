@@ -17,7 +17,7 @@ import numpy as np
 from ..errors import SimulationFailure
 from ..parallel.agreement import agreed
 from ..tolerances import BEYOND
-from .forces import held_by_supports
+from .node_walls import held_by_supports
 
 if TYPE_CHECKING:
     from .frames import NodalFrames

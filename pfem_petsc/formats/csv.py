@@ -59,9 +59,9 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     """
     of_nodes, of_bars = _pair(path)
     nodes = _Table(of_nodes)
-    axes = [nodes.numbers(axis) if axis != "z" or nodes.has("z") else np.zeros(nodes.n) for axis in "xyz"]
+    axes = [nodes.numbers(axis) if axis != "z" or nodes.place("z") is not None else np.zeros(nodes.n) for axis in "xyz"]
     number: dict[str, int] = {}
-    for i, label in enumerate(nodes.labels("node") if nodes.has("node") else map(str, range(nodes.n))):
+    for i, label in enumerate(nodes.labels("node") if nodes.place("node") is not None else map(str, range(nodes.n))):
         if number.setdefault(label, i) != i:
             raise InputError(f"{nodes.where(i)}: node {label!r} is listed more than once")
     groups = nodes.groups()
@@ -75,9 +75,9 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
             label = next(islice(bars.labels(name), row, None))
             raise InputError(f"{bars.where(row)}: there is no node {label!r} in {of_nodes.name}")
     mesh = WholeMesh(np.stack(axes, axis=1), ends, groups, bars.groups())
-    known = {bars.has(what) for what in ("bar", "first", "second", "groups")}
-    for name, column in zip(bars.headings, bars.columns):
-        if name and bars.key(name) not in known:
+    known = {bars.place(what) for what in ("bar", "first", "second", "groups")}
+    for place, (name, column) in enumerate(zip(bars.headings, bars.columns)):
+        if name and place not in known:
             values = bars.converted(column)
             if values is None:
                 mesh.warnings.append(f"{of_bars}: left out column {name!r}, which has text other than numbers")
@@ -104,48 +104,43 @@ class _Table:
         self._decimal_comma = separator == ";"
         self._lines = np.array(kept[1:], np.int64) + 1
         self.n = len(self._lines)
-        rows = csv.reader((lines[i] for i in kept), delimiter=separator, skipinitialspace=True, strict=True)
+        texts = (lines[i] for i in kept)
+        rows = csv.reader(texts, delimiter=separator, skipinitialspace=True, strict=True)
         try:
-            self._take(rows)
+            self.headings = [_without_unit(name) for name in next(rows)]
+            self.columns: list[list[str]] = [[] for _ in self.headings]
+            count = self._fill(rows)
         except csv.Error as error:
             raise InputError(f"{path}: {error}") from None
-
-    def _take(self, rows: Iterator[list[str]]) -> None:
-        """Put the entries into columns, row by row; a large table has them once in memory, and repeated ones shared."""
-        self.headings = [_without_unit(name) for name in next(rows)]
-        width, count = len(self.headings), 0
-        self.columns: list[list[str]] = [[] for _ in self.headings]
-        add = [column.append for column in self.columns]
-        last = [""] * width
-        for row in rows:
-            if len(row) != width and (len(row) < width or any(word.strip() for word in row[width:])):
-                raise InputError(f"{self.where(count)}: {len(row)} entries; expected {width}, as the first line has")
-            for k in range(width):
-                if row[k] != last[k]:
-                    last[k] = row[k]
-                add[k](last[k])
-            count += 1
         if count != self.n:
-            raise InputError(f"{self.path}: a text in quotes goes over several lines")
+            raise InputError(f"{path}: a text in quotes goes over several lines")
+        self._keys = [name.lower().replace(" ", "_") for name in self.headings]
+
+    def _fill(self, rows: Iterator[list[str]]) -> int:
+        """Put the entries into columns, row by row, which needs less memory and time; return the number of rows."""
+        width, count = len(self.headings), 0
+        for count, row in enumerate(rows, 1):
+            if len(row) != width and (len(row) < width or any(word.strip() for word in row[width:])):
+                where = self.where(count - 1)
+                raise InputError(f"{where}: {len(row)} entries; expected {width}, as the first line has")
+            for column, word in zip(self.columns, row):
+                column.append(word)
+        return count
 
     def where(self, row: int) -> str:
         """Return file and line of a row."""
         return f"{self.path}: line {self._lines[row]}"
 
-    def key(self, heading: str) -> str:
-        """Return a name of a column as it is compared."""
-        return heading.lower().replace(" ", "_")
-
-    def has(self, what: str) -> str | None:
-        """Return the name of the column of this meaning, as it is compared; None without it."""
-        keys = [self.key(name) for name in self.headings]
-        return next((name for name in _NAMES[what] if name in keys), None)
+    def place(self, what: str) -> int | None:
+        """Return the place of the column of this meaning; None without it."""
+        return next((self._keys.index(name) for name in _NAMES[what] if name in self._keys), None)
 
     def _column(self, what: str) -> list[str]:
-        name, keys = self.has(what), [self.key(name) for name in self.headings]
-        if name is None:
-            raise InputError(f"{self.path}: line 1: there is no column {what!r}; it has {', '.join(map(repr, keys))}")
-        return self.columns[keys.index(name)]
+        place = self.place(what)
+        if place is None:
+            has = ", ".join(map(repr, self._keys))
+            raise InputError(f"{self.path}: line 1: there is no column {what!r}; it has {has}")
+        return self.columns[place]
 
     def labels(self, what: str) -> Iterator[str]:
         """Yield the entries of a column; whole numbers written as 3.0 or +3 are 3."""
@@ -172,7 +167,7 @@ class _Table:
     def groups(self) -> dict[str, np.ndarray]:
         """Return the members of the groups of the column ``groups``."""
         found: dict[str, list[int]] = {}
-        for row, word in enumerate(self._column("groups") if self.has("groups") else ()):
+        for row, word in enumerate(self._column("groups") if self.place("groups") is not None else ()):
             for name in word.split(";"):
                 if name.strip():
                     found.setdefault(name.strip().replace("/", "_"), []).append(row)

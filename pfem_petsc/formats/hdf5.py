@@ -18,7 +18,7 @@ from mpi4py import MPI
 from ..errors import InputError
 from ..mesh.exchange import Router
 from ..mesh.slab import MeshSlab, check_memory, index_type, slab_of, slab_range
-from ..mesh.whole import WholeMesh, missing_field, without_slashes
+from ..mesh.whole import WholeMesh, check_fields, without_slashes
 from ..parallel.agreement import agreed, on_root
 
 SUFFIXES = (".h5",)
@@ -115,9 +115,7 @@ def _content(path: Path, fields: Mapping[str, str] | None) -> _Content:
         sets = {name: group.get(name) for name in group} if isinstance(group, h5py.Group) else {}
         known = [name for name, data in sets.items() if isinstance(data, h5py.Dataset) and data.shape == (counts[1],)]
         known = [name for name in known if sets[name].dtype.kind in "fiu"]
-    missing = missing_field(path, fields or {}, known)
-    if missing is not None:
-        raise InputError(missing)
+    check_fields(path, fields, known)
     return _Content(counts[0], counts[1], groups, known)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
-from ._numbers import numbers_of
+from ._numbers import numbers_of, shown
 
 SUFFIXES = (".stl",)
 
@@ -63,23 +63,16 @@ def _edges(triangles: np.ndarray, n: int) -> np.ndarray:
 
 
 def _text(path: Path, content: bytes) -> np.ndarray:
-    found = [match.group(1) for match in _VERTEX.finditer(content)]
-    try:
-        values = numbers_of(b" ".join(found))
-    except ValueError:
-        values = np.empty(0)
-    if not found or len(values) != 3 * len(found) or len(found) % 3:
-        for match in _VERTEX.finditer(content):
-            words = match.group(1).split()
-            line = content.count(b"\n", 0, match.start()) + 1
-            try:
-                whole = len([float(word) for word in words]) == 3
-            except ValueError:
-                whole = False
-            if not whole:
-                shown = match.group(1)[:60].decode("utf-8", "replace")
-                raise InputError(f"{path}: line {line}: 'vertex {shown}' does not have three numbers")
+    """Return the corners of triangles (3 n, 3)."""
+    found = _VERTEX.findall(content)
+    for k, words in enumerate(found, 1):
+        if len(words.split()) != 3:
+            raise InputError(f"{path}: 'vertex {shown(words)}', number {k}, does not have three numbers")
+    if not found or len(found) % 3:
         raise InputError(
             f"{path}: has {len(found)} lines 'vertex x y z', not three for each triangle; is it truncated?"
         )
-    return values.reshape(-1, 3)
+    try:
+        return numbers_of(b" ".join(found)).reshape(-1, 3)
+    except ValueError as error:
+        raise InputError(f"{path}: lines 'vertex x y z': {error}") from None

@@ -19,7 +19,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
@@ -29,6 +30,7 @@ import numpy as np
 from ..errors import InputError
 
 if TYPE_CHECKING:
+    import pyvista
     from mpi4py import MPI
 
     from ..mesh.slab import MeshSlab
@@ -42,13 +44,10 @@ _NAMED = ("group", "section")
 _MASK = "group:"
 _REFUSED = 3
 """Status of the process for a file without a mesh of bars; the reason is on stdout."""
-_ALL = "*"
-"""In the place of names of fields: all of them."""
-_ESCAPED = {'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"}
 
 
 def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
-    """Return the mesh in a VTK file, with the named cell fields; None: all.
+    """Return the mesh in a VTK file, with all cell fields.
 
     Raises
     ------
@@ -60,7 +59,6 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder, "mesh.npz")
         command = [sys.executable, "-P", "-m", __name__, str(path.resolve()), str(result)]
-        command += [_ALL] if fields is None else list(fields)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)
         if done.returncode == _REFUSED:
@@ -84,16 +82,15 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
             if arrays["snapshots"] > 1:
                 text = f"has {arrays['snapshots']} snapshots: the mesh and its fields are those of the last one"
                 mesh.warnings.append(f"{path}: {text}")
-            mesh.known_fields = arrays["cell_fields"].tolist()
     return mesh
 
 
 # ---- the process that reads by VTK
 
 
-def _extract(path: str, result: str, *fields: str) -> int:
-    """Read ``path``; write ``points``, ``bars``, ``node_groups/<name>``, ``bar_groups/<name>``, ``bar_fields/<name>``
-    of the named cell fields, and the names of all, ``cell_fields``, to ``result``; of the last of several snapshots."""
+def _extract(path: str, result: str) -> int:
+    """Read ``path``; write ``points``, ``bars``, ``node_groups/NAME``, ``bar_groups/NAME``, ``bar_fields/NAME`` of
+    the last of several snapshots to ``result``."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
     if path.lower().endswith(".vtu"):
@@ -121,7 +118,7 @@ def _extract(path: str, result: str, *fields: str) -> int:
     try:
         if lines:
             raise ValueError(f"cannot be read: {(messages or lines)[0].strip()}")
-        arrays = dict(_arrays(reader.GetOutputDataObject(0), fields))
+        arrays = dict(_arrays(reader.GetOutputDataObject(0)))
     except ValueError as error:
         print(error)
         return _REFUSED
@@ -129,7 +126,7 @@ def _extract(path: str, result: str, *fields: str) -> int:
     return 0
 
 
-def _arrays(grid: Any, fields: tuple[str, ...]) -> Iterator[tuple[str, np.ndarray]]:
+def _arrays(grid: Any) -> Iterator[tuple[str, np.ndarray]]:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     if grid is None or not grid.IsA("vtkUnstructuredGrid"):
@@ -160,11 +157,9 @@ def _arrays(grid: Any, fields: tuple[str, ...]) -> Iterator[tuple[str, np.ndarra
     ):
         for name, members in _groups_of(data, grid.GetFieldData(), kept).items():
             yield f"{kind}/{name}", members
-    known = {name: values for name, values in _numbers(grid.GetCellData()).items() if not name.startswith(_MASK)}
-    yield "cell_fields", np.array(list(known), dtype=str)
-    every = [name for name in known if name not in _NAMED and "/" not in name]
-    for name in every if fields == (_ALL,) else set(fields) & set(known):
-        yield f"bar_fields/{name}", known[name].astype(np.float64)[lines]
+    for name, values in _numbers(grid.GetCellData()).items():
+        if not name.startswith(_MASK) and name not in _NAMED:
+            yield f"bar_fields/{name}", values.astype(np.float64)[lines]
 
 
 def _numbers(data: Any) -> dict[str, np.ndarray]:
@@ -214,15 +209,13 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
     from mpi4py import MPI
 
     from ..mesh.slab import check_memory
-    from ..mesh.whole import missing_field
+    from ..mesh.whole import check_fields
 
     plain = comm.bcast(_plain(path) if comm.rank == 0 and path.suffix.lower() == ".vtkhdf" else None)
     if plain is None:
         return None
     n_nodes, masks, known = plain
-    missing = missing_field(path, fields or {}, known)
-    if missing is not None:
-        raise InputError(missing)
+    check_fields(path, fields, known)
     check_memory(n_nodes, str(path))
     slab, fits = None, True
     try:
@@ -309,23 +302,51 @@ def write(path: Path, mesh: WholeMesh) -> None:
     """Write the mesh with its bar fields, to the last digit; groups are arrays of ones and zeros."""
     from ..mesh.whole import without_slashes
 
-    hdf = path.suffix.lower() == ".vtkhdf"
-    data: dict[str, dict[str, np.ndarray]] = {"CellData": {}, "PointData": {}}
-    for kind, named, n in (
-        ("CellData", mesh.bar_fields, -1),
-        ("PointData", mesh.node_groups, len(mesh.points)),
-        ("CellData", mesh.bar_groups, len(mesh.bars)),
-    ):
-        for name, values in (without_slashes(named) if hdf else named).items():
-            if n >= 0:
-                mask = np.zeros(n, np.uint8)
-                mask[values] = 1
-                name, values = f"{_MASK}{name}", mask
-            data[kind][name] = np.ascontiguousarray(values)
-    (_write_vtkhdf if hdf else _write_vtu)(path, mesh, data)
+    if path.suffix.lower() == ".vtkhdf":
+        kinds = ("node_groups", "bar_groups", "bar_fields")
+        _write_vtkhdf(path, replace(mesh, **{kind: without_slashes(getattr(mesh, kind)) for kind in kinds}))
+        return
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.SetFileName(str(path))
+    writer.SetInputData(grid_of(mesh, _escaped))
+    if not writer.Write() or not path.is_file():
+        raise InputError(f"{path}: VTK could not write the file; is there room?")
 
 
-def _write_vtkhdf(path: Path, mesh: WholeMesh, data: dict[str, dict[str, np.ndarray]]) -> None:
+def _escaped(name: str) -> str:
+    return escape(name, {'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"})  # VTK writes names as they are
+
+
+def grid_of(mesh: WholeMesh, named: Callable[[str], str] = str) -> pyvista.UnstructuredGrid:
+    """Return a grid of lines with the bar fields; groups are ``group:NAME``, 1 for members; ``named`` gives names."""
+    import pyvista
+
+    cells = np.column_stack([np.full(len(mesh.bars), 2), mesh.bars]).ravel()
+    grid = pyvista.UnstructuredGrid(cells, np.full(len(mesh.bars), _LINE, np.uint8), mesh.points)
+    for kind, arrays in _data(mesh).items():
+        for name, values in arrays.items():
+            getattr(grid, kind)[named(name)] = values
+    return grid
+
+
+def _data(mesh: WholeMesh) -> dict[str, dict[str, np.ndarray]]:
+    """Return arrays of points and cells by name: bar fields, and masks of groups."""
+
+    def masks(groups: Mapping[str, np.ndarray], n: int) -> dict[str, np.ndarray]:
+        found = {f"{_MASK}{name}": np.zeros(n, np.uint8) for name in groups}
+        for mask, members in zip(found.values(), groups.values()):
+            mask[members] = 1
+        return found
+
+    return {
+        "cell_data": mesh.bar_fields | masks(mesh.bar_groups, len(mesh.bars)),
+        "point_data": masks(mesh.node_groups, len(mesh.points)),
+    }
+
+
+def _write_vtkhdf(path: Path, mesh: WholeMesh) -> None:
     """Version 1.0 of the format."""
     import h5py
 
@@ -341,36 +362,11 @@ def _write_vtkhdf(path: Path, mesh: WholeMesh, data: dict[str, dict[str, np.ndar
         root["Connectivity"] = np.asarray(mesh.bars, np.int64).ravel()
         root["Offsets"] = np.arange(0, 2 * n + 1, 2, dtype=np.int64)
         root["Types"] = np.full(n, _LINE, np.uint8)
-        for kind, arrays in data.items():
-            group = root.create_group(kind, track_order=True)  # in the order in which they are given
+        for kind, arrays in _data(mesh).items():
+            # in the order in which they are given
+            group = root.create_group({"cell_data": "CellData", "point_data": "PointData"}[kind], track_order=True)
             for name, values in arrays.items():
                 group[name] = values
-
-
-def _write_vtu(path: Path, mesh: WholeMesh, data: dict[str, dict[str, np.ndarray]]) -> None:
-    """Compressed."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
-    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
-
-    points, cells, grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
-    points.SetData(numpy_to_vtk(np.ascontiguousarray(mesh.points, dtype=np.float64), deep=True))
-    offsets = np.arange(0, 2 * len(mesh.bars) + 1, 2, dtype=np.int64)
-    ends = np.ascontiguousarray(mesh.bars, dtype=np.int64).ravel()
-    cells.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(ends, deep=True))
-    grid.SetPoints(points)
-    grid.SetCells(_LINE, cells)
-    for kind, arrays in data.items():
-        for name, values in arrays.items():
-            array = numpy_to_vtk(values, deep=True)
-            array.SetName(escape(name, _ESCAPED))  # VTK writes names as they are
-            getattr(grid, f"Get{kind}")().AddArray(array)
-    writer = vtkXMLUnstructuredGridWriter()
-    writer.SetFileName(str(path))
-    writer.SetInputData(grid)
-    if not writer.Write() or not path.is_file():
-        raise InputError(f"{path}: VTK could not write the file; is there room?")
 
 
 if __name__ == "__main__":

@@ -105,7 +105,6 @@ class Scheme(ABC):
         the memory ``half_velocity``, so that they can be made in batches (``stepping/batch_loop.py``)
     symmetric : whether the Hessian is symmetric
     remembers : names of the scheme's nodal arrays in the state's memory, which are linear in the motion
-    dissipates : whether the scheme dissipates energy at high frequencies
     turns_held : x1 - x0 = h (v0 + v1)/2 and nothing else relates velocity to position, so the velocity of a node that
         is fixed from one step to the next is reversed
     notice : message to users who choose the scheme; empty for none
@@ -122,7 +121,6 @@ class Scheme(ABC):
     leapfrog = False
     symmetric = True
     remembers: tuple[str, ...] = ()
-    dissipates = True
     turns_held = False
     notice = ""
 

@@ -26,7 +26,6 @@ class Scheme(ExplicitScheme):
     solves_next_position = True
     leapfrog = True
     remembers = ("half_velocity",)
-    dissipates = False
 
     def limit(self, damping_ratio: float = 0.0, viscous_ratio: float = 0.0) -> float:
         """Return 2 for any damping ratio, because damping is centred; that of viscous bars, whose rate is extrapolated

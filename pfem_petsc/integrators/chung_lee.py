@@ -32,7 +32,6 @@ class Scheme(ExplicitGeneralisedAlpha):
 
     def set_coefficients(self) -> None:
         """Set alpha_m, beta, gamma from the parameters."""
-        self.dissipates = self.parameters.beta > 1.0
         self.alpha_m = 0.0
         self.beta = self.parameters.beta
         self.gamma = 1.5

@@ -25,7 +25,6 @@ class Scheme(Base):
     force_acts_once = True
     discrete_gradient = True
     symmetric = False
-    dissipates = False
     turns_held = True
 
     def balance(self, state: State, h: float) -> Balance:

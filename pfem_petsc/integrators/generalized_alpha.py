@@ -37,7 +37,6 @@ class Scheme(Base):
     def __init__(self, parameters: StrictModel) -> None:
         super().__init__(parameters)
         rho = parameters.rho_inf
-        self.dissipates = rho < 1.0
         self.alpha_m = (2.0 * rho - 1.0) / (rho + 1.0)
         self.alpha_f = rho / (rho + 1.0)
         self.gamma = 0.5 - self.alpha_m + self.alpha_f

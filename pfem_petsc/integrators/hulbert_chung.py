@@ -56,7 +56,6 @@ class Scheme(ExplicitScheme):
     def set_coefficients(self) -> None:
         """Set alpha_m, beta, gamma from the parameters."""
         rho = self.parameters.rho_b
-        self.dissipates = rho < 1.0
         self.alpha_m = (2.0 * rho - 1.0) / (1.0 + rho)
         self.beta = (5.0 - 3.0 * rho) / ((1.0 + rho) ** 2 * (2.0 - rho))
         self.gamma = 1.5 - self.alpha_m

@@ -32,10 +32,6 @@ class Scheme(Base):
 
     force_acts_once = True
 
-    def __init__(self, parameters: StrictModel) -> None:
-        super().__init__(parameters)
-        self.dissipates = parameters.gamma > 0.5
-
     def limit(self, damping_ratio: float = 0.0, viscous_ratio: float = 0.0) -> float:
         """Return infinity for 2 beta >= gamma >= 1/2; else Omega with Omega^2 (gamma/2 - beta) = 1 (undamped)."""
         beta, gamma = self.parameters.beta, self.parameters.gamma

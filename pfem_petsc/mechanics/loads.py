@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from ..case.base import has_rows
 from ..case.files import Forces, read_forces
-from ..case.tables import LoadFile, has_rows
+from ..case.tables import LoadFile
 from ..errors import InputError
 from ..parallel.agreement import on_root
 from ..registry import nearest

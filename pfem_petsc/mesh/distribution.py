@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from ..parallel.natural import NaturalOrder
 from .exchange import GhostExchange, Messages, Router
-from .ordering import bar_order, bounding_box, node_order, partition, sweep_axes, sweep_keys
+from .ordering import bar_order, bounding_box, partition, sweep_axes, sweep_keys
 from .slab import MeshSlab, index_type, slab_of
 
 __all__ = ["Block", "DistributedMesh", "distribute"]
@@ -151,7 +151,7 @@ def distribute(
 
 def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, keep: bool) -> None:
     """Reorder nodes and bars on one rank, with few temporary arrays of the size of the mesh."""
-    order = node_order(sweep_keys(slab.points))
+    order = np.argsort(sweep_keys(slab.points), kind="stable")
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     mesh.n_owned = mesh.n_local = slab.n_nodes
@@ -179,7 +179,7 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
     points = to_owner.send(slab.points)
     if not keep:
         slab.points = slab.points[:0].copy()
-    order = node_order(sweep_keys(points, sweep_axes(*bounding_box(points, comm))), ids)
+    order = np.lexsort((ids, sweep_keys(points, sweep_axes(*bounding_box(points, comm)))))
     n_owned = len(ids)
     starts = np.concatenate([[0], np.cumsum(comm.allgather(n_owned))]).astype(np.int64)
     numbers = np.empty(n_owned, np.int64)

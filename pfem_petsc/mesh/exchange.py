@@ -210,8 +210,6 @@ class GhostExchange:
         if self.alone:
             return
         width = array.size // array.shape[0]
-        if width not in self._buffers:
-            self._check(array)
         rows, leaving = array.reshape(-1, width), self.leaving(width)
         # mode="clip" avoids the temporary array of NumPy's default; the rows are known to be in range
         np.take(rows, self.rows, axis=0, out=leaving, mode="clip")
@@ -223,13 +221,6 @@ class GhostExchange:
             for request in buffers.requests:
                 request.Free()
         self._buffers.clear()
-
-    def _check(self, array: np.ndarray) -> None:
-        if array.dtype != np.float64 or not array.flags.c_contiguous or len(array) != self._n_owned + self._n_ghosts:
-            raise ValueError(
-                f"ghosts are updated in C-contiguous float64 arrays of {self._n_owned + self._n_ghosts} rows, "
-                f"not in {array.dtype} {array.shape}"
-            )
 
     def _of(self, width: int) -> _Buffers:
         if width not in self._buffers:

@@ -181,13 +181,6 @@ def _spacing(extents: np.ndarray, n: int) -> float:
     return high
 
 
-def node_order(keys: np.ndarray, ids: np.ndarray | None = None) -> np.ndarray:
-    """Return the order (indices) of nodes by key, then by mesh number; ``ids`` None: numbers are ascending already."""
-    if ids is None:
-        return np.argsort(keys, kind="stable")
-    return np.lexsort((ids, keys))
-
-
 def bar_order(bars: np.ndarray, group: np.ndarray | None, n_local: int) -> np.ndarray:
     """Return the order (indices) of bars by group and block of nodes of the lower local end.
 
@@ -316,12 +309,6 @@ def bounding_box(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, np.nda
     return box[0], -box[1]
 
 
-def bounding_cube(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, float]:
-    """Return the lowest corner (3,) [m] and largest extent [m] of the points of all ranks. Collective."""
-    low, high = bounding_box(points, comm)
-    return low, float((high - low).max())
-
-
 def _works(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
     """Return the work of a step for each node of the slab (int64), in halves of that for a bar. Collective."""
     works = np.full(len(slab.points), _OF_NODE, np.int64)
@@ -346,7 +333,8 @@ def _by_coordinates(slab: MeshSlab, works: np.ndarray, comm: MPI.Comm) -> np.nda
     The borders are found by summing works below candidate positions, refined around each border, so the result depends
     on the nodes, their works and the number of ranks only.
     """
-    keys = hilbert_keys(slab.points, *bounding_cube(slab.points, comm))
+    low, high = bounding_box(slab.points, comm)
+    keys = hilbert_keys(slab.points, low, float((high - low).max()))
     order = np.argsort(keys)
     in_order, sums = keys[order], np.concatenate([[0], np.cumsum(works[order])])
     wanted = (comm.allreduce(int(sums[-1])) * np.arange(1, comm.size)) // comm.size

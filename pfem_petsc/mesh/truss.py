@@ -197,22 +197,10 @@ class Truss:
 
     def grid(self) -> pyvista.UnstructuredGrid:
         """Return a pyvista grid of lines with the bar fields; groups are ``group:NAME``, 1 for members."""
-        import pyvista
+        from ..formats.vtk import grid_of
 
         self._require("drawn")
-        cells = np.column_stack([np.full(self.n_bars, 2), self.bars]).ravel()
-        grid = pyvista.UnstructuredGrid(cells, np.full(self.n_bars, pyvista.CellType.LINE, dtype=np.uint8), self.points)
-        for name, values in self.bar_fields.items():
-            grid.cell_data[name] = values
-        for groups, data, n in (
-            (self.node_groups, grid.point_data, self.n_nodes),
-            (self.bar_groups, grid.cell_data, self.n_bars),
-        ):
-            for name, members in groups.items():
-                mask = np.zeros(n, np.uint8)
-                mask[members] = 1
-                data[f"group:{name}"] = mask
-        return grid
+        return grid_of(self.to_mesh())
 
     def _require(self, what: str) -> None:
         if self.points is None:

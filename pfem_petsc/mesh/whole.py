@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ from mpi4py import MPI
 
 from ..case.toml import table_text
 from ..errors import InputError
-from ..parallel.agreement import agreed
 from .exchange import Router
 from .slab import MeshSlab, check_size, slab_of, slab_range
 
@@ -34,8 +34,6 @@ class WholeMesh:
     """What a file has besides the mesh: ``material``, ``section``, ``support`` and ``load`` (by node group),
     ``gravity``, each with the keys of a case by name, and ``analysis``: ``static``, ``time`` and ``modes``."""
     warnings: list[str] = field(default_factory=list)
-    known_fields: list[str] | None = None
-    """Names of all fields of a file; None: those in ``bar_fields``."""
     source: str = "mesh"
     """The file, for messages."""
 
@@ -63,32 +61,20 @@ def without_slashes(named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return found
 
 
-def missing_field(path: Path | str, fields: Mapping[str, str], known: Iterable[str]) -> str | None:
-    """Return the message about the first of ``fields`` that is not among the ``known`` cell fields of a file."""
-    known = sorted(known)
-    for name, key in fields.items():
-        if name not in known:
-            there = f"; it has {', '.join(known)}" if known else ""
-            return f"{key} = {name!r}: {path} has no cell field of this name with one number for each bar{there}"
-    return None
-
-
-def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Comm) -> MeshSlab:
-    """Read a file on rank 0 and send every rank its slab. Collective.
+def check_fields(path: Path | str, fields: Mapping[str, str] | None, known: Iterable[str]) -> None:
+    """Refuse ``fields``, by the keys that ask for them, that are not among the ``known`` cell fields of a file.
 
     Raises
     ------
     InputError
-        On all ranks, as raised by ``read`` on rank 0, and if the mesh does not fit in memory.
     """
-    whole: WholeMesh | None = None
-    with agreed(comm):
-        if comm.rank == 0:
-            try:
-                whole = read(path)
-            except MemoryError:
-                raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
-    return scattered(whole, str(path), comm)
+    known = sorted(known)
+    for name, key in (fields or {}).items():
+        if name not in known:
+            there = f"; it has {', '.join(known)}" if known else ""
+            raise InputError(
+                f"{key} = {name!r}: {path} has no cell field of this name with one number for each bar{there}"
+            )
 
 
 def scattered(whole: WholeMesh | None, source: str, comm: MPI.Comm) -> MeshSlab:
@@ -303,42 +289,42 @@ def _lengths(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_points(slab: MeshSlab, comm: MPI.Comm) -> None:
-    bad = np.flatnonzero(~(np.abs(slab.points) < LARGE).all(axis=1))
-    lines = [f"node {slab.first_node + i} at ({', '.join(f'{x:g}' for x in slab.points[i])})" for i in bad[:_SHOWN]]
-    _refuse(slab, comm, lines, len(bad), f"nodes have coordinates that are not numbers below {LARGE:g}", "correct them")
+    bad = ~(np.abs(slab.points) < LARGE).all(axis=1)
+
+    def named(i: int) -> str:
+        return f"node {slab.first_node + i} at ({', '.join(f'{x:g}' for x in slab.points[i])})"
+
+    what = f"nodes have coordinates that are not numbers below {LARGE:g}"
+    _refuse(slab, comm, bad, named, what, "correct them", mended=False)
 
 
 def _check_ends(slab: MeshSlab, comm: MPI.Comm) -> None:
-    bad = np.flatnonzero(((slab.bars < 0) | (slab.bars >= slab.n_nodes)).any(axis=1))
-    lines = [_bar(slab, i) for i in bad[:_SHOWN]]
+    bad = ((slab.bars < 0) | (slab.bars >= slab.n_nodes)).any(axis=1)
     remedy = f"nodes are numbered from 0 to {slab.n_nodes - 1}"
-    _refuse(slab, comm, lines, len(bad), "bars have an end that does not exist", remedy)
-    bad = np.flatnonzero(slab.bars[:, 0] == slab.bars[:, 1])
-    lines = [_bar(slab, i) for i in bad[:_SHOWN]]
-    _refuse(slab, comm, lines, len(bad), "bars start and end at the same node", "remove them" + _way(slab))
+    _refuse(slab, comm, bad, partial(_bar, slab), "bars have an end that does not exist", remedy, mended=False)
+    bad = slab.bars[:, 0] == slab.bars[:, 1]
+    _refuse(slab, comm, bad, partial(_bar, slab), "bars start and end at the same node", "remove them")
 
 
 def _check_bare_nodes(slab: MeshSlab, comm: MPI.Comm, used: np.ndarray) -> None:
-    bad = np.flatnonzero(~used)
-    lines = [f"node {slab.first_node + i}" for i in bad[:_SHOWN]]
-    remedy = "remove them: a node without bars has neither mass nor stiffness" + _way(slab)
+    remedy = "remove them: a node without bars has neither mass nor stiffness"
     if slab.source.endswith(".msh"):
         remedy += (
             " (Gmsh saves each point of a physical group: these are points that no line in a group ends at; points at "
             "the same place are merged by `Coherence;`)"
         )
-    _refuse(slab, comm, lines, len(bad), "nodes belong to no bar", remedy)
+    _refuse(slab, comm, ~used, lambda i: f"node {slab.first_node + i}", "nodes belong to no bar", remedy)
 
 
 def _check_lengths(slab: MeshSlab, comm: MPI.Comm, length: np.ndarray) -> list[str]:
-    bad = np.flatnonzero(~((length > 0.0) & (length < np.inf)))
-    lines = [f"{_bar(slab, i)}, length {length[i]:g}" for i in bad[:_SHOWN]]
-    remedy = "merge the nodes at its ends, or correct their positions" + _way(slab)
-    _refuse(slab, comm, lines, len(bad), "bars have a length that is zero or overflows double precision", remedy)
+    def named(i: int) -> str:
+        return f"{_bar(slab, i)}, length {length[i]:g} m"
+
+    what = "bars have a length that is zero or overflows double precision"
+    remedy = "merge the nodes at its ends, or correct their positions"
+    _refuse(slab, comm, ~((length > 0.0) & (length < np.inf)), named, what, remedy)
     mean = comm.allreduce(float(length.sum())) / slab.n_bars
-    short = np.flatnonzero(length < SHORT * mean)
-    lines = [f"{_bar(slab, i)}, length {length[i]:g} m" for i in short[:_SHOWN]]
-    text = _sentence(comm, lines, len(short), f"bars are far shorter than the mean length {mean:g} m")
+    text = _sentence(comm, length < SHORT * mean, named, f"bars are far shorter than the mean length {mean:g} m")
     return [f"{slab.source}: {text}; the explicit time step decreases with the shortest bar"] if text else []
 
 
@@ -349,21 +335,21 @@ def _check_duplicates(slab: MeshSlab, comm: MPI.Comm) -> None:
     if not comm.allreduce(int((key[1:] == key[:-1]).any())):
         return
     # the bars are named by sending all of them once more, with their numbers
-    key = slab.bars.min(axis=1).astype(np.int64)
-    router = Router(comm, slab_of(key, slab.n_nodes, comm.size))
-    key *= slab.n_nodes
-    key += slab.bars.max(axis=1)
-    key = router.send(key)
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    again = np.flatnonzero(key[1:] == key[:-1])
-    numbers = router.send(np.arange(slab.first_bar, slab.first_bar + len(slab.bars)))
-    pairs = sorted((int(numbers[order[i]]), int(numbers[order[i + 1]]), int(key[i])) for i in again[:1000])
-    lines = []
-    for one, other, ends in pairs[:_SHOWN]:
-        lines.append(f"bars {one} and {other} (nodes {ends // slab.n_nodes} and {ends % slab.n_nodes})")
+    ends = np.sort(slab.bars, axis=1).astype(np.int64)
+    router = Router(comm, slab_of(ends[:, 0], slab.n_nodes, comm.size))
+    ends, numbers = router.send(ends), router.send(np.arange(slab.first_bar, slab.first_bar + len(slab.bars)))
+    order = np.lexsort((numbers, ends[:, 1], ends[:, 0]))
+    ends, numbers = ends[order], numbers[order]
+    again = np.flatnonzero((ends[1:] == ends[:-1]).all(axis=1))
+    again = again[np.argsort(numbers[again], kind="stable")]
+
+    def named(i: int) -> str:
+        return (
+            f"bars {numbers[again[i]]} and {numbers[again[i] + 1]} (nodes {ends[again[i], 0]} and {ends[again[i], 1]})"
+        )
+
     what = "bars join the same two nodes as another bar"
-    _refuse(slab, comm, lines, len(again), what, "keep one of each, with the sum of the areas" + _way(slab))
+    _refuse(slab, comm, np.ones(len(again), bool), named, what, "keep one of each, with the sum of the areas")
 
 
 def _pairs_of_ends(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
@@ -383,28 +369,33 @@ def _pairs_of_ends(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
     return keys
 
 
-def _way(slab: MeshSlab) -> str:
-    """Return the command that mends a mesh file; nothing for meshes from elsewhere."""
-    file = Path(slab.source)
-    return f"; python -m pfem_petsc mesh clean {file} {file.stem}_clean.h5" if file.is_file() else ""
-
-
 def _bar(slab: MeshSlab, i: int) -> str:
     return f"bar {slab.first_bar + i} (nodes {slab.bars[i, 0]} and {slab.bars[i, 1]})"
 
 
-def _sentence(comm: MPI.Comm, lines: list[str], count: int, what: str) -> str:
-    """Return what all ranks found: the count, ``what``, and the first few; empty if nothing. Collective."""
-    total = comm.allreduce(count)
+def _sentence(comm: MPI.Comm, bad: np.ndarray, named: Callable[[int], str], what: str) -> str:
+    """Return what all ranks found, ``bad`` (n,): the count, ``what``, and the first few; empty if none. Collective."""
+    total = comm.allreduce(int(np.count_nonzero(bad)))
     if total == 0:
         return ""
-    found = [line for rank_lines in comm.allgather(lines) for line in rank_lines]
-    more = ", ..." if total > _SHOWN else ""
-    return f"{total} {what}: {', '.join(found[:_SHOWN])}{more}"
+    found = [name for names in comm.allgather([named(i) for i in np.flatnonzero(bad)[:_SHOWN]]) for name in names]
+    return f"{total} {what}: {', '.join(found[:_SHOWN])}{', ...' if total > _SHOWN else ''}"
 
 
-def _refuse(slab: MeshSlab, comm: MPI.Comm, lines: list[str], count: int, what: str, remedy: str) -> None:
-    """Raise the same InputError on all ranks if any rank found something. Collective."""
-    text = _sentence(comm, lines, count, what)
+def _refuse(
+    slab: MeshSlab,
+    comm: MPI.Comm,
+    bad: np.ndarray,
+    named: Callable[[int], str],
+    what: str,
+    remedy: str,
+    mended: bool = True,
+) -> None:
+    """Raise the same InputError on all ranks if any rank found something; ``mended``: `mesh clean` is a way out.
+    Collective."""
+    text = _sentence(comm, bad, named, what)
     if text:
+        file = Path(slab.source)
+        if mended and file.is_file():
+            remedy += f"; python -m pfem_petsc mesh clean {file} {file.stem}_clean.h5"
         raise InputError(f"{slab.source}: {text}; {remedy}")

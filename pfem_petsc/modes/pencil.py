@@ -53,34 +53,82 @@ class Holds:
     """
 
     def __init__(self, model: Model, state: State) -> None:
-        self._mesh, self._comm = model.mesh, model.comm
+        self._mesh = model.mesh
         self.held = model.supports.fixed.copy()
         self.curvature: tuple[np.ndarray, np.ndarray] | None = None
         self._nodes, self._turns = np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
         if model.links:
-            _refuse_links(model)
-        walls = None
-        with agreed(model.comm):
-            walls = _Walls(model, state) if model.can_touch else None
-        if walls is not None:
-            self._take(walls)
+            totals = model.comm.allreduce(np.abs(model.links.totals()).sum())
+            stiffest = model.comm.allreduce(float(model.nodal_stiffness.max(initial=0.0)), op=MPI.MAX)
+            if totals > _PRESSES * stiffest * model.length:
+                raise SimulationFailure(_LINKED.format("nodes of the truss press on each other"))
+        if model.can_touch:
+            with agreed(model.comm):
+                curved = self._take_walls(model, state)
+            if model.comm.allreduce(len(curved[0])):
+                self.curvature = curved
         self.at_walls = model.comm.allreduce(len(self._nodes))
         if model.supports.inclined is not None:
             self._take_directions(model.supports.inclined)
         self.number = model.comm.allreduce(int(self.held.sum()))
-        self._turn: PETSc.Mat | None = None
-        if self.at_walls or model.supports.inclined is not None:
-            self._turn = self._turning()
+        turned = self.at_walls or model.supports.inclined is not None
+        self._turn: PETSc.Mat | None = self._turning() if turned else None
 
-    def _take(self, walls: _Walls) -> None:
-        nodes = walls.nodes
-        directions = np.concatenate([walls.directions, np.einsum("mi,ij->mij", self.held[nodes], np.eye(3))], axis=1)
+    def _take_walls(self, model: Model, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Hold this rank's nodes in contact with walls; return nodes and blocks of :attr:`curvature`."""
+        contact, owned = model.contact, model.mesh.n_owned
+        weight = np.abs(state.contact).max(axis=1, initial=0.0)
+        presses = weight > _PRESSES * model.nodal_stiffness * model.length
+        tied = contact.ties.held if contact.ties.any else np.zeros(owned, dtype=bool)
+        self._nodes = nodes = np.flatnonzero(presses | tied)
+        x, displacements = state.position[nodes], contact.motion.displacements(state.time)
+        applicable = contact.applicable(nodes, x, displacements)
+        normals, offsets = contact.planes(applicable, x, displacements)
+        gaps = np.einsum("mwi,mi->mw", normals, x) - offsets
+        touched = np.abs(gaps) <= 10.0 * BEYOND * contact.size
+        unknown = nodes[~touched.any(axis=1) & ~tied[nodes]]
+        if len(unknown):
+            what = f"node {model.mesh.node_ids[unknown[0]]} has a contact force, but there is no wall"
+            raise SimulationFailure(_LINKED.format(what))
+        massive = [k for k in contact.motion.bodies.at if touched[:, k].any()]
+        if massive:
+            raise SimulationFailure(
+                f"modes: wall {contact.names[massive[0]]!r} has mass and is in contact: modes of a truss with such a "
+                "wall are not available; let the analysis end without that contact, or give the wall no mass"
+            )
+        rough = (touched & (contact.static_friction > 0.0)).any(axis=1) | tied[nodes]
+        everywhere = np.broadcast_to(np.eye(3), (len(nodes), 3, 3))
+        held = [
+            np.where(touched[:, :, None], normals, 0.0),
+            rough[:, None, None] * everywhere,
+            self.held[nodes][:, :, None] * everywhere,
+        ]
         # right singular vectors: orthonormal, held ones first
-        _, values, self._turns = np.linalg.svd(directions)
-        self._nodes = nodes
+        _, values, self._turns = np.linalg.svd(np.concatenate(held, axis=1))
         self.held[nodes] = values > RANK * values[:, :1]
-        if self._comm.allreduce(len(walls.curved[0])):
-            self.curvature = walls.curved
+        curved = touched & ~rough[:, None] & ~contact.flat
+        at = np.flatnonzero(curved.any(axis=1))
+        if not len(at):
+            return nodes[:0], np.empty((0, 3, 3))
+        return nodes[at], self._curvature(model, state, touched & ~rough[:, None], normals)[at]
+
+    def _curvature(self, model: Model, state: State, touched: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Return minus the force times the derivative of the normal (m, 3, 3) [N/m], of nodes at walls."""
+        contact, nodes = model.contact, self._nodes
+        displacements = contact.motion.displacements(state.time)
+        blocks, forces = np.zeros((len(nodes), 3, 3)), np.zeros(touched.shape)
+        for m, node in enumerate(nodes):
+            at = np.flatnonzero(touched[m])
+            # prescribed components go to the supports; the walls' forces are the rest of the contact force
+            forces[m, at] = np.linalg.lstsq(normals[m, at].T, state.contact[node], rcond=None)[0]
+        h = _DIFFERENCE * model.length
+        for k in np.flatnonzero(~contact.flat):
+            x = state.position[nodes] - displacements[k]
+            for axis in range(3):
+                shift = h * np.eye(3)[axis]
+                slope = (contact.walls[k].planes(x + shift)[0] - contact.walls[k].planes(x - shift)[0]) / (2.0 * h)
+                blocks[:, :, axis] -= forces[:, k, None] * slope
+        return 0.5 * (blocks + blocks.transpose(0, 2, 1))
 
     def _take_directions(self, directions: Directions) -> None:
         """Add the nodes with supports along directions that are no axes; walls do not touch them."""
@@ -94,7 +142,7 @@ class Holds:
         owned, first = self._mesh.n_owned, 3 * self._mesh.first_node
         blocks = np.broadcast_to(np.eye(3), (owned, 3, 3)).copy()
         blocks[self._nodes] = self._turns.transpose(0, 2, 1)
-        turn = PETSc.Mat().createAIJ(((3 * owned, None), (3 * owned, None)), bsize=3, nnz=3, comm=self._comm)
+        turn = PETSc.Mat().createAIJ(((3 * owned, None), (3 * owned, None)), bsize=3, nnz=3, comm=self._mesh.comm)
         columns = first + (3 * np.arange(owned)[:, None, None] + np.arange(3)).repeat(3, axis=1)
         pointers = 3 * np.arange(3 * owned + 1, dtype=PETSc.IntType)
         turn.setValuesCSR(pointers, columns.ravel().astype(PETSc.IntType), blocks.ravel())
@@ -128,76 +176,6 @@ class Holds:
         shapes = shapes.copy()
         shapes[:, self._nodes] = np.einsum("mij,kmj->kmi", self._turns, shapes[:, self._nodes])
         return np.where(self.held, 0.0, shapes)
-
-
-def _refuse_links(model: Model) -> None:
-    """Collective."""
-    totals = model.comm.allreduce(np.abs(model.links.totals()).sum())
-    scale = model.comm.allreduce(float(model.nodal_stiffness.max(initial=0.0)), op=MPI.MAX) * model.length
-    if totals > _PRESSES * scale:
-        raise SimulationFailure(_LINKED.format("nodes of the truss press on each other"))
-
-
-class _Walls:
-    """Nodes of this rank in contact with walls.
-
-    Attributes
-    ----------
-    nodes : (m,) ascending
-    directions : (m, walls + 3, 3) held directions, padded with zero rows
-    curved : nodes (c,) and blocks (c, 3, 3) of :attr:`Holds.curvature`
-    """
-
-    def __init__(self, model: Model, state: State) -> None:
-        contact, owned = model.contact, model.mesh.n_owned
-        weight = np.abs(state.contact).max(axis=1, initial=0.0)
-        presses = weight > _PRESSES * model.nodal_stiffness * model.length
-        tied = contact.ties.held if contact.ties.any else np.zeros(owned, dtype=bool)
-        self.nodes = nodes = np.flatnonzero(presses | tied)
-        x, displacements = state.position[nodes], contact.motion.displacements(state.time)
-        applicable = contact.applicable(nodes, x, displacements)
-        normals, offsets = contact.planes(applicable, x, displacements)
-        gaps = np.einsum("mwi,mi->mw", normals, x) - offsets
-        touched = np.abs(gaps) <= 10.0 * BEYOND * contact.size
-        unknown = nodes[~touched.any(axis=1) & ~tied[nodes]]
-        if len(unknown):
-            what = f"node {model.mesh.node_ids[unknown[0]]} has a contact force, but there is no wall"
-            raise SimulationFailure(_LINKED.format(what))
-        massive = [k for k in contact.motion.bodies.at if touched[:, k].any()]
-        if massive:
-            raise SimulationFailure(
-                f"modes: wall {contact.names[massive[0]]!r} has mass and is in contact: modes of a truss with such a "
-                "wall are not available; let the analysis end without that contact, or give the wall no mass"
-            )
-        rough = (touched & (contact.static_friction > 0.0)).any(axis=1) | tied[nodes]
-        self.directions = np.zeros((len(nodes), normals.shape[1] + 3, 3))
-        self.directions[:, :-3] = np.where(touched[:, :, None], normals, 0.0)
-        self.directions[rough, -3:] = np.eye(3)
-        self.curved = self._curved(model, state, touched & ~rough[:, None], normals)
-
-    def _curved(
-        self, model: Model, state: State, touched: np.ndarray, normals: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return minus the force times the derivative of the normal, for nodes at curved walls."""
-        contact, nodes = model.contact, self.nodes
-        displacements = contact.motion.displacements(state.time)
-        blocks = np.zeros((len(nodes), 3, 3))
-        if len(nodes) == 0 or contact.flat.all():
-            return np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
-        forces = np.zeros(touched.shape)
-        for m, node in enumerate(nodes):
-            at = np.flatnonzero(touched[m])
-            # prescribed components go to the supports; the walls' forces are the rest of the contact force
-            forces[m, at] = np.linalg.lstsq(normals[m, at].T, state.contact[node], rcond=None)[0]
-        h = _DIFFERENCE * model.length
-        for k in np.flatnonzero(~contact.flat):
-            x = state.position[nodes] - displacements[k]
-            for axis in range(3):
-                shift = h * np.eye(3)[axis]
-                slope = (contact.walls[k].planes(x + shift)[0] - contact.walls[k].planes(x - shift)[0]) / (2.0 * h)
-                blocks[:, :, axis] -= forces[:, k, None] * slope
-        at = np.flatnonzero((touched & ~contact.flat).any(axis=1))
-        return nodes[at], 0.5 * (blocks + blocks.transpose(0, 2, 1))[at]
 
 
 @dataclass

@@ -71,18 +71,6 @@ def sum_of_words(words: np.ndarray, start: int) -> np.uint64:
     return total
 
 
-@kernel
-def gather_rows(words: np.ndarray, rows: np.ndarray, out: np.ndarray) -> None:
-    """Copy rows (n,) of words (m, k) to ``out`` (n, k)."""
-    if words.shape[1] == 1:
-        for i in range(len(rows)):
-            out[i, 0] = words[rows[i], 0]
-    else:
-        for i in range(len(rows)):
-            for k in range(words.shape[1]):
-                out[i, k] = words[rows[i], k]
-
-
 def seeded(name: str, total: int) -> int:
     """Return a sum that depends on the name of its array; zero stays zero, for ranks without rows."""
     return (total * (2 * zlib.crc32(name.encode()) + 1)) & _WORD

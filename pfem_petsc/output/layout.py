@@ -261,9 +261,14 @@ def check_version(file: h5py.File, path: Path) -> None:
         )
 
 
+def mesh_sizes(file: h5py.File) -> tuple[int, int]:
+    """Return the numbers of nodes and bars."""
+    return int(file["VTKHDF/NumberOfPoints"][0]), int(file["VTKHDF/NumberOfCells"][0])
+
+
 def complete_snapshots(file: h5py.File) -> int:
     """Return the number of complete snapshots; a killed run may have left parts of another one."""
-    vtk, steps = file["VTKHDF"], file["VTKHDF/Steps"]
+    steps, (n_nodes, n_bars) = file["VTKHDF/Steps"], mesh_sizes(file)
     lengths = [
         int(steps.attrs["NSteps"]),
         len(steps["Values"]),
@@ -272,8 +277,7 @@ def complete_snapshots(file: h5py.File) -> int:
     ]
     lengths += [len(steps[name]) for name in PER_STEP]
     lengths.append(len(file[CHECKS]["snapshots"]) if "snapshots" in file[CHECKS] else 0)
-    n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
-    for name, dataset in field_datasets(vtk).items():
+    for name, dataset in field_datasets(file["VTKHDF"]).items():
         rows = n_bars if name.startswith("CellData") else n_nodes
         lengths += [len(dataset) // rows] if rows else []
     return min(lengths)

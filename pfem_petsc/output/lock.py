@@ -2,32 +2,30 @@
 
 A file beside the folder, ``NAME.lock``, identifies the owner: machine, process, and start time of that process. It is
 created by a hard link, which is atomic on network file systems too, or by exclusive creation if there are no hard
-links. A killed run leaves its file behind. On the same machine, process number and start time show that it has ended,
-and the next run takes the lock over. On another machine only the time of the last renewal is known: a lock not renewed
-for an hour is taken over, a more recent one is respected.
+links. A killed run leaves its file behind: on the same machine, process number and start time show that it has ended,
+and the next run takes the lock over. Nothing is known of processes on other machines: their locks are respected until
+somebody removes the file.
 """
 
 from __future__ import annotations
 
 import contextlib
-import getpass
+import fcntl
 import json
 import os
 import socket
 import time
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, SimulationFailure
-from .units import duration
 
 __all__ = ["FolderLock"]
 
-RENEWAL = 30.0  # seconds between renewals
-ABANDONED = 3600.0  # seconds without renewal after which a lock of another machine counts as abandoned
+INTERVAL = 30.0  # seconds between checks that the lock is still held
 _UNFINISHED = 5.0  # seconds in which a file made by exclusive creation must get its content
-_ATTEMPTS = 200
 
 
 class FolderLock:
@@ -48,20 +46,12 @@ class FolderLock:
             raise InputError(f"the name of the output folder {str(folder)!r} contains a NUL character")
         folder = folder.resolve()
         self.folder = folder
-        beside = folder.parent
-        while not beside.exists():
-            beside = beside.parent
-        self._beside = beside
+        self._beside = next(parent for parent in folder.parents or (folder,) if parent.exists())
         # if the user can write only into the folder itself, the folder cannot be moved aside either
-        inside = folder.is_dir() and not os.access(beside, os.W_OK | os.X_OK)
+        inside = folder.is_dir() and not os.access(self._beside, os.W_OK | os.X_OK)
         self.path = folder / "run.lock" if inside or not folder.name else folder.with_name(folder.name + ".lock")
         self._token: str | None = None
-        self._renewed = 0.0
-
-    @property
-    def held(self) -> bool:
-        """Whether this object holds the lock."""
-        return self._token is not None
+        self._checked = 0.0
 
     def check(self) -> None:
         """Refuse a folder that another run has locked, or that cannot be made, without taking the lock.
@@ -74,9 +64,7 @@ class FolderLock:
             raise InputError(
                 f"{self.folder}: cannot write the results there: {self._beside} is no folder; choose another with -o"
             )
-        owner = _read(self.path)
-        if owner is not None and not _abandoned(self.path, owner):
-            self._refuse(owner)
+        self._refuse(_read(self.path))
 
     def take(self) -> None:
         """Take the lock.
@@ -86,86 +74,66 @@ class FolderLock:
         InputError
             If another run holds it, or its file cannot be written.
         """
-        if self.held:
+        if self._token is not None:
             return
         mine = _identity()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            for _ in range(_ATTEMPTS):
-                if _create(self.path, mine):
-                    self._token, self._renewed = mine["token"], time.monotonic()
-                    return
-                owner = _read(self.path)
-                if owner is None:
-                    continue
-                if not _abandoned(self.path, owner):
+            with _exclusive(self.path.parent):
+                while not _create(self.path, mine):
+                    owner = _read(self.path)
                     self._refuse(owner)
-                _remove_abandoned(self.path)
+                    if owner is not None:
+                        self.path.unlink(missing_ok=True)
         except OSError as error:
             raise InputError(
                 f"{self.folder}: cannot write the results there: {error.strerror} ({self.path}); choose another with -o"
             ) from error
-        raise InputError(f"{self.folder}: its lock {self.path} changes repeatedly; choose another folder with -o")
+        self._token, self._checked = mine["token"], time.monotonic()
 
     def renew(self) -> None:
-        """Renew the lock if the renewal interval has elapsed; otherwise this only reads the clock.
+        """Look every 30 s whether this run still holds the lock; otherwise this only reads the clock.
 
         Raises
         ------
         SimulationFailure
-            If this run no longer holds the lock.
+            If it does not.
         """
-        if self._token is None or time.monotonic() - self._renewed < RENEWAL:
+        if self._token is None or time.monotonic() - self._checked < INTERVAL:
             return
-        self._renewed = time.monotonic()
-        with contextlib.suppress(OSError):
-            owner = _read(self.path)
-            if owner == {}:  # temporarily unreadable
-                return
-            if owner is None or owner.get("token") != self._token:
-                self._token = None
-                raise SimulationFailure(
-                    f"{self.path}: the lock of the output folder was removed or taken over by another run: this one "
-                    "stops before both write into it; continue with --restart when the other has ended"
-                )
-            os.utime(self.path)
+        self._checked = time.monotonic()
+        owner = _read(self.path)
+        if owner is None or owner.get("token", self._token) != self._token:  # {}: temporarily unreadable
+            self._token = None
+            raise SimulationFailure(
+                f"{self.path}: the lock of the output folder was removed or taken over by another run: this one "
+                "stops before both write into it; continue with --restart when the other has ended"
+            )
 
     def release(self) -> None:
         """Release the lock if it is held."""
         token, self._token = self._token, None
-        if token is None:
-            return
-        with contextlib.suppress(OSError):
-            owner = _read(self.path)
-            if owner is not None and owner.get("token") == token:
+        if token is not None and (_read(self.path) or {}).get("token") == token:
+            with contextlib.suppress(OSError):
                 self.path.unlink()
 
-    def _refuse(self, owner: dict[str, Any]) -> None:
-        who = f"process {owner.get('pid', '?')} on {owner.get('host', '?')}"
-        if owner.get("user"):
-            who += f" of {owner['user']}"
-        if owner.get("since"):
-            who += f", since {owner['since']}"
-        way = "wait until it has ended, stop it (SIGTERM), or choose another folder with -o"
-        if not _is_here(owner):
-            way += (
-                f"; it renewed its lock {duration(_age(self.path))} ago: if it is dead, remove {self.path}; this "
-                f"happens automatically after {duration(ABANDONED)}"
-            )
-        raise InputError(f"{self.folder}: another run is writing into this folder: {who}; {way}")
+    def _refuse(self, owner: dict[str, Any] | None) -> None:
+        """Refuse a folder whose lock has an owner that may be alive."""
+        if owner is None or _has_ended(self.path, owner):
+            return
+        who = f"process {owner.get('pid', '?')} on {owner.get('host', '?')}, since {owner.get('since', '?')}"
+        remedy = "wait until it has ended, stop it (SIGTERM), or choose another folder with -o"
+        if owner.get("machine") != _machine():
+            remedy += f"; if it was killed there, or that machine has restarted, remove {self.path}"
+        raise InputError(f"{self.folder}: another run is writing into this folder: {who}; {remedy}")
 
 
 def _identity() -> dict[str, Any]:
-    try:
-        user = getpass.getuser()
-    except (KeyError, OSError):
-        user = ""
     return {
         "host": socket.gethostname(),
         "machine": _machine(),
         "pid": os.getpid(),
         "start": _start_time(os.getpid()),
-        "user": user,
         "since": time.strftime("%Y-%m-%d %H:%M:%S"),
         "token": uuid.uuid4().hex,
     }
@@ -177,7 +145,7 @@ def _machine() -> str:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         return f"{boot} {os.readlink('/proc/self/ns/pid')}"
     except OSError:
-        return ""
+        return socket.gethostname()
 
 
 def _start_time(pid: int) -> str | None:
@@ -198,32 +166,29 @@ def _start_time(pid: int) -> str | None:
     return None if fields[0] in (b"Z", b"X") else fields[19].decode()
 
 
-def _is_here(owner: dict[str, Any]) -> bool:
-    return owner.get("host") == socket.gethostname() and owner.get("machine") == _machine()
-
-
-def _abandoned(path: Path, owner: dict[str, Any]) -> bool:
+def _has_ended(path: Path, owner: dict[str, Any]) -> bool:
     """Return whether the run that created this lock has certainly ended."""
     if not owner:  # no content: its owner was killed, or is about to write it
-        return _age(path) > _UNFINISHED
-    if _is_here(owner) and isinstance(owner.get("pid"), int):
-        return _start_time(owner["pid"]) != owner.get("start")
-    return _age(path) > ABANDONED
-
-
-def _age(path: Path) -> float:
-    """Return the seconds since a file was renewed, by the clock of its file system."""
-    probe = _beside(path)
-    try:
-        probe.touch()
-        return probe.stat().st_mtime - path.stat().st_mtime
-    except FileNotFoundError:
-        return 0.0
-    except OSError:
-        return time.time() - path.stat().st_mtime if path.exists() else 0.0
-    finally:
         with contextlib.suppress(OSError):
-            probe.unlink()
+            return time.time() - path.stat().st_mtime > _UNFINISHED
+        return False
+    known = owner.get("machine") == _machine() and isinstance(owner.get("pid"), int)
+    return known and _start_time(owner["pid"]) != owner.get("start")
+
+
+@contextlib.contextmanager
+def _exclusive(folder: Path) -> Iterator[None]:
+    """Context that processes of this machine enter one at a time, so that none removes a lock just taken by another.
+
+    Only locks of this machine are removed. File systems without ``flock`` for folders do without.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -237,18 +202,12 @@ def _read(path: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else {}
 
 
-def _beside(path: Path) -> Path:
-    """Return a unique name beside a path."""
-    return path.with_name(f".{path.name}.{os.getpid()}.{uuid.uuid4().hex[:12]}")
-
-
 def _create(path: Path, content: dict[str, Any]) -> bool:
     """Create a lock with its content atomically; return False if it exists."""
     raw = json.dumps(content).encode()
-    temporary = _beside(path)
+    temporary = path.with_name(f".{path.name}.{content['token']}")
     try:
-        with temporary.open("xb") as file:
-            file.write(raw)
+        temporary.write_bytes(raw)
         try:
             os.link(temporary, path)
             return True
@@ -259,32 +218,10 @@ def _create(path: Path, content: dict[str, Any]) -> bool:
             if temporary.stat().st_nlink == 2:
                 return True
     finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
+        temporary.unlink(missing_ok=True)
     try:
         with path.open("xb") as file:  # a file system without hard links
             file.write(raw)
         return True
     except FileExistsError:
         return False
-
-
-def _remove_abandoned(path: Path) -> None:
-    """Remove an abandoned lock; of several processes, one at a time checks again and removes it.
-
-    Thus no process removes a lock that another one has just taken instead.
-    """
-    guard = path.with_name(path.name + ".broken")
-    mine = _identity()
-    if not _create(guard, mine):
-        owner = _read(guard)
-        if owner is not None and _abandoned(guard, owner):
-            guard.unlink(missing_ok=True)
-        time.sleep(0.02)
-        return
-    try:
-        owner = _read(path)
-        if owner is not None and _abandoned(path, owner):
-            path.unlink(missing_ok=True)
-    finally:
-        guard.unlink(missing_ok=True)

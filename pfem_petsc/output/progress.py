@@ -3,53 +3,112 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 import os
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Self, TextIO
+from typing import TYPE_CHECKING, NamedTuple, TextIO
 
+from ..errors import InputError
 from ..parallel.agreement import agreed
-from .bar import NotebookBar, ProgressBar, is_notebook, is_terminal
-from .log import LogFile
 from .units import TIME, Axis, duration
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-__all__ = ["Progress"]
+__all__ = ["LogFile", "Progress", "Span"]
 
 FIRST_LINE = 2.0  # seconds until the first line, and between the first lines
 LAST_LINE = 10.0  # maximum number of seconds between lines
 BAR_REFRESH = 0.1  # seconds between two updates of the bar
 
+# Open MPI gives rank 0 a pseudo-terminal, so isatty() alone would draw a bar into the line-wise forwarding of mpirun.
+_LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID")
 
-def _speed(rate: float) -> str:
-    return f"{rate:,.0f} steps/s" if rate >= 10 else f"{rate:.2g} steps/s"
+
+class LogFile:
+    """Appends lines to a log, each with date and level; an existing one is continued.
+
+    A file that cannot be opened at the start is an error. If it is lost during the run (folder removed, disk full), a
+    warning is printed once on stderr, later lines are dropped, and the run continues.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be created; a missing folder is created.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file: TextIO | None = self.path.open("a", buffering=1, encoding="utf-8")
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: the log cannot be written ({error.strerror}); choose another output folder with -o"
+            ) from error
+
+    def write(self, text: str, level: str = "INFO") -> None:
+        """Append a line."""
+        if self._file is None:
+            return
+        stamp = datetime.datetime.now().strftime("%Y-%m-%d %H:%M:%S")
+        try:
+            if not self.path.exists():  # lines written to an unlinked file would be lost
+                self._file.close()
+                self._file = self.path.open("a", buffering=1, encoding="utf-8")
+            self._file.write(f"{stamp} {level:<7} {text}\n")
+        except OSError as error:
+            self._file = None
+            print(
+                f"warning: {self.path}: the log cannot be written any more ({error.strerror}); "
+                "the run continues without it",
+                file=sys.stderr,
+                flush=True,
+            )
+
+    def close(self) -> None:
+        """Close the file; later lines are dropped."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+class Span(NamedTuple):
+    """What a run computes, from which its progress is measured.
+
+    Attributes
+    ----------
+    steps : number of the last step, None if unknown (then progress is measured by time)
+    end : [s], or in the unit of the axis
+    axis : of the times
+    first_step, start : number and time at which a restarted run begins; rates and remaining time count from there
+    """
+
+    steps: int | None
+    end: float
+    axis: Axis = TIME
+    first_step: int = 0
+    start: float = 0.0
 
 
 class Progress:
     """Progress report of a run. Rank 0 writes; on the other ranks every call returns at once.
 
-    On a terminal and in a notebook a bar is drawn; elsewhere (files, pipes, under ``mpirun``) a line is printed after
-    2 s and then at intervals that grow to 10 s. ``log.txt`` gets the lines in any case, each with date and level; an
-    existing log is continued. Between two reports :meth:`update` costs a few additions and one reading of the clock.
-
-    A log that cannot be opened at the start is an :class:`~pfem_petsc.errors.InputError` on all ranks (the constructor
-    is collective); for a log that is lost during the run see :class:`~pfem_petsc.output.log.LogFile`. If the reader of
-    stdout exits (``| head``), the log records it and the run continues.
+    On a terminal a bar is drawn; elsewhere (files, pipes, notebooks, under ``mpirun``) a line is printed after 2 s and
+    then at intervals that grow to 10 s. The log gets the lines in any case. Between two reports :meth:`update` costs a
+    few additions and one reading of the clock. If the reader of stdout exits (``| head``), the log records it and the
+    run continues.
 
     Parameters
     ----------
     title : heading of the bar and the log
-    n_steps : number of the last step, None if unknown (then progress is measured by time)
-    end_time : [s], or in the unit of the axis
+    span : Span
     quiet : print nothing on stdout; the log is still written, and warnings still go to stderr
-    log_path : file of the log, None for no log
-    start_step, start_time : at which a restarted run begins; rates and remaining time count from there
-    axis : of the times
+    log_path : file of the log, None for no log; one that cannot be opened is an
+        :class:`~pfem_petsc.errors.InputError` on all ranks (the constructor is collective)
     stream, clock : stdout and the wall clock [s], replaceable in tests
     """
 
@@ -57,56 +116,36 @@ class Progress:
         self,
         comm: MPI.Comm,
         title: str,
-        n_steps: int | None,
-        end_time: float,
+        span: Span,
         quiet: bool = False,
         log_path: Path | str | None = None,
-        *,
-        start_step: int = 0,
-        start_time: float = 0.0,
-        axis: Axis = TIME,
         stream: TextIO | None = None,
         clock: Callable[[], float] = perf_counter,
     ) -> None:
         self._root = comm.rank == 0
-        self._axis = axis
-        self._title, self._n_steps, self._end_time = title, n_steps, end_time
+        self._title, self._span, self._clock = title, span, clock
         self._stream = None if quiet else (stream or sys.stdout)
-        self._bar: NotebookBar | ProgressBar | None = None
         self._log: LogFile | None = None
-        self._clock = clock
         with agreed(comm):
             if self._root and log_path is not None:
                 self._log = LogFile(log_path)
         self._begin = clock()
-        self._start = (start_step, start_time)
         self._newton = self._linear = 0
-        self._last = (start_step, start_time, 0.0, 0, None)
-        self._marked = (self._begin, start_step, start_time, 0, 0)  # state at the last line, for rates and means
-        self._rate: tuple[float, float] | None = None  # steps and simulated seconds per second of wall time
+        self._last = (span.first_step, span.start, 0.0, 0, None)
+        self._marked = (self._begin, span.first_step, 0, 0, span.start)  # state at the last line, for rates and means
         self._interval = FIRST_LINE
         self._next_line = self._due = self._begin + FIRST_LINE
         self._closed = False
         self._compiling = 0.0
-        if self._root and self._stream is not None and (is_notebook(self._stream) or is_terminal(self._stream)):
-            kind = NotebookBar if is_notebook(self._stream) else ProgressBar
-            self._bar = kind(title, self._stream)
+        self._bar = None
+        if self._root and self._stream is not None and _is_terminal(self._stream):
+            self._bar = _Bar(title, self._stream)
             self._due = self._begin + BAR_REFRESH
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        self.close("done" if kind is None else "stopped")
-
     def summary(self, entries: dict[str, str]) -> None:
-        """Print the start-up block: label and text of each entry, aligned; in a notebook it goes to the log alone."""
-        if not self._root:
-            return
+        """Print the start-up block: label and text of each entry, aligned."""
         width = max((len(label) for label in entries), default=0)
-        write = self._write if not isinstance(self._bar, NotebookBar) else partial(self._log_line, level="INFO")
-        for line in [self._title, *(f"  {label:<{width}}  {text}" for label, text in entries.items())]:
-            write(line)
+        self.message("\n".join([self._title, *(f"  {label:<{width}}  {text}" for label, text in entries.items())]))
 
     def update(
         self,
@@ -136,9 +175,12 @@ class Progress:
         now = self._clock()
         if first:
             # the first step includes compiling, loading, and waiting for ranks that do so
-            self._marked = (now, step, time, self._newton, self._linear)
+            self._mark(now)
         if now >= self._due:
             self._report(now)
+
+    def _mark(self, now: float) -> None:
+        self._marked = (now, self._last[0], self._newton, self._linear, self._last[1])
 
     def compiled(self, seconds: float) -> None:
         """Exclude compilation time [s] from rates and from the remaining time, because it does not recur."""
@@ -170,23 +212,21 @@ class Progress:
         now = self._clock()
         step, time, *_ = self._last
         if self._bar is not None:
-            self._draw_bar()
-        in_notebook = isinstance(self._bar, NotebookBar)
-        if self._bar is not None:
             try:
+                self._bar.draw(*self._state())
                 self._bar.stop()
                 self._bar = None
             except OSError:
                 self._let_go_of_stdout()
         if step > self._marked[1]:
-            (self._log_line if in_notebook else self._write)(self._line(now), "INFO")
-        wall, steps = now - self._begin, step - self._start[0]
+            self._write(self._line(now))
+        wall, steps = now - self._begin, step - self._span.first_step
         text = f"{outcome}: {steps:,} steps in {duration(wall)}"
         if self._compiling >= 0.1:
             text += f", including {duration(self._compiling)} for compiling"
         if steps and wall > self._compiling:
             text += f" ({_speed(steps / (wall - self._compiling))})"
-        text += f", {self._axis.place(time)}"
+        text += f", {self._span.axis.place(time)}"
         if self._newton:
             text += f", {self._newton:,} Newton and {self._linear:,} linear iterations"
         self._write(text)
@@ -199,67 +239,50 @@ class Progress:
             if self._bar is None:
                 self._write(line)
             else:
-                self._log_line(line, "INFO")
-            self._marked = (now, *self._last[:2], self._newton, self._linear)
+                self._log_line(line)
+            self._mark(now)
             self._interval = min(LAST_LINE, 1.25 * self._interval)
-            self._next_line = now + self._interval
+            self._next_line = self._due = now + self._interval
         if self._bar is not None:
-            self._draw_bar()
-        self._due = self._next_line if self._bar is None else min(self._next_line, now + BAR_REFRESH)
-
-    def _measure(self, now: float) -> float:
-        """Update the smoothed rates since the last line and return the remaining wall time [s] (inf if unknown)."""
-        wall = now - self._marked[0]
-        step, time, *_ = self._last
-        if wall > 0 and step > self._marked[1]:
-            new = ((step - self._marked[1]) / wall, (time - self._marked[2]) / wall)
-            # exponential smoothing with weight 1/2 per line
-            self._rate = new if self._rate is None else tuple(0.5 * a + 0.5 * b for a, b in zip(self._rate, new))
-        if self._rate is None:
-            return float("inf")
-        left, rate = (self._end_time - time, self._rate[1])
-        if self._n_steps is not None:
-            left, rate = (self._n_steps - step, self._rate[0])
-        return max(left, 0.0) / rate if rate > 0 else float("inf")
+            try:
+                self._bar.draw(*self._state())
+                self._due = min(self._next_line, now + BAR_REFRESH)
+            except OSError:
+                self._let_go_of_stdout()
 
     def _done(self) -> float:
         """Return the completed fraction of the run."""
         step, time, *_ = self._last
-        if self._n_steps:
-            return min(1.0, step / self._n_steps)
-        return min(1.0, time / self._end_time) if self._end_time > 0 else 1.0
+        if self._span.steps:
+            return min(1.0, step / self._span.steps)
+        return min(1.0, time / self._span.end) if self._span.end > 0 else 1.0
 
-    def _counters(self) -> list[str]:
-        """Return iterations per step since the last line, contacts and drift; items that do not occur are omitted."""
-        step, _, _, contacts, drift = self._last
-        steps = max(1, step - self._marked[1])
-        newton, linear = self._newton - self._marked[3], self._linear - self._marked[4]
-        parts = [f"Newton {newton / steps:.1f}/step"] if newton else []
-        parts += [f"linear {linear / steps:.1f}/step"] if linear else []
-        parts += [f"contacts {contacts:,}"]
-        return parts + ([f"energy drift {drift:+.1e}"] if drift is not None else [])
+    def _state(self) -> tuple[float, str]:
+        """Return the completed fraction, and a text that fits into 80 columns; the lines of the log say more."""
+        step, time, _, contacts, _ = self._last
+        total = f"/{self._span.steps}" if self._span.steps is not None else ""
+        text = f"{step}{total}  {self._span.axis.place(time)}"
+        return self._done(), text + (f"  contacts {contacts:,}" if contacts else "")
 
     def _line(self, now: float) -> str:
-        step, time, dt, *_ = self._last
-        remaining = self._measure(now)
-        total = f"/{self._n_steps}" if self._n_steps is not None else ""
-        width = len(str(self._n_steps)) if self._n_steps is not None else 8
-        parts = [f"step {step:>{width}}{total} {100 * self._done():3.0f} %"]
-        parts += [self._axis.place(time)]
-        parts += [f"d{self._axis.place(dt, 3)}"] if self._axis.unit else []
-        parts += self._counters()
-        parts += [_speed(self._rate[0])] if self._rate is not None else []
+        """Return the state, means and rates since the last line, and the remaining wall time."""
+        step, time, dt, contacts, drift = self._last
+        begin, before, newton, linear, start = self._marked
+        n_steps, axis, wall, made = self._span.steps, self._span.axis, now - begin, step - before
+        width = len(str(n_steps)) if n_steps is not None else 8
+        total = f"/{n_steps}" if n_steps is not None else ""
+        parts = [f"step {step:>{width}}{total} {100 * self._done():3.0f} %", axis.place(time)]
+        parts += [f"d{axis.place(dt, 3)}"] if axis.unit else []
+        parts += [f"Newton {(self._newton - newton) / max(1, made):.1f}/step"] if self._newton > newton else []
+        parts += [f"linear {(self._linear - linear) / max(1, made):.1f}/step"] if self._linear > linear else []
+        parts += [f"contacts {contacts:,}"]
+        parts += [f"energy drift {drift:+.1e}"] if drift is not None else []
+        remaining = float("inf")
+        if wall > 0.0 and made > 0:
+            parts += [_speed(made / wall)]
+            left, done = (n_steps - step, made) if n_steps is not None else (self._span.end - time, time - start)
+            remaining = max(left, 0.0) * wall / done if done > 0.0 else remaining
         return "  ".join([*parts, f"ETA {duration(remaining)}"])
-
-    def _draw_bar(self) -> None:
-        step, time, _, contacts, _ = self._last
-        total = f"/{self._n_steps}" if self._n_steps is not None else ""
-        # must fit into 80 columns; the lines of the log have more details
-        state = f"{step}{total}  {self._axis.place(time)}" + (f"  contacts {contacts:,}" if contacts else "")
-        try:
-            self._bar.draw(self._done(), state)
-        except OSError:
-            self._let_go_of_stdout()
 
     def _write(self, text: str, level: str = "INFO") -> None:
         """Write a line to stdout (above the bar, if there is one) and to the log."""
@@ -282,6 +305,51 @@ class Progress:
         self._stream = self._bar = None
         self._log_line("stdout is closed: the run continues and reports here only", "WARNING")
 
-    def _log_line(self, text: str, level: str) -> None:
+    def _log_line(self, text: str, level: str = "INFO") -> None:
         if self._log is not None:
             self._log.write(text, level)
+
+
+def _speed(rate: float) -> str:
+    return f"{rate:,.0f} steps/s" if rate >= 10 else f"{rate:.2g} steps/s"
+
+
+def _is_terminal(stream: TextIO) -> bool:
+    """Return whether a bar can be drawn into a stream: not into files, pipes, or the output of a launcher."""
+    launched = any(name in os.environ for name in _LAUNCHERS)
+    return stream.isatty() and not launched and os.environ.get("TERM", "dumb") != "dumb"
+
+
+class _Bar:
+    """A bar by rich, redrawn only on request. All methods raise OSError if the terminal is closed."""
+
+    def __init__(self, title: str, stream: TextIO) -> None:
+        # loaded here, so that only a terminal pays for loading rich
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            TaskProgressColumn,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+        state = TextColumn("{task.fields[state]}", markup=False)
+        columns = (BarColumn(bar_width=20), TaskProgressColumn(), state, TimeElapsedColumn(), TextColumn("ETA"))
+        # no refresh thread, which would interrupt the solver at any time
+        self._bar = Progress(*columns, TimeRemainingColumn(), console=Console(file=stream), auto_refresh=False)
+        self._task = self._bar.add_task(title, total=1.0, state="")
+        self._bar.start()
+
+    def draw(self, done: float, state: str) -> None:
+        self._bar.update(self._task, completed=done, state=state)
+        self._bar.refresh()
+
+    def print(self, text: str, style: str | None = None) -> None:
+        """Print a line above the bar."""
+        self._bar.console.print(text, style=style, markup=False, highlight=False)
+
+    def stop(self) -> None:
+        """End the bar; its last state remains on the terminal."""
+        self._bar.stop()

@@ -25,6 +25,7 @@ from .layout import (
     create_result,
     create_snapshot_checks,
     field_datasets,
+    mesh_sizes,
     prepare_modes,
     read_attributes,
     row_type,
@@ -87,7 +88,7 @@ def _extents(file: h5py.File, counts: tuple[int, int, int]) -> dict[str, int]:
     """Return the numbers of rows of all growing datasets, but those of modes, for these numbers of snapshots, history
     rows and events."""
     n_snapshots, vtk = counts[0], file["VTKHDF"]
-    n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
+    n_nodes, n_bars = mesh_sizes(file)
     rows = {f"VTKHDF/Steps/{name}": n_snapshots for name in (*PER_STEP, "Values")}
     rows |= {f"snapshots/{name}": n_snapshots for name in ("step", "time")}
     for name in field_datasets(vtk):
@@ -147,7 +148,7 @@ def _refuse_damaged(path: Path) -> None:
 
 def _check_same(file: h5py.File, path: Path, n_snapshots: int, sizes: tuple[int, int], contents: Contents) -> None:
     vtk = file["VTKHDF"]
-    has = (int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0]))
+    has = mesh_sizes(file)
     if has != sizes:
         raise InputError(
             f"{path}: has {has[0]} nodes and {has[1]} bars, the case has {sizes[0]} and {sizes[1]}: it was "
@@ -159,21 +160,15 @@ def _check_same(file: h5py.File, path: Path, n_snapshots: int, sizes: tuple[int,
                 f"{path}: has the fields {', '.join(sorted(vtk[kind])) or 'none'} ({kind}), the case requests "
                 f"{', '.join(names) or 'none'}: keep [output] fields unchanged, or write elsewhere (-o)"
             )
-    group = file["history"]
-    for name, dtype in contents.columns.items():
-        found = group.get(name)
-        if not isinstance(found, h5py.Dataset) or found.shape[1:] != dtype.shape:
-            has = f"rows of shape {found.shape[1:]}" if isinstance(found, h5py.Dataset) else "nothing"
+    found = {name: file["history"][name].shape[1:] for name in dataset_names(file["history"])}
+    wanted = {name: dtype.shape for name, dtype in contents.columns.items()}
+    for name in sorted(found.keys() | wanted.keys()):
+        if found.get(name) != wanted.get(name):
+            has, records = (f"rows of shape {some[name]}" if name in some else "nothing" for some in (found, wanted))
             raise InputError(
-                f"{path}: history/{name}: the run records rows of shape {dtype.shape}, the file has {has}: it was "
-                "written with another case; restart with the same walls and probes, or write elsewhere (-o)"
+                f"{path}: history/{name}: the run records {records}, the file has {has}: it was written with another "
+                "case; restart with the same walls and probes, or write elsewhere (-o)"
             )
-    others = sorted(set(dataset_names(group)) - set(contents.columns))
-    if others:
-        raise InputError(
-            f"{path}: the history has {', '.join(others)}, which the run does not record: it was written with another "
-            "case; restart with the same walls and probes, or write elsewhere (-o)"
-        )
 
 
 def _rebuild(target: h5py.File, source: h5py.File, counts: tuple[int, int, int], contents: Contents) -> None:
@@ -182,7 +177,7 @@ def _rebuild(target: h5py.File, source: h5py.File, counts: tuple[int, int, int],
     ``counts``: snapshots, history rows and events
     """
     vtk, history = source["VTKHDF"], source["history"]
-    n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
+    n_nodes, n_bars = mesh_sizes(source)
     columns = {name: row_type(history[name]) for name in dataset_names(history)}
     events = {name: dataset.dtype for name, dataset in source[EVENT].items()} if EVENT in source else {}
     compressed = is_compressed(vtk["Points"])

@@ -22,6 +22,7 @@ from .layout import (
     complete_modes,
     complete_rows,
     complete_snapshots,
+    mesh_sizes,
     read_attributes,
 )
 from .table import Table, flat_columns
@@ -199,7 +200,7 @@ class Result:
         n = complete_snapshots(file)
         self.times: np.ndarray = file["snapshots/time"][:n]
         self.steps: np.ndarray = file["snapshots/step"][:n]
-        self.n_nodes, self.n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
+        self.n_nodes, self.n_bars = mesh_sizes(file)
         self.point_fields, self.cell_fields = sorted(vtk["PointData"]), sorted(vtk["CellData"])
         self.case_text: str = file["case/text"][()].decode()
         self.attributes: dict[str, Any] = read_attributes(file["case"])

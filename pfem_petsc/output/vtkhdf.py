@@ -28,7 +28,7 @@ from .hdf5 import (
     writes_together,
     writing,
 )
-from .integrity import RowDigests, gather_rows, mark_digest, numbers_digest, snapshot_digests, summed, word_sum
+from .integrity import RowDigests, mark_digest, numbers_digest, snapshot_digests, summed, word_sum
 from .layout import (
     CHECKS,
     CHUNK_BYTES,
@@ -174,9 +174,8 @@ class _Snapshots:
     """
 
     def __init__(self, file: h5py.File, comm: MPI.Comm, path: Path, mesh: DistributedMesh, contents: Contents) -> None:
-        self._together = writes_together(comm)
-        # the chunks of several ranks are compressed by one of them
-        self._compressed = comm.size > 1 and is_compressed(file["VTKHDF/Points"])
+        # chunks that several ranks share are compressed by one of them
+        self._together = writes_together(comm) or (comm.size > 1 and is_compressed(file["VTKHDF/Points"]))
         self._file, self._vtk, self.comm, self.path = file, file["VTKHDF"], comm, path
         self._fields, self._precision = contents.fields, np.dtype(contents.precision)
         self._nodes, self._bars = mesh.node_order, mesh.bar_order
@@ -248,8 +247,14 @@ class _Snapshots:
         with writing(self.comm, self.path):
             for name in arrays:
                 self._data[name].grow((n + 1) * self._order(name).n_global)
-        together = self._together or self._compressed
-        sums = self._write_together(n, arrays) if together else self._write_alone(n, arrays)
+        sums = {}
+        for name, array in arrays.items():
+            order = self._order(name)
+            slab = order.to_slab(array)
+            slab = slab.astype(self._row_type(name, slab), copy=False)
+            sums[name] = word_sum(slab, order.first)
+            with writing(self.comm, self.path):
+                self._data[name].write(n * order.n_global + order.first, slab, collective=self._together)
         digests = snapshot_digests(self.comm, sums)
         with writing(self.comm, self.path):
             for dataset in (*self._per_step.values(), *self._marks.values(), self._digests):
@@ -277,37 +282,6 @@ class _Snapshots:
             self._file.flush()
         self.count = n + 1
 
-    def _write_together(self, n: int, arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
-        """Write by collective transfers, and return each rank's share of the digests."""
-        sums = {}
-        for name, array in arrays.items():
-            first, slab, sums[name] = self._slab(name, array)
-            with writing(self.comm, self.path):
-                self._data[name].write(n * self._order(name).n_global + first, slab, collective=True)
-        return sums
-
-    def _write_alone(self, n: int, arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
-        """Write this rank's rows without waiting for others, and return its share of the digests."""
-        sums, failure = {}, None
-        with writing(self.comm, self.path):
-            for name, array in arrays.items():
-                first, slab, sums[name] = self._slab(name, array)
-                try:
-                    if failure is None:
-                        self._data[name].write(n * self._order(name).n_global + first, slab)
-                except (OSError, RuntimeError) as error:
-                    failure = error  # other ranks need the rows that are here for their slabs
-            if failure is not None:
-                raise failure
-        return sums
-
-    def _slab(self, name: str, array: np.ndarray) -> tuple[int, np.ndarray, int]:
-        """Return the first number of this rank's slab, the slab in the type of the file, and its sum. Collective."""
-        order = self._order(name)
-        slab = _permuted(order, array) if order.permutes else order.to_slab(array)
-        slab = slab.astype(self._row_type(name, slab), copy=False)
-        return order.first, slab, word_sum(slab, order.first)
-
     def _order(self, name: str) -> NaturalOrder:
         return self._bars if name.startswith("CellData") else self._nodes
 
@@ -320,17 +294,6 @@ def _as_slice(index: slice | np.ndarray) -> slice | np.ndarray:
     if isinstance(index, slice) or not len(index) or (np.diff(index) != 1).any():
         return index
     return slice(int(index[0]), int(index[-1]) + 1)
-
-
-def _permuted(order: NaturalOrder, array: np.ndarray) -> np.ndarray:
-    """Return what :meth:`~pfem_petsc.parallel.natural.NaturalOrder.to_slab` gives on one rank, in a compiled loop."""
-    array = np.ascontiguousarray(array)
-    slab = np.empty((order.count, *array.shape[1:]), array.dtype)
-    word, width = f"u{array.itemsize}", int(np.prod(array.shape[1:], dtype=np.int64))
-    gather_rows(
-        array.view(word).reshape(-1, width), order.owned_rows(0, order.count), slab.view(word).reshape(-1, width)
-    )
-    return slab
 
 
 class ResultWriter:

@@ -83,11 +83,6 @@ class NaturalOrder:
         self._slab = {rank: places[at].astype(rows.dtype) for rank, at in self._slab.items()}
         return len(places) == self.count and bool((np.bincount(places, minlength=self.count) == 1).all())
 
-    @property
-    def permutes(self) -> bool:
-        """Whether there is one rank, whose rows have another order than the mesh."""
-        return self.alone and not self._identity
-
     def owned_rows(self, first: int, last: int) -> np.ndarray:
         """Return the rows of the numbers first to last - 1; on one rank only."""
         return self._owned_rows[first:last]

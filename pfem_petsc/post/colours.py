@@ -117,15 +117,10 @@ def _rounding_of(result: Any, name: str) -> float:
     length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     strain = 1e-13 * float(np.abs(points).max()) / max(float(np.median(length)), 1e-300)
     case = result.case
-    moduli = [getattr(each, "young_modulus", None) for each in getattr(case, "material", {}).values()]
-    areas = [each.area for each in getattr(case, "section", {}).values()]
-    if name == "strain":
-        return strain
-    if None in moduli or not moduli:
-        return 0.0
-    if name == "stress":
-        return strain * max(moduli)
-    return strain * max(moduli) * max(areas) if areas and None not in areas else 0.0
+    moduli = [getattr(each, "young_modulus", None) or 0.0 for each in getattr(case, "material", {}).values()]
+    areas = [each.area or 0.0 for each in getattr(case, "section", {}).values()]
+    stress = strain * max(moduli, default=0.0)
+    return {"strain": strain, "stress": stress, "axial_force": stress * max(areas, default=0.0)}[name]
 
 
 class ColourScale:

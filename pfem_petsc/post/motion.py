@@ -5,7 +5,7 @@ A wall module may define ``surface(parameters, bounds)``, which returns what is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..fields import STATUS
 from ..mechanics.bars import area_fields, bar_shapes, named_groups, section_of_bars
 from ..mesh import load_slab
 from ..output.units import MODE, Axis, prefix_for
-from ..registry import lookup, nearest
+from ..registry import choices, lookup, nearest
 from .camera import Camera
 from .colours import GHOST, MARKS, TRAILS
 from .scene import Layer, Scene
@@ -109,7 +109,7 @@ class Motion:
         Those that a stage does not have are left out.
         """
         times = self.result.times[self.frames]
-        shifts, present = wall_shifts(self.result, times), walls_present(self.result, times)
+        shifts, present = walls_at(self.result, times)
         still = {surface.name: surface for surface in wall_surfaces(walls, self.bounds, self.note)}
         surfaces: dict[int, list[Surface]] = {frame: [] for frame in self.frames}
         for k, wall in enumerate(walls):
@@ -527,18 +527,6 @@ def plane(wall: Any, bounds: np.ndarray) -> Surface:
     return slab(wall.name, face, normal, 0.05 * size)
 
 
-_OWN: dict[str, Callable[[Any, np.ndarray], Surface]] = {"plane": plane}
-
-
-def _drawing_of(kind: str) -> Callable[[Any, np.ndarray], Any] | None:
-    """Return the drawing function of a wall type: ``surface`` of its module if it exists, else the one here."""
-    try:
-        module = lookup("pfem_petsc.contact.walls", kind, "wall.type")
-    except InputError:
-        return _OWN.get(kind)
-    return getattr(module, "surface", None) or _OWN.get(kind)
-
-
 def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str], None] = print) -> list[Surface]:
     """Return the surfaces of a case's walls; a wall whose type has no drawing is skipped with a message to ``note``.
 
@@ -547,7 +535,9 @@ def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str]
     """
     drawn = []
     for wall in walls:
-        draw = _drawing_of(wall.type)
+        kinds = choices("pfem_petsc.contact.walls")
+        module = lookup("pfem_petsc.contact.walls", wall.type, "wall.type") if wall.type in kinds else None
+        draw = getattr(module, "surface", plane if wall.type == "plane" else None)
         if draw is None:
             note(f"wall '{wall.name}' is left out of the picture: type '{wall.type}' has no drawing")
             continue
@@ -560,68 +550,36 @@ def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str]
     return drawn
 
 
-def wall_shifts(result: Any, times: Sequence[float]) -> np.ndarray:
-    """Return displacements (times, walls, 3) [m] of a result's walls from their initial positions.
+def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return displacements (times, walls, 3) [m] of a result's walls from where they are first given, and which of them
+    are there (times, walls) bool.
 
-    Positions of walls with mass are interpolated linearly between rows of the history; others follow from the case.
-    A wall that a stage no longer has remains at its last position; :func:`walls_present` says which are there.
+    Positions of walls with mass are interpolated linearly between rows of the history; others follow from the case. The
+    end of a stage belongs to it, and not to the next one. A wall that a stage no longer has remains where it was.
     """
-    walls = result.case.every_wall
-    if result.case.stage:
-        return np.array([_shifts_in_stages(result, time) for time in times]).reshape(len(times), len(walls), 3)
-    motion = WallMotion(walls)
-    displacements = np.array([motion.displacements(time) for time in times]).reshape(len(times), len(walls), 3)
-    for k, wall in enumerate(walls):
-        if wall.mass is not None:
-            when = np.asarray(result.history["time"], dtype=float)
-            places = np.asarray(result.history[f"wall/{wall.name}/position"], dtype=float)
-            for axis in range(3):
-                displacements[:, k, axis] = np.interp(times, when, places[:, axis] - places[0, axis])
-    return displacements
-
-
-def walls_present(result: Any, times: Sequence[float]) -> np.ndarray:
-    """Return which of a result's walls are there (times, walls) bool: with stages, those of the stage at that time."""
-    walls = result.case.every_wall
-    if not result.case.stage:
-        return np.ones((len(times), len(walls)), dtype=bool)
-    present = np.zeros((len(times), len(walls)), dtype=bool)
+    walls, history = result.case.every_wall, result.history
+    names = [wall.name for wall in walls]
+    shifts, present = np.zeros((len(times), len(walls), 3)), np.zeros((len(times), len(walls)), dtype=bool)
+    when = np.asarray(history["time"], dtype=float)
+    numbers = np.asarray(history["stage"]) if "stage" in history else np.zeros(len(when), dtype=int)
     for row, time in enumerate(times):
-        *_, (stage, _, _) = _stages_until(result, time)
-        names = [wall.name for wall in stage.wall]
-        present[row] = [wall.name in names for wall in walls]
-    return present
-
-
-def _stages_until(result: Any, time: float) -> Iterator[tuple[Any, float, float]]:
-    """Yield the stages that have begun before a time, each with its beginning and its end, at most this time.
-
-    The end of a stage belongs to it, and not to the next one.
-    """
-    times, numbers = np.asarray(result.history["time"]), np.asarray(result.history["stage"])
-    for stage in result.case.stage:
-        rows = times[numbers == stage.number]
-        begin = times[numbers < stage.number].max(initial=0.0)
-        if stage.number and (not len(rows) or begin >= time):
-            return
-        yield stage, begin, min(time, rows[-1]) if len(rows) else begin
-
-
-def _shifts_in_stages(result: Any, time: float) -> np.ndarray:
-    """Displacements (walls, 3) [m] at a time, from the place where a wall is first given."""
-    walls = result.case.every_wall
-    times, numbers = np.asarray(result.history["time"]), np.asarray(result.history["stage"])
-    shifts = np.zeros((len(walls), 3))
-    for stage, begin, end in _stages_until(result, time):
-        for wall, moved in zip(stage.wall, WallMotion(stage.wall).displacements(end - begin), strict=True):
-            k = [each.name for each in walls].index(wall.name)
-            if wall.mass is not None:
-                places = np.asarray(result.history[f"wall/{wall.name}/position"])
-                shifts[k] = [np.interp(time, times, places[:, axis]) for axis in range(3)]
-                shifts[k] -= places[numbers == stage.number][0]
-            elif not stage.holds("wall"):
-                shifts[k] = _place(wall) - _place(walls[k]) + moved
-    return shifts
+        for number, stage in enumerate(result.case.stages):
+            begin, rows = when[numbers < number].max(initial=0.0), when[numbers == number]
+            if number and (not len(rows) or begin >= time):
+                break
+            present[row] = np.isin(names, [wall.name for wall in stage.wall])
+            end = min(time, rows[-1]) if len(rows) else time
+            for wall, moved in zip(stage.wall, WallMotion(stage.wall).displacements(end - begin), strict=True):
+                k = names.index(wall.name)
+                if wall.mass is not None:
+                    places = np.asarray(history[f"wall/{wall.name}/position"], dtype=float)
+                    now = [np.interp(time, when, places[:, axis]) for axis in range(3)]
+                    shifts[row, k] = now - places[numbers == number][0]
+                elif number == 0:
+                    shifts[row, k] = moved
+                elif not stage.holds("wall"):
+                    shifts[row, k] = _place(wall) - _place(walls[k]) + moved
+    return shifts, present
 
 
 def _place(wall: Any) -> np.ndarray:

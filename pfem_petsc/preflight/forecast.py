@@ -92,7 +92,7 @@ def checkpoint_bytes(model: Model) -> float:
     return 1e4 + model.mesh.n_nodes * 24.0 * 8 + 8.0 * len(model.bars.kept_names) * model.mesh.n_bars
 
 
-def memory_warning(case: Case, model: Model, plan: Plan) -> list[str]:
+def memory_warning(model: Model, plan: Plan, source: str) -> list[str]:
     """Return a warning if the ranks on a machine need more memory than it has. Collective."""
     comm = model.comm
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
@@ -103,7 +103,7 @@ def memory_warning(case: Case, model: Model, plan: Plan) -> list[str]:
     if ratio <= 1.0:
         return []
     return [
-        f"{case.source}: the {ranks} ranks on {name} will need about {engineering(needed, 'B', 3)} of memory, and it "
+        f"{source}the {ranks} ranks on {name} will need about {engineering(needed, 'B', 3)} of memory, and it "
         f"has {engineering(available, 'B', 3)}: the system may end the run; use more machines, a smaller mesh, or an "
         "explicit scheme"
     ]

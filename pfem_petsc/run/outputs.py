@@ -18,13 +18,12 @@ from ..mechanics.compiled import Compilation
 from ..modes.find import Found, find_modes, weakest_member
 from ..output.checkpoint import NAME as CHECKPOINT
 from ..output.layout import MODE_VALUES, Contents, Kept
-from ..output.progress import Progress
+from ..output.progress import Progress, Span
 from ..output.units import MODE
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import on_root
+from ..preflight.checks import odd_accelerations, warnings_before
 from ..preflight.forecast import summarise
-from ..preflight.inspection import warnings_before
-from ..preflight.values import odd_accelerations
 from ..restart.checkpoints import RESULT, Restart, prepare_folder
 from ..restart.state import RunState
 from ..signals import early
@@ -285,13 +284,9 @@ class Outputs:
         progress = Progress(
             model.comm,
             printable(case.title),
-            plan.steps,
-            plan.end or 0.0,
+            Span(plan.steps, plan.end or 0.0, plan.axis, stepper.number, stepper.place),
             self._quiet,
             self._folder / "log.txt",
-            start_step=stepper.number,
-            start_time=stepper.place,
-            axis=plan.axis,
         )
         progress.summary(summarise(case, model, plan))
         warnings = warnings_before(model.case, model, stages.analysis.plan)

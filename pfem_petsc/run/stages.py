@@ -16,7 +16,7 @@ from ..fields import Fields
 from ..modes.find import describe_modes
 from ..modes.initial_state import InitialState
 from ..output.units import TIME as AXIS
-from ..preflight.inspection import warnings_of_stage
+from ..preflight.checks import warnings_before
 from ..statics.analysis import StaticAnalysis
 from ..stepping.model import Model
 from ..stepping.plan import make_plan
@@ -134,7 +134,7 @@ class Stages:
             cells |= dict.fromkeys(fields.cells)
             warnings += [f"stage {stage.name!r}: {text}" for text in model.warnings]
             if k >= number:
-                found = warnings_of_stage(stage, model, analysis.plan)
+                found = warnings_before(stage, model, analysis.plan, first=False)
                 new = [text for text in found if text not in told]
                 warnings += [f"stage {stage.name!r}: {text}" for text in new if k > number]
                 told += new

@@ -35,7 +35,7 @@ class StaticAnalysis(Analysis):
     Parameters
     ----------
     model : Model
-    recorded : ``StaticPlan.record`` of the run that is continued
+    recorded : ``PlanAtRest.record`` of the run that is continued
 
     Raises
     ------

@@ -121,8 +121,8 @@ class CriticalPoints:
         NotConverged
             On all ranks, if one cannot be located between the points: the last may lie on another path.
         """
-        ends = (_End(0.0, self.first.slope, self.first.negatives), self._end(self.last))
-        yield from self._look(_Interval(*ends), 0)
+        start = _End(0.0, self.first.slope, self.first.negatives)
+        yield from self._look(_Interval(start, self._end(self.last)), 0)
 
     def _look(self, interval: _Interval, depth: int) -> Iterator[Critical]:
         """Locate the critical points of an interval, starting from its first end."""

@@ -45,7 +45,6 @@ class Equilibrium(Scheme):
 
     inertial = False
     remembers = ("rate",)
-    dissipates = True
 
     def __init__(self, lack: np.ndarray | None = None) -> None:
         super().__init__(NoParameters())

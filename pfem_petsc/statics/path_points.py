@@ -462,9 +462,8 @@ class PointSolver:
         self.model, self.state, self.system, self.metric = system.model, state, system, metric
         self.stability: Stability | None = None
         if looks:
-            self.stability = Stability(
-                self.model, system.hessian if isinstance(system.hessian, HessianMatrix) else None
-            )
+            assembled = isinstance(system.hessian, HessianMatrix)
+            self.stability = Stability(self.model, system.hessian if assembled else None)
 
     @property
     def place(self) -> str:

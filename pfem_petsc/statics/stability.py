@@ -14,7 +14,7 @@ from ..solvers.matrix import HessianMatrix
 from .equilibrium import problem_at_rest
 
 if TYPE_CHECKING:
-    from ..contact.forces import WallForces
+    from ..contact.node_walls import WallForces
     from ..integrators.base import State
     from ..solvers.lagged import LaggedPreconditioner
     from ..solvers.matrix_free import MatrixFreeHessian
@@ -74,7 +74,7 @@ class Stability:
         most = most if largest is None else min(most, largest)
         self.refusal: str | None = None
         if unknowns > most:
-            why = "" if self._mumps else ", and this PETSc does not have MUMPS"
+            why = ", and this PETSc does not have MUMPS" if most == LARGEST and largest is None else ""
             self.refusal = f"the model has {unknowns:,} unknowns, more than {most:,}{why}"
         elif self.comm.size > 1 and not self._mumps and not self.dense:
             self.refusal = "on several ranks it requires MUMPS, which this PETSc does not have"

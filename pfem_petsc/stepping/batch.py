@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.forces import WallForces
+from ..contact.node_walls import WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.elements import batch_parts

@@ -18,8 +18,8 @@ from numba.extending import intrinsic
 from ..columns import HEAD
 from ..contact.explicit import find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows, solve_rows
-from ..contact.forces import compare_contacts
 from ..contact.impact import Approach, join_nodes, plane_gaps, stop_nodes, unpressed
+from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import accelerations, advance, advance_loaded, centre, kick, move
 from ..mechanics.compiled import borrowing, kernel
 from ..mechanics.elements import BarData, first_inverted
@@ -80,7 +80,7 @@ class NodeArrays(NamedTuple):
 
 
 class WallArrays(NamedTuple):
-    """Flat walls and their log; see :mod:`~pfem_petsc.contact.explicit` and :mod:`~pfem_petsc.contact.forces`."""
+    """Flat walls and their log; see :mod:`~pfem_petsc.contact.explicit` and :mod:`~pfem_petsc.contact.node_walls`."""
 
     fixed: np.ndarray
     normals: np.ndarray

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.forces import WallForces
 from ..contact.initial_equilibrium import start_at_rest
 from ..contact.monitoring import CarriedNodes
+from ..contact.node_walls import WallForces
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy, release

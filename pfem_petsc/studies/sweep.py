@@ -5,23 +5,21 @@ from __future__ import annotations
 import itertools
 import re
 import shutil
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from ..case.schema import Case
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.result import Result, open_result, peak_force, touch_impulse
 from ..output.table import Table, flat_columns
-from ..output.units import duration
 from .pool import Report, Task, performed
 
-_BETWEEN = 10.0  # seconds between lines of progress where they are not rewritten
 _OWN = ("run", "status", "message", "wall_time", "steps")
 """Columns that a table has besides parameters and results."""
 
@@ -89,25 +87,27 @@ def sweep(
     numbers = list(cases)
     rows: dict[int, dict[str, Any]] = {}
     found: dict[int, dict[str, Any]] = {}
-    progress = _Progress(len(changes), quiet)
-    for number, report in itertools.chain(
+    ended = itertools.chain(
         ((number, Report(2, text, 0.0, 0)) for number, text in refused.items()),
         ((numbers[k], report) for k, report in performed(tasks, processes)),
-    ):
-        place = folder / f"{number:04d}"
-        if not report.status:
-            try:
-                found[number] = _results_of(open_result(place), results)
-            except Exception as error:  # noqa: BLE001 - of a user's function; the other runs go on
-                text = error.args[0] if isinstance(error, KeyError) and error.args else error
-                report = report._replace(status=1, message=f"results: {type(error).__name__}: {text}")
-        rows[number] = {"run": number, **_shown(changes[number]), **report._asdict()}
-        if not keep and report.status == 0:
-            shutil.rmtree(place, ignore_errors=True)
-        progress.done(report)
-        table = _table(rows, found, asked, results is None)
-        table.to_csv(folder / "sweep.csv")
-    progress.done(None)
+    )
+    with _progress(quiet) as progress:
+        counter = progress.add_task("", total=len(changes), failed=0)
+        for number, report in ended:
+            place = folder / f"{number:04d}"
+            if not report.status:
+                try:
+                    found[number] = _results_of(open_result(place), results)
+                except Exception as error:  # noqa: BLE001 - of a user's function; the other runs go on
+                    text = error.args[0] if isinstance(error, KeyError) and error.args else error
+                    report = report._replace(status=1, message=f"results: {type(error).__name__}: {text}")
+            rows[number] = {"run": number, **_shown(changes[number]), **report._asdict()}
+            if not keep and report.status == 0:
+                shutil.rmtree(place, ignore_errors=True)
+            failed = sum(row["status"] != 0 for row in rows.values())
+            progress.update(counter, advance=1, failed=failed)
+            table = _table(rows, found, asked, results is None)
+            table.to_csv(folder / "sweep.csv")
     return table
 
 
@@ -189,28 +189,10 @@ def _table(rows: dict[int, dict[str, Any]], found: dict[int, dict[str, Any]], as
     return Table({name: [row.get(name, float("nan")) for row in ordered] for name in dict.fromkeys([*own, *names])})
 
 
-class _Progress:
-    """Counts finished runs on stderr: one line that is rewritten on a terminal, else a line now and then."""
-
-    def __init__(self, runs: int, quiet: bool) -> None:
-        self._runs, self._ended, self._failed, self._quiet = runs, 0, 0, quiet
-        self._begin = self._last = perf_counter()
-
-    def done(self, report: Report | None) -> None:
-        """Count a run that has ended; None: all have."""
-        now = perf_counter()
-        rewrites = sys.stderr is not None and sys.stderr.isatty()
-        text = f" in {duration(now - self._begin)}"
-        if report is not None:
-            self._ended += 1
-            self._failed += report.status != 0
-            text = f", {duration((now - self._begin) / self._ended * (self._runs - self._ended))} left"
-        failed = f", {self._failed} without result (see the column message)" if self._failed else ""
-        text = f"sweep: {self._ended} of {self._runs} runs{failed}{text}"
-        if not self._quiet and (report is None or rewrites or now - self._last > _BETWEEN):
-            self._last = now
-            line = f"\r{text:<78}" if rewrites else text
-            print(line, end="" if rewrites and report else "\n", file=sys.stderr, flush=True)
+def _progress(quiet: bool) -> Progress:
+    """Return a line on stderr that counts runs."""
+    parts = (BarColumn(), MofNCompleteColumn(), "runs, {task.fields[failed]} without result", TimeRemainingColumn())
+    return Progress("sweep", *parts, console=Console(stderr=True), disable=quiet)
 
 
 def _results_of(result: Result, results: ResultFunction | Mapping[str, ResultFunction | str] | None) -> dict[str, Any]:

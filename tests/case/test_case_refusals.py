@@ -28,9 +28,9 @@ REFUSED = {
     "integer beyond floats for a step": ([f"time.step=1{'0' * 400}"], ["time.step", "finite number of seconds"]),
     "integer beyond floats for a prestress": (
         [f"section.strut.prestress=1{'0' * 400}"],
-        ["section.strut.prestress", SI],
+        ["section.strut.prestress", "fits in double precision"],
     ),
-    "no rows of a prestress": (["section.strut.pretension=[]"], ["section.strut.pretension = []", "rows [t, value]"]),
+    "no rows of a prestress": (["section.strut.pretension=[]"], ["section.strut.pretension = []", "rows [t, force]"]),
     "thickness whose square overflows": (
         ["section.strut.shape=tube", "section.strut.thickness=1e300"],
         ["section.strut", "thickness = 1e+300 m is too much"],

@@ -6,21 +6,13 @@ from pfem_petsc.case.schema import Case
 from pfem_petsc.errors import InputError
 
 
-@pytest.mark.parametrize("brackets", [1, 100_000])
-def test_syntax_error_names_the_place(tmp_path, brackets):
+@pytest.mark.parametrize(
+    ("value", "told"), [("[", "TOML"), ("[" * 100_000, "nested too deep"), ("= 1", "line 2, column 10")]
+)
+def test_syntax_error_names_the_place(tmp_path, value, told):
     path = tmp_path / "broken.toml"
-    path.write_text("[mesh]\nlength = " + "[" * brackets + "\n")
-    with pytest.raises(InputError) as refused:
-        Case.load(path)
-    message = str(refused.value)
-    assert message.startswith(f"{path}: ")
-    assert "nested too deep" in message if brackets > 1 else "TOML" in message
-
-
-def test_syntax_error_names_line_and_column(tmp_path):
-    path = tmp_path / "broken.toml"
-    path.write_text("[mesh]\nlength = = 1\n")
-    with pytest.raises(InputError, match=r"broken\.toml: .*line 2, column 10"):
+    path.write_text(f"[mesh]\nlength = {value}\n")
+    with pytest.raises(InputError, match=rf"{path}: .*{told}"):
         Case.load(path)
 
 

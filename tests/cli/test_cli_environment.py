@@ -146,13 +146,6 @@ def test_what_is_missing_has_its_remedy(monkeypatch, capsys, part, answer, name,
     assert f"check --env: missing: {name}; the list above" in capsys.readouterr().err
 
 
-def test_conda_has_its_own_commands(monkeypatch):
-    monkeypatch.setenv("CONDA_PREFIX", "/opt/conda")
-    found = inspect_environment(machine(require_rendering=(1, "InputError: no OpenGL")))
-    (drawing,) = (each for each in found if each.name == "OpenGL")
-    assert drawing.state == "optional" and drawing.remedy == "conda install -c conda-forge mesalib"
-
-
 def test_probes_run_here():
     """The real probes of PETSc and of a package: their output is what the report reads."""
     status, output = environment._run(environment._python(environment._PETSC))
@@ -160,19 +153,6 @@ def test_probes_run_here():
     assert status == 0 and about["scalar"] == "float64" and set(about) >= {"mumps", "hypre", "ptscotch", "index"}
     status, output = environment._run(environment._python("import nothing_of_this_name"))
     assert status and environment._last(output) == "ModuleNotFoundError: No module named 'nothing_of_this_name'"
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["check", "--env", "rod_impact"], "takes no case"),
-        (["check"], "required: CASE (give it before --set), or --env"),
-        (["completion", "tcsh"], "invalid choice: 'tcsh'"),
-    ],
-)
-def test_wrong_words_are_refused(words, text, capsys):
-    assert main(words) == 2
-    assert text in capsys.readouterr().err
 
 
 def test_a_numpy_that_is_too_new_has_its_remedy(tmp_path, monkeypatch):

@@ -42,13 +42,6 @@ def test_refusal_is_printed_once(on_ranks, tmp_path, ranks, words, text):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("words", [["--help"], ["list"], ["run", "--help"], ["--version"]])
-def test_print_comes_from_one_rank(on_ranks, words):
-    alone, together = (on_ranks(n, "-m", "pfem_petsc", *words, timeout=240.0) for n in (1, 2))
-    assert (alone.returncode, together.returncode) == (0, 0)
-    assert together.stdout == alone.stdout != ""
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("failure", "status", "text"),
@@ -101,16 +94,3 @@ def test_rank_that_ends_early_does_not_hide_a_failure(on_ranks, tmp_path):
     done = run_collectively(on_ranks, tmp_path, 2, body)
     assert done.returncode == 3
     assert "rank 1: error: late" in done.stderr
-
-
-def test_debug_shows_the_traceback_once(on_ranks, tmp_path):
-    done = run_collectively(on_ranks, tmp_path, 2, "raise RuntimeError('surprise')", debug=True)
-    assert done.returncode == 3
-    assert done.stderr.count("Traceback") == 1
-    assert "verb.py" in done.stderr
-
-
-def test_status_of_success(on_ranks, tmp_path):
-    done = run_collectively(on_ranks, tmp_path, 2, "return 0")
-    assert done.returncode == 0
-    assert done.stderr == ""

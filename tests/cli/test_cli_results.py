@@ -66,19 +66,6 @@ def test_a_run_says_where_earlier_results_went_and_how_energy_drifts(tmp_path, c
     assert abs(float(re.search(r"energy drift (\S+)", shown)[1])) < 1e-9
 
 
-def test_quiet_run_prints_nothing(tmp_path, capsys):
-    assert main(["rod_impact", "-o", str(tmp_path / "quiet"), "--quiet", "--set", "time.end=0.05"]) == 0
-    assert capsys.readouterr().out == ""
-    assert main(["rod_impact", "-o", str(tmp_path / "loud"), "--set", "time.end=0.05"]) == 0
-    assert "Elastic rod against a rigid wall" in capsys.readouterr().out
-
-
-def test_folder_that_cannot_be_made(tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    assert main(["rod_impact", "-o", str(tmp_path / "file" / "results")]) == 2
-    assert str(tmp_path / "file") in capsys.readouterr().err
-
-
 def test_info(short_run, capsys):
     assert main(["info", str(short_run)]) == 0
     by_folder = capsys.readouterr().out
@@ -129,12 +116,6 @@ def test_result_that_is_none(verb, tmp_path, capsys):
     assert str(tmp_path / "result.vtkhdf") in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["--size", "big"], ["--frames", "some"], ["--fps", "x"]])
-def test_refused_option_of_render(words, capsys):
-    assert main(["render", "anything", *words]) == 2
-    assert words[1] in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_petsc_takes_its_options(on_ranks, tmp_path):
     done = on_ranks(
@@ -142,10 +123,3 @@ def test_petsc_takes_its_options(on_ranks, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "PETSc Performance Summary" in done.stdout
-
-
-@pytest.mark.slow
-def test_one_rank_draws_and_tells(on_ranks, short_run, tmp_path):
-    done = on_ranks(2, "-m", "pfem_petsc", "info", short_run, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("history columns:") == 1

@@ -82,11 +82,6 @@ def test_names_with_a_nul(tables, tmp_path):
         Case.from_dict({**ROD, **tables}, folder=tmp_path)
 
 
-def test_an_output_folder_with_a_nul():
-    with pytest.raises(InputError, match="NUL"):
-        Simulation(Case.from_dict(ROD), output="a\0b", quiet=True)
-
-
 @pytest.mark.parametrize(
     "mesh",
     [
@@ -163,12 +158,6 @@ def test_a_second_run_does_nothing(tmp_path):
     assert simulation.run() == 0
     assert list(simulation) == []
     assert simulation.state.step == 10
-
-
-def test_functions_that_are_none(tmp_path):
-    simulation = Simulation(Case.from_dict(ROD), output=tmp_path / "out", quiet=True)
-    with simulation, pytest.raises(InputError, match="on_step: 5 is not a function"):
-        simulation.on_step(5)
 
 
 def test_unstressed_cables_are_not_slack(tmp_path):

@@ -39,23 +39,6 @@ def test_bounds_are_the_planes(walls):
         assert given == min(walls, 3 - fixed.sum()) or walls > given
 
 
-def test_box_needs_no_turning():
-    """Six planes along the axes: two-sided bounds on the components as they are."""
-    normals = np.vstack([np.eye(3), -np.eye(3)])
-    frames = frames_of(normals, [0.0, 0.1, 0.2, -1.0, -1.1, -1.2])
-    assert not frames.oblique
-    np.testing.assert_array_equal(frames.lower[0], [0.0, 0.1, 0.2])
-    np.testing.assert_array_equal(frames.upper[0], [1.0, 1.1, 1.2])
-
-
-def test_nearly_parallel_planes_wait():
-    """Planes closer than the stated angle do not share coordinates: the nearer one has the row."""
-    angle = 0.5 * MIN_VOLUME
-    normals = [[0.0, 0.0, 1.0], [0.0, np.sin(angle), np.cos(angle)]]
-    frames = frames_of(normals, [0.0, 0.0], rank=[0.2, 0.1])
-    assert list(frames.rows[0] >= 0) == [False, True]
-
-
 def test_overlapping_bounds():
     """Opposite planes that overlap by rounding meet in the middle; by more, the node is named."""
     normals = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]

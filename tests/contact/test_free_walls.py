@@ -6,7 +6,7 @@ from helpers.lattices import lattice_case, planes, simulation
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError, SimulationFailure
-from pfem_petsc.preflight.inspection import warnings_before
+from pfem_petsc.preflight.checks import warnings_before
 
 SCHEMES = [("central_differences", {}), ("chung_lee", {}), ("newmark", {}), ("houbolt", {})]
 SPEED = np.array([1.0, -0.5, -4.0])
@@ -161,25 +161,6 @@ def test_gravity_of_a_wall_in_a_case_without_is_told(comm, shared_tmp_path):
         run = Simulation(built, comm, check_only=True)
         texts = warnings_before(run.case, run.model, run.plan)
         assert sum("wall 'ram': gravity = true, but the case has no [gravity]" in t for t in texts) == told
-
-
-@pytest.mark.slow
-def test_restart_keeps_the_walls(comm, shared_tmp_path):
-    """A run in two parts is the run in one, bit for bit: walls with mass, restitution and friction included."""
-    walls = planes([[0.2, 0.1, 1.0]], [-0.01], mass=0.05, restitution=0.3, name="free")
-    walls += planes([[0.0, 0.1, 1.0]], [-0.012], friction=0.3, name="rough")
-    rows = {}
-    for name, end in (("one", 0.04), ("two", 0.02), ("two", 0.04)):
-        case = lattice_case(walls, velocity=[0.5, 0.0, -4.0], end=end)
-        case["output"]["checkpoint_every"] = 50
-        restart = name == "two" and end > 0.03
-        run = Simulation(
-            Case.from_dict(case, name="it"), comm, output=shared_tmp_path / name, quiet=True, restart=restart
-        )
-        rows[name] = [s.row for s in run][-1]
-    for column, value in rows["one"].items():
-        np.testing.assert_array_equal(rows["two"][column], value, err_msg=column)
-    assert rows["one"]["wall/free/releases"] > 0 and rows["one"]["wall/rough/impulse"][2] > 0.0
 
 
 @pytest.mark.slow

@@ -7,8 +7,6 @@ from helpers.lattices import lattice_case, simulation
 from pfem_petsc.errors import InputError, SimulationFailure
 
 ANGLE, G = 0.4, 9.81
-SLOPE = np.array([np.cos(ANGLE), 0.0, -np.sin(ANGLE)])  # downhill
-NORMAL = np.array([np.sin(ANGLE), 0.0, np.cos(ANGLE)])
 
 
 def block(integrator, friction, *, velocity=0.0, end=0.1, static=None, step=2e-4, **wall):

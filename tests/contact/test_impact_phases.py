@@ -1,7 +1,6 @@
 """Stability of contact over the phases of an impact: the small rod, the program itself, the warning and the page."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import impact_phases as table
 import numpy as np
@@ -13,8 +12,6 @@ from mpi4py import MPI
 from pfem_petsc import Case, Simulation
 from pfem_petsc.contact.impact_gains import BOUND, STEPS, RodImpact, impact_gain, overshoots, warn_of_gain
 from pfem_petsc.registry import lookup
-
-ROOT = Path(__file__).parents[2]
 
 TRAPEZOID = {"beta": 0.25, "gamma": 0.5}
 

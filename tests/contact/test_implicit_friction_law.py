@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from helpers.lattices import lattice_case, planes, rotation, simulation
+from helpers.lattices import lattice_case, planes, simulation
 from helpers.parts import last_rows
 from helpers.sliding import SCHEMES, G, rows_of, tumbling
-from helpers.turning import with_mesh_file
 
 WALLS = {
     "plane": planes([[0.3, -0.2, 1.0]], [-0.02], friction=0.4),
@@ -99,21 +98,6 @@ def test_implicit_steps_tend_to_the_explicit_ones(keys, integrator, comm, shared
             apart.append(np.abs(x[integrator] - x["central_differences"]).max() / far)
     if comm.rank == 0:
         assert apart[1] < 0.7 * apart[0] and apart[1] < 0.001
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["plane", "static", "corner", "sphere"])
-def test_turned(name, comm, shared_tmp_path):
-    """The problem turned about is the same one."""
-    turn, x = rotation(5), {}
-    for title, by in (("as it is", None), ("turned", turn)):
-        case = tumbling(WALLS[name], "newmark", {}, end=0.03, solver={"rtol": 1e-13})
-        run = simulation(with_mesh_file(case, shared_tmp_path / f"{title}.vtu", by), comm, shared_tmp_path, title)
-        for _ in run:
-            pass
-        x[title] = run.gather(run.state.position)
-    if comm.rank == 0:
-        assert np.abs(x["turned"] - x["as it is"] @ turn.T).max() < 1e-9 * 0.2
 
 
 @pytest.mark.slow

@@ -4,10 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
-from pfem_petsc.contact import forces as logs
-from pfem_petsc.contact.forces import ContactLog
+from pfem_petsc.contact import node_walls as logs
+from pfem_petsc.contact.node_walls import ContactLog
 
 pytestmark = pytest.mark.parallel
 
@@ -33,16 +32,6 @@ def expected(comm, steps):
     return lengths[i % (comm.size + 1) < comm.size].sum(), lengths[i % 5 == 0].sum()
 
 
-@pytest.mark.parametrize("steps", [0, 3, 40, 41, 167])
-def test_time_on_walls_of_many_steps_without_a_row(comm, monkeypatch, steps):
-    monkeypatch.setattr(logs, "_PENDING", 40)
-    log = booked(ContactLog(7, 2), comm, steps)
-    assert len(log._steps) == len(log._flags) == 40
-    log.meet(comm)
-    # multiples of a quarter: exact in any order
-    np.testing.assert_array_equal(log.time, expected(comm, steps))
-
-
 def test_pending_steps_come_back_from_a_checkpoint(comm, monkeypatch):
     """Also on other numbers of ranks: all have what any has."""
     monkeypatch.setattr(logs, "_PENDING", 40)
@@ -54,12 +43,5 @@ def test_pending_steps_come_back_from_a_checkpoint(comm, monkeypatch):
     assert len(times["steps"]) == 19
     booked(again, comm, 167, start=99).meet(comm)
     assert again.time.tobytes() == whole.time.tobytes()
-
-
-def test_no_walls(comm):
-    log = ContactLog(3, 0)
-    for _ in range(10):
-        log.book(walls([]), 1.0, MPI.COMM_SELF)
-    log.load_state(log.share(), log.times(comm), np.zeros((3, 0), bool))
-    log.meet(comm)
-    assert len(log.time) == 0
+    # multiples of a quarter: exact in any order
+    np.testing.assert_array_equal(whole.time, expected(comm, 167))

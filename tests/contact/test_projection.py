@@ -49,19 +49,6 @@ def test_equals_search_over_all_sets(walls):
         np.testing.assert_allclose(multipliers[0] @ np.where(fixed, 0.0, normals), moved[0] - x, atol=1e-12)
 
 
-def test_clamping_would_be_wrong():
-    """Two planes 30 degrees apart: the nearest point is on both, where clamping one after the other ends elsewhere."""
-    normals = np.array([[0.0, 0.0, 1.0], [0.0, np.sin(0.5), np.cos(0.5)]])
-    x = np.array([[0.0, -0.5, -1.0]])
-    moved, multipliers = x.copy(), np.zeros((1, 2))
-    project(moved, np.zeros((1, 3), dtype=bool), normals[None].copy(), np.zeros((1, 2)), 1e-13, multipliers)
-    clamped = x[0].copy()
-    for normal in normals:
-        clamped -= min(clamped @ normal, 0.0) * normal
-    np.testing.assert_allclose(moved[0], search(x[0], np.zeros(3, bool), normals, np.zeros(2))[1] + x[0], atol=1e-14)
-    assert np.linalg.norm(moved[0] - clamped) > 0.05
-
-
 def test_contradiction_is_told():
     """Opposite walls that overlap leave no room; the first such node is named."""
     normals = np.tile(np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), (2, 1, 1))

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.lattices import lattice_case, planes, rotation, simulation
+from helpers.lattices import lattice_case, planes, simulation
 from helpers.parts import last_rows
-from helpers.turning import with_mesh_file
 
 from pfem_petsc.errors import InputError
 
@@ -108,22 +107,6 @@ def test_energy_does_not_grow(integrator, parameters, restitution, comm, shared_
     assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-10 * energy[0]
     if integrator == "energy_momentum" and restitution == 1.0:
         assert energy[-1] > 0.8 * energy[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["chung_lee", "newmark", "houbolt"])
-def test_turned(integrator, comm, shared_tmp_path):
-    """The problem turned about is the same one, at a sphere as well."""
-    ball = {"type": "sphere", "point": [0.1, 0.05, -0.31], "radius": 0.3}
-    turn, x = rotation(5), {}
-    for title, by in (("as it is", None), ("turned", turn)):
-        case = tumbling(integrator, {}, 0.7, walls=[ball], end=0.04)
-        run = simulation(with_mesh_file(case, shared_tmp_path / f"{title}.vtu", by), comm, shared_tmp_path, title)
-        rows = [step.row for step in run]
-        x[title] = run.gather(run.state.position)
-        assert rows[-1]["wall/wall1/releases"] >= 1
-    if comm.rank == 0:
-        assert np.abs(x["turned"] - x["as it is"] @ turn.T).max() < 1e-9 * 0.2
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from pfem_petsc import Case
 from pfem_petsc.contact.constraints.base import Constraint
 from pfem_petsc.contact.constraints.base import ConstraintKeys as Parameters
 from pfem_petsc.contact.contact import Candidates
-from pfem_petsc.contact.transform import Transform, _pivots
+from pfem_petsc.contact.transform import Transform
 from pfem_petsc.solvers.matrix import HessianMatrix
 from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
 from pfem_petsc.stepping.model import Model
@@ -176,13 +176,3 @@ def test_matrix_adjoint_inverse_and_both_operators(model, comm):
     assembled.destroy()
     free.destroy()
     stepper.destroy()
-
-
-def test_pivots_leave_an_invertible_part():
-    rng = np.random.default_rng(1)
-    matrices = rng.normal(size=(2, 4, 9))
-    matrices[1, 3] = matrices[1, 0] - matrices[1, 1]  # says nothing new
-    rows, columns, count, turns = _pivots(matrices)
-    assert sorted(rows[0]) == [0, 1, 2, 3] and count.tolist() == [4, 3]
-    for k, matrix in enumerate(np.einsum("gpni,gnij->gpnj", matrices.reshape(2, 4, 3, 3), turns).reshape(2, 4, 9)):
-        assert np.linalg.cond(matrix[np.ix_(rows[k, : count[k]], columns[k, : count[k]])]) < 50.0

@@ -48,6 +48,10 @@ class SyntheticCase(SimpleNamespace):
     def every_wall(self):
         return self.wall
 
+    @property
+    def stages(self):
+        return (self,)
+
 
 class SyntheticResult:
     """Interface of :func:`pfem_petsc.open_result` over made-up motion along -``normal`` and back."""

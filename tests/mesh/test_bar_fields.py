@@ -94,36 +94,6 @@ def test_batches_are_single_steps(tmp_path):
         np.testing.assert_array_equal(found[0][column], found[1][column], err_msg=column)
 
 
-@pytest.mark.slow
-@pytest.mark.parallel
-@pytest.mark.parametrize("suffix", ["vtu", "vtkhdf"])
-def test_field_of_a_vtk_file(suffix, shared_tmp_path, comm):
-    import pyvista
-
-    points, bars, areas = octet()
-    if comm.rank == 0:
-        cells = np.column_stack([np.full(len(bars), 2), bars]).ravel()
-        grid = pyvista.UnstructuredGrid(cells, np.full(len(bars), 3, np.uint8), points)
-        grid.cell_data["thickness"] = areas
-        grid.cell_data["direction"] = np.zeros((len(bars), 3))
-        grid.save(shared_tmp_path / f"graded.{suffix}")
-    comm.Barrier()
-    one = {"s": {"area_field": "thickness", "material": "m"}}
-    with Simulation(
-        graded(shared_tmp_path / f"graded.{suffix}", one), comm, output=shared_tmp_path / "o", quiet=True
-    ) as simulation:
-        lengths = np.linalg.norm(points[bars[:, 1]] - points[bars[:, 0]], axis=1)
-        assert simulation.model.total_mass == pytest.approx(DENSITY * areas @ lengths, rel=1e-14)
-    for name in ("width", "direction"):
-        with pytest.raises(InputError, match=f"section.s.area_field = '{name}': .*graded.* it has thickness"):
-            Simulation(
-                graded(shared_tmp_path / f"graded.{suffix}", {"s": {"area_field": name, "material": "m"}}),
-                comm,
-                output=shared_tmp_path / "o",
-                quiet=True,
-            )
-
-
 @pytest.mark.parallel
 def test_pretension_of_bars_with_areas_of_their_own(shared_tmp_path, comm):
     """The force is the same in all bars, the stress is not."""
@@ -190,10 +160,3 @@ def test_refused(section, mesh, text, tmp_path):
     with pytest.raises(InputError, match="section.s") as error:
         Simulation(Case.from_dict(data), output=tmp_path / "out", quiet=True)
     assert text in str(error.value)
-
-
-def test_fields_that_are_not_one_number_for_each_bar(tmp_path):
-    points, bars, areas = octet()
-    for name, values in (("a", areas[1:]), ("a/b", areas), ("c", ["x"] * len(bars))):
-        with pytest.raises(InputError, match=f"bar_fields\\['{name}'\\]"):
-            write_mesh(tmp_path / "mesh.h5", points, bars, bar_fields={name: values})

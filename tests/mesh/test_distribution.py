@@ -115,16 +115,6 @@ def test_ghosts_take_the_owners_values(case, columns):
         np.testing.assert_array_equal(values, wanted + offset)
 
 
-def test_arrays_that_cannot_be_updated_are_refused(case):
-    _, _, mesh = case
-    if mesh.n_neighbours:
-        for wrong in (np.zeros((mesh.n_local + 1, 2)), np.zeros((mesh.n_local, 2), np.float32)):
-            with pytest.raises(ValueError, match="ghosts are updated in"):
-                mesh.update_ghosts(wrong)
-    else:
-        assert mesh.n_local == mesh.n_owned
-
-
 def test_parts_are_balanced(comm, case):
     original, _, mesh = case
     if mesh.partitioner == "coordinates":
@@ -209,25 +199,6 @@ def test_bars_lie_close_to_each_other_in_memory(comm):
     local = distribute(slab, np.zeros(len(slab.bars), np.int32), comm, "coordinates")
     span = np.abs(np.diff(local.bars[(local.bars < local.n_owned).all(axis=1)], axis=1))
     assert span.max() <= (n + 1) ** 2 + (n + 1)
-
-
-def test_widths_of_one_row_arrays_on_one_rank():
-    from mpi4py import MPI
-
-    slab = five_nodes(MPI.COMM_SELF)
-    mesh = distribute(slab, np.full(len(slab.bars), 2, np.int32), MPI.COMM_SELF)
-    (block,) = mesh.blocks
-    assert (block.section, block.start, block.counted, block.stop) == (2, 0, 9, 9)
-    mesh.update_ghosts(mesh.points)
-    assert mesh.n_neighbours == 0
-
-
-def test_values_of_ghosts_can_be_brought_alone(case):
-    _, _, mesh = case
-    exchange = mesh._exchange
-    own = mesh.points[: mesh.n_owned]
-    for _ in range(2):
-        np.testing.assert_array_equal(exchange.bring(own[exchange.rows]), mesh.points[mesh.n_owned :])
 
 
 def test_rows_are_swapped(comm):

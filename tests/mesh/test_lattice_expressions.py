@@ -158,10 +158,11 @@ def test_names_of_fields_are_checked(name):
         generated(fields={name: {"file": "a.vti", "array": "a"}})
 
 
-def test_file_of_a_field_is_relative_to_the_case(tmp_path):
+def test_files_are_relative_to_the_case(tmp_path):
+    """Of fields and of the surface."""
     write_grid(tmp_path / "grid.vti")
     mesh = {"generator": "lattice", "cells": [2, 2, 2], "pitch": 0.1, "bar_fields": {"a": "1e-6*rho"}}
-    mesh["fields"] = {"rho": {"file": "grid.vti", "array": "density"}}
+    mesh |= {"fields": {"rho": {"file": "grid.vti", "array": "density"}}, "surface": {"file": "cube.stl"}}
     case = {
         "mesh": mesh,
         "material": {"m": {"young_modulus": 1e9, "density": 1000.0}},
@@ -170,6 +171,7 @@ def test_file_of_a_field_is_relative_to_the_case(tmp_path):
     }
     read = Case.from_dict(case, folder=tmp_path)
     assert read.mesh.parameters.fields["rho"].file == str((tmp_path / "grid.vti").resolve())
+    assert read.mesh.parameters.surface.file == str((tmp_path / "cube.stl").resolve())
     assert Case.from_toml(read.to_toml()).mesh == read.mesh
 
 

@@ -45,8 +45,8 @@ def test_stl_edges(tmp_path):
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        (STL.replace("vertex 0 0 1", "vertex 0 0"), "line 13: 'vertex 0 0' does not have three numbers"),
-        (STL.replace("vertex 0 0 1", "vertex 0 0 one"), "line 13: 'vertex 0 0 one' does not have three numbers"),
+        (STL.replace("vertex 0 0 1", "vertex 0 0"), "'vertex 0 0', number 6, does not have three numbers"),
+        (STL.replace("vertex 0 0 1", "vertex 0 0 one"), "w.stl: lines 'vertex x y z': "),
         (STL.replace("vertex 0 0 1\n", "\n"), "5 lines 'vertex x y z', not three for each triangle"),
         (STL.replace("0 1 -0.0", "0 nan 0"), "triangle 0 .* has coordinates that are not finite"),
         ("x" * 83, "is not STL"),

@@ -1,13 +1,9 @@
 """Meshes in pairs of tables, as spreadsheets write them."""
 
-import tracemalloc
-
-import numpy as np
 import pytest
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.formats import read_whole, write_whole
-from pfem_petsc.mesh.whole import WholeMesh
+from pfem_petsc.formats import read_whole
 
 
 def test_tables_as_spreadsheets_save_them(tmp_path):
@@ -55,17 +51,3 @@ def test_a_table_without_a_pair(tmp_path):
     (tmp_path / "t.csv").write_text("x,y\n")
     with pytest.raises(InputError, match="is a pair of files, t_nodes.csv and t_bars.csv: name one of them"):
         read_whole(tmp_path / "t.csv")
-
-
-def test_tables_have_their_entries_once_in_memory(tmp_path):
-    """The most memory while a table is read: below 600 bytes a bar, of four columns with short texts."""
-    random = np.random.default_rng(0)
-    n, many = 2000, 10000
-    ends = np.stack([np.arange(many) % n, random.integers(n, 2 * n, many)], axis=1)
-    groups, areas = {"legs": np.arange(many)}, {"area": np.full(many, 1e-4)}
-    write_whole(tmp_path / "m_bars.csv", WholeMesh(random.random((2 * n, 3)), ends, {}, groups, areas))
-    tracemalloc.start()
-    mesh = read_whole(tmp_path / "m_bars.csv")
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert mesh.bars.tolist() == ends.tolist() and peak < 600 * many

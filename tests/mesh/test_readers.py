@@ -74,45 +74,28 @@ def test_vtk(comm, shared_tmp_path, suffix):
     assert list(mesh.node_groups) == ["group_2"]
 
 
-def test_vtk_with_other_cells_between_the_lines(comm, shared_tmp_path):
-    """Vertices and triangles, as other programs add them, are left out, and so are they from the groups of cells."""
+def test_vtk_with_other_cells_and_lines_of_several_points(comm, shared_tmp_path):
+    """A line of n points is n - 1 bars, each with its group and number; vertices and triangles are left out."""
 
     def write(path):
         import pyvista
 
-        cells, kinds, legs = [1, 0], [1], [1]
-        for number, ends in enumerate(BARS):
-            cells, kinds, legs = [*cells, 2, *ends], [*kinds, 3], [*legs, int(number in LEGS)]
-        grid = pyvista.UnstructuredGrid([*cells, 3, 0, 1, 2], np.array([*kinds, 5], np.uint8), POINTS)
-        grid.cell_data["section"] = np.array([*legs, 1], np.int32)
+        cells = [1, 0, 5, 0, 1, 2, 0, 3, 2, 3, 1, 2, 2, 3, 3, 0, 1, 2]
+        grid = pyvista.UnstructuredGrid(cells, np.array([1, 4, 3, 3, 5], np.uint8), POINTS)
+        grid.cell_data["section"] = np.array([1, 0, 1, 1, 1], np.int32)
+        grid.cell_data["area"] = np.array([9.0, 1.0, 2.0, 3.0, 9.0])
         grid.point_data["group"] = np.where(np.isin(np.arange(len(POINTS)), TOP), 2, -1)
         grid.save(path)
 
-    slab = read(written(comm, shared_tmp_path, "mixed.vtu", write), comm)
+    path = written(comm, shared_tmp_path, "mixed.vtu", write)
+    slab = load_slab(SimpleNamespace(generator=None, file=path), comm, {"area": "area_field"})
     (warning,) = slab.warnings
     assert warning.endswith("mixed.vtu: left out 2 cells that are not lines")
-    check_sample(whole(slab, comm), ("group_2",), ("section_1",))
-
-
-def test_vtk_with_lines_of_several_points(comm, shared_tmp_path):
-    """A line of n points is n - 1 bars, each with the group and the numbers of the line."""
-
-    def write(path):
-        import pyvista
-
-        cells = [5, 0, 1, 2, 0, 3, 2, 3, 1, 2, 2, 3]
-        grid = pyvista.UnstructuredGrid(cells, np.array([4, 3, 3], np.uint8), POINTS)
-        grid.cell_data["section"] = np.array([0, 1, 1], np.int32)
-        grid.cell_data["area"] = np.array([1.0, 2.0, 3.0])
-        grid.save(path)
-
-    path = written(comm, shared_tmp_path, "lines.vtu", write)
-    slab = load_slab(SimpleNamespace(generator=None, file=path), comm, {"area": "area_field"})
     mesh = whole(slab, comm)
-    check_sample(mesh, (), ())
+    check_sample(mesh, ("group_2",), ())
     assert sorted(mesh.bar_groups["section_0"].tolist()) == [0, 1, 2, 3]
-    areas = np.concatenate(comm.allgather(slab.bar_fields["area"]))
-    assert areas.tolist() == [1.0, 1.0, 1.0, 1.0, 2.0, 3.0] and slab.warnings == []
+    assert sorted(mesh.bar_groups["section_1"].tolist()) == [4, 5]
+    assert np.concatenate(comm.allgather(slab.bar_fields["area"])).tolist() == [1.0, 1.0, 1.0, 1.0, 2.0, 3.0]
 
 
 def test_hdf5_of_another_writer(comm, shared_tmp_path):

@@ -26,21 +26,6 @@ def small_pieces(monkeypatch):
     monkeypatch.setattr(gmsh, "BYTES", 61)
 
 
-@pytest.fixture
-def reads(monkeypatch):
-    """Numbers of rows that are read from datasets at a time."""
-    rows = []
-    read = h5py.Dataset.__getitem__
-
-    def counted(dataset, key, *more):
-        found = read(dataset, key, *more)
-        rows.append(len(found))
-        return found
-
-    monkeypatch.setattr(h5py.Dataset, "__getitem__", counted)
-    return rows
-
-
 def on_rank_0(comm, path, write):
     """Write a file on rank 0; return its name."""
     if comm.rank == 0:
@@ -71,12 +56,11 @@ def check(slab, mesh, comm):
 
 
 @pytest.mark.parametrize("suffix", ["vtkhdf", "h5", "msh"])
-def test_every_rank_reads_its_share(comm, shared_tmp_path, monkeypatch, reads, suffix):
+def test_every_rank_reads_its_share(comm, shared_tmp_path, monkeypatch, suffix):
     path = shared_tmp_path / f"lattice.{suffix}"
     mesh = lattice_file(comm, path)
     monkeypatch.setattr(vtk, "read", None)
     slab = load_slab(SimpleNamespace(generator=None, file=path), comm, {"area": "area_field"})
-    assert max(reads, default=0) <= 2 * 7 + 1
     check(slab, mesh, comm)
     first, last = slab_range(len(mesh.bars), comm.rank, comm.size)
     np.testing.assert_array_equal(slab.bar_fields["area"], mesh.bar_fields["area"][first:last])
@@ -103,10 +87,9 @@ def test_a_field_that_is_missing_is_named(comm, shared_tmp_path, suffix):
         load_slab(SimpleNamespace(generator=None, file=path), comm, {"thickness": "section.strut.area_field"})
 
 
-def test_members_of_a_group_are_read_once_by_all_ranks_together(comm, shared_tmp_path, reads):
-    """In any order, and several times."""
+def test_members_of_a_group_in_any_order_and_several_times(comm, shared_tmp_path):
     path = shared_tmp_path / "lattice.h5"
-    mesh = lattice_file(comm, path)
+    lattice_file(comm, path)
     members = np.random.default_rng(1).permutation(np.tile(np.arange(0, 100, 3), 2))
 
     def write(path, members=members):
@@ -115,24 +98,12 @@ def test_members_of_a_group_are_read_once_by_all_ranks_together(comm, shared_tmp
             file["bar_groups/third"] = members
 
     on_rank_0(comm, path, write)
-    reads.clear()
     slab = read_slab(path, comm)
     assert np.concatenate(comm.allgather(slab.bar_groups["third"])).tolist() == list(range(0, 100, 3))
-    of_nodes = sum(map(len, mesh.node_groups.values()))
-    assert comm.allreduce(sum(reads)) == len(mesh.points) + len(mesh.bars) + of_nodes + len(members) and max(reads) <= 7
     members[-1] = 10**6  # on the last rank alone
     on_rank_0(comm, path, write)
     with pytest.raises(InputError, match="/bar_groups/third has member 1000000, but numbers go from 0 to"):
         read_slab(path, comm)
-
-
-def test_vtk_reads_plain_files_as_the_ranks_do(comm, shared_tmp_path):
-    path = shared_tmp_path / "lattice.vtkhdf"
-    lattice_file(comm, path)
-    mesh = comm.bcast(vtk.read(path) if comm.rank == 0 else None)
-    slab = vtk.read_on(path, comm)
-    check(slab, mesh, comm)
-    assert list(slab.bar_fields) == list(mesh.bar_fields)
 
 
 def same_as_of_one_rank(comm, path):

@@ -89,6 +89,13 @@ def test_ranks_must_agree(comm):
         (POINTS, BARS * 1.0, {}, "bars has shape (6, 2) and type float64; expected (bars, 2) integers"),
         (POINTS, BARS, {"node_groups": {"a": [4]}}, "node_groups['a'] has member 4, but numbers go from 0 to 3"),
         (POINTS, BARS, {"bar_groups": {"a/b": [1]}}, "bar_groups['a/b']: expected a name without slashes"),
+        ([[0, 0, 0], [1, 0]], BARS, {}, "points has shape"),
+        (POINTS + 1j, BARS, {}, "complex128"),
+        (POINTS, [], {}, "bars has shape (0,)"),
+        (POINTS, BARS, {"node_groups": {"a": [-1]}}, "has member -1"),
+        (POINTS, BARS, {"bar_groups": {"a": [0.0]}}, "bar_groups['a'] has shape (1,) and type float64"),
+        (POINTS, BARS, {"bar_groups": {"a": np.ones(3, bool)}}, "(6,) booleans"),
+        (POINTS, BARS, {"bar_fields": {"c": ["x"] * 6}}, "bar_fields['c']"),
         (POINTS, BARS, {"bar_fields": {"area": [1.0]}}, "bar_fields['area'] has shape (1,)"),
     ],
 )

@@ -12,9 +12,8 @@ from helpers.truss import Truss, options, write
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.output.damage import damages
 from pfem_petsc.output.result import open_result
-from pfem_petsc.output.verify import examine
+from pfem_petsc.output.verify import damages, examine
 from pfem_petsc.output.vtkhdf import ResultWriter
 
 STEPS = 12

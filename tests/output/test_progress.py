@@ -1,4 +1,4 @@
-"""The report of a run: lines, quiet mode, log file, and nothing formatted when nothing is due."""
+"""The report of a run: lines, quiet mode, log file, and the bar."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.output import progress as module
-from pfem_petsc.output.progress import Progress
+from pfem_petsc.output.progress import Progress, Span
 from pfem_petsc.output.units import duration, engineering, unit_of
 
 COMM = MPI.COMM_SELF
@@ -38,7 +37,8 @@ class OtherRank:
 
 def run(steps: int, wall_per_step: float, **options) -> str:
     clock, stream = Clock(), io.StringIO()
-    progress = Progress(COMM, "Rod", options.pop("n_steps", steps), 1e-3 * steps, stream=stream, clock=clock, **options)
+    span = Span(options.pop("n_steps", steps), 1e-3 * steps)
+    progress = Progress(COMM, "Rod", span, stream=stream, clock=clock, **options)
     progress.summary({"nodes": "21", "critical step": "2.0 µs"})
     for step in range(1, steps + 1):
         clock.now += wall_per_step
@@ -83,7 +83,7 @@ def test_intervals_stretch_from_two_to_ten_seconds(tmp_path):
 
 def test_restart_counts_its_own_steps():
     clock, stream = Clock(), io.StringIO()
-    progress = Progress(COMM, "Rod", 100, 1.0, stream=stream, clock=clock, start_step=50, start_time=0.5)
+    progress = Progress(COMM, "Rod", Span(100, 1.0, first_step=50, start=0.5), stream=stream, clock=clock)
     for step in range(51, 101):
         clock.now += 0.125
         progress.update(step, 0.01 * step, 0.01)
@@ -95,7 +95,7 @@ def test_restart_counts_its_own_steps():
 def test_first_step_and_compiling_are_no_measure_of_what_remains():
     """Twenty seconds for the first step, and eight in a later one: the others take an eighth of a second."""
     clock, stream = Clock(), io.StringIO()
-    progress = Progress(COMM, "Rod", 100, 1.0, stream=stream, clock=clock)
+    progress = Progress(COMM, "Rod", Span(100, 1.0), stream=stream, clock=clock)
     for step in range(1, 101):
         clock.now += 0.125
         if step == 1:
@@ -125,9 +125,10 @@ def test_quiet_writes_the_log_only(tmp_path, capsys):
 def test_log_has_date_and_level_and_is_continued(tmp_path, capsys):
     log = tmp_path / "log.txt"
     for _ in range(2):
-        with Progress(COMM, "Rod", 1, 1.0, log_path=log, stream=io.StringIO()) as progress:
-            progress.message("checkpoint written")
-            progress.warning("node 3 is fast")
+        progress = Progress(COMM, "Rod", Span(1, 1.0), log_path=log, stream=io.StringIO())
+        progress.message("checkpoint written")
+        progress.warning("node 3 is fast")
+        progress.close()
     lines = log.read_text().splitlines()
     assert sum("done" in line for line in lines) == 2
     date, time, level, *text = lines[1].split()
@@ -137,31 +138,23 @@ def test_log_has_date_and_level_and_is_continued(tmp_path, capsys):
     assert captured.out == "" and captured.err.count("warning: node 3 is fast") == 2
 
 
-def test_failure_is_not_called_done():
-    stream = io.StringIO()
-    with pytest.raises(ValueError, match="boom"), Progress(COMM, "Rod", 5, 1.0, stream=stream):
-        raise ValueError("boom")
-    assert "stopped: 0 steps" in stream.getvalue() and "done" not in stream.getvalue()
-
-
-def test_nothing_is_formatted_when_nothing_is_due(monkeypatch):
-    calls = []
-    original = module.Axis.place
-    monkeypatch.setattr(module.Axis, "place", lambda *a: calls.append(a) or original(*a))
+def test_nothing_is_said_when_nothing_is_due():
     clock, stream = Clock(), io.StringIO()
-    progress = Progress(COMM, "Rod", 10**6, 1.0, stream=stream, clock=clock)
+    progress = Progress(COMM, "Rod", Span(10**6, 1.0), stream=stream, clock=clock)
     for step in range(1, 10001):
         progress.update(step, 1e-6 * step, 1e-6, 1, 10, 0, 0.0)
-    assert calls == [] and stream.getvalue() == ""
+    assert stream.getvalue() == ""
     clock.now += 2.0
     progress.update(10001, 0.010001, 1e-6, 1, 10, 0, 0.0)
-    assert len(calls) >= 2 and stream.getvalue().count("\n") == 1
+    assert stream.getvalue().count("\n") == 1
     assert "Newton 1.0/step" in stream.getvalue()  # the silent steps are counted
+    progress.close("stopped")
+    assert "stopped: 10,001 steps" in stream.getvalue() and "done" not in stream.getvalue()
 
 
 def test_other_ranks_say_nothing(tmp_path, capsys):
     stream, clock = io.StringIO(), Clock()
-    progress = Progress(OtherRank(), "Rod", 10, 1.0, stream=stream, clock=clock, log_path=tmp_path / "log.txt")
+    progress = Progress(OtherRank(), "Rod", Span(10, 1.0), stream=stream, clock=clock, log_path=tmp_path / "log.txt")
     progress.summary({"nodes": "21"})
     clock.now += 60
     progress.update(1, 0.1, 0.1)
@@ -176,13 +169,13 @@ def test_other_ranks_say_nothing(tmp_path, capsys):
 def test_unwritable_log_is_refused_on_all_ranks(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"log\.txt.*choose another output folder"):
-        Progress(MPI.COMM_WORLD, "Rod", 10, 1.0, log_path=tmp_path / "file" / "log.txt", stream=io.StringIO())
+        Progress(MPI.COMM_WORLD, "Rod", Span(10, 1.0), log_path=tmp_path / "file" / "log.txt", stream=io.StringIO())
 
 
 def test_lost_log_is_said_once_and_the_run_goes_on(tmp_path, capsys):
     folder = tmp_path / "results"
     stream = io.StringIO()
-    progress = Progress(COMM, "Rod", 10, 1.0, log_path=folder / "log.txt", stream=stream)
+    progress = Progress(COMM, "Rod", Span(10, 1.0), log_path=folder / "log.txt", stream=stream)
     shutil.rmtree(folder)
     progress.message("one")
     progress.message("two")
@@ -194,7 +187,7 @@ def test_lost_log_is_said_once_and_the_run_goes_on(tmp_path, capsys):
 
 def test_removed_log_is_begun_again(tmp_path):
     log = tmp_path / "log.txt"
-    progress = Progress(COMM, "Rod", 10, 1.0, log_path=log, stream=io.StringIO())
+    progress = Progress(COMM, "Rod", Span(10, 1.0), log_path=log, stream=io.StringIO())
     log.unlink()
     progress.message("still here")
     assert "still here" in log.read_text()
@@ -207,7 +200,7 @@ class Gone(io.StringIO):
 
 def test_reader_of_stdout_that_leaves_does_not_stop_the_run(tmp_path):
     log = tmp_path / "log.txt"
-    progress = Progress(COMM, "Rod", 10, 1.0, log_path=log, stream=Gone())
+    progress = Progress(COMM, "Rod", Span(10, 1.0), log_path=log, stream=Gone())
     progress.message("one")
     progress.message("two")
     progress.close()
@@ -231,11 +224,12 @@ def test_bar_on_a_terminal_and_lines_under_a_launcher(monkeypatch):
 
 def _drawn_by_bar() -> bool:
     stream, clock = Terminal(), Clock()
-    with Progress(COMM, "Rod", 10, 1.0, stream=stream, clock=clock) as progress:
-        for step in range(1, 11):
-            clock.now += 0.2
-            progress.update(step, 0.1 * step, 0.1, contacts=4)
-        progress.message("[brackets] stay")
+    progress = Progress(COMM, "Rod", Span(10, 1.0), stream=stream, clock=clock)
+    for step in range(1, 11):
+        clock.now += 0.2
+        progress.update(step, 0.1 * step, 0.1, contacts=4)
+    progress.message("[brackets] stay")
+    progress.close()
     text = stream.getvalue()
     assert "[brackets] stay" in text and "done: 10 steps" in text
     return "5/10  t = 500.0 ms  contacts 4" in text

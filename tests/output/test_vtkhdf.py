@@ -1,5 +1,8 @@
 """The result file: values, structure, and reading by VTK and ``open_result``, the same for any number of ranks."""
 
+import re
+from pathlib import Path
+
 import h5py
 import numpy as np
 import pytest
@@ -9,11 +12,13 @@ from helpers.truss import Truss, options, write
 from mpi4py import MPI
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
+from pfem_petsc.columns import DECLARED, OF_MODES
 from pfem_petsc.errors import InputError
 from pfem_petsc.output import hdf5 as growing
-from pfem_petsc.output.damage import damages
 from pfem_petsc.output.layout import complete_snapshots
 from pfem_petsc.output.result import open_result
+from pfem_petsc.output.units import unit_of
+from pfem_petsc.output.verify import damages
 from pfem_petsc.output.vtkhdf import ResultWriter
 
 WRITTEN = [0, 5, 10, 15, 20]
@@ -259,3 +264,14 @@ def test_attributes_of_any_length_come_back(shared_tmp_path):
         if COMM.rank == 0:
             found = open_result(path).attributes
             assert {name: found[name] for name in given} == changed
+
+
+def test_documented_columns_have_the_units_of_the_declaration():
+    """Those of docs/python.md; energies are in docs/contact.md."""
+    pages = Path(__file__).parents[2] / "docs"
+    rows = re.findall(r"^\| (`[^|]*`) \| ([^|]*)\| ", (pages / "python.md").read_text(), re.MULTILINE)
+    told = {name: unit.strip() for names, unit in rows for name in re.findall("`([^`]+)`", names)}
+    assert {name: unit_of(name) for name in told} == told
+    named = {name.rsplit("/")[-1] for name in told}
+    energies = set(re.findall("`([a-z_]+)`", (pages / "contact.md").read_text()))
+    assert set(DECLARED) - {one.name for one in OF_MODES} <= named | energies

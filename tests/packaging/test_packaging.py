@@ -80,11 +80,6 @@ def test_other_ends_of_a_job(queue, variables, status, queued, text):
     assert text in done.stderr
 
 
-def test_a_job_without_a_case_is_refused(queue):
-    done, _ = queue("rod_impact")
-    assert done.returncode == 2 and "usage: sbatch" in done.stderr
-
-
 def test_conda_environment_has_every_dependency():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = {re.match(r"[\w-]+", text)[0].lower() for text in project["dependencies"]}

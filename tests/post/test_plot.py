@@ -12,9 +12,8 @@ from helpers.synthetic import SyntheticResult, ring, write_result
 from PIL import Image
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.columns import LOST, STORED, SUPPLIED
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.chart import COLOURS, Chart, Curve, Panel
+from pfem_petsc.post.chart import Chart, Curve, Panel
 from pfem_petsc.post.plot import balance_error, plot
 
 
@@ -45,29 +44,6 @@ def test_what_a_result_lacks_is_left_out(tmp_path, result):
     result.history = {name: values for name, values in result.history.items() if "/" not in name}
     names = [path.name for path in plot(result, tmp_path / "pictures", formats=["csv"])]
     assert names == ["energies.csv", "momentum.csv", "solver.csv"]
-
-
-@pytest.mark.slow
-def test_many_terms_that_are_zero_leave_the_width_to_the_curves(tmp_path, result):
-    def size(picture):
-        """Columns between the first and the last that have a curve, and columns of the picture."""
-        pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
-        coloured = np.flatnonzero((np.ptp(pixels, axis=2) > 60).sum(axis=0))
-        return np.ptp(coloured), pixels.shape[1]
-
-    zero = 0.0 * result.history["kinetic_energy"]
-    result.history |= {name: zero for name in (*STORED, *LOST, *SUPPLIED) if name not in result.history}
-    curves, picture = size(plot(result, tmp_path)[0])
-    assert curves > 0.6 * picture
-
-
-@pytest.mark.slow
-def test_contact_has_no_panel_without_walls(tmp_path, result):
-    result.history = {name: values for name, values in result.history.items() if "/" not in name}
-    with_contact = Image.open(plot(result, tmp_path)[-1]).height
-    result.history["active_contacts"] = 0 * result.history["active_contacts"]
-    without = plot(result, tmp_path)[-1]
-    assert without.name == "solver.png" and Image.open(without).height < with_contact
 
 
 def test_a_picture_is_not_a_panel_of_another(tmp_path, result):
@@ -132,12 +108,6 @@ def test_characters_that_the_font_lacks_are_boxes_without_a_warning(tmp_path, re
     assert not [str(warning.message) for warning in recwarn if "Glyph" in str(warning.message)]
 
 
-@pytest.mark.slow
-def test_titles_are_no_formulas(tmp_path, result):
-    result.case.title = r"a force of $\frac{1}$ N"
-    assert len(plot(result, tmp_path)) == 6
-
-
 def test_stored_and_lost_energies_fill_what_was_supplied(tmp_path, result):
     """The picture's table has the sums that its areas and its line show."""
     result.history["external_work"] = np.linspace(0.0, 7.0, len(result.history["time"]))
@@ -174,20 +144,6 @@ def test_options_that_do_not_work_are_refused(tmp_path, result, options, message
     with pytest.raises(InputError, match=message):
         plot(result, tmp_path, **options)
     assert not list(tmp_path.glob("*.png")) or "force_filter" in options
-
-
-def test_colours_are_told_apart_by_colour_blind_eyes():
-    """Distances of the first six colours as seen without red or green cones (Viénot, Brettel and Mollon 1999)."""
-    from matplotlib.colors import to_rgb
-
-    rgb = np.array([to_rgb(colour) for colour in COLOURS[:6]])
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    protan = np.array([[0.11238, 0.88762, 0.0], [0.11238, 0.88762, 0.0], [0.00401, -0.00401, 1.0]])
-    deutan = np.array([[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]])
-    for seen in (linear, linear @ protan.T, linear @ deutan.T):
-        seen = np.clip(seen, 0.0, 1.0) ** (1 / 2.4)
-        apart = np.linalg.norm(seen[:, None] - seen[None], axis=2)
-        assert apart[~np.eye(6, dtype=bool)].min() > 0.1
 
 
 @pytest.mark.slow
@@ -238,13 +194,6 @@ def test_what_does_not_change_is_named_instead_of_drawn(tmp_path, result):
     # where nothing changes, everything is drawn
     result.history = {name: values if name == "time" else 0 * values for name, values in result.history.items()}
     assert "hinge" in drawn("probes")[0]
-
-
-def test_balance_error_has_one_scale(tmp_path, result):
-    """It is a share: neither a prefix nor joules beside a power of ten."""
-    result.history["kinetic_energy"] = result.history["kinetic_energy"] + 1e-13 * np.sin(result.history["time"])
-    text = texts(plot(result, tmp_path, formats=["svg"])[0])
-    assert "share of largest" in text and not re.search(r"\[[pn]J\]", text)
 
 
 def test_rows_that_are_not_finite_leave_the_others(tmp_path, result):

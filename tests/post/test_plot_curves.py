@@ -22,12 +22,6 @@ def result(tmp_path):
     return SyntheticResult(tmp_path / "result.vtkhdf", *ring())
 
 
-def test_named_curves(tmp_path, result):
-    written = plot(result, tmp_path, curves=["kinetic_energy", "momentum", "probe/tip/velocity", "wall/wall/contacts"])
-    assert [path.name for path in written] == ["curves.png"] and len(saturated(written[0])) > 500
-    assert not (tmp_path / "energies.png").exists()
-
-
 def test_unknown_curve_is_refused_with_the_nearest(tmp_path, result):
     with pytest.raises(InputError, match=r"no column 'kinetic_enrgy', did you mean 'kinetic_energy'\?"):
         plot(result, tmp_path, curves=["kinetic_enrgy"])
@@ -60,12 +54,6 @@ def test_window_mean_keeps_the_impulse_of_uneven_steps():
     inner = slice(50, 350)
     # of the time before each point
     assert window_mean(time, line, 0.03)[inner] == pytest.approx(line[inner] - 3.0 * 0.015, rel=1e-9, abs=1e-12)
-
-
-def test_window_mean_does_not_rise_before_its_cause():
-    time = np.linspace(0.0, 1.0, 101)
-    values = np.where(time > 0.5, 1.0, 0.0)
-    assert not window_mean(time, values, 0.1)[time <= 0.5].any()
 
 
 def test_curves_of_an_earlier_call_stay(tmp_path, result):

@@ -10,14 +10,14 @@ from types import SimpleNamespace
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from helpers.synthetic import AT_REST, WALL, SyntheticResult, lattice, ring, rod, write_result
+from helpers.synthetic import WALL, SyntheticResult, lattice, ring, rod, write_result
 from PIL import Image
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.contact.walls.plane import Parameters
 from pfem_petsc.errors import InputError
 from pfem_petsc.post import scene
-from pfem_petsc.post.motion import walls_present
+from pfem_petsc.post.motion import walls_at
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.render import render, render_modes
 
@@ -137,21 +137,13 @@ def test_walls_are_drawn_in_the_stages_that_have_them(tmp_path):
     with Simulation(Case.from_dict(data), output=tmp_path / "result", quiet=True) as simulation:
         simulation.run()
     result = open_result(tmp_path / "result")
-    assert walls_present(result, result.times).ravel().tolist() == [True] * 3 + [False] * 2
+    assert walls_at(result, result.times)[1].ravel().tolist() == [True] * 3 + [False] * 2
     files = render(tmp_path / "result", tmp_path / "frames", size=SMALL, video="none", poster=False, note=silent)
     inks = [len(inked(drawing(file))[0]) for file in files]
     assert min(inks[:3]) > 1.5 * max(inks[3:])
     quiet = {"size": SMALL, "video": "none", "poster": False, "note": silent}
     (mode, *_) = render_modes(tmp_path / "result", tmp_path / "modes", period=4, **quiet)
     assert len(inked(drawing(mode))[0]) < 1.5 * max(inks[3:])
-
-
-def test_unknown_wall_is_left_out_with_a_note(tmp_path):
-    notes = []
-    result = SyntheticResult(tmp_path / "x", *ring())
-    result.case.wall = [SimpleNamespace(type="pyramid", name="tomb", **AT_REST)]
-    draw(tmp_path, result, frames=[0], note=notes.append)
-    assert notes == ["wall 'tomb' is left out of the picture: type 'pyramid' has no drawing"]
 
 
 def test_camera_stays_and_the_structure_moves(tmp_path):
@@ -189,13 +181,6 @@ def test_other_shapes_fill_the_picture(tmp_path, structure):
     assert max(np.ptp(rows) / 217, np.ptp(columns) / 416) > 0.6
 
 
-def test_many_bars_are_drawn_as_lines(tmp_path):
-    result = SyntheticResult(tmp_path / "x", *lattice(11))
-    assert result.n_bars > 5000
-    picture = drawing(draw(tmp_path, result, frames=[6], field="velocity")[0])
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -215,12 +200,6 @@ def test_many_bars_are_drawn_as_lines(tmp_path):
 def test_refused_options(tmp_path, options, message):
     with pytest.raises(InputError, match=message):
         draw(tmp_path, **options)
-
-
-def test_folder_that_cannot_be_made_is_refused(tmp_path):
-    (tmp_path / "out").write_text("")
-    with pytest.raises(InputError, match="cannot be written here"):
-        draw(tmp_path, frames=[0])
 
 
 def test_crash_of_the_graphics_is_foreseen(monkeypatch):
@@ -262,8 +241,3 @@ def test_a_window_of_another_kind_than_asked_for_does_not_count(tmp_path, monkey
     assert scene._works("vtkOSOpenGLRenderWindow")
     scene.require_rendering.__wrapped__()
     assert os.environ[scene.VARIABLE] == "vtkOSOpenGLRenderWindow"
-
-
-def test_title_with_characters_that_the_font_lacks(tmp_path, recwarn):
-    draw(tmp_path, SyntheticResult(tmp_path / "result.vtkhdf", *ring(), title="壁"), frames=[0])
-    assert not [str(warning.message) for warning in recwarn if "Glyph" in str(warning.message)]

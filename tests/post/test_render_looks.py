@@ -11,7 +11,6 @@ from helpers.frames import box, camera_of, draw, drawing, near, picture_of, pixe
 from helpers.synthetic import SyntheticResult, lattice, ring
 
 from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.cli.main import main
 from pfem_petsc.cli.render import _frames
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.colours import GHOST, MARKS, TRAILS
@@ -76,14 +75,6 @@ def test_stout_bars_are_drawn_thinner_with_a_remark(flying):
     length = np.linalg.norm(start[flying.bars[:, 1]] - start[flying.bars[:, 0]], axis=1)
     assert drawn_radii(flying, said.append) == pytest.approx(0.2 * length)
     assert f"{flying.n_bars} of {flying.n_bars} bars" in said[0] and "(10 m at most)" in said[0]
-
-
-def test_radii_without_the_mesh(flying):
-    """The only area is that of all bars; which of several a bar has is not known."""
-    section = without_mesh(flying, math.pi * 0.01)
-    assert radii_of(flying) == pytest.approx(np.full(flying.n_bars, 0.1))
-    flying.case.section = {"one": section, "two": section}
-    assert radii_of(flying) is None
 
 
 CUBE = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
@@ -243,22 +234,3 @@ def test_frames_by_number_and_by_index(words, chosen):
     """A single frame is the last one: at the first, a structure looks like its mesh."""
     assert chosen_frames(_frames(words), np.arange(12.0), print) == chosen
     assert chosen_frames(1, np.arange(12.0), print, span=(2.0, 5.5)) == [5]
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["--frames", "0"], "frames = 0 must be positive"),
-        (["--frames", "3,,"], "neither a number of frames nor a list"),
-        (["--view", "1,a,0"], "not a direction"),
-        (["--size", "5k"], "720p, 1080p, 4k"),
-        (["--html", "--window"], "one of the two"),
-        (["--html", "--frames", "1,2"], "number of one snapshot"),
-        (["--modes", "--rate", "10"], "--rate"),
-        (["--path", "is/not/there.csv"], "cannot be read"),
-        (["--", "-log_view"], "no PETSc options"),
-    ],
-)
-def test_refused_words(bars_of_sections, words, text, capsys):
-    assert main(["render", str(bars_of_sections), *words]) == 2
-    assert text in capsys.readouterr().err

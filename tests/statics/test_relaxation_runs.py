@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.cables import chain, heavy_cable, run
-from helpers.kills import differences
-from helpers.stopped import everywhere
 from mpi4py import MPI
 
-from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc import Case, open_result
 from pfem_petsc.errors import InputError, SimulationFailure
 
 pytestmark = pytest.mark.parallel
@@ -18,21 +16,6 @@ INCREMENTS = [
     *("static.step=0.25", "mesh.cells=[4, 4]", "output.checkpoint_every=1", "output.fields_every=1"),
 ]
 FLOOR = "wall=[{name='floor', type='plane', point=[0.0, 0.0, -2.3], normal=[0.0, 0.0, 1.0]}]"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("newton", [True, False])
-def test_restart_between_increments_is_bitwise(comm, shared_tmp_path, newton):
-    keys = [FLOOR, "material.rope.young_modulus=1e7", f"static.newton={str(newton).lower()}"]
-    if newton and comm.size > 1:
-        return  # a factorisation by MUMPS on several ranks is not the same to the last bit from run to run
-    folders = shared_tmp_path / "whole", shared_tmp_path / "stopped"
-    for folder in folders:
-        for end, restart in ((0.5, False), (1.0, True)) if folder == folders[1] else ((1.0, False),):
-            case = Case.load("hanging_net", [*INCREMENTS, *keys, f"static.end={end}"])
-            with Simulation(case, comm, output=folder, quiet=True, restart=restart) as simulation:
-                assert simulation.run() == 0
-    assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}
 
 
 @pytest.mark.parametrize("newton", [True, False])

@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import time
-import types
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from pfem_petsc.mechanics.compiled import Compilation
 from pfem_petsc.output.table import Table
 from pfem_petsc.solvers import matrix_free as outlive
 from pfem_petsc.studies import pool
-from pfem_petsc.studies.pool import Report, Task
+from pfem_petsc.studies.pool import Task
 
 
 @pytest.fixture(scope="module")
@@ -150,12 +149,6 @@ def wait_for(condition, seconds=60.0):
         time.sleep(0.05)
 
 
-def test_worker_reports_what_it_does_not_know(tmp_path):
-    report = pool.perform(Task(3, tmp_path, None))
-    assert isinstance(report, Report) and report.status == 2
-    assert report.message.startswith("Simulation: expected a Case, got 3")
-
-
 def test_environment_is_not_that_of_a_rank(monkeypatch):
     monkeypatch.setenv("OMPI_COMM_WORLD_RANK", "3")
     monkeypatch.setenv("PMIX_RANK", "3")
@@ -260,14 +253,3 @@ def test_loops_over_runs_keep_nothing_and_compile_nothing(tmp_path, integrator):
     assert compiled == []
     assert after[1:] == before[1:]
     assert after[0] - before[0] < 64  # less than four for each run: there was one for each atexit function
-
-
-def test_pandas_is_not_needed(monkeypatch):
-    table = Table({"a": [1, 2]})
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(InputError, match="to_pandas needs pandas"):
-        table.to_pandas()
-    pandas = types.ModuleType("pandas")
-    pandas.DataFrame = dict
-    monkeypatch.setitem(sys.modules, "pandas", pandas)
-    assert table.to_pandas()["a"].tolist() == [1, 2]

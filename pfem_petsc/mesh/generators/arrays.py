@@ -14,7 +14,7 @@ from ...errors import InputError
 from ...parallel.agreement import agreed
 from ..slab import MeshSlab, check_size, slab_of_whole
 from ..truss import Truss
-from ..whole import WholeMesh, missing_field, scattered
+from ..whole import WholeMesh, check_fields, scattered
 
 
 class Parameters(StrictModel):
@@ -92,9 +92,7 @@ def generate_on(
         )
     with agreed(comm):
         if comm.rank == 0:
-            missing = missing_field("mesh", fields, list(truss.bar_fields))
-            if missing is not None:
-                raise InputError(missing)
+            check_fields("mesh", fields, truss.bar_fields)
     check_size(truss.n_nodes, "mesh")
     if not all(whole for _, whole in found):
         whole = None

@@ -24,11 +24,11 @@ class Part:
     Raises
     ------
     InputError
-        If the mesh is too large; it names ``key``.
+        If the mesh is too large; ``where`` names the key.
     """
 
-    def __init__(self, n_nodes: int, n_bars: int, rank: int, size: int, key: str) -> None:
-        check_size(n_nodes, f"mesh.{key}", n_bars)
+    def __init__(self, n_nodes: int, n_bars: int, rank: int, size: int, where: str = "mesh") -> None:
+        check_size(n_nodes, where, n_bars)
         self.n_nodes, self.n_bars = n_nodes, n_bars
         self.nodes = np.arange(*slab_range(n_nodes, rank, size))
         self.bars = np.arange(*slab_range(n_bars, rank, size))

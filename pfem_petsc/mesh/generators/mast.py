@@ -41,7 +41,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     guys, inner = 3 * p.levels, p.elements - 1
     mast_nodes, mast_bars = 3 * (n + 1), 9 * n + 3
     n_nodes, n_bars = mast_nodes + 3 + guys * inner, mast_bars + guys * p.elements
-    part = Part(n_nodes, n_bars, rank, size, "bays")
+    part = Part(n_nodes, n_bars, rank, size, "mesh.bays")
     numbers = part.nodes
 
     def place(nodes: np.ndarray) -> np.ndarray:

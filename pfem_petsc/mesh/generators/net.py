@@ -30,7 +30,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     nx, ny = parameters.cells
     across, along = nx + 1, nx * (ny + 1)
     n_nodes, n_bars = across * (ny + 1), along + across * ny
-    part = Part(n_nodes, n_bars, rank, size, "cells")
+    part = Part(n_nodes, n_bars, rank, size, "mesh.cells")
     numbers, bars = part.nodes, part.bars
     j, i = np.divmod(numbers, across)
     points = np.zeros((len(numbers), 3))

@@ -36,7 +36,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     """
     n = parameters.sides
     twist = 90.0 + 180.0 / n if parameters.twist is None else parameters.twist
-    part = Part(2 * n, 4 * n, rank, size, "sides")
+    part = Part(2 * n, 4 * n, rank, size, "mesh.sides")
     top, corner = np.divmod(part.nodes, n)
     angles = np.deg2rad(360.0 * corner / n - 180.0 / n - 90.0 + twist * top)
     points = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1) * parameters.radius

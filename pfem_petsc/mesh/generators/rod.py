@@ -24,7 +24,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     Node groups ``start`` and ``end``; bar group ``rod`` (all).
     """
     n = parameters.elements
-    part = Part(n + 1, n, rank, size, "elements")
+    part = Part(n + 1, n, rank, size, "mesh.elements")
     points = np.zeros((len(part.nodes), 3))
     points[:, 0] = parameters.length * part.nodes / n
     ends = {"start": part.nodes == 0, "end": part.nodes == n}

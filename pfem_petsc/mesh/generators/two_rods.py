@@ -26,7 +26,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     Node groups ``start``, ``first_end``, ``second_start``, ``end``; bar groups ``first`` and ``second``.
     """
     n = parameters.elements
-    part = Part(2 * (n + 1), 2 * n, rank, size, "elements")
+    part = Part(2 * (n + 1), 2 * n, rank, size, "mesh.elements")
     rod, place = np.divmod(part.nodes, n + 1)
     points = np.zeros((len(part.nodes), 3))
     points[:, 0] = parameters.length * place / n + rod * (parameters.length + parameters.gap)

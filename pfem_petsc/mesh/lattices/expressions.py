@@ -193,10 +193,8 @@ class MeshField:
 
         path, array, where = self._path, self._array, f"{self._key}.file: {self._path}"
         try:
-            with open(readable_whole(path), "rb"):
-                pass
             with warnings.catch_warnings(record=True):  # a file that cannot be read has no cells, which is told below
-                mesh = pyvista.read(path)
+                mesh = pyvista.read(readable_whole(path))
         except OSError as error:
             raise InputError(f"{where}: cannot open: {error.strerror or error}") from None
         except (ValueError, RuntimeError) as error:

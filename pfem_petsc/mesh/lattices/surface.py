@@ -54,14 +54,6 @@ class Surface:
         return pyvista.PolyData.from_regular_faces(self.points, self.triangles)
 
     @cached_property
-    def _distance(self) -> Any:
-        from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
-
-        function = vtkImplicitPolyDataDistance()
-        function.SetInput(self._data)
-        return function
-
-    @cached_property
     def _locator(self) -> Any:
         from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
@@ -72,14 +64,11 @@ class Surface:
 
     def distances(self, points: np.ndarray) -> np.ndarray:
         """Return the signed distances (n,) [m] of points (n, 3) from the surface: negative inside."""
-        from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-        from vtkmodules.vtkCommonCore import vtkDoubleArray
+        import pyvista
 
-        found = vtkDoubleArray()
         if len(points) == 0:
             return np.empty(0)
-        self._distance.FunctionValue(numpy_to_vtk(np.ascontiguousarray(points)), found)
-        return vtk_to_numpy(found).copy()
+        return np.array(pyvista.PolyData(points).compute_implicit_distance(self._data)["implicit_distance"])
 
     def rough_distances(self, points: np.ndarray, spacing: float) -> np.ndarray:
         """Return signed distances (n,) [m] that are exact near the surface, and elsewhere too small, never too large.

@@ -1,4 +1,4 @@
-"""Paths continued from checkpoints: the same to the last bit, events and branches included."""
+"""Static analyses continued from checkpoints: the same to the last bit, events and branches included."""
 
 import h5py
 import numpy as np
@@ -7,23 +7,44 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
 
-DOME = [
-    "static.branch_at=[2]",
-    "static.step=0.05",
-    "static.max_points=17",
-    "output.fields_every=7",
-    "output.checkpoint_every=1",
-]
+DOME = "static.branch_at=[2]", "static.step=0.05", "static.max_points=17", "output.checkpoint_every=1"
+NET = "mesh.cells=[4, 4]", "static.step=0.25", "material.rope.young_modulus=1e7", "output.checkpoint_every=1"
+FLOOR = {"name": "floor", "type": "plane", "point": [0.0, 0.0, -2.3], "normal": [0.0, 0.0, 1.0]}
+SLIDERS = {
+    "mesh": {"generator": "rod", "length": 3.0, "elements": 3},
+    "node_set": {"all": {"all": True}, "sliders": {"indices": [0, 1, 2]}, "hand": {"indices": [3]}},
+    "material": {"rope": {"young_modulus": 1e8, "density": 1000.0}},
+    "section": {"all": {"area": 1e-4, "material": "rope"}},
+    "support": [
+        {"node_set": "all", "fix": "y"},
+        {"node_set": "hand", "fix": "xz", "interpolation": "linear"}
+        | {"motion": [[0.0, 0, 0, 0], [0.25, 0.004, 0, 0], [0.75, -0.003, 0, 0], [1.0, 0.001, 0, 0]]},
+    ],
+    "load": [{"node_set": "sliders", "force": [0.0, 0.0, -15.0], "table": [[0.0, 1.0], [1.0, 1.0]]}],
+    "wall": [FLOOR | {"point": [0.0, 0.0, 0.0], "node_set": "sliders", "friction": 0.4}],
+    "static": {"step": 0.05},
+    "solver": {"linear": "cg", "rtol": 1e-12},  # MUMPS on several ranks repeats to rounding alone
+    "output": {"fields_every": 3, "checkpoint_every": 7},
+}
+STOPPED = {"increments": 4, "slip": 10, "relaxation": 2, "relaxation alone": 2, "branch": 12, "at the branch": 13}
+"""The step at which each is stopped."""
 
 
 def case_of(name):
-    overrides = DOME if name == "dome_16" else ["output.checkpoint_every=5"]
-    if name == "von_mises by displacement":
-        data = Case.load("von_mises").to_dict()
+    if name == "slip":
+        return Case.from_dict(SLIDERS)
+    if name.startswith("relaxation"):
+        newton = f"static.newton={str(name == 'relaxation').lower()}"
+        return Case.from_dict(Case.load("hanging_net", [*NET, newton]).to_dict() | {"wall": [FLOOR]})
+    if name.endswith("branch"):
+        return Case.load("dome_16", [*DOME, "output.fields_every=7"])
+    data = Case.load("von_mises", ["output.checkpoint_every=3"]).to_dict()
+    if name == "increments":
+        data |= {"static": {"step": 0.03, "max_step": 0.1, "end": 0.3}, "solver": {"linear": "cg"}}
+    else:
         del data["static"]["constraint"]
         data["static"]["method"] = "displacement"
-        return Case.from_dict(data, name="von_mises", overrides=overrides)
-    return Case.load(name, overrides)
+    return Case.from_dict(data)
 
 
 def contents(path):
@@ -45,20 +66,24 @@ def run_until(case, comm, folder, step):
 
 @pytest.mark.slow
 @pytest.mark.parallel
-@pytest.mark.parametrize(("name", "at"), [("dome_16", 12), ("dome_16", 13), ("von_mises by displacement", 9)])
-def test_restart_is_bitwise(name, at, tmp_path):
-    """In the middle of a path, before and at the point where it leaves for a branch, with events before and after."""
-    comm = MPI.COMM_WORLD
-    folder, case = comm.bcast(tmp_path), case_of(name)
+@pytest.mark.parametrize(("name", "at"), [*STOPPED.items(), ("displacement", 9)])
+def test_restart_is_bitwise(name, at, comm, shared_tmp_path):
+    """In the middle of increments, of slip, of a path before and at the point where it leaves for a branch."""
+    folder, case = shared_tmp_path, case_of(name)
     Simulation(case, comm, output=folder / "whole", quiet=True).run()
     run_until(case, comm, folder / "parts", at)
     Simulation(case, comm, output=folder / "parts", restart=True, quiet=True).run()
     if comm.rank == 0:
         whole, parts = contents(folder / "whole"), contents(folder / "parts")
-        assert whole.keys() == parts.keys()
+        assert whole.keys() == parts.keys() and whole["history/step"][-1] > at
         for column, values in whole.items():
-            np.testing.assert_array_equal(parts[column], values, err_msg=column)
-        assert len(whole["event/kind"]) >= 2
+            # ranks may get other nodes in the next run of a process: sums have another order
+            exact = comm.size == 1 or name in ("branch", "at the branch", "displacement")
+            if exact or values.dtype.kind not in "f":
+                assert not exact or np.array_equal(parts[column], values), column
+            else:
+                atol = 1e-9 * max(np.abs(values).max(initial=0.0), 1e-3)
+                np.testing.assert_allclose(parts[column], values, rtol=0.0, atol=atol, err_msg=column)
 
 
 @pytest.mark.slow

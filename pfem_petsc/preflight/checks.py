@@ -1,0 +1,301 @@
+"""Checks before a run: values out of any engineering range, gaps to walls, and odd nodes and bars.
+
+Odd values are mostly due to units other than SI. They are reported, never rejected.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from ..output.units import engineering
+from ..statics.stability import names_motions
+from .forecast import memory_warning
+from .geometry import Geometry
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..stepping.model import Model
+    from ..stepping.plan import Plan
+
+_SLENDER = 1e4
+"""Length over thickness of a bar beyond which one of the two is mostly in another unit: a cable of 100 m and 1 cm."""
+
+_STRONGEST = 50.0
+"""Acceleration [m/s2] beyond which a record is mostly in another unit: the strongest ground motions reach 40 m/s2."""
+
+_LEAST = 5e-6
+"""Strain at which no material yields or breaks: 220 for 220 MPa is 1e-9, in kPa 1e-6; soft metals yield at 1e-4."""
+
+_PRESTRAINS = 1e-6, 0.2
+"""Range of strains that prestress gives engineering structures: cables have 1e-4 to 1e-2, those hardly taut 1e-5."""
+
+_STRENGTHS = ("yield_stress", "proof_stress", "tensile_strength")
+
+_HINT = "case files are in SI units (m, kg, s, N, Pa)"
+
+
+def warnings_before(case: Case, model: Model, plan: Plan, first: bool = True) -> list[str]:
+    """Return warnings of the cheap checks, which run at every start. Collective.
+
+    ``first``: False for a later stage: positions and velocities at its start are not known before the run, and what
+    depends on the mesh alone is reported with the first stage.
+    """
+    geometry, source = Geometry(model), f"{case.source}: " if first else ""
+    texts = [f"{source}{text}" for text in odd_numbers(case, model)]
+    texts += memory_warning(model, plan, source) + idle_walls(model) + (wall_gaps(model)[1] if first else [])
+    chained, lowest = geometry.chains() if _is_own(case) else (0, -1)
+    if first:
+        texts += _mesh_warnings(case, model, geometry)
+        if chained:
+            nodes = "1 node is" if chained == 1 else f"{chained} nodes are"
+            texts.append(
+                f"{nodes} only connected to two collinear bars, and nothing supports them laterally; the first is node "
+                f"{lowest}. Was the mesh subdivided? Each member of a truss is one bar: in Gmsh `Transfinite Curve "
+                "{:} = 2;` (an intended chain of bars, such as a cable, needs tension to be stiff)"
+            )
+    return texts + _loose_nodes(model, geometry, chained)
+
+
+def _mesh_warnings(case: Case, model: Model, geometry: Geometry) -> list[str]:
+    texts = []
+    count, nodes, lowest = geometry.parts()
+    if count > 1 and not model.links:  # links connect bodies
+        texts.append(
+            f"the truss is in {count} parts that no bar connects; the smallest has {nodes} nodes, node {lowest} among "
+            "them"
+        )
+    pairs, shown = geometry.overlaps() if _is_own(case) else (0, [])
+    if pairs:
+        texts.append(
+            f"{pairs} pair{'s' if pairs > 1 else ''} of bars overlap{'' if pairs > 1 else 's'} from a common node on: "
+            f"{_list(pairs, shown)}; if a node is intended to divide the longer one, remove that bar"
+        )
+    return texts
+
+
+def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
+    """Return label and text of further entries of ``check``, and warnings. Collective."""
+    geometry, warnings = Geometry(model), []
+    count, _, _ = geometry.parts()
+    entries = {"parts": "all bars are connected" if count == 1 else f"{count} that no bar connects"}
+    rigidity = geometry.rigidity()
+    entries |= {"rigidity": rigidity} if rigidity else {}
+    entries |= {f"wall {name}": text for name, text in wall_gaps(model)[0].items()}
+    if not _is_own(case):
+        return entries, warnings
+    found = geometry.nodes_on_bars()
+    if found is None:
+        entries["nodes on bars"] = "not checked: bars of too different lengths"
+        return entries, warnings
+    between, on_bars, coinciding, together = found
+    if coinciding:
+        pairs = _list(coinciding // 2, together)
+        entries["same place"] = f"{coinciding:,} nodes, {pairs}: merge them unless they are on different bodies"
+    if between:
+        many = "nodes lie on bars that they are not connected to"
+        what = many if between > 1 else "node lies on a bar that it is not connected to"
+        shown = _list(between, on_bars)
+        warnings = [f"{between} {what}: {shown}; if they are intended to be connected, divide the bar there"]
+    return entries, warnings
+
+
+def _is_own(case: Case) -> bool:
+    """Whether nodes and bars come from the user: from a file, arrays, or from a unit cell of a lattice.
+
+    Other generated meshes are valid by construction, and their members are not divided.
+    """
+    return not case.mesh.arranged or getattr(case.mesh.parameters, "cell", None) is not None
+
+
+def _loose_nodes(model: Model, geometry: Geometry, chained: int) -> list[str]:
+    """Warn of nodes that can move freely, besides those within ``chained`` bars. Collective.
+
+    Static analyses that need a stiffness name such nodes and their directions themselves, if it is singular.
+    """
+    static = model.case.static is not None and model.case.static.method != "relaxation"
+    if static and names_motions(model):
+        return []
+    loose, first = geometry.unbraced()
+    if loose <= chained:
+        return []
+    return [
+        f"{loose} node{'s' if loose > 1 else ''} can move freely, to first order: bars and supports hold too few "
+        f"directions there; the first is node {first}"
+    ]
+
+
+def _list(count: int, shown: list[str]) -> str:
+    return ", ".join(shown) + (", ..." if count > len(shown) else "")
+
+
+def odd_numbers(case: Case, model: Model) -> Iterator[str]:
+    """Yield one message for each suspicious value: key, value, reason. Collective."""
+    yield from _materials(case)
+    yield from _sections(case)
+    yield from _mesh(model)
+    yield from _slender(case, model)
+    for wall in case.wall:
+        if wall.gravity and case.gravity is None:
+            yield f"wall {wall.name!r}: gravity = true, but the case has no [gravity], so none acts on it"
+    for name, node_set in case.node_set.items():
+        if node_set.nearest is not None:
+            away = np.linalg.norm(model.mesh.points[: model.mesh.n_owned] - np.array(node_set.nearest), axis=1)
+            distance, node = _extreme(model, -away)
+            if -distance > model.length:
+                yield (
+                    f"node_set.{name}.nearest: the nearest node is node {node}, {engineering(-distance, 'm')} away "
+                    "from the point, more than the size of the truss"
+                )
+
+
+def odd_accelerations(case: Case) -> list[str]:
+    """Return one message for each ground acceleration or gravity, of all stages, that is beyond those of the Earth."""
+    texts = []
+    for k, stage in enumerate(case.stages):
+        where = f"stage[{k}]." if case.stage and k > 0 else ""  # tables at the top belong to the first stage
+        given = {f"support[{n}]": entry.acceleration for n, entry in enumerate(stage.support)}
+        if stage.gravity is not None:
+            given["gravity"] = stage.gravity.acceleration
+        for table, rows in given.items():
+            if rows is None or (k > 0 and stage.holds(table.split("[")[0])):
+                continue
+            peak = float(np.abs(np.atleast_2d(np.array(rows, dtype=float))[:, -3:]).max(initial=0.0))
+            if peak > _STRONGEST:
+                texts.append(
+                    f"{case.source}: {where}{table}.acceleration reaches {peak:.4g} m/s2, {peak / 9.80665:.3g} g: a "
+                    "record in cm/s2 needs scale = 0.01, lengths in mm 0.001"
+                )
+    return texts
+
+
+def _materials(case: Case) -> Iterator[str]:
+    for name, material in case.material.items():
+        key = f"material.{name}"
+        speed = math.sqrt(material.young_modulus / material.density)
+        if not 0.1 <= material.density <= 3e4:
+            yield f"{key}.density = {material.density:g} kg/m3: no solid has that; {_HINT}"
+        if not 0.5 <= speed <= 2e4 or (speed < 10.0 and material.density > 100.0):
+            yield (
+                f"{key}.young_modulus = {material.young_modulus:g} Pa gives a wave speed of "
+                f"{engineering(speed, 'm/s')}: that of steel is 5 km/s, of rubber 30 m/s; {_HINT}"
+            )
+        yield from material.suspicions(key, _HINT)
+        strengths = {f"{key}.{name}": getattr(material, name, None) for name in _STRENGTHS}
+        for name in ("stress", "compressive_stress"):
+            strengths[f"{key}.rupture.{name}"] = getattr(material.rupture, name, None)
+        for name, stress in strengths.items():
+            if stress is not None and stress < _LEAST * material.young_modulus:
+                strain = stress / material.young_modulus
+                yield f"{name} = {stress:g} Pa is reached at a strain of {strain:.3g}; 220 MPa are 220e6; {_HINT}"
+
+
+def _sections(case: Case) -> Iterator[str]:
+    for name, section in case.section.items():
+        if section.area is not None and not 1e-18 <= section.area <= 10.0:
+            yield f"section.{name}.area = {section.area:g} m2: no bar has that; 1 mm2 is 1e-6 m2"
+        young = case.material[section.material].young_modulus
+        stiffness = None if section.area is None else young * section.area
+        for key, unit, hard in (("prestress", "Pa", young), ("pretension", "N", stiffness)):
+            given = getattr(section, key)
+            if given is None or hard is None:
+                continue
+            value = float(np.abs(np.atleast_2d(np.array(given, dtype=float))[:, -1]).max())
+            if value and not _PRESTRAINS[0] <= value / hard <= _PRESTRAINS[1]:
+                yield f"section.{name}.{key} reaches {value:g} {unit}, a strain of {value / hard:.3g}; {_HINT}"
+
+
+def _slender(case: Case, model: Model) -> Iterator[str]:
+    """Bars far longer than thick: a mesh in millimetres with areas in square metres."""
+    mesh = model.mesh
+    worst = np.zeros((len(case.section), 3))  # length over thickness, length, area
+    for block, bars in zip(mesh.blocks, model.bars.blocks, strict=True):
+        lengths = model.bars.mesh_lengths[block.start : block.counted]
+        if len(lengths) and block.section < len(worst):  # others are springs and dashpots
+            areas = np.broadcast_to(bars.counted_area, lengths.shape)
+            ratios = lengths / np.sqrt(areas)
+            k = int(np.lexsort((lengths, ratios))[-1])
+            worst[block.section] = ratios[k], lengths[k], areas[k]
+    for name, *rows in zip(case.section, *model.comm.allgather(worst.tolist()), strict=True):
+        ratio, length, area = max(rows)
+        if ratio > _SLENDER and area >= 1e-18:  # smaller areas are reported as such
+            yield (
+                f"section.{name}: a bar of {engineering(length, 'm')} is {ratio:,.0f} times as long as it "
+                f"is thick (area = {area:g} m2): is the mesh in millimetres? {_HINT}"
+            )
+
+
+def _extreme(model: Model, values: np.ndarray) -> tuple[float, int]:
+    """Return the largest of the values (owned,) of nodes, and the lowest mesh number of a node with it. Collective."""
+    at = int(values.argmax()) if len(values) else -1
+    mine = (-float(values[at]), int(model.mesh.node_ids[at])) if at >= 0 else (np.inf, -1)
+    least, node = min(model.comm.allgather(mine))
+    return -least, node
+
+
+def _mesh(model: Model) -> Iterator[str]:
+    if model.reach > 1e6 * max(model.length, np.finfo(float).tiny):
+        yield (
+            f"the truss is {engineering(model.length, 'm')} in size and {engineering(model.reach, 'm')} away from the "
+            "origin: strains lose accuracy by this ratio; move it to the origin"
+        )
+    with np.errstate(over="ignore"):  # reported below
+        fastest, node = _extreme(model, np.linalg.norm(model.initial_velocity(), axis=1))
+    if fastest > model.wave_speed:
+        yield (
+            f"node {node} starts at {engineering(fastest, 'm/s')}, faster than waves in the bars "
+            f"({engineering(model.wave_speed, 'm/s')}): an impact at that speed crushes bars to zero length"
+        )
+
+
+def idle_walls(model: Model) -> list[str]:
+    """Warn of walls that apply to no node. Collective."""
+    members = model.comm.allreduce(model.contact.members.sum(axis=0))
+    return [
+        f"wall {name!r} applies to no node: name a node_set that has nodes, or omit node_set"
+        for name, count in zip(model.contact.names, members, strict=True)
+        if not count
+    ]
+
+
+def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
+    """Return, by wall name, nearest node, gap and approach velocity at the start; and warnings. Collective."""
+    contact, mesh, comm = model.contact, model.mesh, model.comm
+    told: dict[str, str] = {}
+    warnings: list[str] = []
+    if not contact.any:
+        return told, warnings
+    points, v = mesh.points[: mesh.n_owned], model.initial_velocity()
+    # the rate of the gap over a short displacement, a thousandth of the model's size
+    fastest = comm.allreduce(float(np.abs(v).max(initial=0.0)), op=MPI.MAX)
+    ahead = 1e-6 * model.length / fastest if fastest > 0.0 else 1e-9
+    now, then = contact.gaps(points, 0.0), contact.gaps(points + ahead * v, ahead)
+    bodies = contact.motion.bodies  # not moving yet: displacements of nodes relative to these walls
+    for k, speed in zip(bodies.at, bodies.state.v, strict=True):
+        seen = contact.gap(k, points + ahead * (v - speed), contact.motion.displacements(0.0))
+        then[:, k] = np.where(contact.members[:, k], seen, np.inf)
+    with np.errstate(invalid="ignore"):
+        rate = np.nanmin((then - now) / ahead, axis=0, initial=np.inf)
+    comm.Allreduce(MPI.IN_PLACE, rate, op=MPI.MIN)
+    # a moving wall, or the other node of a link, may push the truss against this wall
+    pushed = model.external.active or contact.moving.any() or bool(model.links) or model.supports.any
+    for k, name in enumerate(contact.names):
+        at = int(np.argmin(now[:, k])) if len(now) else -1
+        gap, node = min(comm.allgather((float(now[at, k]), int(mesh.node_ids[at])) if at >= 0 else (np.inf, -1)))
+        if not np.isfinite(gap):
+            told[name] = "applies to no node"
+            continue
+        told[name] = f"gap {engineering(gap, 'm')} at node {node}"
+        if rate[k] < 0.0:
+            told[name] += f", closing at up to {engineering(-float(rate[k]), 'm/s')}"
+        elif not pushed:
+            told[name] += ", not approached"
+            warnings.append(
+                f"no node moves towards wall {name!r}, and no force drives one there: check the direction of its "
+                "normal and of the initial velocity"
+            )
+    return told, warnings

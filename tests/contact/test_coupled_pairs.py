@@ -4,8 +4,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from helpers.bodies import two_lattices
-from helpers.lattices import box, planes, simulation
+from helpers.lattices import box, planes, simulation, two_lattices
 
 from pfem_petsc.contact.projection import complementary
 from pfem_petsc.errors import InputError, SimulationFailure

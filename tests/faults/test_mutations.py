@@ -22,7 +22,7 @@ def test_mutants_are_mutants(tmp_path):
     """Most of them are refused: else the test above would not try much."""
     import random
 
-    from helpers.mutations import mutated_bytes, mutated_text, small_cases
+    from helpers.files import mutated_bytes, mutated_text, small_cases
 
     from pfem_petsc import Case
     from pfem_petsc.errors import InputError

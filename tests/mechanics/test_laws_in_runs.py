@@ -5,9 +5,8 @@ import math
 
 import numpy as np
 import pytest
-from helpers.laws import DENSITY, KEYS, SOFTENING, Twin, integrated
-from helpers.one_bar import AREA, STEP, STEPS, one_bar, pulled
 from helpers.runs import run
+from helpers.twins import AREA, DENSITY, KEYS, SOFTENING, STEP, STEPS, Twin, integrated, one_bar, pulled
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.cli.main import main

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.gathered import assert_part_of, stiffness_modes
-from helpers.generated import OCTET, degrees, generated, lengths
+from helpers.meshes import OCTET, assert_part_of, degrees, generated, lengths, stiffness_modes
 from mpi4py import MPI
 from pydantic import ValidationError
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from helpers.chains import AREA, MATERIAL, YOUNG
 from helpers.kills import differences
 from helpers.runs import run
+from helpers.small_models import AREA, MATERIAL, YOUNG
 
 from pfem_petsc import Case, Simulation, open_result, write_mesh
 from pfem_petsc.errors import InputError

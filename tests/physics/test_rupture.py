@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from helpers.chains import AREA, DENSITY, MATERIAL, SPEED, YOUNG, chain
 from helpers.kills import differences
 from helpers.runs import run
+from helpers.small_models import AREA, DENSITY, MATERIAL, SPEED, YOUNG, chain
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError

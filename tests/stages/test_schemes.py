@@ -7,7 +7,7 @@ import random
 import numpy as np
 import pytest
 from helpers.kills import differences
-from helpers.stages import BLOCK, FLOOR, PLATE, check_balances
+from helpers.small_models import BLOCK, FLOOR, PLATE, check_balances
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.case.model import INTEGRATORS

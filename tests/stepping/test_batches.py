@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.bodies import two_lattices
+from helpers.lattices import two_lattices
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result

@@ -27,7 +27,6 @@ from ..preflight.forecast import summarise
 from ..restart.checkpoints import RESULT, Restart, prepare_folder
 from ..restart.state import RunState
 from ..signals import early
-from ..stepping.batches import Batches
 from ..stepping.model import Model
 from .observers import (
     Callback,
@@ -425,18 +424,6 @@ class Outputs:
     def steps_left(self, step: int) -> int:
         """Return the number of steps until an observer must act or the ranks synchronise."""
         return min(self._synchroniser.steps_left(step), *(each.steps_left(step) for each in self._observers))
-
-    def advance_together(self, batches: Batches) -> None:
-        """Fuse the steps that need only rows of the history, if possible. Collective.
-
-        Raises
-        ------
-        SimulationFailure
-            As for a single step.
-        """
-        left = self.steps_left(self._analysis.stepper.number)
-        if not batches.advance(self._analysis, self.history, left):
-            self._synchroniser.synchronise()
 
     def stop_early(self) -> None:
         """Stop with a checkpoint if the ranks have agreed to stop, unless the run is at its end. Collective.

@@ -38,8 +38,19 @@ from pathlib import Path
 TESTS = Path(__file__).resolve().parent.parent / "tests"
 sys.path[:0] = [str(TESTS), str(TESTS / "random_cases")]
 
-from helpers import together as at_once  # noqa: E402
-from helpers.kills import KINDS, LEFT_OVER, Kind, VtkReader, assert_readable, differences, killed, run  # noqa: E402
+from helpers.kills import (  # noqa: E402
+    KINDS,
+    LATER,
+    LEFT_OVER,
+    Kind,
+    VtkReader,
+    assert_readable,
+    differences,
+    killed,
+    play,
+    run,
+    shared_words,
+)
 
 EVERY = (7, 40, 1000)  # steps between checkpoints: many, some, none before the end
 MOST = 4  # kills of a run before it may run to its end
@@ -259,7 +270,7 @@ def mutants(seed: int, number: int, folder: Path) -> int:
 
 def try_mutants(seed: int, count: int, folder: Path) -> int:
     """Try mutants in this process, which one of them may end."""
-    from helpers.mutations import small_cases, sound_meshes, try_one
+    from helpers.files import small_cases, sound_meshes, try_one
 
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     texts, meshes = small_cases(), sound_meshes(folder / "sound")
@@ -276,10 +287,10 @@ def together(number: int, folder: Path, chance: random.Random) -> int:
     from pfem_petsc.cli.main import main as program
 
     starts, restarts, failed = Counter(), Counter(), 0
-    program(at_once.words(folder / "alone", at_once.LATER))
+    program(shared_words(folder / "alone", LATER))
     for each in range(number):
         try:
-            found = at_once.play(folder / f"round{each}", folder / "alone" / "result.vtkhdf", chance)
+            found = play(folder / f"round{each}", folder / "alone" / "result.vtkhdf", chance)
             starts.update(found[0])
             restarts.update(found[1])
             print(f"round {each}: starts {dict(found[0])}, restarts {dict(found[1])}", flush=True)

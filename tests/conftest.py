@@ -24,8 +24,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.launch import OF_A_LAUNCH, environment
-from helpers.selection import refuse_repeated_names, thinned
+from helpers.launch import OF_A_LAUNCH, environment, refuse_repeated_names, thinned
 from hypothesis import settings
 
 if "PYTEST_XDIST_WORKER" in os.environ:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from helpers.selection import refuse_repeated_names, thinned
+from helpers.launch import refuse_repeated_names, thinned
 
 
 def test_files_of_one_name_are_refused(tmp_path):

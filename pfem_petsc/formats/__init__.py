@@ -59,15 +59,19 @@ def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = Non
         On all ranks, if there is no such file, no reader for its suffix, or its content is not a mesh of bars.
     """
     from ..mesh.slab import check_size
-    from ..mesh.whole import read_and_scatter
-    from ..parallel.agreement import on_root
+    from ..mesh.whole import scattered
+    from ..parallel.agreement import agreed, on_root
 
     # files that rank 0 sends on need not be there on other machines
     reader = importlib.import_module(on_root(comm, lambda: _reader_of(path, "mesh.file: ").__name__))
     wanted = fields or {}
     slab = reader.read_on(path, comm, wanted) if hasattr(reader, "read_on") else None
     if slab is None:
-        return read_and_scatter(lambda path: _read(reader, path, wanted), path, comm)
+        whole = None
+        with agreed(comm):
+            if comm.rank == 0:
+                whole = _read(reader, path, wanted)
+        return scattered(whole, str(path), comm)
     check_size(slab.n_nodes, str(path))
     return slab
 
@@ -98,9 +102,13 @@ def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
 
 
 def _read(reader: Any, path: Path, fields: Mapping[str, str] | None) -> WholeMesh:
+    from ..errors import InputError
     from ..mesh.whole import check_fields
 
-    whole = reader.read(path, fields)
+    try:
+        whole = reader.read(path, fields)
+    except MemoryError:
+        raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
     check_fields(path, fields, whole.bar_fields)
     if fields is not None:
         whole.bar_fields = {name: whole.bar_fields[name] for name in fields}

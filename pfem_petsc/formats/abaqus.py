@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..files import readable_whole
@@ -69,7 +68,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         Naming file and line, for any content that is not a mesh of bars.
     """
     deck = _Deck(path)
-    for block in _blocks(path):
+    for block in list(_blocks(path)):
         if not deck.add(block):
             break
     mesh = deck.mesh()
@@ -199,31 +198,16 @@ def _alike(text: bytes) -> np.ndarray | None:
     return values.reshape(-1, columns) if simple else None
 
 
-def _blocks(path: Path) -> Iterator[_Block]:
-    """Return the blocks of a file, and of those that it includes.
+def _blocks(path: Path, above: tuple[Path, ...] = (), before: _Block | None = None) -> Iterator[_Block]:
+    """Yield the blocks of a file, and of those that it includes; a block is complete when the next one comes.
+
+    ``above`` are the files that include this one, and ``before`` is the block at that place, whose data may go on here.
 
     Raises
     ------
     InputError
         For data before the first keyword, and files that cannot be included.
     """
-    current: _Block | None = None
-    for part in _parts(path, ()):
-        if isinstance(part, _Block):
-            if current is not None:
-                yield current
-            current = part
-        elif current is None:
-            text = shown(part.text.strip().split(b"\n")[0])
-            raise InputError(f"{part.path}: line {part.line}: {text!r} precedes the first *KEYWORD")
-        else:
-            current.pieces.append(part)
-    if current is not None:
-        yield current
-
-
-def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[_Block | _Piece]:
-    """Return keywords and data lines in their order."""
     try:
         content = readable_whole(path).read_bytes().removeprefix(codecs.BOM_UTF8)
     except OSError as error:
@@ -231,16 +215,22 @@ def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[_Block | _Piece]:
     if b"\0" in content:
         raise InputError(f"{path}: is not text: save it as an Abaqus input file in UTF-8 or ASCII")
     content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    line = 1
+    line, block = 1, before
     for k, text in enumerate(_KEYWORD.split(_COMMENT.sub(b"", content))):
         if k % 2:
-            block = _keyword(path, line, text.decode("utf-8", "replace"))
-            if block.keyword != "INCLUDE":
+            found = _keyword(path, line, text.decode("utf-8", "replace"))
+            if found.keyword != "INCLUDE":
+                block = found
                 yield block
-            if block.keyword == "INCLUDE" or "INPUT" in block.parameters:
-                yield from _parts(_included(block, path, above), (*above, path))
+            if found.keyword == "INCLUDE" or "INPUT" in found.parameters:
+                for inner in _blocks(_included(found, path, above), (*above, path), block):
+                    block = inner
+                    yield inner
         elif text.strip():
-            yield _Piece(path, line, text)
+            if block is None:
+                first = shown(text.strip().split(b"\n")[0])
+                raise InputError(f"{path}: line {line}: {first!r} precedes the first *KEYWORD")
+            block.pieces.append(_Piece(path, line, text))
         line += text.count(b"\n")
 
 
@@ -395,6 +385,8 @@ def _placing(block: _Block) -> np.ndarray:
     The first data line has the translation, the second two points of an axis and an angle [degrees] about it, which
     turns the instance after the translation.
     """
+    from scipy.spatial.transform import Rotation  # takes longer than most files
+
     rows = np.nan_to_num(block.rows(7, 3))
     move = rows[0, :3] if len(rows) else np.zeros(3)
     if len(rows) < 2:

@@ -104,20 +104,28 @@ class _Table:
         self._decimal_comma = separator == ";"
         self._lines = np.array(kept[1:], np.int64) + 1
         self.n = len(self._lines)
+        texts = (lines[i] for i in kept)
+        rows = csv.reader(texts, delimiter=separator, skipinitialspace=True, strict=True)
         try:
-            texts = (lines[i] for i in kept)
-            head, *rows = csv.reader(texts, delimiter=separator, skipinitialspace=True, strict=True)
+            self.headings = [_without_unit(name) for name in next(rows)]
+            self.columns: list[list[str]] = [[] for _ in self.headings]
+            count = self._fill(rows)
         except csv.Error as error:
             raise InputError(f"{path}: {error}") from None
-        if len(rows) != self.n:
+        if count != self.n:
             raise InputError(f"{path}: a text in quotes goes over several lines")
-        width = len(head)
-        for k, row in enumerate(rows):
-            if len(row) < width or any(word.strip() for word in row[width:]):
-                raise InputError(f"{self.where(k)}: {len(row)} entries; expected {width}, as the first line has")
-        self.headings = [_without_unit(name) for name in head]
         self._keys = [name.lower().replace(" ", "_") for name in self.headings]
-        self.columns = [[row[k] for row in rows] for k in range(width)]
+
+    def _fill(self, rows: Iterator[list[str]]) -> int:
+        """Put the entries into columns, row by row, which needs less memory and time; return the number of rows."""
+        width, count = len(self.headings), 0
+        for count, row in enumerate(rows, 1):
+            if len(row) != width and (len(row) < width or any(word.strip() for word in row[width:])):
+                where = self.where(count - 1)
+                raise InputError(f"{where}: {len(row)} entries; expected {width}, as the first line has")
+            for column, word in zip(self.columns, row):
+                column.append(word)
+        return count
 
     def where(self, row: int) -> str:
         """Return file and line of a row."""

@@ -141,7 +141,7 @@ class _Section:
         self._content.seek(self._at)
         line = self._content.readline()
         self._at += len(line)
-        if not line.strip().isdigit():
+        if not re.fullmatch(rb"\s*\d{1,18}\s*", line):
             raise InputError(f"{self._where}: {shown(line)!r} is not a count")
         return int(line)
 
@@ -185,7 +185,8 @@ class _Section:
 
     def end(self) -> None:
         """Refuse surplus numbers."""
-        if len(self.peek(1)) if not self._layout.binary else self._content[self._at : self._stop].strip():
+        left = self._content[self._at : self._stop].strip() if self._layout.binary else self.peek(1)
+        if len(left):
             raise InputError(f"{self._where}: has more numbers than its counts declare")
 
     def _take(self, n: int, kind: str = "f8") -> np.ndarray:
@@ -347,7 +348,7 @@ def _joined(rows: Rows, head: _Head) -> Rows:
 def _physical_names(path: Path, payload: bytes) -> dict[tuple[int, int], str]:
     """Return names by dimension and tag; this section is text even in binary files."""
     count, *lines = payload.decode("utf-8", "replace").split("\n") if payload.strip() else ["0"]
-    found = [re.fullmatch(r'\s*(-?\d+)\s+(-?\d+)\s+"(.+?)"+\s*', line) for line in lines if line.strip()]
+    found = [re.fullmatch(r'\s*(-?\d{1,18})\s+(-?\d{1,18})\s+"(.+?)"+\s*', line) for line in lines if line.strip()]
     if None in found or count.strip() != str(len(found)):
         raise InputError(
             f"{path}: section $PhysicalNames: its {len(found)} lines after the first are not the {count[:20].strip()} "
@@ -465,11 +466,11 @@ def _data_head(where: str, content: mmap.mmap, head: _Head) -> tuple[str, int | 
     words: list[list[bytes]] = []
     for _ in range(3):  # texts, real numbers, whole numbers
         count = content.readline().strip()
-        if not count.isdigit() or int(count) > 100:
+        if not re.fullmatch(rb"\d{1,2}", count):
             raise InputError(f"{where}: {shown(count)!r} is not the number of its tags")
         words.append([content.readline().strip() for _ in range(int(count))])
     name = words[0][0].decode("utf-8", "replace").strip('"') if words[0] else ""
-    if len(words[2]) < 3 or not all(word.isdigit() for word in words[2][:3]):
+    if len(words[2]) < 3 or not all(re.fullmatch(rb"\d{1,18}", word) for word in words[2][:3]):
         raise InputError(f"{where} {name!r}: expected three whole numbers: time step, components, number of elements")
     if int(words[2][1]) != 1 or not name or "/" in name:
         head.warnings.append(f"{where} {name!r} is left out: a bar field has a name without slash and one component")

@@ -14,7 +14,6 @@ from mpi4py import MPI
 
 from ..case.toml import table_text
 from ..errors import InputError
-from ..parallel.agreement import agreed
 from .exchange import Router
 from .slab import MeshSlab, check_size, slab_of, slab_range
 
@@ -76,24 +75,6 @@ def check_fields(path: Path | str, fields: Mapping[str, str] | None, known: Iter
             raise InputError(
                 f"{key} = {name!r}: {path} has no cell field of this name with one number for each bar{there}"
             )
-
-
-def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Comm) -> MeshSlab:
-    """Read a file on rank 0 and send every rank its slab. Collective.
-
-    Raises
-    ------
-    InputError
-        On all ranks, as raised by ``read`` on rank 0, and if the mesh does not fit in memory.
-    """
-    whole: WholeMesh | None = None
-    with agreed(comm):
-        if comm.rank == 0:
-            try:
-                whole = read(path)
-            except MemoryError:
-                raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
-    return scattered(whole, str(path), comm)
 
 
 def scattered(whole: WholeMesh | None, source: str, comm: MPI.Comm) -> MeshSlab:

@@ -28,7 +28,6 @@ from ..preflight.forecast import summarise
 from ..restart.checkpoints import Restart, prepare_folder
 from ..restart.state import RunState
 from ..signals import early
-from ..stepping.batches import Batches
 from ..stepping.model import Model
 from .observers import Checkpointing, Events, History, Observer, RuptureReport, Snapshots
 from .stages import Stages
@@ -413,18 +412,6 @@ class Outputs:
         left = [observer.steps_left(step) for observer in self._observers]
         left += [every - step % every for _, every in self._callbacks]
         return min(self._synchroniser.steps_left(step), *left)
-
-    def advance_together(self, batches: Batches) -> None:
-        """Fuse the steps that need only rows of the history, if possible. Collective.
-
-        Raises
-        ------
-        SimulationFailure
-            As for a single step.
-        """
-        left = self.steps_left(self._analysis.stepper.number)
-        if not batches.advance(self._analysis, self.history, left):
-            self._synchroniser.synchronise()
 
     def stop_early(self) -> None:
         """Stop with a checkpoint if the ranks have agreed to stop, unless the run is at its end. Collective.

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.lattices import lattice_case, planes
+from helpers.lattices import SCHEMES, G, lattice_case, planes, rod, rows_of, tumbling
 from helpers.runs import run
-from helpers.sliding import SCHEMES, G, rod, rows_of, tumbling
 
 from pfem_petsc import Case
 

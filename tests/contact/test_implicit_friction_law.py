@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.lattices import lattice_case, planes, simulation
-from helpers.parts import last_rows
-from helpers.sliding import SCHEMES, G, rows_of, tumbling
+from helpers.lattices import SCHEMES, G, lattice_case, planes, rows_of, simulation, tumbling
+from helpers.runs import last_rows
 
 WALLS = {
     "plane": planes([[0.3, -0.2, 1.0]], [-0.02], friction=0.4),

@@ -3,7 +3,7 @@
 import h5py
 import numpy as np
 import pytest
-from helpers.balances import GRAVITY, SCHEMES
+from helpers.runs import GRAVITY, SCHEMES
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation

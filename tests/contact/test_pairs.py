@@ -2,10 +2,17 @@
 
 import numpy as np
 import pytest
-from helpers.bodies import two_lattices
-from helpers.lattices import planes, rotation, simulation
-from helpers.rods_that_meet import DIRECTION, TRAPEZOID, half, two_rods
-from helpers.turning import with_mesh_file
+from helpers.lattices import (
+    DIRECTION,
+    TRAPEZOID,
+    half,
+    planes,
+    rotation,
+    simulation,
+    two_lattices,
+    two_rods,
+    with_mesh_file,
+)
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError

@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.bodies import two_lattices
-from helpers.lattices import planes, rotation, simulation
-from helpers.rods_that_meet import two_rods
+from helpers.lattices import planes, rotation, simulation, two_lattices, two_rods
 
 from pfem_petsc.solvers.linear import LinearChoice
 from pfem_petsc.stepping.implicit import ImplicitStepper

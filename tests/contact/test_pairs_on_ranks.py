@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.bodies import two_lattices
-from helpers.lattices import planes, simulation
+from helpers.lattices import planes, simulation, two_lattices
 from mpi4py import MPI
 
 CASES = {

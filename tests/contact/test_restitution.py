@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers.lattices import lattice_case, planes, simulation
-from helpers.parts import last_rows
+from helpers.runs import last_rows
 
 from pfem_petsc.errors import InputError
 

@@ -6,8 +6,7 @@ import importlib
 
 import numpy as np
 import pytest
-from helpers.bodies import two_lattices
-from helpers.lattices import planes
+from helpers.lattices import planes, two_lattices
 from mpi4py import MPI
 
 from pfem_petsc import Case

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.lattices import lattice_case, planes, simulation
-from helpers.turning import with_mesh_file
+from helpers.lattices import lattice_case, planes, simulation, with_mesh_file
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation

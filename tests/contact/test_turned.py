@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.lattices import lattice_case, planes, rotation, simulation
-from helpers.turning import with_mesh_file
+from helpers.lattices import lattice_case, planes, rotation, simulation, with_mesh_file
 
 # schemes whose recursion of a held node is stable under walls that bound positions alone
 SCHEMES = {

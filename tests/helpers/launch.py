@@ -1,10 +1,12 @@
-"""The environment of processes that tests start."""
+"""How tests are started: the environment of processes, and which tests run without ``--all-sets``."""
 
 from __future__ import annotations
 
 import os
+from collections import defaultdict
+from pathlib import Path
 
-__all__ = ["OF_A_LAUNCH", "environment"]
+import pytest
 
 OF_A_LAUNCH = (
     *("PMIX_", "PMI_", "OPAL_", "ORTE_", "OMPI_COMM_", "OMPI_APP_", "OMPI_UNIVERSE_"),
@@ -21,3 +23,43 @@ def environment() -> dict[str, str]:
     allowed = ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "OMPI_MCA_rmaps_base_oversubscribe")
     variables |= dict.fromkeys((*allowed, "OMPI_MCA_mpi_yield_when_idle", "OMP_NUM_THREADS"), "1")
     return variables | {"PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
+
+
+STRIDE = {1: 10, 2: 8}
+"""Of sets of parameters that are kept, by number of ranks; 12 on more."""
+FEWER = 4
+"""Factor on the stride for tests marked ``few_sets``."""
+
+
+def refuse_repeated_names(folder: Path) -> None:
+    """Raise ``pytest.UsageError`` if two test files in the folders below have the same name."""
+    found: dict[str, list[str]] = defaultdict(list)
+    for path in sorted(folder.rglob("test_*.py")):
+        found[path.name].append(path.relative_to(folder.parent).as_posix())
+    repeated = [paths for paths in found.values() if len(paths) > 1]
+    if repeated:
+        lines = "\n".join(f"  {' and '.join(paths)}" for paths in repeated)
+        raise pytest.UsageError(
+            f"test files of the same name:\n{lines}\n"
+            "pytest imports test files by their names alone, whatever their folders: rename all but one of each line"
+        )
+
+
+def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
+    """Return all tests except the thorough ones, with some of their sets of parameters.
+
+    Tests with several sets run with every tenth of them (eighth on two ranks, twelfth on three), tests marked
+    ``few_sets`` with a quarter of these. Of the parallel tests one half runs on two ranks, the other on three. Being
+    ``slow`` makes no difference.
+    """
+    sets: dict[tuple[Path, str], list[pytest.Item]] = {}
+    for item in items:
+        if item.get_closest_marker("thorough") is None:
+            sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
+    chosen: set[pytest.Item] = set()
+    for group in list(sets.values())[ranks % 2 :: 2] if ranks > 1 else list(sets.values()):
+        if len(group) > 1:
+            every = STRIDE.get(ranks, 12) * (FEWER if group[0].get_closest_marker("few_sets") is not None else 1)
+            group = group[(ranks - 1) % min(every, len(group)) :: every]
+        chosen |= set(group)
+    return [item for item in items if item in chosen]

@@ -1,9 +1,12 @@
 """Cases that are stopped at a step and continued."""
 
+from __future__ import annotations
+
 import pytest
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import EarlyStop
+from pfem_petsc.output.result import open_result
 
 SHORT = ("time.end=1.6", "output.fields_every=7")
 LATTICE = ("mesh.cells=[3,3,3]", "time.end=1.2e-4", "time.step=1e-6")
@@ -73,15 +76,12 @@ CASES = {
 
 def request_stop(simulation, last):
     """Let a run be asked to stop after a step, as by a signal."""
-    advance = simulation._advance
 
-    def advance_and_stop():
-        made = advance()
-        if made.step == last and simulation.comm.rank == simulation.comm.size - 1:
+    def stop(step):
+        if step.step == last and simulation.comm.rank == simulation.comm.size - 1:
             simulation._synchroniser.stop._signal = 15
-        return made
 
-    simulation._advance = advance_and_stop
+    simulation.on_step(stop, every=last)
 
 
 def simulate(case, overrides, folder, comm, stop_after=None, **options):
@@ -99,3 +99,15 @@ def simulate(case, overrides, folder, comm, stop_after=None, **options):
 def everywhere(comm, function, *arguments):
     """What a function gives on rank 0."""
     return comm.bcast(function(*arguments) if comm.rank == 0 else None)
+
+
+ROD = ["rod_impact", "--quiet", "--set", "output.checkpoint_every=20"]
+
+
+def rod(folder, *more, end=0.5):
+    return [*ROD, f"time.end={end}", "-o", str(folder), *more]
+
+
+def steps(folder):
+    with open_result(folder) as result:
+        return result.history["step"], result.steps

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.mesh_files import case_of
 from helpers.runs import run
+from helpers.small_models import case_of
 
 from pfem_petsc import Case
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.strut_twin import Strut, solid
+from helpers.twins import Strut, solid
 
 from pfem_petsc.case.tables import Section
 from pfem_petsc.mechanics.bars import bar_shapes

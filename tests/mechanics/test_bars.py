@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.bar_twins import Law, shaken, whole_truss
+from helpers.twins import Law, shaken, whole_truss
 
 from pfem_petsc import Case
 from pfem_petsc.solvers.matrix import HessianMatrix

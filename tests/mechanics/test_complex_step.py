@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.complex_step import SIZE, Complex, derivative, patch, real
-from helpers.laws import KEYS, SOFTENING, cycles, make
+from helpers.twins import KEYS, SIZE, SOFTENING, Complex, cycles, derivative, make, patch, real
 
 from pfem_petsc.case.tables import Section
 from pfem_petsc.mechanics import rupture

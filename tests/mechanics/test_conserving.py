@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.bar_twins import Law
+from helpers.twins import Law
 from mpi4py import MPI
 
 from pfem_petsc import Case

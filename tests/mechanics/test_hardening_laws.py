@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.laws import KEYS, RATES, SOFTENING, YOUNG, cycles, flow_stress, follow, integrated, make, yield_stress
+from helpers.twins import KEYS, RATES, SOFTENING, YOUNG, cycles, flow_stress, follow, integrated, make, yield_stress
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 

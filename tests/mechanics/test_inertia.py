@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.bar_twins import Law, whole_truss
+from helpers.twins import Law, whole_truss
 
 from pfem_petsc import Case
 from pfem_petsc.stepping.model import Model

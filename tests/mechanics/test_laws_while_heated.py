@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.laws import SOFTENING, YOUNG
-from helpers.one_bar import AREA, STEP, one_bar, pulled
 from helpers.runs import run
+from helpers.twins import AREA, SOFTENING, STEP, YOUNG, one_bar, pulled
 
 from pfem_petsc import Case
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.gathered import every_node
+from helpers.meshes import every_node
 from mpi4py import MPI
 
 from pfem_petsc import Case

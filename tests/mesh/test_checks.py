@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from helpers.gathered import slab_from
+from helpers.meshes import slab_from
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.whole import check_mesh
@@ -9,10 +9,6 @@ pytestmark = pytest.mark.parallel
 
 SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
 ROUND = [[0, 1], [1, 2], [2, 3], [3, 0]]
-
-
-def test_a_sound_mesh_passes(comm):
-    assert check_mesh(slab_from(SQUARE, ROUND, comm), comm) == []
 
 
 @pytest.mark.parametrize(

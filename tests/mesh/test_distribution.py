@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from helpers.gathered import slab_from, whole
+from helpers.meshes import slab_from, whole
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.distribution import distribute

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.gathered import assert_part_of, whole
+from helpers.meshes import assert_part_of, whole
 from mpi4py import MPI
 from pydantic import ValidationError
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.generated import OCTET, degrees, generated, lengths
+from helpers.meshes import OCTET, degrees, generated, lengths
 
 from pfem_petsc.mesh.lattices.block import random_numbers
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.abaqus import FLAT, MESHES, written
+from helpers.files import FLAT, MESHES, written
 
 from pfem_petsc import Case, Truss
 from pfem_petsc.errors import InputError

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.gathered import whole
+from helpers.meshes import whole
 
 from pfem_petsc import Truss, write_mesh
 from pfem_petsc.errors import InputError

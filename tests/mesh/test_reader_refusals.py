@@ -4,8 +4,7 @@ import random
 
 import numpy as np
 import pytest
-from helpers.mutations import mutated_bytes, sound_meshes
-from helpers.samples import BARS, GMSH, POINTS, write_hdf5, write_vtk
+from helpers.files import BARS, GMSH, POINTS, mutated_bytes, sound_meshes, write_hdf5, write_vtk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI

@@ -3,8 +3,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.gathered import stiffness_modes, whole
-from helpers.samples import BARS, GMSH, LEGS, POINTS, TOP, write_hdf5, write_vtk
+from helpers.files import BARS, GMSH, LEGS, POINTS, TOP, write_hdf5, write_vtk
+from helpers.meshes import stiffness_modes, whole
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.formats import read_slab

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from helpers.gathered import whole
-from helpers.samples import GMSH
+from helpers.files import GMSH
+from helpers.meshes import whole
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.formats import gmsh, hdf5, read_slab, read_whole, vtk, write_whole

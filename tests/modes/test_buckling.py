@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.mesh_files import case_of
-from helpers.statics import ARCH_AREA, ARCH_YOUNG, LIMIT, arch_of, press
+from helpers.small_models import ARCH_AREA, ARCH_YOUNG, LIMIT, arch_of, case_of, press
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import SimulationFailure

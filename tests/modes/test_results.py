@@ -7,7 +7,7 @@ import signal
 import h5py
 import numpy as np
 import pytest
-from helpers.statics import arch_of, press
+from helpers.small_models import arch_of, press
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation

@@ -6,7 +6,7 @@ import importlib.util
 
 import numpy as np
 import pytest
-from helpers.statics import ARCH_AREA, ARCH_YOUNG, arch_of, press
+from helpers.small_models import ARCH_AREA, ARCH_YOUNG, arch_of, press
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import SimulationFailure

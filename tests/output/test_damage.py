@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from endurance import damaged
 from helpers.kills import differences
-from helpers.truss import Truss, options, write
+from helpers.synthetic import Truss, options, write
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError

@@ -7,9 +7,8 @@ import sys
 import h5py
 import numpy as np
 import pytest
-from helpers.grids import assert_history_is
 from helpers.launch import environment
-from helpers.truss import Truss, options, write
+from helpers.synthetic import Truss, assert_history_is, options, write
 from mpi4py import MPI
 from test_interrupted import HERE, READER
 

@@ -9,9 +9,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.grids import assert_grid_is, assert_history_is, read_with_vtk
 from helpers.launch import environment
-from helpers.truss import Truss, options, write
+from helpers.synthetic import Truss, assert_grid_is, assert_history_is, options, read_with_vtk, write
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
@@ -28,7 +27,7 @@ import time
 from mpi4py import MPI
 sys.path[:0] = sys.argv[1].split(':')
 from helpers.launch import environment
-from helpers.truss import Truss, options, write
+from helpers.synthetic import Truss, options, write
 from pfem_petsc.output.vtkhdf import ResultWriter
 truss = Truss(MPI.COMM_SELF, n_nodes=400, n_bars=900)
 writer = ResultWriter(sys.argv[2], MPI.COMM_SELF, truss.mesh, **options(compressed=sys.argv[3] == "True"))
@@ -43,8 +42,8 @@ READER = """
 import sys
 sys.path[:0] = sys.argv[1].split(':')
 from mpi4py import MPI
-from helpers.grids import assert_grid_is, read_with_vtk
-from helpers.truss import Truss
+from helpers.synthetic import assert_grid_is, read_with_vtk
+from helpers.synthetic import Truss
 truss = Truss(MPI.COMM_SELF, n_nodes=400, n_bars=900)
 for path in sys.argv[2:]:
     _, n_steps = read_with_vtk(path, 0)
@@ -213,7 +212,7 @@ import sys
 from mpi4py import MPI
 sys.path[:0] = sys.argv[1].split(':')
 from helpers.launch import environment
-from helpers.truss import Truss, options, write
+from helpers.synthetic import Truss, options, write
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.output import vtkhdf
 vtkhdf.require_room = lambda *given, **named: None  # as where a quota, not the disk, is full

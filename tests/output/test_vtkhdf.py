@@ -7,8 +7,17 @@ import h5py
 import numpy as np
 import pytest
 import pyvista
-from helpers.grids import COMM, STEPS, assert_grid_is, assert_history_is, read_with_vtk, write_all
-from helpers.truss import Truss, options, write
+from helpers.synthetic import (
+    COMM,
+    STEPS,
+    Truss,
+    assert_grid_is,
+    assert_history_is,
+    options,
+    read_with_vtk,
+    write,
+    write_all,
+)
 from mpi4py import MPI
 from vtkmodules.util.numpy_support import vtk_to_numpy
 

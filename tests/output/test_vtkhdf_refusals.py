@@ -3,8 +3,7 @@
 import h5py
 import numpy as np
 import pytest
-from helpers.grids import COMM, assert_history_is, write_all
-from helpers.truss import COLUMNS, Truss, options, write
+from helpers.synthetic import COLUMNS, COMM, Truss, assert_history_is, options, write, write_all
 
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.output.result import open_result

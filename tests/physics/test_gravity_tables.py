@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.ground import TIMES, ground, modal_response
 from helpers.kills import differences
+from helpers.oscillator import TIMES, ground, modal_response
 from helpers.runs import run
 from helpers.stopped import everywhere
 from mpi4py import MPI

@@ -4,9 +4,8 @@ import copy
 
 import numpy as np
 import pytest
-from helpers.in_time import SCHEMES, in_time
-from helpers.mesh_files import case_of
 from helpers.runs import run
+from helpers.small_models import SCHEMES, case_of, in_time
 
 from pfem_petsc import Case
 from pfem_petsc.errors import InputError

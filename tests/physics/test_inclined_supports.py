@@ -5,8 +5,8 @@ import copy
 import h5py
 import numpy as np
 import pytest
-from helpers.in_time import SCHEMES, in_time
 from helpers.runs import run
+from helpers.small_models import SCHEMES, in_time
 from scipy.spatial.transform import Rotation
 
 from pfem_petsc import Case, Simulation, open_result

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.balances import GRAVITY, SCHEMES, case, floor, unexplained
-from helpers.bodies import two_lattices
-from helpers.runs import run
+from helpers.lattices import two_lattices
+from helpers.runs import GRAVITY, SCHEMES, case, floor, run, unexplained
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.columns import LOST, STORED, SUPPLIED

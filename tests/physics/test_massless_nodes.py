@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.balances import MIDDLE, case, unexplained
-from helpers.runs import run
+from helpers.runs import MIDDLE, case, run, unexplained
 
 
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark", "houbolt", "generalized_alpha"])

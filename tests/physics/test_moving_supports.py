@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.ground import TIMES, ground, modal_response, response
+from helpers.oscillator import TIMES, ground, modal_response, response
 from helpers.runs import run
 from mpi4py import MPI
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from helpers.cables import AREA, DENSITY, LENGTH, YOUNG, cell, fan, rod
 from helpers.kills import differences
-from helpers.prestressed import AREA, DENSITY, LENGTH, YOUNG, cell, fan, rod
 from helpers.runs import run
 from helpers.stopped import everywhere
 

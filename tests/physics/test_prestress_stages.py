@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.cables import AREA, LENGTH, YOUNG, cell, fan, rod
 from helpers.kills import differences
-from helpers.prestressed import AREA, LENGTH, YOUNG, cell, fan, rod
 from helpers.runs import run
-from helpers.stages import check_balances
+from helpers.small_models import check_balances
 from helpers.stopped import everywhere
 
 from pfem_petsc import Case, Simulation, open_result, write_mesh

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.in_time import in_time
 from helpers.runs import run
+from helpers.small_models import in_time
 from scipy.spatial.transform import Rotation
 
 from pfem_petsc import Case, Simulation, Truss

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.balances import SCHEMES, case, unexplained
-from helpers.runs import run
+from helpers.runs import SCHEMES, case, run, unexplained
 
 
 @pytest.mark.parametrize("integrator", ["newmark", "houbolt", "chung_lee"])

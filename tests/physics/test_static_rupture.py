@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.chains import AREA, DENSITY, MATERIAL, YOUNG, chain
 from helpers.runs import run
+from helpers.small_models import AREA, DENSITY, MATERIAL, YOUNG, chain
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import SimulationFailure

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.gathered import every_node
 from helpers.kills import differences
+from helpers.meshes import every_node
 from helpers.runs import run
 from helpers.stopped import everywhere
 from mpi4py import MPI

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.frames import camera_of, corners
+from helpers.pictures import camera_of, corners
 from helpers.synthetic import SyntheticResult, ring
 
 from pfem_petsc.post.colours import ColourField

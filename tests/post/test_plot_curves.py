@@ -6,7 +6,7 @@ import csv
 
 import numpy as np
 import pytest
-from helpers.charts import saturated, table_columns
+from helpers.pictures import saturated, table_columns
 from helpers.synthetic import SyntheticResult, ring
 from mpi4py import MPI
 

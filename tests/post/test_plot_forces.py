@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.charts import saturated, table_columns
+from helpers.pictures import saturated, table_columns
 from helpers.synthetic import SyntheticResult, ring
 from PIL import Image
 

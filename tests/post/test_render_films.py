@@ -7,7 +7,7 @@ import math
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from helpers.frames import TINY, box, draw, drawing, near, pixels
+from helpers.pictures import TINY, box, draw, drawing, near, pixels
 from helpers.synthetic import SyntheticResult, ring
 from PIL import Image
 

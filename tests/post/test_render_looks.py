@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.frames import box, camera_of, draw, drawing, near, picture_of, pixels
+from helpers.pictures import box, camera_of, draw, drawing, near, picture_of, pixels
 from helpers.synthetic import SyntheticResult, lattice, ring
 
 from pfem_petsc import Case, Simulation, open_result

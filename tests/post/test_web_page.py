@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.browser import PROGRAM, Browser
+from helpers.pictures import PROGRAM, Browser
 from helpers.synthetic import WALL, SyntheticResult, lattice, ring
 
 from pfem_petsc.errors import InputError

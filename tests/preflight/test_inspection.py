@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.counted import CUBE, CUBE_EDGES, TRUSSES
-from helpers.mesh_files import case_of
 from helpers.runs import inspected
+from helpers.small_models import CUBE, CUBE_EDGES, TRUSSES, case_of
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.preflight import forecast

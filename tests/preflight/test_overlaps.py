@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.counted import TRUSSES
-from helpers.mesh_files import case_of
 from helpers.runs import inspected
+from helpers.small_models import TRUSSES, case_of
 
 from pfem_petsc import Case
 from pfem_petsc.registry import lookup

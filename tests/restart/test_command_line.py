@@ -8,7 +8,7 @@ import zlib
 import h5py
 import numpy as np
 import pytest
-from helpers.rods import rod, steps
+from helpers.stopped import rod, steps
 
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers.kills import KINDS, command, differences, processes_of
 from helpers.launch import environment
-from helpers.rods import steps
+from helpers.stopped import steps
 
 from pfem_petsc.cli.main import main
 from pfem_petsc.output.result import open_result

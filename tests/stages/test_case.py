@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 
 import pytest
-from helpers.stages import BLOCK
+from helpers.small_models import BLOCK
 
 from pfem_petsc import Case
 from pfem_petsc.errors import InputError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.stages import check_balances
+from helpers.small_models import check_balances
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import SimulationFailure

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.kills import differences
-from helpers.stages import BLOCK, DOME, check_balances
+from helpers.small_models import BLOCK, DOME, check_balances
 from helpers.stopped import everywhere
 from mpi4py import MPI
 

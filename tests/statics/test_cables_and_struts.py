@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
-from helpers.last_state import run
-from helpers.mesh_files import case_of
-from helpers.strut_twin import Strut, solid
+from helpers.runs import run_with_fields
+from helpers.small_models import case_of
+from helpers.twins import Strut, solid
 
 from pfem_petsc import Case, Simulation, write_mesh
 from pfem_petsc.errors import InputError, SimulationFailure
@@ -46,7 +46,7 @@ def test_slack_members(comm, shared_tmp_path, method):
         },
         folder=shared_tmp_path,
     )
-    history, fields = run(case, comm, shared_tmp_path / "out")
+    history, fields = run_with_fields(case, comm, shared_tmp_path / "out")
     expected = [0.0, 0.0, -1000.0, 0.0, 1000.0 * math.sqrt(2.0), 0.0]
     assert fields["axial_force"] == pytest.approx(expected, rel=1e-4, abs=0.1)
     assert fields["status"].tolist() == [0.0, 0.0, 0.0, 0.0, 0.0, 2.0]
@@ -74,7 +74,7 @@ def test_cable_longer_than_its_span_is_slack_until_it_is_pulled(comm, shared_tmp
             "output": {"probe": [{"name": "tip", "node_set": "tip"}]},
         }
     )
-    history, fields = run(case, comm, shared_tmp_path / "out")
+    history, fields = run_with_fields(case, comm, shared_tmp_path / "out")
     flow = (2e11 * 3e-3 - 2e8) / (2e11 + 1e9)
     way = history["probe/tip/position"][:, 0, 0] - 1.0
     force = history["probe/tip/reaction"][:, 0, 0]
@@ -111,7 +111,7 @@ def test_path_control_follows_the_softening_of_a_strut(comm, shared_tmp_path, me
     peak = min(bar.euler, bar.yields) * bar.area
     static = {"method": method, "node_set": "tip", "direction": [-1.0, 0.0, 0.0], "displacement": 4e-3 * bar.length}
     static |= {"max_points": 600, "step": 0.05}
-    history, _ = run(strut_case(bar, static, force=-peak), comm, shared_tmp_path / "out")
+    history, _ = run_with_fields(strut_case(bar, static, force=-peak), comm, shared_tmp_path / "out")
     assert history["newton_iterations"].max() <= 12
     strain = history["probe/tip/position"][:, 0, 0] / bar.length - 1.0
     state, expected = bar.start(), [0.0]
@@ -147,7 +147,7 @@ def test_prestress(law, comm, shared_tmp_path):
         section={"s": {"area": 1e-4, "material": "m", "shape": "round", "pretension": force}},
         static={"step": 1.0},
     )
-    _, fields = run(case, comm, shared_tmp_path / "out")
+    _, fields = run_with_fields(case, comm, shared_tmp_path / "out")
     assert fields["axial_force"] == pytest.approx([force, force], rel=1e-9)
 
 
@@ -172,7 +172,7 @@ def test_each_strut_buckles_at_the_load_of_its_own_area_and_length(comm, shared_
         },
         folder=shared_tmp_path,
     )
-    _, fields = run(case, comm, shared_tmp_path / "out")
+    _, fields = run_with_fields(case, comm, shared_tmp_path / "out")
     euler = 0.25 * math.pi * 2e11 * np.array([1e-4, 3e-4]) ** 2 / np.array([1.0, 1.5]) ** 2
     assert fields["axial_force"] == pytest.approx(-euler, rel=1e-9)
 
@@ -194,7 +194,7 @@ def test_iterative_solvers_take_slack_cables_whose_nodes_are_held(linear, comm, 
         static={"step": 0.5},
         solver={"linear": linear},
     )
-    history, fields = run(case, comm, shared_tmp_path / "out")
+    history, fields = run_with_fields(case, comm, shared_tmp_path / "out")
     assert (fields["status"] == 2.0).sum() == history["slack_bars"][-1]
     force = fields["axial_force"]
     assert force.min() >= 0.0

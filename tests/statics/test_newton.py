@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.mesh_files import case_of
+from helpers.small_models import case_of
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError, SimulationFailure

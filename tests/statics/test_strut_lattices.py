@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.last_state import run
+from helpers.runs import run_with_fields
 
 from pfem_petsc import Case, Simulation, open_result
 
@@ -42,7 +42,7 @@ def octet_strength(area, cells, comm, folder):
             "output": {"fields_every": 0, "probe": [{"name": "top", "node_set": "top"}]},
         }
     )
-    history, _ = run(case, comm, folder)
+    history, _ = run_with_fields(case, comm, folder)
     return -history["probe/top/reaction"][:, :, 2].sum(axis=1).min()
 
 

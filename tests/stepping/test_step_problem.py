@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.bar_twins import STEP, Law, shaken, whole_truss
+from helpers.twins import COMPLEX_STEP, Law, shaken, whole_truss
 
 from pfem_petsc import Case
 from pfem_petsc.contact.frames import Planes, build_frames
@@ -108,8 +108,8 @@ class Twin:
         out = np.empty((n, n))
         for k in range(n):
             z = w.astype(complex).ravel()
-            z[k] += 1j * STEP
-            out[:, k] = self.residual(z.reshape(w.shape)).imag.ravel() / STEP
+            z[k] += 1j * COMPLEX_STEP
+            out[:, k] = self.residual(z.reshape(w.shape)).imag.ravel() / COMPLEX_STEP
         out[:, self.fixed.ravel()] = 0.0
         held = np.flatnonzero(self.fixed)
         out[held, held] = 1.0

@@ -78,15 +78,12 @@ CASES = {
 
 def request_stop(simulation, last):
     """Let a run be asked to stop after a step, as by a signal."""
-    advance = simulation._advance
 
-    def advance_and_stop():
-        made = advance()
-        if made.step == last and simulation.comm.rank == simulation.comm.size - 1:
+    def stop(step):
+        if step.step == last and simulation.comm.rank == simulation.comm.size - 1:
             simulation._synchroniser.stop._signal = 15
-        return made
 
-    simulation._advance = advance_and_stop
+    simulation.on_step(stop, every=last)
 
 
 def simulate(case, overrides, folder, comm, stop_after=None, **options):

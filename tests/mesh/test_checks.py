@@ -11,10 +11,6 @@ SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
 ROUND = [[0, 1], [1, 2], [2, 3], [3, 0]]
 
 
-def test_a_sound_mesh_passes(comm):
-    assert check_mesh(slab_from(SQUARE, ROUND, comm), comm) == []
-
-
 @pytest.mark.parametrize(
     ("points", "bars", "text"),
     [

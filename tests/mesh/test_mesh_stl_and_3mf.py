@@ -5,7 +5,6 @@ import zipfile
 import numpy as np
 import pytest
 
-from pfem_petsc import Truss
 from pfem_petsc.errors import InputError
 from pfem_petsc.formats import read_whole
 
@@ -144,5 +143,3 @@ def test_3mf_without_lattice_and_damaged(tmp_path):
         (tmp_path / "d.3mf").write_bytes(damaged)
         with pytest.raises(InputError, match="d.3mf: is not 3MF, or damaged"):
             read_whole(tmp_path / "d.3mf")
-    with pytest.raises(InputError, match="3MF needs a radius of each bar"):
-        Truss([[0, 0, 0], [1, 0, 0]], [[0, 1]]).write(tmp_path / "n.3mf")

@@ -123,11 +123,6 @@ def test_arrays_are_kept_and_read_only():
     assert (grid.n_points, grid.n_cells, grid["group:legs"].sum()) == (4, 6, 3)
 
 
-def test_written_and_read(tmp_path):
-    truss = tripod()
-    assert Truss.read(truss.write(tmp_path / "a.h5"), bar_fields=["area"]) == truss
-
-
 def test_arrays_in_a_case_file():
     case = Case(TABLES, mesh=tripod())
     again = Case.from_toml(case.to_toml())

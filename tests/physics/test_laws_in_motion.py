@@ -138,12 +138,12 @@ THROWN |= {("compaction", "engineering"): -4.0}
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "strain"), THROWN)
-def test_fused_steps_are_single_steps(law, strain, tmp_path):
+def test_batches_are_single_steps(law, strain, tmp_path):
     found = []
     for together in (False, True):
         case = row_of_bars(law, strain, THROWN[law, strain])
         with Simulation(case, output=tmp_path / str(together), quiet=True) as simulation:
-            for _ in simulation.batches(min_steps=1) if together else simulation:
+            for _ in simulation.batches() if together else simulation:
                 pass
             assert simulation.state.step == 200
             found.append((simulation.state.x.copy(), simulation.model.bars.history()))

@@ -1,4 +1,4 @@
-"""Equilibria of slack structures by dynamic relaxation: cables that start straight, mechanisms, nets, tensegrities."""
+"""Equilibria by dynamic relaxation: cables that start straight, nets, tensegrities, floors; ranks and failures."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from helpers.cables import chain, elastic_catenary, funicular, heavy_cable, run
 from helpers.small_models import case_of
+from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.errors import InputError, SimulationFailure
+from pfem_petsc.statics.relaxation import node_stiffness
 
 pytestmark = pytest.mark.parallel
 
@@ -223,3 +226,142 @@ def test_bars_that_yield_remember_equilibria_alone(comm, shared_tmp_path):
     assert newton["plastic_dissipation"][-1] > 0.1
     for name in ("probe/all/position", "plastic_dissipation", "elastic_energy", "load_factor"):
         np.testing.assert_allclose(relaxation[name], newton[name], rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("newton", [True, False])
+def test_a_net_lies_down_on_a_floor(comm, shared_tmp_path, newton):
+    """The floor and the corners bear the weight; nodes are on the floor or above it."""
+    keys = ["mesh.cells=[4, 4]",
+            "wall=[{name='floor', type='plane', point=[0.0, 0.0, -2.0], normal=[0.0, 0.0, 1.0]}]",
+            "material.rope.young_modulus=1e7", f"static.newton={str(newton).lower()}"]  # fmt: skip
+    row, x = run(Case.load("hanging_net", keys), comm, shared_tmp_path / "out")
+    weight = 1000.0 * 1e-4 * 9.81 * 2 * 5 * 10.0
+    assert x[:, 2].min() > -2.0 - 1e-11
+    down = x[:, 2] < -2.0 + 1e-9
+    assert 1 <= down.sum() == row["active_contacts"] < 21
+    floor = row["wall/floor/force"]
+    # Newton's method begins with the nodes on the floor where the relaxed ones are, not with those at the start
+    assert (0 < row["newton_iterations"] < 10) == newton
+    assert 0.05 * weight < floor[2] == pytest.approx(weight - row["support_force"][2], rel=1e-7)
+    assert np.abs(floor[:2]).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_chain_that_rests_on_a_floor(comm, shared_tmp_path):
+    """A mooring line, anchor and part of it on the floor, beside pycatenary 1.0.0 (scripts/peers/run_pycatenary.py).
+
+    ``MooringLine(L=6.98, w=1.036, EA=5600.0, anchor=[0, 0, 0], fairlead=[5.2, 1, 2.65], floor=True)`` has the
+    horizontal and vertical tension at the fairlead and the length on the floor below. The reaction there bears half of
+    the last bar's weight, as the end of a cable does.
+    """
+    horizontal, vertical, lying = 0.7530436, 3.4154658, 3.6832184
+    n, top = 60, np.array([5.2, 1.0, 2.65])
+    points = np.outer(np.linspace(0.0, 1.0, n + 1), [6.98, 0.0, 0.0])
+    case = chain(
+        shared_tmp_path,
+        comm,
+        points,
+        material={"m": {"young_modulus": 5600e4, "density": 1.036 / 9.81e-4}},
+        support=[
+            {"node_set": "at0", "fix": "xyz"},
+            {"node_set": f"at{n}", "fix": "xyz", "motion": [[0.0, 0.0, 0.0, 0.0], [1.0, *(top - points[-1])]]},
+        ],
+        gravity=-9.81,
+        wall=[{"name": "floor", "type": "plane", "point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}],
+    )
+    row, x = run(case, comm, shared_tmp_path / "out")
+    anchor, fairlead = row["probe/ends/reaction"]
+    assert np.hypot(*anchor[:2]) == pytest.approx(horizontal, rel=1e-3)
+    assert np.hypot(*fairlead[:2]) == pytest.approx(horizontal, rel=1e-3)
+    assert fairlead[2] == pytest.approx(vertical, rel=1e-3)
+    assert (x[1:, 2] < 1e-9).sum() * 6.98 / n == pytest.approx(lying, abs=6.98 / n)
+    assert fairlead[:2] / np.hypot(*fairlead[:2]) == pytest.approx(top[:2] / np.hypot(*top[:2]), abs=1e-6)
+
+
+INCREMENTS = [
+    *("static.step=0.25", "mesh.cells=[4, 4]", "output.checkpoint_every=1", "output.fields_every=1"),
+]
+FLOOR = "wall=[{name='floor', type='plane', point=[0.0, 0.0, -2.3], normal=[0.0, 0.0, 1.0]}]"
+
+
+@pytest.mark.parametrize("newton", [True, False])
+def test_ranks_agree(comm, shared_tmp_path, newton):
+    keys = [*INCREMENTS, FLOOR, "material.rope.young_modulus=1e7", "static.step=0.5"]
+    keys += [f"static.newton={str(newton).lower()}", "static.tolerance=1e-11"]
+    row, x = run(Case.load("hanging_net", keys), comm, shared_tmp_path / "all")
+    alone = None
+    if comm.rank == 0:
+        alone = run(Case.load("hanging_net", keys), MPI.COMM_SELF, shared_tmp_path / "one")
+    alone, places = comm.bcast(alone)
+    assert np.abs(x - places).max() < 1e-8 * 10.0
+    for name in ("elastic_energy", "wall/floor/force", "support_force"):
+        assert row[name] == pytest.approx(alone[name], rel=1e-7, abs=1e-6)
+
+
+def test_what_does_not_settle_ends_with_its_residual(comm, shared_tmp_path):
+    with pytest.raises(SimulationFailure) as failure:
+        run(heavy_cable(10, step=0.5, max_iterations=50), comm, shared_tmp_path / "out")
+    assert failure.value.exit_status == 3
+    text = str(failure.value)
+    for part in ("load factor 0.5", "50 pseudo-steps", "residual", "required", "worst at node", "max_iterations"):
+        assert part in text
+    assert list(open_result(shared_tmp_path / "out").history["load_factor"]) == [0.0]
+
+
+def test_crushed_bars_end_the_run_on_all_ranks(comm, shared_tmp_path):
+    case = chain(shared_tmp_path, comm, [[0, 0, 0], [1, 0, 0]], support=[
+        {"node_set": "at0", "fix": "xyz"}, {"node_set": "at1", "fix": "yz"}],
+        load=[{"node_set": "at1", "force": [-1e6, 0, 0]}])  # fmt: skip
+    with pytest.raises(SimulationFailure, match="bar 0 collapsed"):
+        run(case, comm, shared_tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"wall": [{"name": "floor", "type": "plane", "point": [0.0, 0.0, -9.0], "normal": [0.0, 0.0, 1.0],
+                    "friction": 0.2}]}, "wall 'floor': friction"),
+        ({"contact_pair": [{"name": "pair", "first": "at1", "second": "at2", "direction": [1.0, 0.0, 0.0]}]},
+         r"does not support \[\[contact_pair\]\]"),
+        ({"static": {"method": "relaxation", "damping": "viscous"}}, "static.damping"),
+        ({"static": {"method": "relaxation", "tolerance": 2.0}}, "static.tolerance"),
+    ],
+)  # fmt: skip
+def test_refusals(comm, shared_tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        run(chain(shared_tmp_path, comm, [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]], **change), comm,
+            shared_tmp_path / "out")  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_masses_keep_pseudo_steps_stable(seed):
+    """Of half the bound on each node's block the highest frequency is at most 2 in a step of 1."""
+    random = np.random.default_rng(seed)
+    n = 12
+    x = random.random((n, 3))
+    bars = np.array([[a, b] for a in range(n) for b in range(a + 1, n) if random.random() < 0.4])
+    ways = x[bars[:, 1]] - x[bars[:, 0]]
+    lengths = np.linalg.norm(ways, axis=1)
+    directions = ways / lengths[:, None]
+    axial, geometric = 10.0 ** random.uniform(0, 3, len(bars)), random.normal(0.0, 2.0, len(bars))
+    modulus = axial * random.choice([0.5, 2.0], len(bars))  # of a bar that yields the present stiffness is less
+    stored = np.vstack([directions.T, axial - geometric, geometric])
+    counted = random.random(len(bars)) < 0.5
+    bound = np.empty(n)
+    forces = node_stiffness(x, bars.astype(np.int32), stored, modulus, counted, np.empty((n, 6)), bound)
+    assert forces == pytest.approx(((geometric * lengths)[counted] ** 2).sum(), rel=1e-12)
+
+    along = np.maximum(axial, modulus)[:, None, None] * directions[:, :, None] * directions[:, None, :]
+    across = np.maximum(geometric, 0.0)[:, None, None] * (np.eye(3) - directions[:, :, None] * directions[:, None, :])
+    stiffness, blocks = np.zeros((n, 3, n, 3)), np.zeros((n, 3, 3))
+    for (a, b), k in zip(bars, along + across, strict=True):
+        for i, j, sign in ((a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)):
+            stiffness[i, :, j] += sign * k
+        blocks[a] += k
+        blocks[b] += k
+    largest = np.linalg.eigvalsh(blocks)[:, -1]
+    assert (bound >= largest * (1.0 - 1e-12)).all() and (bound <= 1.75 * largest).all()
+    root = np.repeat(1.0 / np.sqrt(0.5 * bound), 3)
+    scaled = root[:, None] * stiffness.reshape(3 * n, 3 * n) * root
+    assert np.sqrt(np.linalg.eigvalsh(scaled)[-1]) <= 2.0 * (1.0 + 1e-12)

@@ -27,6 +27,7 @@ from ...case.base import (
     listed,
 )
 from ...errors import InputError
+from ..generators.base import Length
 from ..slab import check_length, check_size
 from .cells import ANGLE, KINDS, UnitCell, auxetic, cell_of
 from .expressions import COORDINATES, Expression, Fields, MeshField, can_be_variable
@@ -139,7 +140,7 @@ class Parameters(StrictModel):
     cells: PositiveInts3 | None = None
     """Number of cubic cells along x, y and z; with ``surface``, default: as many as cover it, from ``origin`` on where
     ``grading`` is an expression."""
-    pitch: PositiveFloat
+    pitch: Length
     """Edge of the cubic cell [m]."""
     angle: Annotated[float, Field(gt=0.0, lt=45.0)] | None = None
     """Angle of the inclined struts of ``auxetic`` against the x-y plane [degrees]; default: 20."""
@@ -443,17 +444,13 @@ class Block(Joints):
     def __init__(self, keys: Parameters, plain: bool) -> None:
         self.keys, self.expressions = keys, keys.expressions()
         closed = keys.curved is not None and keys.curved.closed
-        check_length(keys.pitch, "mesh.pitch")
         cell, cells = keys.unit_cell(), np.array(keys.cells, np.int64)
         # the edge of all cells along an axis, or the coordinates of their borders and of one more
         self._levels: list[float | np.ndarray] = []
         for axis, factor in enumerate(keys.grading or (1.0, 1.0, 1.0)):
             edge = keys.pitch * cell.aspect[axis]
             if isinstance(factor, str):
-                try:
-                    self._levels.append(graded_levels(-(-int(cells[axis]) // cell.layers[axis]), edge, factor, axis))
-                except ValueError as error:
-                    raise InputError(f"mesh.grading[{axis}]: {error}") from None
+                self._levels.append(graded_levels(-(-int(cells[axis]) // cell.layers[axis]), edge, factor, axis))
             else:
                 check_length(edge * factor, f"mesh.pitch times mesh.grading[{axis}]")
                 self._levels.append(float(edge * factor))
@@ -469,8 +466,6 @@ class Block(Joints):
         self._extents = self._box()
         farthest = float(np.abs(keys.origin or 0.0).max()) + float(self._extents.max())
         check_length(farthest, "mesh.origin and the extent of the block")
-        for length, axis in zip(self._extents, COORDINATES):
-            check_length(float(length), f"mesh.cells: extent along {axis}")
         self.volume = self._shell() if keys.curved is not None else float(np.prod(self._extents))
 
     def _box(self) -> np.ndarray:
@@ -574,7 +569,7 @@ def graded_levels(cells: int, edge: float, factor: str, axis: int) -> np.ndarray
 
     Raises
     ------
-    ValueError
+    InputError
         If the factor is not positive somewhere.
     """
     levels = list(islice(_borders(edge, factor, axis), cells + 1))
@@ -587,7 +582,7 @@ def graded_count(length: float, edge: float, factor: str, axis: int, most: int =
 
     Raises
     ------
-    ValueError
+    InputError
         If the factor is not positive somewhere, or more than ``most`` cells are needed.
     """
     start = 0.0
@@ -595,7 +590,9 @@ def graded_count(length: float, edge: float, factor: str, axis: int, most: int =
         if end >= length - 1e-9 * (end - start):
             return count
         start = end
-    raise ValueError(f"{factor!r} takes more than {most:,} cells over {length:g} m, and reaches {start:g} m")
+    raise InputError(
+        f"mesh.grading[{axis}]: {factor!r} takes more than {most:,} cells over {length:g} m, and reaches {start:g} m"
+    )
 
 
 def _borders(edge: float, factor: str, axis: int) -> Iterator[float]:
@@ -606,7 +603,9 @@ def _borders(edge: float, factor: str, axis: int) -> Iterator[float]:
     def slope(x: float) -> float:
         value = float(expression({name: np.array([x])})[0])
         if not (np.isfinite(value) and value > 0.0):
-            raise ValueError(f"{factor!r} is {value:g} at {name} = {x:g} m; expected a factor > 0 in the block")
+            raise InputError(
+                f"mesh.grading[{axis}]: {factor!r} is {value:g} at {name} = {x:g} m; expected a factor > 0 in the block"
+            )
         return edge * value
 
     x, h = 0.0, 1.0 / _STEPS
@@ -639,7 +638,12 @@ def fitted(keys: Parameters, surface: Surface) -> Parameters:
     for axis, factor in enumerate(keys.grading or (1.0, 1.0, 1.0)):
         edge = keys.pitch * cell.aspect[axis]
         if isinstance(factor, str):
-            count[axis] = _graded_count(factor, axis, edge, (low, high, origin))
+            if origin[axis] > low[axis] + 1e-9 * edge:
+                raise InputError(
+                    f"mesh.grading[{axis}] = {factor!r}: an expression begins at mesh.origin, and the surface below it "
+                    f"would stay empty: use {COORDINATES[axis]} = {low[axis]:.9g} or less there, or leave the key out"
+                )
+            count[axis] = graded_count(float(high[axis] - origin[axis]), edge, factor, axis)
             continue
         first = np.floor((low[axis] - origin[axis]) / (edge * factor) + 1e-9)
         count[axis] = max(np.ceil((high[axis] - origin[axis]) / (edge * factor) - 1e-9) - first, 1.0)
@@ -655,22 +659,3 @@ def fitted(keys: Parameters, surface: Surface) -> Parameters:
     )
     cells = tuple((count.astype(np.int64) * np.array(cell.layers)).tolist())
     return keys.model_copy(update={"cells": cells, "origin": tuple(start.tolist())})
-
-
-def _graded_count(factor: str, axis: int, edge: float, box: tuple[np.ndarray, np.ndarray, np.ndarray]) -> int:
-    """Return the number of cells along an axis, from the origin to the upper side of the surface."""
-    name, (low, high, origin) = COORDINATES[axis], box
-    lowest, highest = (f"({', '.join(f'{x:.6g}' for x in point.tolist())})" for point in (low, high))
-    around = f"the surface is in the box from {lowest} to {highest} m"
-    if origin[axis] > low[axis] + 1e-9 * edge:
-        raise InputError(
-            f"mesh.grading[{axis}] = {factor!r}: an expression begins at mesh.origin, and the surface below it would "
-            f"stay empty: {around}; use {name} = {low[axis]:.9g} or less in mesh.origin, or leave mesh.origin out"
-        )
-    try:
-        return graded_count(float(high[axis] - origin[axis]), edge, factor, axis)
-    except ValueError as error:
-        raise InputError(
-            f"mesh.grading[{axis}]: {error}; {around}, and {name} of the expression is measured from "
-            f"{name} = {origin[axis]:.9g} m"
-        ) from None

@@ -57,7 +57,7 @@ def main() -> int:
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.worker:
-        from random_trusses.work import work
+        from random_trusses.comparisons import work
 
         seeds = json.loads(arguments.seeds)
         sources = {number: str(path) for number, path in enumerate(arguments.cases)}

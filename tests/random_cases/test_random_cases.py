@@ -8,13 +8,19 @@ import tomllib
 import numpy as np
 import pytest
 from mpi4py import MPI
-from random_trusses.additions import LAWS
 from random_trusses.checks import Loaded, check_result
-from random_trusses.copies import KINDS, judge_copies
-from random_trusses.draw import draw_case
+from random_trusses.comparisons import (
+    EXACT,
+    KINDS,
+    MARGIN,
+    _compare,
+    check_case,
+    judge_copies,
+    judge_ranks,
+    judge_schemes,
+)
+from random_trusses.draw import LAWS, draw_case
 from random_trusses.running import case_text, run_case
-from random_trusses.schemes import EXACT, MARGIN, _compare, judge_schemes
-from random_trusses.work import check_case, judge_ranks
 
 from pfem_petsc import Case
 from pfem_petsc.run.observers import Snapshots

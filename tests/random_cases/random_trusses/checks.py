@@ -28,7 +28,7 @@ from pfem_petsc.contact.walls.base import WallKeys
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
 
-from .body import generated
+from .draw import generated
 
 Faults = list[tuple[str, str]]
 _ENDS = ("_energy", "_dissipation", "_work")

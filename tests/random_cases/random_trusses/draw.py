@@ -6,27 +6,596 @@ drawn, except in a few percent of the cases, which must be refused with a messag
 
 from __future__ import annotations
 
+import importlib
+import math
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
-from .additions import (
-    ODD,
-    draw_bar_law,
-    draw_connectors,
-    draw_inclined,
-    draw_laws,
-    draw_loads_over_time,
-    draw_points,
-    draw_prestress,
-    draw_rupture,
-    draw_stiffness_damping,
-    vector,
-)
-from .body import OPEN_KINDS, Body, draw_body
-from .walls import draw_walls
+from pfem_petsc.mesh.slab import MeshSlab
+
+ODD = 0.03
+"""Fraction of the cases in which a rule of combination is violated on purpose."""
+
+
+def vector(chance: random.Random, length: float) -> np.ndarray:
+    """Return a vector (3,) of this length in a random direction."""
+    vector = np.array([chance.gauss(0, 1) for _ in range(3)])
+    return length * vector / np.linalg.norm(vector)
+
+
+def draw_prestress(chance: random.Random, case: dict[str, Any], end: float) -> None:
+    """Prescribe rest lengths of a section, drawn on its own so that cases without them stay as they are."""
+    if chance.random() > 0.12:
+        return
+    section = case["section"][chance.choice(sorted(case["section"]))]
+    material = case["material"][section["material"]]
+    young = material["young_modulus"]
+    most = min(3e-3, 0.9 * material.get("yield_stress", young) / young)
+    key = chance.choice(("pretension", "prestress", "rest_length"))
+
+    def value() -> float:
+        strain = most * chance.uniform(-1.0, 1.0)
+        return {"pretension": young * strain * section["area"], "prestress": young * strain}.get(key, 1.0 - strain)
+
+    rows = sorted(chance.random() for _ in range(chance.randint(1, 4)))
+    section[key] = value() if chance.random() < 0.4 else [[row * end, value()] for row in rows]
+
+
+def draw_bar_law(chance: random.Random, case: dict[str, Any], longest: float) -> None:
+    """Replace the law of a material, drawn on its own so that cases without it stay as they are."""
+    if chance.random() > 0.12:
+        return
+    name = chance.choice(sorted(case["material"]))
+    table = {key: value for key, value in case["material"][name].items() if not key.endswith(("_hardening", "_stress"))}
+    young, law = table["young_modulus"], chance.choice(("cable", "strut", "strut", "damage", "compaction"))
+    table["law"], strong = law, young * 10 ** chance.uniform(-3, -1.7)
+    if law == "damage":
+        energy = 0.5 * strong**2 / young * longest * 10 ** chance.uniform(0.05, 1.0)
+        table |= {"tensile_strength": strong, "fracture_energy": energy}
+    elif law == "strut" or chance.random() < 0.6:
+        table["yield_stress"] = strong
+    if law == "strut":
+        table["imperfection"] = chance.choice((0.0, 10 ** chance.uniform(-4, -2)))
+    if law == "cable" and "yield_stress" in table and chance.random() < 0.7:
+        table["isotropic_hardening"] = young * 10 ** chance.uniform(-2, -0.3)
+    if law == "compaction":
+        table |= {"compaction_strain": 10 ** chance.uniform(-3, -1.5), "compaction_modulus": 0.2 * young}
+    case["material"][name] = table
+    for section in case["section"].values():
+        if section["material"] == name:
+            shape = {"shape": "tube", "thickness": 0.1 * section["area"] ** 0.5}
+            section |= chance.choice(({"shape": "round"}, shape, {"second_moment": 0.05 * section["area"] ** 2}))
+            section["effective_length"] = chance.choice((1.0, 0.7, 0.5))
+
+
+def draw_loads_over_time(chance: random.Random, case: dict[str, Any], speed: float, end: float) -> None:
+    """Wind, gravity over time and smooth tables, drawn on their own so that cases without them stay as they are."""
+    if chance.random() > 0.12:
+        return
+
+    def rows(values: Any) -> list[list[float]]:
+        times = sorted(chance.random() for _ in range(chance.randint(1, 5)))
+        return [[t * end, *(chance.uniform(-1.0, 1.0) * np.array(values))] for t in times]
+
+    smooth = {"interpolation": "smooth"} if chance.random() < 0.5 else {}
+    if not any(wall.get("gravity") for wall in case.get("wall", ())) and chance.random() < 0.5:
+        strength = speed / end * vector(chance, chance.uniform(0.1, 2.0))
+        case["gravity"] = {"acceleration": rows(strength), **smooth}
+    for load in case.get("load", ()):
+        load |= smooth if "table" in load else {}
+    # nodes without mass cannot follow wind, which is refused
+    massless = case.get("contact", {}).get("treatment") == "mass_redistribution" and chance.random() > ODD
+    if ("gravity" not in case or chance.random() < 0.6) and not massless:
+        wind = speed * vector(chance, chance.uniform(0.3, 1.5))
+        # drag that stops the lightest bars at twice the speed of the body in some part of the run
+        section = min(case["section"].values(), key=lambda s: case["material"][s["material"]]["density"] * s["area"])
+        line = case["material"][section["material"]]["density"] * section["area"]
+        widest = max(2.0 * np.sqrt(s["area"] / np.pi) for s in case["section"].values())
+        density = chance.uniform(0.02, 0.8) * line / (1.2 * widest * 2.0 * speed * end)
+        steady = chance.random() < 0.4
+        case["wind"] = {"velocity": wind if steady else rows(wind), "density": density, **({} if steady else smooth)}
+        if chance.random() < 0.3:
+            section["drag_coefficient"] = chance.uniform(0.0, 1.2)
+
+
+def draw_stiffness_damping(chance: random.Random, case: dict[str, Any], limit: float) -> None:
+    """Damp a material in proportion to its stiffness, drawn on its own; rest lengths that change exclude it."""
+    if chance.random() > 0.08 or any(isinstance(value, list) for s in case["section"].values() for value in s.values()):
+        return
+    material = case["material"][chance.choice(sorted(case["material"]))]
+    material["stiffness_damping"] = limit * 10 ** chance.uniform(-3.0, -1.0)
+
+
+LAWS = ("voce", "ludwik", "ramberg_osgood", "multilinear", "cowper_symonds", "perzyna", "johnson_cook")
+HARDENING = ("isotropic_hardening", "kinematic_hardening")
+
+
+def draw_laws(chance: random.Random, case: dict[str, Any], end: float) -> None:
+    """Change the law of a material or let it soften, drawn on its own so that other cases stay as they are."""
+    if chance.random() > 0.12:
+        return
+    table = case["material"][chance.choice(sorted(case["material"]))]
+    if "law" in table:  # drawn elsewhere
+        return
+    if "temperature" not in case and chance.random() < 0.3:
+        case["temperature"] = [{"table": [[0.0, 0.0], [end * chance.uniform(0.1, 1.0), chance.uniform(-60.0, 60.0)]]}]
+    softens = "temperature" in case and chance.random() < 0.7
+    if not softens or chance.random() < 0.5:
+        name = chance.choice(LAWS)
+        yields = table.pop("yield_stress", None) or table["young_modulus"] * 10 ** chance.uniform(-3, -1.7)
+        for key in HARDENING:
+            table.pop(key, None)
+        table |= {"law": name, **_law_keys(chance, name, table, yields)}
+        softens = softens and name != "johnson_cook"
+    yields = table.get("law") or "yield_stress" in table
+    if softens and not (yields and case["time"]["integrator"] == "energy_momentum"):
+        rows = sorted(chance.uniform(-60.0, 60.0) for _ in range(chance.randint(1, 4)))
+        table["softening"] = [[row, chance.uniform(0.3, 1.0), chance.uniform(0.3, 1.1)] for row in rows]
+
+
+def _law_keys(chance: random.Random, name: str, table: dict[str, Any], yields: float) -> dict[str, Any]:
+    young = table["young_modulus"]
+    power = {"strength_coefficient": yields * chance.uniform(0.5, 5.0), "hardening_exponent": chance.uniform(0.05, 1.0)}
+    if name == "ramberg_osgood":
+        return {"proof_stress": yields, "exponent": chance.uniform(1.0, 20.0)}
+    if name == "multilinear":
+        rows, stress, plastic = [[yields / young, yields]], yields, 0.0
+        for _ in range(chance.randint(0, 4)):
+            stress, plastic = stress + yields * chance.uniform(0.0, 0.3), plastic + chance.uniform(1e-3, 0.02)
+            rows.append([plastic + stress / young, stress])
+        return {"curve": rows}
+    if name == "ludwik":
+        return {"yield_stress": yields, **power}
+    rate = 10 ** chance.uniform(-2, 3)
+    if name == "johnson_cook":
+        heating = {"melting_temperature": chance.uniform(100.0, 1500.0), "thermal_exponent": chance.uniform(0.5, 1.5)}
+        if chance.random() < 0.6:  # so that a plastic strain of one heats by about the melting temperature
+            heating["specific_heat"] = yields / (table["density"] * heating["melting_temperature"])
+        rates = {"rate_coefficient": chance.uniform(0.0, 0.1), "rate_reference": rate}
+        return {"yield_stress": yields, **power, **rates, **heating}
+    keys = {"yield_stress": yields, "saturation_stress": yields * chance.uniform(0.0, 2.0)}
+    keys |= {"saturation_rate": 10 ** chance.uniform(0, 2.5)}
+    for key in HARDENING:
+        if chance.random() < 0.5:
+            keys[key] = young * 10 ** chance.uniform(-3, -0.3)
+    if name == "cowper_symonds":
+        keys |= {"rate_reference": rate, "rate_exponent": chance.uniform(1.0, 8.0)}
+    if name == "perzyna":
+        keys |= {"fluidity": rate, "overstress_exponent": chance.uniform(1.0, 8.0)}
+    return keys
+
+
+def draw_rupture(chance: random.Random, case: dict[str, Any], end: float) -> None:
+    """Let bars break, or remove a support, drawn on its own so that other cases stay as they are."""
+    if chance.random() > 0.12:
+        return
+    table = case["material"][chance.choice(sorted(case["material"]))]
+    small = 10 ** chance.uniform(-4, -2)
+    limits = {"strain": small, "compressive_strain": small * chance.uniform(0.5, 2.0)}
+    limits |= {"stress": small * table["young_modulus"]}
+    plastic = "yield_stress" in table or "proof_stress" in table or "curve" in table
+    if plastic:
+        limits["plastic_strain"] = small
+    keys = chance.sample(sorted(limits), chance.randint(1, 2))
+    table["rupture"] = {key: limits[key] for key in keys}
+    if chance.random() < 0.3:
+        table["rupture"]["steps"] = chance.randint(2, 8)
+    if case.get("support") and "contact_pair" not in case and chance.random() < 0.5:
+        case["support"][0]["name"] = "held"
+        removal = {"supports": "held", "time": chance.uniform(0.0, 1.0) * end}
+        case["remove"] = [removal | ({"duration": 0.3 * end} if chance.random() < 0.5 else {})]
+
+
+def draw_points(chance: random.Random, case: dict[str, Any], size: float) -> None:
+    """Give nodes masses, springs and dashpots, drawn on their own so that other cases stay as they are.
+
+    ``size`` : of the truss [m]; a mass is a part of that of a bar of this length.
+    """
+    sections = [
+        (section.get("area", 0.0), case["material"][section["material"]]) for section in case["section"].values()
+    ]
+    bar = max(area * material["density"] for area, material in sections) * size
+    if bar and math.isfinite(bar) and chance.random() < 0.15:
+        node_sets = [chance.choice(sorted(case["node_set"])) for _ in range(chance.randint(1, 2))]
+        case["mass"] = [{"node_set": name, "value": bar * 10 ** chance.uniform(-2, 1)} for name in node_sets]
+    if any("damping" in material for material in case["material"].values()) and chance.random() < 0.3:
+        end = case["time"]["end"]
+        case["time"]["damping_table"] = [[0.0, chance.uniform(0.0, 2.0)], [chance.uniform(0.1, 1.0) * end, 0.0]]
+    if case.get("contact", {}).get("treatment") == "mass_redistribution":
+        return  # refuses both
+    stiffness = max(area * material["young_modulus"] for area, material in sections) / size
+    if stiffness and math.isfinite(stiffness) and chance.random() < 0.15:
+        parts = [stiffness * 10 ** chance.uniform(-3, 1) if chance.random() < 0.7 else 0.0 for _ in range(3)]
+        case["spring"] = [{"node_set": chance.choice(sorted(case["node_set"])), "stiffness": parts}]
+    if stiffness and math.isfinite(stiffness) and chance.random() < 0.1:
+        coefficient = 10 ** chance.uniform(-3, -0.5) * math.sqrt(stiffness * bar)
+        case["dashpot"] = [{"node_set": chance.choice(sorted(case["node_set"])), "coefficient": coefficient}]
+    if "spring" in case and chance.random() < 0.5:
+        case["spring"][0]["frame"] = [[chance.uniform(-1.0, 1.0) for _ in range(3)] for _ in range(2)]
+
+
+def draw_inclined(chance: random.Random, case: dict[str, Any]) -> None:
+    """Turn supports, or add a roller; drawn on their own so that other cases stay as they are."""
+    if chance.random() > 0.1:
+        return
+    if case.get("wall") or case.get("contact_pair"):
+        if chance.random() > 0.4:
+            return
+        for key in ("wall", "contact_pair", "contact"):
+            case.pop(key, None)
+
+    def direction() -> list[float]:
+        return [chance.uniform(-1.0, 1.0) for _ in range(3)]
+
+    supports = case.setdefault("support", [])
+    for table in supports:
+        if chance.random() < 0.7:
+            table["frame"] = [direction(), direction()]
+    if not supports or chance.random() < 0.5:
+        names = [name for name in sorted(case["node_set"]) if name != "every"]
+        supports.append({"node_set": chance.choice(names), "normal": direction()})
+        if chance.random() < 0.3 and len(supports) == 1 and "remove" not in case:
+            supports[0]["name"] = "roller"
+            case["remove"] = [{"supports": "roller", "time": chance.random() * case["time"]["end"]}]
+
+
+def draw_connectors(chance: random.Random, case: dict[str, Any], size: float) -> None:
+    """Connect nodes, drawn on their own so that other cases stay as they are; ``size`` of the truss [m]."""
+    if chance.random() > 0.08:
+        return
+    sections = [
+        (section.get("area", 0.0), case["material"][section["material"]]) for section in case["section"].values()
+    ]
+    stiffness = max(area * material["young_modulus"] for area, material in sections) / size
+    bar = max(area * material["density"] for area, material in sections) * size
+    names = [name for name, chosen in case["node_set"].items() if "nearest" in chosen or "indices" in chosen]
+    if not stiffness or not math.isfinite(stiffness + bar) or len(names) < 2:
+        return
+    between = chance.sample(sorted(names), 2)
+    if chance.random() < 0.8:
+        table = {"between": between, "stiffness": stiffness * 10 ** chance.uniform(-3, 0)}
+        case.setdefault("spring", []).append(table)
+    if chance.random() < 0.6:
+        coefficient = 10 ** chance.uniform(-3, -1) * math.sqrt(stiffness * bar)
+        case.setdefault("dashpot", []).append({"between": between, "coefficient": coefficient})
+
+
+CELLS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (1, 1, 2), (2, 2, 1), (2, 1, 2), (1, 2, 2), (3, 1, 1))
+PLAIN_KINDS = ("cubic", "octet", "bcc")
+OPEN_KINDS = ("fcc", "bcc_diagonals", "kelvin", "diamond", "gyroid", "auxetic", "tetrahedral_octahedral")
+
+
+@dataclass
+class Body:
+    """A truss at rest.
+
+    Attributes
+    ----------
+    tables : the tables mesh, material, section and, where bars are heated, temperature
+    points : (nodes, 3) [m]
+    bars : (bars, 2)
+    groups : node groups of the mesh
+    limit : estimate of the stable step of central differences with lumped mass [s]
+    wave : speed of waves in the fastest material [m/s]
+    length : of the shortest bar [m]
+    size : largest extent [m]
+    mass : of the truss [kg]
+    stiffness : largest young_modulus times area [N]
+    """
+
+    tables: dict[str, Any]
+    points: np.ndarray
+    bars: np.ndarray
+    groups: dict[str, np.ndarray]
+    limit: float = 0.0
+    wave: float = 0.0
+    length: float = 0.0
+    size: float = 0.0
+    mass: float = 0.0
+    stiffness: float = 0.0
+    bar_groups: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def draw_body(chance: random.Random) -> Body:
+    """A mesh of a generator with materials and sections."""
+    table = _mesh(chance)
+    plain = dict(table)
+    if table["generator"] == "lattice":
+        table |= _varied(table)
+    slab = generated(table)
+    groups = {name: members for name, members in slab.node_groups.items() if len(members)}
+    body = Body({"mesh": table}, slab.points, np.asarray(slab.bars), groups)
+    if table["generator"] != "lattice" or table != plain:
+        body.bar_groups = {name: members for name, members in slab.bar_groups.items() if len(members)}
+    vectors = body.points[body.bars[:, 1]] - body.points[body.bars[:, 0]]
+    lengths = np.linalg.norm(vectors, axis=1)
+    body.length = float(lengths.min())
+    body.size = float(np.ptp(body.points, axis=0).max())
+    materials = {"m0": _material(chance, body.size)}
+    sections: dict[str, Any] = {"s0": {"area": 10 ** chance.uniform(-4, -2), "material": "m0"}}
+    stiffness = np.full(len(lengths), materials["m0"]["young_modulus"] * sections["s0"]["area"])
+    weight = np.full(len(lengths), materials["m0"]["density"] * sections["s0"]["area"])
+    if len(body.bar_groups) > 1 and chance.random() < 0.4:
+        group = chance.choice(sorted(body.bar_groups))
+        name = "m0"
+        if chance.random() < 0.5:
+            name, materials["m1"] = "m1", _material(chance, body.size)
+        sections["s1"] = {"area": 10 ** chance.uniform(-4, -2), "material": name, "bars": group}
+        members = body.bar_groups[group]
+        stiffness[members] = materials[name]["young_modulus"] * sections["s1"]["area"]
+        weight[members] = materials[name]["density"] * sections["s1"]["area"]
+    body.tables |= {"material": materials, "section": sections}
+    body.wave = float(np.sqrt((stiffness / weight).max()))
+    body.mass = float((weight * lengths).sum())
+    body.stiffness = float(stiffness.max())
+    body.limit = _limit(body, vectors, lengths, stiffness, weight)
+    if chance.random() < 0.15:
+        body.tables["temperature"] = [_temperature(chance, body)]
+    return body
+
+
+def _mesh(chance: random.Random) -> dict[str, Any]:
+    kind = chance.choices(("rod", "two_rods", "ring", "lattice"), (25, 18, 22, 35))[0]
+    if kind == "rod":
+        return {"generator": "rod", "length": chance.uniform(0.5, 2.0), "elements": chance.randint(1, 20)}
+    if kind == "two_rods":
+        length = chance.uniform(0.5, 1.5)
+        gap = length * 10 ** chance.uniform(-3, -1.3)
+        return {"generator": kind, "length": length, "elements": chance.randint(1, 9), "gap": gap}
+    if kind == "ring":
+        outer = chance.uniform(0.5, 2.0)
+        return {
+            "generator": "ring",
+            "outer_radius": outer,
+            "inner_radius": outer * chance.uniform(0.6, 0.9),
+            "bays": chance.randint(3, 10),
+            "bracing": chance.choice(("x", "single")),
+            "orientation": chance.choice(("vertex", "flat")),
+        }
+    cells, shape = chance.choice(CELLS), chance.choice(PLAIN_KINDS)
+    return {"generator": "lattice", "kind": shape, "cells": cells, "pitch": chance.uniform(0.1, 0.5)}
+
+
+def generated(table: dict[str, Any]) -> MeshSlab:
+    """Return the whole mesh of a table ``[mesh]``."""
+    module = importlib.import_module(f"pfem_petsc.mesh.generators.{table['generator']}")
+    keys = module.Parameters(**{key: value for key, value in table.items() if key != "generator"})
+    if hasattr(module, "generate_on"):
+        return module.generate_on(keys, MPI.COMM_SELF, {}, None)
+    return module.generate(keys, 0, 1)
+
+
+def _varied(table: dict[str, Any]) -> dict[str, Any]:
+    """Return other keys of a quarter of the lattices, by a chance of their own: other cases stay as they were."""
+    chance = random.Random(repr(table))
+    if chance.random() < 0.75:
+        return {}
+    keys: dict[str, Any] = {}
+    if chance.random() < 0.7:
+        keys["kind"] = chance.choice(OPEN_KINDS)
+    if chance.random() < 0.4:
+        keys["perturbation"] = chance.uniform(0.005, 0.04)
+    if chance.random() < 0.3:
+        keys |= {"missing": chance.uniform(0.02, 0.15), "dangling": "keep"}
+    if chance.random() < 0.3:
+        factor = chance.uniform(0.5, 2.0)
+        keys["grading"] = chance.choice(([1, 1, factor], [1, f"1 + {factor:.3g}*y", 1]))
+    elif chance.random() < 0.2:
+        keys["curved"] = {"shape": chance.choice(("cylinder", "sphere")), "radius": chance.uniform(3.0, 5.0)}
+    return keys
+
+
+def _material(chance: random.Random, size: float) -> dict[str, Any]:
+    young, density = 10 ** chance.uniform(5, 8), 10 ** chance.uniform(2.5, 4)
+    table: dict[str, Any] = {"young_modulus": young, "density": density}
+    table["strain"] = chance.choices(("engineering", "green", "logarithmic"), (2, 1, 1))[0]
+    if chance.random() < 0.3:
+        table["yield_stress"] = young * 10 ** chance.uniform(-3, -1.7)
+        hardening = chance.choice(((1,), (0,), (1, 0), (0, 1), (1, 0)))
+        for key, used in zip(("isotropic_hardening", "kinematic_hardening"), (*hardening, 1), strict=False):
+            if used:
+                table[key] = young * 10 ** chance.uniform(-2, -0.3)
+    if chance.random() < 0.25:
+        table["damping"] = density * np.sqrt(young / density) / size * 10 ** chance.uniform(-2, 0)
+    if chance.random() < 0.4:
+        table["thermal_expansion"] = chance.choice((1, 1, -1)) * 10 ** chance.uniform(-6, -4)
+    return {key: value if isinstance(value, str) else float(value) for key, value in table.items()}
+
+
+def _limit(body: Body, vectors: np.ndarray, lengths: np.ndarray, stiffness: np.ndarray, weight: np.ndarray) -> float:
+    """2 / omega of the highest mode with lumped mass, from the dense matrices."""
+    n = len(body.points)
+    mass, matrix = np.zeros(n), np.zeros((n, 3, n, 3))
+    for (i, j), vector, length, ea, w in zip(body.bars, vectors, lengths, stiffness, weight, strict=True):
+        block = ea / length**3 * np.outer(vector, vector)
+        mass[[i, j]] += 0.5 * w * length
+        matrix[i, :, i] += block
+        matrix[j, :, j] += block
+        matrix[i, :, j] -= block
+        matrix[j, :, i] -= block
+    root = 1.0 / np.sqrt(np.repeat(mass, 3))
+    scaled = matrix.reshape(3 * n, 3 * n) * root[:, None] * root[None, :]
+    return float(2.0 / np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
+
+
+def _temperature(chance: random.Random, body: Body) -> dict[str, Any]:
+    table: dict[str, Any] = {}
+    if body.bar_groups and chance.random() < 0.5:
+        table["bars"] = chance.choice(sorted(body.bar_groups))
+    if chance.random() < 0.4:
+        return {**table, "value": chance.uniform(-60.0, 60.0)}
+    # rows over the duration, which is not known yet: fractions of it
+    rows = sorted(chance.random() for _ in range(chance.randint(1, 4)))
+    return {**table, "table": [[row, chance.uniform(-60.0, 60.0)] for row in rows]}
+
+
+def draw_walls(
+    chance: random.Random,
+    body: Body,
+    motion: Any,
+    sets: dict[str, Any],
+    treatment: str,
+    time: dict[str, Any],
+    pair: dict[str, Any] | None,
+) -> list[dict[str, Any]]:
+    """Return tables of zero to three walls; the first ones are in the path of the body."""
+    count = chance.choices((0, 1, 2, 3), (5, 55, 28, 12) if pair is None else (40, 45, 15, 0))[0]
+    if treatment == "mass_redistribution":
+        count = min(count, 1) or 1
+    walls = []
+    for k in range(count):
+        aimed = k == 0 or chance.random() < 0.4
+        name, members = _members(chance, body, motion, sets, treatment, pair)
+        simple = pair is not None and chance.random() > ODD
+        wall: dict[str, Any] = {"name": f"wall {k}" if chance.random() < 0.9 else f"Wand-{k}"}
+        if name is not None:
+            wall["node_set"] = name
+        way = motion.way if aimed else _tilted(chance, motion.way, 2.0)
+        if pair is not None and chance.random() < 0.5:
+            way = np.array([1.0, 0.0, 0.0])
+        tilt = chance.choice((0.0, 0.0, 0.2))
+        gap = motion.speed * motion.end * chance.choice((0.0, *(chance.uniform(0.02, 0.6) for _ in range(5))))
+        if chance.random() < 0.07:
+            # nodes that start beyond the wall
+            wall["adjust"], gap = True, -0.02 * body.length * chance.random()
+        _shape(chance, wall, body, members, _tilted(chance, way, tilt), gap, simple or treatment[0] == "m")
+        _move(chance, wall, body, motion, way, treatment, simple)
+        if not simple:
+            _law(chance, wall, treatment, time)
+        walls.append(wall)
+    return walls
+
+
+def _members(
+    chance: random.Random, body: Body, motion: Any, sets: dict[str, Any], treatment: str, pair: Any
+) -> tuple[str | None, np.ndarray]:
+    """A node set, None for every node, and the positions of its nodes."""
+    if pair is not None and chance.random() < 0.7:
+        name = chance.choice(("g_start", "g_end") if pair["first"] == "g_first_end" else ("g_bottom", "g_top"))
+    elif treatment == "mass_redistribution" or chance.random() < 0.5:
+        # the group that is farthest ahead
+        ahead = {name: float((members_of(body, sets[name]) @ motion.way).mean()) for name in sorted(sets)}
+        groups = [name for name in ahead if name.startswith("g_")]
+        name = max(groups, key=ahead.get) if chance.random() < 0.8 else chance.choice(sorted(sets))
+    else:
+        return None, body.points
+    return name, members_of(body, sets[name])
+
+
+def members_of(body: Body, table: dict[str, Any]) -> np.ndarray:
+    """Positions (m, 3) of the nodes of a node set."""
+    if "group" in table:
+        return body.points[body.groups[table["group"]]]
+    if "indices" in table:
+        return body.points[table["indices"]]
+    if "nearest" in table:
+        return body.points[[np.linalg.norm(body.points - table["nearest"], axis=1).argmin()]]
+    if "box" in table:
+        low, high = np.array(table["box"])
+        return body.points[((body.points >= low) & (body.points <= high)).all(axis=1)]
+    return body.points
+
+
+def _shape(
+    chance: random.Random,
+    wall: dict[str, Any],
+    body: Body,
+    members: np.ndarray,
+    way: np.ndarray,
+    gap: float,
+    flat: bool,
+) -> None:
+    """Kind and place: the nearest of the members is ``gap`` [m] before the wall, along ``way``."""
+    kind = chance.choices(("plane", "rectangle", "sphere", "cylinder"), (45, 12, 22, 21))[0]
+    first = members[(members @ way).argmax()]
+    if flat and kind in ("sphere", "cylinder") and chance.random() > ODD:
+        kind = "plane"
+    wall["type"] = kind
+    if kind in ("plane", "rectangle"):
+        sideways = np.cross(way, vector(chance, 1.0)) * body.size * (chance.uniform(0, 0.3) if kind == "plane" else 0.1)
+        wall |= {"point": first + gap * way + sideways, "normal": -way * chance.choice((1.0, 0.5, 3.0))}
+        if kind == "rectangle":
+            wall["along"] = np.cross(way, vector(chance, 1.0)) + 0.1 * way
+            wall["size"] = [body.size * chance.uniform(0.4, 4.0) for _ in range(2)]
+        return
+    axis = np.zeros(3)
+    if kind == "cylinder":
+        axis = np.cross(way, vector(chance, 1.0)) if chance.random() < 0.8 else vector(chance, 1.0)
+        axis /= np.linalg.norm(axis)
+        wall["axis"] = axis * chance.choice((1.0, 2.0))
+
+    def distance(centre: np.ndarray) -> np.ndarray:
+        arm = members - centre
+        return np.linalg.norm(arm - np.multiply.outer(arm @ axis, axis), axis=1)
+
+    if chance.random() < 0.4:
+        centre = members.mean(axis=0) + 0.2 * gap * way
+        wall |= {"point": centre, "side": "inside", "radius": float(distance(centre).max()) + gap + 1e-9 * body.size}
+        return
+    radius = body.size * chance.uniform(0.15, 1.5)
+    centre = first + (gap + radius) * way
+    for _ in range(200):
+        lack = gap + radius - float(distance(centre).min())
+        if lack <= 0.0:
+            break
+        centre = centre + (lack + 1e-9 * body.size) * way
+    wall |= {"point": centre, "radius": radius}
+    if chance.random() < 0.5:
+        wall["side"] = "outside"
+
+
+def _move(
+    chance: random.Random,
+    wall: dict[str, Any],
+    body: Body,
+    motion: Any,
+    way: np.ndarray,
+    treatment: str,
+    simple: bool,
+) -> None:
+    kind = chance.random()
+    towards = -motion.speed * chance.uniform(-0.3, 0.7) * _tilted(chance, way, chance.choice((0.0, 0.3)))
+    if kind < 0.15:
+        wall["velocity"] = towards
+    elif kind < 0.25:
+        times = [0.0, *sorted(chance.uniform(0.05, 0.95) for _ in range(chance.randint(1, 3)))]
+        factors = [0.0, *(chance.uniform(-0.3, 1.0) * fraction for fraction in times[1:])]
+        rows = zip(times, factors, strict=True)
+        wall["motion"] = [[t * motion.end, *(f * motion.end * towards)] for t, f in rows]
+    elif kind < 0.4 and not simple and (treatment == "scheme" or chance.random() < ODD):
+        wall["mass"] = body.mass * 10 ** chance.uniform(-1.0, 1.5)
+        if chance.random() < 0.3:
+            wall["velocity"] = towards
+        if chance.random() < 0.3:
+            wall["gravity"] = True
+
+
+def _law(chance: random.Random, wall: dict[str, Any], treatment: str, time: dict[str, Any]) -> None:
+    """Friction, restitution, a tie, or none of them."""
+    kind = chance.choices(("smooth", "friction", "restitution", "tied"), (45, 27, 15, 13))[0]
+    odd = chance.random() < ODD
+    if kind == "friction" and (odd or treatment in ("scheme", "stick")):
+        wall["friction"] = 10 ** chance.uniform(-1.3, 0.3)
+        if chance.random() < 0.4:
+            wall["static_friction"] = wall["friction"] * chance.uniform(1.0, 1.6)
+    solves_next_position = time["integrator"] == "central_differences"
+    fits = "mass" not in time and (treatment == "scheme" or treatment == "stick" and not solves_next_position)
+    if kind == "restitution" and (odd or fits and (solves_next_position or "mass" not in wall)):
+        wall["restitution"] = chance.choice((0.3, 0.7, 1.0, chance.random()))
+        if solves_next_position and chance.random() < 0.2:
+            wall["friction"] = 0.3
+    if kind == "tied" and (odd or treatment in ("scheme", "stick")):
+        wall["tied"] = True
+
+
+def _tilted(chance: random.Random, way: np.ndarray, amount: float) -> np.ndarray:
+    tilted = way + amount * vector(chance, 1.0) if amount else way
+    return tilted / np.linalg.norm(tilted)
+
 
 EXPLICIT = {"central_differences": 2.0, "chung_lee": 1.85, "hulbert_chung": 1.5, "souza_moura": 1.7}
 """Explicit integrators, with a limit of Omega that is safe for all their parameters without damping."""

@@ -1,24 +1,39 @@
-"""Copies of a random case whose results follow from those of the case: moved, turned, renumbered and in other units."""
+"""Comparisons of results: copies of a case, explicit and implicit schemes, one rank and several, restarts.
+
+Copies are moved, turned, renumbered or in other units, and their results follow from those of the case. Schemes are
+compared at small steps, at which they must converge to the same motion: a case is run with an explicit and an implicit
+scheme at steps h and h/2. For each the change between the two steps is the error of the smaller step, to first order
+(impacts allow no more), and their distance is at most :data:`MARGIN` times the sum of these errors. Motions that are
+chaotic, or that yield within few steps, have large errors and are not judged.
+"""
 
 from __future__ import annotations
 
 import copy
+import functools
+import json
 import random
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
 from itertools import permutations, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from helpers.kills import differences
 from mpi4py import MPI
 
-from .body import generated
-from .checks import Loaded, energy_scale
-from .running import case_text, clear, run_case
+from pfem_petsc import Case, open_result
+from pfem_petsc.errors import InputError
+from pfem_petsc.stepping.model import Model
+from pfem_petsc.stepping.plan import make_plan
 
-AGREE, LOOSE, CHAOS = 1e-9, 1e-6, 300.0
-"""As for comparisons between ranks; more chaos, because a copy rounds in every step and not only at the start."""
+from .checks import Loaded, check_result, distance, energy_scale
+from .draw import draw_case, generated
+from .running import case_text, clear, run_case, run_in_two_parts, steps_of
+
+CHAOS_OF_COPIES = 300.0
+"""As :data:`CHAOS`; more, because a copy rounds in every step and not only at the start."""
 
 # exponents of length, mass and time of the numbers in a case; keys that are not here have no unit
 UNITS: dict[str, tuple[int, int, int]] = {
@@ -295,7 +310,7 @@ def judge_copies(
             continue
         moved = amplified() if moved is None else moved
         detail = f"{apart:.3g} in {where}; a change of the start by 1e-13 makes {moved:.3g}"
-        chaotic = apart <= CHAOS * moved * changed.rounding
+        chaotic = apart <= CHAOS_OF_COPIES * moved * changed.rounding
         faults.append((f"chaotic: {kind}" if chaotic else f"{kind}: another result", detail))
     clear(MPI.COMM_SELF, folder / "copy")
     return faults
@@ -317,3 +332,221 @@ def _distance(case: Loaded, other: Loaded, changed: Copy) -> tuple[float, str]:
             if not apart <= worst[0]:
                 worst = apart, name
     return worst
+
+
+MARGIN = 4.0
+EXACT = 1e-6
+"""Differences below this fraction of the size, or of the largest energy, count as equal."""
+VAGUE = 0.05
+"""Errors above this fraction of the motion, or of the energy, are inconclusive."""
+FIRST = 0.25
+"""The larger step relative to the limit of central differences."""
+STEPS = 160
+"""Maximum number of steps."""
+EXPLICIT = ("central_differences", {}), ("hulbert_chung", {"rho_b": 0.8}), ("chung_lee", {})
+IMPLICIT = (
+    ("newmark", {"beta": 0.25, "gamma": 0.5}),
+    ("generalized_alpha", {"rho_inf": 0.8}),
+    ("energy_momentum", {}),
+)
+ENERGIES = ("kinetic_energy", "elastic_energy", "plastic_dissipation", "damping_dissipation")
+
+
+def pair_of(seed: int) -> tuple[dict, dict]:
+    """The schemes of a case, as tables ``time`` without step and end."""
+    (explicit, first), (implicit, second) = EXPLICIT[seed // 3 % 3], IMPLICIT[seed % 3]
+    return {"integrator": explicit, **first}, {"integrator": implicit, **second}
+
+
+def judge_schemes(table: dict, seed: int, folder: Path, source: str) -> tuple[str, list[tuple[str, str]]]:
+    """Run a case with both schemes, at both steps, on one rank.
+
+    Returns
+    -------
+    (what it says: "agree", "differ", "vague", or "refused" where a run does not come to its end, faults)
+    """
+    if any("mass" in wall for wall in table.get("wall", ())):
+        return "refused", []  # implicit schemes have only their own formulas there, which gain energy in impacts
+    explicit, implicit = pair_of(seed)
+    limit = _largest_step(table, explicit, source)
+    if limit is None:
+        return "refused", []
+    step = FIRST * limit
+    count = max(min(STEPS, int(table["time"]["end"] / step)), 1)
+    found = {}
+    for name, scheme in (("explicit", explicit), ("implicit", implicit)):
+        for parts in (1, 2):
+            time = scheme | {"step": step / parts, "end": count * step}
+            place = folder / f"{name}-{parts}"
+            outcome = run_case(case_text(_changed(table, time)), MPI.COMM_SELF, place, source=source)
+            if outcome.status == 0:
+                found[name, parts] = _measures(Loaded(place))
+            clear(MPI.COMM_SELF, place)
+            if outcome.status != 0:
+                return "refused", []
+    return _compare(found, f"{explicit['integrator']} and {implicit['integrator']}")
+
+
+def _largest_step(table: dict, time: dict, source: str) -> float | None:
+    """Limit of the step of central differences [s]; None where the case is not one for both schemes."""
+    try:
+        text = case_text(_changed(table, time | {"step": 1e-9, "end": 1e-9}))
+        case = Case.from_toml(text, source=source, name=Path(source).stem)
+        return 2.0 / make_plan(Model(case, MPI.COMM_SELF)).frequency.upper
+    except InputError:
+        return None
+
+
+def _changed(table: dict, time: dict) -> dict:
+    """The same bodies, walls and loads with another scheme, and the treatment that means the same with both."""
+    changed = copy.deepcopy(table)
+    changed["time"] = {"mass": "lumped"} | time
+    changed["solver"] = {"rtol": 1e-12}
+    changed["output"] = {"fields_every": 1_000_000}
+    # explicit schemes stop nodes for good by themselves; of the others the treatment "stick" does
+    changed["contact"] = {"treatment": "scheme" if time["integrator"] == "central_differences" else "stick"}
+    return changed
+
+
+def _measures(result: Loaded) -> dict[str, np.ndarray]:
+    """Positions at the end over the size, their way since the start, and energies over the largest of them.
+
+    Works of walls that strike nodes may be larger by far, and are no measure of the motion.
+    """
+    scale = max(*(float(result.history[name].max()) for name in ENERGIES), 1e-300)
+    size = max(result.size, 1e-300)
+    energies = np.array([result.history[name][-1] for name in ENERGIES]) / scale
+    start, end = result.positions[0] / size, result.positions[-1] / size
+    return {"positions": end, "energies": energies, "way": end - start}
+
+
+def _compare(found: dict, names: str) -> tuple[str, list[tuple[str, str]]]:
+    verdict, faults = "agree", []
+    scales = {"positions": _size(found["explicit", 2]["way"]), "energies": 1.0}
+    for what, scale in scales.items():
+        errors = sum(_size(found[name, 1][what] - found[name, 2][what]) for name in ("explicit", "implicit"))
+        apart = _size(found["explicit", 2][what] - found["implicit", 2][what])
+        if errors > VAGUE * scale:
+            verdict = "vague" if verdict == "agree" else verdict
+        elif apart > MARGIN * errors + EXACT:
+            verdict = "differ"
+            text = f"{names}: {what} {apart:.3g} apart, where halving the step changes them by {errors:.3g}"
+            faults.append(("schemes do not agree", text))
+    return verdict, faults
+
+
+def _size(values: np.ndarray) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt((values * values).mean()))
+
+
+CHAOS = 100.0
+"""Allowed difference between ranks, relative to the effect of a change of the positions by 1e-13."""
+AGREE = 1e-9
+LOOSE = 1e-6
+"""The same for implicit runs whose solver stops at its default tolerance of 1e-9."""
+
+
+def check_case(text: str, comm: MPI.Comm, folder: Path, source: str, restart: bool) -> dict:
+    """Run a case, check its results and, if requested, that stopping and continuing changes nothing. Collective.
+
+    The result is kept in ``folder``/whole.
+    """
+    outcome = run_case(text, comm, folder / "whole", source=source)
+    told = asdict(outcome) | {"touched": False, "parts": False}
+    if outcome.status == 0 and comm.rank == 0:
+        told["faults"] += check_result(folder / "whole", outcome.warnings)
+        told["touched"] = _touched(folder / "whole")
+    steps = comm.bcast(steps_of(folder / "whole") if outcome.status == 0 and comm.rank == 0 else 0)
+    if restart and outcome.status == 0 and steps > 4:
+        files = (folder / "whole" / "result.vtkhdf", folder / "parts" / "result.vtkhdf")
+        second = run_in_two_parts(text, comm, folder / "parts", steps // 2, source)
+        told["faults"] += [(f"in two parts: {cause}", detail) for cause, detail in second.faults]
+        told["parts"] = second.stopped > 0
+        if second.status != 0 and not second.faults:
+            told["faults"].append(("continued run fails", f"stopped at {second.stopped}: {second.message[:300]}"))
+        elif second.status == 0 and comm.rank == 0 and (apart := differences(*files)):
+            first = ", ".join(f"{name} by {size:.3g}" for name, size in list(apart.items())[:3])
+            cause = "continued run differs" if second.stopped > 0 else "a second run differs"
+            told["faults"].append((cause, f"stopped at step {second.stopped}: {len(apart)} datasets: {first}"))
+    clear(comm, folder / "parts")
+    return told
+
+
+def judge_ranks(text: str, table: dict, one: Path, other: Path, folder: Path, source: str) -> list[tuple[str, str]]:
+    """Check that results of one rank and of several agree; a run is chaotic if a change of the positions by 1e-13 of
+    the size has the same effect."""
+    apart, where = distance(one, other)
+    explicit = "solver" not in table and table["time"].get("mass") != "consistent"
+    tight = explicit or table.get("solver", {}).get("rtol", 1.0) < 1e-10
+    if apart <= (AGREE if tight else LOOSE):
+        return []
+    moved = amplification(text, one, folder, source)
+    if apart <= CHAOS * moved:
+        return [("chaotic: ranks part as runs do that start 1e-13 apart", f"{apart:.3g} ({where}), {moved:.3g}")]
+    return [("ranks differ", f"{apart:.3g} in {where}; a change of the start by 1e-13 makes {moved:.3g}")]
+
+
+def amplification(text: str, whole: Path, folder: Path, source: str) -> float:
+    """Return the largest distance of three runs with changed positions from the run itself, on one rank."""
+    worst = 0.0
+    for number in (1, 2, 3):
+        outcome = run_case(text, MPI.COMM_SELF, folder / f"jiggle{number}", source=source, jiggle=number)
+        if outcome.status != 0:
+            worst = np.inf
+        else:
+            worst = max(worst, distance(whole, folder / f"jiggle{number}")[0])
+        clear(MPI.COMM_SELF, folder / f"jiggle{number}")
+    return worst
+
+
+def work(mode: str, seeds: Iterable[int], folder: Path, every_restart: int, sources: dict[int, str]) -> None:
+    """Process the cases of a worker. Collective.
+
+    ``mode``: "check" runs and checks, "run" only runs, "judge" compares the results of both and removes them, "schemes"
+    compares explicit and implicit schemes, "copies" the copies of a case.
+    """
+    comm = MPI.COMM_WORLD
+    for seed in seeds:
+        _tell(comm, "begin", seed, {})
+        source = sources.get(seed, f"random-{seed}.toml")
+        if seed in sources:
+            text, table = Path(source).read_text(), {}
+        else:
+            table = draw_case(seed)
+            text = case_text(table)
+        place = folder / str(seed)
+        if mode == "check":
+            restart = every_restart > 0 and seed % every_restart == 0
+            told = check_case(text, comm, place / "1", source, restart)
+        elif mode == "schemes":
+            verdict, faults = judge_schemes(table or _table(text), seed, place, source)
+            told = {"verdict": verdict, "faults": faults}
+        elif mode == "copies":
+            table = table or _table(text)
+            whole = place / "1/whole"
+            amplified = functools.partial(amplification, text, whole, place, source)
+            told = {"faults": judge_copies(table, seed, whole, place, amplified)}
+        elif mode == "run":
+            told = check_case(text, comm, place / "n", source, False)
+        else:
+            table = table or _table(text)
+            told = {"faults": judge_ranks(text, table, place / "1/whole", place / "n/whole", place, source)}
+        clear(comm)
+        _tell(comm, "done", seed, told)
+
+
+def _table(text: str) -> dict:
+    from pfem_petsc.case.toml import parse_toml
+
+    return parse_toml(text, "case")
+
+
+def _tell(comm: MPI.Comm, what: str, seed: int, told: dict) -> None:
+    if comm.rank == 0:
+        print(f"{what} {seed} {json.dumps(told, default=str)}", flush=True)
+
+
+def _touched(folder: Path) -> bool:
+    history = open_result(folder).history
+    return bool(np.asarray(history["active_contacts"]).any())

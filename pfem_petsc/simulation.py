@@ -102,12 +102,12 @@ class Simulation(WithEquations):
 
     def _prepare(self, stop: StopRequest, lock: FolderLock) -> None:
         case, restart = self.case, self.restart
-        recorded, number = (restart.attributes["plan"], restart.stage) if restart is not None else (None, 0)
+        recorded, number = (restart.file.attributes["plan"], restart.stage) if restart is not None else (None, 0)
         self._stages = Stages(case, self.comm, recorded, number)
         self.plan = self._stages.plan
         self._reached: float | None = None
         if self.restart is not None and self.restart.continues or self.notes:
-            self._reached = finished(case, self.comm, self.folder, self.plan.end)
+            self._reached = on_root(self.comm, finished, case, self.folder, self.plan.end)
         self.mesh = self.model.mesh
         if number == 0:
             check_start(self.model.contact, self.mesh.points[: self.mesh.n_owned], self.model.size)

@@ -15,7 +15,6 @@ from ..columns import Row
 from ..contact.monitoring import Piercing, check_positions
 from ..fields import Fields, Snapshot
 from ..output.checkpoint import write_checkpoint
-from ..output.progress import Progress
 from ..output.vtkhdf import ResultWriter
 from ..restart.state import STATE_VERSION, RunState
 from ..stepping.bar_events import MOST_TOLD
@@ -64,17 +63,6 @@ class Observer(ABC):
     def remarks(self) -> list[str]:
         """Return remarks for the user at the end of the run."""
         return []
-
-
-class Callback(Observer):
-    """Calls a function with the finished step."""
-
-    def __init__(self, function: Callable[[Step], object], every: int) -> None:
-        self._function, self.every = function, every
-
-    def observe(self, made: Step) -> None:
-        """Call the function."""
-        self._function(made)
 
 
 class History(Observer):
@@ -352,27 +340,6 @@ class Checkpointing(Observer):
         """Write the checkpoint of the last step, if the case requests checkpoints."""
         if self.at_end:
             self.write()
-
-
-class ProgressReport(Observer):
-    """Reports each step, the last one of a batch, to the progress bar, or to the lines that replace it."""
-
-    every = 1
-
-    def __init__(self, progress: Progress, analysis: Analysis, history: History) -> None:
-        self._progress, self._analysis, self._history = progress, analysis, history
-
-    def steps_left(self, step: int) -> int:
-        """Return a number that never ends a batch."""
-        return NEVER
-
-    def observe(self, made: Step) -> None:
-        """Report a step."""
-        history = self._history
-        contacts = history.row["active_contacts"]
-        self._progress.update(
-            made.step, made.time, self._analysis.step_size, made.newton, made.linear, contacts, history.drift
-        )
 
 
 class Events(Observer):

@@ -80,15 +80,16 @@ class Analysis:
         """Return why no step can be made, as far as it is known before the first; empty otherwise."""
         return ""
 
-    def advance(self) -> Step:
-        """Make one step; its ``row`` is None, because rows are made by recording.
+    def advance(self, most: int = 1) -> Step:
+        """Make one step, or up to ``most`` if nothing needs Python between them, and return the last one; its ``row``
+        is None, because rows are made by recording.
 
         Raises
         ------
         SimulationFailure
             On all ranks; the state is the last complete one, or undefined.
         """
-        self.stepper.step()
+        self.stepper.steps(min(most, self.last_step - self.state.step))
         solution = self.stepper.solution
         return Step(self.stepper.number, self.stepper.place, solution.newton, solution.linear, None)
 

@@ -28,7 +28,6 @@ from .run.recorder import Recorder
 from .run.stages import Stages
 from .run.synchroniser import StopRequest, Synchroniser
 from .statics.equilibrium import WithEquations
-from .stepping.batches import WORTH, Batches
 from .stepping.model import Model
 from .stepping.stepper import Stepper
 
@@ -103,12 +102,12 @@ class Simulation(WithEquations):
 
     def _prepare(self, stop: StopRequest, lock: FolderLock) -> None:
         case, restart = self.case, self.restart
-        recorded, number = (restart.attributes["plan"], restart.stage) if restart is not None else (None, 0)
+        recorded, number = (restart.file.attributes["plan"], restart.stage) if restart is not None else (None, 0)
         self._stages = Stages(case, self.comm, recorded, number)
         self.plan = self._stages.plan
         self._reached: float | None = None
         if self.restart is not None and self.restart.continues or self.notes:
-            self._reached = finished(case, self.comm, self.folder, self.plan.end)
+            self._reached = on_root(self.comm, finished, case, self.folder, self.plan.end)
         self.mesh = self.model.mesh
         if number == 0:
             check_start(self.model.contact, self.mesh.points[: self.mesh.n_owned], self.model.size)
@@ -203,8 +202,8 @@ class Simulation(WithEquations):
         """Register a function to be called on all ranks after each step whose number is a multiple of ``every``.
 
         It receives the finished :class:`Step`, and may read :attr:`state` and call collective functions; its result is
-        ignored. With a large ``every``, :meth:`run` still fuses the steps in between into compiled calls. Functions are
-        called in the order of registration.
+        ignored. With a large ``every``, :meth:`run` still makes the steps in between in batches. Functions are called
+        in the order of registration.
 
         Raises
         ------
@@ -261,17 +260,14 @@ class Simulation(WithEquations):
 
     def __iter__(self) -> Iterator[Step]:
         """Run step by step; the output is closed when the iteration ends."""
-        return self._iterate(None)
+        return self._iterate(batches=False)
 
-    def batches(self, min_steps: int = WORTH) -> Iterator[Step]:
-        """Run as by iteration, but yield only some of the steps; those in between may be fused into one compiled call.
+    def batches(self) -> Iterator[Step]:
+        """Run as by iteration, but yield only some of the steps: those in between are made in one compiled call, if
+        possible, when no output is due after them."""
+        return self._iterate(batches=True)
 
-        ``min_steps``: minimum number of steps of a run for which the fused loop is compiled, which takes some seconds
-        the first time.
-        """
-        return self._iterate(Batches(min_steps))
-
-    def _iterate(self, batches: Batches | None) -> Iterator[Step]:
+    def _iterate(self, batches: bool) -> Iterator[Step]:
         self._usable()
         if self.finished:
             return
@@ -290,14 +286,11 @@ class Simulation(WithEquations):
                 outputs.stop_early()
                 while True:
                     while self.state.step < self.analysis.last_step:
-                        if batches is not None:
-                            outputs.advance_together(batches)
-                        yield self._advance()
+                        yield self._advance(outputs.steps_left(self.stepper.number) if batches else 1)
                         outputs.stop_early()
                     if stages.at_last:
                         break
                     outputs.begin_stage()
-                    batches = None if batches is None else batches.anew()
                 # a run that was killed after its last checkpoint may not have done this
                 outputs.complete()
                 outputs.record_modes()
@@ -315,10 +308,10 @@ class Simulation(WithEquations):
                 end("failed")
                 raise
 
-    def _advance(self) -> Step:
-        """Make one step and serve the outputs that are due after it. Collective."""
+    def _advance(self, most: int = 1) -> Step:
+        """Make one step, or a batch of at most ``most``, and serve the outputs that are due after it. Collective."""
         self._usable()
-        made = self.analysis.advance()
+        made = self.analysis.advance(most)
         self._synchroniser.stop.stepped = True
         return self.outputs.after(made)
 

@@ -351,10 +351,10 @@ def time_job(
         simulation = Simulation(case, comm, output=folder, quiet=True)
         ready = perf_counter()
         times, newton, linear, count = [], 0, 0, None
-        running = simulation.batches(min_steps=1)  # as in a long run
+        running = simulation.batches()  # as in a long run
         next(running)
         first = perf_counter() - ready
-        last = next(running).step  # loads the fused loop
+        last = next(running).step  # loads the loop of batches
         before, cpu_before = perf_counter(), process_time()
         for step in running:
             now = perf_counter()

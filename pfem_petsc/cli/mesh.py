@@ -163,9 +163,9 @@ def _made(what: str, overrides: list[str]) -> WholeMesh:
     from mpi4py import MPI
 
     from ..case.schema import Case
-    from ..mechanics.bars import section_of_bars
     from ..mesh import load_slab
     from ..mesh.whole import WholeMesh
+    from ..post.motion import section_areas
     from ..registry import choices
 
     plain = what in choices("pfem_petsc.mesh.generators")
@@ -189,14 +189,7 @@ def _made(what: str, overrides: list[str]) -> WholeMesh:
     slab = load_slab(case.mesh, MPI.COMM_SELF, dict.fromkeys(names, "mesh.bar_fields"))
     mesh = WholeMesh(slab.points, slab.bars.astype("int64"), slab.node_groups, slab.bar_groups, dict(slab.bar_fields))
     if not plain:
-        import numpy as np
-
-        index = section_of_bars(case, slab)
-        area = np.empty(len(mesh.bars))
-        for k, section in enumerate(case.section.values()):
-            own = index == k
-            area[own] = section.area if section.area_field is None else slab.bar_fields[section.area_field][own]
-        mesh.bar_fields["area"] = area
+        mesh.bar_fields["area"] = section_areas(case, slab)[1]
         given = case.to_dict()
         mesh.tables = {name: given[name] for name in ("material", "section") if name in given}
     return mesh

@@ -108,7 +108,7 @@ class NodalFrames:
     normals, offsets : (m, w, 3), (m, w) planes that have a row; offset -inf for the others
     oblique : whether any basis is not the identity
     contradiction : index in ``nodes`` of a node with infeasible bounds, -1 for none
-    sliding : friction forces on nodes that slip, None without friction
+    sliding : friction forces on nodes that slip
     """
 
     def __init__(self, nodes: np.ndarray, walls: int) -> None:
@@ -127,7 +127,7 @@ class NodalFrames:
         self.offsets = np.full((m, walls), -np.inf)
         self.oblique = False
         self.contradiction = -1
-        self.sliding: Sliding | None = None
+        self.sliding = Sliding.none(walls)
 
     def pin(self, at: np.ndarray, values: np.ndarray, which: np.ndarray) -> None:
         """Fix the coordinates ``which`` (k, 3) bool of the frames ``at`` (k,) at values (k, 3) [m]."""

@@ -100,7 +100,7 @@ class NeighbourSearch:
         """Send segments to the ranks of their cells, and sort the cells that are held by this one. Collective."""
         none, no_rows, corners = np.empty(0, np.int64), np.empty(0, np.int32), np.empty((len(own.ids), 3), np.int64)
         if comm.size > 1:
-            cells = own.ends, own.margin, self._low, self._cell, corners
+            cells = (own.ends, own.margin), (self._low, self._cell), corners
             count = _list_cells(*cells, (comm.size, -1), none, (none, no_rows))
             ranks, rows = np.empty(count, np.int64), np.empty(count, np.int32)
             _list_cells(*cells, (comm.size, -1), none, (ranks, rows))
@@ -108,7 +108,7 @@ class NeighbourSearch:
             router = Router(comm, each % comm.size, each // comm.size)
             own = Segments(*(router.send(array) for array in own))
         self._corners = np.empty((len(own.ids), 3), np.int64)
-        cells = own.ends, own.margin, self._low, self._cell, self._corners
+        cells = (own.ends, own.margin), (self._low, self._cell), self._corners
         counts = np.zeros(1 << (2 * len(own.ids)).bit_length(), np.int64)
         count = _list_cells(*cells, (comm.size, comm.rank), counts, (none, no_rows))
         self._start = np.append(0, np.cumsum(counts))
@@ -145,11 +145,13 @@ def _mixed(key):
 
 
 @kernel
-def _list_cells(ends, margins, low, cell, corners, ranks, buckets, listed):
+def _list_cells(segments, grid, corners, ranks, buckets, listed):
     """List the cells around segments: the key of the cell and the row of the segment, for cells of ``ranks[1]`` of
     ``ranks[0]``; with -1, the rank of the cell and the row. Each goes to the place that its bucket, if there are any,
     is at, which moves on; without arrays for the list they are counted. ``corners`` (n, 3) are set to
     the first cell of each segment, or far away for those longer than a cell. Returns the length of the list."""
+    ends, margins = segments
+    low, cell = grid
     keys, rows = listed
     size, rank = ranks
     first = np.empty(3, np.int64)

@@ -17,7 +17,7 @@ from ..integrators.base import Balance, State
 from ..parallel.agreement import agreed
 from ..tolerances import FREE_PART, PROJECTED
 from .constraint_set import ConstraintSet
-from .frames import NodalFrames, Sliding
+from .frames import NodalFrames
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -366,13 +366,13 @@ class Transform:
         self.mesh = mesh
         self.links = tuple(links)
         walls = 0 if frames is None else frames.rows.shape[1]
-        own = frames is not None and (frames.oblique or (frames.sliding is not None and len(frames.sliding.nodes) > 0))
+        own = frames is not None and (frames.oblique or len(frames.sliding.nodes) > 0)
         self._oblique = frames is not None and mesh.comm.allreduce(int(own)) > 0
         self.bounded = frames is not None or bool(self.links)
         self.identity = not self._oblique and not self.links
         # frames along the axes change no coordinates
         self._frames = frames if self._oblique else NodalFrames(np.empty(0, dtype=np.int64), walls)
-        self.sliding = self._frames.sliding or Sliding.none(walls)
+        self.sliding = self._frames.sliding
         if self._oblique:
             self._share_frames()
 

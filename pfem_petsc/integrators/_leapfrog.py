@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from ..mechanics.compiled import kernel
 
-__all__ = ["advance", "advance_loaded", "centre", "drift", "finish", "kick", "move"]
+__all__ = ["accelerations", "advance", "advance_loaded", "centre", "drift", "finish", "kick", "move"]
 
 
 @kernel
@@ -37,6 +37,13 @@ def centre(u, eta, half, v):
     """Compute velocities ``v`` of the balance from the increments and the velocities half a step later."""
     for i in range(len(u)):
         v[i] = half[i] - eta * u[i]
+
+
+@kernel
+def accelerations(u, alpha, a):
+    """Compute ``a`` = alpha u; arrays (3 n,)."""
+    for j in range(len(u)):
+        a[j] = alpha * u[j]
 
 
 @kernel

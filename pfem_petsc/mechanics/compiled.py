@@ -98,8 +98,8 @@ def _global_names(code: CodeType) -> set[str]:
 
 
 # Neither contraction to fused multiply-add nor reassociation: the result of a loop must not depend on how it was
-# compiled, alone or into the fused loop, for one bar or for eight at once. Then a bar evaluated on two ranks has the
-# same bits on both, and a restarted run is bitwise identical to an uninterrupted one (contraction would save 5 %).
+# compiled, alone or into the loop of batches, for one bar or for eight at once. Then a bar evaluated on two ranks has
+# the same bits on both, and a restarted run is bitwise identical to an uninterrupted one (contraction would save 5 %).
 # Assuming "no NaN" would hide divergence.
 _FAST = {"nsz"}
 

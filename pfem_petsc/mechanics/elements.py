@@ -683,7 +683,7 @@ def make_loops(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
 
 
 def batch_parts(loops: SimpleNamespace) -> tuple:
-    """Return what :func:`~pfem_petsc.stepping.batch_loop.make_fused_loop` makes its loop from."""
+    """Return what :func:`~pfem_petsc.stepping.batch_loop.make_batch_loop` makes its loop from."""
     return (
         loops.add_forces,
         loops.sum_energies,

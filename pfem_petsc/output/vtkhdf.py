@@ -201,25 +201,10 @@ class _Snapshots:
     def arrays(
         self, points: np.ndarray, point_data: Mapping[str, np.ndarray], cell_data: Mapping[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
-        """Return this rank's owned rows of each dataset, by name.
-
-        Raises
-        ------
-        ValueError
-            If the fields are not those of the file, or an array has another number of rows.
-        """
-        given = {"PointData": point_data, "CellData": cell_data}
-        for kind, names in self._fields.items():
-            if sorted(given[kind]) != names:
-                raise ValueError(f"a snapshot has {kind} {names}, got {sorted(given[kind])}")
+        """Return this rank's owned rows of each dataset, by name."""
         arrays = {"Points": points}
-        for name in self._fields["PointData"]:
-            arrays[f"PointData/{name}"] = np.asarray(point_data[name])
-        for name in self._fields["CellData"]:
-            arrays[f"CellData/{name}"] = np.asarray(cell_data[name])[self._counted]
-        for name, array in arrays.items():
-            if len(array) != self._order(name).n_owned:
-                raise ValueError(f"{name} has {len(array)} rows, expected {self._order(name).n_owned}")
+        arrays |= {f"PointData/{name}": np.asarray(point_data[name]) for name in self._fields["PointData"]}
+        arrays |= {f"CellData/{name}": np.asarray(cell_data[name])[self._counted] for name in self._fields["CellData"]}
         return arrays
 
     def n_bytes(self, arrays: Mapping[str, np.ndarray]) -> int:

@@ -28,7 +28,7 @@ EVENTS: dict[str, tuple[str, ...]] = {
     "pfemHessian": ("stepper.newton._hessian",),
     "pfemPreconditioner": ("stepper.lagged.renew",),
     "pfemContact": ("model.contact.explicit", "model.contact.near", "model.contact.frames"),
-    "pfemLedger": ("stepper.booking",),
+    "pfemLedger": ("stepper.ledger.update",),
     "pfemHistory": ("outputs.history.record",),
     "pfemSnapshot": ("outputs.snapshots.write",),
     "pfemCheckpoint": ("outputs.checkpointing.write",),

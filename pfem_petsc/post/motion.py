@@ -399,13 +399,19 @@ def radii_of(result: Any) -> np.ndarray | None:
     all bars have the radius of the only section; with several sections, radii are not known. Springs and dashpots
     between nodes have no section: they are as thin as the thinnest bar.
     """
+    from mpi4py import MPI
+
     case = result.case
     sections = list(getattr(case, "section", {}).values())
     if not sections:
         return None
     length = _lengths(result)
+    numbers, areas = np.full(len(length), -1), np.ones(len(length))
     try:
-        numbers, areas = _sections_and_areas(case, len(length))
+        mesh = load_slab(case.mesh, MPI.COMM_SELF, area_fields(case), named_groups(case))
+        if mesh.n_bars > len(length):
+            raise InputError(f"the mesh of {case.source} has {mesh.n_bars} bars now, the result {len(length)}")
+        numbers[: mesh.n_bars], areas[: mesh.n_bars] = section_areas(case, mesh)
     except (InputError, OSError):
         if len(sections) > 1 or sections[0].area is None:
             return None
@@ -423,18 +429,12 @@ def _lengths(result: Any) -> np.ndarray:
     return np.linalg.norm(start[bars[:, 1]] - start[bars[:, 0]], axis=1)
 
 
-def _sections_and_areas(case: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of the section of each bar (count,), -1 for none, and its area [m2]."""
-    from mpi4py import MPI
-
-    part = load_slab(case.mesh, MPI.COMM_SELF, area_fields(case), named_groups(case))
-    if part.n_bars > count:
-        raise InputError(f"the mesh of {case.source} has {part.n_bars} bars now, the result {count}")
-    numbers, areas = np.full(count, -1), np.ones(count)
-    numbers[: part.n_bars] = section_of_bars(case, part)
+def section_areas(case: Any, mesh: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of the section of each bar of a whole mesh (bars,), and its area [m2]."""
+    numbers, areas = section_of_bars(case, mesh), np.ones(mesh.n_bars)
     for number, section in enumerate(case.section.values()):
         own = np.flatnonzero(numbers == number)
-        areas[own] = section.area if section.area_field is None else part.bar_fields[section.area_field][own]
+        areas[own] = section.area if section.area_field is None else mesh.bar_fields[section.area_field][own]
     return numbers, areas
 
 

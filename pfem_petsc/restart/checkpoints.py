@@ -21,6 +21,7 @@ from ..output.checkpoint import (
     asked_checkpoint,
     check_seal,
 )
+from ..output.result import RESULT_NAME as RESULT
 from ..output.result import open_result
 from ..output.units import engineering
 from ..output.verify import examine
@@ -79,22 +80,6 @@ def _is_free(key: str, last: int) -> bool:
     return any(key == free or key.startswith(free + ".") for free in FREE)
 
 
-def check_version(path: Path, attributes: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint with another version of the state.
-
-    Raises
-    ------
-    InputError
-    """
-    version = attributes.get("state_version")
-    if version != STATE_VERSION:
-        raise InputError(
-            f"{path}: holds version {version} of a run's state, this program reads {STATE_VERSION}: restart with the "
-            f"version of pfem_petsc that wrote it ({attributes.get('pfem_petsc', 'unknown')}), or start without "
-            "--restart"
-        )
-
-
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
     """Flatten nested tables and lists of tables: {"wall[0].point": ...}."""
     found: dict[str, Any] = {}
@@ -116,7 +101,6 @@ def _text(values: Mapping[str, Any], key: str) -> str:
     return text if len(text) <= 60 else text[:56] + " ..."
 
 
-RESULT = "result.vtkhdf"
 ASIDE = "checkpoint-later.h5"
 
 
@@ -138,30 +122,20 @@ class Restart:
     continues: bool
 
     @property
-    def scalars(self) -> dict[str, Any]:
-        """The numbers of the checkpoint."""
-        return self.file.scalars
-
-    @property
-    def attributes(self) -> dict[str, Any]:
-        """Attributes of the run that wrote the checkpoint."""
-        return self.file.attributes
-
-    @property
     def step(self) -> int:
         """The step after which the checkpoint was written."""
-        return int(self.scalars["step"])
+        return int(self.file.scalars["step"])
 
     @property
     def stage(self) -> int:
         """Number of the stage in which it was written; 0 for a case without stages."""
-        stage = self.scalars.get("stage")
+        stage = self.file.scalars.get("stage")
         return 0 if stage is None else int(stage["number"])
 
     @property
     def last(self) -> tuple[int, int]:
         """Steps of the last snapshot and of the last history row before the checkpoint."""
-        return int(self.scalars["snapshot"]), int(self.scalars["row"]["step"])
+        return int(self.file.scalars["snapshot"]), int(self.file.scalars["row"]["step"])
 
 
 def find_restart(
@@ -184,19 +158,22 @@ def find_restart(
     if path is None:
         return None, [f"{folder}: no checkpoint to restart from: starting from zero"]
     file = Checkpoint(path, comm)
-    check_version(path, file.attributes)
+    version = file.attributes.get("state_version")
+    if version != STATE_VERSION:
+        raise InputError(
+            f"{path}: holds version {version} of a run's state, this program reads {STATE_VERSION}: restart with the "
+            f"version of pfem_petsc that wrote it ({file.attributes.get('pfem_petsc', 'unknown')}), or start without "
+            "--restart"
+        )
     changed = changed_keys(path, file.attributes["case"], case.to_dict(), case.source)
     continues = on_root(comm, _continues, folder, path)
     return Restart(path, file, changed, continues), []
 
 
-def finished(case: Case, comm: MPI.Comm, folder: Path, end: float | None) -> float | None:
-    """Return the last time [s] of results of this case in the folder, None if they are incomplete. Collective."""
-    return None if end is None else on_root(comm, _finished, case, folder / RESULT, end)
-
-
-def _finished(case: Case, path: Path, end: float) -> float | None:
-    if not path.is_file():
+def finished(case: Case, folder: Path, end: float | None) -> float | None:
+    """Return the last time [s] of results of this case in the folder, None if they are incomplete. On one rank."""
+    path = folder / RESULT
+    if end is None or not path.is_file():
         return None
     try:
         examine(path)
@@ -223,23 +200,6 @@ def finished_message(folder: Path, reached: float, plan: Plan) -> str:
 
 def _continues(folder: Path, path: Path) -> bool:
     return (folder / RESULT).is_file() and path.resolve().parent == folder.resolve()
-
-
-def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
-    """Create the output folder; existing results are moved aside to a numbered name unless a restart continues them.
-
-    The caller holds the lock of the folder. ``plan`` defines the end of the run: results beyond it are not truncated.
-
-    Returns
-    -------
-    The new name of results that were moved aside, or None
-
-    Raises
-    ------
-    InputError
-        On all ranks, if the folder cannot be written, or a restart would lose results.
-    """
-    return on_root(comm, _prepare, folder, restart, plan)
 
 
 def _refuse_other(restart: Restart) -> None:
@@ -281,7 +241,21 @@ def _refuse_gap(path: Path, restart: Restart) -> None:
         )
 
 
-def _prepare(folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
+def prepare_folder(folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
+    """Create the output folder; existing results are moved aside to a numbered name unless a restart continues them.
+
+    On one rank, which holds the lock of the folder. ``plan`` defines the end of the run: results beyond it are not
+    truncated.
+
+    Returns
+    -------
+    The new name of results that were moved aside, or None
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or a restart would lose results.
+    """
     aside = None
     try:
         if restart is not None and restart.continues:

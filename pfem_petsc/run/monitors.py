@@ -223,9 +223,15 @@ class ContactWatch:
 # which the interval between searches is longer by one snapshot.
 _FEW, _WORK = 2_500, 20_000
 
-_BUCKLED = "they would buckle, which their law does not describe"
-_BEYOND = "forces are extrapolated there"
-_CROSSED = "bars do not touch bars, and results from then on are doubtful"
+_REMEDIES = {
+    "buckling": 'they would buckle, which their law does not describe; use law = "strut", or stockier bars',
+    "shortening": "forces are extrapolated there",
+    "crossing": "bars do not touch bars, and results from then on are doubtful",
+}
+_BEYOND = {
+    "buckling": "compressed beyond Euler's load",
+    "shortening": "shortened beyond the range of the law",
+}
 
 
 class Doubts:
@@ -283,14 +289,22 @@ class Doubts:
         none = {"looks": 0, "seen": 0, "first": "", "most": 0, "worst": [0.0, -1, ""]}
         return self._kept.setdefault(kind, none)
 
-    def _seen(self, counts: dict[str, Any], number: int, place: str) -> bool:
-        """Count a snapshot with a number of bars or pairs; return whether it is the first."""
+    def _count(self, kind: str, number: int, worst: tuple[float, int], place: str, text: str) -> None:
+        """Count a snapshot with a number of bars or pairs, and warn of the first one.
+
+        ``worst``: the measure by which snapshots are compared, and what is told with it
+        """
+        counts = self._counts(kind)
+        counts["looks"] += 1
+        if not number:
+            return
         counts["seen"] += 1
-        first = not counts["first"]
-        if first:
-            counts["first"] = place
         counts["most"] = max(counts["most"], number)
-        return first
+        if worst[0] > counts["worst"][0]:
+            counts["worst"] = [*worst, place]
+        if not counts["first"]:
+            counts["first"] = place
+            self._warn(f"{place}: {text}: {_REMEDIES[kind]}")
 
     def _exceeded(self, kind: str, ratios: np.ndarray, place: str) -> None:
         """Count bars whose ratio to a limit exceeds one. Collective."""
@@ -298,22 +312,11 @@ class Doubts:
         worst = min(zip((-ratios[over]).tolist(), self._ids[over].tolist(), strict=True), default=(0.0, -1))
         parts = self._model.comm.allgather((len(over), worst))
         number, (ratio, bar) = sum(part[0] for part in parts), min(part[1] for part in parts)
-        counts = self._counts(kind)
-        counts["looks"] += 1
-        if not number:
-            return
-        if -ratio > counts["worst"][0]:
-            counts["worst"] = [-ratio, bar, place]
-        if self._seen(counts, number, place):
-            many = f"{number:,} bars are" if number > 1 else "1 bar is"
-            self._warn(
-                f"{place}: {many} {self._beyond(kind)}, most of all {self._worst(kind, bar, -ratio)}: {_remedy(kind)}"
-            )
+        many = f"{number:,} bars are" if number > 1 else "1 bar is"
+        text = f"{many} {_BEYOND[kind]}, most of all {self._worst(kind, -ratio, bar)}" if number else ""
+        self._count(kind, number, (-ratio, bar), place, text)
 
-    def _beyond(self, kind: str) -> str:
-        return "compressed beyond Euler's load" if kind == "buckling" else "shortened beyond the range of the law"
-
-    def _worst(self, kind: str, bar: int, ratio: float) -> str:
+    def _worst(self, kind: str, ratio: float, bar: int) -> str:
         if kind == "buckling":
             return f"bar {bar} with {100.0 * ratio:.0f} % of it"
         limits = {m.largest_shortening: m.law for m in self._model.case.material.values()}
@@ -336,21 +339,16 @@ class Doubts:
     def _crossed(self, x: np.ndarray, place: str) -> None:
         """Count bars that pass through each other. Collective."""
         found, counts = self._crossing.find(x), self._counts("crossing")
-        counts["looks"] += 1
         if found is None:
+            counts["looks"] += 1
             if not counts.get("unknown"):
                 counts["unknown"] = True
                 self._warn(f"{place}: bars are not searched for passing through each other: they are too crowded")
             return
-        if not found.pairs:
-            return
         share = found.bars / (self._model.mesh.n_bars - self._model.mesh.n_connectors)
-        if found.pairs > counts["most"]:
-            counts["worst"] = [share, found.bars, place]
-        if self._seen(counts, found.pairs, place):
-            pairs = f"{found.pairs:,} pairs of bars pass" if found.pairs > 1 else "1 pair of bars passes"
-            some = f"{100.0 * share:.1f} % of all bars, bars {found.lowest[0]} and {found.lowest[1]} among them"
-            self._warn(f"{place}: {pairs} through each other ({some}): {_CROSSED}")
+        pairs = f"{found.pairs:,} pairs of bars pass" if found.pairs > 1 else "1 pair of bars passes"
+        some = f"{100.0 * share:.1f} % of all bars, bars {found.lowest[0]} and {found.lowest[1]} among them"
+        self._count("crossing", found.pairs, (share, found.bars), place, f"{pairs} through each other ({some})")
 
     def summary(self) -> list[str]:
         """Return sentences for the end of the run."""
@@ -359,19 +357,13 @@ class Doubts:
             if not counts["seen"]:
                 continue
             often = f"in {counts['seen']:,} of {counts['looks']:,} snapshots, first at {counts['first']}"
+            often += f": up to {counts['most']:,}"
             value, bar, place = counts["worst"]
             if kind == "crossing":
-                texts.append(
-                    f"bars passed through each other {often}: up to {counts['most']:,} pairs ({bar:,} bars, "
-                    f"{100.0 * value:.1f} % of all) at {place}: {_CROSSED}"
-                )
+                share = f"{bar:,} bars, {100.0 * value:.1f} % of all"
+                text = f"bars passed through each other {often} pairs ({share}) at {place}"
             else:
-                texts.append(
-                    f"bars were {self._beyond(kind)} {often}: up to {counts['most']:,} at once, most of all "
-                    f"{self._worst(kind, bar, value)}, at {place}: {_remedy(kind)}"
-                )
+                worst = self._worst(kind, value, bar)
+                text = f"bars were {_BEYOND[kind]} {often} at once, most of all {worst}, at {place}"
+            texts.append(f"{text}: {_REMEDIES[kind]}")
         return texts
-
-
-def _remedy(kind: str) -> str:
-    return f'{_BUCKLED}; use law = "strut", or stockier bars' if kind == "buckling" else _BEYOND

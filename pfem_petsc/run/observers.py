@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..analysis import Analysis, Step
-from ..columns import HEAD, Row
+from ..columns import Row
 from ..contact.monitoring import Piercing, check_positions
 from ..fields import Fields, Snapshot
 from ..output.checkpoint import write_checkpoint
-from ..output.progress import Progress
 from ..output.vtkhdf import ResultWriter
 from ..restart.state import STATE_VERSION, RunState
 from ..stepping.bar_events import MOST_TOLD
-from ..stepping.ledger import make_ledger
+from ..stepping.ledger import Ledger
 from ..version import __version__
 from .monitors import BlowUp, ContactWatch, Doubts
 from .recorder import Recorder
@@ -40,12 +39,10 @@ class Observer(ABC):
     Attributes
     ----------
     every : due after steps whose number is a multiple of it; 0: never
-    fuses : whether steps after which it is due may be fused into one compiled call
     needs_agreement : whether the ranks must agree first that none of them has a fault
     """
 
     every: int = 0
-    fuses: bool = False
     needs_agreement: bool = False
 
     def due(self, step: int) -> bool:
@@ -53,8 +50,8 @@ class Observer(ABC):
         return bool(self.every) and step % self.every == 0
 
     def steps_left(self, step: int) -> int:
-        """Return the number of steps until it must act again; these may be fused into one compiled call."""
-        return NEVER if self.fuses or not self.every else self.every - step % self.every
+        """Return the number of steps until it must act again, which may be made in a batch."""
+        return self.every - step % self.every if self.every else NEVER
 
     @abstractmethod
     def observe(self, made: Step) -> None:
@@ -66,17 +63,6 @@ class Observer(ABC):
     def remarks(self) -> list[str]:
         """Return remarks for the user at the end of the run."""
         return []
-
-
-class Callback(Observer):
-    """Calls a function with the finished step."""
-
-    def __init__(self, function: Callable[[Step], object], every: int) -> None:
-        self._function, self.every = function, every
-
-    def observe(self, made: Step) -> None:
-        """Call the function."""
-        self._function(made)
 
 
 class History(Observer):
@@ -96,21 +82,18 @@ class History(Observer):
     writer : of the result file
     """
 
-    fuses = True  # rows of fused steps are passed to :meth:`take_sums`
-
     def __init__(self, stages: Stages, synchroniser: Synchroniser, warn: Callable[[str], None]) -> None:
         stepper, model = stages.analysis.stepper, stages.model
         self.every = model.case.output.history_every
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
-        self.ledger = make_ledger(stepper)
-        self.recorder = Recorder(stepper, self.ledger, stages.columns)
+        self.ledger = stepper.ledger = Ledger(stepper)
+        self.recorder = Recorder(stepper, stages.columns)
         inertial = stepper.scheme.inertial
         self.blow_up = BlowUp(model, inertial)
         # works over the increments of equilibria are quadratures, whose error is no energy that something has made
         self._contact_watch = ContactWatch(model, warn, stages.analysis.plan) if inertial else None
         self.row: Mapping[str, Any] | None = None
         self.writer: ResultWriter | None = None
-        stepper.booking, stepper.bars_removed = self._book, self.ledger.follow_removal
 
     def begin_stage(self, earlier: History, last: Row, kick: tuple[float, np.ndarray]) -> None:
         """Go on with the rows of the stage that has ended. Collective.
@@ -124,7 +107,7 @@ class History(Observer):
         """Return what a restart goes on with, besides the ledger."""
         recorder = self.recorder
         return {
-            "iterations": list(recorder.iterations),
+            "iterations": list(self._stepper.iterations),
             "start_energy": recorder.start_energy,
             "energy_scale": recorder.energy_scale,
             "blow_up": self.blow_up.kept(),
@@ -134,7 +117,7 @@ class History(Observer):
     def load_state(self, kept: Mapping[str, Any]) -> None:
         """Take what :meth:`kept` gave; for a case with stages, under ``stage``, also what :meth:`stage` gave."""
         recorder = self.recorder
-        recorder.iterations = [int(n) for n in kept["iterations"]]
+        self._stepper.iterations = [int(n) for n in kept["iterations"]]
         recorder.start_energy, recorder.energy_scale = kept["start_energy"], kept["energy_scale"]
         self.blow_up.load_state(kept["blow_up"])
         self.row = dict(kept["row"])
@@ -155,11 +138,6 @@ class History(Observer):
             "watch": None if watch is None else watch.start,
         }
 
-    def _book(self) -> None:
-        """Add energies and iterations of a step, or of each part of a bisected step."""
-        self.ledger.update()
-        self.recorder.count(self._stepper.solution.newton, self._stepper.solution.linear)
-
     def observe(self, made: Step) -> None:
         """Record a row."""
         self.record()
@@ -170,15 +148,6 @@ class History(Observer):
         if self.recorder.alarmed:
             self._synchroniser.synchronise()
         self.take(row)
-
-    def take_sums(self, sums: np.ndarray) -> bool:
-        """Take the row of this rank's sums (width,) at the state's step and time, unless a rank has a fault; return
-        whether none has. Collective."""
-        total = self.recorder.total(sums)
-        if self._model.comm.size > 1 and total[HEAD.first("alarm")] > 0.0:
-            return False
-        self.take(self.recorder.row_of(total))
-        return True
 
     def take(self, row: Row) -> None:
         """Check a row, store it and add it to the history."""
@@ -371,23 +340,6 @@ class Checkpointing(Observer):
         """Write the checkpoint of the last step, if the case requests checkpoints."""
         if self.at_end:
             self.write()
-
-
-class ProgressReport(Observer):
-    """Reports each step, the last one of fused steps, to the progress bar, or to the lines that replace it."""
-
-    every, fuses = 1, True
-
-    def __init__(self, progress: Progress, analysis: Analysis, history: History) -> None:
-        self._progress, self._analysis, self._history = progress, analysis, history
-
-    def observe(self, made: Step) -> None:
-        """Report a step."""
-        history = self._history
-        contacts = history.row["active_contacts"]
-        self._progress.update(
-            made.step, made.time, self._analysis.step_size, made.newton, made.linear, contacts, history.drift
-        )
 
 
 class Events(Observer):

@@ -19,26 +19,17 @@ from ..modes.find import Found, find_modes, weakest_member
 from ..output.checkpoint import NAME as CHECKPOINT
 from ..output.layout import MODE_VALUES, Contents, Kept
 from ..output.progress import Progress, Span
+from ..output.result import RESULT_NAME
 from ..output.units import MODE
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import on_root
 from ..preflight.checks import odd_accelerations, warnings_before
 from ..preflight.forecast import summarise
-from ..restart.checkpoints import RESULT, Restart, prepare_folder
+from ..restart.checkpoints import Restart, prepare_folder
 from ..restart.state import RunState
 from ..signals import early
-from ..stepping.batches import Batches
 from ..stepping.model import Model
-from .observers import (
-    Callback,
-    Checkpointing,
-    Events,
-    History,
-    Observer,
-    ProgressReport,
-    RuptureReport,
-    Snapshots,
-)
+from .observers import Checkpointing, Events, History, Observer, RuptureReport, Snapshots
 from .stages import Stages
 from .synchroniser import Synchroniser
 
@@ -217,8 +208,8 @@ class Outputs:
         self.checkpointing: Checkpointing | None = None
         self.events: Events | None = None
         self.ruptures: RuptureReport | None = None
-        self._report: ProgressReport | None = None
-        self._callbacks: list[Callback] = []
+        self._observers: tuple[Observer, ...] = ()
+        self._callbacks: list[tuple[Callable[[Step], object], int]] = []
         self._writer: ResultWriter | None = None
         self._continues = False
 
@@ -231,17 +222,9 @@ class Outputs:
         """Whether results are being written."""
         return self._writer is not None
 
-    @property
-    def _recording(self) -> tuple[Observer, ...]:
-        return self.history, self.events, self.ruptures, self.snapshots, self.checkpointing
-
-    @property
-    def _observers(self) -> tuple[Observer, ...]:
-        return *self._recording, self._report, *self._callbacks
-
     def call(self, function: Callable[[Step], object], every: int) -> None:
         """Call a function after each step whose number is a multiple of ``every``."""
-        self._callbacks.append(Callback(function, every))
+        self._callbacks.append((function, every))
 
     def open(self, restart: Restart | None, notes: list[str]) -> None:
         """Initialise the state, or restore it from a checkpoint, and open all outputs. Collective.
@@ -258,7 +241,7 @@ class Outputs:
             # before any change to the folder, because the checkpoint may be refused
             state.restore(restart.file, stages.case.source)
             self._continues = restart.continues
-        aside = prepare_folder(model.comm, folder, restart, plan)
+        aside = on_root(model.comm, prepare_folder, folder, restart, plan)
         notes = [*notes, *([] if aside is None else [f"{folder}: earlier results were moved to {aside}"])]
         self.progress = self._compilation.progress = self._open_progress(notes)
         if restart is None:
@@ -266,9 +249,9 @@ class Outputs:
             self._synchroniser.synchronise()
         self._observe(state)
         if restart is not None:
-            self.history.ledger.load_state(state.share(restart.scalars["ranks"])["ledger"])
-            self.history.load_state(restart.scalars)
-            self.snapshots.load_state(restart.scalars)
+            self.history.ledger.load_state(state.share(restart.file.scalars["ranks"])["ledger"])
+            self.history.load_state(restart.file.scalars)
+            self.snapshots.load_state(restart.file.scalars)
             self._tell_restart(restart)
             # the file of modes does not belong to the new end
             on_root(model.comm, (folder / MODES_FILE).unlink, True)
@@ -276,7 +259,7 @@ class Outputs:
         if self._continues:
             self.checkpointing.last_step = restart.step
             kept = Kept(analysis.stepper.number, *restart.last)
-        self._write_to(ResultWriter(folder / RESULT, model.comm, model.mesh, self._contents(), kept))
+        self._write_to(ResultWriter(folder / RESULT_NAME, model.comm, model.mesh, self._contents(), kept))
 
     def _open_progress(self, notes: Iterable[str]) -> Progress:
         """Open the progress report and write summary, warnings and notes. Collective."""
@@ -303,7 +286,7 @@ class Outputs:
         place = f"step {stepper.number}, {self._stages.plan.axis.place(stepper.place)}"
         changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
         self.progress.message(f"restart from {restart.path}: {place}{changes}")
-        before = int(restart.attributes.get("external_functions", 0))
+        before = int(restart.file.attributes.get("external_functions", 0))
         if before != functions:
             self.progress.warning(
                 f"{restart.path}: the run had {before} function{'s' * (before != 1)} for forces, and this one has "
@@ -357,7 +340,7 @@ class Outputs:
         self.snapshots = Snapshots(analysis, self.fields, warn)
         saved = self.history, self.snapshots, self._synchroniser
         self.checkpointing = Checkpointing(stages, self._folder / CHECKPOINT, state, *saved)
-        self._report = ProgressReport(self.progress, analysis, self.history)
+        self._observers = self.history, self.events, self.ruptures, self.snapshots, self.checkpointing
 
     def begin_stage(self) -> None:
         """End the current stage with a row and a snapshot, and begin the next. Collective.
@@ -400,7 +383,7 @@ class Outputs:
         """Serve the observers that are due after a step; return the step with its row. Collective."""
         step, synchroniser = made.step, self._synchroniser
         last = self._analysis.state.step == self._analysis.last_step
-        history, *others = self._recording
+        history, *others = self._observers
         recorded = history.due(step)
         if recorded:
             history.observe(made)
@@ -417,26 +400,18 @@ class Outputs:
             self._complete_stage()
         if recorded or last:
             made = made._replace(row=history.row)
-        for observer in (self._report, *self._callbacks):
-            if observer.due(step):
-                observer.observe(made)
+        size, contacts = self._analysis.step_size, history.row["active_contacts"]
+        self.progress.update(step, made.time, size, made.newton, made.linear, contacts, history.drift)
+        for function, every in self._callbacks:
+            if step % every == 0:
+                function(made)
         return made
 
     def steps_left(self, step: int) -> int:
         """Return the number of steps until an observer must act or the ranks synchronise."""
-        return min(self._synchroniser.steps_left(step), *(each.steps_left(step) for each in self._observers))
-
-    def advance_together(self, batches: Batches) -> None:
-        """Fuse the steps that need only rows of the history, if possible. Collective.
-
-        Raises
-        ------
-        SimulationFailure
-            As for a single step.
-        """
-        left = self.steps_left(self._analysis.stepper.number)
-        if not batches.advance(self._analysis, self.history, left):
-            self._synchroniser.synchronise()
+        left = [observer.steps_left(step) for observer in self._observers]
+        left += [every - step % every for _, every in self._callbacks]
+        return min(self._synchroniser.steps_left(step), *left)
 
     def stop_early(self) -> None:
         """Stop with a checkpoint if the ranks have agreed to stop, unless the run is at its end. Collective.

@@ -33,7 +33,6 @@ from ..columns import (
 
 if TYPE_CHECKING:
     from ..integrators.base import State
-    from ..stepping.ledger import Ledger
     from ..stepping.stepper import Stepper
 
 
@@ -80,10 +79,6 @@ class Probes:
         self.size = _NUMBERS * len(self.nodes)
         self.width = _NUMBERS * int(self._counts.sum())
 
-    def places(self) -> np.ndarray:
-        """Return where this rank's nodes begin in its share (m,) int64."""
-        return _NUMBERS * np.arange(len(self.nodes), dtype=np.int64)
-
     def fill(self, share: np.ndarray, state: State, acceleration: np.ndarray, support: np.ndarray) -> None:
         """Write this rank's share (size,), with acceleration and forces of supports (owned, 3) to record."""
         values, nodes = share.reshape(-1, len(PROBED), 3), self.nodes
@@ -119,7 +114,6 @@ class Recorder:
     Parameters
     ----------
     stepper : Stepper
-    ledger : Ledger; None where only the columns are asked for
     columns : of all stages of the case, see :attr:`columns`; what this one does not have, such as a wall that is gone,
         is zero in its rows; sums, contact times and the load factor keep their values. None for a case without stages
 
@@ -127,7 +121,6 @@ class Recorder:
     ----------
     columns : name to the type of a value, with its shape
     energy_scale : largest energy of any kind in the rows so far [J]
-    iterations : Newton and linear-solver iterations since the last row
     alarmed : whether any rank raised a fault flag with the last row
     carried : (width of a row of this stage,) sums of the stages before, added to its columns; None without
     rest : (width of a row of all stages,) values of the columns that this stage does not have; None without stages
@@ -135,14 +128,11 @@ class Recorder:
     probe_nodes : probe name to the mesh numbers of its nodes, ascending, the order of rows in a probe's columns
     """
 
-    def __init__(
-        self, stepper: Stepper, ledger: Ledger | None = None, columns: Mapping[str, np.dtype] | None = None
-    ) -> None:
-        self.stepper, self.ledger, self.model = stepper, ledger, stepper.model
+    def __init__(self, stepper: Stepper, columns: Mapping[str, np.dtype] | None = None) -> None:
+        self.stepper, self.model = stepper, stepper.model
         self.start_energy: float | None = None
         self.energy_scale = 0.0
         self.alarmed = False
-        self.iterations = [0, 0]
         self.carried: np.ndarray | None = None
         model = self.model
         probes = {probe.name: model.nodes[probe.node_set] for probe in model.case.output.probe}
@@ -197,36 +187,13 @@ class Recorder:
             (layout.first(one.name), [HEAD.first(part) for part in one.parts]) for one in ENERGIES if one.parts
         ]
 
-    def probed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return this rank's nodes of all probes; where their positions are among its sums of probes; and the distance
-        between the vectors of a node there, over three. Arrays (m,) int64."""
-        return self._probes.nodes, self._probes.places(), np.ones(len(self._probes.nodes), dtype=np.int64)
-
-    def count(self, newton: int, linear: int) -> None:
-        """Add the iterations of a step to those of the next row."""
-        self.iterations[0] += newton
-        self.iterations[1] += linear
-
     def row(self, alarm: bool = False) -> Row:
         """Return the history row of the present state. Collective.
 
         ``alarm``: whether this rank has a fault; :attr:`alarmed` is then true on all ranks.
         """
         self._fill(self._sums, alarm)
-        return self.row_of(self.total(self._sums))
-
-    def total(self, sums: np.ndarray) -> np.ndarray:
-        """Return the sums over all ranks from this rank's share (width,), and the probes of all. Collective."""
-        probes = self._probed
-        total = np.empty(probes + self._probes.width)
-        total[:probes] = sums[:probes]
-        if self.model.comm.size > 1:
-            self.model.comm.Allreduce(MPI.IN_PLACE, total[:probes])
-        self._probes.unite(sums[probes:], total[probes:])
-        return total
-
-    def row_of(self, total: np.ndarray) -> Row:
-        """Return the row at the state's step and time from what :meth:`total` gives. Collective."""
+        total = self._total(self._sums)
         self.alarmed = total[HEAD.first("alarm")] > 0.0
         contact = self.model.contact
         contacts = self._of_walls(total)[:, WALL.first("contacts")] if contact.any else None
@@ -237,12 +204,23 @@ class Recorder:
             vector[self._at] = own
         return Row(self._whole, vector)
 
+    def _total(self, sums: np.ndarray) -> np.ndarray:
+        """Return the sums over all ranks from this rank's share (width,), and the probes of all. Collective."""
+        probes = self._probed
+        total = np.empty(probes + self._probes.width)
+        total[:probes] = sums[:probes]
+        if self.model.comm.size > 1:
+            self.model.comm.Allreduce(MPI.IN_PLACE, total[:probes])
+        self._probes.unite(sums[probes:], total[probes:])
+        return total
+
     def _of_walls(self, sums: np.ndarray) -> np.ndarray:
         return sums[_WALLS : self._links].reshape(-1, WALL.width)
 
     def _fill(self, sums: np.ndarray, alarm: bool) -> None:
         """Write this rank's share of a row."""
-        stepper, state, ledger, contact = self.stepper, self.stepper.state, self.ledger, self.model.contact
+        stepper, state, contact = self.stepper, self.stepper.state, self.model.contact
+        ledger = stepper.ledger
         solution = stepper.solution
         ledger.complete()
         sums[: HEAD.width] = ledger.sums
@@ -276,7 +254,7 @@ class Recorder:
             vector[at(column.name)] = column.value(stepper)
         for name in stepper.columns:
             vector[at(name)] = getattr(stepper, name)
-        vector[at("newton_iterations")], vector[at("linear_iterations")] = self.iterations
+        vector[at("newton_iterations")], vector[at("linear_iterations")] = stepper.iterations
         for first, parts in self._parts:
             vector[first] = sum(sums[part] for part in parts)
         vector[layout["centre_of_mass"]] /= self.model.total_mass
@@ -288,7 +266,7 @@ class Recorder:
             self.start_energy = held
         self.energy_scale = max(self.energy_scale, float(np.abs(energies).max()))
         vector[at("energy_imbalance")] = held - self.start_energy
-        self.iterations = [0, 0]
+        stepper.iterations = [0, 0]
         if contact.any:
             vector[self._contact_times] = contact.log.time
             contact.log.changes = 0

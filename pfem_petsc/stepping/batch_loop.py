@@ -1,83 +1,77 @@
-"""The loop of a batch: many steps of central differences in one compiled call, on named arrays."""
+"""The loop of a batch: steps of central differences in one compiled call, block of nodes by block of nodes.
+
+A block is moved shortly before its first bar, and finished after its last one, while it is in the cache. Blocks are
+those of the order of nodes; the bars of a block reach its own nodes and those of some blocks behind it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
 
 from ..columns import HEAD
+from ..contact.explicit import find_beyond, press_nodes
+from ..contact.fixed_rows import close_rows, solve_rows
+from ..contact.impact import Approach, join_nodes, plane_gaps, stop_nodes, unpressed
 from ..contact.node_walls import compare_contacts
-from ..integrators._leapfrog import centre
+from ..integrators._leapfrog import accelerations, advance, advance_loaded, centre, kick, move
 from ..mechanics.compiled import borrowing, kernel
 from ..mechanics.elements import BarData, first_inverted
-from ..mechanics.runs import Columns, exchange_history, new_rows, slide_planes
+from ..mechanics.runs import Columns, exchange_history, join_components, new_rows, slide_planes, split_components
 from ..mechanics.tuples import CHUNK
 from ..mesh.ordering import NODE_BLOCK
-from .batch_blocks import (
-    RowSums,
-    advance_block,
-    complete,
-    fill_row,
-    find_pressed,
-    finish_block,
-    finish_positions,
-    finish_rows,
-    join_block,
-    mark_blocks,
-    move_block,
-    new_pressed,
-    pass_block,
-    press_block,
-    push_particles,
-    solve_block,
-    split_block,
-    start_positions,
-    stop_at_walls,
-    sum_rows,
-)
+from .impulses import WALLS
 from .ledger_loops import (
     CONTACT,
     INTERNAL,
+    LANES,
+    REACTIONS,
     WORKS,
     Acting,
+    add_drags,
+    add_loads,
+    add_powers,
+    add_sparse_forces,
     add_sparse_powers,
     clear_forces,
     clear_sums,
-    fill_walls,
-    new_row_room,
     new_sums,
+    spread,
     start_of_step,
     sum_balance,
 )
 
 
 class BarArrays(NamedTuple):
-    """The bars of a batch: ``data`` of all of them; ``watched``, see ``Bars``; ``slack``: row of the history with the
-    variable of this name, or -1; ``counted``: columns of the history that belong to counted bars; ``reach``: how
-    many blocks of nodes beyond its own the bars of a block reach; ``columns`` of the bars, or none; ``planes`` and
-    ``pulls`` (3 stride,): positions and forces by components, of a window of the nodes."""
+    """The bars of a batch: ``data`` of all of them; ``watched``, see ``Bars``; ``reach``: how many blocks of nodes
+    beyond its own the bars of a block reach; ``meeting``: the first block that waits for messages; ``columns`` of the
+    bars, or none; ``planes`` and ``pulls`` (3 stride,): positions and forces by components, of a window of the
+    nodes."""
 
     data: BarData
     watched: np.ndarray
-    slack: int
-    counted: int
     reach: int
     meeting: int
-    can_break: bool
     columns: Columns
     planes: np.ndarray
     pulls: np.ndarray
 
 
 class NodeArrays(NamedTuple):
-    """Constant arrays at the nodes; ``damping`` (0,) and ``external`` (0, 3) if there are none;
-    ``support_starts`` (blocks + 1,) the first prescribed component of each block of nodes, which are sorted by node."""
+    """Constant arrays at the nodes; ``damping`` (0,) and ``external`` (0, 3) if there are none; ``stiffness`` (n,) of
+    the balance and its inverse; ``support_starts`` (blocks + 1,) the first prescribed component of each block of nodes,
+    which are sorted by node."""
 
     mass: np.ndarray
     damping: np.ndarray
+    stiffness: np.ndarray
+    inverses: np.ndarray
     external: np.ndarray
     support_nodes: np.ndarray
     support_components: np.ndarray
@@ -134,30 +128,24 @@ class ImpulseArrays(NamedTuple):
     v: np.ndarray
 
 
-class ProbeArrays(NamedTuple):
-    """Nodes of all probes, see :meth:`~pfem_petsc.run.recorder.Recorder.probed`."""
-
-    nodes: np.ndarray
-    places: np.ndarray
-    counts: np.ndarray
-
-
 class StateArrays(NamedTuple):
-    """Arrays (n, 3) of the state, and the energies of the bars [J]. Wall forces are zero except at the nodes that touch
-    walls; support forces are written at prescribed components alone."""
+    """Arrays (n, 3) of the state, the increments ``u`` of the balance, and the energies of the bars [J]. Wall forces
+    are zero except at the nodes that touch walls; support forces are written at prescribed components alone."""
 
     f: np.ndarray
     a: np.ndarray
     v: np.ndarray
     support: np.ndarray
     contact: np.ndarray
+    u: np.ndarray
     energies: np.ndarray
 
 
 class BatchData(NamedTuple):
     """All that a batch reads and writes: the step [s]; positions (local, 3), those of the previous step, which are
-    computed for the last step alone, and velocities at half steps (n, 3); records of arrays; the ledger's sums and its
-    works of balances; and its particles."""
+    computed for the last step alone, and velocities at half steps (n, 3); records of arrays; the sums of the ledger, of
+    which the dissipation by impact is added to; works (2, 5) of all balances, and of those before the last; and
+    particles of impulses."""
 
     h: float
     x: np.ndarray
@@ -167,7 +155,6 @@ class BatchData(NamedTuple):
     nodes: NodeArrays
     walls: WallArrays
     rows: NamedTuple
-    probes: ProbeArrays
     messages: NamedTuple
     state: StateArrays
     ledger: np.ndarray
@@ -175,12 +162,463 @@ class BatchData(NamedTuple):
     impulses: ImpulseArrays
 
 
-_HEAD, _ALARM = HEAD.width, HEAD.first("alarm")  # constants of the machine code
-_IMPACT = HEAD.first("impact_dissipation")
+class Made(NamedTuple):
+    """Outcome of a batch.
+
+    ``done``: number of steps made; ``lost``: error code of MPI. In the last step: ``changed``: number of bars that
+    changed their state of rupture; ``failed``, ``turned``: the first bar that collapsed, and that went through zero
+    length, or -1; ``infeasible``: index in ``near`` of a node that no position satisfies, or -1, with the ``offsets``
+    of its planes; ``force``, ``contacts``, ``moment``: sums of the walls; ``near``: nodes with wall forces, the walls
+    that they are ``touching``, and their ``places``; ``touched``, ``met``: nodes that touch walls, and that have
+    touched them and not left; ``pressing``: number of nodes with contact forces; and ``changes``: contacts that closed
+    or opened in all steps.
+    """
+
+    done: int
+    lost: int
+    changed: int
+    failed: int
+    turned: int
+    infeasible: int
+    offsets: np.ndarray
+    force: np.ndarray
+    contacts: np.ndarray
+    moment: np.ndarray
+    near: np.ndarray
+    touching: np.ndarray
+    places: np.ndarray
+    touched: np.ndarray
+    met: np.ndarray
+    pressing: int
+    changes: int
+
+
+_IMPACT = HEAD.first("impact_dissipation")  # a constant of the machine code
+
+
+@borrowing
+def move_block(block, shared, f, light, bars, base):
+    """Move the nodes of a block, and set their forces to zero; in ``light`` steps those of :func:`split_block`."""
+    first = NODE_BLOCK * block
+    last = min(first + NODE_BLOCK, len(shared.half))
+    where = shared.x[first:last].reshape(-1)
+    move(where, shared.h, shared.half[first:last].reshape(-1))
+    if light:
+        split_block(first, last, shared.x, bars.planes, bars.pulls, base)
+        return
+    sums = f[first:last].reshape(-1)
+    for j in range(len(sums)):
+        sums[j] = 0.0
+
+
+@borrowing
+def split_block(first, last, x, planes, pulls, base):
+    """Write the positions of nodes [first, last) to ``planes`` (3 stride,), which begin at node ``base``, and set their
+    forces in ``pulls`` (3 stride,) to zero."""
+    stride = len(planes) // 3
+    split_components(x, first, last - first, planes, stride, base)
+    for c in range(3):
+        part = pulls[c * stride + first - base : c * stride + last - base]
+        for i in range(len(part)):
+            part[i] = 0.0
+
+
+@borrowing
+def join_block(block, n, pulls, base, f, start):
+    """Write the forces of the nodes of a block from ``pulls``."""
+    first = NODE_BLOCK * block
+    join_components(pulls, base, first, f[first - start : min(first + NODE_BLOCK, n) - start])
+
+
+@borrowing
+def hold_still(block, nodes, shared, f, inverse):
+    """Write the increments of the prescribed components of a block without damping and contact to ``shared.held`` (k,),
+    and their reactions to ``shared.support`` (owned, 3) [N]; set their inverse stiffness to zero in ``inverse`` (3 m,).
+    This array and the forces ``f`` (m, 3) are those of the block."""
+    components, positions, external = nodes.support_components, nodes.support_positions, nodes.external
+    held, support, x, half = shared.held, shared.support, shared.x, shared.half
+    origin, loaded = NODE_BLOCK * block, len(external) > 0
+    for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
+        i, c = nodes.support_nodes[k], components[k]
+        stiffness = nodes.stiffness[i]
+        pull = f[i - origin, c]
+        force = external[i, c] - pull if loaded else -pull
+        free = stiffness * (force * (1.0 / stiffness))
+        held[k] = positions[k] - (x[i, c] + shared.h * half[i, c])
+        support[i, c] = stiffness * held[k] - free
+        inverse[3 * (i - origin) + c] = 0.0
+
+
+@borrowing
+def advance_block(block, nodes, shared, f, start):
+    """Finish the step of a block without walls and damping in one pass: forces alone determine its increments."""
+    h, alpha, eta, half, held, support = shared.h, shared.alpha, shared.eta, shared.half, shared.held, shared.support
+    lanes = shared.lanes
+    first = NODE_BLOCK * block
+    last = min(first + NODE_BLOCK, len(half))
+    begin, end = nodes.support_starts[block], nodes.support_starts[block + 1]
+    components = nodes.support_components
+    here, factor = shared.speeds[: 3 * (last - first)], shared.factors[: 3 * (last - first)]
+    forces = f[first - start : last - start]
+    spread(shared.inverses[first:last], factor)
+    hold_still(block, nodes, shared, forces, factor)
+    force, ahead = forces.reshape(-1), half[first:last].reshape(-1)
+    if len(nodes.external) > 0:
+        load = nodes.external[first:last].reshape(-1)
+        advance_loaded(force, load, factor, alpha, eta, h, ahead, here, lanes[INTERNAL])
+        add_loads(load, here, lanes)
+    else:
+        advance(force, factor, alpha, eta, h, ahead, lanes[INTERNAL])
+    for k in range(begin, end):
+        half[nodes.support_nodes[k], components[k]] += h * (alpha * held[k])
+    add_sparse_forces(begin, end, nodes.support_nodes, components, support, lanes[REACTIONS])
+
+
+@borrowing
+def solve_block(block, nodes, shared, f, start, free, u):
+    """Compute the increments ``u`` (3 m,) of a block without contact, and its ``free`` positions (3 m,); those of its
+    prescribed components are written to ``shared`` too."""
+    h = shared.h
+    first = NODE_BLOCK * block
+    last = min(first + NODE_BLOCK, len(shared.half))
+    where, speed = shared.x[first:last].reshape(-1), shared.half[first:last].reshape(-1)
+    force = f[first - start : last - start].reshape(-1)
+    factor = shared.factors[: len(u)]
+    damped = len(nodes.damping) > 0
+    if len(nodes.external) > 0:
+        given = nodes.external[first:last].reshape(-1)
+        for j in range(len(u)):
+            u[j] = given[j] - force[j]
+    else:
+        for j in range(len(u)):
+            u[j] = -force[j]
+    if damped:
+        spread(nodes.damping[first:last], factor)
+        for j in range(len(u)):
+            u[j] -= factor[j] * speed[j]
+    spread(shared.inverses[first:last], factor)
+    for j in range(len(u)):
+        u[j] *= factor[j]
+        free[j] = where[j] + h * speed[j]
+    for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
+        i = nodes.support_nodes[k]
+        j = 3 * (i - first) + nodes.support_components[k]
+        shared.load[k] = nodes.stiffness[i] * u[j]
+        u[j] = shared.held[k] = nodes.support_positions[k] - free[j]
+    for j in range(len(u)):
+        free[j] += u[j]
+
+
+@borrowing
+def finish_block(block, nodes, shared, f, start, contact, u):
+    """Finish the step of a block from its increments ``u`` (3 m,): reactions, velocities half a step later, and powers.
+
+    The velocities of the balance remain in ``shared.speeds``.
+    """
+    alpha, eta, support, lanes = shared.alpha, shared.eta, shared.support, shared.lanes
+    first = NODE_BLOCK * block
+    last = min(first + NODE_BLOCK, len(shared.half))
+    begin, end = nodes.support_starts[block], nodes.support_starts[block + 1]
+    damped = len(shared.drag) > 0
+    for k in range(begin, end):
+        i, c = nodes.support_nodes[k], nodes.support_components[k]
+        stiffness = nodes.stiffness[i]
+        support[i, c] = stiffness * u[3 * (i - first) + c] - shared.load[k] - contact[i, c]
+    ahead, here = shared.half[first:last].reshape(-1), shared.speeds[: len(u)]
+    kick(u, alpha, shared.h, ahead)
+    centre(u, eta, ahead, here)
+    add_powers(f[first - start : last - start].reshape(-1), here, lanes[INTERNAL])
+    add_sparse_forces(begin, end, nodes.support_nodes, nodes.support_components, support, lanes[REACTIONS])
+    if len(nodes.external) > 0:
+        add_loads(nodes.external[first:last].reshape(-1), here, lanes)
+    if damped:
+        add_drags(nodes.damping[first:last], here, shared.drag, lanes)
+
+
+@borrowing
+def pass_block(block, counts, rows, alone, nodes, shared, arrays):
+    """Solve a block and the rows of its nodes whose other node is in it or in a block before; finish all blocks that
+    wait for no other rows.
+
+    ``alone`` (blocks,) bool: whether forces alone determine the increments of a block; ``counts``: numbers of blocks
+    that are finished, and of rows that have a force; ``arrays``: internal forces, increments, contact forces (n, 3).
+    Returns both numbers, and that of rows whose force begins or ends.
+    """
+    finished, pressing = counts
+    f, u, contact = arrays
+    n = len(shared.half)
+    if not alone[block]:
+        first = NODE_BLOCK * block
+        last = min(first + NODE_BLOCK, n)
+        solve_block(block, nodes, shared, f, 0, shared.speeds[: 3 * (last - first)], u[first:last].reshape(-1))
+    count, changed = solve_rows(block, rows, nodes, shared, u, contact)
+    pressing += count
+    while finished < len(rows.ready) and rows.ready[finished] <= block:
+        if alone[finished]:
+            advance_block(finished, nodes, shared, f, 0)
+        else:
+            first = NODE_BLOCK * finished
+            last = min(first + NODE_BLOCK, n)
+            finish_block(finished, nodes, shared, f, 0, contact, u[first:last].reshape(-1))
+            if pressing > 0:
+                _add_pushes(finished, rows, contact, shared.speeds, shared.lanes[CONTACT])
+        finished += 1
+    return finished, pressing, changed
+
+
+@borrowing
+def _add_pushes(block, rows, contact, speeds, sums):
+    """Add the powers of the rows' forces on the nodes of a block with velocities ``speeds`` (3 m,) to ``sums``."""
+    first = NODE_BLOCK * block
+    for k in range(rows.node_starts[block], rows.node_starts[block + 1]):
+        if rows.force[rows.of[k]] > 0.0:
+            i = rows.nodes[k]
+            at, place = 3 * (i % LANES), 3 * (i - first)
+            for c in range(3):
+                sums[at + c] += contact[i, c] * speeds[place + c]
+
+
+@kernel
+def sum_rows(rows, pressing):
+    """Write the forces on the second nodes of each table to ``rows.totals``, as
+    :func:`~pfem_petsc.contact.rows.last_forces` does; ``pressing`` rows have a force."""
+    force, normals, place = rows.force, rows.normals, rows.place
+    for k in range(len(rows.totals)):
+        x = y = z = 0.0
+        if pressing > 0:
+            for j in range(rows.table_starts[k], rows.table_starts[k + 1]):
+                p = place[j]
+                x += force[p] * normals[p, 0]
+                y += force[p] * normals[p, 1]
+                z += force[p] * normals[p, 2]
+        rows.totals[k, 0], rows.totals[k, 1], rows.totals[k, 2] = x, y, z
+
+
+@kernel
+def finish_rows(rows, changed, slack, nodes, shared, state, u):
+    """Return the dissipation [J] of rows that close; ``changed`` rows have a force that begins or ends.
+
+    Velocities and accelerations of the state are written at their nodes.
+    """
+    x, half, alpha, eta = shared.x, shared.half, shared.alpha, shared.eta
+    v, a, contact = state.v, state.a, state.contact
+    where, force, closed = rows.where, rows.force, rows.closed
+    at, count = np.empty(changed, dtype=np.int64), 0
+    ends = np.empty((2, changed, 10))
+    for p in rows.place:
+        if (force[p] > 0.0) != closed[p]:
+            at[count] = p
+            count += 1
+    for end in range(2):
+        around = where[end][at]
+        for i in around:
+            centre(u[i], eta, half[i], v[i])
+            accelerations(u[i], alpha, a[i])
+        free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
+        for m in range(count):
+            i = around[m]
+            ends[end, m, 9] = nodes.mass[i]
+            for c in range(3):
+                # rows do not change prescribed components
+                fixed = rows.free[end, at[m], c] == 0.0
+                ends[end, m, c] = x[i, c]
+                ends[end, m, 3 + c] = v[i, c] if fixed else free_v[m, c]
+                ends[end, m, 6 + c] = a[i, c] if fixed else free_a[m, c]
+    counted = np.ones(len(force), dtype=np.bool_)
+    return close_rows(rows, at, ends, counted, slack)
+
+
+class Pressed(NamedTuple):
+    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` for all blocks of a step: room for ``nodes`` (n,),
+    the planes that they are ``touching`` (n, w), their ``places`` (n, 3); ``offsets`` (w,) of the infeasible node; and
+    the sums of each wall, ``force`` (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
+
+    nodes: np.ndarray
+    touching: np.ndarray
+    places: np.ndarray
+    offsets: np.ndarray
+    force: np.ndarray
+    contacts: np.ndarray
+    moment: np.ndarray
+
+
+@kernel
+def new_pressed(n, w):
+    """Return room for ``n`` nodes and ``w`` walls. Pages of memory that no node needs are not touched."""
+    nodes = np.empty(n if w > 0 else 0, dtype=np.int64)
+    touching, places = np.empty((len(nodes), w), dtype=np.bool_), np.empty((len(nodes), 3))
+    force, contacts, moment = np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3))
+    return Pressed(nodes, touching, places, np.empty(w), force, contacts, moment)
+
+
+@kernel
+def mark_blocks(marks, nodes, value):
+    """Set ``marks`` of the blocks of ``nodes`` to ``value``."""
+    for i in nodes:
+        marks[i // NODE_BLOCK] = value
+
+
+@borrowing
+def find_pressed(block, walls, free):
+    """Write the nodes of a block that lie beyond a plane at ``free`` (3 m,) to ``walls.room``; return their number."""
+    first = NODE_BLOCK * block
+    return find_beyond(first, free, walls, walls.room)
+
+
+@kernel
+def press_block(block, counts, nodes, walls, shared, places_of, out):
+    """Press the nodes of a block that :func:`find_pressed` has found, and append them to those of before; ``counts``:
+    their numbers. Return the first infeasible node among all of them, or -1.
+
+    ``places_of``: positions and increments of the nodes of the block, flat, of which the latter are corrected; ``out``:
+    contact forces (n, 3) [N], and Pressed, to which they are written.
+    """
+    m, count = counts
+    free, u = places_of
+    contact, pressed = out
+    first = NODE_BLOCK * block
+    found = walls.room[:m].copy()
+    places, stiffness = np.empty((m, 3)), np.empty(m)
+    for j in range(m):
+        i = found[j]
+        stiffness[j] = nodes.stiffness[i]
+        for c in range(3):
+            places[j, c] = free[3 * (i - first) + c]
+    infeasible, offsets, total, touching = press_nodes(found, places, walls, stiffness, pressed)
+    for j in range(m):
+        i = found[j]
+        for c in range(3):
+            at = 3 * (i - first) + c
+            u[at] += places[j, c] - free[at]
+            contact[i, c] = total[j, c]
+            pressed.places[count + j, c] = places[j, c]
+        pressed.nodes[count + j] = i
+        for k in range(touching.shape[1]):
+            pressed.touching[count + j, k] = touching[j, k]
+    if infeasible >= 0:
+        pressed.offsets[:] = offsets[infeasible]
+        infeasible += count
+    return infeasible
+
+
+@kernel
+def stop_at_walls(nodes, walls, shared, state, u, touched, met):
+    """Return the dissipation of contacts that close [J], and the nodes that are on walls afterwards.
+
+    Velocities and accelerations of the state are written at the nodes that touch walls or have touched them.
+    """
+    x, half, alpha, eta = shared.x, shared.half, shared.alpha, shared.eta
+    v, a, contact = state.v, state.a, state.contact
+    around = join_nodes(met, touched, walls.present)
+    for i in around:
+        centre(u[i], eta, half[i], v[i])
+        accelerations(u[i], alpha, a[i])
+    all_normals, gaps = plane_gaps(around, x, walls.normals, walls.offsets)
+    free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
+    for j in range(len(around)):
+        i = around[j]
+        for c in range(3):
+            if walls.fixed[i, c]:  # wall forces do not change prescribed components
+                free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
+    still = np.zeros(walls.normals.shape)
+    approach = Approach(all_normals, gaps, free_v, free_a, still, still)
+    counted = np.ones(len(walls.offsets), dtype=np.bool_)
+    return stop_nodes(around, approach, walls, nodes.mass, counted, np.empty(gaps.shape))
+
+
+@kernel
+def push_particles(totals, force, links, alpha, h, impulses, u):
+    """Advance the particles of the impulses by a step; ``totals`` (3, 3), ``force`` of walls (walls, 3) and ``links``
+    (tables, 3) [N]; their increments are written to ``u`` (rows, 3)."""
+    first = WALLS + len(force)
+    for k in range(len(u)):
+        for c in range(3):
+            if k < WALLS:
+                load = totals[k, c]
+            elif k < first:
+                load = force[k - WALLS, c]
+            else:  # the last rows are those of jumps, which need Python
+                load = links[k - first, c] if k < first + len(links) else 0.0
+            u[k, c] = load / alpha
+    kick(u.reshape(-1), alpha, h, impulses.half.reshape(-1))
+
+
+@kernel
+def complete(nodes, shared, state, alone):
+    """Compute the increments of blocks whose forces ``alone`` (blocks,) determine them, and accelerations and
+    velocities of all nodes."""
+    n, f, v, a, u, external = len(shared.half), state.f, state.v, state.a, state.u, nodes.external
+    half, held, inverses, loaded = shared.half, shared.held, shared.inverses, len(external) > 0
+    for block in range(len(alone)):
+        if not alone[block]:
+            continue
+        for i in range(NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)):
+            for c in range(3):
+                u[i, c] = ((external[i, c] - f[i, c]) if loaded else -f[i, c]) * inverses[i]
+        for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
+            u[nodes.support_nodes[k], nodes.support_components[k]] = held[k]
+    centre(u.reshape(-1), shared.eta, half.reshape(-1), v.reshape(-1))
+    accelerations(u.reshape(-1), shared.alpha, a.reshape(-1))
+
+
+_INT, _SHORT, _BYTES = ir.IntType(64), ir.IntType(32), ir.IntType(8).as_pointer()
+
+
+def _call(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    """Generate a call of the function at an address with the number of requests and pointers to arrays."""
+    address, count, *arrays = values
+    pointers = [
+        context.make_array(kind)(context, builder, array).data
+        for kind, array in zip(signature.args[2:], arrays, strict=True)
+    ]
+    kind = ir.FunctionType(_SHORT, [_SHORT] + [_BYTES] * len(pointers))
+    function = builder.inttoptr(address, kind.as_pointer())
+    arguments = [builder.trunc(count, _SHORT), *(builder.bitcast(pointer, _BYTES) for pointer in pointers)]
+    return builder.call(function, arguments)
+
+
+@intrinsic
+def _start_all(typingctx, address, count, requests):  # noqa: ANN001, ANN201
+    """Call ``MPI_Startall`` at an address; return its error code."""
+    return types.int32(types.int64, types.int64, requests), _call
+
+
+@intrinsic
+def _wait_all(typingctx, address, count, requests, statuses):  # noqa: ANN001, ANN201
+    """Call ``MPI_Waitall`` at an address; return its error code."""
+    return types.int32(types.int64, types.int64, requests, statuses), _call
+
+
+@kernel
+def start_positions(messages, x, h, half):
+    """Send the positions that owned nodes reach in a step, x + h ``half`` (owned, 3); return MPI's error code.
+
+    ``messages``: a :class:`~pfem_petsc.mesh.exchange.Messages`.
+    """
+    rows, leaving = messages.rows, messages.leaving
+    for k in range(len(rows)):
+        i = rows[k]
+        for c in range(3):
+            leaving[k, c] = x[i, c] + h * half[i, c]
+    return _start_all(messages.start_all, messages.count, messages.requests)
+
+
+@kernel
+def finish_positions(messages, x, before, fill):
+    """Wait for the messages of :func:`start_positions`; if ``fill``, update the ghosts in ``x`` (local, 3), with their
+    previous positions in ``before``. Return MPI's error code."""
+    arriving = messages.arriving
+    failed = _wait_all(messages.wait_all, messages.count, messages.requests, messages.statuses)
+    first = len(x) - len(arriving)
+    for k in range(len(arriving) if fill else 0):
+        for c in range(3):
+            before[first + k, c] = x[first + k, c]
+            x[first + k, c] = arriving[k, c]
+    return failed
 
 
 @cache
-def make_fused_loop(
+def make_batch_loop(
     add_forces: Callable,
     sum_energies: Callable,
     clear_energies: Callable,
@@ -188,23 +626,18 @@ def make_fused_loop(
     add_padded: Callable,
     padded_rows: int,
 ) -> Callable:
-    """Return the fused loop for a law and strain measure.
+    """Return the loop for a law and strain measure.
 
     ``add_forces`` is the bar loop over a part of a sweep, with the functions for its energies and the number of its
     working arrays; ``add_padded``, with ``padded_rows`` working arrays, is the loop over columns, for steps
     whose energies nothing reads; see
     :func:`~pfem_petsc.mechanics.elements.make_loops`.
 
-    Its arguments are BatchData; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them;
-    whether a row of the history is ``due`` (count,) after each step; and ``sums`` (count, width), which receives the
-    sums of the rows that are due, and for each step the changes of contacts. Velocities, accelerations, momenta and
-    energies are computed only where a row is due, and after the last step.
-
-    It returns the number of steps made, and MPI's error code; for the last step, which is the last one too if bars
-    change their state of rupture there, the number of these bars, the first bar that collapsed and the first that went
-    through zero length, or -1, and the infeasible node, or -1, with the offsets of its planes; the kinetic energy [J];
-    increments (n, 3); the results of :func:`~pfem_petsc.contact.explicit.press_planes` for nodes and walls; the nodes
-    that touch walls, and those that have touched them; and the number of nodes with contact forces.
+    Its arguments are BatchData; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them; and
+    ``flags`` (count, walls) bool, which receives the walls that are touched in each step. Velocities, accelerations,
+    momenta and energies are computed after the last step alone. It returns Made: fewer steps on one rank where
+    something fails or bars change their state of rupture; several ranks make all steps, as others wait for their
+    messages.
     """
 
     @borrowing
@@ -223,8 +656,8 @@ def make_fused_loop(
         pull(x, bars, 0, bars.data.sweep.counted, f, work)
 
     @kernel
-    def fused_loop(data, touched, met, due, sums):
-        count, h, x, before, half = len(due), data.h, data.x, data.before, data.half
+    def batch_loop(data, touched, met, flags):
+        count, h, x, before, half = len(flags), data.h, data.x, data.before, data.half
         bars, nodes, walls, rows, messages, state = (
             data.bars,
             data.nodes,
@@ -237,24 +670,19 @@ def make_fused_loop(
         n = len(half)
         n_walls = len(walls.offsets)
         f, a, v, support, contact = state.f, state.a, state.v, state.support, state.contact
-        energies = state.energies
+        energies, u = state.energies, state.u
         alpha = 1.0 / (h * h)
         eta = 0.5 / h
         supported, loaded = len(nodes.support_nodes) > 0, len(nodes.external) > 0
         damped = len(nodes.damping) > 0
         linked = len(rows.ready) > 0
         plain = n_walls == 0 and not damped and not linked  # forces alone determine increments
-        increments, factors, inverses = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK), np.empty(n)
-        for i in range(n):
-            inverses[i] = 1.0 / (alpha * nodes.mass[i] + (eta * nodes.damping[i] if damped else 0.0))
-        u = np.empty((n, 3))
-        stiffness = np.empty(n)
+        increments, factors = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK)
         load, held = np.empty(len(nodes.support_nodes)), np.empty(len(nodes.support_nodes))
         speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
-        ends, totals, lanes, room = np.empty(len(WORKS)), np.zeros((6, 3)), new_sums(), new_row_room()
-        after = np.empty(len(WORKS))
+        totals, lanes, after = np.zeros((3, 3)), new_sums(), np.empty(len(WORKS))
         numbers, buffers = (h, alpha, eta), (factors, speeds, drag)
-        shared = BlockArrays(*numbers, x, half, inverses, *buffers, held, load, support, lanes)
+        shared = BlockArrays(*numbers, x, half, nodes.inverses, *buffers, held, load, support, lanes)
         work, columns_work = np.empty(work_rows * CHUNK), new_rows(padded_rows)
         pulled = np.empty((NODE_BLOCK, 3))  # forces of a block
         push_u = np.empty(impulses.v.shape)
@@ -274,18 +702,15 @@ def make_fused_loop(
         changed = 0
         touching = 0
         done = 0
-        kinetic = 0.0
+        changes = 0
         several = len(x) > n or messages.count > 0
         lost = 0  # error code of MPI
         aside = np.empty(len(work) if several else 0)  # energies of bars that other ranks count
-        spread = False  # whether the history of the bars is that of the columns
+        by_columns = False  # whether the history of the bars is that of the columns
         shortened = False
         for step in range(count):
-            row = sums[step]
-            row[_ALARM] = 0.0
             if failed >= 0 or turned >= 0 or infeasible >= 0:
                 # the other ranks still need messages, until all know of the failure
-                row[_ALARM] = 1.0
                 lost = start_positions(messages, x, h, half)
                 lost = finish_positions(messages, x, before, False) if lost == 0 else lost
                 if lost != 0:
@@ -295,14 +720,13 @@ def make_fused_loop(
                 contact[i] = 0.0
             clear_forces(lanes, n, Acting(supported, loaded, False, damped))
             changed = 0
-            changes = 0
             moved = 0
             base = 0  # first node of the planes
             # nothing reads the energies of other steps: a failure ends the run
-            light = len(parts) > 0 and not (due[step] or step == count - 1)
-            if light != spread:
-                exchange_history(bars.data.sweep, bars.columns, bars.data.history, spread)
-                spread = light
+            light = len(parts) > 0 and step < count - 1
+            if light != by_columns:
+                exchange_history(bars.data.sweep, bars.columns, bars.data.history, by_columns)
+                by_columns = light
             # Forces that nothing reads stay in the cache. The check of shortened bars reads them, as the next one is
             # likely to; those of laws with history could not be computed again. Blocks that wait for rows need them.
             brief = light and not shortened and len(bars.data.history) == 0 and not linked
@@ -399,9 +823,10 @@ def make_fused_loop(
                 mark_blocks(on_walls, met, False)
                 near = pressed.nodes[:count_near]
                 if count_near > 0 or len(touched) > 0:
-                    changes, touched = compare_contacts(
+                    more, touched = compare_contacts(
                         walls.touching, touched, near, pressed.touching, walls.present, walls.releases
                     )
+                    changes += more
             if lost != 0:
                 break
             impact = 0.0
@@ -416,41 +841,38 @@ def make_fused_loop(
                 impact += finish_rows(rows, altered, walls.slack, nodes, shared, state, u)
             sum_rows(rows, pressing)
             touching = len(near) + 2 * pressing
-            after[:] = powers
+            after[:] = powers[0]
             sum_balance(lanes, n, h, Acting(supported, loaded, touching > 0, damped), totals, after)
             push_particles(totals, pressed.force, rows.totals, alpha, h, impulses, push_u)
             ledger[_IMPACT] += impact
-            if n_walls > 0:
-                row[_HEAD] = changes
-                fill_walls(row, _HEAD + 1, pressed.force, pressed.moment, impulses.v, pressed.contacts, walls.releases)
+            for k in range(n_walls):
+                flags[step, k] = pressed.contacts[k] > 0
             done += 1
             wrong = failed >= 0 or infeasible >= 0 or changed > 0 or not np.isfinite(after[INTERNAL])
-            if due[step] or shortened or wrong or step == count - 1:
+            if shortened or wrong or step == count - 1:
                 turned = -1
                 if brief:
                     pull_again(x, n, bars, f, work, aside)
-                complete(nodes, shared, state, alone, stiffness, u)
-                if shortened or wrong or step == count - 1:
-                    start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
+                complete(nodes, shared, state, alone)
+                start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
                 if failed < 0 and shortened:
                     turned = first_inverted(x, before, bars.data.ends, bars.watched)
                 wrong = wrong or turned >= 0
-            if due[step] or wrong or step == count - 1:
+            if wrong or step == count - 1:
                 if light:
                     exchange_history(bars.data.sweep, bars.columns, bars.data.history, True)
-                    spread = False
+                    by_columns = False
                 else:
                     for k in range(len(energies)):
                         energies[k] = 0.0
                     sum_energies(work, energies)
-                of_walls = (pressed.force, pressed.moment, pressed.contacts, walls.releases)
-                row_sums = RowSums(push_u, *of_walls, rows.totals, touching, totals, room, ends)
-                kinetic = fill_row(data, row_sums, row)
-                row[_ALARM] = 1.0 if failed >= 0 or turned >= 0 or infeasible >= 0 else 0.0
-            powers[:] = after
+                centre(push_u.reshape(-1), eta, impulses.half.reshape(-1), impulses.v.reshape(-1))
+                accelerations(push_u.reshape(-1), alpha, impulses.a.reshape(-1))
+            powers[1] = powers[0]
+            powers[0] = after
             if wrong and not several:
                 break
-        return (
+        return Made(
             done,
             lost,
             changed,
@@ -458,19 +880,16 @@ def make_fused_loop(
             turned,
             infeasible,
             pressed.offsets,
-            kinetic,
-            u,
-            (
-                pressed.force,
-                pressed.contacts,
-                pressed.moment,
-                near.copy(),
-                pressed.touching[: len(near)].copy(),
-                pressed.places[: len(near)].copy(),
-            ),
+            pressed.force,
+            pressed.contacts,
+            pressed.moment,
+            near.copy(),
+            pressed.touching[: len(near)].copy(),
+            pressed.places[: len(near)].copy(),
             touched,
             met,
             touching,
+            changes,
         )
 
-    return fused_loop
+    return batch_loop

@@ -11,8 +11,8 @@ import numpy as np
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
 from ..mechanics.compiled import kernel
-from ..mesh.ordering import NODE_BLOCK
 from ..tolerances import BEYOND, PROJECTED
+from .batch import Batch
 from .stepper import Solution, Stepper
 
 if TYPE_CHECKING:
@@ -65,13 +65,6 @@ def explicit_increments(forces, inertia, factors, known, stiffness, u):
 
 
 @kernel
-def accelerations(u, alpha, a):
-    """Compute ``a`` = alpha u; arrays (3 n,)."""
-    for j in range(len(u)):
-        a[j] = alpha * u[j]
-
-
-@kernel
 def hold(supports, predictor, stiffness, u, load):
     """Set prescribed components of ``u`` (owned, 3) to their values; ``load`` (k,) output: force that would move them
     [N]. ``supports``: nodes, components and positions (k,)."""
@@ -80,28 +73,6 @@ def hold(supports, predictor, stiffness, u, load):
         i, c = nodes[k], components[k]
         load[k] = stiffness[i] * u[i, c]
         u[i, c] = positions[k] - predictor[i, c]
-
-
-@kernel
-def hold_still(block, nodes, shared, f, inverse):
-    """:func:`hold` and :func:`react` for a leapfrog scheme without damping and contact, before its other components.
-
-    Writes the increments of the prescribed components of a block of nodes to ``shared.held`` (k,) and their reactions
-    to ``shared.support`` (owned, 3) [N], and sets their inverse stiffness to zero in ``inverse`` (3 m,). This array and
-    the forces ``f`` (m, 3) are those of the block.
-    """
-    components, positions, external = nodes.support_components, nodes.support_positions, nodes.external
-    held, support, x, half = shared.held, shared.support, shared.x, shared.half
-    origin, loaded = NODE_BLOCK * block, len(external) > 0
-    for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
-        i, c = nodes.support_nodes[k], components[k]
-        stiffness = shared.alpha * nodes.mass[i]
-        pull = f[i - origin, c]
-        force = external[i, c] - pull if loaded else -pull
-        free = stiffness * (force * (1.0 / stiffness))
-        held[k] = positions[k] - (x[i, c] + shared.h * half[i, c])
-        support[i, c] = stiffness * held[k] - free
-        inverse[3 * (i - origin) + c] = 0.0
 
 
 @kernel
@@ -114,28 +85,40 @@ def react(supports, load, contact, stiffness, u, support):
 
 
 class ExplicitStepper(Stepper):
-    """Solves (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat node by node.
-
-    Attributes
-    ----------
-    other_force : (local, 3) internal force before the last evaluation [N], overwritten by the next one; None after
-        fused steps, which keep one force
-    """
-
-    renews_forces = True
-    steady = True
+    """Solves (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat node by node; steps that nothing interrupts are
+    made in batches where these apply."""
 
     def __init__(self, model: Model, scheme: Scheme, h: float) -> None:
         super().__init__(model, scheme, h)
         self._none = np.empty((0, 3))
         self._nobody = np.empty(0, dtype=np.int64)
-        self.other_force: np.ndarray | None = None
+        self._batch: Batch | None = None
+        self._batched: bool | None = None  # whether batches apply; None until it is known
         self._stiffness, self._stiffness_of = np.empty(0), (0.0, 0.0, self._none)
 
-    def evaluate(self, commit: bool) -> None:
-        other = np.empty_like(self.state.f) if self.other_force is None else self.other_force
-        self.state.f, self.other_force = other, self.state.f
-        super().evaluate(commit)
+    def steps(self, most: int) -> None:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`. The first step is made alone: the start may have stopped
+        nodes."""
+        ledger, state = self.ledger, self.state
+        if self._batched is None:
+            self._batched = ledger is not None and Batch.serves(self)
+        if not self._batched or ledger.powers is None:
+            if ledger is not None:
+                ledger.complete()
+            self.step()
+            if self._batched:
+                ledger.begin_batches()
+            return
+        if self._batch is None:
+            self._batch = Batch(self)
+        self._batch.make(min(most, self.removals.steps_left(state.time, self.h)))
+        if self.model.case.remove:
+            ledger.complete()  # bars that are removed change the forces of the end of the step
+        self.leave()
+        state.step += 1
+
+    def supports_changed(self) -> None:
+        self._batch, self._batched = None, None
 
     def accelerate(self, load: np.ndarray) -> np.ndarray:
         a = load / self.model.inertia.mass[:, None]

@@ -21,31 +21,18 @@ import numpy as np
 
 from ..columns import HEAD, PAIR, WALL
 from ..integrators.base import State
-from ..mechanics.compiled import kernel
 from ..tolerances import RANK
 
 if TYPE_CHECKING:
     from .stepper import Stepper
 
-__all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "NoImpulses", "fill_impulses", "wall_shares"]
+__all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "NoImpulses", "wall_shares"]
 
 SUPPORT, EXTERNAL, DAMPING, WALLS = 0, 1, 2, 3
-
-_SUPPORT, _EXTERNAL = HEAD.first("support_impulse"), HEAD.first("external_impulse")
-_DAMPING = HEAD.first("damping_impulse")
-
-
-@kernel
-def fill_impulses(sums, v) -> None:
-    """Write impulses of supports, external forces and damping from the velocities of their particles (rows, 3)."""
-    for c in range(3):
-        sums[_SUPPORT + c] = v[SUPPORT, c]
-        sums[_EXTERNAL + c] = v[EXTERNAL, c]
-        sums[_DAMPING + c] = v[DAMPING, c]
-
-
 """Rows of the particles: three in the order of the totals of :mod:`~pfem_petsc.stepping.ledger_loops`, then walls and
 pairs, then the jumps of walls and pairs."""
+
+_IMPULSES = slice(HEAD["external_impulse"].start, HEAD["damping_impulse"].stop)
 
 
 def wall_shares(stepper: Stepper, nodes: np.ndarray, jumps: np.ndarray) -> np.ndarray:
@@ -144,7 +131,7 @@ class Impulses:
 
     def fill(self, head: np.ndarray) -> None:
         """Write the impulses of support, external and damping forces into the sums of a row."""
-        fill_impulses(head, self.state.v)
+        head[_IMPULSES] = self.state.v[[EXTERNAL, SUPPORT, DAMPING]].reshape(-1)
 
     def fill_walls(self, share: np.ndarray) -> None:
         """Write the impulses of walls into (walls, width of WALL)."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mpi4py import MPI
 
 from ..columns import ENERGIES, HEAD
 from ..contact.impact import Impacts
@@ -14,22 +13,7 @@ from ..mechanics.bars import StrainEnergy, state_before_rupture
 from ..mechanics.elements import MEASURES
 from ..mechanics.materials.base import SMALL
 from .impulses import Impulses, NoImpulses, wall_shares
-from .ledger_loops import (
-    DAMPING,
-    EXTERNAL,
-    INERTIAL,
-    TOTALS,
-    WORKS,
-    NodeValues,
-    StepWorks,
-    add_totals,
-    add_works,
-    book_balance,
-    book_nodes,
-    book_row,
-    fill_works,
-    new_row_room,
-)
+from .ledger_loops import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS, power, sum_momenta, total
 
 if TYPE_CHECKING:
     from ..mechanics.bars import BarBlock
@@ -38,18 +22,17 @@ if TYPE_CHECKING:
 
 @dataclass
 class Moment:
-    """Data of the ledger at an instant; arrays (owned, 3).
+    """Data of the ledger at an instant; vectors (owned, 3).
 
-    With lumped mass ``momentum``, ``a`` and ``v`` are velocity, acceleration and velocity; with consistent mass they
-    are M v [kg m/s], M a and C v [N], and ``v`` also with damping over time. ``velocity`` and ``acceleration`` are
-    always velocity and acceleration.
+    ``momentum`` M v [kg m/s], ``inertial`` M a and ``damping`` C v [N] with the mass and damping matrices, the forces
+    in the balance [N], and the energies of nodes and bars [J].
     """
 
-    momentum: np.ndarray
     velocity: np.ndarray
     acceleration: np.ndarray
-    a: np.ndarray
-    v: np.ndarray
+    momentum: np.ndarray
+    inertial: np.ndarray
+    damping: np.ndarray
     internal: np.ndarray
     external: np.ndarray
     support: np.ndarray
@@ -61,24 +44,16 @@ class Moment:
 def moment_of(stepper: Stepper) -> Moment:
     """Return the data at the present state of a stepper."""
     state, inertia = stepper.state, stepper.model.inertia
-    owned = stepper.model.mesh.n_owned
-    a, v, momentum = state.a, state.v, state.v
     contact = state.contact
     if "contact_change" in state.memory:  # changes of accelerations by a treatment of impact
         contact = contact + state.memory["contact_change"]
-    if inertia.products:
-        momentum = inertia.mass_times(state.v, np.empty_like(state.v))
-        a = inertia.mass_times(state.a, np.empty_like(state.a))
-    if inertia.products or inertia.varies:
-        v = inertia.damping_times(state.v, np.empty_like(state.v))
-    internal = state.f[:owned]
     return Moment(
-        momentum=momentum,
         velocity=state.v,
         acceleration=state.a,
-        a=a,
-        v=v,
-        internal=internal if stepper.renews_forces else internal.copy(),
+        momentum=inertia.mass_times(state.v, np.empty_like(state.v)),
+        inertial=inertia.mass_times(state.a, np.empty_like(state.a)),
+        damping=damping_force(stepper, state.v),
+        internal=state.f[: stepper.model.mesh.n_owned].copy(),
         external=state.external,
         support=state.support,
         contact=contact,
@@ -86,34 +61,33 @@ def moment_of(stepper: Stepper) -> Moment:
     )
 
 
+def damping_force(stepper: Stepper, v: np.ndarray) -> np.ndarray:
+    """Return C v (owned, 3) [N]; the stepper's zeros without damping."""
+    inertia = stepper.model.inertia
+    return inertia.damping_times(v, np.empty_like(v)) if inertia.damped else stepper.zero
+
+
 def balanced(stepper: Stepper, before: Moment) -> Moment:
     """Return the forces of the last balance, for schemes whose balance does not hold at the ends of steps."""
     inertia, balance = stepper.model.inertia, stepper.balance
     state, u = stepper.state, stepper.solution.u
-    owned = stepper.model.mesh.n_owned
     a = balance.alpha * u
     if balance.a_hat is not None:
         a += balance.a_hat
-    v = balance.eta * u + balance.v_hat if inertia.damped else u
-    if inertia.products:
-        a = inertia.mass_times(a, np.empty_like(a))
-    if inertia.products or inertia.varies:
-        v = inertia.damping_times(v, np.empty_like(v))
-    internal = before.internal
+    damping = damping_force(stepper, balance.eta * u + balance.v_hat) if inertia.damped else stepper.zero
+    internal, solved = before.internal, stepper.solution.internal[: len(u)]
     if balance.weight == 1.0:
-        internal = stepper.solution.internal[:owned]
+        internal = solved
     elif balance.weight:
-        internal = (1.0 - balance.weight) * internal + balance.weight * stepper.solution.internal[:owned]
-    return Moment(
-        before.momentum,
-        before.velocity,
-        before.acceleration,
-        a,
-        v,
-        internal,
-        state.external,
-        state.support,
-        state.contact,
+        internal = (1.0 - balance.weight) * internal + balance.weight * solved
+    return replace(
+        before,
+        inertial=inertia.mass_times(a, np.empty_like(a)),
+        damping=damping,
+        internal=internal,
+        external=state.external,
+        support=state.support,
+        contact=state.contact,
     )
 
 
@@ -227,19 +201,13 @@ class BarChanges:
         return float((block.counted_area * (rest * mean * (whole - moved) + density * (rest1 - rest0))).sum())
 
 
-_NO_FORCES = np.empty((0, 3))
 _AT = {energy.name: HEAD.first(energy.name) for energy in ENERGIES if energy.source != "derived"}
-_SUPPORT = TOTALS.index("support")
 _TOTALS = slice(HEAD.first("momentum"), HEAD["support_force"].stop)
 
 
-def _loads(moment: Moment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the forces (owned, 3) that may be zero, in the order of :class:`NodeValues`."""
-    return moment.external, moment.support, moment.contact
-
-
 class Ledger:
-    """Accumulates this rank's share of works, dissipations and impulses.
+    """Accumulates this rank's share of works, dissipations and impulses: step by step, or, of batches of steps, balance
+    by balance.
 
     Attributes
     ----------
@@ -247,26 +215,20 @@ class Ledger:
         and totals of this rank's nodes at the present state; valid after :meth:`complete`
     impulses : Impulses
     impacts : Impacts
-    begun : whether the works of the steps before are continued; false until the first step, and after a restart from a
-        checkpoint of another ledger, where a ledger needs steps of its own
+    powers : (5,) works of all balances of a leapfrog scheme up to the present one, in the order of ``WORKS`` [J]; at
+    the
+        place of inertia is the constant that continues the numerical dissipation of what came before. None if the last
+        step was not of a batch
     """
-
-    begun = True
 
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.model = stepper.model
         self.sums = np.zeros(HEAD.width)
-        inertia = self.model.inertia
-        ones = np.ones_like(inertia.mass)
-        # factors in the loops: lumped values, or one if products with the matrices are given
-        self._mass = ones if inertia.products else inertia.mass
-        self._damping = ones if inertia.products or inertia.varies else inertia.damping
-        self._damping = self._damping if inertia.damped else np.empty(0)
-        self._works = np.zeros(len(WORKS))
-        self._totals = np.zeros((6, 3))
+        self.powers: np.ndarray | None = None
+        self._complete = True
         self._before = moment_of(self.stepper)
-        self._book(self._before, self._before, self._before, self.stepper.state.position)
+        self._sum_state(self._before, self._before)
         self._changes = BarChanges(stepper)
         self._walls_before()
         self.impacts = Impacts(stepper)
@@ -278,23 +240,22 @@ class Ledger:
                 self.impulses.step(stepper.totals_solved)
                 self.impulses.state.v[:] = 0.0  # like the nodal velocities, which have not jumped yet
                 self._pending = [self._impact(self._before, started=True), stepper.solution.walls.friction]
-                if inertia.damped:  # damping treats nodes that walls stop at the start as already stopped
-                    v = stepper.velocity_solved
-                    given = inertia.products or inertia.varies
-                    self._before.v = inertia.damping_times(v, np.empty_like(v)) if given else v
+                # damping treats nodes that walls stop at the start as already stopped
+                self._before.damping = damping_force(stepper, stepper.velocity_solved)
 
     def update(self) -> None:
         """Add the last step."""
         stepper, owned = self.stepper, self.model.mesh.n_owned
         present = after = moment_of(self.stepper)
         before, self._before = self._before, after
+        self.powers = None
         jumped = 0.0
         jump = stepper.treatment.jump if stepper.treatment is not None else None
         if jump is not None and not self.model.inertia.products:  # massless nodes carry no momentum that jumps
             after, jumped = self._before_jump(after)
         first, second = (before, after) if stepper.scheme.balance_at_endpoints else 2 * (balanced(stepper, before),)
-        self._book(present, first, second, stepper.before[:owned])
-        self.impulses.step(self._totals[3:])
+        works = self._works(0.5 * (stepper.state.position - stepper.before[:owned]), first, second)
+        self.impulses.step(self._sum_state(present, second))
         if jump is not None:
             self.impulses.jump()
         self.impulses.fill(self.sums)
@@ -309,17 +270,103 @@ class Ledger:
         follows = stepper.scheme.explicit and stepper.scheme.balance_at_endpoints
         if self.model.inertia.damped and not follows:
             damping = self._damped()
-            of, by = WORKS.index("inertial"), WORKS.index("damping")
-            self._works[of] = self._works[of] + self._works[by] - damping
-            self._works[by] = damping
-        add_works(
-            self.sums, self._works, StepWorks(stored, heating, impact, friction, work, given, weight, lost, jumped)
-        )
-        self.sums[_AT["prestress_work"]] += stressing
+            works[INERTIAL] += works[DAMPING] - damping
+            works[DAMPING] = damping
+        # the work of contact on nodes in excess of the work of walls and the losses by friction and impact
+        left = works[CONTACT] + jumped - work - given + friction
+        numerical = works[INERTIAL] + works[INTERNAL] + heating - stored - left - impact + lost
+        for name, value in (
+            ("external_work", works[EXTERNAL] + weight),
+            ("contact_work", work),
+            ("damping_dissipation", works[DAMPING]),
+            ("thermal_work", heating),
+            ("friction_dissipation", friction),
+            ("impact_dissipation", impact),
+            ("numerical_dissipation", numerical),
+            ("prestress_work", stressing),
+        ):
+            self.sums[_AT[name]] += value
         self.sums[_AT["numerical_dissipation"]] += stressing
 
+    def _works(self, way: np.ndarray, first: Moment, second: Moment) -> np.ndarray:
+        """Return the works (5,) [J] of two sets of forces, each over the displacements ``way`` (owned, 3) [m]."""
+        zero = self.stepper.zero
+        works = np.zeros(len(WORKS))
+        for k, name in (*enumerate(WORKS), (EXTERNAL, "support")):
+            one, other = getattr(first, name), getattr(second, name)
+            if one is not zero or other is not zero:
+                works[k] += power(one + other, way)
+        return works
+
+    def _sum_state(self, present: Moment, second: Moment) -> np.ndarray:
+        """Set the kinetic energy at the present state, and its totals in the sums; return the sums (3, 3) of support,
+        external and damping forces of a set of forces [N]."""
+        state, zero, sums = self.stepper.state, self.stepper.zero, np.zeros((3, 3))
+        present.kinetic = 0.5 * power(present.momentum, present.velocity)
+        self.sums[_AT["kinetic_energy"]] = present.kinetic
+        for k, force in enumerate((state.support, second.external, second.damping)):
+            if force is not zero:
+                sums[k] = total(force)
+        sums[2] *= -1.0
+        if self.model.bars.springs is not None:  # reactions of the ground: the forces of bars cancel in the sum
+            sums[0] -= second.internal.sum(axis=0)
+        momenta = sum_momenta(state.position, self.model.inertia.mass, present.momentum)
+        self.sums[_TOTALS] = np.concatenate([momenta, sums[:1]]).reshape(-1)
+        return sums
+
+    def begin_batches(self) -> None:
+        """Continue the works balance by balance, after a step."""
+        present, h, sums = self._before, self.stepper.h, self.sums
+        ends = self._half_works(present)
+        self.powers = -ends
+        self.powers[EXTERNAL] += sums[_AT["external_work"]]
+        self.powers[DAMPING] += sums[_AT["damping_dissipation"]]
+        impact, numerical = sums[_AT["impact_dissipation"]], sums[_AT["numerical_dissipation"]]
+        self.powers[INERTIAL] = numerical + ends[INERTIAL] + present.energy.total + impact
+        for k in (EXTERNAL, CONTACT, DAMPING, INTERNAL):
+            force = getattr(present, WORKS[k])
+            if force is not self.stepper.zero:
+                self.powers[k] += h * power(force, present.velocity)
+
+    def _half_works(self, present: Moment) -> np.ndarray:
+        """Return half the works (5,) [J] over the last step of a leapfrog scheme of the forces at its end.
+
+        The step was h v - h^2 a/2. At the place of inertia is h^2/8 times the sum of m a . a.
+        """
+        h, works = self.stepper.h, np.zeros(len(WORKS))
+        way = (0.5 * h) * (present.velocity - (0.5 * h) * present.acceleration)
+        for k in (EXTERNAL, CONTACT, DAMPING, INTERNAL):
+            force = getattr(present, WORKS[k])
+            if force is not self.stepper.zero:
+                works[k] = power(force, way)
+        works[INERTIAL] = 0.125 * h * h * power(present.inertial, present.acceleration)
+        return works
+
+    def follow_batch(self, powers: np.ndarray) -> None:
+        """Take the works (2, 5) [J] of all balances, and of those before the last, after a batch of steps;
+        :meth:`complete` computes the rest."""
+        self.powers, self._earlier = powers
+        self._complete = False
+
     def complete(self) -> None:
-        """Complete :attr:`sums` for a row; nothing is left to do where each step does it."""
+        """Compute what only rows, checkpoints and other steps need of the last step of a batch."""
+        if self._complete:
+            return
+        self._complete = True
+        present = self._before = moment_of(self.stepper)
+        self._sum_state(present, present)
+        self.impulses.fill(self.sums)
+        sums, powers, ends = self.sums, self._earlier, self._half_works(present)
+        sums[_AT["external_work"]] = powers[EXTERNAL] + ends[EXTERNAL]
+        sums[_AT["damping_dissipation"]] = powers[DAMPING] + ends[DAMPING]
+        bars, contact = powers[INTERNAL] + ends[INTERNAL], powers[CONTACT] + ends[CONTACT]
+        sums[_AT["numerical_dissipation"]] = (
+            (bars - present.energy.total)
+            + powers[INERTIAL]
+            - ends[INERTIAL]
+            - contact
+            - sums[_AT["impact_dissipation"]]
+        )
 
     def _damped(self) -> float:
         """Return the damping dissipation of the last step, C dx . dx / h [J]; never negative.
@@ -415,48 +462,27 @@ class Ledger:
         lost = float((bodies.mass[:, None] * a * way).sum()) - (self._bodies_kinetic - kinetic)
         return work, given, float((bodies.weight * way).sum()), lost
 
-    def _book(self, present: Moment, first: Moment, second: Moment, start: np.ndarray) -> None:
-        """Add kinetic energy and totals at the present state, and the works from positions ``start`` (owned, 3)."""
-        state, inertia = self.stepper.state, self.model.inertia
-        zero, x, mass = self.stepper.zero, state.position, inertia.mass
-
-        def values(moment: Moment) -> NodeValues:
-            forces = (
-                _NO_FORCES if one is zero and other is zero else own
-                for one, other, own in zip(_loads(first), _loads(second), _loads(moment), strict=True)
-            )
-            return NodeValues(x, moment.v, moment.a, moment.internal, *forces, mass, self._damping)
-
-        here = NodeValues(x, state.v, state.a, state.f, zero, state.support, zero, mass, self._damping)
-        momenta = self._mass, present.momentum
-        present.kinetic = book_nodes(start, here, momenta, values(first), values(second), self._totals, self._works)
-        self.sums[_AT["kinetic_energy"]] = present.kinetic
-        if self.model.bars.springs is not None:  # reactions of the ground: the forces of bars cancel in the sum
-            self._totals[_SUPPORT] -= second.internal.sum(axis=0)
-        add_totals(self.sums, self._totals)
-
     def _before_jump(self, after: Moment) -> tuple[Moment, float]:
         """Return the end of the step before velocity jumps, and the energy of the jumps [J], a work of contact."""
-        jump = self.stepper.treatment.jump
-        a, v = after.a.copy(), after.v.copy()
+        stepper, inertia = self.stepper, self.model.inertia
+        jump = stepper.treatment.jump
+        a, v = after.acceleration.copy(), after.velocity.copy()
         a[jump.nodes], v[jump.nodes] = jump.a, jump.v
-        if self.model.inertia.varies:
-            v[jump.nodes] *= self.model.inertia.damping[jump.nodes, None]
-        return replace(after, a=a, v=v, contact=self.stepper.state.contact), jump.energy
+        inertial, damping = inertia.mass_times(a, np.empty_like(a)), damping_force(stepper, v)
+        return replace(after, inertial=inertial, damping=damping, contact=stepper.state.contact), jump.energy
 
     def follow_removal(self) -> None:
         """Start the next step from the energies and stresses of the bars after some were removed, as a restart does."""
+        if self.powers is not None:
+            self.powers[INERTIAL] += self.stepper.energy.total - self._before.energy.total
         self._before.energy = self.stepper.energy
         self._changes.keep()
 
-    def resume(self, kinetic: float) -> None:
-        """Continue from the present state with its kinetic energy [J] after the fused loop updated :attr:`sums`."""
-        self._before = moment_of(self.stepper)
-        self._before.kinetic = kinetic
-
     def kept(self) -> dict[str, Any]:
         """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""
-        return {"sums": self.sums.tolist(), "pending": list(self._pending), "impulses": self.impulses.kept()}
+        self.complete()
+        kept = {"sums": self.sums.tolist(), "pending": list(self._pending), "impulses": self.impulses.kept()}
+        return kept | ({} if self.powers is None else {"powers": self.powers.tolist()})
 
     def load_state(self, kept: dict[str, Any]) -> None:
         """Restore this rank's share from a checkpoint, after the state."""
@@ -466,117 +492,7 @@ class Ledger:
         self.sums[_AT["kinetic_energy"]] = self._before.kinetic
         self._pending = [float(value) for value in kept["pending"]]
         self.impulses.load_state(kept["impulses"])
+        if "powers" in kept:
+            self.powers = np.array(kept["powers"])
         if self.model.contact.moving.any():
             self._walls_before()
-
-    @property
-    def kinetic(self) -> float:
-        """Kinetic energy of this rank's nodes [J]."""
-        return self._before.kinetic
-
-
-_EXTERNAL, _DAMPING = HEAD.first("external_work"), HEAD.first("damping_dissipation")
-_IMPACT, _NUMERICAL = HEAD.first("impact_dissipation"), HEAD.first("numerical_dissipation")
-_KINETIC = HEAD.first("kinetic_energy")
-
-
-def make_ledger(stepper: Stepper) -> Ledger:
-    """Return the ledger for the steps of a run or stage, after the start of the stepper. Collective."""
-    leapfrog = stepper.scheme.leapfrog and stepper.steady and stepper.treatment is None
-    same = stepper.model.comm.allreduce(leapfrog and stepper.model.constant, op=MPI.LAND)
-    return (LeapfrogLedger if same else Ledger)(stepper)
-
-
-class LeapfrogLedger(Ledger):
-    """Accumulates works balance by balance, from the second step on.
-
-    Attributes
-    ----------
-    powers : (5,) works of all balances up to the present one, in the order of ``WORKS`` [J]; at the place of inertia is
-        the constant that continues the numerical dissipation of what came before
-    """
-
-    def __init__(self, stepper: Stepper) -> None:
-        self.powers = np.zeros(len(WORKS))
-        self.begun = False
-        super().__init__(stepper)
-        self._ends = np.zeros(len(WORKS))
-        self._room = new_row_room()
-        self._complete = True
-        # bars that are removed after a step change the forces of its end
-        self._at_once = bool(stepper.model.case.remove)
-
-    def update(self) -> None:
-        """Add the last step."""
-        stepper = self.stepper
-        if not self.begun:  # the start may have stopped nodes
-            super().update()
-            self._sum_row(self._before)
-            self._begin()
-            self._sum_balance(self._before)
-            return
-        before, self._before = self._before, moment_of(stepper)
-        self._works[:] = self.powers
-        self._sum_balance(self._before)
-        self.impulses.step(self._totals[3:])
-        impact, _ = self._dissipated(before)
-        self.sums[_IMPACT] += impact
-        self._complete = False
-        if self._at_once:
-            self.complete()
-
-    def complete(self) -> None:
-        """Compute what only rows and checkpoints need of the last step."""
-        if self._complete:
-            return
-        present, self._complete = self._before, True
-        self.sums[_KINETIC] = present.kinetic = self._sum_row(present)
-        add_totals(self.sums, self._totals)
-        self.impulses.fill(self.sums)
-        fill_works(self.sums, self._works, self._ends, present.energy.total)
-
-    def _sum_row(self, present: Moment) -> float:
-        """Return the kinetic energy [J]; compute totals and the works of half a step."""
-        return book_row(self._values(present), self.stepper.h, self._room, self._totals, self._ends)
-
-    def _sum_balance(self, present: Moment) -> None:
-        """Add the works of the present balance."""
-        book_balance(self._values(present), self.stepper.h, self._totals, self.powers)
-
-    def _values(self, present: Moment) -> NodeValues:
-        """Return the values at the state, with placeholders for arrays of zeros."""
-        state, zero = self.stepper.state, self.stepper.zero
-        loads = (_NO_FORCES if force is zero else force for force in _loads(present))
-        mass = self.model.inertia.mass
-        return NodeValues(state.position, state.v, state.a, present.internal, *loads, mass, self._damping)
-
-    def _begin(self) -> None:
-        """Continue the works of the steps before."""
-        sums, ends = self.sums, self._ends
-        self.powers[:] = -ends
-        self.powers[EXTERNAL] += sums[_EXTERNAL]
-        self.powers[DAMPING] += sums[_DAMPING]
-        self.begun = True
-        self.powers[INERTIAL] = sums[_NUMERICAL] + ends[INERTIAL] + self.stepper.energy.total + sums[_IMPACT]
-
-    def follow_removal(self) -> None:
-        """Take account of the energy of bars that were removed."""
-        self.powers[INERTIAL] += self.stepper.energy.total - self._before.energy.total
-        super().follow_removal()
-
-    def resume(self, kinetic: float) -> None:
-        """See :class:`~pfem_petsc.stepping.ledger.Ledger`."""
-        super().resume(kinetic)
-        self._complete = True
-
-    def kept(self) -> dict[str, Any]:
-        """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""
-        self.complete()
-        return super().kept() | ({"powers": self.powers.tolist()} if self.begun else {})
-
-    def load_state(self, kept: dict[str, Any]) -> None:
-        """Restore this rank's share from a checkpoint, after the state."""
-        super().load_state(kept)
-        self.begun = "powers" in kept
-        if self.begun:
-            self.powers[:] = kept["powers"]

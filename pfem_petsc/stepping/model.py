@@ -237,15 +237,12 @@ class Model:
             self.rest_lengths.apply(time)
 
     @property
-    def constant(self) -> bool:
-        """Whether supports, loads and bars are constant in time, bars of one section, and walls flat and at rest."""
-        changing = self.supports.moving or self.bars_vary or bool(self.bars.families) or self.inertia.varies
-        return not changing and len(self.bars.blocks) == 1 and self.external.steady and self.contact.steady
-
-    @property
     def steady(self) -> bool:
-        """Whether the model is constant in time, and the fused loop supports its bars and contact."""
-        return self.constant and self.links.batched
+        """Whether steps can be made in batches: supports, loads and bars are constant in time, bars of one section,
+        walls flat and at rest, and pairs and constraints served too."""
+        changing = self.supports.moving or self.bars_vary or bool(self.bars.families) or self.inertia.varies
+        steady = not changing and len(self.bars.blocks) == 1 and self.external.steady and self.contact.steady
+        return steady and self.links.batched
 
     def initial_velocity(self) -> np.ndarray:
         """Return initial velocities (owned, 3) [m/s]; later ``[initial]`` tables override earlier ones. Collective."""

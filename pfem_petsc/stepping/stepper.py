@@ -23,6 +23,7 @@ from ..tolerances import BEYOND, ON_BOUND, ROUNDING, TIME
 from .bar_events import Collapse, Removals, Ruptures, collapse_message
 
 if TYPE_CHECKING:
+    from .ledger import Ledger
     from .model import Model
 
 
@@ -254,7 +255,8 @@ class Stepper(ABC):
     fault_step : number of the last finished step when the fault was found
     h : the case's time step [s]; ``part`` the size of the current part, ``smallest`` the smallest part of the last step
     treatment : of impact, None for the scheme's own formulas
-    booking : called after each part of a step; bars_removed : after bars are removed between steps
+    ledger : Ledger, which accumulates each part of a step; None for steps that nothing records
+    iterations : numbers of Newton and linear iterations since the last row of the history
     before : (local, 3) positions at the start of the last part, with ghosts [m]
     massless : MasslessNodes if contact nodes are massless along their walls' normals, else None
     closed : (owned, walls) bool, nodes that have touched a wall and not left it since
@@ -262,14 +264,11 @@ class Stepper(ABC):
     ruptures : Ruptures, which counts broken bars
     removals : Removals of bars and supports
     carried : CarriedNodes, which supports may carry through rectangles
-    support_changes : how often components have ceased or begun to be prescribed
-    step_changed : whether the scheme was notified of another step size since the last booking
+    step_changed : whether the scheme was notified of another step size since the ledger's last update
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
         and of the balance solved there by a scheme that solves for the next position; None after a restart
     velocity_solved : (owned, 3) velocity of that balance if there is damping, whose force depends on it [m/s]
     walls_at_start, links_at_start : (walls, 3), (tables of links, 3) forces at the start [N]
-    renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
-    steady : the loop over many steps (``stepping/batch_loop.py``) makes the same steps, where all else allows it
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
         arrays with a row for each owned node, and for each local bar
     columns : names of attributes, numbers, that are columns of the history
@@ -285,16 +284,14 @@ class Stepper(ABC):
     remedy = "reduce time.step"
     event_columns: Mapping[str, Any] = {}
     events: Sequence[Any] = ()
-    renews_forces = False
-    steady = False
 
     def __init__(self, model: Model, scheme: Scheme, h: float) -> None:
         self.model = model
         self.scheme = scheme
         self.h = self.part = self.smallest = h
         self.treatment = None  # of impact; see pfem_petsc.contact.treatments
-        self.booking: Callable[[], None] = lambda: None
-        self.bars_removed: Callable[[], None] = lambda: None
+        self.ledger: Ledger | None = None
+        self.iterations = [0, 0]
         mesh = model.mesh
         owned = mesh.n_owned
         self.energy = StrainEnergy()
@@ -320,7 +317,6 @@ class Stepper(ABC):
         self.prescribed = PrescribedMotion(self)
         self.ruptures = Ruptures(model.bars, mesh)
         self.removals = Removals(model)
-        self.support_changes = 0
         self.carried = CarriedNodes(model.contact)
         self.totals_at_start: np.ndarray | None = None
         self.totals_solved: np.ndarray | None = None
@@ -493,6 +489,10 @@ class Stepper(ABC):
         """Time of the state in the results, from the start of the stage; increases from step to step."""
         return self.state.time
 
+    def steps(self, most: int) -> None:
+        """Make at least one step, and at most ``most`` if nothing needs Python between them. Collective."""
+        self.step()
+
     def step(self) -> None:
         """Advance from t_n to t_{n+1}; the state is complete at both. Collective if the solve is."""
         self._make_part((self.state.step + 1) * self.h)
@@ -532,11 +532,11 @@ class Stepper(ABC):
         change = release(self.model.bars, self.state.x, members, share)
         energies = np.array(self.energy.energies) + change
         self.energy = self.energy._replace(energies=tuple(energies.tolist()))
-        self.bars_removed()
+        if self.ledger is not None:
+            self.ledger.follow_removal()
 
-    def supports_changed(self) -> None:
+    def supports_changed(self) -> None:  # noqa: B027 - most steppers read the supports in each step
         """Take account of components that are no longer prescribed, or now are. Collective."""
-        self.support_changes += 1
 
     def resume(self) -> None:
         """Continue from a state that was restored from a checkpoint. Collective."""
@@ -653,7 +653,10 @@ class Stepper(ABC):
 
     def _account(self, end: float) -> None:
         """Update the ledger."""
-        self.booking()
+        self.iterations[0] += self.solution.newton
+        self.iterations[1] += self.solution.linear
+        if self.ledger is not None:
+            self.ledger.update()
 
     def _check(self, end: float) -> None:
         """Find nodes that supports have carried through a rectangle."""

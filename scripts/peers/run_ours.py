@@ -79,7 +79,7 @@ def run(cells: int, mode: str, steps: int, operator: str, folder: str) -> tuple[
     """Run as from the command line; seconds a step after the first, and iterations of the linear solver."""
     case = Case.from_dict(table(cells, mode, steps, operator), source="peers", folder=Path(folder))
     simulation = Simulation(case, output=folder, quiet=True)
-    running = simulation.batches(min_steps=1)  # as a long run
+    running = simulation.batches()  # as a long run
     linear = next(running).linear
     if mode.endswith("long"):
         next(running)  # orders the bars for many steps in one call

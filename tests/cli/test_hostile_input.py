@@ -12,7 +12,7 @@ from pfem_petsc import Case
 from pfem_petsc.cli.main import exit_message, main
 from pfem_petsc.cli.parser import PREFIXES, without_effect
 from pfem_petsc.errors import InputError, printable
-from pfem_petsc.restart.checkpoints import _prepare
+from pfem_petsc.restart.checkpoints import prepare_folder
 
 ROD = Path("pfem_petsc/cases/rod_impact.toml").resolve()
 
@@ -135,7 +135,7 @@ def test_the_current_folder_is_not_moved_aside(tmp_path, monkeypatch):
     (tmp_path / "result.vtkhdf").write_text("x")
     for folder in (Path("."), tmp_path):
         with pytest.raises(InputError, match="cannot be moved aside because the current folder is inside.*-o"):
-            _prepare(folder, None, None)
+            prepare_folder(folder, None, None)
 
 
 def test_numpy_values_in_a_case():

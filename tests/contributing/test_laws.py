@@ -9,7 +9,7 @@ import re
 import numpy as np
 import pytest
 from document_laws import text_of, undocumented
-from helpers.contributed import assert_same_results, run
+from helpers.pages import assert_same_results, run
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.cli.main import main
@@ -103,12 +103,12 @@ def test_law_is_integrated_as_by_itself(integrator, operator, examples, comm, sh
 
 
 @pytest.mark.slow
-def test_law_in_the_fused_loop(examples, tmp_path):
+def test_law_in_batches(examples, tmp_path):
     """Many steps in one call are the single steps to the last bit."""
     case, found = one_bar("central_differences", 2e-3, 200), []
     for together in (False, True):
         with Simulation(case, output=tmp_path / str(together), quiet=True) as simulation:
-            count = len(list(simulation.batches(min_steps=1) if together else simulation))
+            count = len(list(simulation.batches() if together else simulation))
             found.append((count, simulation.state.x.copy(), simulation.model.bars.history()))
     assert found[0][0] == 200 and np.array_equal(found[0][1], found[1][1]) and np.array_equal(found[0][2], found[1][2])
     assert np.abs(found[0][2]).max() > 0.0

@@ -77,4 +77,4 @@ def test_work_of_a_step_is_the_change_of_energy(model):
 
 
 def test_batches_leave_models_with_other_elements_to_single_steps(model):
-    assert not model.constant
+    assert not model.steady

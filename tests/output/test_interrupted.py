@@ -13,7 +13,7 @@ from helpers.launch import environment
 from helpers.synthetic import Truss, assert_grid_is, assert_history_is, options, read_with_vtk, write
 from mpi4py import MPI
 
-from pfem_petsc.errors import InputError, SimulationFailure
+from pfem_petsc.errors import InputError
 from pfem_petsc.output.layout import Kept
 from pfem_petsc.output.repair import repair
 from pfem_petsc.output.result import open_result
@@ -205,22 +205,6 @@ def test_what_is_not_a_result_is_refused(tmp_path):
     for function in (open_result, repair):
         with pytest.raises(InputError, match="not a result of pfem_petsc"):
             function(path)
-
-
-def test_disk_full_stops_before_the_file_is_damaged(small_disk):
-    path = small_disk / "result.vtkhdf"
-    truss = Truss(MPI.COMM_SELF, n_nodes=2000, n_bars=4000)
-    with (
-        pytest.raises(SimulationFailure, match="disk full.*--restart"),
-        ResultWriter(path, MPI.COMM_SELF, truss.mesh, **options()) as writer,
-    ):
-        write(writer, truss, range(1000), every=1)
-    result = open_result(path)
-    n = len(result.times)
-    assert n > 3
-    assert repair(path) == (n, n)
-    assert_history_is(result.history, truss, range(n))
-    assert_grid_is(read_with_vtk(path, n - 1)[0], truss, n - 1)
 
 
 FULL = """

@@ -63,15 +63,6 @@ def test_a_folder_that_vanishes_ends_the_run_on_all_ranks(shared_tmp_path):
 
 
 @pytest.mark.parallel
-def test_wrong_fields_are_refused(shared_tmp_path):
-    truss = Truss(COMM)
-    with ResultWriter(shared_tmp_path / "result.vtkhdf", COMM, truss.mesh, **options()) as writer:
-        points, point_data, _ = truss.snapshot(0)
-        with pytest.raises(ValueError, match="CellData"):
-            writer.write_snapshot(0.0, 0, points, point_data, {})
-
-
-@pytest.mark.parallel
 def test_a_serial_h5py_is_refused_on_several_ranks(shared_tmp_path, monkeypatch):
     class Config:
         mpi = False

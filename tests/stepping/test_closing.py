@@ -75,6 +75,6 @@ def test_functions_after_steps(comm, shared_tmp_path):
         for every in (0, 2.0, True):
             with pytest.raises(InputError, match="on_step: every"):
                 simulation.on_step(print, every=every)
-        for _ in simulation.batches(min_steps=1):
+        for _ in simulation.batches():
             pass
     assert calls == [("b", 7, 7), ("b", 14, 14), ("a", 14, 14)]

@@ -12,6 +12,7 @@ to a unit vector, and the wall does not apply to a node that it cannot move.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from ..contact import Contact
 
 
+@dataclass(frozen=True)
 class Redistribution:
     """The redistributed masses of this rank.
 
@@ -42,21 +44,12 @@ class Redistribution:
     tensors : (k, 3, 3) the matrix minus mass times identity [kg]
     """
 
-    def __init__(
-        self,
-        nodes: np.ndarray,
-        walls: np.ndarray,
-        normals: np.ndarray,
-        across: np.ndarray,
-        touched: np.ndarray,
-        tensors: np.ndarray,
-    ) -> None:
-        self.nodes = nodes
-        self.walls = walls
-        self.normals = normals
-        self.across = across
-        self.touched = touched
-        self.tensors = tensors
+    nodes: np.ndarray
+    walls: np.ndarray
+    normals: np.ndarray
+    across: np.ndarray
+    touched: np.ndarray
+    tensors: np.ndarray
 
     def inverse(self, mass: np.ndarray, fixed: np.ndarray) -> np.ndarray:
         """Return the inverses (k, 3, 3) of the mass matrices of the touched nodes on their free components [1/kg].

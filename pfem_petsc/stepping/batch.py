@@ -1,0 +1,204 @@
+"""Batches of steps: consecutive steps of central differences in one compiled call; a single step is a batch of one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from ..contact.node_walls import WallForces
+from ..errors import SimulationFailure
+from ..mechanics.bars import StrainEnergy
+from ..mechanics.elements import batch_parts
+from ..mechanics.runs import Columns, make_columns, new_planes, no_columns
+from ..mesh.ordering import NODE_BLOCK
+from ..parallel.heap import return_freed_memory
+from ..tolerances import PROJECTED
+from .batch_loop import (
+    BarArrays,
+    BatchData,
+    ImpulseArrays,
+    Made,
+    NodeArrays,
+    StateArrays,
+    WallArrays,
+    make_batch_loop,
+)
+from .stepper import Solution
+
+if TYPE_CHECKING:
+    from .stepper import Stepper
+
+
+_WINDOW = 4  # times the nodes of the blocks that bars of one block belong to
+
+
+class Batch:
+    """Makes steps of a stepper in compiled calls, as long as its supports remain.
+
+    Parameters
+    ----------
+    stepper : Stepper that :meth:`serves`
+    """
+
+    def __init__(self, stepper: Stepper) -> None:
+        self.stepper, self.model, self.ledger = stepper, stepper.model, stepper.ledger
+        block = self.model.bars.blocks[0]
+        self._loop = make_batch_loop(*batch_parts(block.loops))
+        self._bars, self._nodes, self._walls = self._bar_arrays(), self._node_arrays(), self._wall_arrays()
+        self._messages = self.model.mesh.messages()
+        self._stiffness = self._nodes.stiffness if self.model.links else np.empty(0)
+        state = stepper.state
+        self._support, self._contact = np.zeros_like(state.v), np.zeros_like(state.v)
+        if state.contact is not stepper.zero:
+            self._contact[:] = state.contact
+        self._u = np.zeros_like(state.v)
+        return_freed_memory()
+
+    def _bar_arrays(self) -> BarArrays:
+        bars = self.model.bars
+        reach, columns = self._reach(), self._columns()
+        data = bars.data(bars.blocks[0])._replace(step=self.stepper.h)
+        return BarArrays(data, bars.watched, reach, self._meeting(), columns, *self._planes(reach, columns))
+
+    def _node_arrays(self) -> NodeArrays:
+        model, h = self.model, self.stepper.h
+        supports, inertia = model.supports, model.inertia
+        external = self.stepper.state.external if model.external.active else np.empty((0, 3))
+        damping = inertia.damping if inertia.damped else np.empty(0)
+        order = np.argsort(supports.nodes, kind="stable")
+        nodes, held = supports.nodes[order], supports.positions(0.0)[order]
+        limits = np.arange(0, len(inertia.mass) + NODE_BLOCK, NODE_BLOCK)
+        starts = np.searchsorted(nodes, limits).astype(np.int64)
+        stiffness = 1.0 / (h * h) * inertia.mass + (0.5 / h * inertia.damping if inertia.damped else 0.0)
+        fixed = nodes, supports.components[order], held, starts
+        return NodeArrays(inertia.mass, damping, stiffness, 1.0 / stiffness, external, *fixed)
+
+    def _wall_arrays(self) -> WallArrays:
+        contact, log = self.model.contact, self.model.contact.log
+        walls = (contact.fixed, contact.normals, contact.plane_offsets(0.0), contact.all_nodes, contact.members)
+        room = np.empty(len(contact.fixed), dtype=np.int64)
+        impact = self.stepper.closed, contact.restitution, self.ledger.impacts.slack
+        return WallArrays(*walls, PROJECTED * self.model.size, room, log.touching, log.present, log.releases, *impact)
+
+    def _columns(self) -> Columns:
+        """Return the columns of the bars, or none if bars are heated, can break or are not in diagonal runs."""
+        bars = self.model.bars
+        block = bars.blocks[0]
+        if bars.can_break or bars.heat.size or not len(bars.rest) or not block.sweep.diagonal.all():
+            return no_columns(block.area, len(block.history))
+        return make_columns(block.sweep, bars.rest, block.area, len(block.history))
+
+    def _planes(self, reach: int, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
+        """Return planes for all nodes; on one rank for a window of them, which stays in the cache."""
+        nodes = len(self.model.mesh.points) if len(columns.parts) else 0
+        if self.model.comm.size == 1:
+            nodes = min(nodes, _WINDOW * (reach + 1) * NODE_BLOCK)
+        return new_planes(nodes)
+
+    def _reach(self) -> int:
+        """Return how many blocks of nodes beyond its own the bars of a block reach."""
+        ends = self.model.bars.ends
+        blocks = ends.max(axis=1) // NODE_BLOCK - ends.min(axis=1) // NODE_BLOCK
+        return int(blocks.max(initial=0))
+
+    def _meeting(self) -> int:
+        """Return the first block of nodes that needs ghosts, or whose nodes have bars that other ranks count.
+
+        Forces of these bars come first at each node: a block before must neither have nor reach such a node.
+        """
+        ends, n_owned = self.model.bars.ends, len(self.model.inertia.mass)
+        block = self.model.bars.blocks[0]
+        late = np.zeros(len(self.model.mesh.points), dtype=bool)
+        late[n_owned:] = True
+        late[ends[block.counted - block.start :].reshape(-1)] = True
+        reached = ends[late[ends].any(axis=1)]
+        return int(reached.min(initial=n_owned)) // NODE_BLOCK
+
+    @staticmethod
+    def serves(stepper: Stepper) -> bool:
+        """Return whether steps of this stepper can be made in batches. Collective."""
+        from petsc4py import PETSc
+
+        model = stepper.model
+        alone = model.comm.size == 1
+        serves = (
+            stepper.scheme.leapfrog
+            and stepper.treatment is None
+            # -log_view measures the methods of single steps
+            and not PETSc.Log.isActive()
+            # all ranks would have to stop where a bar of one breaks
+            and (alone or not model.bars.can_break)
+            and model.mesh.messages() is not None
+            and model.steady
+        )
+        return model.comm.allreduce(serves, op=MPI.LAND)
+
+    def make(self, count: int) -> None:
+        """Make up to ``count`` steps, the last of which remains to be counted.
+
+        On one rank fewer steps are made if a bar breaks or something fails. With several ranks all make all steps, but
+        this rank's state remains that of a failure, and the stepper has a fault.
+
+        Raises
+        ------
+        SimulationFailure
+            On one rank, if a bar fails, a node is infeasible or the energy is not finite.
+        """
+        stepper, ledger, state, model = self.stepper, self.ledger, self.stepper.state, self.model
+        log, comm = model.contact.log, model.comm
+        begin, walls, impulses = state.step, model.contact.walls, ledger.impulses.state
+        energies, flags = np.array(stepper.energy.energies), np.zeros((count, len(walls)), dtype=bool)
+        rows = model.links.export_rows(self._stiffness)
+        data = BatchData(
+            stepper.h,
+            state.x,
+            stepper.before,
+            state.memory["half_velocity"],
+            self._bars,
+            self._nodes,
+            self._walls,
+            rows,
+            self._messages,
+            StateArrays(state.f, state.a, state.v, self._support, self._contact, self._u, energies),
+            ledger.sums,
+            np.stack([ledger.powers, ledger.powers]),
+            ImpulseArrays(impulses.memory["half_velocity"], impulses.a, impulses.v),
+        )
+        made = self._loop(data, log.last, ledger.impacts.met, flags)
+        if made.lost:
+            raise MPI.Exception(made.lost)
+        model.links.import_rows(rows)
+        log.last, ledger.impacts.met = made.touched, made.met
+        for step in flags[: made.done if comm.size == 1 else count] if len(walls) else ():
+            log.note(step, stepper.h, comm)
+        log.changes += made.changes
+        state.support = self._support if model.supports.any else stepper.zero
+        state.contact = self._contact if made.pressing else stepper.zero
+        stepper.energy = StrainEnergy(tuple(energies.tolist()), made.failed)
+        forces = WallForces(made.force, made.contacts, made.moment, made.near, made.touching, made.places)
+        stepper.solution = Solution(
+            self._u, state.f, forces if len(walls) else model.contact.nothing, contacts=made.pressing
+        )
+        state.step, state.time = begin + made.done - 1, (begin + made.done) * stepper.h
+        if made.changed:
+            stepper.ruptures.note(state.x, stepper.number + 1, stepper.arrived())
+        if stepper.fault is None:  # ranks that have not synchronised since may know of an earlier one
+            stepper.fault = self._failure(made)
+        if comm.size > 1:
+            state.step, state.time = begin + count - 1, (begin + count) * stepper.h
+        elif stepper.fault is not None:
+            state.step += 1
+            raise stepper.fault
+        ledger.follow_batch(data.powers)
+
+    def _failure(self, made: Made) -> SimulationFailure | None:
+        """Return the failure in the last step, None for none."""
+        stepper = self.stepper
+        if made.failed >= 0 or made.turned >= 0:
+            return SimulationFailure(stepper.collapse(max(made.failed, made.turned)))
+        if made.infeasible >= 0:
+            text = self.model.contact.infeasible_message(made.touching[made.infeasible], made.offsets)
+            return SimulationFailure(f"{stepper.when(stepper.scheme.balance(stepper.state, stepper.h))}: {text}")
+        return None

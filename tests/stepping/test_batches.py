@@ -1,0 +1,282 @@
+"""Batches of steps: the bits of single steps, which are batches of one, and the motion of the general stepper."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.lattices import two_lattices
+from mpi4py import MPI
+
+from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.errors import EarlyStop, SimulationFailure
+from pfem_petsc.mesh.ordering import NODE_BLOCK
+
+IT = {"young_modulus": 110e9, "density": 4500.0}
+LATTICE = {
+    "mesh": {"generator": "lattice", "kind": "cubic", "cells": [2, 2, 2], "pitch": 0.01},
+    "node_set": {"foot": {"group": "bottom"}, "corner": {"nearest": [0.02, 0.02, 0.02]}},
+    "material": {"it": IT},
+    "section": {"it": {"area": 1e-6, "material": "it"}},
+    "initial": {"velocity": [3.0, 1.0, -20.0]},
+    "time": {"integrator": "central_differences", "step": 2e-7, "end": 8e-5},
+    "output": {"fields_every": 150, "history_every": 7, "probe": [{"name": "feet", "node_set": "foot"}]},
+}
+PLASTIC = {"yield_stress": 100e6, "isotropic_hardening": 1e9, "kinematic_hardening": 2e9}
+DAMPED = {"it": IT | {"damping": 2e4}}
+FLOOR = {"name": "floor", "type": "plane", "point": [0, 0, -1e-5], "normal": [0.0, 0.1, 1.0]}
+SIDE = {"name": "side", "type": "plane", "point": [0.0201, 0, 0], "normal": [-1.0, 0.0, 0.0], "node_set": "foot"}
+SMALL = {
+    "yielding": {"material": {"it": DAMPED["it"] | PLASTIC}, "wall": [FLOOR]},
+    "flying": {},
+    "held by feet": {"material": DAMPED, "support": [{"node_set": "foot", "fix": "xyz"}]},
+    "walls": {"wall": [FLOOR, SIDE]},
+    "held on an inclined wall": {
+        "support": [{"node_set": "foot", "fix": "x"}],
+        "wall": [FLOOR | {"normal": [0.5, 0.1, 1.0], "point": [0, 0, -2e-4]}],
+    },
+    "heavy": {"support": [{"node_set": "foot", "fix": "xz"}], "gravity": {"acceleration": [0.0, 0.0, -1e4]}},
+    "held and loaded": {
+        "material": DAMPED,
+        "support": [{"node_set": "foot", "fix": "z"}],
+        "load": [{"node_set": "corner", "force": [10.0, 0.0, 0.0]}],
+        "wall": [SIDE],
+    },
+    "removed": {
+        "support": [{"name": "feet", "node_set": "foot", "fix": "z"}],
+        "remove": [{"supports": "feet", "time": 3e-5}],
+    },
+}
+
+
+def block(*cells):
+    return LATTICE["mesh"] | {"cells": list(cells)}
+
+
+LARGE = {  # bars by padded runs
+    "yielding block": {"mesh": block(12, 9, 10), "material": {"it": DAMPED["it"] | PLASTIC}, "wall": [FLOOR]},
+    "block": {"mesh": block(9, 10, 11)},
+    "shortened bars": {  # by up to 17 %
+        "mesh": block(9, 10, 11),
+        "load": [{"node_set": "corner", "force": [1e5, 3e3, 0.0]}],
+    },
+    "missing bars": {"mesh": block(16, 17, 16) | {"missing": 0.02, "seed": 4}},
+    "moving window": {"mesh": block(45, 12, 12)},
+    "held on a wall": {
+        "mesh": block(11, 9, 10),
+        "material": DAMPED,
+        "support": [{"node_set": "foot", "fix": "x"}],
+        "load": [{"node_set": "corner", "force": [10.0, 0.0, 0.0]}],
+        "wall": [FLOOR],
+    },
+    "viscoplastic": {
+        "mesh": block(9, 10, 11),
+        "material": {
+            "it": IT
+            | {"law": "cowper_symonds", "yield_stress": 50e6, "isotropic_hardening": 1e9}
+            | {"rate_reference": 40.4, "rate_exponent": 5.0}
+        },
+        "support": [{"node_set": "foot", "fix": "z"}],
+    },
+    "viscous": {"mesh": block(10, 9, 11), "material": {"it": IT | {"stiffness_damping": 2e-8}}, "wall": [FLOOR]},
+    "struts": {
+        "mesh": block(9, 11, 10),
+        "material": {"it": IT | {"law": "strut", "yield_stress": 1e6}},
+        "section": {"it": {"area": 1e-6, "shape": "round", "material": "it"}},
+        "support": [{"node_set": "foot", "fix": "z"}],
+    },
+    "own areas": {
+        "mesh": block(10, 11, 9) | {"bar_fields": {"area": "1e-6*(1 + 20*x)"}},
+        "section": {"it": {"area_field": "area", "material": "it"}},
+        "support": [{"node_set": "foot", "fix": "z"}],
+    },
+}
+PAIRS = {
+    "free": {},
+    "held, damped and heavy": {
+        "supports": [{"node_set": "held", "fix": "x"}, {"node_set": "hinged", "fix": "xyz"}],
+        "material": {"damping": 20.0},
+        "gravity": (0.0, 0.0, -50.0),
+    },
+    "along an axis": {"direction": (1.0, 0.0, 0.0), "cells": (1, 3, 3)},
+    "yielding": {"material": {"yield_stress": 1e4, "isotropic_hardening": 1e4, "kinematic_hardening": 1e4}},
+    "many blocks": {"cells": (1, 14, 14), "end": 0.006},
+}
+COMPILED_HERE = ("viscoplastic", "viscous", "struts")  # their loops take 15 s each to compile
+NAMES = [
+    *SMALL,
+    *(pytest.param(name, marks=pytest.mark.thorough if name in COMPILED_HERE else ()) for name in LARGE),
+]
+ARRAYS = ("x", "v", "a", "f", "contact", "support")
+
+
+def case(changes, **time):
+    return Case.from_dict(LATTICE | changes | {"time": LATTICE["time"] | time})
+
+
+def made(case, folder, how, comm=None):
+    """Run a case in ``batches``, by ``single`` steps, or by the ``general`` stepper, as functions of loads need it."""
+    simulation = Simulation(case, comm, output=folder / how, quiet=True)
+    if how == "general":
+        simulation.external_force(lambda time, state: np.zeros((len(simulation.state.v), 3)))
+    steps = list(simulation.batches() if how == "batches" else simulation)
+    return simulation, len(steps)
+
+
+def compare(one, other, exact=True):
+    """Compare the states and the histories of two runs; return the history."""
+    for what in ARRAYS:
+        np.testing.assert_array_equal(getattr(one.state, what), getattr(other.state, what), err_msg=what)
+    first, second = (open_result(simulation.folder).history for simulation in (one, other))
+    assert sorted(first) == sorted(second)
+    scale = max(np.abs(first[column]).max() for column in first if column.endswith(("energy", "work")))
+    for column in first:
+        if exact:
+            np.testing.assert_array_equal(first[column], second[column], err_msg=column)
+        elif column.endswith(("energy", "work", "dissipation", "imbalance")):
+            np.testing.assert_allclose(first[column], second[column], atol=1e-11 * scale, err_msg=column)
+        else:
+            np.testing.assert_allclose(first[column], second[column], rtol=1e-9, atol=1e-12, err_msg=column)
+    return first
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", NAMES)
+def test_batches_are_single_steps_and_move_as_the_general_stepper(name, comm, shared_tmp_path):
+    given = case(SMALL[name]) if name in SMALL else case(LARGE[name], end=2.2e-5)
+    one, count = made(given, shared_tmp_path, "single")
+    many, fewer = made(given, shared_tmp_path, "batches")
+    assert count == round(given.time.end / given.time.step) and fewer < count / 4
+    history = compare(one, many)
+    assert np.abs(history["energy_imbalance"]).max() < 1e-11 * history["kinetic_energy"].max()
+    kept = [simulation.model.bars.blocks[0].history for simulation in (one, many) if simulation.model.bars.blocks]
+    for first, second in zip(kept[::2], kept[1::2], strict=True):
+        np.testing.assert_array_equal(first, second)
+    if name in SMALL and name != "removed":  # a support that is removed gives its reaction to another list of loads
+        compare(one, made(given, shared_tmp_path, "general")[0], exact=False)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", PAIRS)
+def test_batches_with_pairs(name, comm, shared_tmp_path):
+    tables = two_lattices(shared_tmp_path / "mesh.vtu", "central_differences", **PAIRS[name])
+    tables["output"] = {"fields_every": 0, "history_every": 3, "probe": [{"name": "held", "node_set": "held"}]}
+    given = Case.from_dict(tables)
+    one, count = made(given, shared_tmp_path, "single", comm)
+    many, fewer = made(given, shared_tmp_path, "batches", comm)
+    between = comm.allreduce(int((many.model.links.two.nodes < 0).sum()))  # ranks: these take single steps
+    assert fewer == count if between else fewer < 0.4 * count
+    assert name != "many blocks" or comm.size > 1 or len(one.state.v) > 2 * NODE_BLOCK
+    history = compare(one, many)
+    np.testing.assert_array_equal(one.model.links.force, many.model.links.force)
+    assert history["active_contacts"].max() > 8 and np.ptp(history["active_contacts"]) > 8
+    assert np.abs(history["pair/faces/impulse"][-1]).max() > 0.01 and history["impact_dissipation"][-1] > 0.0
+    assert np.abs(history["energy_imbalance"]).max() < 1e-11 * history["kinetic_energy"].max()
+    compare(one, made(given, shared_tmp_path, "general", comm)[0], exact=False)
+
+
+def test_batches_with_pairs_of_several_tables(tmp_path):
+    tables = two_lattices(tmp_path / "mesh.vtu", "central_differences", cells=(1, 3, 3))
+    pair = tables["contact_pair"][0]
+    for k, part in enumerate(("left", "right")):
+        nodes = tables["node_set"][part]["indices"]
+        low, high = nodes[: len(nodes) // 2], nodes[len(nodes) // 2 :]
+        tables["node_set"] |= {f"low{k}": {"indices": low}, f"high{k}": {"indices": high}}
+    tables["contact_pair"] = [
+        pair | {"name": "high", "first": "high0", "second": "high1", "direction": [1.0, 0.0, 0.0]},
+        pair | {"name": "low", "first": "low0", "second": "low1", "gap": 0.002},
+    ]
+    tables["output"] = {"fields_every": 0, "history_every": 7}
+    given = Case.from_dict(tables)
+    history = compare(*(made(given, tmp_path, how, MPI.COMM_SELF)[0] for how in ("single", "batches")))
+    for name in ("low", "high"):
+        assert np.abs(history[f"pair/{name}/impulse"][-1]).max() > 0.01
+
+
+SQUEEZED = LATTICE | {
+    "mesh": block(1, 11, 4),  # whole planes of nodes for a rank
+    "node_set": {"left": {"group": "left"}, "right": {"group": "right"}, "held": {"nearest": [0.0, 0.0, 0.0]}},
+    "support": [{"node_set": "held", "fix": "xyz"}],
+    "initial": {
+        "velocity": [0.0, 1.0, 0.0],
+        "on": [{"node_set": "left", "velocity": [20.0, 0, 0]}, {"node_set": "right", "velocity": [-15.0, 2.0, 0]}],
+    },
+    "contact_pair": [{"name": "faces", "first": "left", "second": "right", "direction": [1, 0, 0], "gap": 0.00999}],
+    "time": LATTICE["time"] | {"end": 4e-5},
+    "output": {"fields_every": 0, "history_every": 3},
+}
+
+
+@pytest.mark.parallel
+def test_ranks_make_batches_with_pairs_of_their_own(comm, shared_tmp_path):
+    given = Case.from_dict(SQUEEZED)
+    one, count = made(given, shared_tmp_path, "single", comm)
+    many, fewer = made(given, shared_tmp_path, "batches", comm)
+    between = comm.allreduce(int((one.model.links.two.nodes < 0).sum()))
+    assert between == 0 or comm.size > 2
+    assert fewer == count if between else fewer < 0.4 * count
+    history = compare(one, many)
+    assert history["active_contacts"].max() > 8 and np.ptp(history["active_contacts"]) > 8
+
+
+@pytest.mark.parametrize("what", ["chung_lee", "newmark", "pairs that share nodes", "pairs with walls"])
+def test_what_batches_do_not_serve_takes_single_steps(what, tmp_path):
+    tables = two_lattices(tmp_path / "mesh.vtu", "central_differences", end=0.004)
+    pair = tables["contact_pair"][0]
+    if what == "pairs that share nodes":
+        tables["contact_pair"] = [pair, pair | {"name": "across", "direction": [1.0, -0.4, 0.3]}]
+    elif what == "pairs with walls":
+        tables["wall"] = [{"type": "plane", "point": [0, 0, -1.0], "normal": [0.0, 0.0, 1.0]}]
+    else:
+        del tables["contact_pair"]
+        tables["time"] |= {"integrator": what}
+    tables["output"] = {"fields_every": 0, "history_every": 10}
+    _, count = made(Case.from_dict(tables), tmp_path, "batches", MPI.COMM_SELF)
+    assert count == 20
+
+
+@pytest.mark.parametrize("pairs", [False, True])
+def test_a_stopped_run_of_batches_goes_on_to_the_same_end(pairs, tmp_path):
+    given = case(SMALL["yielding"])
+    if pairs:
+        given = Case.from_dict(two_lattices(tmp_path / "mesh.vtu", "central_differences"))
+        given.output.history_every = 7
+    whole, _ = made(given, tmp_path / "whole", "batches", MPI.COMM_SELF)
+    stopped = Simulation(given, MPI.COMM_SELF, output=tmp_path / "part", quiet=True)
+    with pytest.raises(EarlyStop):
+        for step in stopped.batches():
+            if step.step > 40:
+                stopped._synchroniser.stop._signal = 15
+    assert 40 < stopped.state.step < whole.state.step
+    rest = Simulation(given, MPI.COMM_SELF, output=tmp_path / "part", restart=True, quiet=True)
+    for _ in rest.batches():
+        pass
+    compare(whole, rest)
+
+
+CRUSHED = {"initial": {"velocity": [0.0, 0.0, -2e4]}, "wall": [FLOOR]}
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", ["on a wall", "by a load"])
+def test_a_failure_is_that_of_single_steps(name, shared_tmp_path):
+    """Also of bars by padded runs, where those between the rows of the lattice do not count."""
+    load = {"node_set": "corner", "force": [1e7, 1e5, 0.0]}
+    given = case({"on a wall": CRUSHED, "by a load": {"mesh": block(9, 10, 11), "load": [load]}}[name])
+    texts, steps = [], []
+    for how in ("single", "batches", "general"):
+        with pytest.raises(SimulationFailure) as failure:
+            made(given, shared_tmp_path, how)
+        texts.append(str(failure.value))
+        steps.append(open_result(shared_tmp_path / how).history["step"])
+    assert "bar" in texts[0] and texts[0] == texts[1] == texts[2]
+    np.testing.assert_array_equal(steps[0], steps[1])
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("every", [1, 1000])
+def test_the_first_failure_is_reported(every, shared_tmp_path):
+    """A bar fails on one rank; before the ranks synchronise, more fail on others as a consequence."""
+    output = {"history_every": every, "fields_every": 0}
+    for how in ("single", "batches"):
+        with pytest.raises(SimulationFailure, match=r"step 140, .* nodes 32 and 33 "):
+            made(case(CRUSHED | {"mesh": block(2, 4, 3), "output": output}), shared_tmp_path, how)

@@ -466,7 +466,8 @@ class _OverTime(WithFiles):
     def as_table(self, given: bool = False) -> dict[str, Any]:
         """Return the keys; the interpolation of a constant vector says nothing."""
         table = super().as_table(given)
-        return table if self.varies else {key: value for key, value in table.items() if key != "interpolation"}
+        interpolation = table.pop("interpolation", None)
+        return table | {"interpolation": interpolation} if self.varies and interpolation else table
 
 
 class Gravity(_OverTime):

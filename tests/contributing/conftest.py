@@ -6,7 +6,7 @@ import shutil
 import sys
 
 import pytest
-from helpers.contributed import EXAMPLES
+from helpers.pages import EXAMPLES
 
 from pfem_petsc import registry
 from pfem_petsc.case import toml

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.contributed import assert_same_results, run
+from helpers.pages import assert_same_results, run
 
 from pfem_petsc import Case, open_result
 from pfem_petsc.errors import InputError

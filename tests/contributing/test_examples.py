@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.contributed import EXAMPLES, PACKAGES, TEXT, assert_same_results, run
+from helpers.pages import EXAMPLES, PACKAGES, TEXT, assert_same_results, run
 
 from pfem_petsc import Case, Simulation, fields, open_result
 from pfem_petsc.cli.main import main

@@ -9,7 +9,7 @@ import re
 import numpy as np
 import pytest
 from document_laws import text_of, undocumented
-from helpers.contributed import assert_same_results, run
+from helpers.pages import assert_same_results, run
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.cli.main import main

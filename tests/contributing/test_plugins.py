@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from helpers.contributed import EXAMPLES
+from helpers.pages import EXAMPLES
 
 from pfem_petsc import Case, InputError, registry
 

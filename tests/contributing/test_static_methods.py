@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.contributed import assert_same_results, run
+from helpers.pages import assert_same_results, run
 from helpers.small_models import ARCH_AREA, ARCH_YOUNG, LIMIT, arch_of
 
 from pfem_petsc import open_result

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from helpers.kills import differences
+from helpers.runs import run
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import EarlyStop
 from pfem_petsc.output.result import open_result
@@ -111,3 +113,22 @@ def rod(folder, *more, end=0.5):
 def steps(folder):
     with open_result(folder) as result:
         return result.history["step"], result.steps
+
+
+def assert_restart_is_bitwise(case, comm, folder, *stops):
+    """Runs that end after each of these steps and go on have the results of one that does not end, to the last bit.
+
+    Returns the history, the same on all ranks. Collective.
+    """
+    history = run(case, folder / "whole", comm)
+    for at in stops:
+        part = folder / f"stopped at {at}"
+        with Simulation(case, comm, output=part, quiet=True) as first:
+            for made in first:
+                if made.step == at:
+                    first.outputs.checkpointing.write()
+                    break
+        with Simulation(case, comm, output=part, quiet=True, restart=True) as rest:
+            assert [made.step for made in rest][0] == at + 1
+        assert everywhere(comm, differences, folder / "whole/result.vtkhdf", part / "result.vtkhdf") == {}
+    return history

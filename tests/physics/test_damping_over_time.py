@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from helpers.kills import differences
 from helpers.runs import run
-from helpers.stopped import everywhere
+from helpers.stopped import assert_restart_is_bitwise
 from mpi4py import MPI
 
-from pfem_petsc import Case, Simulation
+from pfem_petsc import Case
 from pfem_petsc.errors import InputError
 
 DENSITY, RATE, END = 500.0, 8.0, 0.4
@@ -55,15 +54,7 @@ def test_restart_and_factor_one(scheme, comm, shared_tmp_path):
     """Bitwise over a restart; a constant factor of one makes the motion without the table."""
     held = {"support": [{"node_set": "start", "fix": "xyz"}], "gravity": {"acceleration": [0.0, 0.0, -9.81]}}
     it = case(scheme, **held)
-    folders = shared_tmp_path / "whole", shared_tmp_path / "parts"
-    run(it, folders[0], comm)
-    with Simulation(it, comm, output=folders[1], quiet=True) as simulation:
-        for made in simulation:
-            if made.step == 90:
-                simulation.outputs.checkpointing.write()
-                break
-    assert Simulation(it, comm, output=folders[1], quiet=True, restart=True).run() == 0
-    assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}
+    assert_restart_is_bitwise(it, comm, shared_tmp_path, 90)
     one = run(case(scheme, table=((0.0, 1.0),), **held), shared_tmp_path / "one", comm)
     data = it.to_dict()
     del data["time"]["damping_table"]

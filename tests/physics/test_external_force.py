@@ -1,8 +1,5 @@
 """Forces that a function of time and state returns in each step."""
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 from helpers.kills import differences
@@ -12,7 +9,6 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError, SimulationFailure
-from pfem_petsc.stepping.model import Model
 
 SCHEMES = ["central_differences", "chung_lee", "hulbert_chung", "souza_moura", "newmark", "wilson", "houbolt"]
 SCHEMES += ["generalized_alpha", "energy_momentum"]
@@ -37,22 +33,6 @@ def rod(scheme="newmark", load=(), **tables):
         },
         name="rod",
     )
-
-
-def test_constant_forces_are_computed_once():
-    steady = {"load": [{"node_set": "end", "force": [1.0, 2.0, 3.0]}], "gravity": {"acceleration": [0.0, 0.0, -9.81]}}
-    for tables in (steady, {"gravity": steady["gravity"]}):
-        external = Model(rod(**tables), MPI.COMM_SELF).external
-        forces = external.constant()
-        assert forces is external.constant() and forces.any()
-        assert np.array_equal(forces, external.at(0.3, np.empty_like(forces)))
-        external.reactions.append((np.ones_like(forces), 0.0, 1.0))  # a support that is removed gradually
-        assert external.constant() is None
-        external.reactions.clear()
-        external.call(lambda time, state: 0.0)
-        assert external.constant() is None
-    varying = [{"node_set": "end", "force": [1.0, 0.0, 0.0], "table": [[0.0, 0.0], [1.0, 1.0]]}]
-    assert Model(rod(load=varying), MPI.COMM_SELF).external.constant() is None
 
 
 def on_end(t, state):
@@ -199,15 +179,6 @@ def test_refusals(tmp_path):
         simulation.start()
         with pytest.raises(InputError, match="the run has started"):
             simulation.external_force(on_end)
-
-
-def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch):
-    text = (Path(__file__).parents[2] / "docs" / "loads.md").read_text()
-    code = re.search(r"^```python\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)[1]
-    monkeypatch.chdir(tmp_path)
-    exec(compile(code, "loads.md", "exec"), {})
-    history = open_result(tmp_path / "results" / "rod_impact").history
-    assert history["external_work"][2] == 0.0 > -1e-6 > history["external_work"][-1]
 
 
 @pytest.mark.slow

@@ -66,19 +66,6 @@ def test_momentum_over_a_thousand_steps(integrator, linear, angular, comm, share
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("integrator", "parameters"),
-    [("chung_lee", {"beta": 1.0}), ("hulbert_chung", {}), ("houbolt", {}), ("wilson", {}), ("generalized_alpha", {})],
-)
-def test_every_scheme_keeps_linear_momentum(integrator, parameters, comm, shared_tmp_path):
-    case = flight(integrator, 20e-3, **parameters)
-    momentum, _ = sizes(case, comm)
-    history = run(case, shared_tmp_path / "it", comm)
-    assert np.abs(history["momentum"] - history["momentum"][0]).max() < 1e-10 * momentum
-    assert imbalance(history) < 1e-9
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["newmark", "houbolt", "generalized_alpha", "energy_momentum"])
 def test_a_coarse_solution_keeps_linear_momentum(integrator, comm, shared_tmp_path):
     coarse = Case.from_toml(flight(integrator, 4e-3).to_toml(), MESHES, overrides=["solver.rtol=1e-4"])

@@ -44,37 +44,6 @@ def test_momentum_is_that_of_impulses_and_jumps(integrator, treatment, shared_tm
         assert not history["impact_dissipation"].any()
 
 
-def test_impulses_with_damping_and_halved_steps(shared_tmp_path, comm, monkeypatch):
-    """Houbolt's method forgets its history when a step is halved; so does the rule of the impulses."""
-    from pfem_petsc import Simulation, open_result
-
-    material = {"default": {"young_modulus": 1e4, "density": 1.0, "damping": 20.0}}
-    made = case(
-        "houbolt",
-        step=1e-3,
-        steps=20,
-        material=material,
-        gravity={"acceleration": [1.0, 2.0, 3.0]},
-        initial={"velocity": [1.0, 0.0, 0.0]},
-    )
-    simulation = Simulation(made, comm, shared_tmp_path, quiet=True)
-    stepper = simulation.stepper
-    step = stepper.step
-
-    def halved():
-        if stepper.state.step == 7:
-            stepper.level = 2
-        step()
-
-    monkeypatch.setattr(stepper, "step", halved)
-    simulation.run()
-    history = open_result(shared_tmp_path).history
-    history = {name: history[name] for name in history}
-    assert history["step_size"].min() == pytest.approx(2.5e-4)
-    assert np.abs(history["damping_impulse"]).max() > 0.01
-    assert unexplained(history) < 1e-12
-
-
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
 @pytest.mark.parametrize("integrator", SCHEMES)
 def test_impulses_of_supports_that_move(integrator, mass, shared_tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.runs import run
 from helpers.small_models import SCHEMES, in_time
+from helpers.stopped import assert_restart_is_bitwise
 from scipy.spatial.transform import Rotation
 
 from pfem_petsc import Case, Simulation, open_result
@@ -158,18 +159,7 @@ def test_restart_in_a_stage_without_a_removed_support(integrator, comm, tmp_path
     removal = [{"supports": "guide", "time": 1e-3, "duration": 5e-4}]
     stages = [{"name": "one", **time, "remove": removal}, {"name": "two", **time}]
     both(tmp_path, comm, stage=stages)
-    output = {"fields_every": 0, "checkpoint_every": 30, "probe": [{"name": "every", "node_set": "every"}]}
-    case = tower(tmp_path, comm, True, stage=stages, output=output)
-    whole = run(case, tmp_path / "whole", comm)
-    with Simulation(case, comm, tmp_path / "part", quiet=True) as first:
-        for made in first:
-            if made.step == 30:
-                break
-    with Simulation(case, comm, tmp_path / "part", True, quiet=True) as rest:
-        assert [made.step for made in rest][0] == 31
-    history = open_result(tmp_path / "part").history
-    for column in whole:
-        np.testing.assert_array_equal(history[column], whole[column], err_msg=column)
+    assert_restart_is_bitwise(tower(tmp_path, comm, True, stage=stages), comm, tmp_path, 30)
 
 
 @pytest.mark.parallel
@@ -190,16 +180,5 @@ def test_reports_before_a_run(comm, shared_tmp_path):
 @pytest.mark.parametrize("integrator", ["central_differences", "hulbert_chung", "houbolt", "generalized_alpha"])
 def test_restart_is_bitwise(integrator, comm, shared_tmp_path):
     removal = [{"supports": "roller", "time": 1e-3, "duration": 1e-3}]
-    output = {"fields_every": 0, "checkpoint_every": 15, "probe": [{"name": "every", "node_set": "every"}]}
-    case = tower(shared_tmp_path, comm, True, **in_time(integrator, end=3e-3), remove=removal, output=output)
-    whole = run(case, shared_tmp_path / "whole", comm)
-    with Simulation(case, comm, shared_tmp_path / "part", quiet=True) as first:
-        for made in first:
-            if made.step == 15:
-                break
-    with Simulation(case, comm, shared_tmp_path / "part", True, quiet=True) as rest:
-        assert [made.step for made in rest][0] == 16
-    if comm.rank == 0:
-        history = open_result(shared_tmp_path / "part").history
-        for column in whole:
-            assert np.array_equal(whole[column], history[column], equal_nan=True), column
+    case = tower(shared_tmp_path, comm, True, **in_time(integrator, end=3e-3), remove=removal)
+    assert_restart_is_bitwise(case, comm, shared_tmp_path, 15)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.kills import differences
-from helpers.stopped import everywhere
+from helpers.runs import run
+from helpers.stopped import assert_restart_is_bitwise
 
 from pfem_petsc import Case, Simulation, open_result
 
@@ -65,16 +66,6 @@ def tower(comm, shared_tmp_path):
     return case
 
 
-def run(case, comm, folder, **options):
-    with Simulation(case, comm, output=folder, quiet=True, **options) as simulation:
-        assert simulation.run() == 0
-    found = None
-    if comm.rank == 0:
-        history = open_result(folder).history
-        found = {name: np.asarray(history[name]) for name in history}
-    return comm.bcast(found)
-
-
 SCHEMES = {
     "central_differences": {},
     "chung_lee": {},
@@ -91,7 +82,7 @@ SCHEMES = {
 def test_tower_of_all_laws(scheme, tower, comm, shared_tmp_path):
     """Energies balance, everything happens, and the fine solution is the same."""
     keys = {"integrator": scheme} | SCHEMES[scheme]
-    history = run(tower(**keys), comm, shared_tmp_path / "out")
+    history = run(tower(**keys), shared_tmp_path / "out", comm)
     energy = history["kinetic_energy"][0]
     assert np.abs(history["energy_imbalance"]).max() < 1e-7 * energy
     if scheme == "energy_momentum":
@@ -99,7 +90,7 @@ def test_tower_of_all_laws(scheme, tower, comm, shared_tmp_path):
     for name in ("plastic_heat", "damage_dissipation"):
         assert (np.diff(history[name]) >= -1e-12 * energy).all() and history[name][-1] > 1e-3 * energy
     assert history["slack_bars"].max() >= 2 and history["slack_bars"].min() == 0
-    reference = run(tower("central_differences", 2e-4, 1500), comm, shared_tmp_path / "fine")
+    reference = run(tower("central_differences", 2e-4, 1500), shared_tmp_path / "fine", comm)
     assert history["plastic_heat"][-1] == pytest.approx(reference["plastic_heat"][-1], rel=0.1)
     assert history["damage_dissipation"][-1] == pytest.approx(reference["damage_dissipation"][-1], rel=0.1)
 
@@ -110,9 +101,9 @@ def test_ranks_agree(tower, comm, shared_tmp_path):
     from mpi4py import MPI
 
     keys = {"output": {"fields_every": 50, "fields": ["stress", "status", "hinge_rotation", "damage"]}}
-    together = run(tower("central_differences", **keys), comm, shared_tmp_path / "together")
+    together = run(tower("central_differences", **keys), shared_tmp_path / "together", comm)
     if comm.rank == 0:
-        alone = run(tower("central_differences", **keys), MPI.COMM_SELF, shared_tmp_path / "alone")
+        alone = run(tower("central_differences", **keys), shared_tmp_path / "alone", MPI.COMM_SELF)
         assert (alone["slack_bars"] == together["slack_bars"]).all()
         for name in ("kinetic_energy", "elastic_energy", "plastic_heat", "damage_dissipation"):
             assert together[name] == pytest.approx(alone[name], rel=1e-9, abs=1e-9 * alone["kinetic_energy"][0])
@@ -161,34 +152,6 @@ def test_batches_are_single_steps(law, strain, tmp_path):
     assert differences(*(tmp_path / str(name) / "result.vtkhdf" for name in (False, True))) == {}
 
 
-@pytest.mark.few_sets
-@pytest.mark.slow
-@pytest.mark.parametrize("strain", ["engineering", "green", "logarithmic"])
-@pytest.mark.parametrize("law", MATERIALS)
-def test_products_are_derivatives_of_forces(law, strain, tower, comm, shared_tmp_path):
-    """K_t u against differences of forces, at positions at which bars yield, buckle, soften and are slack."""
-    case = tower(strain=strain)
-    with Simulation(case, comm, output=shared_tmp_path / "out", quiet=True) as simulation:
-        simulation.start()
-        bars, mesh = simulation.model.bars, simulation.model.mesh
-        random = np.random.default_rng(7)
-        block = next(block for block in bars.blocks if block.section == law)
-        bars.blocks = [block]
-        checked = 0
-        for size in (5e-3, 2e-2, 5e-2):
-            x = mesh.points + size * random.uniform(-1.0, 1.0, mesh.points.shape)
-            u = random.uniform(-1.0, 1.0, x.shape)
-            out, h = np.zeros_like(x), 1e-7
-            bars.product(x, u, out)
-            ends = [np.zeros_like(x), np.zeros_like(x)]
-            for f, sign in zip(ends, (1.0, -1.0), strict=True):
-                bars.forces(x + sign * h * u, f, commit=False)
-            difference = (ends[0] - ends[1]) / (2.0 * h)
-            assert out == pytest.approx(difference, abs=3e-6 * YOUNG * 1e-3)
-            checked += np.abs(out).max() > 1e-3 * YOUNG * 1e-3
-        assert checked >= 2
-
-
 @pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("law", MATERIALS)
@@ -199,7 +162,7 @@ def test_heat_that_comes_and_goes_balances(law, comm, shared_tmp_path):
     data["material"]["it"]["thermal_expansion"] = 1e-4
     data["temperature"] = [{"table": [[0.0, 0.0], [0.03, 60.0], [0.06, -60.0], [0.1, 30.0]]}]
     data["solver"] = {"rtol": 1e-13}
-    history = run(Case.from_dict(data), comm, shared_tmp_path / "out")
+    history = run(Case.from_dict(data), shared_tmp_path / "out", comm)
     energy = history["kinetic_energy"][0]
     assert np.abs(history["energy_imbalance"]).max() < 1e-12 * energy
     assert np.abs(history["numerical_dissipation"]).max() < 1e-11 * energy
@@ -215,11 +178,9 @@ RESTARTED += [("compaction", "newmark"), ("cable", "central_differences"), ("str
 @pytest.mark.parallel
 @pytest.mark.parametrize(("law", "integrator"), RESTARTED)
 def test_restart_is_bitwise(law, integrator, comm, shared_tmp_path):
-    """A row of bars whose tip is thrown; the first run ends after a checkpoint and between snapshots."""
+    """A row of bars whose tip is thrown; the first run ends between snapshots."""
     velocity = 6.0 if law in ("cable", "damage") else -6.0
-    whole, stopped = shared_tmp_path / "whole", shared_tmp_path / "stopped"
-    for folder, steps, restart in ((whole, 150, False), (stopped, 75, False), (stopped, 150, True)):
-        case = row_of_bars(law, "engineering", velocity, steps, integrator, elements=5)
-        last = run(case, comm, folder, restart=restart)
-    assert everywhere(comm, differences, whole / "result.vtkhdf", stopped / "result.vtkhdf") == {}
+    last = assert_restart_is_bitwise(
+        row_of_bars(law, "engineering", velocity, 150, integrator, elements=5), comm, shared_tmp_path, 75
+    )
     assert max(last["plastic_heat"][-1], last["damage_dissipation"][-1]) > 1e-3 * last["kinetic_energy"][0]

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from helpers.oscillator import TIMES, ground, modal_response, response
+from helpers.oscillator import TIMES, ground, response
 from helpers.runs import run
-from mpi4py import MPI
 
 from pfem_petsc import Case
-from pfem_petsc.stepping.model import Model
 
 pytestmark = pytest.mark.parallel
 
@@ -121,35 +119,3 @@ def test_reactions_of_a_body_carried_along(scheme, mass, comm, shared_tmp_path):
     speed = record[row] + s * values[row] + 0.5 * s * s * np.diff(values)[row] / 0.02
     total = history["support_force"][1:, 0]
     assert total == pytest.approx(expected + 3.0 * speed, abs=1e-9 * np.abs(values).max())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["trapezoid", "central_differences"])
-def test_tower_against_its_modes(scheme, comm, shared_tmp_path):
-    """A braced tower on shaken ground: the top moves on it by the sum of its modes' exact responses."""
-    integrator, parameters = ALL[scheme]
-    values = 1e-3 * ground(TIMES)[2]  # so small that the tower stays linear
-    data = {
-        "mesh": {"generator": "lattice", "kind": "octet", "cells": [1, 1, 3], "pitch": 1.0},
-        "node_set": {"base": {"group": "bottom"}, "top": {"group": "top"}},
-        "material": {"m": {"young_modulus": 2e5, "density": 100.0}},
-        "section": {"s": {"area": 1e-2, "material": "m"}},
-        "support": [{"node_set": "base", "fix": "xyz", "acceleration": rows(values)}],
-        "time": {"integrator": integrator, "step": STEP, "end": 0.6, **parameters},
-        "output": {
-            "fields_every": 0,
-            "history_every": 10,
-            "probe": [{"name": "top", "node_set": "top"}, {"name": "base", "node_set": "base"}],
-        },
-        "solver": {"rtol": 1e-11, "linear": "mumps"},
-    }
-    case = Case.from_dict(data)
-    history = run(case, shared_tmp_path)
-    model = Model(case, MPI.COMM_SELF)
-    exact, lowest = modal_response(model, 2e5 * 1e-2, TIMES, values, history["time"])
-    top = model.nodes["top"]
-    exact = exact[:, top[np.argsort(model.mesh.node_ids[top])], 0]
-    ground_moved = history["probe/base/position"][:, :1, 0] - history["probe/base/position"][0, 0, 0]
-    found = history["probe/top/position"][:, :, 0] - history["probe/top/position"][0, :, 0] - ground_moved
-    assert lowest * STEP < 0.1
-    assert np.abs(found - exact).max() <= 1e-3 * np.abs(exact).max()

@@ -5,8 +5,9 @@ import pytest
 from helpers.kills import differences
 from helpers.runs import run
 from helpers.small_models import AREA, MATERIAL, YOUNG
+from helpers.stopped import assert_restart_is_bitwise
 
-from pfem_petsc import Case, Simulation, open_result, write_mesh
+from pfem_petsc import Case, Simulation, write_mesh
 from pfem_petsc.errors import InputError
 
 HEIGHT, MASS = 2.0, None
@@ -115,30 +116,15 @@ def test_a_support_is_taken_away_in_equilibrium(method, comm, tmp_path):
 @pytest.mark.parametrize("scheme", ["central_differences", "newmark"])
 @pytest.mark.parametrize("what", [{"bars": "leg"}, {"supports": "foot"}, {"supports": "foot", "duration": 0.0}])
 def test_restarts_are_bitwise_while_something_is_removed(what, scheme, comm, tmp_path):
-    """From before, within and after a gradual removal; in fused steps as in single ones."""
+    """From before, within and after a gradual removal; in batches of steps as in single ones."""
     step = PERIOD / 100.0
     time = {"integrator": scheme, "step": step, "end": 60 * step}
-    remove = [{"time": 20 * step, "duration": 20 * step, **what}]
-    case = tower(tmp_path, comm, time=time, remove=remove)
-    whole = run(case, tmp_path / "whole", comm)
-    for at in (15, 20, 30, 45):
-        tables = {**case.to_dict(), "output": {**case.to_dict()["output"], "checkpoint_every": at}}
-        again = Case.from_dict(tables, folder=tmp_path)
-        folder = tmp_path / str(at)
-        with Simulation(again, comm, folder, quiet=True) as first:
-            for made in first:
-                if made.step == at:
-                    break
-        with Simulation(again, comm, folder, True, quiet=True) as rest:
-            rest.run()
-        found = differences(tmp_path / "whole" / "result.vtkhdf", folder / "result.vtkhdf")
-        assert not [name for name in found if "history" in name], at
-    with Simulation(case, comm, tmp_path / "fused", quiet=True) as fused:
-        for _ in fused.batches():
+    case = tower(tmp_path, comm, time=time, remove=[{"time": 20 * step, "duration": 20 * step, **what}])
+    whole = assert_restart_is_bitwise(case, comm, tmp_path, 15, 20, 30, 45)
+    with Simulation(case, comm, tmp_path / "batches", quiet=True) as simulation:
+        for _ in simulation.batches():
             pass
-    history = open_result(tmp_path / "fused").history
-    for column in history:
-        np.testing.assert_array_equal(history[column], whole[column], err_msg=column)
+    assert differences(tmp_path / "whole/result.vtkhdf", tmp_path / "batches/result.vtkhdf") == {}
     assert np.abs(whole["energy_imbalance"]).max() < 1e-8 * whole["external_work"].max()
 
 
@@ -185,7 +171,7 @@ def test_removals_that_make_no_sense_are_refused(remove, told, comm, tmp_path):
 @pytest.mark.parametrize("scheme", ["central_differences", "generalized_alpha", "energy_momentum"])
 def test_restarts_while_heated_bars_are_removed_have_the_same_ledger(scheme, comm, tmp_path):
     """A step begins with the energies and the stresses that a removal has left."""
-    step, at = PERIOD / 100.0, 6
+    step = PERIOD / 100.0
     rows = [[k * step, 20.0 * np.sin(k)] for k in range(20)]
     tables = {
         "material": {"it": {**MATERIAL, "thermal_expansion": 1e-5}},
@@ -193,20 +179,9 @@ def test_restarts_while_heated_bars_are_removed_have_the_same_ledger(scheme, com
         "remove": [{"time": 2.3 * step, "duration": 9.1 * step, "bars": bars} for bars in ("leg", "second")],
         "load": [{"node_set": "top", "force": [0.0, 0.0, -37.3 * WEIGHT]}],
         "time": {"integrator": scheme, "step": step, "end": 14 * step},
-        "output": {"fields_every": 0, "checkpoint_every": at},
+        "output": {"fields_every": 0},
     }
     case = tower(tmp_path, comm, **tables)
-    whole = run(case, tmp_path / "whole", comm)
-    with Simulation(case, comm, tmp_path / "part", quiet=True) as first:
-        for made in first:
-            ledger, left = first.outputs.history.ledger, made.step
-            assert ledger._before.energy == first.stepper.energy
-            if left == at:
-                break
-    with Simulation(case, comm, tmp_path / "part", True, quiet=True) as rest:
-        rest.run()
-    history = open_result(tmp_path / "part").history
-    for column in whole:
-        np.testing.assert_array_equal(history[column], whole[column], err_msg=column)
+    whole = assert_restart_is_bitwise(case, comm, tmp_path, 6)
     assert whole["rupture_dissipation"][-1] > 0.0
     assert np.abs(whole["energy_imbalance"]).max() < 1e-9 * np.abs(whole["thermal_work"]).max()

@@ -1,12 +1,10 @@
 """Temperatures: restrained and free bars, heating over time, and the work of heating in the ledger."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.runs import run
 
-from pfem_petsc import Case, Simulation
+from pfem_petsc import Case
 from pfem_petsc.output.result import open_result
 
 pytestmark = pytest.mark.parallel
@@ -87,33 +85,6 @@ def test_heating_a_free_bar(shared_tmp_path, comm):
     )
     assert history["kinetic_energy"].max() > 0.01
     assert np.abs(history["energy_imbalance"]).max() < 1e-11 * history["kinetic_energy"].max()
-
-
-def test_heating_in_halved_steps(shared_tmp_path, comm):
-    """A step that fails has heated the bars to its end; its halves start from the temperature at the start again."""
-    table = {"table": [[0.0, 0.0], [2e-3, 400.0]]}
-    options = {"integrator": "energy_momentum", "ends": ("start",)}
-    halves = run(case(table, step=5e-5, steps=40, **options), shared_tmp_path / "halves")
-    simulation = Simulation(case(table, step=1e-4, steps=20, **options), comm, shared_tmp_path / "halved", quiet=True)
-    newton, whole = simulation.stepper.newton, []
-    solve = newton.solve
-
-    def fail_whole_steps(*arguments):
-        report = solve(*arguments)
-        if simulation.stepper.part < simulation.stepper.h:
-            return report
-        whole.append(simulation.state.step)
-        return replace(report, converged=False, why="made to fail")
-
-    newton.solve = fail_whole_steps
-    assert simulation.run() == 0
-    assert whole == list(range(20))
-    if comm.rank == 0:
-        history = open_result(shared_tmp_path / "halved").history
-        assert history["step_size"][1:] == pytest.approx(np.full(20, 5e-5))
-        assert halves["kinetic_energy"].max() > 1e-3
-        for name in ("probe/end/position", "probe/end/velocity", "elastic_energy", "thermal_work"):
-            assert history[name] == pytest.approx(halves[name][::2], rel=1e-9, abs=1e-12), name
 
 
 def held_bar(folder, comm, law, **tables):

@@ -22,11 +22,6 @@ def plateau(history):
     return force(history, "symmetry")[(since > 0.1 * DURATION) & (since < 0.9 * DURATION)]
 
 
-def test_theory():
-    assert FORCE == pytest.approx(133.5e3, rel=2e-3)
-    assert DURATION == pytest.approx(98.9e-6, rel=1e-3)
-
-
 @pytest.mark.parametrize(
     ("elements", "step", "slack"), [(20, 0.5e-6, 0.035), (20, 2e-6, 0.035), (80, 0.25e-6, 0.015), (80, 0.5e-6, 0.015)]
 )

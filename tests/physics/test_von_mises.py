@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 from helpers.runs import run
-from mpi4py import MPI
 
 from pfem_petsc import Case
-from pfem_petsc.stepping.model import Model
 
 HALF_SPAN, RISE, YOUNG, AREA, DENSITY = 1.0, 0.1, 1e9, 1e-4, 1000.0
 REST = np.hypot(HALF_SPAN, RISE)
@@ -49,24 +47,6 @@ def arch(folder, **tables):
 def path(z):
     """Downward load [N] that holds the apex at height z [m]."""
     return 2 * YOUNG * AREA * z * (1 / np.hypot(HALF_SPAN, z) - 1 / REST)
-
-
-def test_equilibrium_path_and_limit_load_of_the_bars(tmp_path):
-    """Internal force of the apex along its way down, and its maximum against the closed form."""
-    model = Model(arch(tmp_path), MPI.COMM_SELF)
-    apex = int(np.flatnonzero(model.mesh.node_ids == 1)[0])
-    x, f = model.mesh.points.copy(), np.empty((3, 3))
-    heights = np.linspace(RISE, -RISE, 4001)
-    loads = []
-    for z in heights:
-        x[apex, 2] = z
-        model.bars.forces(x, f, commit=False)
-        loads.append(-f[apex, 2])
-    np.testing.assert_allclose(loads, path(heights), atol=1e-12 * YOUNG * AREA)
-    assert max(loads) == pytest.approx(LIMIT, rel=1e-6)
-    assert heights[np.argmax(loads)] == pytest.approx(
-        np.sqrt((REST * HALF_SPAN**2) ** (2 / 3) - HALF_SPAN**2), abs=1e-4
-    )
 
 
 @pytest.mark.slow

@@ -1,15 +1,19 @@
-"""The examples in the text of CONTRIBUTING.md."""
+"""Pages of the documentation: their prose, blocks and commands, and the examples of CONTRIBUTING.md."""
 
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
 
 from pfem_petsc import Simulation, open_result
 
-TEXT = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text()
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.glob("*.md")])
+TEXT = (ROOT / "CONTRIBUTING.md").read_text()
 PACKAGES = (
     *("integrators", "contact.walls", "contact.constraints", "mesh.generators", "mechanics.materials"),
     *("contact.treatments", "formats", "statics.methods"),
@@ -20,6 +24,24 @@ EXAMPLES = {
         r"^```(?:python|toml)\n(# pfem_petsc/(\S+)\n.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL
     )
 }
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    """Texts of the blocks of a page in these languages; ``""`` is a block without one."""
+    fenced = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    return [text for name, text in fenced if name in languages]
+
+
+def prose(page: Path) -> str:
+    """A page without its blocks."""
+    return re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+
+
+def program_lines(page: Path) -> list[list[str]]:
+    """Words after ``python -m pfem_petsc`` of the lines that begin so in blocks of commands."""
+    lines = "".join(blocks(page, "", "sh", "bash")).splitlines()
+    words = [shlex.split(line, comments=True) for line in lines if line.startswith("python -m pfem_petsc ")]
+    return [line[3:] for line in words]
 
 
 def assert_same_results(whole, parts, *fields):

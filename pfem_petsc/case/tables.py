@@ -452,11 +452,22 @@ class _OverTime(WithFiles):
         rest = cls._rows_of_files({name: value for name, value in data.items() if name != key}, info)
         return {**rest, key: [[t, *(a + b for a, b in zip(row, constant, strict=True))] for t, *row in rest[key]]}
 
+    @property
+    def varies(self) -> bool:
+        """Whether the vector is given by rows over time."""
+        return any(has_rows(value) for value in self.__dict__.values())
+
     @model_validator(mode="after")
     def _interpolates(self) -> _OverTime:
-        if self.interpolation == "smooth" and not any(has_rows(value) for value in self.__dict__.values()):
+        if self.interpolation == "smooth" and not self.varies:
             raise ValueError('interpolation = "smooth" requires rows over time')
         return self
+
+    def as_table(self, given: bool = False) -> dict[str, Any]:
+        """Return the keys; the interpolation of a constant vector says nothing."""
+        table = super().as_table(given)
+        interpolation = table.pop("interpolation", None)
+        return table | {"interpolation": interpolation} if self.varies and interpolation else table
 
 
 class Gravity(_OverTime):

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ..case.base import has_rows
 from ..case.files import Forces, read_forces
 from ..case.tables import LoadFile
 from ..errors import InputError
@@ -240,7 +239,7 @@ class Wind:
         self.held: np.ndarray | None = None
         self._holds = case.holds("wind")
         self._table, self._constant = None, np.zeros(3)
-        if has_rows(wind.velocity):
+        if wind.varies:
             self._table = Table(wind.velocity, wind.interpolation == "smooth")
         else:
             self._constant = np.array(wind.velocity, dtype=np.float64)
@@ -315,7 +314,7 @@ class ExternalForce:
             self.state_forces.append(self.wind)
         self._keeps = case.holds("load"), case.holds("gravity")
         self._loads = None if self._keeps[0] else NodalLoads(case, nodes, inertia.mesh)
-        varies = case.gravity is not None and has_rows(case.gravity.acceleration)
+        varies = case.gravity is not None and case.gravity.varies
         gravity = case.gravity.acceleration if case.gravity is not None and not varies else (0.0, 0.0, 0.0)
         self.gravity = np.array(gravity, dtype=np.float64)
         self._gravity_table: Table | None = None

@@ -89,7 +89,7 @@ class Curve(NamedTuple):
 
 @dataclass
 class Panel:
-    """What one pair of axes shows. All panels of a chart that have the same unit have the same prefix.
+    """What one pair of axes shows. All panels of a chart with the same unit, and no scale, have the same prefix.
 
     Attributes
     ----------
@@ -238,7 +238,8 @@ class Chart:
         self._columns: list[tuple[str, np.ndarray, str, np.ndarray]] = []
         sizes: dict[str, list[float]] = {}
         for panel in drawn:
-            sizes.setdefault(panel.unit, []).append(panel.size)
+            if panel.scale is None:
+                sizes.setdefault(panel.unit, []).append(panel.size)
             for curve in panel.curves if panel.over else ():
                 sizes.setdefault(panel.over[1], []).append(largest(curve.place))
         self._scales = {unit: common_prefix(found, unit) for unit, found in sizes.items()}

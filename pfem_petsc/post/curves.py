@@ -234,6 +234,8 @@ def draw_spectra(
         end = highest or max(curve.place[-1] for curve in panel.curves)
         inside = [(curve.place > 0.0) & (curve.place <= end) for curve in panel.curves]
         top = max(largest(curve.values[part]) for curve, part in zip(panel.curves, inside, strict=True))
+        for line, curve, part in zip(axes.lines, panel.curves, inside, strict=True):  # the mean is none of it
+            line.set_data(curve.place[part] * factor, curve.values[part])
         if len(panel.curves) == 1:
             _tell_peaks(axes, panel.curves[0].place[inside[0]], panel.curves[0].values[inside[0]], factor, shown)
         if top > 0.0:

@@ -191,7 +191,7 @@ def test_an_exception_is_found_and_told(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [8, 9, 10, 14, 22, 24, 28, 35])
+@pytest.mark.parametrize("seed", [8, 14, 22, 24, 28, 35, 36, 37])
 def test_explicit_and_implicit_schemes_agree(seed, tmp_path):
     """At small steps they are apart by no more than halving the step changes, with contact, plasticity and supports."""
     verdict, faults = judge_schemes(draw_case(seed), seed, tmp_path, f"random-{seed}.toml")

@@ -318,7 +318,7 @@ def solve_rows(block, rows, nodes, shared, u, contact):
 
 @kernel
 def close_rows(rows, at, ends, counted, slack):
-    """Return the energy [J] that closing rows lose, see :mod:`pfem_petsc.contact.impact`; update ``rows.closed``.
+    """Return the energy [J] that closing rows lose, see :mod:`~pfem_petsc.stepping.impact`; update ``rows.closed``.
 
     Parameters
     ----------

@@ -18,7 +18,6 @@ from numba.extending import intrinsic
 from ..columns import HEAD
 from ..contact.explicit import find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows, solve_rows
-from ..contact.impact import Approach, join_nodes, plane_gaps, stop_nodes, unpressed
 from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import accelerations, advance, advance_loaded, centre, kick, move
 from ..mechanics.compiled import borrowing, kernel
@@ -26,6 +25,7 @@ from ..mechanics.elements import BarData, first_inverted
 from ..mechanics.runs import Columns, exchange_history, join_components, new_rows, slide_planes, split_components
 from ..mechanics.tuples import CHUNK
 from ..mesh.ordering import NODE_BLOCK
+from .impact import Approach, join_nodes, plane_gaps, stop_nodes, unpressed
 from .impulses import WALLS
 from .ledger_loops import (
     CONTACT,

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..columns import ENERGIES, HEAD
-from ..contact.impact import Impacts
 from ..mechanics.bars import StrainEnergy, state_before_rupture
 from ..mechanics.elements import MEASURES
 from ..mechanics.materials.base import SMALL
+from .impact import Impacts
 from .impulses import Impulses, NoImpulses, wall_shares
 from .ledger_loops import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS, power, sum_momenta, total
 
@@ -216,8 +216,7 @@ class Ledger:
     impulses : Impulses
     impacts : Impacts
     powers : (5,) works of all balances of a leapfrog scheme up to the present one, in the order of ``WORKS`` [J]; at
-    the
-        place of inertia is the constant that continues the numerical dissipation of what came before. None if the last
+        the place of inertia is the constant that continues the numerical dissipation of what came before. None if the last
         step was not of a batch
     """
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -23,8 +23,30 @@ from ..tolerances import BEYOND, ON_BOUND, ROUNDING, TIME
 from .bar_events import Collapse, Removals, Ruptures, collapse_message
 
 if TYPE_CHECKING:
-    from .ledger import Ledger
     from .model import Model
+
+
+class Accumulating(Protocol):
+    """What accumulates the works of a stepper: :class:`~pfem_petsc.stepping.ledger.Ledger`.
+
+    Attributes
+    ----------
+    powers : (5,) works of all balances of a leapfrog scheme so far [J]; None if the last step was not made in a batch
+    """
+
+    powers: np.ndarray | None
+
+    def update(self) -> None:
+        """Add the last part of a step."""
+
+    def follow_removal(self) -> None:
+        """Start the next step from the energies of the bars after some were removed."""
+
+    def begin_batches(self) -> None:
+        """Continue balance by balance."""
+
+    def complete(self) -> None:
+        """Compute what batches leave for rows, checkpoints and other steps."""
 
 
 class PrescribedMotion:
@@ -255,7 +277,7 @@ class Stepper(ABC):
     fault_step : number of the last finished step when the fault was found
     h : the case's time step [s]; ``part`` the size of the current part, ``smallest`` the smallest part of the last step
     treatment : of impact, None for the scheme's own formulas
-    ledger : Ledger, which accumulates each part of a step; None for steps that nothing records
+    ledger : what accumulates each part of a step; None for steps that nothing records
     iterations : numbers of Newton and linear iterations since the last row of the history
     before : (local, 3) positions at the start of the last part, with ghosts [m]
     massless : MasslessNodes if contact nodes are massless along their walls' normals, else None
@@ -290,7 +312,7 @@ class Stepper(ABC):
         self.scheme = scheme
         self.h = self.part = self.smallest = h
         self.treatment = None  # of impact; see pfem_petsc.contact.treatments
-        self.ledger: Ledger | None = None
+        self.ledger: Accumulating | None = None
         self.iterations = [0, 0]
         mesh = model.mesh
         owned = mesh.n_owned

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
+from ..contact.fixed_rows import close_rows
 from ..mechanics.compiled import kernel
 from ..tolerances import ON_BOUND
-from .fixed_rows import close_rows
 
 if TYPE_CHECKING:
-    from ..stepping.stepper import Stepper
+    from .stepper import Stepper
 
 
 @kernel

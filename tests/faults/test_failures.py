@@ -30,18 +30,18 @@ def provoke(stepper):
 
 provoked = []
 
-def watched(step):
-    def wrapper(self):
-        if self.state.step >= {at} and not provoked:  # some steps before may be fused
+def watched(steps):
+    def wrapper(self, most):
+        if self.state.step >= {at} and not provoked:  # a batch may pass this step
             provoked.append(True)
             if rank == 0:
                 print("provoked after step", self.state.step, flush=True)
             provoke(self)
-        step(self)
+        steps(self, most)
     return wrapper
 
 for kind in (ExplicitStepper, ImplicitStepper):
-    kind.step = watched(kind.step)
+    kind.steps = watched(kind.steps)
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -118,6 +118,7 @@ class ExplicitStepper(Stepper):
         state.step += 1
 
     def supports_changed(self) -> None:
+        super().supports_changed()
         self._batch, self._batched = None, None
 
     def accelerate(self, load: np.ndarray) -> np.ndarray:

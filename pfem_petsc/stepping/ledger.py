@@ -216,8 +216,8 @@ class Ledger:
     impulses : Impulses
     impacts : Impacts
     powers : (5,) works of all balances of a leapfrog scheme up to the present one, in the order of ``WORKS`` [J]; at
-        the place of inertia is the constant that continues the numerical dissipation of what came before. None if the last
-        step was not of a batch
+        the place of inertia is the constant that continues the numerical dissipation of what came before. None if the
+        last step was not of a batch
     """
 
     def __init__(self, stepper: Stepper) -> None:

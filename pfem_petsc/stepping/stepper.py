@@ -286,6 +286,7 @@ class Stepper(ABC):
     ruptures : Ruptures, which counts broken bars
     removals : Removals of bars and supports
     carried : CarriedNodes, which supports may carry through rectangles
+    support_changes : how often components have ceased or begun to be prescribed
     step_changed : whether the scheme was notified of another step size since the ledger's last update
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
         and of the balance solved there by a scheme that solves for the next position; None after a restart
@@ -336,6 +337,7 @@ class Stepper(ABC):
         self.massless = MasslessNodes(model) if model.inertia.redistribution is not None else None
         self.closed = np.zeros_like(self.touching)
         self.step_changed = False
+        self.support_changes = 0
         self.prescribed = PrescribedMotion(self)
         self.ruptures = Ruptures(model.bars, mesh)
         self.removals = Removals(model)
@@ -557,8 +559,9 @@ class Stepper(ABC):
         if self.ledger is not None:
             self.ledger.follow_removal()
 
-    def supports_changed(self) -> None:  # noqa: B027 - most steppers read the supports in each step
+    def supports_changed(self) -> None:
         """Take account of components that are no longer prescribed, or now are. Collective."""
+        self.support_changes += 1
 
     def resume(self) -> None:
         """Continue from a state that was restored from a checkpoint. Collective."""

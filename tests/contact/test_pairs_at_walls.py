@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.lattices import planes, rotation, simulation, two_lattices, two_rods
 
+from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.solvers.linear import LinearChoice
 from pfem_petsc.stepping.implicit import ImplicitStepper
 
@@ -99,6 +100,7 @@ def test_explicit_steps_solve_the_variational_inequality(name, supported, comm, 
         return solution
 
     explicit.solve = both
+    run.external_force(lambda time, state: np.zeros_like(run.state.v))  # without batches: each step is solved here
     assert run.run() == 0
     implicit.destroy()
     assert max(pressed) > 8 and max(worst) < 1e-13
@@ -116,3 +118,33 @@ def test_explicit_steps_on_ranks(name, comm, shared_tmp_path):
 def test_nodes_in_several_pairs(name, comm, shared_tmp_path):
     """Groups of pairs that share nodes, in explicit and implicit steps."""
     test_explicit_steps_solve_the_variational_inequality(name, True, comm, shared_tmp_path, crowded=True)
+
+
+def test_walls_stop_nodes_beside_pairs(tmp_path):
+    """Nodes in no pair meet a wall in the same explicit run, whose steps nothing interrupts."""
+    case = Case.from_dict(
+        {
+            "mesh": {"generator": "two_rods", "length": 1.0, "elements": 5, "gap": 0.001},
+            "material": {"it": {"young_modulus": 1e6, "density": 1000.0}},
+            "section": {"it": {"area": 1e-4, "material": "it"}},
+            "node_set": {name: {"group": name} for name in ("start", "first_end", "second_start")},
+            "initial": {"velocity": [-0.5, 0.0, 0.0]},
+            "contact_pair": [
+                {"name": "faces", "first": "first_end", "second": "second_start", "direction": [1.0, 0.0, 0.0]}
+            ],
+            "wall": [
+                {"name": "wall", "type": "plane", "node_set": "start", "point": [-0.01, 0, 0], "normal": [1, 0, 0]}
+            ],
+            "time": {"integrator": "central_differences", "step": 1e-4, "end": 0.15},
+            "output": {"fields_every": 0, "history_every": 500},
+        }
+    )
+    run = Simulation(case, output=tmp_path / "it", quiet=True)
+    assert run.run() == 0
+    history = open_result(run.folder).history
+    assert history["wall/wall/impulse"][-1, 0] > 0.0
+    assert run.state.x[0, 0] >= -0.01 - 1e-9
+    moved = history["momentum"] - history["momentum"][0]
+    np.testing.assert_allclose(
+        moved, history["wall/wall/impulse"] + history["wall/wall/jump_impulse"], atol=1e-12 * np.abs(moved).max()
+    )

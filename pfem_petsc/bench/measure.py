@@ -24,8 +24,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..parallel.petsc_log import OF_BALANCE, OF_FORCE, OF_PRODUCT
-
 if TYPE_CHECKING:
     from mpi4py import MPI
 
@@ -174,18 +172,6 @@ ASSUMED = {
 }
 """Bytes per item."""
 
-OPERATIONS = {
-    "bar": OF_FORCE,
-    "plastic bar": 12,  # trial stress, yield function, return
-    "explicit node": OF_BALANCE + 6 + 6 + 6,  # balance; position, velocity, work of the internal forces
-    "residual node": 15,
-    "linearised bar": 20,
-    "product": OF_PRODUCT,
-    "matrix entry": 2,
-    "conjugate gradients node": 36,  # three sums of vectors, two products, the diagonal
-}
-"""Floating-point operations per item, of linear elastic bars."""
-
 
 class Work(NamedTuple):
     """What a step does.
@@ -229,28 +215,11 @@ class Work(NamedTuple):
         else:
             matrix = bars * (far + size["linearised bar"]) + nodes * size["product node"]
             update = bars * (bar + size["ends of a linearised bar"] + size["linearised bar"])
-        solves = self._solves(
-            bars * bar + nodes * size["residual node"], update, matrix + nodes * size["conjugate gradients node"]
-        )
-        return float(bars * bar + nodes * node + solves)
-
-    def operations(self) -> float:
-        """Return the number of floating-point operations of a step, over all ranks."""
-        size, bars, nodes = OPERATIONS, self.bars, self.nodes
-        forces = bars * (size["bar"] + self.plastic * size["plastic bar"])
-        product = self.entries * size["matrix entry"] if self.assembled else bars * size["product"]
-        solves = self._solves(
-            forces + nodes * size["residual node"],
-            bars * size["linearised bar"],
-            product + nodes * size["conjugate gradients node"],
-        )
-        return float(forces + nodes * size["explicit node"] + solves)
-
-    def _solves(self, evaluation: float, update: float, iteration: float) -> float:
-        """Of an implicit step: residuals, updates of the Hessian, and iterations of conjugate gradients."""
-        if not self.implicit:
-            return 0.0
-        return (self.newton + 1.0) * evaluation + self.newton * update + self.linear * iteration
+        total = bars * bar + nodes * node
+        if self.implicit:
+            total += (self.newton + 1.0) * (bars * bar + nodes * size["residual node"]) + self.newton * update
+            total += self.linear * (matrix + nodes * size["conjugate gradients node"])
+        return float(total)
 
 
 def share_in_runs(bars: Bars) -> float:
@@ -300,7 +269,6 @@ class Record:
     traffic : number of bytes that a step moves
     share : percent of the bandwidth of all ranks that this traffic needs at the median
     memory : maximum growth of resident memory, all ranks together
-    operations : floating-point operations of a step
     runs : share of the bars that go by runs of constant offset
     ghosts, neighbours : maximum number of ghosts, and of neighbouring ranks, over all ranks
     evaluated : bars evaluated on all ranks together; those between two ranks are evaluated on both
@@ -322,7 +290,6 @@ class Record:
     traffic: float
     share: float
     memory: float
-    operations: float
     runs: float
     ghosts: int
     neighbours: int
@@ -407,7 +374,6 @@ def time_job(
         traffic=work.bytes(),
         share=100.0 * work.bytes() / bandwidth / middle if bandwidth else 0.0,
         memory=grown,
-        operations=work.operations(),
         runs=work.runs,
         ghosts=max(comm.allgather(mesh.n_local - mesh.n_owned)),
         neighbours=max(comm.allgather(mesh.n_neighbours)),

@@ -27,6 +27,10 @@ docs/performance.md. Nothing else should run during the measurement.
 exit status: 0 done, 2 invalid input, 3 a run failed"""
 
 
+_MOST = 10**12
+"""Bars of the largest lattice that can be asked for; no machine has the memory."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.add_argument(
@@ -52,7 +56,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--compile", action="store_true", help="only compile the loops of the jobs for later runs; measure nothing"
     )
-    parser.add_argument("--roofline", metavar="FILE.png", type=Path, help="draw a roofline plot of the jobs")
     parser.add_argument("-o", "--output", metavar="FILE", type=Path, help="write all figures as JSON")
 
 
@@ -65,7 +68,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
 
     if not 0.0 < arguments.seconds < float("inf"):
         raise InputError(f"--seconds {arguments.seconds}: give a positive time")
-    on_root(comm, _require_writable, arguments.output, arguments.roofline)
+    on_root(comm, _require_writable, arguments.output)
 
     def say(text: str) -> None:
         if comm.rank == 0:
@@ -98,29 +101,25 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     tiny = [time_job(job, "cubic", 2, comm, None, seconds, 3000) for job in tiny_jobs(explicit)]
     for record in tiny:
         say(f"outside the loops over bars and nodes: {1e6 * record.median:.0f} us a step ({record.job})")
-    operations = report.measure_operations(comm) if arguments.roofline else None
-    if arguments.roofline and comm.rank == 0:
-        report.draw_roofline(arguments.roofline, bandwidth, operations, records, title)
     if arguments.output and comm.rank == 0:
-        text = report.document(comm, bandwidth, records, tiny, operations)
-        arguments.output.write_text(text, encoding="utf-8")
+        arguments.output.write_text(report.document(comm, bandwidth, records, tiny), encoding="utf-8")
     return 0
 
 
 def _size(text: str) -> int:
     with contextlib.suppress(ValueError, OverflowError):
-        if float(text) == int(float(text)) > 0:
+        if 0 < float(text) == int(float(text)) <= _MOST:
             return int(float(text))
-    raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number")
+    raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number up to {_MOST:,}")
 
 
-def _require_writable(*paths: Path | None) -> None:
-    """Open the output files before the measurements, which take minutes."""
-    for path in filter(None, paths):
-        try:
+def _require_writable(path: Path | None) -> None:
+    """Open the output file before the measurements, which take minutes."""
+    try:
+        if path is not None:
             path.open("a").close()
-        except OSError as error:
-            raise InputError(f"--output {path}: cannot be written: {error.strerror}") from error
+    except OSError as error:
+        raise InputError(f"--output {path}: cannot be written: {error.strerror}") from error
 
 
 VERBS = (Verb("bench", str(__doc__), EXAMPLE, "all", add_arguments, run),)

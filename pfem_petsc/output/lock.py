@@ -1,9 +1,9 @@
 """The lock of an output folder: only one run at a time writes into it.
 
 A file beside the folder, ``NAME.lock``, identifies the owner: machine, process, and start time of that process. It is
-created by a hard link, which is atomic on network file systems too, or by exclusive creation if there are no hard
-links. A killed run leaves its file behind: on the same machine, process number and start time show that it has ended,
-and the next run takes the lock over. Nothing is known of processes on other machines: their locks are respected until
+created exclusively, which network file systems do atomically too, and then gets its content. A killed run leaves its
+file behind: on the same machine, process number and start time show that it has ended, and the next run takes the lock
+over. Nothing is known of processes on other machines: their locks are respected until
 somebody removes the file.
 """
 
@@ -25,7 +25,7 @@ from ..errors import InputError, SimulationFailure
 __all__ = ["FolderLock"]
 
 INTERVAL = 30.0  # seconds between checks that the lock is still held
-_UNFINISHED = 5.0  # seconds in which a file made by exclusive creation must get its content
+_UNFINISHED = 5.0  # seconds in which a file that was created must get its content
 
 
 class FolderLock:
@@ -121,9 +121,14 @@ class FolderLock:
         """Refuse a folder whose lock has an owner that may be alive."""
         if owner is None or _has_ended(self.path, owner):
             return
-        who = f"process {owner.get('pid', '?')} on {owner.get('host', '?')}, since {owner.get('since', '?')}"
+        if not owner:
+            raise InputError(
+                f"{self.folder}: another run is about to write into this folder, or {self.path} is no lock of this "
+                "program: try again in some seconds, remove that file, or choose another folder with -o"
+            )
+        who = f"process {owner['pid']} on {owner['host']}, since {owner['since']}"
         remedy = "wait until it has ended, stop it (SIGTERM), or choose another folder with -o"
-        if owner.get("machine") != _machine():
+        if owner["machine"] != _machine():
             remedy += f"; if it was killed there, or that machine has restarted, remove {self.path}"
         raise InputError(f"{self.folder}: another run is writing into this folder: {who}; {remedy}")
 
@@ -172,8 +177,7 @@ def _has_ended(path: Path, owner: dict[str, Any]) -> bool:
         with contextlib.suppress(OSError):
             return time.time() - path.stat().st_mtime > _UNFINISHED
         return False
-    known = owner.get("machine") == _machine() and isinstance(owner.get("pid"), int)
-    return known and _start_time(owner["pid"]) != owner.get("start")
+    return owner["machine"] == _machine() and _start_time(owner["pid"]) != owner["start"]
 
 
 @contextlib.contextmanager
@@ -199,29 +203,14 @@ def _read(path: Path) -> dict[str, Any] | None:
         return None
     except (OSError, ValueError):
         return {}
-    return content if isinstance(content, dict) else {}
+    return content if isinstance(content, dict) and content.keys() >= _identity().keys() else {}
 
 
 def _create(path: Path, content: dict[str, Any]) -> bool:
-    """Create a lock with its content atomically; return False if it exists."""
-    raw = json.dumps(content).encode()
-    temporary = path.with_name(f".{path.name}.{content['token']}")
+    """Create a lock with its content; return False if it exists."""
     try:
-        temporary.write_bytes(raw)
-        try:
-            os.link(temporary, path)
-            return True
-        except FileExistsError:
-            return False
-        except OSError:
-            # a network file system may have created the link and lost the reply
-            if temporary.stat().st_nlink == 2:
-                return True
-    finally:
-        temporary.unlink(missing_ok=True)
-    try:
-        with path.open("xb") as file:  # a file system without hard links
-            file.write(raw)
-        return True
+        with path.open("xb") as file:
+            file.write(json.dumps(content).encode())
     except FileExistsError:
         return False
+    return True

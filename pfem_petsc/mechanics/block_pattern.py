@@ -59,6 +59,15 @@ class BlockPattern:
         expand_columns(self.ptr, self.columns, columns)
         return pointers, columns
 
+    def add_blocks(self, nodes: np.ndarray, blocks: np.ndarray, values: np.ndarray) -> None:
+        """Add blocks (k, 3, 3) to the diagonal blocks of owned nodes (k,), which must be distinct."""
+        ptr = self.ptr.astype(np.int64)
+        start = 6 * ptr[nodes] + 3 * self.diagonal[nodes]
+        width = 3 * (ptr[nodes + 1] - ptr[nodes])
+        for i in range(3):
+            for j in range(3):
+                values[start + i * width + j] += blocks[:, i, j]
+
 
 @kernel
 def expand_columns(ptr, columns, out):

@@ -86,9 +86,8 @@ def motion_of(entry: Support | WallKeys) -> Motion | None:
         return _accelerated(np.array(entry.acceleration, dtype=np.float64))
     if entry.motion is not None:
         rows = np.array(entry.motion, dtype=np.float64)
-        if getattr(entry, "interpolation", "smooth") == "linear":
-            return _linear(rows[:, 0], rows[:, 1:])
-        return _smooth(rows[:, 0], rows[:, 1:])
+        smooth = getattr(entry, "interpolation", "smooth") == "smooth"
+        return Motion(rows[:, 0], pieces(rows[:, 0], rows[:, 1:], smooth), jumps=not smooth)
     if entry.velocity is not None and any(entry.velocity):
         coefficients = np.zeros((1, 4, 3))
         coefficients[0, 1] = entry.velocity
@@ -96,24 +95,21 @@ def motion_of(entry: Support | WallKeys) -> Motion | None:
     return None
 
 
-def _linear(times: np.ndarray, values: np.ndarray) -> Motion:
-    coefficients = np.zeros((len(times), 4, 3))
-    coefficients[:, 0] = values
-    coefficients[:-1, 1] = np.diff(values, axis=0) / np.diff(times)[:, None]
-    return Motion(times, coefficients, jumps=True)
-
-
-def _smooth(times: np.ndarray, values: np.ndarray) -> Motion:
-    coefficients = np.zeros((len(times), 4, 3))
+def pieces(times: np.ndarray, values: np.ndarray, smooth: bool) -> np.ndarray:
+    """Return the coefficients (n, 4, k) of the cubics through values (n, k), by a spline if ``smooth``, else linear;
+    see :class:`Motion`. The last one is constant."""
+    coefficients = np.zeros((len(times), 4, values.shape[1]))
     coefficients[:, 0] = values
     width = np.diff(times)[:, None]
-    if len(times) > 1:
-        slopes = np.column_stack([spline_slopes(times, column) for column in values.T])
-        rate = np.diff(values, axis=0) / width
-        coefficients[:-1, 1] = slopes[:-1]
-        coefficients[:-1, 2] = (3.0 * rate - 2.0 * slopes[:-1] - slopes[1:]) / width
-        coefficients[:-1, 3] = (slopes[:-1] + slopes[1:] - 2.0 * rate) / width**2
-    return Motion(times, coefficients)
+    rate = np.diff(values, axis=0) / width
+    if not smooth:
+        coefficients[:-1, 1] = rate
+        return coefficients
+    slopes = np.array([spline_slopes(times, column) for column in values.T]).reshape(values.T.shape).T
+    coefficients[:-1, 1] = slopes[:-1]
+    coefficients[:-1, 2] = (3.0 * rate - 2.0 * slopes[:-1] - slopes[1:]) / width
+    coefficients[:-1, 3] = (slopes[:-1] + slopes[1:] - 2.0 * rate) / width**2
+    return coefficients
 
 
 def spline_slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -167,39 +163,25 @@ def _accelerated(rows: np.ndarray) -> Motion:
 
 
 @kernel
-def _evaluate(time, first, count, times, start, width, smooth, values, slopes, out):
-    """Write the values of all groups at a time to ``out``, group by group."""
+def _evaluate(time, groups, out):
+    """Write the values of all groups at a time to ``out``, group by group; ``groups``: see :class:`TimeTables`."""
+    first, count, start, width, times, coefficients = groups
     at = 0
     for g in range(len(first)):
-        t, n, w, here = first[g], count[g], width[g], start[g]
-        low, high = 0, n - 1
+        low, high = first[g], first[g] + count[g]
         while high - low > 1:
             middle = (low + high) // 2
-            if times[t + middle] <= time:
+            if times[middle] <= time:
                 low = middle
             else:
                 high = middle
-        passed = time - times[t + low]
-        if time >= times[t + n - 1]:
-            low, passed = n - 1, 0.0
-        v0 = here + low * w
-        if passed <= 0.0:
-            for c in range(w):
-                out[at + c] = values[v0 + c]
-        elif smooth[g]:
-            span = times[t + low + 1] - times[t + low]
-            for c in range(w):
-                y0, m0, m1 = values[v0 + c], slopes[v0 + c], slopes[v0 + w + c]
-                rate = (values[v0 + w + c] - y0) / span
-                square = (3.0 * rate - 2.0 * m0 - m1) / span
-                cube = (m0 + m1 - 2.0 * rate) / (span * span)
-                out[at + c] = y0 + passed * (m0 + passed * (square + passed * cube))
-        else:
-            span = times[t + low + 1] - times[t + low]
-            for c in range(w):
-                y0 = values[v0 + c]
-                out[at + c] = (values[v0 + w + c] - y0) / span * passed + y0
-        at += w
+        passed = max(time - times[low], 0.0) if low < first[g] + count[g] - 1 else 0.0
+        w = width[g]
+        c0 = start[g] + 4 * w * (low - first[g])
+        for c in range(c0, c0 + w):
+            cubic = coefficients[c + 2 * w] + passed * coefficients[c + 3 * w]
+            out[at] = coefficients[c] + passed * (coefficients[c + w] + passed * cubic)
+            at += 1
 
 
 class Group(NamedTuple):
@@ -229,26 +211,15 @@ class TimeTables:
         self.width = sum(group.values.shape[1] for group in groups)
         counts = np.array([len(group.times) for group in groups], dtype=np.int64)
         widths = np.array([group.values.shape[1] for group in groups], dtype=np.int64)
-        smooth = np.array([group.smooth for group in groups], dtype=np.bool_)
-        nothing = np.zeros(0)
-        times = np.concatenate([nothing, *(group.times for group in groups)])
-        values = np.concatenate([nothing, *(np.ravel(group.values) for group in groups)])
-        slopes = nothing
-        if smooth.any():
-            slopes = np.concatenate([np.ravel(_slopes(g) if g.smooth else np.zeros_like(g.values)) for g in groups])
-        first = np.cumsum(counts) - counts
-        start = np.cumsum(counts * widths) - counts * widths
-        self._arguments = (first, counts, times, start, widths, smooth, values, slopes)
+        sizes = 4 * counts * widths
+        times = np.concatenate([np.zeros(0), *(group.times for group in groups)])
+        coefficients = np.concatenate([np.zeros(0), *(pieces(*group).ravel() for group in groups)])
+        # of each group: first row, rows, first coefficient, columns; of all rows: times and coefficients
+        self._groups = np.cumsum(counts) - counts, counts, np.cumsum(sizes) - sizes, widths, times, coefficients
 
     def at(self, time: float, out: np.ndarray) -> None:
         """Write the values (width,) at a time [s], group by group."""
-        _evaluate(time, *self._arguments, out)
-
-
-def _slopes(group: Group) -> np.ndarray:
-    if len(group.times) < 2:
-        return np.zeros_like(group.values)
-    return np.column_stack([spline_slopes(group.times, column) for column in group.values.T])
+        _evaluate(time, self._groups, out)
 
 
 def grouped(tables: Sequence[tuple[np.ndarray, bool]]) -> tuple[list[Group], np.ndarray]:

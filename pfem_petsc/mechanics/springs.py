@@ -53,12 +53,7 @@ class Springs:
         """Add ``weight`` times the stiffness to the values of a matrix."""
         if not weight:
             return
-        ptr = pattern.ptr.astype(np.int64)
-        start = 6 * ptr[self.nodes] + 3 * pattern.diagonal[self.nodes]
-        width = 3 * (ptr[self.nodes + 1] - ptr[self.nodes])
-        for i in range(3):
-            for j in range(3):
-                values[start + i * width + j] += weight * self.stiffness[:, i, j]
+        pattern.add_blocks(self.nodes, weight * self.stiffness, values)
 
     def largest(self) -> np.ndarray:
         """Return the largest stiffness of each node in any direction (m,) [N/m]."""

@@ -259,12 +259,7 @@ class HessianMatrix:
 
     def add_blocks(self, nodes: np.ndarray, blocks: np.ndarray, values: np.ndarray) -> None:
         """Add blocks (k, 3, 3) to the diagonal blocks of owned nodes (k,), which must be distinct."""
-        ptr = self.pattern.ptr.astype(np.int64)
-        start = 6 * ptr[nodes] + 3 * self.pattern.diagonal[nodes]
-        width = 3 * (ptr[nodes + 1] - ptr[nodes])
-        for i in range(3):
-            for j in range(3):
-                values[start + i * width + j] += blocks[:, i, j]
+        self.pattern.add_blocks(nodes, blocks, values)
 
     def constrain(self, scale: float, values: np.ndarray) -> None:
         """Replace rows and columns of prescribed components by ``scale`` on the diagonal."""

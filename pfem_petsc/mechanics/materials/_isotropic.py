@@ -9,7 +9,7 @@ import numpy as np
 
 from ...case.base import NonNegativeFloat, PositiveFloat
 from ..compiled import inlined, kernel
-from .base import Law, MaterialKeys, Softening
+from .base import Law, MaterialKeys, Softening, yield_texts
 
 NOISE = 4.0 * 2.0**-52
 """Residual relative to its terms below which it is rounding."""
@@ -59,13 +59,6 @@ VARIABLES = (("plastic_strain", ""), ("accumulated_plastic_strain", ""))
 ENERGIES = ("elastic_energy", "plastic_heat", "hardening_energy")
 
 _ROUNDING = 1e-8  # E (e1 - e0)/s1, below which the derivative of the mean stress would be rounding
-
-
-def yield_texts(key: str, hint: str, name: str, stress: float, young: float) -> list[str]:
-    """Return a message about a yield stress that is reached at an unrealistic strain, if it is."""
-    if stress <= 0.2 * young:
-        return []
-    return [f"{key}.{name} = {stress:g} Pa is reached at a strain of {stress / young:.3g}; {hint}"]
 
 
 class PlasticKeys(MaterialKeys):

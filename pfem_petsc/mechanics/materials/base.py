@@ -273,6 +273,13 @@ class MaterialKeys(StrictModel):
         return []
 
 
+def yield_texts(key: str, hint: str, name: str, stress: float, young: float) -> list[str]:
+    """Return a message about a yield stress that is reached at an unrealistic strain, if it is."""
+    if stress <= 0.2 * young:
+        return []
+    return [f"{key}.{name} = {stress:g} Pa is reached at a strain of {stress / young:.3g}; {hint}"]
+
+
 @dataclass(frozen=True)
 class Law:
     """A material law.

@@ -11,7 +11,7 @@ from typing import ClassVar
 from numba.extending import register_jitable
 
 from ...case.base import NonNegativeFloat, PositiveFloat
-from .base import Law, MaterialKeys, mean_of_work
+from .base import Law, MaterialKeys, mean_of_work, yield_texts
 
 __all__ = ["LAW", "Parameters", "response"]
 
@@ -39,10 +39,7 @@ class Parameters(MaterialKeys):
         if self.yield_stress is None:
             unused = self.isotropic_hardening > 0.0
             return [f"{key}.isotropic_hardening has no effect without a yield_stress"] if unused else []
-        if self.yield_stress > 0.2 * self.young_modulus:
-            strain = self.yield_stress / self.young_modulus
-            return [f"{key}.yield_stress = {self.yield_stress:g} Pa is reached at a strain of {strain:.3g}; {hint}"]
-        return []
+        return yield_texts(key, hint, "yield_stress", self.yield_stress, self.young_modulus)
 
 
 @register_jitable

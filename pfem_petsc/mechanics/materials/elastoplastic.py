@@ -20,7 +20,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ...case.base import NonNegativeFloat, PositiveFloat
-from .base import Law, MaterialKeys, Softening
+from .base import Law, MaterialKeys, Softening, yield_texts
 
 __all__ = ["LAW", "Parameters", "mean_correction", "response"]
 
@@ -43,12 +43,7 @@ class Parameters(MaterialKeys):
 
     def suspicions(self, key: str, hint: str) -> list[str]:
         """Return messages about unrealistic strains at yield, and about yielding without hardening."""
-        texts = []
-        if self.yield_stress > 0.2 * self.young_modulus:
-            texts.append(
-                f"{key}.yield_stress = {self.yield_stress:g} Pa is reached at a strain of "
-                f"{self.yield_stress / self.young_modulus:.3g}; {hint}"
-            )
+        texts = yield_texts(key, hint, "yield_stress", self.yield_stress, self.young_modulus)
         if self.isotropic_hardening + self.kinematic_hardening == 0.0:
             texts.append(
                 f"{key} yields without hardening: plastic strain localises in one bar of a row, "

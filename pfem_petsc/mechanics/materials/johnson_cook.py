@@ -19,9 +19,8 @@ from pydantic import Field
 
 from ...case.base import NonNegativeFloat, PositiveFloat
 from ..compiled import inlined
-from ._isotropic import yield_texts
 from ._viscous import viscous_law
-from .base import MaterialKeys
+from .base import MaterialKeys, yield_texts
 
 __all__ = ["LAW", "Parameters", "flow_stress", "heating", "stored"]
 

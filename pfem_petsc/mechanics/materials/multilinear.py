@@ -14,8 +14,8 @@ from pydantic import Field, model_validator
 
 from ...case.base import Finite, listed
 from ..compiled import inlined
-from ._isotropic import isotropic_law, yield_texts
-from .base import MaterialKeys
+from ._isotropic import isotropic_law
+from .base import MaterialKeys, yield_texts
 
 __all__ = ["LAW", "Parameters", "curve", "find", "mean", "scale"]
 

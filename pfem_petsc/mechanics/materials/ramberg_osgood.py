@@ -15,8 +15,8 @@ from pydantic import Field
 
 from ...case.base import PositiveFloat
 from ..compiled import inlined
-from ._isotropic import isotropic_law, yield_texts
-from .base import MaterialKeys
+from ._isotropic import isotropic_law
+from .base import MaterialKeys, yield_texts
 from .ludwik import power_mean
 
 __all__ = ["LAW", "Parameters", "curve", "mean", "scale"]

@@ -9,7 +9,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ...case.base import NonNegativeFloat, PositiveFloat
-from .base import BarShapes, Law, MaterialKeys, UnsuitableBarError, mean_of_work
+from .base import BarShapes, Law, MaterialKeys, UnsuitableBarError, mean_of_work, yield_texts
 
 _POINTS = 200  # at which the slope of a branch is looked at
 _AT_ONCE = 4096  # bars
@@ -102,12 +102,7 @@ class Parameters(MaterialKeys):
 
     def suspicions(self, key: str, hint: str) -> list[str]:
         """Return messages about unrealistic yield strains and imperfections."""
-        texts = []
-        if self.yield_stress > 0.2 * self.young_modulus:
-            strain = self.yield_stress / self.young_modulus
-            texts.append(
-                f"{key}.yield_stress = {self.yield_stress:g} Pa is reached at a strain of {strain:.3g}; {hint}"
-            )
+        texts = yield_texts(key, hint, "yield_stress", self.yield_stress, self.young_modulus)
         if self.imperfection > 0.1:
             texts.append(f"{key}.imperfection = {self.imperfection:g} of the length is an arch, not a strut")
         return texts

@@ -152,6 +152,29 @@ class Expression:
         return _OPERATORS[type(operator)]
 
 
+def read_vtk(path: Path, where: str) -> Any:
+    """Return what VTK reads from a file: nothing, or data without cells, from one that is damaged.
+
+    Raises
+    ------
+    InputError
+        Beginning with ``where``, if the file cannot be opened, or VTK cannot read it.
+    """
+    import pyvista
+    from vtkmodules.vtkCommonCore import vtkObject
+
+    vtkObject.GlobalWarningDisplayOff()  # messages of VTK beside those of this program
+    try:
+        with warnings.catch_warnings(record=True):
+            return pyvista.read(readable_whole(path))
+    except OSError as error:
+        raise InputError(f"{where}: cannot open: {error.strerror or error}") from None
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"{where}: cannot be read: {error}") from None
+    finally:
+        vtkObject.GlobalWarningDisplayOn()
+
+
 class MeshField:
     """A field on a mesh of VTK, such as densities of a topology optimisation, whose file every rank reads at first use.
 
@@ -192,13 +215,7 @@ class MeshField:
         import pyvista
 
         path, array, where = self._path, self._array, f"{self._key}.file: {self._path}"
-        try:
-            with warnings.catch_warnings(record=True):  # a file that cannot be read has no cells, which is told below
-                mesh = pyvista.read(readable_whole(path))
-        except OSError as error:
-            raise InputError(f"{where}: cannot open: {error.strerror or error}") from None
-        except (ValueError, RuntimeError) as error:
-            raise InputError(f"{where}: cannot be read: {error}") from None
+        mesh = read_vtk(path, where)
         if not isinstance(mesh, pyvista.DataSet) or mesh.n_cells == 0:
             raise InputError(f"{where}: has no cells to take a field from")
         of_points = array in mesh.point_data

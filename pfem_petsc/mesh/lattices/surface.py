@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...errors import InputError
-from ...files import readable_whole
+from .expressions import read_vtk
 
 if TYPE_CHECKING:
     import pyvista
@@ -150,11 +148,7 @@ class Surface:
         return line, np.clip(along, 0.0, 1.0)
 
 
-_READERS = {
-    ".stl": ("vtkmodules.vtkIOGeometry", "vtkSTLReader"),
-    ".obj": ("vtkmodules.vtkIOGeometry", "vtkOBJReader"),
-    ".ply": ("vtkmodules.vtkIOPLY", "vtkPLYReader"),
-}
+_SUFFIXES = (".stl", ".obj", ".ply")
 _MERGED = 1e-7
 """Points of a file closer than this fraction of its diagonal are merged if it is not closed without that."""
 
@@ -170,23 +164,12 @@ def read_surface(path: Path, scale: float) -> Surface:
     import pyvista
 
     where = f"mesh.surface.file: {path}"
-    if path.suffix.lower() not in _READERS:
-        raise InputError(f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_READERS)}")
-    try:
-        with open(readable_whole(path), "rb"):
-            pass
-    except OSError as error:
-        raise InputError(f"{where}: cannot open: {error.strerror}") from None
-    module, name = _READERS[path.suffix.lower()]
-    reader = getattr(importlib.import_module(module), name)()
-    messages = _observed(reader)
-    reader.SetFileName(str(path))
-    reader.Update()
-    data = pyvista.wrap(reader.GetOutput())
+    if path.suffix.lower() not in _SUFFIXES:
+        raise InputError(f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_SUFFIXES)}")
+    data = read_vtk(path, where)
     points, triangles = _triangles(data)
     if len(triangles) == 0 or not np.isfinite(points).all():
-        what = f" ({messages[0]})" if messages else ""
-        raise InputError(f"{where}: no surface of triangles could be read from it{what}")
+        raise InputError(f"{where}: no surface of triangles could be read from it")
     count, edge = _open_edges(triangles)
     if count:
         points, triangles = _better((points, triangles), _triangles(data, _MERGED))
@@ -207,20 +190,6 @@ def read_surface(path: Path, scale: float) -> Surface:
     if surface.volume < 0.0:
         surface = Surface(surface.points, triangles[:, ::-1].copy())
     return surface
-
-
-def _observed(reader: Any) -> list[str]:
-    """Return a list that gets the messages of a VTK object, which would go to stderr."""
-    messages: list[str] = []
-
-    def note(_reader: object, _event: str, text: str = "") -> None:
-        messages.append(re.sub(r"^\w+: In .*?\): ", "", " ".join(str(text).split()))[:200])
-
-    note.CallDataType = "string0"  # type: ignore[attr-defined]
-    for event in ("ErrorEvent", "WarningEvent"):
-        for source in (reader, reader.GetExecutive()):
-            source.AddObserver(event, note)
-    return messages
 
 
 def _triangles(data: pyvista.PolyData, tolerance: float = 0.0) -> _Triangles:

@@ -48,34 +48,14 @@ def warnings_before(case: Case, model: Model, plan: Plan, first: bool = True) ->
     geometry, source = Geometry(model), f"{case.source}: " if first else ""
     texts = [f"{source}{text}" for text in odd_numbers(case, model)]
     texts += memory_warning(model, plan, source) + idle_walls(model) + (wall_gaps(model)[1] if first else [])
-    chained, lowest = geometry.chains() if _is_own(case) else (0, -1)
     if first:
-        texts += _mesh_warnings(case, model, geometry)
-        if chained:
-            nodes = "1 node is" if chained == 1 else f"{chained} nodes are"
+        count, nodes, lowest = geometry.parts()
+        if count > 1 and not model.links:  # links connect bodies
             texts.append(
-                f"{nodes} only connected to two collinear bars, and nothing supports them laterally; the first is node "
-                f"{lowest}. Was the mesh subdivided? Each member of a truss is one bar: in Gmsh `Transfinite Curve "
-                "{:} = 2;` (an intended chain of bars, such as a cable, needs tension to be stiff)"
+                f"the truss is in {count} parts that no bar connects; the smallest has {nodes} nodes, node {lowest} "
+                "among them"
             )
-    return texts + _loose_nodes(model, geometry, chained)
-
-
-def _mesh_warnings(case: Case, model: Model, geometry: Geometry) -> list[str]:
-    texts = []
-    count, nodes, lowest = geometry.parts()
-    if count > 1 and not model.links:  # links connect bodies
-        texts.append(
-            f"the truss is in {count} parts that no bar connects; the smallest has {nodes} nodes, node {lowest} among "
-            "them"
-        )
-    pairs, shown = geometry.overlaps() if _is_own(case) else (0, [])
-    if pairs:
-        texts.append(
-            f"{pairs} pair{'s' if pairs > 1 else ''} of bars overlap{'' if pairs > 1 else 's'} from a common node on: "
-            f"{_list(pairs, shown)}; if a node is intended to divide the longer one, remove that bar"
-        )
-    return texts
+    return texts + _loose_nodes(case, model, geometry)
 
 
 def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
@@ -112,21 +92,24 @@ def _is_own(case: Case) -> bool:
     return not case.mesh.arranged or getattr(case.mesh.parameters, "cell", None) is not None
 
 
-def _loose_nodes(model: Model, geometry: Geometry, chained: int) -> list[str]:
-    """Warn of nodes that can move freely, besides those within ``chained`` bars. Collective.
+def _loose_nodes(case: Case, model: Model, geometry: Geometry) -> list[str]:
+    """Warn of nodes that can move freely, as those within a member that was divided. Collective.
 
     Static analyses that need a stiffness name such nodes and their directions themselves, if it is singular.
     """
-    static = model.case.static is not None and model.case.static.method != "relaxation"
+    static = case.static is not None and case.static.method != "relaxation"
     if static and names_motions(model):
         return []
     loose, first = geometry.unbraced()
-    if loose <= chained:
-        return []
-    return [
+    divided = (
+        ". Was the mesh subdivided? Each member of a truss is one bar: in Gmsh `Transfinite Curve {:} = 2;` (an "
+        "intended chain of bars, such as a cable, needs tension to be stiff)"
+    )
+    text = (
         f"{loose} node{'s' if loose > 1 else ''} can move freely, to first order: bars and supports hold too few "
-        f"directions there; the first is node {first}"
-    ]
+        f"directions there; the first is node {first}{divided if _is_own(case) else ''}"
+    )
+    return [text] if loose else []
 
 
 def _list(count: int, shown: list[str]) -> str:

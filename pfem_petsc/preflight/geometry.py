@@ -1,4 +1,4 @@
-"""Checks of the nodes and bars of a truss: parts, chains, overlaps, nodes on bars, bracing.
+"""Checks of the nodes and bars of a truss: parts, nodes on bars, bracing.
 
 Mechanisms are not an error in dynamics: chains and cables consist of them. They are reported because unintended ones
 are a common mistake in a truss.
@@ -20,17 +20,12 @@ from ..mesh.slab import slab_of
 if TYPE_CHECKING:
     from ..stepping.model import Model
 
-_ANGLE = 1e-6
-"""Bars that meet at a node at a smaller angle overlap [rad]; a node whose distance from a bar is less than this
-fraction of its length lies on it. Coordinates saved in single precision have this accuracy."""
+_NEAR = 1e-6
+"""A node whose distance from a bar is less than this fraction of its length lies on it. Coordinates saved in single
+precision have this accuracy."""
 
-_STRAIGHT = 1e-4  # angle between two bars that count as collinear [rad]
 _SHOWN = 5
-_WINDOW = 64  # neighbours in the order of directions that are compared with a bar
 _RANK = 1e-9
-
-# A generic direction, to which bars of a mesh are unlikely to be perpendicular.
-_GENERIC = np.array([0.6180339887, 0.4656766723, 0.6335178142])
 
 _LARGEST = 600
 """Maximum number of unknowns for the global test, a singular value decomposition of a dense matrix."""
@@ -84,61 +79,6 @@ class Geometry:
         smallest = min(zip(total.tolist(), own.tolist()), default=(mesh.n_nodes + 1, -1))
         return comm.allreduce(len(own)), *min(comm.allgather(smallest))
 
-    def chains(self) -> tuple[int, int]:
-        """Return the number of unsupported nodes with exactly two collinear bars, and the lowest of them.
-
-        A straight rod is excluded: its nodes are intended, so a truss on one line has no such nodes.
-        """
-        mesh, owned = self._mesh, self._mesh.n_owned
-        way = self._directions(slice(None))
-        leaving = np.zeros((mesh.n_local, 3))
-        np.add.at(leaving, mesh.bars[:, 0], way)
-        np.subtract.at(leaving, mesh.bars[:, 1], way)
-        found = np.bincount(mesh.bars.ravel(), minlength=mesh.n_local)[:owned] == 2
-        found &= np.linalg.norm(leaving[:owned], axis=1) < _STRAIGHT
-        found &= ~self._model.supports.spans().any(axis=(1, 2))
-        return self._lowest(found & (len(self.span) > 1))
-
-    def _directions(self, bars: np.ndarray | slice) -> np.ndarray:
-        """Return unit vectors (n, 3) of bars from their first to their second ends."""
-        ends = self._mesh.points[self._mesh.bars[bars]]
-        direction = ends[:, 1] - ends[:, 0]
-        direction /= np.sqrt(np.einsum("ij,ij->i", direction, direction))[:, None]
-        return direction
-
-    def overlaps(self) -> tuple[int, list[str]]:
-        """Return the number of pairs of bars with a common node and direction, and the lowest few as texts.
-
-        A common mistake is a bar from node 0 to node 2 together with bars 0-1 and 1-2 on the same line. The truss is
-        then stiffer and heavier there than intended. The bars of a node are compared in the order of their directions
-        along a generic line: O(n log n) for n bars.
-        """
-        mesh = self._mesh
-        along = self._directions(slice(None)) @ _GENERIC
-        # bar k has the halves 2 k and 2 k + 1 at its ends, the second one reversed
-        nodes = mesh.bars.ravel()
-        half = np.flatnonzero(nodes < mesh.n_owned)
-        half = half[mesh.bar_ids[half // 2] < mesh.n_bars - mesh.n_connectors]  # springs lie where they like
-        # one number sorts by node, then by direction; for 10^7 nodes its last digit is 1e-9
-        key = nodes[half] + 0.25 * np.where(half % 2, -1.0, 1.0) * along[half // 2]
-        order = np.argsort(key)
-        key, half, pairs = key[order], half[order], [np.empty((0, 2), np.intp)]
-        for shift in range(1, min(_WINDOW, len(key))):
-            near = np.flatnonzero(key[shift:] - key[:-shift] < _ANGLE)
-            if len(near) == 0:
-                break
-            a, b = half[near], half[near + shift]
-            sign = np.where(a % 2 == b % 2, 1.0, -1.0)[:, None]
-            apart = self._directions(a // 2) - sign * self._directions(b // 2)
-            same = (np.einsum("ij,ij->i", apart, apart) < _ANGLE**2) & (nodes[a] == nodes[b])
-            pairs.append(np.stack([a, b], axis=1)[same] // 2)
-        found = np.concatenate(pairs)
-        rows = np.concatenate([mesh.bar_ids[found][..., None], mesh.node_ids[mesh.bars[found]]], axis=2)
-        each = sorted(sorted(pair) for pair in rows[np.argsort(rows[:, :, 0].min(axis=1))][:1000].tolist())[:_SHOWN]
-        every = sorted(pair for some in self._comm.allgather(each) for pair in some)
-        shown = [f"{_bar(*one)} and {_bar(*two)}" for one, two in every[:_SHOWN]]
-        return self._comm.allreduce(len(found)), shown
-
     def nodes_on_bars(self) -> tuple[int, list[str], int, list[str]] | None:
         """Return the number of nodes on bars between their ends, and of coinciding nodes, each with the lowest few as
         texts; None if the search would take too long, as lengths of bars differ too much."""
@@ -146,7 +86,7 @@ class Geometry:
         bars = np.arange(len(mesh.bars))[mesh.counted]
         bars = bars[mesh.bar_ids[bars] < mesh.n_bars - mesh.n_connectors]
         ends, ids = mesh.points[mesh.bars[bars]], mesh.node_ids[: mesh.n_owned].astype(np.int64)
-        margin = _ANGLE * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        margin = _NEAR * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
         labels = mesh.node_ids[mesh.bars[bars]].astype(np.int64)
         own = Segments(mesh.bar_ids[bars].astype(np.int64), labels, ends, margin)
         at = np.repeat(mesh.points[: mesh.n_owned, None], 2, axis=1)
@@ -157,7 +97,7 @@ class Geometry:
         between, on_bars, twins = 0, [], np.empty((0, 2), np.int64)
         for pairs in search.pairs():
             part = pairs.at[:, 0]
-            inner = (part > _ANGLE) & (part < 1.0 - _ANGLE)
+            inner = (part > _NEAR) & (part < 1.0 - _NEAR)
             between += int(inner.sum())
             rows = np.concatenate([pairs.ids, pairs.labels[:, 0]], axis=1)[inner]
             on_bars = sorted(on_bars + rows.tolist())[:_SHOWN]

@@ -1,4 +1,4 @@
-"""Parts, divided members, overlapping bars, and nodes that lie on bars they are not connected to."""
+"""Parts, divided members, and nodes that lie on bars they are not connected to."""
 
 import numpy as np
 import pytest
@@ -22,11 +22,7 @@ TRIANGLE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
 
 def test_bar_that_lies_along_two_others(told):
     """The slip: bar 4 from node 0 to node 2, and node 1 in the middle, connected to both."""
-    _, (overlap, lies) = told(TRIANGLE, [(0, 1), (1, 2), (1, 3), (0, 3), (2, 0), (3, 2)])
-    assert overlap.startswith(
-        "2 pairs of bars overlap from a common node on: bar 0 (nodes 0 and 1) and bar 4 (nodes 2 and 0), "
-        "bar 1 (nodes 1 and 2) and bar 4 (nodes 2 and 0); "
-    )
+    _, (lies,) = told(TRIANGLE, [(0, 1), (1, 2), (1, 3), (0, 3), (2, 0), (3, 2)])
     assert lies.startswith("1 node lies on a bar that it is not connected to: node 1 on bar 4 (nodes 2 and 0); ")
 
 
@@ -47,7 +43,6 @@ def test_overlaps_without_a_common_node(told):
     (text,) = [text for text in warnings if "lie on bars" in text]
     on = "node 1 on bar 0 (nodes 0 and 2), node 2 on bar 1 (nodes 1 and 3)"
     assert text.startswith(f"2 nodes lie on bars that they are not connected to: {on}; ")
-    assert not any("overlap" in text for text in warnings)
 
 
 def test_nodes_that_were_not_merged(told):
@@ -113,7 +108,7 @@ def test_generated_meshes_have_no_overlaps(comm, name, shared_tmp_path):
     slab = lookup("pfem_petsc.mesh.generators", mesh.generator, "").generate(mesh.parameters, 0, 1)
     entries, warnings = inspected(case_of(shared_tmp_path, comm, slab.points, slab.bars), comm)
     assert not {"same place", "nodes on bars"} & set(entries)
-    assert not any("overlap" in text or "on bars" in text for text in warnings)
+    assert not any("on bars" in text for text in warnings)
 
 
 @pytest.mark.parametrize(("sizes", "seed"), [((60, 41, 7), 4), ((3, *(2,) * 70), 6)])
@@ -151,12 +146,9 @@ def test_subdivided_members_are_told(told, parts):
     _, warnings = told(*divided(points, bars, parts), [] if parts == 1 else [len(points)])
     found = [text for text in warnings if "Transfinite Curve {:} = 2" in text]
     count = len(bars) * (parts - 1) - 1
-    told_of = [text.startswith(f"{count} nodes are only connected to two collinear bars") for text in found]
-    assert told_of == [True] * (parts > 1)
-    assert not any("can move freely" in text for text in warnings)
+    assert [text.startswith(f"{count} nodes can move freely") for text in found] == [True] * (parts > 1)
 
 
-@pytest.mark.parametrize("bend", [0.0, 0.2])
-def test_a_rod_and_a_bent_chain_are_no_subdivided_truss(told, bend):
-    points = [[0.1 * k, bend * 0.1 * k * k, 0.0] for k in range(8)]
-    assert not any("collinear" in text for text in told(points, [[k, k + 1] for k in range(7)])[1])
+def test_a_rod_is_no_subdivided_truss(told):
+    points = [[0.1 * k, 0.0, 0.0] for k in range(8)]
+    assert not any("can move freely" in text for text in told(points, [[k, k + 1] for k in range(7)])[1])

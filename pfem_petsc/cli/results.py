@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import printable
+from ..post.options import PlotOptions, add_options
 from .parser import PROGRAM, Verb, surviving
 
 if TYPE_CHECKING:
@@ -113,42 +115,7 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: that of the first result"
     )
-    parser.add_argument(
-        "--curves",
-        metavar="NAME",
-        nargs="+",
-        action="extend",
-        help="columns of the history to plot in one picture (info lists them), or components: probe/tip/velocity.x, "
-        "momentum.norm; default: the usual pictures",
-    )
-    parser.add_argument(
-        "--against", metavar="NAME", help="column or component over which the curves are drawn; default: time"
-    )
-    parser.add_argument(
-        "--spectrum", metavar="NAME", nargs="+", action="extend", help="columns whose amplitude spectra are drawn"
-    )
-    parser.add_argument(
-        "--window",
-        default="hann",
-        help="window of spectra: hann, flattop, hamming, blackman, rectangular; default: %(default)s",
-    )
-    parser.add_argument("--highest", metavar="HZ", type=float, help="frequency at which the spectra end")
-    parser.add_argument(
-        "--filter",
-        dest="force_filter",
-        metavar="FILTER",
-        help="filter of forces and of --curves: cfc:CLASS (SAE J211), butterworth:HZ[:ORDER], mean:SECONDS, none; "
-        "default: forces by the mean of 2 %% of the run",
-    )
-    parser.add_argument(
-        "--format",
-        dest="formats",
-        metavar="FORMAT",
-        nargs="+",
-        action="extend",
-        help="png, svg, pdf; csv writes what the pictures show as tables; default: png",
-    )
-    parser.add_argument("--no-closed-form", dest="closed_forms", action="store_false", help="do not draw closed forms")
+    add_options(PlotOptions, parser)
 
 
 def plot_history(arguments: argparse.Namespace) -> int:
@@ -156,9 +123,8 @@ def plot_history(arguments: argparse.Namespace) -> int:
     from ..post.plot import plot
 
     paths = [surviving(result) for result in arguments.results]
-    names = ("curves", "against", "spectrum", "window", "highest", "force_filter", "closed_forms")
-    options = {name: getattr(arguments, name) for name in names}
-    for path in plot(paths, arguments.output, formats=arguments.formats or ("png",), **options):
+    options = {each.name: getattr(arguments, each.name) for each in fields(PlotOptions)}
+    for path in plot(paths, arguments.output, **options):
         print(path)
     return 0
 

@@ -14,7 +14,8 @@ from ..errors import InputError
 from .camera import Camera
 from .chart import opened
 from .motion import chosen_frames
-from .render import Film, Options
+from .options import Options
+from .render import Film
 from .scene import FEW, VARIABLE, WALL_COLOUR, Segments, add_wall, point_camera, require_rendering
 
 _WIDTHS = ((300, 3.0), (20_000, 1.8))  # least widths of bars in pixels, by the number of bars
@@ -39,7 +40,7 @@ def render_html(
     frame : number of the snapshot; -1: the last
     note : receives messages
     options : ``field, component, clim, symmetric, cmap, scale, style, radius_scale, title, view``, see
-        :class:`~pfem_petsc.post.render.Options`
+        :class:`~pfem_petsc.post.options.Options`
 
     Raises
     ------

@@ -47,7 +47,7 @@ class Motion:
     result : an open result
     frames : numbers of its snapshots
     options : ``scale`` of displacements, and what is drawn in addition to the bars: ``ghost``, ``marks``, ``trails``,
-        see :class:`~pfem_petsc.post.render.Options`
+        see :class:`~pfem_petsc.post.options.Options`
     note : receives messages
 
     Attributes

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,11 @@ import numpy as np
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.units import TIME, engineering, unit_of
-from .chart import COLOURS, REFERENCE, STYLE, Chart, Curve, Panel, check_formats, largest, opened
+from .chart import COLOURS, REFERENCE, STYLE, Chart, Curve, Panel, largest, opened
 from .closed_forms import ClosedForm, closed_form
 from .curves import History, column, draw_curves, draw_spectra, exact_curves, read, usual_curves, words
-from .filters import AS_COMPUTED, WINDOWS, Filter, make_filter
+from .filters import AS_COMPUTED, Filter, make_filter
+from .options import PlotOptions
 
 WINDOW = 0.02  # width of the moving average of forces, relative to the run
 
@@ -28,49 +28,6 @@ _QUANTITIES = ("displacement", "velocity", "reaction")
 """Of probes that have panels; accelerations in impacts are mostly noise."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """Options of :func:`plot`.
-
-    Parameters
-    ----------
-    curves : names of history columns, drawn into ``curves.png`` instead of the other pictures; an existing
-        ``curves.png`` is kept, and the new one is ``curves_2.png`` and so on
-    formats : of :data:`~pfem_petsc.post.chart.FORMATS`; "csv" writes a table of each picture, with all rows in SI
-        units, and, without curves, ``history.csv``
-    force_filter : of the forces of walls and others, and of the curves with which it is given: see
-        :func:`~pfem_petsc.post.filters.make_filter`; None: the mean of the last 2 % of the run, for forces alone
-    against : column or component, like ``probe/tip/position.x``, over which the curves are drawn instead of time
-    spectrum : names of history columns whose amplitude spectra are drawn into ``spectra.png`` instead
-    window : of the spectra, one of :data:`~pfem_petsc.post.filters.WINDOWS`
-    highest : frequency [Hz] at which the spectra end; None: half the sampling rate
-    closed_forms : whether closed forms are drawn where the case has one
-
-    Raises
-    ------
-    InputError
-        For an unknown format or window, and options that exclude each other.
-    """
-
-    curves: Iterable[str] | None = None
-    formats: Iterable[str] = ("png",)
-    force_filter: str | None = None
-    against: str | None = None
-    spectrum: Iterable[str] | None = None
-    window: str = "hann"
-    highest: float | None = None
-    closed_forms: bool = True
-
-    def __post_init__(self) -> None:
-        if self.spectrum is not None and (self.curves is not None or self.against is not None):
-            raise InputError("plot: spectrum is a picture of its own: give it without curves and against")
-        if self.against is not None and self.curves is None:
-            raise InputError(f"plot: against = {self.against!r} needs curves, the columns to draw over it")
-        if self.window not in WINDOWS:
-            raise InputError(f"plot: window = {self.window!r} is not known; it is one of {', '.join(WINDOWS)}")
-        object.__setattr__(self, "formats", check_formats(self.formats))
-
-
 def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | None = None, **options: Any) -> list[Path]:
     """Draw the history: ``energies.png``, ``momentum.png``, ``probes.png``, ``walls.png``, ``solver.png`` and others.
 
@@ -79,7 +36,7 @@ def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | Non
     result_path : result file or its folder, or an open result; several of them are drawn over each other, into
         ``comparison.png`` without ``curves``
     output : folder of the pictures; None: beside the (first) result
-    options : see :class:`Options`
+    options : see :class:`~pfem_petsc.post.options.PlotOptions`
 
     Returns
     -------
@@ -96,7 +53,7 @@ def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | Non
 
     several = isinstance(result_path, Sequence) and not isinstance(result_path, str)
     paths = list(result_path) if several else [result_path]
-    given = Options(**options)
+    given = PlotOptions(**options)
     suffixes = given.formats
     chosen = make_filter(given.force_filter) if given.force_filter is not None else None
     if not paths:

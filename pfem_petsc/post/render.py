@@ -7,9 +7,8 @@ import pickle
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,25 +16,17 @@ import numpy as np
 
 from ..errors import InputError
 from ..parallel.agreement import agreed
-from .camera import Moves, at_one_scale
+from .camera import at_one_scale
 from .chart import opened
 from .colours import MARKS, ColourField, ColourScale, limits_of
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_times
+from .options import Options
 from .page import Heading, Inset, Page, grid, inset_room, over
 from .scene import FEW, TUBE_LIMIT, Scene, Style, few_threads
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-STYLES = ("auto", "tubes", "lines")
-VIDEOS = {
-    "mp4": ("mp4",),
-    "gif": ("gif",),
-    "both": ("mp4", "gif"),
-    "none": (),
-    "webm": ("webm",),
-    "webp": ("webp",),
-}
 SHORT = 2.0  # seconds below which a film is too short to follow
 TELL = 5.0  # seconds between two progress messages
 SHARE = 12  # frames for which it is worth to start another process
@@ -58,116 +49,11 @@ _ENCODERS = {
 }
 
 
-@dataclass(frozen=True)
-class Options:
-    """Options of :func:`render`.
-
-    Parameters
-    ----------
-    field : point or cell field that colours the bars
-    component : "x", "y" or "z" of a vector field; None: its length
-    frames : numbers of snapshots, or how many of them (evenly spaced); None: all, up to 300
-    fps : frames per second of the film
-    size : of a frame in pixels
-    view : "xy", "xz", "yz", "iso", "front", "back", "left", "right", "top", "bottom", the direction (3,) from the
-        structure to the eye, or "auto": along the flat direction of a flat structure, oblique otherwise
-    video : "mp4", "gif", "both", "webm", "webp" or "none"; None: "mp4", "webm" with a transparent background
-    poster : also draw six instants on one page
-    clim : range of the colours in the field's SI unit; None: from the snapshots, symmetric for signed fields
-    symmetric : whether the range is symmetric about zero for any field
-    cmap : matplotlib colour map or its name
-    scale : factor on the nodes' displacements since the first snapshot; walls are not scaled
-    style : "tubes" of the radii of the sections, "lines", or "auto": tubes for up to 20,000 bars
-    radius_scale : factor on the radii of tubes
-    bar_width : least width of bars in pixels
-    nodes : whether to draw nodes as balls; None: for small models
-    ghost : whether to draw the first snapshot, pale, behind the others
-    marks : "broken" bars as stubs, "yielded" ones with a rim
-    trails : names of probes whose trajectories are drawn
-    inset : column of the history, drawn as a curve with a marker in a corner, of several results with the same axes
-    zoom, orbit, path, follow : of the camera, see :class:`~pfem_petsc.post.camera.Moves`
-    rate : frames per simulated second, between snapshots if need be; None: frames are snapshots
-    span : first and last time [s] of the film
-    labels : of several results; None: the names of their folders
-    transparent : whether frames and film have a transparent background
-    title : None: that of the case
-
-    Raises
-    ------
-    InputError
-        For values that make no picture.
-    """
-
-    field: str = "stress"
-    component: str | int | None = None
-    frames: int | Iterable[int] | None = None
-    fps: float = 24
-    size: tuple[int, int] = (1280, 720)
-    view: str | Sequence[float] = "auto"
-    video: str | None = None
-    poster: bool = True
-    clim: tuple[float, float] | None = None
-    symmetric: bool = False
-    cmap: Any = None
-    scale: float = 1.0
-    style: str = "auto"
-    radius_scale: float = 1.0
-    bar_width: float | None = None
-    nodes: bool | None = None
-    ghost: bool = False
-    marks: Sequence[str] = ()
-    trails: Sequence[str] = ()
-    inset: str | None = None
-    zoom: float = 1.0
-    orbit: float = 0.0
-    path: Any = None
-    follow: str | None = None
-    rate: float | None = None
-    span: Sequence[float] | None = None
-    labels: Sequence[str] | None = None
-    transparent: bool = False
-    title: str | None = None
-
-    def __post_init__(self) -> None:
-        video, size = self.video or ("webm" if self.transparent else "mp4"), self.size
-        if video not in VIDEOS:
-            raise InputError(f"render: video = {video!r} is not known; it is one of {', '.join(VIDEOS)}")
-        if self.transparent and video in ("mp4", "both"):
-            raise InputError(
-                f"render: video = {video!r}: MP4 has no transparent background; use webm, webp, gif or none"
-            )
-        if size[0] < 160 or size[1] < 120 or max(size) > 8192:
-            raise InputError(
-                f"render: size = {size[0]} x {size[1]} pixels is out of range; widths are 160 to 8192, heights 120 to "
-                "8192"
-            )
-        if not 1e-3 <= self.fps <= 1e3:
-            raise InputError(f"render: fps = {self.fps:g} must be from 0.001 to 1000 frames per second")
-        if self.style not in STYLES:
-            raise InputError(f"render: style = {self.style!r} is not known; it is one of {', '.join(STYLES)}")
-        if not 1e-6 <= self.radius_scale <= 1e6:
-            raise InputError(f"render: radius_scale = {self.radius_scale:g} must be from 1e-6 to 1e6")
-        if self.bar_width is not None and not 0.0 < self.bar_width <= 500.0:
-            raise InputError(f"render: bar_width = {self.bar_width:g} must be positive, and 500 pixels at most")
-        assert self.moves  # refuses what makes no film
-        if isinstance(self.frames, Iterable):
-            object.__setattr__(self, "frames", list(self.frames))
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """The kinds of films to make."""
-        return VIDEOS[self.video or ("webm" if self.transparent else "mp4")]
-
-    @property
-    def moves(self) -> Moves:
-        """The view and its movement."""
-        return Moves(self.view, self.zoom, self.orbit, self.path, self.follow)
-
-    def style_of(self, result: Any, note: Callable[[str], None]) -> Style:
-        """Return how the bars of a result are drawn."""
-        tubes = len(result.bars) <= TUBE_LIMIT if self.style == "auto" else self.style == "tubes"
-        radius = drawn_radii(result, note if self.style == "tubes" else None) if tubes else None
-        return Style(tubes, None if radius is None else self.radius_scale * radius, self.bar_width, self.nodes)
+def _style(options: Options, result: Any, note: Callable[[str], None]) -> Style:
+    """Return how the bars of a result are drawn."""
+    tubes = len(result.bars) <= TUBE_LIMIT if options.style == "auto" else options.style == "tubes"
+    radius = drawn_radii(result, note if options.style == "tubes" else None) if tubes else None
+    return Style(tubes, None if radius is None else options.radius_scale * radius, options.bar_width, options.nodes)
 
 
 def render(
@@ -187,7 +73,7 @@ def render(
     note : receives messages, such as walls that cannot be drawn, and progress
     comm : its ranks divide the frames, and the first one makes the film; None, or one rank: processes of this machine
         divide the frames of a long film
-    options : see :class:`Options`
+    options : see :class:`~pfem_petsc.post.options.Options`
 
     Returns
     -------
@@ -302,7 +188,7 @@ class Film:
             note(f"{self.colours[0].title} is zero in all frames, to rounding")
         self.scale = ColourScale(limits, options.cmap, self.colours[0].unit)
         self.motions = [Motion(result, chosen, options, note) for result in shown]
-        self.styles = [options.style_of(result, note) for result in results]
+        self.styles = [_style(options, result, note) for result in results]
         for motion, style in zip(self.motions, self.styles, strict=True):
             if style.radius is not None and len(style.radius):
                 motion.reach = 1.2 * float(style.radius.max())  # balls of nodes are that much wider than bars

@@ -11,10 +11,10 @@ from helpers.pictures import box, camera_of, draw, drawing, near, picture_of, pi
 from helpers.synthetic import SyntheticResult, lattice, ring
 
 from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.cli.render import _frames
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.colours import GHOST, MARKS, TRAILS
 from pfem_petsc.post.motion import chosen_frames, drawn_radii, radii_of
+from pfem_petsc.post.options import frames_of
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.scene import Layer, Style
 
@@ -232,5 +232,5 @@ def test_refused_looks(tmp_path, flying, options, message):
 )
 def test_frames_by_number_and_by_index(words, chosen):
     """A single frame is the last one: at the first, a structure looks like its mesh."""
-    assert chosen_frames(_frames(words), np.arange(12.0), print) == chosen
+    assert chosen_frames(frames_of(words), np.arange(12.0), print) == chosen
     assert chosen_frames(1, np.arange(12.0), print, span=(2.0, 5.5)) == [5]

@@ -1,0 +1,252 @@
+"""The options of pictures, films and curves, declared once for Python, the command line, and their help."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    from .camera import Moves
+
+STYLES = ("auto", "tubes", "lines")
+VIDEOS = {
+    "mp4": ("mp4",),
+    "gif": ("gif",),
+    "both": ("mp4", "gif"),
+    "none": (),
+    "webm": ("webm",),
+    "webp": ("webp",),
+}
+SIZES = {"720p": (1280, 720), "1080p": (1920, 1080), "4k": (3840, 2160)}
+
+
+def _view(text: str) -> str | list[float]:
+    if "," not in text:
+        return text
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a direction like 1,-1,0.5") from None
+
+
+def frames_of(text: str) -> int | list[int]:
+    """Return a number of frames, or the numbers of frames with commas between or behind them."""
+    parts = text.split(",")
+    if len(parts) == 2 and not parts[1].strip():
+        del parts[1]  # a list of one number: "12,"
+    try:
+        numbers = [int(part) for part in parts]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number of frames nor a list like 0,10,20") from None
+    return numbers if "," in text else numbers[0]
+
+
+def _size(text: str) -> tuple[int, int]:
+    if text.lower() in SIZES:
+        return SIZES[text.lower()]
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a size in pixels like 1280x720, or one of {', '.join(SIZES)}"
+        )
+    return int(width), int(height)
+
+
+def _option(default: Any, text: str, **settings: Any) -> Any:
+    """Declare an option: its help, and what ``argparse`` must know to read it."""
+    return field(default=default, metadata={"help": text, **settings})
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of :func:`~pfem_petsc.post.render.render`.
+
+    Raises
+    ------
+    InputError
+        For values that make no picture.
+    """
+
+    field: str = _option("stress", "point or cell field that colours the bars; default: stress")
+    component: str | int | None = _option(None, "x, y or z of a vector field; default: its length")
+    frames: int | Iterable[int] | None = _option(
+        None,
+        "how many snapshots to draw, evenly spaced, or their numbers (one: 12,); default: all, up to 300",
+        metavar="N[,N...]",
+        type=frames_of,
+    )
+    fps: float = _option(24.0, "frames per second of the film; default: 24", type=float)
+    size: tuple[int, int] = _option(
+        (1280, 720), "pixels of a frame, or 720p, 1080p, 4k; default: 1280x720", metavar="WxH", type=_size
+    )
+    view: str | Sequence[float] = _option(
+        "auto",
+        "xy, xz, yz, iso, front, back, left, right, top, bottom, a direction to the eye as x,y,z, or auto: along the "
+        "flat direction of a flat structure, oblique otherwise; default: auto",
+        type=_view,
+    )
+    video: str | None = _option(None, "mp4, gif, both, webm, webp or none; default: mp4, webm with transparent")
+    poster: bool = _option(True, "write no page of six instants", flag="--no-poster", action="store_false")
+    clim: tuple[float, float] | None = _option(
+        None,
+        "range of the colours [SI]; default: of the values, symmetric for signed fields",
+        metavar=("LOW", "HIGH"),
+        nargs=2,
+        type=float,
+    )
+    symmetric: bool = _option(False, "range of the colours symmetric about zero", action="store_true")
+    cmap: Any = _option(None, "matplotlib colour map or its name")
+    scale: float = _option(
+        1.0, "factor on the displacements since the first snapshot, not of walls; default: 1", type=float
+    )
+    style: str = _option("auto", "tubes (with the radii of the sections), lines, auto: tubes up to 20,000 bars")
+    radius_scale: float = _option(1.0, "factor on the radii of tubes; default: 1", type=float)
+    bar_width: float | None = _option(None, "minimum width of the bars", metavar="PIXELS", type=float)
+    nodes: bool | None = _option(
+        None, "draw nodes as balls; default: for small models", action=argparse.BooleanOptionalAction
+    )
+    ghost: bool = _option(False, "draw the first snapshot, pale, behind the others", action="store_true")
+    marks: Sequence[str] = _option(
+        (),
+        "mark bars that are broken (as stubs) or yielded (by a rim): one or both",
+        flag="--mark",
+        metavar="STATE",
+        nargs="+",
+    )
+    trails: Sequence[str] = _option((), "draw the trajectories of probes", metavar="PROBE", nargs="+")
+    inset: str | None = _option(
+        None, "curve of the history with a moving marker, as wall/floor/force.z", metavar="COLUMN"
+    )
+    zoom: float = _option(1.0, "factor on the size in the picture; default: 1", type=float)
+    orbit: float = _option(0.0, "angle of the camera's orbit during the film", metavar="DEGREES", type=float)
+    path: Any = _option(
+        None, "CSV of time, azimuth, elevation [degrees], zoom of the camera; rows of these", metavar="FILE"
+    )
+    follow: str | None = _option(
+        None,
+        "keep the structure, or a probe, in the middle of the picture",
+        metavar="PROBE",
+        nargs="?",
+        const="structure",
+    )
+    rate: float | None = _option(
+        None, "frames per simulated second, also between snapshots: slow motion", metavar="N", type=float
+    )
+    span: Sequence[float] | None = _option(
+        None, "simulated times [s] of the film", metavar=("FROM", "TO"), nargs=2, type=float
+    )
+    labels: Sequence[str] | None = _option(
+        None, "captions of the results; default: their folders", metavar="TEXT", nargs="+"
+    )
+    transparent: bool = _option(False, "transparent background", action="store_true")
+    title: str | None = _option(None, "title of the pictures; default: that of the case")
+
+    def __post_init__(self) -> None:
+        from .camera import camera_path
+
+        video, size = self.video or ("webm" if self.transparent else "mp4"), self.size
+        if video not in VIDEOS:
+            raise InputError(f"render: video = {video!r} is not known; it is one of {', '.join(VIDEOS)}")
+        if self.transparent and video in ("mp4", "both"):
+            raise InputError(
+                f"render: video = {video!r}: MP4 has no transparent background; use webm, webp, gif or none"
+            )
+        if size[0] < 160 or size[1] < 120 or max(size) > 8192:
+            raise InputError(
+                f"render: size = {size[0]} x {size[1]} pixels is out of range; widths are 160 to 8192, heights 120 to "
+                "8192"
+            )
+        if not 1e-3 <= self.fps <= 1e3:
+            raise InputError(f"render: fps = {self.fps:g} must be from 0.001 to 1000 frames per second")
+        if self.style not in STYLES:
+            raise InputError(f"render: style = {self.style!r} is not known; it is one of {', '.join(STYLES)}")
+        if not 1e-6 <= self.radius_scale <= 1e6:
+            raise InputError(f"render: radius_scale = {self.radius_scale:g} must be from 1e-6 to 1e6")
+        if self.bar_width is not None and not 0.0 < self.bar_width <= 500.0:
+            raise InputError(f"render: bar_width = {self.bar_width:g} must be positive, and 500 pixels at most")
+        if isinstance(self.path, str):
+            object.__setattr__(self, "path", camera_path(self.path))
+        assert self.moves  # refuses what makes no film
+        if isinstance(self.frames, Iterable):
+            object.__setattr__(self, "frames", list(self.frames))
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of films to make."""
+        return VIDEOS[self.video or ("webm" if self.transparent else "mp4")]
+
+    @property
+    def moves(self) -> Moves:
+        """The view and its movement."""
+        from .camera import Moves
+
+        return Moves(self.view, self.zoom, self.orbit, self.path, self.follow)
+
+
+@dataclass(frozen=True)
+class PlotOptions:
+    """Options of :func:`~pfem_petsc.post.plot.plot`.
+
+    Raises
+    ------
+    InputError
+        For an unknown format or window, and options that exclude each other.
+    """
+
+    curves: Iterable[str] | None = _option(
+        None,
+        "columns of the history to plot in one picture (info lists them), or components: probe/tip/velocity.x, "
+        "momentum.norm; default: the usual pictures",
+        metavar="NAME",
+        nargs="+",
+        action="extend",
+    )
+    against: str | None = _option(
+        None, "column or component over which the curves are drawn; default: time", metavar="NAME"
+    )
+    spectrum: Iterable[str] | None = _option(
+        None, "columns whose amplitude spectra are drawn", metavar="NAME", nargs="+", action="extend"
+    )
+    window: str = _option("hann", "window of spectra: hann, flattop, hamming, blackman, rectangular; default: hann")
+    highest: float | None = _option(None, "frequency at which the spectra end", metavar="HZ", type=float)
+    force_filter: str | None = _option(
+        None,
+        "filter of forces and of curves: cfc:CLASS (SAE J211), butterworth:HZ[:ORDER], mean:SECONDS, none; default: "
+        "forces by the mean of 2 %% of the run",
+        flag="--filter",
+        metavar="FILTER",
+    )
+    formats: Iterable[str] | None = _option(
+        None,
+        "png, svg, pdf; csv writes what the pictures show as tables, with all rows in SI units, and without curves "
+        "history.csv; default: png",
+        flag="--format",
+        metavar="FORMAT",
+        nargs="+",
+        action="extend",
+    )
+    closed_forms: bool = _option(True, "do not draw closed forms", flag="--no-closed-form", action="store_false")
+
+    def __post_init__(self) -> None:
+        from .chart import check_formats
+        from .filters import WINDOWS
+
+        if self.spectrum is not None and (self.curves is not None or self.against is not None):
+            raise InputError("plot: spectrum is a picture of its own: give it without curves and against")
+        if self.against is not None and self.curves is None:
+            raise InputError(f"plot: against = {self.against!r} needs curves, the columns to draw over it")
+        if self.window not in WINDOWS:
+            raise InputError(f"plot: window = {self.window!r} is not known; it is one of {', '.join(WINDOWS)}")
+        object.__setattr__(self, "formats", check_formats("png" if self.formats is None else self.formats))
+
+
+def add_options(kind: type, parser: argparse.ArgumentParser) -> None:
+    """Add all options of a kind to a parser."""
+    for each in fields(kind):
+        settings = dict(each.metadata)
+        flag = settings.pop("flag", f"--{each.name.replace('_', '-')}")
+        parser.add_argument(flag, dest=each.name, default=each.default, **settings)

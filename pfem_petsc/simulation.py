@@ -179,6 +179,11 @@ class Simulation(WithEquations):
         """The last row of the history."""
         return self.outputs.history.row if self.outputs.history is not None else None
 
+    @property
+    def columns(self) -> dict[str, np.dtype]:
+        """The columns of the history, name to the type of a value with its shape."""
+        return self._stages.columns or Recorder(self.stepper).columns
+
     def summary(self) -> dict[str, str]:
         """Return a summary before a run: text by label. Collective."""
         self._usable()
@@ -187,9 +192,8 @@ class Simulation(WithEquations):
     def inspect(self) -> tuple[dict[str, str], list[str]]:
         """Return further checks and a forecast of the run (text by label), and warnings. Collective."""
         self._usable()
-        columns = Recorder(self.stepper).columns
         entries, warnings = inspect(self.model.case, self.model)
-        entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, columns)
+        entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, self.columns)
         before = warnings_before(self.model.case, self.model, self.analysis.plan)
         return entries, self.model.warnings + odd_accelerations(self.case) + before + warnings
 

@@ -50,11 +50,15 @@ def run(arguments: argparse.Namespace) -> int:
     from ..case.schema import Case
     from ..studies.sweep import sweep
 
+    vary: dict[str, list[Any]] = {}
+    for key, values in map(_values, arguments.vary):
+        if vary.setdefault(key, values) is not values:
+            raise InputError(f"--vary {key}=...: given twice; give all its values in one list, {key}=VALUE,VALUE,VALUE")
     case = Case.load(arguments.case, arguments.overrides)
     output = arguments.output or Path("results") / f"{case.name}-sweep"
     table = sweep(
         case,
-        dict(_values(text) for text in arguments.vary),
+        vary,
         processes=arguments.processes,
         results={name: name for name in arguments.results} if arguments.results else None,
         output=output,

@@ -72,6 +72,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         if not deck.add(block):
             break
     mesh = deck.mesh()
+    if len(mesh.bars) == 0:
+        raise InputError(f"{path}: has no trusses or beams, which would be bars")
     deck.add_sections(mesh)
     _Conditions(mesh, deck).add()
     if fields is None:  # of no interest to a run, which takes mesh and groups alone
@@ -638,6 +640,7 @@ class _Deck:
             if not found.get("area", 0.0) > 0.0:
                 what = f"SECTION={block.get('SECTION')}" if block.get("SECTION") else "the data line"
                 mesh.warnings.append(f"{block.where}: no area is known from {what}")
+                found.pop("area", None)
             areas[members] = found.get("area", np.nan)
             material = block.get("MATERIAL")
             if material:
@@ -726,6 +729,8 @@ def _material_value(block: _Block, material: dict[str, Any]) -> str:
     rows = block.rows(8, 1)
     if len(rows) == 0 or not np.isfinite(rows[0, 0]):
         return "no values: left out"
+    if block.keyword in ("ELASTIC", "DENSITY") and rows[0, 0] <= 0.0:
+        return f"{rows[0, 0]:g} is not positive: left out"
     first = rows[:, column]
     cold = np.isnan(first) | (first == first[0]) if key == "plastic" else np.arange(len(rows)) == 0
     told = "" if cold.all() else f"values at {first[0]:g} degrees are taken for all temperatures"

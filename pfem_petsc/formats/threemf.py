@@ -113,6 +113,8 @@ class _Object:
         self.name, self.components = texts.name, texts.components
         self.points = _numbers(texts.vertices, f"{where}: a vertex", 3)
         table = _numbers(texts.beams, f"{where}: a beam", 4)
+        for k in np.flatnonzero(np.isnan(table[:, :2]).any(axis=1))[:1].tolist():
+            raise InputError(f"{where}: beam {k} lacks the vertex at one of its ends (v1, v2)")
         self.ends, self.radii = _whole(table[:, :2], len(self.points), f"{where}: beams: vertex"), table[:, 2:]
         default = _numbers([texts.radius], f"{where}: radius").ravel()
         for radius in self.radii.T:  # the second radius of a beam is the first one where it is not given
@@ -237,9 +239,12 @@ class _Model:
 def _numbers(rows: Sequence[str | tuple[str | None, ...] | None], what: str, width: int = 1) -> np.ndarray:
     """Return texts as numbers (n, width): NaN for those that are missing."""
     try:
-        return np.array(rows, dtype=np.float64).reshape(-1, width)
+        found = np.array(rows, dtype=np.float64)
     except ValueError as error:
         raise InputError(f"{what}: {error}; expected {width} number{'s' * (width > 1)}") from None
+    if found.ndim == 2 and found.shape[1] != width:
+        raise InputError(f"{what}: has {found.shape[1]} numbers; expected {width}")
+    return found.reshape(-1, width)
 
 
 def _whole(values: np.ndarray, n: int, what: str) -> np.ndarray:

@@ -50,17 +50,18 @@ def components(n: int, pairs: np.ndarray) -> np.ndarray:
     return first[part]
 
 
-def coincident(points: np.ndarray, tolerance: float) -> np.ndarray:
+def coincident(points: np.ndarray, tolerance: float, source: str = "mesh") -> np.ndarray:
     """Return for each node the lowest number (nodes,) of those at its place.
 
     Parameters
     ----------
     points : (nodes, 3) [m]
     tolerance : distance [m] up to which two nodes coincide, also through a third one; 0: equal coordinates
+    source : of the nodes, for messages
     """
     if not np.isfinite(points).all():
         bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise InputError(f"node {bad} has coordinates that are not finite: correct them first")
+        raise InputError(f"{source}: node {bad} has coordinates that are not finite: correct them first")
     if tolerance <= 0.0:
         _, first, place = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
         return first[place.ravel()]
@@ -87,7 +88,7 @@ def cleaned(mesh: WholeMesh, tolerance: float | None = None, sum_areas: bool = F
     """
     distance = tolerance_of(mesh) if tolerance is None else tolerance
     done = []
-    node = coincident(mesh.points, distance)
+    node = coincident(mesh.points, distance, mesh.source)
     merged_away = int((node != np.arange(len(node))).sum())
     if merged_away:
         done.append(f"{merged_away} nodes merged with others within {distance:g} m")
@@ -297,7 +298,7 @@ def _topology(mesh: WholeMesh) -> Iterator[tuple[str, str]]:
 def _problems(mesh: WholeMesh, tolerance: float | None) -> Iterator[tuple[str, str]]:
     """Return what ``mesh clean`` removes."""
     distance = tolerance_of(mesh) if tolerance is None else tolerance
-    place, same = coincident(mesh.points, distance), copies(mesh.bars)
+    place, same = coincident(mesh.points, distance, mesh.source), copies(mesh.bars)
     for label, found, of in (
         ("nodes at the place of another", np.flatnonzero(place != np.arange(len(place))), place),
         ("bars between the nodes of another", np.flatnonzero(same != np.arange(len(same))), same),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 
 from ..case.schema import Case
 from ..columns import LOST, STORED, SUPPLIED
-from ..errors import InputError
+from ..errors import InputError, PfemError
 from ..output.result import Result, open_result, peak_force, touch_impulse
 from ..output.table import Table, flat_columns
+from ..registry import nearest
 from .pool import Report, Task, performed
 
 _OWN = ("run", "status", "message", "wall_time", "steps")
@@ -70,7 +71,7 @@ def sweep(
     Raises
     ------
     InputError
-        If no combination makes a valid case, or the output folder cannot be written.
+        If no combination makes a valid case, no case has a named column, or the output folder cannot be written.
     """
     changes = _combinations(vary)
     if not isinstance(processes, int) or isinstance(processes, bool) or processes < 1:
@@ -82,6 +83,8 @@ def sweep(
     for name in set(asked) & set(_OWN):
         raise InputError(f"sweep: results: the table has a column {name!r} already")
     cases, refused = _cases(case, changes)
+    if isinstance(results, Mapping):
+        _refuse_unknown({label: name for label, name in results.items() if isinstance(name, str)}, cases.values())
     folder = _prepared(Path(output) if output is not None else Path("results") / f"{case.name}-sweep")
     tasks = [Task(each, folder / f"{number:04d}", wall_time) for number, each in cases.items()]
     numbers = list(cases)
@@ -204,17 +207,39 @@ def _results_of(result: Result, results: ResultFunction | Mapping[str, ResultFun
         return dict(values) if isinstance(values, Mapping) else {"result": values}
     found: dict[str, Any] = {}
     for name, what in results.items():
-        found |= {name: what(result)} if callable(what) else _last(result, name, what)
+        found |= {name: what(result)} if callable(what) else _last(result.history, name, what)
     return found
 
 
-def _last(result: Result, label: str, name: str) -> dict[str, Any]:
+def _refuse_unknown(asked: Mapping[str, str], cases: Iterable[Case]) -> None:
+    """Refuse columns of the history, by their names in the table, that no case has; one has all of them as a rule."""
+    from mpi4py import MPI
+
+    from ..simulation import Simulation
+
+    refusal = None
+    for case in cases if asked else ():
+        try:
+            with Simulation(case, MPI.COMM_SELF, check_only=True) as simulation:
+                rows = {name: np.zeros((1, *kind.shape)) for name, kind in simulation.columns.items()}
+        except PfemError:  # which becomes the message of the row
+            continue
+        try:
+            for label, name in asked.items():
+                _last(rows, label, name)
+            return
+        except InputError as error:
+            refusal = refusal or error
+    if refusal is not None:
+        raise refusal
+
+
+def _last(history: Mapping[str, np.ndarray], label: str, name: str) -> dict[str, Any]:
     """Return the last value of a column as ``label``: all components of a vector, or the one at the end of the name."""
-    whole = name if name in result.history else re.sub(r"(\[\d+\])?\.[xyz]$", "", name)
-    try:
-        values = result.history[whole][-1:]
-    except KeyError as error:
-        raise InputError(f"sweep: results: {error.args[0]}") from error
+    whole = name if name in history else re.sub(r"(\[\d+\])?\.[xyz]$", "", name)
+    if whole not in history:
+        raise InputError(f"sweep: results: history has no {whole}{nearest(whole, list(history))}")
+    values = history[whole][-1:]
     if whole == name:
         return {each: column[0] for each, column in flat_columns(label, values).items()}
     columns = flat_columns(whole, values)

@@ -177,6 +177,7 @@ def test_other_elements(tmp_path):
         ("*NSET, NSET=Top", "*NSET, NSET=Top, INSTANCE=J", r"line 21: \*NSET: there is no instance J"),
         ("*HEADING\n A", "A", r"line 1: 'A tripod, written by hand' precedes the first \*KEYWORD"),
         ("*HEADING", "*", r"line 1: '\*' is no keyword"),
+        (FLAT, "", "a.inp: has no trusses or beams, which would be bars"),
     ],
 )
 def test_one_thing_wrong(tmp_path, old, new, text):

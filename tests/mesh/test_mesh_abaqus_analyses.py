@@ -29,6 +29,25 @@ def test_sections_of_beams(tmp_path, text):
     assert bool(mesh.warnings) == (not expected)
 
 
+def test_numbers_that_no_case_takes_are_left_out(tmp_path):
+    """A case for the mesh has the values of steel and the usual area in their place, and says so."""
+    mesh = read_whole(
+        written(
+            tmp_path,
+            "*NODE\n1,0\n2,1\n*ELEMENT, TYPE=T3D2, ELSET=E\n1,1,2\n*SOLID SECTION, ELSET=E, MATERIAL=M\n-2.\n"
+            "*MATERIAL, NAME=M\n*ELASTIC\n-2e11, .3\n*DENSITY\n0.\n",
+        )
+    )
+    assert [text.rpartition("*")[2] for text in mesh.warnings[:3]] == [
+        "ELASTIC: -2e+11 is not positive: left out",
+        "DENSITY: 0 is not positive: left out",
+        "SOLID SECTION: no area is known from the data line",
+    ]
+    text = skeleton(mesh, tmp_path / "a.inp", tmp_path / "a.toml")
+    assert "material.M.young_modulus" in text and "material.M.density" in text and "section.E.area" in text
+    assert Case.from_toml(text, tmp_path).section["E"].area == 1e-4
+
+
 def test_supports_and_loads(tmp_path):
     """Of sets, labels and instances; degrees of freedom in ranges; what a case cannot have is told."""
     step = """*BOUNDARY

@@ -122,6 +122,8 @@ def test_3mf_of_another_program(tmp_path):
         ("2 0 0 0 2 0 0 0 2 0 0 5", "2 0 0", r"transform of object 5: .*; expected 12 numbers"),
         ('encoding="utf-8"', 'encoding="x"', r"unknown encoding"),
         ("</resources>", "", r"mismatched tag: line 17"),
+        ('v1="0" v2="1"', 'v1="0"', "object 4: beam 0 lacks the vertex at one of its ends"),
+        ("2 0 0 0 2 0 0 0 2 0 0 5", "2 0 0 0 2 0 0 0 2 0 0", "transform of object 5: has 11 numbers; expected 12"),
         ('objectid="5" t', 'objectid="5" p:path="/3D/o.model" xmlns:p="u" t', r"in another part of the file"),
     ],
 )

@@ -72,6 +72,14 @@ def test_nodes_at_one_place_against_all_pairs():
     np.testing.assert_array_equal(coincident(exact, 0.0), np.repeat(np.arange(0, 100, 2), 2))
 
 
+def test_coordinates_that_are_not_numbers_are_told_with_their_file():
+    mesh = square()
+    mesh.points[2, 0] = np.nan
+    for look in (summary, cleaned):
+        with pytest.raises(InputError, match="square.msh: node 2 has coordinates that are not finite"):
+            look(mesh)
+
+
 def test_parts_of_a_long_chain():
     order = np.random.default_rng(1).permutation(1000)
     pairs = np.stack([order[:-1], order[1:]], axis=1)[np.arange(999) != 500]

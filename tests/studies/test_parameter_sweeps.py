@@ -175,6 +175,8 @@ def test_command_line(tmp_path, capsys):
     assert "time.step = 0.5" in (tmp_path / "out" / "sweep.csv").read_text()
     assert main(["sweep", "rod_impact", "--vary", "time.step"]) == 2
     assert "--vary time.step: expected KEY=VALUES" in capsys.readouterr().err
+    assert main(["sweep", "rod_impact", "--vary", "time.step=0.01", "time.step=0.02"]) == 2
+    assert "--vary time.step=...: given twice" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -206,8 +208,13 @@ def test_vectors_are_columns_of_their_components(rod, tmp_path):
     rows = list(csv.DictReader((tmp_path / "out" / "sweep.csv").open()))
     assert rows[1]["initial.velocity"] == "[0.2, 0.0, 0.0]"
     assert float(rows[1]["wall/wall/force.x"]) == table["wall/wall/force.x"][1]
-    wrong = sweep(rod, [{}], results={"w": "probe/tip/position[4].x"}, output=tmp_path / "wrong", quiet=True)
-    assert "probe/tip/position has probe/tip/position[0].x" in wrong["message"][0]
+    for name, told in (
+        ("probe/tip/position[4].x", r"probe/tip/position has probe/tip/position\[0\].x"),
+        ("kinetic_energi", "history has no kinetic_energi, did you mean 'kinetic_energy'"),
+    ):
+        with pytest.raises(InputError, match=told):
+            sweep(rod, [{}], results={"w": name}, output=tmp_path / "wrong", quiet=True)
+    assert not (tmp_path / "wrong").exists()
 
 
 def test_tables(tmp_path):

@@ -243,7 +243,7 @@ def _numbers(rows: Sequence[str | tuple[str | None, ...] | None], what: str, wid
     except ValueError as error:
         raise InputError(f"{what}: {error}; expected {width} number{'s' * (width > 1)}") from None
     if found.ndim == 2 and found.shape[1] != width:
-        raise InputError(f"{what}: has {found.shape[1]} numbers; expected {width}")
+        raise InputError(f"{what}: has {found.shape[1]}; expected {width} numbers")
     return found.reshape(-1, width)
 
 

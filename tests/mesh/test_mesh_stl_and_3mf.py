@@ -119,10 +119,9 @@ def test_3mf_of_another_program(tmp_path):
         ('<bl:ref index="1"/>', '<bl:ref index="3"/>', r"beamset thin: beam 3 is not there"),
         ('objectid="5"', 'objectid="9"', r"there is no object 9"),
         ('<component objectid="4"/>', '<component objectid="5"/>', r"object 5 is a component of itself"),
-        ("2 0 0 0 2 0 0 0 2 0 0 5", "2 0 0", r"transform of object 5: .*; expected 12 numbers"),
+        ("2 0 0 0 2 0 0 0 2 0 0 5", "2 0 0", r"transform of object 5: has 3; expected 12 numbers"),
         ('encoding="utf-8"', 'encoding="x"', r"unknown encoding"),
         ("</resources>", "", r"mismatched tag: line 17"),
-        ("2 0 0 0 2 0 0 0 2 0 0 5", "2 0 0 0 2 0 0 0 2 0 0", "transform of object 5: has 11 numbers; expected 12"),
         ('objectid="5" t', 'objectid="5" p:path="/3D/o.model" xmlns:p="u" t', r"in another part of the file"),
     ],
 )

@@ -22,8 +22,6 @@ from statistics import median
 from time import perf_counter, process_time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 if TYPE_CHECKING:
     from mpi4py import MPI
 
@@ -224,6 +222,8 @@ class Work(NamedTuple):
 
 def share_in_runs(bars: Bars) -> float:
     """Return the share of this rank's bars that go by runs of constant offset."""
+    import numpy as np  # not for the help of the command line, which reads the names of the jobs
+
     here = 0
     for block in bars.blocks:
         sweep = block.sweep

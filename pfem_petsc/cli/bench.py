@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ..bench.measure import JOBS, KINDS, cells_for, jobs, tiny_jobs
 from ..errors import InputError
-from .parser import PROGRAM, Verb, start_petsc
+from .parser import PROGRAM, Verb, argument, start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -31,32 +31,39 @@ _MOST = 10**12
 """Bars of the largest lattice that can be asked for; no machine has the memory."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the verb."""
-    parser.add_argument(
+def _size(text: str) -> int:
+    with contextlib.suppress(ValueError, OverflowError):
+        if 0 < float(text) == int(float(text)) <= _MOST:
+            return int(float(text))
+    raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number up to {_MOST:,}")
+
+
+ARGUMENTS = (
+    argument(
         "--sizes",
         metavar="BARS",
         type=_size,
         nargs="+",
         default=[10_000, 100_000, 1_000_000],
         help="approximate numbers of bars",
-    )
-    parser.add_argument("--kind", choices=list(KINDS), default="cubic", help="cells of the lattice")
-    parser.add_argument("--jobs", choices=list(JOBS), nargs="+", default=list(JOBS), help="what to time; default: all")
-    parser.add_argument("--explicit", metavar="NAME", default="central_differences", help="explicit integrator")
-    parser.add_argument("--implicit", metavar="NAME", default="newmark", help="implicit integrator")
-    parser.add_argument("--mass", choices=("lumped", "consistent"), default="lumped", help="mass matrix")
-    parser.add_argument(
+    ),
+    argument("--kind", choices=list(KINDS), default="cubic", help="cells of the lattice"),
+    argument("--jobs", choices=list(JOBS), nargs="+", default=list(JOBS), help="what to time; default: all"),
+    argument("--explicit", metavar="NAME", default="central_differences", help="explicit integrator"),
+    argument("--implicit", metavar="NAME", default="newmark", help="implicit integrator"),
+    argument("--mass", choices=("lumped", "consistent"), default="lumped", help="mass matrix"),
+    argument(
         "--plastic",
         action=argparse.BooleanOptionalAction,
         help="bars that yield; default: in explicit_contact only",
-    )
-    parser.add_argument("--history-every", metavar="N", type=_size, default=1, help="steps between rows of the history")
-    parser.add_argument("--seconds", metavar="T", type=float, default=2.0, help="approximate time for each job")
-    parser.add_argument(
+    ),
+    argument("--history-every", metavar="N", type=_size, default=1, help="steps between rows of the history"),
+    argument("--seconds", metavar="T", type=float, default=2.0, help="approximate time for each job"),
+    argument(
         "--compile", action="store_true", help="only compile the loops of the jobs for later runs; measure nothing"
-    )
-    parser.add_argument("-o", "--output", metavar="FILE", type=Path, help="write all figures as JSON")
+    ),
+    argument("-o", "--output", metavar="FILE", type=Path, help="write all figures as JSON"),
+)
 
 
 def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
@@ -106,13 +113,6 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     return 0
 
 
-def _size(text: str) -> int:
-    with contextlib.suppress(ValueError, OverflowError):
-        if 0 < float(text) == int(float(text)) <= _MOST:
-            return int(float(text))
-    raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number up to {_MOST:,}")
-
-
 def _require_writable(path: Path | None) -> None:
     """Open the output file before the measurements, which take minutes."""
     try:
@@ -122,4 +122,4 @@ def _require_writable(path: Path | None) -> None:
         raise InputError(f"--output {path}: cannot be written: {error.strerror}") from error
 
 
-VERBS = (Verb("bench", str(__doc__), EXAMPLE, "all", add_arguments, run),)
+VERBS = (Verb("bench", str(__doc__), EXAMPLE, "all", ARGUMENTS, run),)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ..case.toml import built_in_cases, built_in_path
 from ..errors import InputError, printable
 from ..registry import choices, description
-from .parser import PROGRAM, Verb, add_case, add_plugins
+from .parser import CASE, PLUGINS, PROGRAM, Verb, argument, fill
 from .run import load_case
 
 if TYPE_CHECKING:
@@ -46,15 +46,16 @@ KINDS = {
 }
 
 
-def _add_check(parser: argparse.ArgumentParser) -> None:
-    """Options of the verb."""
-    add_case(parser, optional=True)
-    add_plugins(parser)
-    parser.add_argument(
+OF_CHECK = (
+    argument("case", **{**CASE[0].settings, "nargs": "?"}),
+    CASE[1],
+    PLUGINS,
+    argument(
         "--env",
         action="store_true",
         help="check this machine instead: versions, MPI, HDF5, PETSc, OpenGL, and how to install what is missing",
-    )
+    ),
+)
 
 
 def _ranks_of_check(arguments: argparse.Namespace) -> str:
@@ -122,9 +123,7 @@ def list_all(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _add_completion(parser: argparse.ArgumentParser) -> None:
-    """Options of the verb."""
-    parser.add_argument("shell", choices=("bash", "zsh"), help="the shell")
+OF_COMPLETION = (argument("shell", choices=("bash", "zsh"), help="the shell"),)
 
 
 def completion(arguments: argparse.Namespace) -> int:
@@ -142,7 +141,7 @@ def completion(arguments: argparse.Namespace) -> int:
     }
     verbs = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction)).choices
     verbs |= dict.fromkeys(built_in_cases(), verbs["run"])
-    run_verb.add_arguments(parser)
+    fill(parser, run_verb.ARGUMENTS)
     for each in _parsers(parser):
         for action in each._actions:
             if action.dest in ("overrides", "vary"):
@@ -191,7 +190,7 @@ VERBS = (
         "List the built-in cases, integrators, mesh generators and formats, walls, constraints, treatments, methods.",
         LIST,
         "one, without MPI",
-        lambda parser: None,
+        (),
         list_all,
     ),
     Verb(
@@ -199,7 +198,7 @@ VERBS = (
         "Check a case: read it, build its mesh and model, and summarise the run. Or, by --env, check this machine.",
         CHECK,
         _ranks_of_check,
-        _add_check,
+        OF_CHECK,
         check,
     ),
     Verb(
@@ -207,7 +206,7 @@ VERBS = (
         "Print a script that completes verbs, options, built-in cases and keys of --set in a shell.",
         COMPLETION,
         "one, without MPI",
-        _add_completion,
+        OF_COMPLETION,
         completion,
     ),
 )

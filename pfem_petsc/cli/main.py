@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 from ..case.toml import built_in_cases
 from ..errors import NUMPY_REMEDY, EarlyStop, InputError, PfemError, SimulationFailure, numpy_is_too_new, printable
 from ..signals import give_back_early
-from .parser import PROGRAM, Parser, Verb, add_debug
+from .parser import PROGRAM, Parser, Verb, fill
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -135,8 +135,11 @@ def make_parser() -> tuple[Parser, dict[str, Verb]]:
             epilog=verb.example,
             prog=f"{PROGRAM} {name}",
         )
-        verb.add_arguments(sub)
-        add_debug(sub)
+        fill(sub, verb.arguments)
+        actions = sub.add_subparsers(dest="action", metavar="ACTION", required=True) if verb.actions else None
+        for action, text, arguments in verb.actions:
+            prog = f"{PROGRAM} {name} {action}"
+            fill(actions.add_parser(action, help=text, description=text, prog=prog), arguments)
     return parser, verbs
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, printable
-from .parser import PROGRAM, Verb, add_debug, add_set
+from .parser import PROGRAM, Action, Verb, argument, setting
 
 if TYPE_CHECKING:
     from ..mesh.whole import WholeMesh
@@ -26,57 +26,6 @@ examples:
 The suffix chooses the format: docs/meshes.md."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Subcommands of the verb."""
-    subparsers = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-
-    def add(name: str, text: str, *files: str) -> argparse.ArgumentParser:
-        sub = subparsers.add_parser(name, help=text, description=text, prog=f"{PROGRAM} mesh {name}")
-        add_debug(sub)
-        for file in files:
-            sub.add_argument(file.lower(), metavar=file, type=Path)
-        return sub
-
-    generate = add("generate", "Write the mesh of a generator or a case.")
-    generate.add_argument("what", metavar="GENERATOR|CASE", help="name of a generator (see list), or a case")
-    generate.add_argument("output", metavar="OUTPUT", type=Path)
-    add_set(generate, "keys of the generator, kind=octet pitch=0.01, or of the case, mesh.pitch=0.01")
-    convert = add("convert", "Write a mesh file in another format.", "INPUT", "OUTPUT")
-    refine = add("refine", "Divide each bar into several.", "INPUT", "OUTPUT")
-    refine.add_argument("--parts", metavar="N", type=int, default=2, help="number of bars that replace one; default: 2")
-    merge = add("merge", "Merge several files, and join nodes at the same position.")
-    merge.add_argument("inputs", metavar="INPUT", type=Path, nargs="+")
-    merge.add_argument("-o", "--output", metavar="OUTPUT", type=Path, required=True)
-    clean = add(
-        "clean", "Merge nodes, remove double bars, bars without length, and nodes without bars.", "INPUT", "OUTPUT"
-    )
-    clean.add_argument("--sum-areas", action="store_true", help="add up the areas of bars between the same nodes")
-    info = add("info", "Show counts, sizes, groups and defects of mesh files.")
-    info.add_argument("inputs", metavar="FILE", type=Path, nargs="+")
-    picture = add("picture", "Draw a mesh file.", "INPUT")
-    picture.add_argument("-o", "--output", metavar="PNG", type=Path, help="default: INPUT with the suffix .png")
-    picture.add_argument("--size", metavar="WxH", type=_size, default=(1280, 720), help="pixels; default: 1280x720")
-    picture.add_argument("--view", default="auto", help="xy, xz, yz, iso or auto; default: %(default)s")
-    for sub in (merge, clean, info):
-        sub.add_argument(
-            "--tolerance",
-            metavar="METRES",
-            type=_distance,
-            help="distance up to which nodes are at the same position; default: 1e-6 of the mean length of the bars",
-        )
-    for sub in (convert, refine, merge, clean, info, picture):
-        sub.add_argument(
-            "--scale",
-            metavar="METRES",
-            type=float,
-            default=1.0,
-            help="metres per unit of the file: 0.001 for millimetres, with MPa and t/mm3",
-        )
-    for sub in (generate, convert, refine, merge, clean):
-        sub.add_argument("--area", metavar="M2", type=_distance, help="area of all bars; replaces that of the file")
-        sub.add_argument("--case", metavar="TOML", type=Path, help="also write a case file for OUTPUT")
-
-
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
     if not (width.isdigit() and height.isdigit() and 50 <= int(width) <= 20000 and 50 <= int(height) <= 20000):
@@ -92,6 +41,89 @@ def _distance(text: str) -> float:
     if not 0.0 <= value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
     return value
+
+
+INPUT, OUTPUT = (argument(name.lower(), metavar=name, type=Path) for name in ("INPUT", "OUTPUT"))
+TOLERANCE = argument(
+    "--tolerance",
+    metavar="METRES",
+    type=_distance,
+    help="distance up to which nodes are at the same position; default: 1e-6 of the mean length of the bars",
+)
+SCALE = argument(
+    "--scale",
+    metavar="METRES",
+    type=float,
+    default=1.0,
+    help="metres per unit of the file: 0.001 for millimetres, with MPa and t/mm3",
+)
+WRITTEN = (
+    argument("--area", metavar="M2", type=_distance, help="area of all bars; replaces that of the file"),
+    argument("--case", metavar="TOML", type=Path, help="also write a case file for OUTPUT"),
+)
+ACTIONS = (
+    Action(
+        "generate",
+        "Write the mesh of a generator or a case.",
+        (
+            argument("what", metavar="GENERATOR|CASE", help="name of a generator (see list), or a case"),
+            OUTPUT,
+            setting("keys of the generator, kind=octet pitch=0.01, or of the case, mesh.pitch=0.01"),
+            *WRITTEN,
+        ),
+    ),
+    Action("convert", "Write a mesh file in another format.", (INPUT, OUTPUT, SCALE, *WRITTEN)),
+    Action(
+        "refine",
+        "Divide each bar into several.",
+        (
+            INPUT,
+            OUTPUT,
+            argument("--parts", metavar="N", type=int, default=2, help="number of bars that replace one; default: 2"),
+            SCALE,
+            *WRITTEN,
+        ),
+    ),
+    Action(
+        "merge",
+        "Merge several files, and join nodes at the same position.",
+        (
+            argument("inputs", metavar="INPUT", type=Path, nargs="+"),
+            argument("-o", "--output", metavar="OUTPUT", type=Path, required=True),
+            TOLERANCE,
+            SCALE,
+            *WRITTEN,
+        ),
+    ),
+    Action(
+        "clean",
+        "Merge nodes, remove double bars, bars without length, and nodes without bars.",
+        (
+            INPUT,
+            OUTPUT,
+            argument("--sum-areas", action="store_true", help="add up the areas of bars between the same nodes"),
+            TOLERANCE,
+            SCALE,
+            *WRITTEN,
+        ),
+    ),
+    Action(
+        "info",
+        "Show counts, sizes, groups and defects of mesh files.",
+        (argument("inputs", metavar="FILE", type=Path, nargs="+"), TOLERANCE, SCALE),
+    ),
+    Action(
+        "picture",
+        "Draw a mesh file.",
+        (
+            INPUT,
+            argument("-o", "--output", metavar="PNG", type=Path, help="default: INPUT with the suffix .png"),
+            argument("--size", metavar="WxH", type=_size, default=(1280, 720), help="pixels; default: 1280x720"),
+            argument("--view", default="auto", help="xy, xz, yz, iso or auto; default: %(default)s"),
+            SCALE,
+        ),
+    ),
+)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -226,4 +258,4 @@ def _picture(arguments: argparse.Namespace) -> None:
     _tell([str(output)])
 
 
-VERBS = (Verb("mesh", str(__doc__), EXAMPLE, "one", add_arguments, run),)
+VERBS = (Verb("mesh", str(__doc__), EXAMPLE, "one", (), run, ACTIONS),)

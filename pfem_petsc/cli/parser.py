@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import difflib
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from ..errors import InputError
 
@@ -21,6 +22,35 @@ _SOLVER = ("snes_", "ksp_", "pc_", "mg_", "sub_", "mat_mumps_", "esteig_", "line
 _FILES = ("-options_file", "-options_file_yaml")
 
 
+class Argument(NamedTuple):
+    """An argument of a verb: what ``argparse`` takes."""
+
+    flags: tuple[str, ...]
+    settings: Mapping[str, Any]
+
+
+def argument(*flags: str, **settings: Any) -> Argument:
+    """Declare an argument."""
+    return Argument(flags, settings)
+
+
+def options_of(kind: type) -> list[Argument]:
+    """Return the options that the fields of a class declare; see :mod:`pfem_petsc.post.options`."""
+    found = []
+    for each in dataclasses.fields(kind):
+        settings = {"dest": each.name, "default": each.default, **each.metadata}
+        found.append(argument(settings.pop("flag", f"--{each.name.replace('_', '-')}"), **settings))
+    return found
+
+
+class Action(NamedTuple):
+    """A part of a verb with arguments of its own: name, help and arguments."""
+
+    name: str
+    text: str
+    arguments: Sequence[Argument]
+
+
 class Verb(NamedTuple):
     """A verb of the command line.
 
@@ -30,16 +60,18 @@ class Verb(NamedTuple):
     text : of its help; the first line is in the list of verbs
     example : below its help
     ranks : ``all`` run it together; ``one`` runs it, with MPI or ``one, without MPI``; or a function of the arguments
-    add_arguments : to its parser
+    arguments : besides ``--debug``, which every verb has
     run : function of the arguments, and of the communicator for ``all``, that returns the exit status
+    actions : its parts, one of which must be named
     """
 
     name: str
     text: str
     example: str
     ranks: str | Callable[[argparse.Namespace], str]
-    add_arguments: Callable[[argparse.ArgumentParser], None]
+    arguments: Sequence[Argument]
     run: Callable[..., int]
+    actions: Sequence[Action] = ()
 
 
 class Parser(argparse.ArgumentParser):
@@ -57,31 +89,32 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message}{hint}; see {self.prog} --help")
 
 
-def add_case(parser: argparse.ArgumentParser, optional: bool = False) -> None:
-    """Add CASE and --set."""
-    parser.add_argument(
-        "case", metavar="CASE", nargs="?" if optional else None, help="TOML file, or name of a built-in case (see list)"
-    )
-    add_set(parser, "values that replace those of the case: time.step=1e-5 wall.0.point=[1,0,0]; KEY= removes a key")
-
-
-def add_set(parser: argparse.ArgumentParser, text: str) -> None:
-    """Add --set with its help."""
+def setting(text: str) -> Argument:
+    """Declare --set with its help."""
     options = {"dest": "overrides", "metavar": "KEY=VALUE", "nargs": "+", "action": "extend", "default": []}
-    parser.add_argument("--set", help=text, **options)
+    return argument("--set", help=text, **options)
 
 
-def add_plugins(parser: argparse.ArgumentParser) -> None:
-    """Add --plugin."""
-    parser.add_argument(
-        "--plugin",
-        dest="plugins",
-        metavar="FILE",
-        nargs="+",
-        action="extend",
-        default=[],
-        help="files with laws, integrators, walls and so on of your own, as the key plugins of a case",
-    )
+CASE = (
+    argument("case", metavar="CASE", help="TOML file, or name of a built-in case (see list)"),
+    setting("values that replace those of the case: time.step=1e-5 wall.0.point=[1,0,0]; KEY= removes a key"),
+)
+PLUGINS = argument(
+    "--plugin",
+    dest="plugins",
+    metavar="FILE",
+    nargs="+",
+    action="extend",
+    default=[],
+    help="files with laws, integrators, walls and so on of your own, as the key plugins of a case",
+)
+_DEBUG = argument("--debug", action="store_true", help="print the traceback of a failure")
+
+
+def fill(parser: argparse.ArgumentParser, arguments: Sequence[Argument]) -> None:
+    """Add arguments to a parser, and --debug."""
+    for flags, settings in (*arguments, _DEBUG):
+        parser.add_argument(*flags, **settings)
 
 
 def surviving(result: str, deep: bool | None = None, refuse: bool = False) -> Path:
@@ -106,11 +139,6 @@ def surviving(result: str, deep: bool | None = None, refuse: bool = False) -> Pa
             raise InputError(f"{text}\nrestore it from a copy; everything that is not named is undamaged")
         print(f"warning: {text}", file=sys.stderr, flush=True)
     return path
-
-
-def add_debug(parser: argparse.ArgumentParser) -> None:
-    """Add --debug, which every verb has."""
-    parser.add_argument("--debug", action="store_true", help="print the traceback of a failure")
 
 
 def seconds(text: str) -> float:

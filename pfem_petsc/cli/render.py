@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from ..post.options import Options, add_options
-from .parser import PROGRAM, Verb, surviving
+from ..post.options import Options
+from .parser import PROGRAM, Verb, argument, options_of, surviving
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -26,15 +26,17 @@ examples:
   mpirun -n 4 {PROGRAM} render results/lattice_drop --size 4k --orbit 90"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the verb."""
-    parser.add_argument(
-        "result", metavar="RESULT", nargs="+", help="result file, or its folder; several are drawn side by side"
-    )
-    parser.add_argument(
-        "-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: that of the result"
-    )
-    parser.add_argument(
+def _modes(text: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers of modes like 1,2,5") from None
+
+
+ARGUMENTS = (
+    argument("result", metavar="RESULT", nargs="+", help="result file, or its folder; several are drawn side by side"),
+    argument("-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: that of the result"),
+    argument(
         "--modes",
         metavar="N[,N...]",
         nargs="?",
@@ -42,12 +44,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_modes,
         help="draw the modes of a case with [modes], or those of these numbers, into DIR/modes; --frames is then the "
         "number of frames of a period",
-    )
-    add_options(Options, parser)
-    parser.add_argument(
+    ),
+    *options_of(Options),
+    argument(
         "--html", action="store_true", help="write render.html instead: the last state, to be turned in a browser"
-    )
-    parser.add_argument("--window", action="store_true", help="show an interactive window instead; needs a display")
+    ),
+    argument("--window", action="store_true", help="show an interactive window instead; needs a display"),
+)
 
 
 def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
@@ -122,11 +125,4 @@ def _draw_modes(
     return render_modes(paths[0], arguments.output, modes=arguments.modes or None, comm=comm, **period, **options)
 
 
-def _modes(text: str) -> list[int]:
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers of modes like 1,2,5") from None
-
-
-VERBS = (Verb("render", str(__doc__), EXAMPLE, "all", add_arguments, run),)
+VERBS = (Verb("render", str(__doc__), EXAMPLE, "all", ARGUMENTS, run),)

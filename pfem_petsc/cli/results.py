@@ -8,10 +8,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..columns import LOST, STORED, SUPPLIED
 from ..errors import printable
-from ..post.options import PlotOptions, add_options
-from .parser import PROGRAM, Verb, surviving
+from ..post.options import PlotOptions
+from .parser import PROGRAM, Verb, argument, options_of, surviving
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,12 +37,10 @@ examples:
   {PROGRAM} report results/ring_impact -o ring.html --filter cfc:180"""
 
 
-def _add_info(parser: argparse.ArgumentParser) -> None:
-    """Options of the verb."""
-    parser.add_argument("result", metavar="RESULT", help="result file, or its folder")
-    parser.add_argument(
-        "--verify", action="store_true", help="compare all values with their checksums; status 2 if one differs"
-    )
+OF_INFO = (
+    argument("result", metavar="RESULT", help="result file, or its folder"),
+    argument("--verify", action="store_true", help="compare all values with their checksums; status 2 if one differs"),
+)
 
 
 def info(arguments: argparse.Namespace) -> int:
@@ -72,7 +69,7 @@ def describe(result: Result) -> list[str]:
     lines += _modes(result.modes) if result.n_modes else []
     lines += ["history columns:", "  " + " ".join(names)]
     if len(time):
-        lines += _energies(history, [name for name in (*STORED, *LOST, *SUPPLIED) if name in names])
+        lines += _energies(history)
     broken = history["broken_bars"] if len(time) and "broken_bars" in names else [0]
     if broken[-1]:
         first = axis.place(float(time[(broken > 0).argmax()]))
@@ -90,32 +87,34 @@ def _modes(modes: Modes) -> list[str]:
     return [heading, *("  " + "  ".join(values[k : k + 8]) for k in range(0, len(values), 8))]
 
 
-def _energies(history: Mapping[str, np.ndarray], present: list[str]) -> list[str]:
+def _energies(history: Mapping[str, np.ndarray]) -> list[str]:
     """Return energies [J] at start and end and their imbalance, also relative to the largest energy in between."""
+    from ..columns import LOST, STORED, SUPPLIED
     from ..output.units import engineering
+    from ..post.plot import balance_error
 
+    present = [name for name in (*STORED, *LOST, *SUPPLIED) if name in list(history)]
     if not present:
         return []
     width = max(map(len, (*present, "balance error")))
-    lines, error = [f"{'energy':{width + 2}}  {'start':>12}  {'end':>12}"], 0.0
+    lines, error = [f"{'energy':{width + 2}}  {'start':>12}  {'end':>12}"], float(balance_error(history)[-1])
     for name in present:
         start, end = float(history[name][0]), float(history[name][-1])
-        error += (start - end) if name in SUPPLIED else (end - start)
         lines.append(f"  {name:{width}}  {engineering(start, 'J'):>12}  {engineering(end, 'J'):>12}")
     scale = max(float(abs(history[name]).max()) for name in present)
     relative = f" ({error / scale:.1e} of the largest)" if scale > 0.0 else ""
     return [*lines, f"  {'balance error':{width}}  {engineering(error, 'J'):>26}{relative}"]
 
 
-def _add_plot(parser: argparse.ArgumentParser) -> None:
-    """Options of the verb."""
-    parser.add_argument(
+OF_PLOT = (
+    argument(
         "results", metavar="RESULT", nargs="+", help="result file, or its folder; several are drawn in one picture"
-    )
-    parser.add_argument(
+    ),
+    argument(
         "-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: that of the first result"
-    )
-    add_options(PlotOptions, parser)
+    ),
+    *options_of(PlotOptions),
+)
 
 
 def plot_history(arguments: argparse.Namespace) -> int:
@@ -129,23 +128,21 @@ def plot_history(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _add_report(parser: argparse.ArgumentParser) -> None:
-    """Options of the verb."""
-    parser.add_argument("result", metavar="RESULT", help="result file, or its folder")
-    parser.add_argument(
+OF_REPORT = (
+    argument("result", metavar="RESULT", help="result file, or its folder"),
+    argument(
         "-o",
         "--output",
         metavar="FILE",
         type=Path,
         help="file name; default: report.html in the folder of the result",
-    )
-    parser.add_argument(
+    ),
+    argument(
         "--no-pictures", dest="pictures", action="store_false", help="do not draw the truss, which takes some seconds"
-    )
-    parser.add_argument("--field", default="stress", help="field that colours the bars; default: %(default)s")
-    parser.add_argument(
-        "--filter", dest="force_filter", metavar="FILTER", help="filter of forces, like cfc:180: see plot --help"
-    )
+    ),
+    argument("--field", default="stress", help="field that colours the bars; default: %(default)s"),
+    argument("--filter", dest="force_filter", metavar="FILTER", help="filter of forces, like cfc:180: see plot --help"),
+)
 
 
 def report(arguments: argparse.Namespace) -> int:
@@ -163,7 +160,7 @@ VERBS = (
         "Show the content of a result: case, versions, snapshots, history and energy balance.",
         INFO,
         "one",
-        _add_info,
+        OF_INFO,
         info,
     ),
     Verb(
@@ -171,7 +168,7 @@ VERBS = (
         "Plot the history of results: energies, momentum, probes, walls, force-displacement, spectra, comparisons.",
         PLOT,
         "one",
-        _add_plot,
+        OF_PLOT,
         plot_history,
     ),
     Verb(
@@ -179,7 +176,7 @@ VERBS = (
         "Write a report of a run, one HTML file: case, summary, warnings, pictures, curves, energies, cost.",
         REPORT,
         "one",
-        _add_report,
+        OF_REPORT,
         report,
     ),
 )

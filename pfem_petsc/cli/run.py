@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EarlyStop, SimulationFailure
-from .parser import PROGRAM, Verb, add_case, add_plugins, seconds, start_petsc
+from .parser import CASE, PLUGINS, PROGRAM, Verb, argument, seconds, start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -26,28 +26,26 @@ examples:
 exit status: 0 done, 2 invalid input, 3 the simulation failed, 4 stopped early with a checkpoint"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the verb."""
-    add_case(parser)
-    add_plugins(parser)
-    parser.add_argument(
-        "-o", "--output", metavar="DIR", type=Path, help="output folder; default: results/NAME OF THE CASE"
-    )
-    parser.add_argument(
+ARGUMENTS = (
+    *CASE,
+    PLUGINS,
+    argument("-o", "--output", metavar="DIR", type=Path, help="output folder; default: results/NAME OF THE CASE"),
+    argument(
         "--restart",
         metavar="FILE",
         nargs="?",
         const=True,
         help="continue from a checkpoint, or the newest of a folder; default: of the output folder; earlier "
         "--set values stay in force",
-    )
-    parser.add_argument("--quiet", action="store_true", help="print no progress")
-    parser.add_argument(
+    ),
+    argument("--quiet", action="store_true", help="print no progress"),
+    argument(
         "--wall-time",
         metavar="TIME",
         type=seconds,
         help="stop with a checkpoint after this time: seconds, or hours:minutes:seconds",
-    )
+    ),
+)
 
 
 def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
@@ -112,4 +110,4 @@ def _command(arguments: argparse.Namespace, case: Case, ranks: int) -> str:
     return shlex.join(words)
 
 
-VERBS = (Verb("run", str(__doc__), EXAMPLE, "all", add_arguments, run),)
+VERBS = (Verb("run", str(__doc__), EXAMPLE, "all", ARGUMENTS, run),)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, printable
-from .parser import PROGRAM, Verb, add_case, seconds
+from .parser import CASE, PROGRAM, Verb, argument, seconds
 
 EXAMPLE = f"""\
 examples:
@@ -18,31 +18,29 @@ examples:
 exit status: 0 all runs are done, 3 some are not (see the column status of the table)"""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the verb."""
-    add_case(parser)
-    parser.add_argument(
+ARGUMENTS = (
+    *CASE,
+    argument(
         "--vary",
         metavar="KEY=VALUES",
         nargs="+",
         action="extend",
         required=True,
         help="values of a key, separated by commas; with several keys, all combinations",
-    )
-    parser.add_argument(
-        "-o", "--output", metavar="DIR", type=Path, help="output folder; default: results/NAME OF THE CASE-sweep"
-    )
-    parser.add_argument("--processes", metavar="N", type=int, default=1, help="number of runs at a time; default: 1")
-    parser.add_argument(
+    ),
+    argument("-o", "--output", metavar="DIR", type=Path, help="output folder; default: results/NAME OF THE CASE-sweep"),
+    argument("--processes", metavar="N", type=int, default=1, help="number of runs at a time; default: 1"),
+    argument(
         "--results",
         metavar="NAME",
         nargs="+",
         help="columns of the history whose last values are in the table; vectors have a column for each component, "
         "wall/floor/force.z is one of them",
-    )
-    parser.add_argument("--remove", action="store_true", help="remove the results of the runs, and keep the table only")
-    parser.add_argument("--wall-time", metavar="TIME", type=seconds, help="stop a run after this time")
-    parser.add_argument("--quiet", action="store_true", help="print no progress")
+    ),
+    argument("--remove", action="store_true", help="remove the results of the runs, and keep the table only"),
+    argument("--wall-time", metavar="TIME", type=seconds, help="stop a run after this time"),
+    argument("--quiet", action="store_true", help="print no progress"),
+)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -99,4 +97,4 @@ def _toml(text: str) -> Any:
     return value
 
 
-VERBS = (Verb("sweep", str(__doc__), EXAMPLE, "one", add_arguments, run),)
+VERBS = (Verb("sweep", str(__doc__), EXAMPLE, "one", ARGUMENTS, run),)

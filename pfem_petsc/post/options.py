@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
@@ -242,11 +242,3 @@ class PlotOptions:
         if self.window not in WINDOWS:
             raise InputError(f"plot: window = {self.window!r} is not known; it is one of {', '.join(WINDOWS)}")
         object.__setattr__(self, "formats", check_formats("png" if self.formats is None else self.formats))
-
-
-def add_options(kind: type, parser: argparse.ArgumentParser) -> None:
-    """Add all options of a kind to a parser."""
-    for each in fields(kind):
-        settings = dict(each.metadata)
-        flag = settings.pop("flag", f"--{each.name.replace('_', '-')}")
-        parser.add_argument(flag, dest=each.name, default=each.default, **settings)

@@ -17,18 +17,8 @@ from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, ExpectedNodes, SetPart
 from .fixed_rows import FixedRows, TwoNodeRows
-from .node_walls import distances_from_planes, near_planes
-from .projection import project
-from .rows import (
-    Planes,
-    RowSet,
-    free_positions,
-    free_stiffness,
-    last_forces,
-    leaving_nodes,
-    mark_pressed,
-    push_nodes,
-)
+from .node_walls import distances_from_planes
+from .rows import Planes, RowSet, free_positions, last_forces, push_nodes
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -37,7 +27,6 @@ if TYPE_CHECKING:
     from .contact import Contact
 
 PACKAGE = "pfem_petsc.contact.constraints"
-_ZERO = np.zeros(1)
 
 
 class PairRows(Constraint):
@@ -85,39 +74,17 @@ class _WallsAtRows:
         self._places = np.where(met, np.cumsum(met) - 1, -1)
         self._normals = np.tile(contact.normals, (len(self.nodes), 1, 1))
 
-    def planes(self, x: np.ndarray, far: np.ndarray, time: float) -> Planes:
-        """The planes at the nodes at x (n, 3), with ``far`` (k, 7...): what other ranks know of their nodes."""
-        return self._places, self._normals, self._gaps(self.nodes, x, far, time)
-
-    def pushed(self, x: np.ndarray, far: np.ndarray, time: float, tolerance: float) -> np.ndarray:
-        """Return the positions (n, 3) to which walls alone push the nodes at x (n, 3), x itself if they push none."""
-        if not self.any:
-            return x
-        near, offsets = np.zeros(len(x), dtype=bool), self._contact.plane_offsets(time)
-        everywhere = np.zeros(len(offsets), dtype=bool)
-        near_planes(x, self._contact.normals, offsets, everywhere, self._members, _ZERO, near)
-        at = np.flatnonzero(near)
-        if len(at) == 0:
-            return x
-        pushed, moved = x.copy(), x[at]
-        gaps = self._gaps(at, x, far, time)
-        normals = np.tile(self._contact.normals, (len(at), 1, 1))
-        offsets = np.where(gaps < np.inf, offsets, -np.inf)
-        project(moved, self._rows.free[at] == 0.0, normals, offsets, tolerance, np.zeros(gaps.shape))
-        pushed[at] = moved
-        return pushed
-
-    def _gaps(self, nodes: np.ndarray, x: np.ndarray, far: np.ndarray, time: float) -> np.ndarray:
-        """Distances (m, w) of some nodes (m,) at positions x (n, 3) from walls, infinite where these do not apply."""
-        contact, gaps = self._contact, np.empty((len(nodes), len(self._contact.normals)))
+    def planes(self, x: np.ndarray, flags: np.ndarray, time: float) -> Planes:
+        """The planes at the nodes at x (n, 3), with ``flags`` (k, flags): walls that can stop nodes of other ranks."""
+        contact, nodes, gaps = self._contact, self.nodes, np.empty((len(self.nodes), len(self._contact.normals)))
         distances_from_planes(nodes, x, contact.normals, contact.plane_offsets(time), self._members, gaps)
         if self.flags:
             where = self._rows.where[nodes]
             own = where >= 0
             displacements = contact.motion.displacements(time)
             gaps[own] = np.where(contact.applicable(where[own], x[nodes][own], displacements), gaps[own], np.inf)
-            gaps[~own] = np.where(far[-1 - where[~own], 7:] > 0.0, gaps[~own], np.inf)
-        return gaps
+            gaps[~own] = np.where(flags[-1 - where[~own]] > 0.0, gaps[~own], np.inf)
+        return self._places, self._normals, gaps
 
 
 class ConstraintSet:
@@ -154,10 +121,10 @@ class ConstraintSet:
         if len(self.two.at) == len(rows.source):
             rows.pairs = self.two.ends, self.two.normals, self.two.least
         self._walls = _WallsAtRows(rows, self.contact)
-        self._turning = not rows.fixed.all()
+        self._turning = self.mesh.comm.allreduce(not rows.fixed.all(), op=MPI.LOR)
         self.walled = self._walls.everywhere
         self.alone = not self.walled and self.mesh.comm.allreduce(self.two.every, op=MPI.LAND)
-        self._x, self._hard = np.empty((len(rows.numbers), 3)), np.empty(len(rows.numbers))
+        self._x = np.empty((len(rows.numbers), 3))
         self._blocks: FixedRows | None = None  # for nodes of the stiffness
         self._blocks_of = np.empty(0)
         self.release()
@@ -221,9 +188,9 @@ class ConstraintSet:
     ) -> np.ndarray:
         """Correct the increments ``u`` (owned, 3) of a step in which each node is solved on its own. Collective.
 
-        ``stiffness`` (owned,) is the force for a displacement of a node [N/m]; as long as its values stay the same, it
-        is the same array, on all ranks. ``tolerance`` [m] is the depth up to which a row counts as satisfied. Returns
-        the forces on nodes (owned, 3) [N], ``none`` if no row acts on a node of this rank.
+        ``stiffness`` (owned,) is the force for a displacement of a node [N/m]. ``tolerance`` [m] is the depth up to
+        which one of several rows that share nodes counts as satisfied. Returns the forces on nodes (owned, 3) [N],
+        ``none`` if no row acts on a node of this rank.
 
         Raises
         ------
@@ -234,34 +201,32 @@ class ConstraintSet:
             return none
         if self.dynamic:
             self.find(balance.predictor + u, np.zeros(len(u)), balance.time)
-        contact = np.zeros(u.shape)
-        if self.alone:
-            self.force = self.two.separate(balance.predictor, u, stiffness, contact)
-            return contact if self.force.any() else none
         rows, x, walls = self.rows, self._x, self._walls
-        far = np.empty((0, 7 + walls.flags))
+        turns, flags = balance.acting < 1.0 and self._turning, slice(4, 4 + walls.flags)
+        far = np.empty((0, flags.stop + 3 * turns))
         if not rows.partners.alone:
             at, leaving = rows.partners.rows, rows.partners.leaving(far.shape[1])
-            leaving_nodes(at, balance.predictor, u, stiffness, state.position, leaving)
+            free_positions(at, balance.predictor, u, far, leaving)
+            leaving[:, 3] = stiffness[at]
             if walls.flags:
                 displacements = self.contact.motion.displacements(balance.time)
-                leaving[:, 7:] = self.contact.applicable(at, leaving[:, :3], displacements)
+                leaving[:, flags] = self.contact.applicable(at, leaving[:, :3], displacements)
+            if turns:
+                leaving[:, flags.stop :] = state.position[at]
             far = rows.partners.bring(leaving)
         free_positions(rows.where, balance.predictor, u, far, x)
-        pushed = walls.pushed(x, far, balance.time, tolerance)
 
-        def given() -> tuple[np.ndarray, np.ndarray | None, Planes | None]:
-            turns = balance.acting < 1.0 and self._turning
-            start = rows.spread(state.position, far[:, 4:7]) if turns else None
-            free_stiffness(rows.where, stiffness, far, self._hard)
-            return self._hard, start, walls.planes(x, far, balance.time) if walls.any else None
+        def given() -> tuple[np.ndarray, np.ndarray | None]:
+            start = rows.spread(state.position, far[:, flags.stop :]) if turns else None
+            return rows.spread(stiffness, far[:, 3]), start
 
-        self.force, self.jacobian = rows.project(x, pushed, tolerance, given)
+        planes = walls.planes(x, far[:, flags], balance.time) if walls.any else None
+        self.force, self.jacobian = rows.project(x, tolerance, given, planes)
         if not self.force.any():
             return none
-        load = rows.forces(self.jacobian, self.force)
+        load, contact = rows.forces(self.jacobian, self.force), np.zeros(u.shape)
         push_nodes(rows.where, load, rows.free, stiffness, u, contact)
-        return contact if load[rows.mine].any() else none
+        return contact if contact.any() else none
 
     @property
     def batched(self) -> bool:
@@ -291,7 +256,9 @@ class ConstraintSet:
 
     def mark(self, held: np.ndarray) -> None:
         """Mark owned nodes (owned,) on which rows press."""
-        mark_pressed(self.rows.ends, self.rows.where, self.force, held)
+        nodes = self.rows.ends[self.force > 0.0]
+        at = self.rows.where[nodes[nodes >= 0]]
+        held[at[at >= 0]] = True
 
     def count_held(self, nodes: np.ndarray, owned: int) -> int:
         """How many of the owned nodes are among those (k,) that walls hold, or held by rows."""
@@ -400,15 +367,13 @@ class ConstraintSet:
         rests = rows.gather(on_walls) > 0.0
         every, hard = rows.gather(a), rows.gather(mass)
         normals, _ = contact.planes(rests, rows.gather(state.position), contact.motion.displacements(state.time))
-        pushed, offsets = every.copy(), np.where(rests, 0.0, -np.inf)
-        project(pushed, rows.free == 0.0, normals, offsets, 0.0, np.zeros(offsets.shape))
-        gaps = np.einsum("nwi,ni->nw", normals, every) - offsets
-        values, pushed = (rows.along(self.jacobian, a) + closed for a in (every, pushed))
+        gaps = np.where(rests, np.einsum("nwi,ni->nw", normals, every), np.inf)
+        values = rows.along(self.jacobian, every) + closed
         largest = self.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)
         place = np.where(rests.any(axis=1), np.arange(len(every)), -1)
         with agreed(self.mesh.comm):
             system = rows.system(self.jacobian, values, hard, (place, normals, gaps))
-            self.force = rows.solve(system, pushed, 1e-13 * largest)
+            self.force = rows.solve(system, 1e-13 * largest)
         change[rows.here] = (rows.forces(self.jacobian, self.force) * rows.free)[rows.mine]
         return change
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..mechanics.compiled import borrowing, kernel
 from ..mesh.ordering import NODE_BLOCK
+from ..tolerances import FREE_PART
 from .rows import RowSet
 
 
@@ -24,7 +25,7 @@ class FixedRows(NamedTuple):
     nodes, of, node_starts : (2 p,), (2 p,), (b + 1,) all nodes, ascending; their rows; the first node of each block
     where : (2, p) local indices of the nodes, else -1 minus the row among those of other ranks
     normals, least : (p, 3) unit directions; (p,) bounds [m]
-    soft : (p,) displacement by which a unit force separates the nodes [m/N]
+    soft : (p,) displacement by which a unit force separates the nodes [m/N], zero if supports hold both
     axes : (k,) components in which any direction is not zero
     free, held : (2, p, 3) 0.0 where supports prescribe a component; (2, p) bool, nodes with such components
     along : (2, p) squared lengths of the free parts of the directions
@@ -53,70 +54,14 @@ class FixedRows(NamedTuple):
     closed: np.ndarray
 
 
-@kernel
-def separate_nodes(rows, x, u, stiffness, far, load):
-    """Move the nodes of rows so that the bounds are satisfied, and set the forces of the rows; return how many act.
+class ClosingRows(NamedTuple):
+    """What :func:`close_rows` needs of rows; fields of :class:`FixedRows`."""
 
-    Parameters
-    ----------
-    rows : FixedRows
-    x, u : (owned, 3); positions are their sum [m]; u is changed
-    stiffness : (owned,) force for a displacement of a node [N/m]
-    far : (partners, k) components ``rows.axes`` of positions [m]
-    load : (owned, 3) to which the forces on nodes are added [N]
-    """
-    where, axes, normals, soft, least = rows.where, rows.axes, rows.normals, rows.soft, rows.least
-    free, held, force = rows.free, rows.held, rows.force
-    count = 0
-    apart = np.zeros(3)
-    for p in range(len(force)):
-        # inlined by hand: a call that passes the arrays costs more than all the rest
-        i, j = where[0, p], where[1, p]
-        for k in range(len(axes)):
-            c = axes[k]
-            there = x[j, c] + u[j, c] if j >= 0 else far[-1 - j, k]
-            here = x[i, c] + u[i, c] if i >= 0 else far[-1 - i, k]
-            apart[c] = normals[p, c] * (there - here)
-        short = least[p] - ((apart[0] + apart[2]) + apart[1])
-        force[p] = 0.0
-        if short <= 0.0 or not soft[p] > 0.0:
-            continue
-        force[p] = short / max(soft[p], 1e-300)
-        count += 1
-        for end in range(2):
-            node = where[end, p]
-            if node < 0:
-                continue
-            hard = stiffness[node]
-            strength = force[p] if end == 1 else -force[p]
-            for c in axes:
-                push = strength * normals[p, c]
-                load[node, c] += push
-                if held[end, p]:
-                    push *= free[end, p, c]
-                u[node, c] += push / hard
-    return count
-
-
-@kernel
-def compliances(where, stiffness, far, along, soft):
-    """Compute the displacement ``soft`` (p,) by which a unit force separates the nodes of each row [m/N].
-
-    ``stiffness`` (owned,), ``far`` (partners,) 1/stiffness; ``along`` (2, p) see :class:`FixedRows`.
-    """
-    for p in range(len(soft)):
-        i, j = where[0, p], where[1, p]
-        soft[p] = (1.0 / stiffness[i] if i >= 0 else far[-1 - i]) * along[0, p]
-        soft[p] += (1.0 / stiffness[j] if j >= 0 else far[-1 - j]) * along[1, p]
-
-
-@kernel
-def leaving_rows(rows, x, u, axes, leaving):
-    """Write components ``axes`` (k,) of x + u (owned, 3) of the nodes that partners need into ``leaving`` (rows, k)."""
-    for m in range(len(rows)):
-        i = rows[m]
-        for k in range(len(axes)):
-            leaving[m, k] = x[i, axes[k]] + u[i, axes[k]]
+    normals: np.ndarray
+    least: np.ndarray
+    along: np.ndarray
+    force: np.ndarray
+    closed: np.ndarray
 
 
 class TwoNodeRows:
@@ -130,7 +75,7 @@ class TwoNodeRows:
     ends, nodes : (2, p) nodes of the rows among those of the set, and their local indices, negative at other ranks
     normals, least, along : see :class:`FixedRows`
     counted : (p,) bool, rows whose second node this rank owns
-    record : FixedRows, in the order of the set, without blocks
+    record : ClosingRows, in the order of the set
     """
 
     def __init__(self, rows: RowSet) -> None:
@@ -145,39 +90,11 @@ class TwoNodeRows:
         self.least = np.empty(0)
         if len(self.at):
             self.least = 0.0 - rows.values(np.zeros((len(rows.numbers), 3)))[self.at]
-        free = rows.free[self.ends]
-        self.along = np.einsum("epi,pi->ep", free, self.normals**2)
-        axes = np.flatnonzero(rows.mesh.comm.allreduce(np.abs(self.normals).sum(axis=0)))
-        p, whole, none = len(self.at), np.empty(0, dtype=np.int64), np.empty(0, dtype=bool)
-        self.record = FixedRows(
-            *(whole, np.arange(p), np.searchsorted(rows.source, np.arange(len(rows.sources) + 1)), whole, none),
-            *(whole, whole, whole, self.nodes, self.normals, np.empty(p), self.least, axes),
-            *(free, (free == 0.0).any(axis=2), self.along),
-            *(np.zeros((len(rows.sources), 3)), np.zeros(p), np.zeros(p, dtype=bool)),
-        )
-        self._soft_of: np.ndarray | None = None
-
-    def separate(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, load: np.ndarray) -> np.ndarray:
-        """Separate the nodes of rows that the free positions, predictor + u (owned, 3), violate; return the forces (p,)
-        [N]. Collective.
-
-        ``stiffness`` (owned,) [N/m] is the same array as long as its values are the same; forces on nodes are added to
-        ``load`` (owned, 3) [N].
-        """
-        rows, partners = self.record, self.rows.partners
-        if stiffness is not self._soft_of:
-            far = np.empty((0, 1))
-            if not partners.alone:
-                far = partners.bring(1.0 / stiffness[partners.rows, None])
-            compliances(rows.where, stiffness, far[:, 0], rows.along, rows.soft)
-            self._soft_of = stiffness
-        far = np.empty((0, len(rows.axes)))
-        if not partners.alone:
-            leaving = partners.leaving(len(rows.axes))
-            leaving_rows(partners.rows, predictor, u, rows.axes, leaving)
-            far = partners.bring(leaving)
-        separate_nodes(rows, predictor, u, stiffness, far, load)
-        return rows.force.copy()
+        self._free = rows.free[self.ends]
+        parts = self._free * self.normals**2
+        self.along = (parts[:, :, 0] + parts[:, :, 1]) + parts[:, :, 2]
+        p = len(self.at)
+        self.record = ClosingRows(self.normals, self.least, self.along, np.zeros(p), np.zeros(p, dtype=bool))
 
     def of_blocks(self, stiffness: np.ndarray) -> FixedRows:
         """Return the rows for batches of steps, sorted by blocks of nodes, without forces.
@@ -185,7 +102,6 @@ class TwoNodeRows:
         ``stiffness`` (owned,) is the force for a displacement of a node [N/m]; both nodes of all rows must be on this
         rank.
         """
-        record = self.record
         p, n_blocks = len(self.at), -(-len(stiffness) // NODE_BLOCK)
         blocks = self.nodes // NODE_BLOCK
         later = blocks.max(axis=0)
@@ -201,29 +117,29 @@ class TwoNodeRows:
         nodes = where.ravel()[at]
         near = np.zeros(n_blocks, dtype=bool)
         near[blocks] = True
-        free, along = np.ascontiguousarray(record.free[:, order]), np.ascontiguousarray(self.along[:, order])
-        soft = np.empty(p)
-        compliances(where, stiffness, np.empty(0), along, soft)
+        free, along = np.ascontiguousarray(self._free[:, order]), np.ascontiguousarray(self.along[:, order])
+        soft = 1.0 / stiffness[where] * along
+        tables = len(self.rows.sources)
         return FixedRows(
-            np.searchsorted(later[order], numbers),
-            place,
-            record.table_starts,
-            np.maximum.accumulate(ready) if p else np.empty(0, dtype=np.int64),
-            near,
-            nodes,
-            at % max(p, 1),
-            np.searchsorted(nodes, NODE_BLOCK * numbers),
-            where,
-            self.normals[order],
-            soft,
-            self.least[order],
-            record.axes.copy(),
-            free,
-            np.ascontiguousarray(record.held[:, order]),
-            along,
-            np.zeros_like(record.totals),
-            np.zeros(p),
-            np.zeros(p, dtype=bool),
+            starts=np.searchsorted(later[order], numbers),
+            place=place,
+            table_starts=np.searchsorted(self.rows.source, np.arange(tables + 1)),
+            ready=np.maximum.accumulate(ready) if p else np.empty(0, dtype=np.int64),
+            near=near,
+            nodes=nodes,
+            of=at % max(p, 1),
+            node_starts=np.searchsorted(nodes, NODE_BLOCK * numbers),
+            where=where,
+            normals=self.normals[order],
+            soft=np.where(along[0] + along[1] > FREE_PART, soft[0] + soft[1], 0.0),
+            least=self.least[order],
+            axes=np.flatnonzero(np.abs(self.normals).sum(axis=0)),
+            free=free,
+            held=(free == 0.0).any(axis=2),
+            along=along,
+            totals=np.zeros((tables, 3)),
+            force=np.zeros(p),
+            closed=np.zeros(p, dtype=bool),
         )
 
     def gather(self, values: np.ndarray) -> np.ndarray:
@@ -248,7 +164,7 @@ class TwoNodeRows:
         gives = (1.0 / masses * self.along).sum(axis=0)
         force = np.where(which & (gives > 0.0), rates - self.apart(ends), 0.0) / np.maximum(gives, 1e-300)
         end, row = np.nonzero((self.nodes >= 0) & (force != 0.0))
-        push = (np.where(end == 1, force[row], -force[row])[:, None] * self.normals[row]) * self.record.free[end, row]
+        push = (np.where(end == 1, force[row], -force[row])[:, None] * self.normals[row]) * self._free[end, row]
         same = values.copy()
         same[self.nodes[end, row]] += push / masses[end, row, None]
         return same
@@ -261,7 +177,8 @@ class TwoNodeRows:
 
 @borrowing
 def solve_rows(block, rows, nodes, shared, u, contact):
-    """Solve the rows whose later node is in a block, as :func:`separate_nodes` does.
+    """Solve the rows whose later node is in a block, with the bits of single steps: those of
+    :func:`~pfem_petsc.contact.projection.project_groups`.
 
     ``nodes`` has ``mass`` and ``damping`` (n,), ``shared`` the step ``h``, the numbers ``alpha`` and ``eta``, and
     positions and velocities at half steps ``x``, ``half`` (n, 3), to which increments ``u`` (n, 3) are added;
@@ -322,7 +239,7 @@ def close_rows(rows, at, ends, counted, slack):
 
     Parameters
     ----------
-    rows : FixedRows
+    rows : ClosingRows or FixedRows
     at : (m,) rows whose force begins or ends
     ends : (2, m, 10) position, velocity and acceleration without contact, and mass of their nodes
     counted : (p,) bool, rows whose energy this rank counts

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import borrowing, kernel
+from ..mechanics.compiled import kernel
 from ..tolerances import FREE_PART, SINGULAR_ROW
 
 
@@ -230,49 +230,6 @@ class System(NamedTuple):
     gaps: np.ndarray
 
 
-@borrowing
-def _project_alone(group, groups, system, tolerance, force, moves):
-    """Project the nodes of a single row, whose walls must remain satisfied; return 1, 0 if they do not, or -1 if
-    nothing moves the row."""
-    r = groups.rows[groups.starts[group]]
-    square, gram = 0.0, 0.0
-    for k in range(system.ends.shape[1]):
-        i = system.ends[r, k]
-        if i < 0:
-            continue
-        for c in range(3):
-            part = system.gradients[r, k, c] * system.free[i, c]
-            square += part * part
-            gram += part * part / system.stiffness[i]
-    force[r] = 0.0
-    if system.values[r] < math.inf and square > FREE_PART and not system.values[r] >= -tolerance:
-        strength = -system.values[r] / gram
-        if not strength < math.inf:
-            return -1
-        force[r] = strength
-        for k in range(system.ends.shape[1]):
-            i = system.ends[r, k]
-            if i >= 0:
-                for c in range(3):
-                    moves[i, c] += strength * (system.gradients[r, k, c] * system.free[i, c]) / system.stiffness[i]
-    for q in range(groups.node_starts[group], groups.node_starts[group + 1]):
-        i = groups.nodes[q]
-        for w in range(system.gaps.shape[1]):
-            gap, square = math.inf, 0.0
-            if system.plane[i] >= 0:
-                gap = system.gaps[system.plane[i], w]
-            if not gap < math.inf:
-                continue
-            least = gap
-            for c in range(3):
-                part = system.normals[system.plane[i], w, c] * system.free[i, c]
-                square += part * part
-                gap += part * moves[i, c]
-            if square > FREE_PART and (least < -tolerance or gap < -tolerance):
-                return 0
-    return 1
-
-
 @kernel
 def project_groups(which, groups, system, tolerances, force, moves):
     """Solve for the forces of the rows of some groups (g,), and the displacements of their nodes, with their walls.
@@ -297,20 +254,46 @@ def project_groups(which, groups, system, tolerances, force, moves):
         tolerance = tolerances[group]
         begin, end, first, last = starts[group], starts[group + 1], node_starts[group], node_starts[group + 1]
         size = end - begin
+        for q in range(first, last if walls > 0 else first):
+            size += walls if plane[every_node[q]] >= 0 else 0
+        if end - begin == 1:  # the common case: a single row, whose walls remain satisfied
+            r = members[begin]
+            square, soft = 0.0, 0.0
+            for k in range(width):
+                i = ends[r, k]
+                if i >= 0:
+                    along = 0.0
+                    for c in range(3):
+                        part = gradients[r, k, c] * free[i, c]
+                        along += part * part
+                    square += along
+                    soft += 1.0 / stiffness[i] * along
+            force[r] = -values[r] / soft if values[r] < 0.0 and square > FREE_PART else 0.0
+            if not force[r] < math.inf:
+                return group
+            for k in range(width):
+                i = ends[r, k]
+                if i >= 0:
+                    push = force[r] / stiffness[i]
+                    for c in range(3):
+                        moves[i, c] = push * (gradients[r, k, c] * free[i, c])
+            fits = True
+            for q in range(first, last if size > 1 else first):
+                i = every_node[q]
+                at = plane[i]
+                for w in range(walls if at >= 0 else 0):
+                    gap, square = gaps[at, w], 0.0
+                    least = gap
+                    for c in range(3):
+                        part = normals[at, w, c] * free[i, c]
+                        square += part * part
+                        gap += part * moves[i, c]
+                    fits = fits and (least == math.inf or square <= FREE_PART or min(least, gap) >= -tolerance)
+            if fits:
+                continue
         for q in range(first, last):
             i = every_node[q]
             moves[i, 0] = moves[i, 1] = moves[i, 2] = 0.0
-            if plane[i] >= 0:
-                size += walls
-        if end - begin == 1:
-            done = _project_alone(group, groups, system, tolerance, force, moves)
-            if done < 0:
-                return group
-            if done > 0:
-                continue
-            for q in range(first, last):
-                i = every_node[q]
-                moves[i, 0] = moves[i, 1] = moves[i, 2] = 0.0
         node, vector = np.full((size, width), -1), np.zeros((size, width, 3))
         value, row = np.empty(size), np.full(size, -1)
         n = 0

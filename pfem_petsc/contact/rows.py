@@ -131,37 +131,46 @@ def gather_rows(at, array, vectors):
 
 @kernel
 def pair_values(ends, normals, least, x, values):
-    """Compute rows n . (x_2 - x_1) - least (r,) at positions (n, 3) of their nodes ``ends`` (2, r)."""
+    """Compute rows n . (x_2 - x_1) - least (r,) at positions (n, 3) of their nodes ``ends`` (2, r), with the bits of
+    :func:`~pfem_petsc.contact.fixed_rows.solve_rows`."""
     for r in range(len(values)):
         i, j = ends[0, r], ends[1, r]
-        apart = normals[r, 0] * (x[j, 0] - x[i, 0]) + normals[r, 1] * (x[j, 1] - x[i, 1])
-        values[r] = apart + normals[r, 2] * (x[j, 2] - x[i, 2]) - least[r]
+        apart = normals[r, 0] * (x[j, 0] - x[i, 0]) + normals[r, 2] * (x[j, 2] - x[i, 2])
+        values[r] = apart + normals[r, 1] * (x[j, 1] - x[i, 1]) - least[r]
 
 
 @kernel
-def broken_groups(groups, values, x, tolerance, chosen, tolerances):
-    """Mark groups with a row below its bound; return their number.
+def find_broken(groups, values, plane, gaps, x, tolerances):
+    """Find groups with a row below its bound or a node beyond a wall; return their number.
 
     Parameters
     ----------
     groups : Groups
-    values : (r,) rows; x : (n, 3) positions
-    tolerance : a row violated by at most this, or by rounding of the group's positions, counts as satisfied
-    chosen, tolerances : (groups,) output; tolerances of chosen groups only
+    values : (r,) rows; plane, gaps : see :class:`~pfem_petsc.contact.projection.System`; x : (n, 3) positions
+    tolerances : (groups,) in: a row among several that is violated by at most this counts as satisfied; out: the same,
+        or the rounding of the group's positions, of the groups found, and -1 of the others
     """
     starts, rows, node_starts, nodes = groups
     count = 0
     for g in range(len(starts) - 1):
-        chosen[g] = False
+        least = tolerances[g] if starts[g + 1] - starts[g] > 1 else 0.0
+        broken = False
         for q in range(starts[g], starts[g + 1]):
-            chosen[g] = chosen[g] or not values[rows[q]] >= -tolerance
-        if chosen[g]:
-            largest = 0.0
+            broken = broken or not values[rows[q]] >= -least
+        if gaps.shape[1] > 0:
             for q in range(node_starts[g], node_starts[g + 1]):
-                for c in range(3):
-                    largest = max(largest, abs(x[nodes[q], c]))
-            tolerances[g] = max(tolerance, 16.0 * 2.0**-52 * largest)
-            count += 1
+                at = plane[nodes[q]]
+                for w in range(gaps.shape[1] if at >= 0 else 0):
+                    broken = broken or gaps[at, w] < 0.0
+        if not broken:
+            tolerances[g] = -1.0
+            continue
+        largest = 0.0
+        for q in range(node_starts[g], node_starts[g + 1]):
+            for c in range(3):
+                largest = max(largest, abs(x[nodes[q], c]))
+        tolerances[g] = max(tolerances[g], 16.0 * 2.0**-52 * largest)
+        count += 1
     return count
 
 
@@ -211,20 +220,6 @@ def add_forces(ends, gradients, force, load):
 
 
 @kernel
-def leaving_nodes(rows, predictor, u, stiffness, start, leaving):
-    """Write predictor + u and stiffness of owned nodes (m,) into ``leaving`` (m, 4...), and initial positions unless
-    these are (0, 3)."""
-    started = len(start) > 0
-    for k in range(len(rows)):
-        i = rows[k]
-        for c in range(3):
-            leaving[k, c] = predictor[i, c] + u[i, c]
-            if started:
-                leaving[k, 4 + c] = start[i, c]
-        leaving[k, 3] = stiffness[i]
-
-
-@kernel
 def free_positions(where, predictor, u, far, x):
     """Fill positions x (n, 3) from predictor + u (owned, 3), or from ``far`` (m, 3 or more) for nodes of other ranks.
 
@@ -234,13 +229,6 @@ def free_positions(where, predictor, u, far, x):
         i = where[k]
         for c in range(3):
             x[k, c] = predictor[i, c] + u[i, c] if i >= 0 else far[-1 - i, c]
-
-
-@kernel
-def free_stiffness(where, stiffness, far, hard):
-    """Fill the stiffness (n,) of the same nodes from owned nodes (owned,) and ``far`` (m, 4 or more)."""
-    for k in range(len(where)):
-        hard[k] = stiffness[where[k]] if where[k] >= 0 else far[-1 - where[k], 3]
 
 
 @kernel
@@ -268,23 +256,13 @@ def push_nodes(where, load, free, stiffness, u, contact):
                 contact[i, c] += load[k, c]
 
 
-@kernel
-def mark_pressed(ends, where, force, held):
-    """Mark owned nodes (owned,) with active rows."""
-    for r in range(len(force)):
-        if force[r] > 0.0:
-            for k in range(ends.shape[1]):
-                if ends[r, k] >= 0 and where[ends[r, k]] >= 0:
-                    held[where[ends[r, k]]] = True
-
-
 _ITERATIONS = 100  # linearisations of a problem
 _TAG = 7700  # of messages between ranks with nodes of the same rows, distinct from those of ghosts
 
 Planes = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Walls at nodes: ``plane``, ``normals`` and ``gaps`` of :class:`~pfem_petsc.contact.projection.System`."""
 
-Given = Callable[[], tuple[np.ndarray, np.ndarray | None, Planes | None]]
+Given = Callable[[], tuple[np.ndarray, np.ndarray | None]]
 """See :meth:`RowSet.project`."""
 
 
@@ -338,6 +316,7 @@ class RowSet:
         self._away = np.flatnonzero(~self.mine)
         self._far = -1 - self.where[self._away]
         self.free = 1.0 - self.gather(fixed)
+        self._no_planes = np.full(len(self.numbers), -1), np.empty((0, 0, 3)), np.empty((0, 0))
         self._gather_groups()
         every = np.arange(len(self.ends))
         self.counted = self.mine[self.ends[every, self.last]]
@@ -523,10 +502,8 @@ class RowSet:
     def system(
         self, jacobian: np.ndarray, values: np.ndarray, stiffness: np.ndarray, planes: Planes | None = None
     ) -> System:
-        """Return rows (r,) with gradients (r, k, 3) for :meth:`project` and :meth:`solve`; ``stiffness`` (n,) [N/m]."""
-        if planes is None:
-            planes = np.full(len(self.numbers), -1), np.empty((0, 0, 3)), np.empty((0, 0))
-        return System(self.ends, jacobian, values, stiffness, self.free, *planes)
+        """Return rows (r,) with gradients (r, k, 3) for :meth:`solve`; ``stiffness`` (n,) [N/m]."""
+        return System(self.ends, jacobian, values, stiffness, self.free, *(planes or self._no_planes))
 
     def gather_of(self, at: np.ndarray, of_nodes: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return values (2, m, n) at the first two nodes of rows ``at`` (m,); ``of_nodes`` gives (k, n) at owned nodes.
@@ -544,27 +521,30 @@ class RowSet:
             data[1 - end, cut] = swap(self.mesh.comm, self.owners[at[cut], 1 - end], data[end, cut])
         return data
 
-    def solve(self, system: System, pushed: np.ndarray, tolerance: float) -> np.ndarray:
+    def solve(self, system: System, tolerance: float) -> np.ndarray:
         """Return forces (r,) [N] that satisfy linear rows; those violated by at most the tolerance count as satisfied.
-
-        ``pushed`` (r,): the rows where walls alone act; groups without violated ones need no forces.
 
         Raises
         ------
         SimulationFailure
             On ranks with rows that are infeasible.
         """
-        nowhere, force = np.zeros((len(self.numbers), 3)), np.zeros(len(system.values))
-        groups, tolerances = self._broken(pushed, nowhere, tolerance)
+        force, nowhere = np.zeros(len(system.values)), np.zeros((len(self.numbers), 3))
+        groups, tolerances = self._broken(
+            system.values, (system.plane, system.normals, system.gaps), nowhere, tolerance
+        )
         self._solve(groups, system, tolerances, force, np.empty_like(nowhere))
         return force
 
-    def _broken(self, values: np.ndarray, x: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-        groups = len(self.groups.starts) - 1
-        chosen, tolerances = np.empty(groups, dtype=bool), np.empty(groups)
-        if not broken_groups(self.groups, values, x, tolerance, chosen, tolerances):
+    def _broken(
+        self, values: np.ndarray, planes: Planes, x: np.ndarray, tolerance: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the groups (g,) with rows (r,) below their bounds or nodes at (n, 3) beyond walls, and the tolerances
+        of all groups."""
+        tolerances = np.full(len(self.groups.starts) - 1, tolerance)
+        if not find_broken(self.groups, values, planes[0], planes[2], x, tolerances):
             return np.empty(0, dtype=np.int64), tolerances
-        return np.flatnonzero(chosen), tolerances
+        return np.flatnonzero(~(tolerances < 0.0)), tolerances
 
     def _solve(
         self, which: np.ndarray, system: System, tolerances: np.ndarray, force: np.ndarray, moves: np.ndarray
@@ -581,38 +561,32 @@ class RowSet:
         return ", ".join(str(number) for number in self.numbers[nodes[starts[group] : starts[group + 1]]][:6])
 
     def project(
-        self, x: np.ndarray, pushed: np.ndarray, tolerance: float, given: Given
+        self, x: np.ndarray, tolerance: float, given: Given, planes: Planes | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return forces (r,) [N] that satisfy the rows, and the gradients (r, k, 3) along which they act.
 
         Parameters
         ----------
-        x, pushed : (n, 3) positions without rows, and where walls alone push the nodes [m]
+        x : (n, 3) positions without rows [m]
         tolerance : [m]
-        given : asked if groups are to be solved; gives the stiffness (n,) of the nodes [N/m], positions (n, 3) where
-            the forces act, None: at the solution, and planes
+        given : asked if groups are to be solved; gives the stiffness (n,) of the nodes [N/m] and positions (n, 3) where
+            the forces act, None: at the solution
+        planes : of walls at the nodes, if there are any
 
         Raises
         ------
         SimulationFailure
             On ranks with rows that are infeasible.
         """
-        values, jacobian = self.values(pushed), self.fixed_jacobian
-        force = np.zeros(len(values))
-        groups, tolerances = self._broken(values, x, tolerance)
+        values, force, jacobian = self.values(x), np.zeros(len(self.source)), self.fixed_jacobian
+        groups, tolerances = self._broken(values, planes or self._no_planes, x, tolerance)
         if len(groups) == 0:
             return force, jacobian
-        if pushed is not x:
-            values = self.values(x)
-        chosen = np.zeros(len(self._turning), dtype=bool)
-        chosen[groups] = True
-        stiffness, start, planes = given()
-        moves = np.empty_like(x)
-        turning = groups[self._turning[groups]]
-        if len(turning) == 0:
+        (stiffness, start), moves = given(), np.empty_like(x)
+        if not self._turning[groups].any():
             self._solve(groups, self.system(jacobian, values, stiffness, planes), tolerances, force, moves)
             return force, jacobian
-        jacobian, at, rows = jacobian.copy(), x.copy(), None
+        jacobian, at, rows, chosen = jacobian.copy(), x.copy(), None, np.empty(len(self._turning), dtype=bool)
         system = self.system(jacobian, values, stiffness, planes)
         for _ in range(_ITERATIONS):
             chosen[:] = False

@@ -163,8 +163,7 @@ class RowCoordinates:
         tolerance = PROJECTED * self.constraints.contact.size
         start = self._start if self._part == 0.0 else None
         with agreed(self.comm):
-            given = k, start, None
-            force, jacobian = rows.project(x, x, tolerance, lambda: given)
+            force, jacobian = rows.project(x, tolerance, lambda: (k, start))
         u[here] += (rows.forces(jacobian, force) * rows.free / k[:, None])[rows.mine]
 
     def forward(self, w: np.ndarray) -> None:

@@ -94,7 +94,7 @@ class ExplicitStepper(Stepper):
         self._nobody = np.empty(0, dtype=np.int64)
         self._batch: Batch | None = None
         self._batched: bool | None = None  # whether batches apply; None until it is known
-        self._stiffness, self._stiffness_of = np.empty(0), (0.0, 0.0, self._none)
+        self._stiffness = np.empty_like(model.inertia.mass)
 
     def steps(self, most: int) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. The first step is made alone: the start may have stopped
@@ -135,19 +135,10 @@ class ExplicitStepper(Stepper):
             if self.fault is None:
                 self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
 
-    def _stiffness_for(self, balance: Balance) -> np.ndarray:
-        """Return the array (owned,) for alpha m + eta c: another one if it changes, on all ranks in the same step."""
-        alpha, eta, damping = self._stiffness_of
-        inertia = self.model.inertia
-        if (alpha, eta) != (balance.alpha, balance.eta) or damping is not inertia.damping:
-            self._stiffness_of = balance.alpha, balance.eta, inertia.damping
-            self._stiffness = np.empty_like(inertia.mass)
-        return self._stiffness
-
     def solve(self, balance: Balance) -> Solution:
         model, state = self.model, self.state
         inertia = model.inertia
-        u, stiffness = np.empty_like(state.v), self._stiffness_for(balance)
+        u, stiffness = np.empty_like(state.v), self._stiffness
         forces = state.external if model.external.active else self._none, state.f
         known = (
             balance.a_hat if balance.a_hat is not None else self._none,

@@ -243,6 +243,29 @@ def _closest(ends, a, b):
     return s, t
 
 
+@inlined
+def _meet(keys, boxes, i, near):
+    """Write the segments of a bucket behind segment ``i`` whose cell is the same and whose ``boxes`` (6, n), components
+    of the lower and the upper corner, meet its own to ``near`` (n,); return how many. Without branches."""
+    low_x, low_y, low_z, high_x, high_y, high_z = boxes[:, i]
+    count = 0
+    for j in range(i + 1, len(keys)):
+        near[count] = j
+        meets = (boxes[0, j] <= high_x) & (boxes[1, j] <= high_y) & (boxes[2, j] <= high_z)
+        meets &= (boxes[3, j] >= low_x) & (boxes[4, j] >= low_y) & (boxes[5, j] >= low_z)
+        count += meets & (keys[j] == keys[i])
+    return count
+
+
+@inlined
+def _common(labels, a, b):
+    common = False
+    for m in range(labels.shape[1]):
+        for n in range(labels.shape[1]):
+            common |= labels[a, m] == labels[b, n]
+    return common
+
+
 @kernel
 def _compare(state, buckets, held, grid, out):
     """Write the rows of segments that are pairs, where they are closest, and their distances; return how many.
@@ -254,50 +277,50 @@ def _compare(state, buckets, held, grid, out):
     low, cell, between = grid
     found_rows, found_at, found_distance = out
     found = 0
-    place = np.empty(3, np.int64)
+    place, first, way = np.empty(3, np.int64), np.empty(3), np.empty(3)
+    most = (start[1:] - start[:-1]).max()
+    boxes, near = np.empty((6, most)), np.empty(most, np.int64)
     for bucket in range(state[0], len(start) - 1):
-        for p in range(max(start[bucket], state[1]), start[bucket + 1]):
-            if found + start[bucket + 1] - p > len(found_rows):
+        begin, end = start[bucket], start[bucket + 1]
+        for p in range(begin, end):
+            one = rows[p]
+            more = margin[one] + 1e-9 * cell
+            for c in range(3):
+                boxes[c, p - begin] = min(ends[one, 0, c], ends[one, 1, c]) - more
+                boxes[3 + c, p - begin] = max(ends[one, 0, c], ends[one, 1, c]) + more
+        for p in range(max(begin, state[1]), end):
+            if found + end - p > len(found_rows):
                 state[0] = bucket
                 state[1] = p
                 return found
             key, one = keys[p], rows[p]
-            for q in range(p + 1, start[bucket + 1]):
-                if keys[q] != key:
-                    continue
-                two = rows[q]
-                i = max(corners[one, 0], corners[two, 0])
-                if (
-                    i < _LONG
-                    and _key(i, max(corners[one, 1], corners[two, 1]), max(corners[one, 2], corners[two, 2])) != key
-                ):
+            for j in range(_meet(keys[begin:end], boxes, p - begin, near)):
+                two = rows[begin + near[j]]
+                corner = max(corners[one, 0], corners[two, 0])
+                y, z = max(corners[one, 1], corners[two, 1]), max(corners[one, 2], corners[two, 2])
+                if corner < _LONG and _key(corner, y, z) != key:
                     continue
                 # rounding must not depend on the order of the segments, which depends on the ranks
                 a, b = (one, two) if ids[one] < ids[two] else (two, one)
                 if between and (ids[a] >= _SECOND or ids[b] < _SECOND):
                     continue
-                apart = False
-                for m in range(labels.shape[1]):
-                    for n in range(labels.shape[1]):
-                        apart |= labels[a, m] == labels[b, n]
-                if apart:
+                if _common(labels, a, b):
                     continue
                 reach = margin[a] + margin[b]
-                for c in range(3):
-                    apart |= min(ends[a, 0, c], ends[a, 1, c]) - max(ends[b, 0, c], ends[b, 1, c]) > reach
-                    apart |= min(ends[b, 0, c], ends[b, 1, c]) - max(ends[a, 0, c], ends[a, 1, c]) > reach
-                if apart:
-                    continue
                 s, t = _closest(ends, a, b)
-                part = margin[a] / reach if reach > 0.0 else 0.5
                 square = 0.0
                 for c in range(3):
-                    here = ends[a, 0, c] + s * (ends[a, 1, c] - ends[a, 0, c])
-                    there = ends[b, 0, c] + t * (ends[b, 1, c] - ends[b, 0, c])
-                    square += (there - here) * (there - here)
-                    place[c] = int(np.floor((here + (there - here) * part - low[c]) / cell))
-                if square > reach * reach or (i == _LONG and _key(place[0], place[1], place[2]) != key):
+                    first[c] = ends[a, 0, c] + s * (ends[a, 1, c] - ends[a, 0, c])
+                    way[c] = ends[b, 0, c] + t * (ends[b, 1, c] - ends[b, 0, c]) - first[c]
+                    square += way[c] * way[c]
+                if square > reach * reach:
                     continue
+                if corner == _LONG:
+                    part = margin[a] / reach if reach > 0.0 else 0.5
+                    for c in range(3):
+                        place[c] = int(np.floor((first[c] + way[c] * part - low[c]) / cell))
+                    if _key(place[0], place[1], place[2]) != key:
+                        continue
                 found_rows[found, 0] = a
                 found_rows[found, 1] = b
                 found_at[found, 0] = s

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import datetime
 import os
 import sys
 from collections.abc import Callable
+from logging import Formatter, LogRecord, makeLogRecord
+from logging.handlers import WatchedFileHandler
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, NamedTuple, TextIO
+from typing import TYPE_CHECKING, NamedTuple, NoReturn, TextIO
 
 from ..errors import InputError
 from ..parallel.agreement import agreed
@@ -28,8 +29,8 @@ BAR_REFRESH = 0.1  # seconds between two updates of the bar
 _LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID")
 
 
-class LogFile:
-    """Appends lines to a log, each with date and level; an existing one is continued.
+class LogFile(WatchedFileHandler):
+    """Appends lines to a log, each with date and level; an existing one is continued, one that is removed begins anew.
 
     A file that cannot be opened at the start is an error. If it is lost during the run (folder removed, disk full), a
     warning is printed once on stderr, later lines are dropped, and the run continues.
@@ -41,39 +42,33 @@ class LogFile:
     """
 
     def __init__(self, path: Path | str) -> None:
-        self.path = Path(path)
+        self._lost = False
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file: TextIO | None = self.path.open("a", buffering=1, encoding="utf-8")
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            super().__init__(path, encoding="utf-8")
         except OSError as error:
             raise InputError(
-                f"{self.path}: the log cannot be written ({error.strerror}); choose another output folder with -o"
+                f"{path}: the log cannot be written ({error.strerror}); choose another output folder with -o"
             ) from error
+        self.setFormatter(Formatter("%(asctime)s %(levelname)-7s %(message)s", "%Y-%m-%d %H:%M:%S"))
 
     def write(self, text: str, level: str = "INFO") -> None:
         """Append a line."""
-        if self._file is None:
-            return
-        stamp = datetime.datetime.now().strftime("%Y-%m-%d %H:%M:%S")
         try:
-            if not self.path.exists():  # lines written to an unlinked file would be lost
-                self._file.close()
-                self._file = self.path.open("a", buffering=1, encoding="utf-8")
-            self._file.write(f"{stamp} {level:<7} {text}\n")
+            if not self._lost:
+                self.emit(makeLogRecord({"msg": text, "levelname": level}))
         except OSError as error:
-            self._file = None
+            self._lost = True
             print(
-                f"warning: {self.path}: the log cannot be written any more ({error.strerror}); "
+                f"warning: {self.baseFilename}: the log cannot be written any more ({error.strerror}); "
                 "the run continues without it",
                 file=sys.stderr,
                 flush=True,
             )
 
-    def close(self) -> None:
-        """Close the file; later lines are dropped."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+    def handleError(self, record: LogRecord) -> NoReturn:  # noqa: N802 - of logging
+        """Raise the error that :meth:`write` reports."""
+        raise
 
 
 class Span(NamedTuple):

@@ -167,7 +167,7 @@ class _Passes(NamedTuple):
         self, time: np.ndarray, values: np.ndarray, corner: Callable[[float], float], zero_before: bool
     ) -> np.ndarray:
         """Return the values after both passes with the corner [Hz] of an interval [s]."""
-        from scipy.signal import butter, sosfilt
+        from scipy.signal import butter, sosfiltfilt
 
         time, values = np.asarray(time, dtype=float), np.asarray(values, dtype=float)
         self._check(time)
@@ -179,10 +179,7 @@ class _Passes(NamedTuple):
         if zero_before:
             longer[:pad] = 0.0
         sections = butter(self.order, corner(interval), fs=1.0 / interval, output="sos")
-        first = longer[0]  # constants pass: from rest without a jump
-        once = sosfilt(sections, longer - first)
-        last = once[-1]
-        smooth = (sosfilt(sections, (once - last)[::-1])[::-1] + (first + last))[pad : pad + len(even)]
+        smooth = sosfiltfilt(sections, longer, padtype=None)[pad : pad + len(even)]
         return smooth if grid is time else np.interp(time, grid, smooth)
 
     def _check(self, time: np.ndarray) -> None:

@@ -333,13 +333,12 @@ def _joined(rows: Rows, head: _Head) -> Rows:
         pairs, times = np.unique(np.column_stack([leader, lines[:, 3]])[grouped], axis=0, return_counts=True)
         copy = (leader != np.arange(len(lines))) & grouped & grouped[leader]
         copy &= ~np.isin(leader, pairs[times > 1, 0])
-        waiting = np.flatnonzero(copy)
-        while len(waiting):  # one more copy of each line at a time
-            line, at = np.unique(leader[waiting], return_index=True)
-            pairs, which = np.unique(lines[np.stack([line, waiting[at]]), 3].T, axis=0, return_inverse=True)
-            tags = [tags for _, tags in head.groups]
-            lines[line, 3] = np.array([head.place(1, tags[a] + tags[b]) for a, b in pairs.tolist()])[which.ravel()]
-            waiting = np.delete(waiting, at)
+        tags = [tags for _, tags in head.groups]
+        joined: dict[int, list[int]] = {}
+        for line, place in zip(leader[copy].tolist(), lines[copy, 3].tolist()):
+            joined.setdefault(line, list(tags[lines[line, 3]])).extend(tags[place])
+        for line, several in joined.items():
+            lines[line, 3] = head.place(1, several)
         lines = lines[~copy]
     for kind, found in (("lines", [lines]), ("marked", parts["marked"])):
         yield from ((kind, part[k : k + PIECE]) for part in found for k in range(0, len(part), PIECE))

@@ -155,23 +155,13 @@ def key_text(path: KeyPath) -> str:
     return text
 
 
-_PART = re.compile(r"""(?:"((?:[^"\\]|\\.)*)"|([^.\[\]"]+))|\[(\d+)\]""")
+_PART = r"""(?:"(?:[^"\\]|\\.)*"|[^.\[\]"]+|\[\d+\])"""
+_KEY = re.compile(rf"{_PART}(?:\.{_PART}|\[\d+\])*")
 
 
 def split_key(key: str) -> list[str] | None:
     """Return the parts of a dotted path, including indices in brackets; None if it is malformed."""
-    parts, position = [], 0
-    while position < len(key):
-        match = _PART.match(key, position)
-        if match is None:
-            return None
-        quoted, bare, index = match.groups()
-        parts.append(next(p.strip() for p in (quoted, bare, index) if p is not None))
-        position = match.end()
-        if position < len(key) and key[position] == ".":
-            position += 1
-            if position == len(key):
-                return None
-        elif position < len(key) and key[position] != "[":
-            return None
-    return parts if parts and all(parts) else None
+    if _KEY.fullmatch(key) is None:
+        return None
+    parts = [part[1:-1].strip() if part[0] in '"[' else part.strip() for part in re.findall(_PART, key)]
+    return parts if all(parts) else None

@@ -1,20 +1,205 @@
-"""Verbs about cases and this program: check a case or the machine, list what is built in, complete words in a shell."""
+"""Verbs about cases and this program: run, sweep, check a case or the machine, list what is built in, completion."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import shlex
 import tomllib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ..case.toml import built_in_cases, built_in_path
-from ..errors import InputError, printable
+from ..errors import EarlyStop, InputError, SimulationFailure, printable
 from ..registry import choices, description
-from .parser import CASE, PLUGINS, PROGRAM, Verb, argument, fill
-from .run import load_case
+from .parser import CASE, PLUGINS, PROGRAM, Verb, argument, fill, seconds, start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
+
+    from ..case.schema import Case
+
+RUN = f"""\
+examples:
+  mpirun -n 2 {PROGRAM} rod_impact
+  mpirun -n 2 {PROGRAM} my_case.toml -o results/fine --set time.step=1e-5 mesh.elements=100
+  mpirun -n 2 {PROGRAM} my_case.toml --restart
+  mpirun -n 2 {PROGRAM} my_case.toml -- -log_view
+
+exit status: 0 done, 2 invalid input, 3 the simulation failed, 4 stopped early with a checkpoint"""
+
+
+OF_RUN = (
+    *CASE,
+    PLUGINS,
+    argument("-o", "--output", metavar="DIR", type=Path, help="output folder; default: results/NAME OF THE CASE"),
+    argument(
+        "--restart",
+        metavar="FILE",
+        nargs="?",
+        const=True,
+        help="continue from a checkpoint, or the newest of a folder; default: of the output folder; earlier "
+        "--set values stay in force",
+    ),
+    argument("--quiet", action="store_true", help="print no progress"),
+    argument(
+        "--wall-time",
+        metavar="TIME",
+        type=seconds,
+        help="stop with a checkpoint after this time: seconds, or hours:minutes:seconds",
+    ),
+)
+
+
+def run_case(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
+    """Simulate, and return the exit status. Collective."""
+    restart = arguments.restart if arguments.restart in (None, True) else Path(arguments.restart)
+    case = load_case(arguments, comm)
+    output = arguments.output or Path("results", case.name)
+    from ..simulation import Simulation
+
+    command = _command(arguments, case, comm.size)
+    try:
+        with Simulation(
+            case, comm, output=output, restart=restart, quiet=arguments.quiet, wall_time=arguments.wall_time
+        ) as simulation:
+            kept = [text for text in case.overrides if text not in arguments.overrides]
+            if kept:
+                simulation.notes.append(f"as in the run that is continued: --set {shlex.join(kept)}")
+            return simulation.run() or 0
+    except (EarlyStop, SimulationFailure) as error:
+        if "continue with --restart" in str(error):
+            raise type(error)(f"{error}\n  {command}") from error
+        raise
+
+
+def load_case(arguments: argparse.Namespace, comm: MPI.Comm) -> Case:
+    """Return the case of the command line, read by rank 0; start PETSc with its options. Collective.
+
+    A restart applies the ``--set`` values of the continued run, overridden by those given now.
+    """
+    start_petsc(arguments.petsc_options, comm.rank)
+    from ..parallel.agreement import on_root
+
+    return on_root(comm, _load, arguments)
+
+
+def _load(arguments: argparse.Namespace) -> Case:
+    from ..case.schema import Case
+    from ..case.toml import built_in_path
+
+    overrides = arguments.overrides
+    restart = getattr(arguments, "restart", None)
+    if restart is not None:
+        from ..restart.checkpoints import joined_overrides, kept_overrides
+
+        name = (built_in_path(arguments.case) or Path(arguments.case)).stem
+        kept = kept_overrides(name, arguments.output or Path("results", name), restart)
+        overrides = joined_overrides(kept, overrides)
+    return Case.load(arguments.case, overrides, plugins=arguments.plugins)
+
+
+def _command(arguments: argparse.Namespace, case: Case, ranks: int) -> str:
+    """Return the shell command that continues this run."""
+    launcher = ["srun" if "SLURM_STEP_NUM_TASKS" in os.environ else "mpirun", "-n", str(ranks)]
+    words = [*(launcher if ranks > 1 else ()), *PROGRAM.split(), str(arguments.case)]
+    words += ["-o", str(arguments.output)] if arguments.output is not None else []
+    words += ["--quiet"] if arguments.quiet else []
+    words += ["--wall-time", f"{arguments.wall_time:g}"] if arguments.wall_time is not None else []
+    words += ["--plugin", *arguments.plugins] if arguments.plugins else []
+    words += ["--set", *case.overrides] if case.overrides else []
+    words += ["--restart"]
+    words += ["--", *arguments.petsc_options] if arguments.petsc_options else []
+    return shlex.join(words)
+
+
+SWEEP = f"""\
+examples:
+  {PROGRAM} sweep rod_impact --vary time.step=0.005,0.01,0.02
+  {PROGRAM} sweep my_case.toml --vary "initial.velocity=[1,0,0],[2,0,0]" --vary section.leg.area=1e-4,2e-4 --processes 4
+
+exit status: 0 all runs are done, 3 some are not (see the column status of the table)"""
+
+
+OF_SWEEP = (
+    *CASE,
+    argument(
+        "--vary",
+        metavar="KEY=VALUES",
+        nargs="+",
+        action="extend",
+        required=True,
+        help="values of a key, separated by commas; with several keys, all combinations",
+    ),
+    argument("-o", "--output", metavar="DIR", type=Path, help="output folder; default: results/NAME OF THE CASE-sweep"),
+    argument("--processes", metavar="N", type=int, default=1, help="number of runs at a time; default: 1"),
+    argument(
+        "--results",
+        metavar="NAME",
+        nargs="+",
+        help="columns of the history whose last values are in the table; vectors have a column for each component, "
+        "wall/floor/force.z is one of them",
+    ),
+    argument("--remove", action="store_true", help="remove the results of the runs, and keep the table only"),
+    argument("--wall-time", metavar="TIME", type=seconds, help="stop a run after this time"),
+    argument("--quiet", action="store_true", help="print no progress"),
+)
+
+
+def run_sweep(arguments: argparse.Namespace) -> int:
+    """Make the runs, and print the table and the name of its file."""
+    from ..case.schema import Case
+    from ..studies.sweep import sweep
+
+    vary: dict[str, list[Any]] = {}
+    for key, values in map(_values, arguments.vary):
+        if vary.setdefault(key, values) is not values:
+            raise InputError(f"--vary {key}=...: given twice; give all its values in one list, {key}=VALUE,VALUE,VALUE")
+    case = Case.load(arguments.case, arguments.overrides)
+    output = arguments.output or Path("results") / f"{case.name}-sweep"
+    table = sweep(
+        case,
+        vary,
+        processes=arguments.processes,
+        results={name: name for name in arguments.results} if arguments.results else None,
+        output=output,
+        keep=not arguments.remove,
+        wall_time=arguments.wall_time,
+        quiet=arguments.quiet,
+    )
+    print(printable(str(table)))
+    print(output / "sweep.csv")
+    return 3 if table["status"].any() else 0
+
+
+def _values(text: str) -> tuple[str, list[Any]]:
+    """Return key and values of ``KEY=VALUE,VALUE``; each value is TOML, or else plain text."""
+    key, _, values = text.partition("=")
+    found = _toml(f"[{values}]")
+    if not values.strip() or found == []:
+        raise InputError(f"--vary {text}: expected KEY=VALUES, like time.step=1e-5,2e-5")
+    if found is not None:
+        return key.strip(), found
+    parts, begun = [], ""
+    for piece in values.split(","):
+        begun = f"{begun},{piece}" if begun else piece
+        # a comma within a list, a table or a text in quotes divides no values
+        if all(begun.count(a) == begun.count(b) for a, b in ("[]", "{}")) and begun.count('"') % 2 == 0:
+            parts.append(begun.strip())
+            begun = ""
+    parts += [begun.strip()] if begun else []
+    return key.strip(), [part if (value := _toml(part)) is None else value for part in parts]
+
+
+def _toml(text: str) -> Any:
+    """Return the value of a text, None if it is none."""
+    try:
+        (value,) = tomllib.loads(f"value = {text}").values()
+    except (ValueError, RecursionError):  # also that of several keys
+        return None
+    return value
+
 
 CHECK = f"""\
 examples:
@@ -130,7 +315,6 @@ def completion(arguments: argparse.Namespace) -> int:
     """Print the script."""
     import shtab
 
-    from . import run as run_verb
     from .main import make_parser
 
     parser, _ = make_parser()
@@ -141,7 +325,7 @@ def completion(arguments: argparse.Namespace) -> int:
     }
     verbs = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction)).choices
     verbs |= dict.fromkeys(built_in_cases(), verbs["run"])
-    fill(parser, run_verb.ARGUMENTS)
+    fill(parser, OF_RUN)
     for each in _parsers(parser):
         for action in each._actions:
             if action.dest in ("overrides", "vary"):
@@ -185,6 +369,15 @@ def keys() -> Iterator[str]:
 
 
 VERBS = (
+    Verb("run", "Run a case (the default: CASE alone means run).", RUN, "all", OF_RUN, run_case),
+    Verb(
+        "sweep",
+        "Run a case for all combinations of values of some keys, and write a table.",
+        SWEEP,
+        "one",
+        OF_SWEEP,
+        run_sweep,
+    ),
     Verb(
         "list",
         "List the built-in cases, integrators, mesh generators and formats, walls, constraints, treatments, methods.",

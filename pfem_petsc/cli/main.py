@@ -29,8 +29,8 @@ from .parser import PROGRAM, Parser, Verb, fill
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-HOMES = {"run": "run", "list": "cases", "check": "cases", "mesh": "mesh", "render": "render", "plot": "results"}
-HOMES |= {"report": "results", "info": "results", "sweep": "sweep", "bench": "bench", "completion": "cases"}
+HOMES = {"run": "cases", "list": "cases", "check": "cases", "mesh": "mesh", "render": "render", "plot": "results"}
+HOMES |= {"report": "results", "info": "results", "sweep": "cases", "bench": "bench", "completion": "cases"}
 """Verbs, and the modules of this package whose ``VERBS`` have them."""
 
 EXAMPLES = f"""\

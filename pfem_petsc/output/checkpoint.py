@@ -322,7 +322,9 @@ def write_checkpoint(
     n_bytes = sum(dtype.itemsize * int(np.prod(shape, dtype=np.int64)) for shape, dtype in shapes.values())
     require_room(comm, path, n_bytes, target=path.parent)
     checks = {name: checksum(comm, slab, arrays[name][0].first) for name, slab in slabs.items()}
-    state = json.dumps({"scalars": dict(scalars), "attributes": dict(attributes)}, default=_plain)
+    state = json.dumps(
+        {"scalars": dict(scalars), "attributes": dict(attributes)}, default=lambda value: value.tolist()
+    )  # of NumPy
     try:
         temporary = create_new(path, comm, _create, shapes, checks, state, userblock_size=_seal_size(len(shapes)))
     except InputError as error:
@@ -374,11 +376,3 @@ def _put_in_place(temporary: Path, path: Path) -> None:
     except OSError as error:
         if error.errno not in (errno.EINVAL, errno.ENOTSUP):
             raise
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"a checkpoint cannot hold {type(value).__name__} {value!r}")

@@ -91,6 +91,10 @@ def describe_run(comm: MPI.Comm, attributes: Mapping[str, Any]) -> dict[str, Any
     }
 
 
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
 def write_case(file: h5py.File, case_text: str, attributes: Mapping[str, Any]) -> None:
     """Store the case in ``/case``: dataset ``text`` and attributes. Values other than numbers or texts become JSON.
 
@@ -124,12 +128,6 @@ def read_attributes(group: h5py.Group) -> dict[str, Any]:
             value = json.loads(value.removeprefix("json:"))
         found[name] = value.item() if isinstance(value, np.generic) else value
     return found
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def create_result(file: h5py.File, n_nodes: int, n_bars: int, contents: Contents) -> None:

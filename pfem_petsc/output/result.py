@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..registry import nearest
-from .hdf5 import HDF5_ERRORS, dataset_names
+from .hdf5 import HDF5_ERRORS, dataset_names, first_line
 from .layout import (
     EVENT,
     MODE_VALUES,
@@ -158,10 +158,7 @@ def readable(path: Path) -> Iterator[None]:
     except HDF5_ERRORS as error:
         if not h5py.is_hdf5(path):
             raise InputError(f"{path}: not a result file: it is not HDF5, or cut off at its beginning") from error
-        reason = str(error).strip().splitlines()
-        raise InputError(
-            f"{path}: not a result of pfem_petsc, or damaged: {reason[0] if reason else type(error).__name__}"
-        ) from error
+        raise InputError(f"{path}: not a result of pfem_petsc, or damaged: {first_line(error)}") from error
 
 
 class Result:
@@ -272,15 +269,13 @@ class Result:
 
     def mesh(self, i: int) -> pyvista.UnstructuredGrid:
         """Return snapshot i (-1: the last) as a pyvista grid of lines with all its fields."""
-        import pyvista
+        from ..formats.vtk import grid_of
+        from ..mesh.whole import WholeMesh
 
-        cells = np.column_stack([np.full(self.n_bars, 2), self.bars]).ravel()
-        types = np.full(self.n_bars, pyvista.CellType.LINE, dtype=np.uint8)
-        grid = pyvista.UnstructuredGrid(cells, types, self.positions(i))
+        fields = {name: self.field(name, i) for name in self.cell_fields}
+        grid = grid_of(WholeMesh(self.positions(i), self.bars, bar_fields=fields))
         for name in self.point_fields:
             grid.point_data[name] = self.field(name, i)
-        for name in self.cell_fields:
-            grid.cell_data[name] = self.field(name, i)
         grid.field_data["TimeValue"] = [self.times[i]]
         return grid
 

@@ -87,8 +87,7 @@ class Motion:
         self.bounds = np.array([low, high])
         walls = result.case.every_wall
         self.surfaces = self._moved(walls)
-        self.normals = [np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")]
-        self.normals = [normal / np.linalg.norm(normal) for normal in self.normals]
+        self.normals = [wall.normal / np.linalg.norm(wall.normal) for wall in walls if hasattr(wall, "normal")]
         every = np.asarray(result.times, dtype=float)
         self.time_factor, self.time_unit = prefix_for(float(np.abs(every).max()), result.axis.unit)
         self._decimals = _decimals(self.time_factor * every)

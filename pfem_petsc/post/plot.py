@@ -219,9 +219,10 @@ def probes(history: History, exact: ClosedForm | None = None) -> tuple[list[Pane
 
 def _vector(history: History, name: str, label: str, exact: ClosedForm | None) -> Panel:
     """Return the panel of the components of a column that are not zero."""
-    curves = []
-    for part, values in column(history, name).items():
-        curves.append(Curve(part[-1], values, {"color": COLOURS["xyz".index(part[-1])]}, part))
+    curves = [
+        Curve(part[-1], values, {"color": COLOURS["xyz".index(part[-1])]}, part)
+        for part, values in column(history, name).items()
+    ]
     curves += exact_curves(exact, [curve.key for curve in curves])
     return Panel(label, unit_of("position" if "displacement" in name else name), curves)
 

@@ -15,7 +15,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, InputError, Simulation, Truss, open_result, sweep
-from pfem_petsc.cli import sweep as verb
+from pfem_petsc.cli import cases as verb
 from pfem_petsc.cli.main import main
 from pfem_petsc.mechanics.compiled import Compilation
 from pfem_petsc.output.table import Table

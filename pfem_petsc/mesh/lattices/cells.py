@@ -116,11 +116,11 @@ def _unit(*axes: int) -> np.ndarray:
 
 
 def _corners_to_faces() -> list[list[int]]:
-    struts = []
-    for axis, (first, second) in enumerate(((1, 2), (0, 2), (0, 1))):
-        for corner in (_unit(), _unit(first), _unit(second), _unit(first, second)):
-            struts.append([0, 1 + axis, *(-corner)])
-    return struts
+    return [
+        [0, 1 + axis, *(-corner)]
+        for axis, (first, second) in enumerate(((1, 2), (0, 2), (0, 1)))
+        for corner in (_unit(), _unit(first), _unit(second), _unit(first, second))
+    ]
 
 
 def _cubic() -> UnitCell:

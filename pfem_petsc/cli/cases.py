@@ -296,8 +296,7 @@ def list_all(arguments: argparse.Namespace) -> int:
             name: tomllib.loads(built_in_path(name).read_text(encoding="utf-8"))["title"] for name in built_in_cases()
         }
     }
-    for kind, package in KINDS.items():
-        sections[kind] = {name: description(package, name) for name in choices(package)}
+    sections |= {kind: {n: description(package, n) for n in choices(package)} for kind, package in KINDS.items()}
     width = max(len(name) for lines in sections.values() for name in lines)
     for kind, lines in sections.items():
         print(f"{kind}:")

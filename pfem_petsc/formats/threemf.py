@@ -140,7 +140,6 @@ class _Model:
 
     def __init__(self, where: str, stream: IO[bytes]) -> None:
         self.where = where
-        self.objects: dict[str, _Object] = {}
         self.items: list[Placed] = []
         self.scale, self.triangles = 1e-3, 0
         self.not_read: list[str] = []
@@ -155,8 +154,7 @@ class _Model:
         self._parser.StartElementHandler = self._start
         self._parser.StartNamespaceDeclHandler = lambda prefix, uri: self._namespaces.update({prefix or "": uri})
         self._parser.ParseFile(stream)
-        for number, texts in self._texts.items():
-            self.objects[number] = _Object(f"{where}: object {number}", texts)
+        self.objects = {number: _Object(f"{where}: object {number}", texts) for number, texts in self._texts.items()}
         for parts in self._metadata:
             name, _, numbers = "".join(parts).partition("\n")
             found = _numbers(numbers.split(), f"{where}: node group {name}").ravel()
@@ -295,8 +293,7 @@ def _assembled(path: Path, model: _Model) -> WholeMesh:
     area = np.where(one == two, np.pi * one * one, np.pi / 3.0 * (one * one + one * two + two * two))
     if (area > 0.0).all():
         mesh.bar_fields["area"] = area
-    for uri in model.not_read:
-        mesh.warnings.append(f"{path}: requires the extension {uri}, which is not read")
+    mesh.warnings += [f"{path}: requires the extension {uri}, which is not read" for uri in model.not_read]
     if (one != two).any():
         text = f"{int((one != two).sum())} beams whose radii differ have a constant area, with the same volume"
         mesh.warnings.append(f"{path}: {text}")

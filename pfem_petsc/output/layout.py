@@ -232,11 +232,8 @@ def create_snapshot_checks(file: h5py.File) -> h5py.Dataset:
 
 def field_datasets(vtk: h5py.Group) -> dict[str, h5py.Dataset]:
     """Return the datasets of points and fields: {"Points": …, "PointData/velocity": …, "CellData/stress": …}."""
-    found = {"Points": vtk["Points"]}
-    for kind in ("PointData", "CellData"):
-        for name in vtk[kind]:
-            found[f"{kind}/{name}"] = vtk[kind][name]
-    return found
+    kinds = "PointData", "CellData"
+    return {"Points": vtk["Points"]} | {f"{kind}/{name}": data for kind in kinds for name, data in vtk[kind].items()}
 
 
 def row_type(dataset: h5py.Dataset) -> np.dtype:

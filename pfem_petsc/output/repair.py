@@ -91,8 +91,8 @@ def _extents(file: h5py.File, counts: tuple[int, int, int]) -> dict[str, int]:
     n_nodes, n_bars = mesh_sizes(file)
     rows = {f"VTKHDF/Steps/{name}": n_snapshots for name in (*PER_STEP, "Values")}
     rows |= {f"snapshots/{name}": n_snapshots for name in ("step", "time")}
-    for name in field_datasets(vtk):
-        rows[f"VTKHDF/{name}"] = n_snapshots * (n_bars if name.startswith("CellData") else n_nodes)
+    sizes = {name: n_bars if name.startswith("CellData") else n_nodes for name in field_datasets(vtk)}
+    rows |= {f"VTKHDF/{name}": n_snapshots * size for name, size in sizes.items()}
     for table, n in (("history", counts[1]), (EVENT, counts[2])):
         if table in file:
             rows |= {f"{table}/{name}": n for name in dataset_names(file[table])} | {f"{CHECKS}/{table}": n}

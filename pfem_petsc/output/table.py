@@ -140,14 +140,11 @@ def _column(values: Sequence[Any] | np.ndarray) -> np.ndarray:
     if isinstance(values, np.ndarray) and values.ndim == 1:
         return values
     values = list(values)
-    if all(isinstance(value, bool | np.bool_) for value in values):
-        return np.array(values, dtype=bool)
-    if all(isinstance(value, int | np.integer) and not isinstance(value, bool) for value in values):
-        return np.array(values, dtype=np.int64)
-    if all(isinstance(value, int | float | np.number) and not isinstance(value, bool) for value in values):
-        return np.array(values, dtype=np.float64)
-    if all(isinstance(value, str) for value in values):
-        return np.array(values, dtype=np.str_)
+    logical = bool(values) and isinstance(values[0], bool | np.bool_)  # which are integers for Python
+    plain = [(int | np.integer, np.int64), (int | float | np.number, np.float64), (str, np.str_)]
+    for kind, dtype in [(bool | np.bool_, bool)] if logical else plain:
+        if all(isinstance(value, kind) and isinstance(value, bool | np.bool_) == logical for value in values):
+            return np.array(values, dtype=dtype)
     made = np.empty(len(values), dtype=object)
     for i, value in enumerate(values):
         made[i] = value  # one by one: lists of one length would be taken for further dimensions

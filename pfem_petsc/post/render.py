@@ -260,11 +260,10 @@ class Film:
         if several:
             columns, rows = len(chosen), len(self.motions)
         self._prepare(_POSTER, (width // columns, height // rows - Page.strip_of(_POSTER)))
-        drawings, captions = [], []
-        for k in range(len(self.motions)):
-            for frame in chosen:
-                drawings.append(self._draw(k, motion.frames.index(frame)))
-                captions.append(f"{self._labels[k]}, {motion.time(frame)}" if several else motion.time(frame))
+        numbers = range(len(self.motions))
+        drawings = [self._draw(k, motion.frames.index(frame)) for k in numbers for frame in chosen]
+        heads = [f"{label}, " if several else "" for label in self._labels]
+        captions = [head + motion.time(frame) for head in heads for frame in chosen]
         return self._page.compose(drawings, self._cameras[0][0], "", captions, columns)
 
     def close(self) -> None:

@@ -235,10 +235,8 @@ def _cost(result: Any, log: Mapping[str, list[str]]) -> dict[str, str]:
         rows["memory"] = log["memory"][-1]
     rows["ranks"] = str(result.attributes.get("ranks", "?"))
     rows["result file"] = f"{Path(result.path).stat().st_size / 1e6:.3g} MB"
-    for column in ("newton_iterations", "linear_iterations"):
-        if column in result.history and np.any(result.history[column]):
-            rows[column.replace("_", " ")] = f"{int(np.sum(result.history[column])):,} in the rows of the history"
-    return rows
+    totals = {name: int(np.sum(result.history.get(name, 0))) for name in ("newton_iterations", "linear_iterations")}
+    return rows | {name.replace("_", " "): f"{n:,} in the rows of the history" for name, n in totals.items() if n}
 
 
 def _table(rows: Mapping[str, str]) -> str:

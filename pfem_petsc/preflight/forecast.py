@@ -165,9 +165,8 @@ def _density(model: Model) -> dict[str, str]:
     mesh = model.mesh
     if mesh.volume is None:
         return {}
-    lengths, own = model.bars.mesh_lengths, 0.0
-    for block in model.bars.blocks:
-        own += float((block.counted_area * lengths[block.start : block.counted]).sum())
-    ratio = model.comm.allreduce(own) / mesh.volume
+    lengths = model.bars.mesh_lengths
+    own = [float((each.counted_area * lengths[each.start : each.counted]).sum()) for each in model.bars.blocks]
+    ratio = model.comm.allreduce(sum(own)) / mesh.volume
     thick = "; struts so thick overlap at nodes, where this counts them more than once" if ratio > _THICK else ""
     return {"relative density": f"{ratio:.4g} (volume of bars over {engineering(mesh.volume, 'm3')}){thick}"}

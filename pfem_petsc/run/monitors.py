@@ -84,8 +84,7 @@ class BlowUp:
             kept["lost"] = lost
         released = sum(start[name] - float(row[name]) for name in _BARS)
         # rises only: what a force has taken away, as drag does, it need not give back
-        for name in SUPPLIED:
-            lowest[name] = min(lowest.get(name, np.inf), float(row[name]))
+        lowest |= {name: min(lowest.get(name, np.inf), float(row[name])) for name in SUPPLIED}
         rises = [float(row[name]) - lowest[name] for name in SUPPLIED]
         kept["most"] = max(kept["most"], released, *rises)
         kept["lost"] = max(kept["lost"], lost)

@@ -311,8 +311,7 @@ class Outputs:
             attributes["stages"] = [stage.name for stage in case.stage]
         if plan.steps is not None:
             attributes["steps"] = plan.steps
-        for name, nodes in recorder.probe_nodes.items():
-            attributes[f"probe_nodes/{name}"] = nodes.tolist()
+        attributes |= {f"probe_nodes/{name}": nodes.tolist() for name, nodes in recorder.probe_nodes.items()}
         return Contents(
             self.fields.points,
             self.fields.cells,

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from ..case.schema import Case
+from ..case.toml import plain
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError, PfemError
 from ..output.result import Result, open_result, peak_force, touch_impulse
@@ -104,7 +105,7 @@ def sweep(
                 except Exception as error:  # noqa: BLE001 - of a user's function; the other runs go on
                     text = error.args[0] if isinstance(error, KeyError) and error.args else error
                     report = report._replace(status=1, message=f"results: {type(error).__name__}: {text}")
-            rows[number] = {"run": number, **_shown(changes[number]), **report._asdict()}
+            rows[number] = {"run": number, **plain(changes[number]), **report._asdict()}
             if not keep and report.status == 0:
                 shutil.rmtree(place, ignore_errors=True)
             failed = sum(row["status"] != 0 for row in rows.values())
@@ -164,19 +165,6 @@ def _prepared(folder: Path) -> Path:
     except OSError as error:
         raise InputError(f"{folder}: cannot write the results of a sweep there: {error.strerror}") from error
     return folder.absolute()
-
-
-def _shown(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of a row: numbers, texts and lists of them; all others as texts."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            return value.tolist()
-        if isinstance(value, list | tuple):
-            return [plain(part) for part in value]
-        return value if isinstance(value, str | int | float | np.number) else str(value)
-
-    return {key: plain(value) for key, value in changes.items()}
 
 
 def _table(rows: dict[int, dict[str, Any]], found: dict[int, dict[str, Any]], asked: list[str], usual: bool) -> Table:

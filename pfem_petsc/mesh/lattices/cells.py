@@ -125,9 +125,8 @@ def _corners_to_faces() -> list[list[int]]:
 
 def _cubic() -> UnitCell:
     """Edges along x, y, z, then the two diagonals of the faces normal to z, to y and to x."""
-    struts = list(_EDGES)
-    for first, second in ((0, 1), (0, 2), (1, 2)):
-        struts += [[0, 0, *_unit(first, second)], [0, 0, *(_unit(second) - _unit(first))]]
+    across = [way for a, b in ((0, 1), (0, 2), (1, 2)) for way in (_unit(a, b), _unit(b) - _unit(a))]
+    struts = [*_EDGES, *([0, 0, *way] for way in across)]
     return cell_of([_CORNER], struts, {"edges": range(3), "diagonals": range(3, 9)}, item_by_item=True)
 
 

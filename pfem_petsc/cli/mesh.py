@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, printable
+from ..files import written
 from .parser import PROGRAM, Action, Verb, argument, setting
 
 if TYPE_CHECKING:
@@ -184,10 +185,8 @@ def _write(arguments: argparse.Namespace, mesh: WholeMesh, done: Sequence[str] =
     path = write_whole(arguments.output, mesh)
     _tell([f"{arguments.output}: {len(mesh.points):,} nodes, {len(mesh.bars):,} bars"])
     if arguments.case is not None:
-        try:
+        with written(arguments.case, "the case"):
             arguments.case.write_text(skeleton(mesh, path, arguments.case), encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"--case {arguments.case}: cannot be written: {error.strerror}") from error
         _tell([f"{arguments.case}: a case for this mesh; see the comments at its top"])
 
 
@@ -250,11 +249,8 @@ def _picture(arguments: argparse.Namespace) -> None:
     if output.suffix.lower() != ".png":
         raise InputError(f"{output}: a picture is written as .png")
     data = mesh_page(mesh, arguments.size, arguments.view)
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
+    with written(output, "the picture"):
         output.write_bytes(data)
-    except OSError as error:
-        raise InputError(f"{output}: cannot be written: {error.strerror}") from error
     _tell([str(output)])
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
+from ..files import written
 from ..registry import nearest
 
 if TYPE_CHECKING:
@@ -88,15 +89,11 @@ class Table(Mapping[str, np.ndarray]):
             If the file cannot be written.
         """
         path = Path(path)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with path.open("w", newline="", encoding="utf-8") as file:
-                writer = csv.writer(file)
-                writer.writerow(self)
-                lists = [[_plain(value) for value in values.tolist()] for values in self.values()]
-                writer.writerows(zip(*lists, strict=True))
-        except OSError as error:
-            raise InputError(f"{path}: the table cannot be written: {error.strerror}") from error
+        with written(path, "the table"), path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(self)
+            lists = [[_plain(value) for value in values.tolist()] for values in self.values()]
+            writer.writerows(zip(*lists, strict=True))
         return path
 
     def _texts(self) -> list[list[str]]:

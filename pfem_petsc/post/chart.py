@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import InputError
+from ..files import written
 from ..output.units import TIME, Axis, common_prefix, prefix_for
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6b7280", "#000000")
@@ -323,23 +324,17 @@ class Chart:
         InputError
             If one cannot be written.
         """
-        written = []
+        made = []
         for suffix in formats:
             path = file.with_name(f"{file.name.removesuffix('.png')}.{suffix}")
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
+            with written(path, "the picture"), boxes_allowed():
                 if suffix == "csv":
                     self._write_table(path)
                 else:
                     metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(suffix)
-                    with boxes_allowed():
-                        self.figure.savefig(path, metadata=metadata)
-            except OSError as error:
-                raise InputError(
-                    f"{path}: the picture cannot be written ({error.strerror}); give another folder"
-                ) from error
-            written.append(path)
-        return written
+                    self.figure.savefig(path, metadata=metadata)
+            made.append(path)
+        return made
 
     def _write_table(self, path: Path) -> None:
         """Write all curves at all points: columns over the same values have these once, before the first of them."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..files import written
 from .camera import Camera
 from .chart import opened
 from .motion import chosen_frames
@@ -51,11 +52,8 @@ def render_html(
         film = Film([result], Options(frames=chosen_frames([frame], np.asarray(result.times), note), **options), note)
         figure = _figure(film)
         file = (Path(output) if output is not None else Path(result.path).parent) / "render.html"
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
+    with written(file, "the page"):
         figure.write_html(file, include_plotlyjs=True, auto_play=False, default_height="98vh", config=_CONFIG)
-    except OSError as error:
-        raise InputError(f"{file}: the page cannot be written ({error.strerror}); give another folder") from error
     return file
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
+from ..files import written
 from ..parallel.agreement import agreed
 from .camera import at_one_scale
 from .chart import opened
@@ -113,16 +114,16 @@ def render(
                 film.write(folder / "frames", share, tell)
         if comm is not None:
             comm.Barrier()
-        written = []
+        made = []
         if first and chosen.poster:
-            written.append(_save(film.poster(), folder / "render.png"))
+            made.append(_save(film.poster(), folder / "render.png"))
         film.close()
         if first:
             pattern = folder / "frames" / "frame_%04d.png"
-            written += [encode(pattern, folder / f"render.{kind}", chosen.fps) for kind in chosen.kinds]
+            made += [encode(pattern, folder / f"render.{kind}", chosen.fps) for kind in chosen.kinds]
     if comm is not None:
-        written = comm.bcast(written)
-    return written + [folder / "frames" / f"frame_{number:04d}.png" for number in range(film.count)]
+        made = comm.bcast(made)
+    return made + [folder / "frames" / f"frame_{number:04d}.png" for number in range(film.count)]
 
 
 def render_modes(
@@ -385,24 +386,17 @@ def _help() -> None:
 
 def _emptied(folder: Path) -> None:
     """Create the folder of the frames and remove frames of an earlier film, which would end up in this one."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with written(folder / "frame_0000.png", "the picture"):
         for old in folder.glob("frame_*.png"):
             old.unlink()
-    except OSError as error:
-        raise InputError(
-            f"{folder}: pictures cannot be written here ({error.strerror}); give another folder"
-        ) from error
 
 
 def _save(picture: np.ndarray, file: Path) -> Path:
     from PIL import Image
 
-    try:
+    with written(file, "the picture"):
         # fast compression, because a film has hundreds of frames
         Image.fromarray(picture).save(file, compress_level=1)
-    except OSError as error:
-        raise InputError(f"{file}: the picture cannot be written ({error}); give another folder") from error
     return file
 
 

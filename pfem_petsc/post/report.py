@@ -16,6 +16,7 @@ import numpy as np
 
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
+from ..files import written
 from ..output.layout import EVENT, MODE_VALUES
 from ..output.result import peak_force, touch_impulse
 from ..output.units import engineering, prefix_for
@@ -80,11 +81,8 @@ def write_report(
             curves = plot(result, folder, force_filter=force_filter)
             drawn, reason = _draw(result, Path(folder) / "truss", field) if pictures else (None, "not asked for")
             text = _document(result, curves, drawn, reason)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
+    with written(file, "the report"):
         file.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{file}: the report cannot be written ({error.strerror}); give another file") from error
     return file
 
 
@@ -93,10 +91,10 @@ def _draw(result: Any, folder: Path, field: str) -> tuple[Path | None, str]:
     from .render import render
 
     try:
-        written = render(result, folder, field=field, frames=POSTER_FRAMES, video="none", note=lambda _: None)
+        made = render(result, folder, field=field, frames=POSTER_FRAMES, video="none", note=lambda _: None)
     except InputError as error:
         return None, str(error)
-    return next((path for path in written if path.name == "render.png"), written[0]), ""
+    return next((path for path in made if path.name == "render.png"), made[0]), ""
 
 
 def _document(result: Any, curves: Sequence[Path], drawn: Path | None, reason: str) -> str:

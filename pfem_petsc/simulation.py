@@ -20,7 +20,7 @@ from .output.lock import FolderLock
 from .parallel.agreement import on_root
 from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
-from .preflight.checks import inspect, odd_accelerations, warnings_before
+from .preflight.checks import inspect, warnings_before
 from .preflight.forecast import forecast, summarise
 from .restart.checkpoints import find_restart, finished, finished_message
 from .run.outputs import Outputs, ReportedCompilation
@@ -195,7 +195,7 @@ class Simulation(WithEquations):
         entries, warnings = inspect(self.model.case, self.model)
         entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, self.columns)
         before = warnings_before(self.model.case, self.model, self.analysis.plan)
-        return entries, self.model.warnings + odd_accelerations(self.case) + before + warnings
+        return entries, self.model.warnings + before + warnings
 
     def obstacle(self) -> str:
         """Return why the run cannot make its first step, as far as it is known before; empty otherwise. Collective."""

@@ -10,7 +10,7 @@ from logging import Formatter, LogRecord, makeLogRecord
 from logging.handlers import WatchedFileHandler
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, NamedTuple, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TextIO
 
 from ..errors import InputError
 from ..parallel.agreement import agreed
@@ -134,7 +134,7 @@ class Progress:
         self._compiling = 0.0
         self._bar = None
         if self._root and self._stream is not None and _is_terminal(self._stream):
-            self._bar = _Bar(title, self._stream)
+            self._bar = _bar(title, self._stream)
             self._due = self._begin + BAR_REFRESH
 
     def summary(self, entries: dict[str, str]) -> None:
@@ -194,10 +194,7 @@ class Progress:
             return
         self._log_line(text, "WARNING")
         with contextlib.suppress(OSError):  # it is in the log
-            if self._bar is not None:
-                self._bar.print(f"warning: {text}", style="yellow")
-            else:
-                print(f"warning: {text}", file=sys.stderr, flush=True)
+            self._show(f"warning: {text}", sys.stderr, style="yellow")
 
     def close(self, outcome: str = "done") -> None:
         """Print the state at the end, the wall time and the speed; a second call does nothing."""
@@ -206,13 +203,11 @@ class Progress:
         self._closed = True
         now = self._clock()
         step, time, *_ = self._last
+        self._draw()
         if self._bar is not None:
-            try:
-                self._bar.draw(*self._state())
+            with contextlib.suppress(OSError):  # the terminal is closed, as the next line will find
                 self._bar.stop()
-                self._bar = None
-            except OSError:
-                self._let_go_of_stdout()
+            self._bar = None
         if step > self._marked[1]:
             self._write(self._line(now))
         wall, steps = now - self._begin, step - self._span.first_step
@@ -237,13 +232,9 @@ class Progress:
                 self._log_line(line)
             self._mark(now)
             self._interval = min(LAST_LINE, 1.25 * self._interval)
-            self._next_line = self._due = now + self._interval
-        if self._bar is not None:
-            try:
-                self._bar.draw(*self._state())
-                self._due = min(self._next_line, now + BAR_REFRESH)
-            except OSError:
-                self._let_go_of_stdout()
+            self._next_line = now + self._interval
+        self._draw()
+        self._due = self._next_line if self._bar is None else min(self._next_line, now + BAR_REFRESH)
 
     def _done(self) -> float:
         """Return the completed fraction of the run."""
@@ -252,12 +243,18 @@ class Progress:
             return min(1.0, step / self._span.steps)
         return min(1.0, time / self._span.end) if self._span.end > 0 else 1.0
 
-    def _state(self) -> tuple[float, str]:
-        """Return the completed fraction, and a text that fits into 80 columns; the lines of the log say more."""
+    def _draw(self) -> None:
+        """Redraw the bar, if there is one, in 80 columns; the lines of the log say more."""
+        if self._bar is None:
+            return
         step, time, _, contacts, _ = self._last
         total = f"/{self._span.steps}" if self._span.steps is not None else ""
-        text = f"{step}{total}  {self._span.axis.place(time)}"
-        return self._done(), text + (f"  contacts {contacts:,}" if contacts else "")
+        text = f"{step}{total}  {self._span.axis.place(time)}" + (f"  contacts {contacts:,}" if contacts else "")
+        try:
+            self._bar.update(self._bar.task_ids[0], completed=self._done(), state=text)
+            self._bar.refresh()
+        except OSError:
+            self._let_go_of_stdout()
 
     def _line(self, now: float) -> str:
         """Return the state, means and rates since the last line, and the remaining wall time."""
@@ -285,12 +282,16 @@ class Progress:
         if self._stream is None:
             return
         try:
-            if self._bar is not None:
-                self._bar.print(text)
-            else:
-                print(text, file=self._stream, flush=True)
+            self._show(text, self._stream)
         except OSError:
             self._let_go_of_stdout()
+
+    def _show(self, text: str, stream: TextIO, style: str | None = None) -> None:
+        """Print a line to a stream, or above the bar if there is one."""
+        if self._bar is not None:
+            self._bar.console.print(text, style=style, markup=False, highlight=False)
+        else:
+            print(text, file=stream, flush=True)
 
     def _let_go_of_stdout(self) -> None:
         """Stop writing to stdout, because its reader or terminal is closed, or its disk is full."""
@@ -315,36 +316,23 @@ def _is_terminal(stream: TextIO) -> bool:
     return stream.isatty() and not launched and os.environ.get("TERM", "dumb") != "dumb"
 
 
-class _Bar:
-    """A bar by rich, redrawn only on request. All methods raise OSError if the terminal is closed."""
+def _bar(title: str, stream: TextIO) -> Any:
+    """Return a bar by rich, redrawn only on request; what writes to it raises OSError if the terminal is closed."""
+    # loaded here, so that only a terminal pays for loading rich
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
-    def __init__(self, title: str, stream: TextIO) -> None:
-        # loaded here, so that only a terminal pays for loading rich
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            Progress,
-            TaskProgressColumn,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
-        state = TextColumn("{task.fields[state]}", markup=False)
-        columns = (BarColumn(bar_width=20), TaskProgressColumn(), state, TimeElapsedColumn(), TextColumn("ETA"))
-        # no refresh thread, which would interrupt the solver at any time
-        self._bar = Progress(*columns, TimeRemainingColumn(), console=Console(file=stream), auto_refresh=False)
-        self._task = self._bar.add_task(title, total=1.0, state="")
-        self._bar.start()
-
-    def draw(self, done: float, state: str) -> None:
-        self._bar.update(self._task, completed=done, state=state)
-        self._bar.refresh()
-
-    def print(self, text: str, style: str | None = None) -> None:
-        """Print a line above the bar."""
-        self._bar.console.print(text, style=style, markup=False, highlight=False)
-
-    def stop(self) -> None:
-        """End the bar; its last state remains on the terminal."""
-        self._bar.stop()
+    state = TextColumn("{task.fields[state]}", markup=False)
+    columns = (BarColumn(bar_width=20), TaskProgressColumn(), state, TimeElapsedColumn(), TextColumn("ETA"))
+    # no refresh thread, which would interrupt the solver at any time
+    bar = Progress(*columns, TimeRemainingColumn(), console=Console(file=stream), auto_refresh=False)
+    bar.add_task(title, total=1.0, state="")
+    bar.start()
+    return bar

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 _SLENDER = 1e4
 """Length over thickness of a bar beyond which one of the two is mostly in another unit: a cable of 100 m and 1 cm."""
 
-_STRONGEST = 50.0
-"""Acceleration [m/s2] beyond which a record is mostly in another unit: the strongest ground motions reach 40 m/s2."""
-
 _LEAST = 5e-6
 """Strain at which no material yields or breaks: 220 for 220 MPa is 1e-9, in kPa 1e-6; soft metals yield at 1e-4."""
 
@@ -134,26 +131,6 @@ def odd_numbers(case: Case, model: Model) -> Iterator[str]:
                     f"node_set.{name}.nearest: the nearest node is node {node}, {engineering(-distance, 'm')} away "
                     "from the point, more than the size of the truss"
                 )
-
-
-def odd_accelerations(case: Case) -> list[str]:
-    """Return one message for each ground acceleration or gravity, of all stages, that is beyond those of the Earth."""
-    texts = []
-    for k, stage in enumerate(case.stages):
-        where = f"stage[{k}]." if case.stage and k > 0 else ""  # tables at the top belong to the first stage
-        given = {f"support[{n}]": entry.acceleration for n, entry in enumerate(stage.support)}
-        if stage.gravity is not None:
-            given["gravity"] = stage.gravity.acceleration
-        for table, rows in given.items():
-            if rows is None or (k > 0 and stage.holds(table.split("[")[0])):
-                continue
-            peak = float(np.abs(np.atleast_2d(np.array(rows, dtype=float))[:, -3:]).max(initial=0.0))
-            if peak > _STRONGEST:
-                texts.append(
-                    f"{case.source}: {where}{table}.acceleration reaches {peak:.4g} m/s2, {peak / 9.80665:.3g} g: a "
-                    "record in cm/s2 needs scale = 0.01, lengths in mm 0.001"
-                )
-    return texts
 
 
 def _materials(case: Case) -> Iterator[str]:

@@ -23,7 +23,7 @@ from ..output.result import RESULT_NAME
 from ..output.units import MODE
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import on_root
-from ..preflight.checks import odd_accelerations, warnings_before
+from ..preflight.checks import warnings_before
 from ..preflight.forecast import summarise
 from ..restart.checkpoints import Restart, prepare_folder
 from ..restart.state import RunState
@@ -274,7 +274,7 @@ class Outputs:
         )
         progress.summary(summarise(case, model, plan))
         warnings = warnings_before(model.case, model, stages.analysis.plan)
-        for warning in model.warnings + odd_accelerations(case) + warnings:
+        for warning in model.warnings + warnings:
             progress.warning(warning)
         for text in (*([plan.scheme.notice] if plan.scheme.notice else []), *notes):
             progress.message(text)

@@ -21,7 +21,7 @@ def test_mechanisms_and_self_stress(comm, shared_tmp_path, name):
     assert len(bars) - unknowns == stresses - mechanisms - rigid
     free = [text for text in warnings if "can move freely" in text]
     assert [text.startswith(f"{loose} node") for text in free] == [True] * bool(loose)
-    assert name != "square with a whip" or free[0].endswith("the first is node 4")
+    assert name != "square with a whip" or "the first is node 4. Was the mesh subdivided?" in free[0]
 
 
 @pytest.mark.parametrize(
@@ -41,24 +41,15 @@ def test_odd_values_are_told(comm, override, texts):
     assert all(text in told[0] for text in texts)
 
 
-@pytest.mark.slow
-def test_ground_accelerations_in_other_units_are_told(comm):
-    overrides = ["stage.1.support.0.acceleration=[[0.0,0,0,0],[0.5,300.0,0,0],[1.0,0,0,0]]"]
-    _, told = inspected(Case.load("dome_earthquake", overrides), comm)
-    (text,) = [text for text in told if "acceleration" in text]
-    assert "stage[1].support[0].acceleration reaches 300 m/s2, 30.6 g" in text and "scale = 0.01" in text
-    _, told = inspected(Case.load("dome_earthquake", ["gravity.acceleration=[0,0,-9810]"]), comm)
-    assert [text for text in told if "gravity.acceleration reaches 9810 m/s2" in text] == told
-    assert inspected(Case.load("dome_earthquake"), comm)[1] == []
-
-
 def test_far_from_the_origin(comm, shared_tmp_path):
     points, bars, _, _ = TRUSSES["tetrahedron"]
     _, (text,) = inspected(case_of(shared_tmp_path, comm, np.add(points, 1e7), bars), comm)
     assert "away from the origin" in text
 
 
-@pytest.mark.parametrize("name", ["rod_impact", "ring_impact", "lattice_drop", "pendulum", "tumbling_lattice"])
+@pytest.mark.parametrize(
+    "name", ["rod_impact", "ring_impact", "lattice_drop", "pendulum", "tumbling_lattice", "dome_earthquake"]
+)
 def test_sound_cases_have_no_warnings(comm, name):
     overrides = ["mesh.cells=[3,3,3]", "node_set.top.nearest=[0.03,0.03,0.03]"] if name == "lattice_drop" else []
     assert inspected(Case.load(name, overrides), comm)[1] == []

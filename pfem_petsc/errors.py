@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
 __all__ = [
     "NUMPY_REMEDY",
     "EarlyStop",
@@ -11,6 +15,7 @@ __all__ = [
     "SimulationFailure",
     "numpy_is_too_new",
     "printable",
+    "written",
 ]
 
 
@@ -66,3 +71,20 @@ class EarlyStop(PfemError):
     """The run stopped early on request (signal or time limit), with a checkpoint written."""
 
     exit_status = 4
+
+
+@contextmanager
+def written(path: Path, what: str) -> Iterator[None]:
+    """Context that writes a file, whose folder it makes; ``what`` is written, for messages.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        text = f"{path}: {what} cannot be written ({error.strerror or error}); give another file or folder"
+        raise InputError(text) from error

@@ -1,4 +1,4 @@
-"""Files that are read whole, the memory that bounds them, and files that cannot be written."""
+"""Sizes and kinds of files that are read whole, and the memory that bounds them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,9 @@ import errno
 import os
 import stat
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from .errors import InputError
-
-__all__ = ["check_contents", "memory_of_machine", "readable_whole", "written"]
+__all__ = ["check_contents", "memory_of_machine", "readable_whole"]
 
 
 def memory_of_machine() -> float:
@@ -63,20 +59,3 @@ def _check(size: int) -> None:
         raise OSError(
             errno.EFBIG, f"it has {size / 1e9:,.1f} GB of content, more than the memory of {memory / 1e9:,.1f} GB"
         )
-
-
-@contextmanager
-def written(path: Path, what: str) -> Iterator[None]:
-    """Context that writes a file, whose folder it makes; ``what`` is written, for messages.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield
-    except OSError as error:
-        text = f"{path}: {what} cannot be written ({error.strerror or error}); give another file or folder"
-        raise InputError(text) from error

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError, printable
-from ..files import written
+from ..errors import InputError, printable, written
 from .parser import PROGRAM, Action, Verb, argument, setting
 
 if TYPE_CHECKING:

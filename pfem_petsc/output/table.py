@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..files import written
+from ..errors import InputError, written
 from ..registry import nearest
 
 if TYPE_CHECKING:

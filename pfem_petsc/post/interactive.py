@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..files import written
+from ..errors import InputError, written
 from .camera import Camera
 from .chart import opened
 from .motion import chosen_frames

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..files import written
+from ..errors import InputError, written
 from ..parallel.agreement import agreed
 from .camera import at_one_scale
 from .chart import opened

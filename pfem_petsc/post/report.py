@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..columns import LOST, STORED, SUPPLIED
-from ..errors import InputError
-from ..files import written
+from ..errors import InputError, written
 from ..output.layout import EVENT, MODE_VALUES
 from ..output.result import peak_force, touch_impulse
 from ..output.units import engineering, prefix_for

@@ -80,8 +80,7 @@ def broken_walls(
     """
     beyond = np.flatnonzero(contact.near(x, displacements, np.array([-tolerance])))
     applicable = contact.applicable(beyond, x[beyond], displacements)
-    normals, offsets = contact.planes(applicable, x[beyond], displacements)
-    gaps = np.einsum("iwk,ik->iw", normals, x[beyond]) - offsets
+    normals, gaps = contact.distances(applicable, x[beyond], displacements)
     broken = gaps < -tolerance
     place = np.searchsorted(candidates.nodes, beyond)
     known = place < len(candidates.nodes)
@@ -188,15 +187,11 @@ class StepFriction:
         self.drag = np.zeros((0, walls, 3))
         self.unsettled = np.empty(0, dtype=np.int64)
 
-    def dissipated(self, nodes: np.ndarray, x: np.ndarray) -> float:
-        """Return the energy [J] that friction dissipates as nodes (m,) move to positions (m, 3)."""
-        slip = (x - self.state.position[nodes])[:, None, :] - self._way
-        return -float((self.drag * slip).sum())
-
     def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
         """Add friction to the forces (m, walls, 3) on nodes (m,) at (m, 3) [N]; return the energy dissipated [J]."""
         force += self.drag
-        return self.dissipated(nodes, x)
+        slip = (x - self.state.position[nodes])[:, None, :] - self._way
+        return -float((self.drag * slip).sum())
 
     def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
         """Fix the sticking nodes of the frames and apply friction to the slipping ones, at a guess (owned, 3)."""

@@ -17,7 +17,6 @@ from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, ExpectedNodes, SetPart
 from .fixed_rows import FixedRows, TwoNodeRows
-from .node_walls import distances_from_planes
 from .rows import Planes, RowSet, free_positions, last_forces, push_nodes
 
 if TYPE_CHECKING:
@@ -76,8 +75,10 @@ class _WallsAtRows:
 
     def planes(self, x: np.ndarray, flags: np.ndarray, time: float) -> Planes:
         """The planes at the nodes at x (n, 3), with ``flags`` (k, flags): walls that can stop nodes of other ranks."""
-        contact, nodes, gaps = self._contact, self.nodes, np.empty((len(self.nodes), len(self._contact.normals)))
-        distances_from_planes(nodes, x, contact.normals, contact.plane_offsets(time), self._members, gaps)
+        contact, nodes = self._contact, self.nodes
+        # bits must not depend on how many nodes this rank has, as those of a product of matrices do
+        along = sum(np.multiply.outer(x[nodes, c], contact.normals[:, c]) for c in range(3))
+        gaps = np.where(self._members[nodes], along - contact.plane_offsets(time), np.inf)
         if self.flags:
             where = self._rows.where[nodes]
             own = where >= 0

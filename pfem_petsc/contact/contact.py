@@ -52,10 +52,6 @@ class Contact(ExplicitContact):
             self.log.book(walls, h, self.mesh.comm)
         return self.ties.take(walls.nodes, walls.touching, walls.places, time)
 
-    def damp_velocity(self, fresh: FreshTies, v: np.ndarray, time: float, h: float) -> None:
-        """See :meth:`~pfem_petsc.contact.tied.Ties.damp_velocity`; velocities (owned, 3), result of :meth:`record`."""
-        self.ties.damp_velocity(*fresh, v, self.motion.rates(time), h)
-
     def frames(
         self, candidates: Candidates, x: np.ndarray, time: float, least: float = MIN_VOLUME, part: float = 1.0
     ) -> NodalFrames:
@@ -144,8 +140,7 @@ class Candidates:
         applicable[np.searchsorted(nodes, joined)] = broken
         place = np.searchsorted(nodes, self.nodes)
         applicable[place] |= self.applicable
-        normals, offsets = contact.planes(applicable, x[nodes], displacements)
-        priority = np.einsum("iwk,ik->iw", normals, x[nodes]) - offsets
+        _, priority = contact.distances(applicable, x[nodes], displacements)
         normal_forces = strengths > 0.0
         largest = max(float(strengths.max(initial=0.0)), 1e-300)
         held = priority[place]
@@ -189,8 +184,7 @@ def _within_reach(
     within = np.zeros_like(applicable)
     starts = state.position[nodes], contact.motion.displacements(state.time), BEYOND * contact.size
     for place, there, distance in ((x, displacements, reach[:, None]), starts):
-        normals, offsets = contact.planes(applicable, place, there)
-        within |= np.einsum("mwi,mi->mw", normals, place) - offsets < distance
+        within |= contact.distances(applicable, place, there)[1] < distance
     return within & applicable
 
 
@@ -244,24 +238,12 @@ def check_start(contact: Contact, x: np.ndarray, length: float) -> None:
     InputError
         On all ranks; names the wall, the deepest node and its depth.
     """
-    if not contact.any:
-        return
-    comm = contact.mesh.comm
-    gaps = contact.gaps(x, 0.0)
-    for k, wall in enumerate(contact.walls):
-        if wall.partial:  # no node starts beyond a wall that nodes can pass beside
-            continue
-        deepest, node, count = 0.0, -1, 0
-        if len(gaps):
-            at = int(np.argmin(gaps[:, k]))
-            deepest, node = float(gaps[at, k]), int(contact.mesh.node_ids[at])
-            count = int((gaps[:, k] < -ON_BOUND * length).sum())
-        depth, node = min(comm.allgather((deepest, node)))
-        count = comm.allreduce(count)
-        if count:
-            raise InputError(
-                f"{contact.source}: wall {contact.names[k]!r}: node {node} starts {-depth:.6g} "
-                f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "
-                "turn the normal to the allowed side, name the nodes that it applies to with 'node_set', or let "
-                "'adjust = true' move the nodes"
-            )
+    found = contact.deepest(x, 0.0, ON_BOUND * length) if contact.any else None
+    if found is not None:
+        depth, node, wall, count = found
+        raise InputError(
+            f"{contact.source}: wall {contact.names[wall]!r}: node {node} starts {depth:.6g} "
+            f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "
+            "turn the normal to the allowed side, name the nodes that it applies to with 'node_set', or let "
+            "'adjust = true' move the nodes"
+        )

@@ -153,17 +153,7 @@ class Planes(NamedTuple):
     places: np.ndarray
 
 
-class _Output(NamedTuple):
-    """Arrays of :class:`NodalFrames` to be filled."""
-
-    basis: np.ndarray
-    inverse: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    rows: np.ndarray
-    signs: np.ndarray
-    shared: np.ndarray
-    bounds: np.ndarray
+_FILLED = "basis", "inverse", "lower", "upper", "rows", "signs", "shared", "bounds"
 
 
 def build_frames(nodes: np.ndarray, planes: Planes, tolerance: float = 0.0, least: float = MIN_VOLUME) -> NodalFrames:
@@ -178,7 +168,7 @@ def build_frames(nodes: np.ndarray, planes: Planes, tolerance: float = 0.0, leas
     """
     frames = NodalFrames(nodes, planes.offsets.shape[1])
     frames.places, frames.normals = planes.places, planes.normals
-    output = _Output(*(getattr(frames, name) for name in _Output._fields))
+    output = tuple(getattr(frames, name) for name in _FILLED)
     frames.oblique, frames.contradiction = _build(planes, tolerance, least, output)
     frames.offsets = np.where(frames.rows >= 0, planes.offsets, -np.inf)
     return frames
@@ -201,7 +191,8 @@ def _rest(vector, spanned, n, out):
 
 @kernel
 def _build(planes, tolerance, least, output):
-    """Fill an _Output; return whether any basis is not the identity, and a node with infeasible bounds, else -1."""
+    """Fill the arrays of :class:`NodalFrames` that ``_FILLED`` names; return whether any basis is not the identity, and
+    a node with infeasible bounds, else -1."""
     fixed, normals, offsets, rank, places = planes
     basis, inverse, lower, upper, rows, signs, shares, bounds = output
     m, w = offsets.shape

@@ -68,8 +68,7 @@ def start_at_rest(
     slack = ON_BOUND * contact.size
     nodes = np.flatnonzero(contact.near(x, displacements, np.array([slack])))
     applicable = contact.members[nodes]
-    normals, offsets = contact.planes(applicable, x[nodes], displacements)
-    gaps = np.einsum("mwi,mi->mw", normals, x[nodes]) - offsets
+    normals, gaps = contact.distances(applicable, x[nodes], displacements)
     away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - rates)
     resting = applicable & (np.abs(gaps) <= slack) & (np.abs(away) <= still)
     resting[:, [wall.partial for wall in contact.walls]] = False  # the plane of a partial wall extends beyond the wall

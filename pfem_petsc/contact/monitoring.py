@@ -39,28 +39,20 @@ def check_positions(model: Model, x: np.ndarray, time: float, where: str) -> Non
     contact, comm = model.contact, model.comm
     if not contact.any:
         return
-    gaps = contact.gaps(x, time)
-    gaps[:, [wall.partial for wall in contact.walls]] = np.inf
-    tolerance = BEYOND * max(model.size, model.reach)
-    # a NaN has its own message elsewhere
-    suspects = np.flatnonzero((gaps < -tolerance).any(axis=1))
-    if comm.allreduce(len(suspects), op=MPI.MAX) == 0:
+    found = contact.deepest(x, time, BEYOND * max(model.size, model.reach))
+    if found is None:
         return
-    deepest = (0.0, -1, -1)
-    if len(suspects):
-        at, wall = np.unravel_index(int(gaps[suspects].argmin()), (len(suspects), len(contact.walls)))
-        deepest = (float(gaps[suspects[at], wall]), int(model.mesh.node_ids[suspects[at]]), int(wall))
-    depth, node, wall = min(comm.allgather(deepest))
-    count = comm.allreduce(int((gaps[:, wall] < -tolerance).sum()))
-    carried = comm.allreduce(deepest == (depth, node, wall) and _prescribed(contact, suspects[at], wall, x, time))
+    depth, node, wall, count = found
+    own = np.flatnonzero(model.mesh.node_ids[: len(x)] == node)
+    carried = comm.allreduce(len(own) > 0 and _prescribed(contact, own[0], wall, x, time))
     if carried:
-        raise SimulationFailure(_told(where, node, -depth, contact.names[wall], count))
+        raise SimulationFailure(_told(where, node, depth, contact.names[wall], count))
     case = model.case
     others = "another contact.treatment or time.integrator"
     if case.contact.treatment != "scheme":
         others = f'contact.treatment = "scheme" instead of "{case.contact.treatment}"'
     raise SimulationFailure(
-        f"{where}: node {node} is {-depth:.3g} m beyond wall {contact.names[wall]!r} "
+        f"{where}: node {node} is {depth:.3g} m beyond wall {contact.names[wall]!r} "
         f"({count} node{'s' if count > 1 else ''} in all), which contact did not prevent: results since it "
         f"passed the wall are wrong; reduce time.step, or use {others}"
     )

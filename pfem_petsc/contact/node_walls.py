@@ -4,7 +4,6 @@ them, and the log of contact times and releases.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -136,9 +135,7 @@ class ContactLog:
         self.time = np.zeros(n_walls)
         self.last = np.empty(0, dtype=np.int64)
         self.present = np.zeros(n_owned, dtype=bool)
-        self._pending = 0
-        self._steps = np.empty(_PENDING)
-        self._flags = np.empty((_PENDING, n_walls), dtype=np.uint8)
+        self._pending: list[tuple[float, np.ndarray]] = []  # steps and the walls touched in them
 
     def book(self, walls: WallForces, step: float, comm: MPI.Comm) -> None:
         """Record the contacts of a step of size ``step`` [s]. Collective whenever the buffer is full."""
@@ -152,25 +149,29 @@ class ContactLog:
 
     def note(self, touched: np.ndarray, step: float, comm: MPI.Comm) -> None:
         """Record the walls (walls,) bool that were touched in a step. Collective whenever the buffer is full."""
-        if self._pending >= _PENDING:
+        if len(self._pending) >= _PENDING:
             self.meet(comm)
-        self._steps[self._pending] = step
-        self._flags[self._pending] = touched
-        self._pending += 1
+        self._pending.append((step, touched))
 
     def meet(self, comm: MPI.Comm, contacts: np.ndarray | None = None) -> None:
         """Update the contact times on all ranks. Collective.
 
         ``contacts`` (walls,): number of nodes of all ranks in contact after the last step, if known.
         """
-        n, self._pending = self._pending, 0
-        if n == 1 and contacts is not None:
-            self.time += self._steps[0] * (contacts > 0)
-        elif n and len(self.time):
-            flags = self._flags[:n]
+        steps, flags = self._buffered()
+        self._pending = []
+        if len(steps) == 1 and contacts is not None:
+            self.time += steps[0] * (contacts > 0)
+        elif len(steps) and len(self.time):
             if comm.size > 1:
                 comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
-            self.time += self._steps[:n] @ flags
+            self.time += steps @ flags
+
+    def _buffered(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return steps (n,) [s] that are not yet added to the times, and walls touched in them (n, walls) uint8."""
+        steps = np.array([step for step, _ in self._pending])
+        flags = np.array([touched for _, touched in self._pending], dtype=np.uint8)
+        return steps, flags.reshape(len(steps), len(self.time))
 
     def share(self) -> dict[str, Any]:
         """Return this rank's sums for a checkpoint."""
@@ -184,18 +185,16 @@ class ContactLog:
 
         Only :meth:`meet` adds them: other partial sums would round differently.
         """
-        flags = self._flags[: self._pending].copy()
+        steps, flags = self._buffered()
         comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
-        return {"sum": self.time.tolist(), "steps": self._steps[: self._pending].tolist(), "flags": flags.tolist()}
+        return {"sum": self.time.tolist(), "steps": steps.tolist(), "flags": flags.tolist()}
 
     def load_state(self, share: dict[str, Any], times: dict[str, Any], touching: np.ndarray) -> None:
         """Restore this rank's sums, the contact times and the contacts from a checkpoint."""
         self.releases[:] = np.array(share["wall_releases"], dtype=np.int64)
         self.changes = int(share["contact_changes"])
         self.time[:] = times["sum"]
-        self._pending = n = len(times["steps"])
-        self._steps[:n] = times["steps"]
-        self._flags[:n] = np.array(times["flags"], dtype=np.uint8).reshape(n, len(self.time))
+        self._pending = list(zip(times["steps"], times["flags"], strict=True))
         self.touching = touching
         self.last = np.flatnonzero(touching.any(axis=1))
 
@@ -229,18 +228,6 @@ def near_planes(x, normals, offsets, all_nodes, members, reach, near):
                 count += 1
                 break
     return count
-
-
-@kernel
-def distances_from_planes(nodes, x, normals, offsets, members, gaps):
-    """Write distances (m, w) of nodes (m,) at x (n, 3) from planes (w, 3), (w,) to ``gaps``, infinite for those that
-    are not ``members`` (n, w)."""
-    for j in range(len(nodes)):
-        i = nodes[j]
-        for k in range(len(offsets)):
-            gaps[j, k] = math.inf
-            if members[i, k]:
-                gaps[j, k] = x[i, 0] * normals[k, 0] + x[i, 1] * normals[k, 1] + x[i, 2] * normals[k, 2] - offsets[k]
 
 
 _ZERO = np.zeros(1)
@@ -390,6 +377,34 @@ class NodeWalls:
                 offsets[:, k] = np.einsum("mi,mi->m", normals[:, k], x) - self.gap(k, x, displacements)
         offsets[~applicable] = -np.inf
         return normals, offsets
+
+    def distances(
+        self, applicable: np.ndarray, x: np.ndarray, displacements: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return normals (m, w, 3) at positions (m, 3), and distances (m, w) along them, infinite for walls that do not
+        apply."""
+        normals, offsets = self.planes(applicable, x, displacements)
+        return normals, np.einsum("mwi,mi->mw", normals, x) - offsets
+
+    def deepest(self, x: np.ndarray, time: float, tolerance: float) -> tuple[float, int, int, int] | None:
+        """Return depth [m], mesh number and wall of the node farthest beyond a wall, and how many nodes are beyond that
+        wall; None if none is by more than the tolerance. Nodes can pass beside partial walls, which do not count.
+        Collective.
+
+        ``x`` (owned, 3) : positions at a time [s]
+        """
+        comm, gaps = self.mesh.comm, self.gaps(x, time)
+        gaps[:, [wall.partial for wall in self.walls]] = np.inf
+        # a NaN has its own message elsewhere
+        suspects = np.flatnonzero((gaps < -tolerance).any(axis=1))
+        if comm.allreduce(len(suspects), op=MPI.MAX) == 0:
+            return None
+        lowest = (0.0, -1, -1)
+        if len(suspects):
+            at, wall = np.unravel_index(int(gaps[suspects].argmin()), (len(suspects), len(self.walls)))
+            lowest = (float(gaps[suspects[at], wall]), int(self.mesh.node_ids[suspects[at]]), int(wall))
+        depth, node, wall = min(comm.allgather(lowest))
+        return -depth, node, wall, comm.allreduce(int((gaps[:, wall] < -tolerance).sum()))
 
     def acting(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray, part: float) -> np.ndarray | None:
         """Return the directions (m, w, 3) in which curved walls push nodes (m,) that move to (m, 3) in a step.

@@ -126,8 +126,7 @@ class Ties:
         displacements = contact.motion.displacements(time)
         applicable = contact.applicable(nodes, places, displacements)
         applicable[np.arange(len(nodes)), walls] = partly
-        normals, offsets = contact.planes(applicable, places, displacements)
-        gaps = np.einsum("mwi,mi->mw", normals, places) - offsets
+        normals, gaps = contact.distances(applicable, places, displacements)
         gaps[held_by_supports(contact.fixed[nodes][:, None, :], normals)] = np.inf
         node, other = np.unravel_index(np.argmin(gaps), gaps.shape)
         if gaps[node, other] < -BEYOND * contact.size and other == walls[node]:

@@ -4,7 +4,7 @@ walls, then by elimination within the groups of rows that share nodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -86,6 +86,8 @@ class RowCoordinates:
     def _place(self, jacobian: np.ndarray, inverse: np.ndarray, room: np.ndarray) -> None:
         """Choose the pivots. ``jacobian`` (r, k, 3) by x; of the nodes: ``inverse`` (n, 3, 3) of their frames' bases,
         and ``room`` (n, 3) bool: coordinates that no wall bounds."""
+        from scipy.sparse import csr_matrix
+
         rows = self.rows
         self.jacobian = jacobian
         some = (rows.ends >= 0)[:, :, None]
@@ -110,18 +112,13 @@ class RowCoordinates:
                 self._transform(groups.rows[part], unknowns[part], dense[part], row[part, :k], column[part, :k])
         self._placed = np.flatnonzero(self._pivot >= 0)
         self._deferred = np.flatnonzero((self._pivot < 0) & rows.usable(jacobian))
-        # the rows of T with more than a diagonal, as entries
-        self._changed = np.zeros(n, dtype=bool)
-        parts = []
+        # T has entries for all pairs of unknowns of a group, so that its pattern never changes
+        entries = [np.empty((3, 0))]
         for unknowns, transform in self._blocks:
-            changed = (transform != np.eye(unknowns.shape[1])).any(axis=2)
-            self._changed[unknowns] = changed
-            group, at, column = np.nonzero((transform != 0.0) & changed[:, :, None])
-            parts.append((unknowns[group, at], unknowns[group, column], transform[group, at, column]))
-        self._to, self._from, self._values = (
-            np.concatenate([np.empty(0, dtype=kind), *(part[k] for part in parts)])
-            for k, kind in ((0, np.int64), (1, np.int64), (2, np.float64))
-        )
+            row, column = np.broadcast_arrays(unknowns[:, :, None], unknowns[:, None, :])
+            entries.append(np.stack([row.ravel(), column.ravel(), transform.ravel()]))
+        row, column, values = np.concatenate(entries, axis=1)
+        self._matrix = csr_matrix((values, (row.astype(np.int64), column.astype(np.int64))), (n, n))
         # pivots of this rank's nodes: local node, component, row
         local = rows.where[self._pivot[self._placed] // 3]
         here = local >= 0
@@ -168,9 +165,7 @@ class RowCoordinates:
 
     def forward(self, w: np.ndarray) -> None:
         """Transform w to y (owned, 3), in place. Collective."""
-        every = self._all(w)
-        changed = np.bincount(self._to, self._values * every[self._from], minlength=len(every))
-        self._write(w, np.where(self._changed, changed, every))
+        self._write(w, self._matrix @ self._all(w))
 
     def _write(self, array: np.ndarray, every: np.ndarray) -> None:
         array[self.rows.here] = every.reshape(-1, 3)[self.rows.mine]
@@ -185,9 +180,7 @@ class RowCoordinates:
 
     def adjoint(self, g: np.ndarray) -> None:
         """Transform a gradient with respect to y to that with respect to w (owned, 3), in place. Collective."""
-        every = self._all(g)
-        kept = np.where(self._changed, 0.0, every)
-        self._write(g, kept + np.bincount(self._from, self._values * every[self._to], minlength=len(every)))
+        self._write(g, self._matrix.T @ self._all(g))
 
     def diagonal(self, blocks: BlocksOf, diagonal: np.ndarray) -> None:
         """Replace the diagonal (owned, 3) of H, with diagonal blocks ``blocks``, by that of T^T H T. Collective."""
@@ -204,46 +197,31 @@ class RowCoordinates:
     def matrix(self) -> PETSc.Mat:
         """Return T, preallocated for all states; the caller destroys it. Collective."""
         rows, mesh = self.rows, self.rows.mesh
-        own = np.arange(mesh.first_node, mesh.first_node + mesh.n_owned)
-        numbers = rows.gather(own).astype(np.int64)
-        local = np.repeat(np.where(rows.mine, 3 * rows.where, -1), 3) + np.tile([0, 1, 2], len(rows.numbers))
-        local[np.repeat(~rows.mine, 3)] = -1
-        counts = np.ones(3 * mesh.n_owned, dtype=np.int64)
-        size = np.zeros(len(local), dtype=np.int64)
-        for unknowns, _ in self._blocks:
-            size[unknowns] = unknowns.shape[1]
-        counts[local[local >= 0]] = size[local >= 0]
-        pointers = np.append(0, np.cumsum(counts))
-        indices = 3 * mesh.first_node + np.repeat(np.arange(3 * mesh.n_owned), counts)
-        self._local, self._wide = local, 3 * np.repeat(numbers, 3) + np.tile([0, 1, 2], len(numbers))
-        for at, columns, _ in self._entries(pointers):
-            indices[at] = columns
-        self._pattern = pointers.astype(PETSc.IntType), indices.astype(PETSc.IntType)
+        numbers = rows.gather(np.arange(mesh.first_node, mesh.first_node + mesh.n_owned)).astype(np.int64)
+        self._local, self._wide = ((3 * at[:, None] + np.arange(3)).ravel() for at in (rows.here, numbers))
         matrix = PETSc.Mat().create(comm=mesh.comm)
         size = 3 * mesh.n_owned, 3 * mesh.n_nodes
         matrix.setSizes((size, size), bsize=3)
         matrix.setType(PETSc.Mat.Type.AIJ)
-        matrix.setPreallocationCSR(self._pattern)
-        self.refresh(matrix)
+        matrix.setPreallocationCSR(self._own_rows())
         return matrix
 
-    def _entries(self, pointers: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Of groups alike, and of T's rows (m,) here: places (m, u) of entries, columns, and values."""
-        for unknowns, transform in self._blocks:
-            wide = self._wide[unknowns]
-            order = np.argsort(wide, axis=1)
-            group, row = np.nonzero(self._local[unknowns] >= 0)
-            at = pointers[self._local[unknowns[group, row]]][:, None] + np.arange(unknowns.shape[1])
-            columns = np.take_along_axis(wide, order, axis=1)[group]
-            yield at, columns, np.take_along_axis(transform[group, row], order[group], axis=1)
+    def _own_rows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return pointers, columns and values of the rows of T of all owned nodes, the identity for those without."""
+        from scipy.sparse import csr_matrix
+
+        mesh = self.rows.mesh
+        some = self._matrix[np.repeat(self.rows.mine, 3)].tocoo()
+        others = np.setdiff1d(np.arange(3 * mesh.n_owned), self._local)
+        row = np.append(self._local[some.row], others)
+        column = np.append(self._wide[some.col], 3 * mesh.first_node + others)
+        values = np.append(some.data, np.ones(len(others)))
+        own = csr_matrix((values, (row, column)), (3 * mesh.n_owned, 3 * mesh.n_nodes))
+        return own.indptr.astype(PETSc.IntType), own.indices.astype(PETSc.IntType), own.data
 
     def refresh(self, matrix: PETSc.Mat) -> None:
         """Update T. Collective."""
-        pointers, indices = self._pattern
-        values = np.ones(len(indices))
-        for at, _, entries in self._entries(pointers):
-            values[at] = entries
-        matrix.setValuesCSR(pointers, indices, values)
+        matrix.setValuesCSR(*self._own_rows())
         matrix.assemble()
 
     def bound(self, x: np.ndarray, w: np.ndarray, lower: np.ndarray) -> None:

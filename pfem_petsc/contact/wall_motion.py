@@ -216,27 +216,27 @@ class WallMotion:
             dtype=bool,
         )
 
-    def displacements(self, time: float) -> np.ndarray:
-        """Return displacements (w, 3) [m] at a time [s]."""
-        displacements = self.held.copy()
+    def _prescribed(self, quantity: int, time: float, ahead: bool = True) -> np.ndarray:
+        """Return the prescribed displacements, velocities or accelerations (w, 3) at a time [s], zero for others."""
+        values = np.zeros((len(self._motions), 3))
         for k, motion in enumerate(self._motions):
             if motion is not None:
-                displacements[k] = motion.at(time)[0]
+                values[k] = motion.at(time, ahead=ahead)[quantity]
+        return values
+
+    def displacements(self, time: float) -> np.ndarray:
+        """Return displacements (w, 3) [m] at a time [s]."""
+        displacements = self.held + self._prescribed(0, time)
         displacements[self.bodies.at] = self.bodies.displacements(time)
         return displacements
 
     def rates(self, time: float, ahead: bool = False) -> np.ndarray:
         """Return velocities (w, 3) [m/s] at a time [s]; at the kinks of a linear table the left limit, or the right one
         if ``ahead``."""
-        rates = np.zeros((len(self._motions), 3))
-        for k, motion in enumerate(self._motions):
-            if motion is not None:
-                rates[k] = motion.at(time, ahead=ahead)[1]
+        rates = self._prescribed(1, time, ahead)
         rates[self.bodies.at] = self.bodies.state.v
         return rates
 
     def accelerations(self, time: float) -> np.ndarray:
         """Return accelerations (w, 3) [m/s2] of walls with prescribed motion at a time [s]; zero for others."""
-        nothing = np.zeros((3, 3))
-        moved = [nothing if motion is None else motion.at(time) for motion in self._motions]
-        return np.array([each[2] for each in moved]).reshape(-1, 3)
+        return self._prescribed(2, time)

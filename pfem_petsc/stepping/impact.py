@@ -276,10 +276,8 @@ class Impacts:
         if contact.plain and not free.any:
             normals, gaps = plane_gaps(nodes, x, contact.normals, contact.plane_offsets(time))
         else:
-            normals, offsets = contact.planes(
-                np.ones((len(nodes), len(contact.names)), dtype=bool), x[nodes], displacements
-            )
-            gaps = np.einsum("mwi,mi->mw", normals, x[nodes]) - offsets
+            every = np.ones((len(nodes), len(contact.names)), dtype=bool)
+            normals, gaps = contact.distances(every, x[nodes], displacements)
         free_v, free_a = self._free(nodes, motion, load)
         rates, speeds = contact.motion.rates(time, ahead=True), np.empty(gaps.shape)
         pulls = np.zeros(rates.shape)

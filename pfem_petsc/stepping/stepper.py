@@ -663,7 +663,7 @@ class Stepper(ABC):
             self.prescribed.take_rates(state.time)
         contact.motion.bodies.finish(self.part, end)
         if scheme.turns_held and self.treatment is None:
-            contact.damp_velocity(fresh, state.v, found.time, self.part)
+            contact.ties.damp_velocity(*fresh, state.v, contact.motion.rates(found.time), self.part)
 
     def _place_supports(self, end: float) -> None:
         """Give supports that move their exact positions and rates."""

@@ -94,32 +94,6 @@ def with_groups(rows: np.ndarray, columns: Sequence[int], starts: np.ndarray, co
 
 
 @kernel
-def _root(parent, i):
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@kernel
-def group_rows(ends, n, label):
-    """Label nodes (n,) with the lowest node to which rows (r, k) connect them."""
-    for i in range(n):
-        label[i] = i
-    for r in range(len(ends)):
-        for k in range(1, ends.shape[1]):
-            if ends[r, k] < 0:
-                continue
-            a, b = _root(label, ends[r, 0]), _root(label, ends[r, k])
-            if a < b:
-                label[b] = a
-            else:
-                label[a] = b
-    for i in range(n):
-        label[i] = _root(label, i)
-
-
-@kernel
 def gather_rows(at, array, vectors):
     """Fill vectors (k, 3, r) of rows with nodes ``at`` (r, k) from those of nodes (n, 3)."""
     for r in range(len(at)):
@@ -376,18 +350,15 @@ class RowSet:
             self._at.append(np.ascontiguousarray(self.ends[part, :width]))
 
     def _gather_groups(self) -> None:
-        label = np.empty(len(self.numbers), dtype=np.int64)
-        group_rows(self.ends, len(label), label)
-        labels, self.group_of_node = np.unique(label, return_inverse=True)
+        count, self.group_of_node = _connected(self.ends, len(self.numbers))
         self.group_of_row = self.group_of_node[self.ends[:, 0]]
         nodes = np.argsort(self.group_of_node, kind="stable")
         rows = np.argsort(self.group_of_row, kind="stable")
-        every = np.arange(len(labels) + 1)
+        every = np.arange(count + 1)
         starts = np.searchsorted(self.group_of_row[rows], every)
         self.groups = Groups(starts, rows, np.searchsorted(self.group_of_node[nodes], every), nodes)
-        turning = np.zeros(len(labels), dtype=bool)
-        turning[self.group_of_row[~self.fixed]] = True
-        self._turning = turning
+        self._turning = np.zeros(count, dtype=bool)
+        self._turning[self.group_of_row[~self.fixed]] = True
 
     @cached_property
     def order(self) -> NaturalOrder:
@@ -608,6 +579,18 @@ class RowSet:
             f"the positions of nodes {self._shown(int(groups[0]))} on their constraints did not converge in "
             f"{_ITERATIONS} iterations; reduce time.step"
         )
+
+
+def _connected(ends: np.ndarray, n: int) -> tuple[int, np.ndarray]:
+    """Return how many groups of nodes rows (r, k) connect, and the group of each node (n,); lowest nodes first."""
+    if n == 0:
+        return 0, np.empty(0, dtype=np.int64)
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    row, end = np.nonzero(ends >= 0)
+    graph = coo_matrix((np.ones(len(row)), (ends[row, 0], ends[row, end])), (n, n))
+    return connected_components(graph, directed=False)
 
 
 def _of_rows(at: np.ndarray, array: np.ndarray) -> np.ndarray:

@@ -135,7 +135,9 @@ class ContactLog:
         self.time = np.zeros(n_walls)
         self.last = np.empty(0, dtype=np.int64)
         self.present = np.zeros(n_owned, dtype=bool)
-        self._pending: list[tuple[float, np.ndarray]] = []  # steps and the walls touched in them
+        self._pending = 0
+        self._steps = np.empty(_PENDING)
+        self._flags = np.empty((_PENDING, n_walls), dtype=np.uint8)
 
     def book(self, walls: WallForces, step: float, comm: MPI.Comm) -> None:
         """Record the contacts of a step of size ``step`` [s]. Collective whenever the buffer is full."""
@@ -149,29 +151,25 @@ class ContactLog:
 
     def note(self, touched: np.ndarray, step: float, comm: MPI.Comm) -> None:
         """Record the walls (walls,) bool that were touched in a step. Collective whenever the buffer is full."""
-        if len(self._pending) >= _PENDING:
+        if self._pending >= _PENDING:
             self.meet(comm)
-        self._pending.append((step, touched))
+        self._steps[self._pending] = step
+        self._flags[self._pending] = touched
+        self._pending += 1
 
     def meet(self, comm: MPI.Comm, contacts: np.ndarray | None = None) -> None:
         """Update the contact times on all ranks. Collective.
 
         ``contacts`` (walls,): number of nodes of all ranks in contact after the last step, if known.
         """
-        steps, flags = self._buffered()
-        self._pending = []
-        if len(steps) == 1 and contacts is not None:
-            self.time += steps[0] * (contacts > 0)
-        elif len(steps) and len(self.time):
+        n, self._pending = self._pending, 0
+        if n == 1 and contacts is not None:
+            self.time += self._steps[0] * (contacts > 0)
+        elif n and len(self.time):
+            flags = self._flags[:n]
             if comm.size > 1:
                 comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
-            self.time += steps @ flags
-
-    def _buffered(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return steps (n,) [s] that are not yet added to the times, and walls touched in them (n, walls) uint8."""
-        steps = np.array([step for step, _ in self._pending])
-        flags = np.array([touched for _, touched in self._pending], dtype=np.uint8)
-        return steps, flags.reshape(len(steps), len(self.time))
+            self.time += self._steps[:n] @ flags
 
     def share(self) -> dict[str, Any]:
         """Return this rank's sums for a checkpoint."""
@@ -185,16 +183,18 @@ class ContactLog:
 
         Only :meth:`meet` adds them: other partial sums would round differently.
         """
-        steps, flags = self._buffered()
+        flags = self._flags[: self._pending].copy()
         comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
-        return {"sum": self.time.tolist(), "steps": steps.tolist(), "flags": flags.tolist()}
+        return {"sum": self.time.tolist(), "steps": self._steps[: self._pending].tolist(), "flags": flags.tolist()}
 
     def load_state(self, share: dict[str, Any], times: dict[str, Any], touching: np.ndarray) -> None:
         """Restore this rank's sums, the contact times and the contacts from a checkpoint."""
         self.releases[:] = np.array(share["wall_releases"], dtype=np.int64)
         self.changes = int(share["contact_changes"])
         self.time[:] = times["sum"]
-        self._pending = list(zip(times["steps"], times["flags"], strict=True))
+        self._pending = n = len(times["steps"])
+        self._steps[:n] = times["steps"]
+        self._flags[:n] = np.array(times["flags"], dtype=np.uint8).reshape(n, len(self.time))
         self.touching = touching
         self.last = np.flatnonzero(touching.any(axis=1))
 

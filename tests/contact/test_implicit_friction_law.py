@@ -117,41 +117,6 @@ def test_linear_solvers_agree(solver, comm, shared_tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
-@pytest.mark.parametrize("name", ["plane", "corner", "bowl"])
-def test_derivative_of_the_drag(name, operator, comm, shared_tmp_path):
-    """The Hessian of a step with slipping nodes is the derivative of its residual, in both forms."""
-    solver = {"rtol": 1e-12, "linear": "cg", "operator": operator}
-    run = simulation(tumbling(WALLS[name], "newmark", {}, solver=solver), comm, shared_tmp_path)
-    newton, checked = run.stepper.newton, []
-    solve = newton.solve
-    random = np.random.default_rng(1)
-
-    def compare(problem, w, *others):
-        slips = (problem.transform.sliding.weight > 0.0).any()
-        if slips and (len(checked) < 5 or (problem.transform.sliding.friction > 0.0).sum(axis=1).max() > 1):
-            at = w + 1e-6 * random.normal(size=w.shape)
-            way = random.normal(size=w.shape)
-            found, less, more = np.empty_like(w), np.empty_like(w), np.empty_like(w)
-            problem.residual(at - 1e-9 * way, less)
-            problem.residual(at + 1e-9 * way, more)
-            problem.residual(at, found)
-            run.stepper.hessian.update(problem, at)
-            x, y = run.stepper.hessian.mat.createVecs()
-            x.array[:] = way.ravel()
-            run.stepper.hessian.mat.mult(x, y)
-            derivative = (more - less) / 2e-9
-            difference = np.abs(y.array.reshape(w.shape) - derivative)[problem.transform.sliding.nodes].max()
-            checked.append(difference / np.abs(derivative).max())
-        return solve(problem, w, *others)
-
-    newton.solve = compare
-    for _ in run:
-        pass
-    assert len(checked) >= 5 and max(checked) < 1e-5
-
-
-@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", ["static", "corner", "sphere"])
 def test_any_number_of_ranks(name, comm, shared_tmp_path):

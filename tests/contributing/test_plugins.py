@@ -2,46 +2,50 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-
 import pytest
 from helpers.pages import EXAMPLES
 
 from pfem_petsc import Case, InputError, registry
+from pfem_petsc.cli.main import main
 
 FILES = sorted(path.rpartition("/")[2] for path in EXAMPLES if path.endswith(".py"))
 CASE = next(code for path, code in EXAMPLES.items() if path.endswith(".toml"))
 
 
-def program(*words, folder, ranks=0):
-    launcher = ["mpirun", "-n", str(ranks)] if ranks else []
-    command = [*launcher, sys.executable, "-m", "pfem_petsc", *map(str, words)]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=os.environ, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return done.stdout + done.stderr
+@pytest.fixture
+def forgotten(monkeypatch):
+    """Lets the registry forget the files that were added, as another process does not know them."""
+
+    def forget():
+        monkeypatch.setattr(registry, "_plugins", {package: {} for package in registry.KINDS})
+        monkeypatch.setattr(registry, "_sources", {})
+
+    return forget
 
 
 @pytest.mark.slow
-def test_results_open_without_the_plugins_of_their_case(plugin_files):
-    """Nothing is installed: the case names the files, relative to it; two ranks; then the files are gone."""
+def test_results_open_without_the_plugins_of_their_case(
+    plugin_files, examples, forgotten, monkeypatch, capsys, recwarn
+):
+    """Nothing is installed: the case names the files, relative to it; then the files are gone."""
+    monkeypatch.chdir(plugin_files)
     (plugin_files / "spin.toml").write_text(f"plugins = {FILES}\n{CASE}")
-    program("spin.toml", "-o", "out", "--set", "time.end=0.01", folder=plugin_files, ranks=2)
-    listed = plugin_files / "polygon_spin.toml"
-    assert "This case can run" in program("check", listed, "--plugin", *FILES, folder=plugin_files)
+    forgotten()
+    assert main(["spin.toml", "-o", "out", "--set", "time.end=0.01"]) == 0
+    assert main(["check", "polygon_spin.toml", "--plugin", *FILES]) == 0
+    assert "This case can run" in capsys.readouterr().out
     for name in FILES:
         (plugin_files / name).unlink()
+    forgotten()
     for verb in ("info", "report", "plot", "render"):
-        words = [verb, "out", "--size", "160x120"] if verb == "render" else [verb, "out"]
-        text = program(*words, folder=plugin_files)
+        assert main([verb, "out", *(["--size", "160x120"] if verb == "render" else [])]) == 0
+        text = " ".join([*capsys.readouterr(), *(str(recwarn.pop().message) for _ in recwarn.list)])
         assert "a wall of type funnel" in text and "the law viscoplastic" in text and "not there" in text, verb
     assert list((plugin_files / "out").glob("*.png"))
 
 
-def test_a_case_names_its_plugins(plugin_files, examples, monkeypatch):
-    monkeypatch.setattr(registry, "_plugins", {package: {} for package in registry.KINDS})
-    monkeypatch.setattr(registry, "_sources", {})
+def test_a_case_names_its_plugins(plugin_files, examples, forgotten):
+    forgotten()
     with pytest.raises(InputError, match="unknown value"):
         Case.from_toml(CASE, plugin_files)
     case = Case.from_toml(f"plugins = {FILES}\n{CASE}", plugin_files)

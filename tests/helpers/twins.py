@@ -1,22 +1,14 @@
-"""Plain twins of the compiled loops over bars and laws: NumPy, SciPy and complex numbers."""
+"""Plain twins of the compiled loops over bars and laws, by NumPy and SciPy."""
 
 from __future__ import annotations
 
 import cmath
 import importlib
 import math
-import pkgutil
-import sys
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
-
-from pfem_petsc.mechanics import materials
-
-COMPLEX_STEP = 1e-40  # of complex-step derivatives: nothing is subtracted, so the smaller the better
 
 STRAINS = {
     "engineering": (lambda s: s - 1.0, lambda s: np.ones_like(s)),
@@ -44,14 +36,14 @@ class Law:
         return table
 
     def mapped(self, strain, plastic, accumulated):
-        """Stress, plastic and accumulated plastic strain after a strain; real parts decide about yielding."""
+        """Stress, plastic and accumulated plastic strain after a strain."""
         stress = self.young_modulus * (strain - plastic)
         if self.yield_stress is None:
             return stress, plastic + 0.0 * strain, accumulated + 0.0 * strain
         relative = stress - self.kinematic * plastic
-        sign = np.sign(relative.real)
+        sign = np.sign(relative)
         excess = sign * relative - (self.yield_stress + self.isotropic * accumulated)
-        step = np.where(excess.real > 0.0, excess, 0.0) / (self.young_modulus + self.isotropic + self.kinematic)
+        step = np.where(excess > 0.0, excess, 0.0) / (self.young_modulus + self.isotropic + self.kinematic)
         return stress - self.young_modulus * sign * step, plastic + sign * step, accumulated + step
 
 
@@ -71,7 +63,7 @@ class WholeTruss:
         return np.linalg.norm(self.points[self.bars[:, 1]] - self.points[self.bars[:, 0]], axis=1)
 
     def response(self, x: np.ndarray) -> dict[str, np.ndarray]:
-        """Per bar, at positions (n, 3), real or complex: strain, stress, axial force, direction, plastic state."""
+        """Per bar, at positions (n, 3): strain, stress, axial force, direction, plastic state."""
         d = x[self.bars[:, 1]] - x[self.bars[:, 0]]
         length = np.sqrt((d * d).sum(axis=1))
         measure, slope = STRAINS[self.law.strain]
@@ -87,22 +79,13 @@ class WholeTruss:
         }
 
     def forces(self, x: np.ndarray) -> np.ndarray:
-        """Internal force (n, 3) at positions (n, 3), real or complex."""
+        """Internal force (n, 3) at positions (n, 3)."""
         bar = self.response(x)
         pull = bar["axial_force"][:, None] * bar["direction"]
-        f = np.zeros(x.shape, dtype=pull.dtype)
+        f = np.zeros(x.shape)
         np.add.at(f, self.bars[:, 0], -pull)
         np.add.at(f, self.bars[:, 1], pull)
         return f
-
-    def stiffness(self, x: np.ndarray) -> np.ndarray:
-        """K_t (3n, 3n), each column by a complex step."""
-        k = np.empty((x.size, x.size))
-        for column in range(x.size):
-            z = x.astype(complex).ravel()
-            z[column] += 1j * COMPLEX_STEP
-            k[:, column] = self.forces(z.reshape(x.shape)).imag.ravel() / COMPLEX_STEP
-        return k
 
     def lumped_mass(self, density: float) -> np.ndarray:
         """(n,) [kg]."""
@@ -425,130 +408,3 @@ def pulled(law, strain, method="newton", **keys):
     moved = {"node_set": "tip", "fix": "x", "motion": [[0.0, 0.0, 0.0, 0.0], [1.0, strain, 0.0, 0.0]]}
     case["support"] = [{"node_set": "foot", "fix": "x"}, {"node_set": "all", "fix": "yz"}, moved]
     return case
-
-
-SIZE = 1e-60
-"""Of the imaginary part of arguments; its square is still a normal number."""
-
-
-def _value(number: Any) -> complex:
-    return number.z if isinstance(number, Complex) else complex(number)
-
-
-class Complex:
-    """A complex number that is ordered by its real part; it cannot become a float by mistake.
-
-    The derivative of f is Im f(x + ih)/h. W. Squire and G. Trapp, Using complex variables to estimate derivatives of
-    real functions, SIAM Rev. 40 (1998) 110-112. No difference is taken, so h may be so small that the error is rounding
-    alone. Comparisons are those of real parts, so that a function takes the branch of its real argument.
-    """
-
-    __slots__ = ("z",)
-    __array_ufunc__ = None  # NumPy's numbers leave operations to this class
-    __hash__ = None
-
-    def __init__(self, real: float, imaginary: float = 0.0) -> None:
-        self.z = complex(real, imaginary)
-
-    @classmethod
-    def of(cls, z: complex) -> Complex:
-        return cls(z.real, z.imag)
-
-    def __add__(self, other: Any) -> Complex:
-        return Complex.of(self.z + _value(other))
-
-    def __sub__(self, other: Any) -> Complex:
-        return Complex.of(self.z - _value(other))
-
-    def __rsub__(self, other: Any) -> Complex:
-        return Complex.of(_value(other) - self.z)
-
-    def __mul__(self, other: Any) -> Complex:
-        return Complex.of(self.z * _value(other))
-
-    def __truediv__(self, other: Any) -> Complex:
-        return Complex.of(self.z / _value(other))
-
-    def __rtruediv__(self, other: Any) -> Complex:
-        return Complex.of(_value(other) / self.z)
-
-    def __pow__(self, other: Any) -> Complex:
-        return Complex.of(self.z ** _value(other))
-
-    def __rpow__(self, other: Any) -> Complex:
-        return Complex.of(_value(other) ** self.z)
-
-    __radd__, __rmul__ = __add__, __mul__
-
-    def __neg__(self) -> Complex:
-        return Complex.of(-self.z)
-
-    def __abs__(self) -> Complex:
-        return -self if self.z.real < 0.0 else self
-
-    def __bool__(self) -> bool:
-        return self.z.real != 0.0
-
-    def __lt__(self, other: Any) -> bool:
-        return self.z.real < _value(other).real
-
-    def __le__(self, other: Any) -> bool:
-        return self.z.real <= _value(other).real
-
-    def __gt__(self, other: Any) -> bool:
-        return self.z.real > _value(other).real
-
-    def __ge__(self, other: Any) -> bool:
-        return self.z.real >= _value(other).real
-
-    def __eq__(self, other: object) -> bool:
-        return self.z.real == _value(other).real
-
-    def __repr__(self) -> str:
-        return f"Complex({self.z})"
-
-
-class ComplexMath:
-    """The module ``math`` for numbers of both kinds; a function that is missing here raises TypeError."""
-
-    def __getattr__(self, name: str) -> Any:
-        real = getattr(math, name)
-        if not callable(real):
-            return real
-        extended = _EXTENDED.get(name) or getattr(cmath, name, None)
-
-        def function(*arguments: Any) -> Any:
-            if not any(isinstance(argument, Complex) for argument in arguments):
-                return real(*arguments)
-            if extended is None:
-                raise TypeError(f"math.{name} has no complex form here")
-            return Complex.of(extended(*map(_value, arguments)))
-
-        return function
-
-
-_EXTENDED: dict[str, Callable[..., complex]] = {
-    "expm1": lambda z: complex(
-        math.expm1(z.real) * math.cos(z.imag) - 2.0 * math.sin(0.5 * z.imag) ** 2, math.exp(z.real) * math.sin(z.imag)
-    ),
-    "log1p": lambda z: complex(0.5 * math.log1p(z.real * (2.0 + z.real) + z.imag**2), math.atan2(z.imag, 1.0 + z.real)),
-}
-
-
-def patch(monkeypatch: Any) -> None:
-    """Give the modules of bars and laws functions of complex numbers."""
-    for law in pkgutil.iter_modules(materials.__path__):
-        importlib.import_module(f"{materials.__name__}.{law.name}")
-    for name, module in list(sys.modules.items()):
-        if name.startswith("pfem_petsc.mechanics") and getattr(module, "math", None) is math:
-            monkeypatch.setattr(module, "math", ComplexMath())
-
-
-def derivative(value: Any) -> float:
-    """Return the derivative of a value with respect to an argument that is Complex(x, SIZE)."""
-    return _value(value).imag / SIZE
-
-
-def real(value: Any) -> float:
-    """Return the real part."""
-    return _value(value).real

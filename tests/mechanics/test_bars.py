@@ -1,4 +1,4 @@
-"""Bar forces, tangents and fields of a lattice against whole-mesh NumPy, on any number of ranks."""
+"""Forces, energies and fields of a lattice against whole-mesh NumPy, on any number of ranks."""
 
 from dataclasses import replace
 
@@ -7,7 +7,6 @@ import pytest
 from helpers.twins import Law, shaken, whole_truss
 
 from pfem_petsc import Case
-from pfem_petsc.solvers.matrix import HessianMatrix
 from pfem_petsc.stepping.model import Model
 
 pytestmark = pytest.mark.parallel
@@ -63,11 +62,11 @@ def whole(model, values):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_forces_and_energies(law, truss):
+def test_forces_energies_and_fields(law, truss):
     model, twin = truss(law)
     x = shaken(twin, 4e-3)
     f = np.empty((model.mesh.n_local, 3))
-    energy = model.bars.forces(local(model, x), f, commit=False)
+    energy = model.bars.forces(local(model, x), f, commit=True)
     expected = twin.forces(x)
     assert np.abs(whole(model, f) - expected).max() < 1e-12 * np.abs(expected).max()
     bar = twin.response(x)
@@ -84,86 +83,7 @@ def test_forces_and_energies(law, truss):
         assert 0.1 < yielding < 0.9  # both branches of the law were met
     else:
         assert heat == hardening == 0.0
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_force_is_the_derivative_of_the_elastic_energy(law, truss):
-    """By central differences of the energy, along one direction, before any bar yields."""
-    model, twin = truss(replace(law, yield_stress=law.yield_stress and 1e12))
-    x, u = shaken(twin, 4e-3), shaken(twin, 1.0, seed=5) - twin.points
-    f = np.empty((model.mesh.n_local, 3))
-    model.bars.forces(local(model, x), f, commit=False)
-    work = (whole(model, f) * u).sum()
-    sides = [
-        model.bars.forces(local(model, x + s * 1e-5 * u), f, commit=False).of("elastic_energy") for s in (1.0, -1.0)
-    ]
-    change = model.comm.allreduce(sides[0] - sides[1])
-    assert change / 2e-5 == pytest.approx(work, rel=1e-6)
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_plastic_state_is_kept_only_when_committed(law, truss):
-    model, twin = truss(law)
-    x = shaken(twin, 4e-3)
-    f = np.empty((model.mesh.n_local, 3))
-    before = [block.history.copy() for block in model.bars.blocks]
-    model.bars.forces(local(model, x), f, commit=False)
-    for block, history in zip(model.bars.blocks, before):
-        assert np.array_equal(block.history, history)
-    model.bars.forces(local(model, x), f, commit=True)
-    if law.yield_stress is not None:
-        bar = twin.response(x)
-        for block in model.bars.blocks:
-            ids = model.mesh.bar_ids[block.start : block.stop]
-            expected = np.stack([bar["plastic_strain"][ids], bar["accumulated"][ids]])
-            assert np.abs(block.history - expected).max(initial=0.0) < 1e-15
-        twin.plastic, twin.accumulated = bar["plastic_strain"], bar["accumulated"]
-    expected = twin.forces(x)
-    model.bars.forces(local(model, x), f, commit=False)
-    assert np.abs(whole(model, f) - expected).max() < 1e-10 * np.abs(expected).max()
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_matrix_product_and_derivative_of_forces_agree(law, truss):
-    """Assembled K_t times a vector, the matrix-free product, and finite and complex-step differences."""
-    model, twin = truss(law)
-    mesh = model.mesh
-    x, u = shaken(twin, 4e-3), shaken(twin, 1.0, seed=5) - twin.points
-    expected = (twin.stiffness(x) @ u.ravel()).reshape(-1, 3)
-    size = np.abs(expected).max()
-
-    out = np.empty((mesh.n_local, 3))
-    model.bars.product(local(model, x), local(model, u), out)
-    assert np.abs(whole(model, out) - expected).max() < 1e-12 * size
-
-    hessian = HessianMatrix(mesh, model.supports)
-    inertia = [0.0] * len(model.bars.blocks)
-    matrix = hessian.fill(lambda values: model.bars.tangents(local(model, x), 1.0, inertia, hessian.pattern, values))
-    right, left = matrix.createVecs()
-    right.array[:] = local(model, u)[: mesh.n_owned].ravel()
-    matrix.mult(right, left)
-    assert np.abs(whole(model, left.array.reshape(-1, 3)) - expected).max() < 1e-12 * size
-    for thing in (right, left):
-        thing.destroy()
-    hessian.destroy()
-
-    forward, backward = np.empty((mesh.n_local, 3)), np.empty((mesh.n_local, 3))
-    h = 1e-8  # small enough that no bar changes its branch of the law
-    model.bars.forces(local(model, x + h * u), forward, commit=False)
-    model.bars.forces(local(model, x - h * u), backward, commit=False)
-    assert np.abs(whole(model, (forward - backward) / (2 * h)) - expected).max() < 1e-7 * size
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_fields(law, truss):
-    model, twin = truss(law)
-    x = shaken(twin, 4e-3)
-    model.bars.forces(local(model, x), np.empty((model.mesh.n_local, 3)), commit=True)
-    bar = twin.response(x)
     fields = model.bars.fields(local(model, x))
     for name in ("strain", "stress", "axial_force", "plastic_strain"):
-        if name == "plastic_strain" and law.yield_stress is None:
-            assert not fields[name].any()
-            continue
         expected = bar[name][model.mesh.bar_ids]
-        assert np.abs(fields[name] - expected).max(initial=0.0) < 1e-12 * np.abs(bar[name]).max(), name
+        assert np.abs(fields[name] - expected).max(initial=0.0) <= 1e-12 * np.abs(bar[name]).max(), name

@@ -82,9 +82,11 @@ class HalvedSteps(Stepper):
         self.smallest = self.h
         while done < ticks:
             self._set_part(self.h * (size / ticks))
+            external = state.external
             try:
                 self._make_part(end if done + size == ticks else start + self.h * ((done + size) / ticks))
             except NotConverged as failure:
+                state.external = external
                 if size == 1:
                     raise NotConverged(f"{failure} (the step was bisected {_HALVINGS} times)") from failure
                 if self.model.bars_vary:

@@ -68,6 +68,7 @@ def crowded(walls, file, integrator="central_differences", **options):
 
 
 @pytest.mark.slow
+@pytest.mark.parallel
 @pytest.mark.parametrize("supported", [False, True], ids=["free", "supported"])
 @pytest.mark.parametrize("name", WALLS)
 def test_every_step_is_optimal(name, supported, comm, shared_tmp_path):
@@ -117,12 +118,6 @@ def test_every_step_is_optimal(name, supported, comm, shared_tmp_path):
     if name == "none" and not supported:
         momentum = np.array([row["momentum"] for row in rows])
         np.testing.assert_allclose(momentum, np.tile(momentum[0], (len(rows), 1)), atol=1e-13)
-
-
-@pytest.mark.parallel
-@pytest.mark.parametrize("name", ["box", "moving"])
-def test_every_step_is_optimal_on_ranks(name, comm, shared_tmp_path):
-    test_every_step_is_optimal(name, True, comm, shared_tmp_path)
 
 
 @pytest.mark.parallel

@@ -60,6 +60,7 @@ SETS = {"held": {"nearest": [0.0, 0.0, 0.0]}, "hinged": {"nearest": [0.2, 0.1, 0
 
 @pytest.mark.few_sets
 @pytest.mark.slow
+@pytest.mark.parallel
 @pytest.mark.parametrize("supported", [False, True], ids=["free", "supported"])
 @pytest.mark.parametrize("name", WALLS)
 def test_steps_are_the_same(name, supported, comm, shared_tmp_path):
@@ -100,10 +101,3 @@ def test_steps_are_the_same(name, supported, comm, shared_tmp_path):
     assert max(contacts) >= 1 and sum(c > 0 for c in contacts) >= 2
     assert max(w[0] for w in worst) < 1e-12 * 0.2
     assert max(w[1] for w in worst) < 1e-8  # curved walls are followed to 1e-13 of the length
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-@pytest.mark.parametrize("name", ["corner", "twelve", "inside a sphere"])
-def test_steps_are_the_same_on_ranks(name, comm, shared_tmp_path):
-    test_steps_are_the_same(name, True, comm, shared_tmp_path)

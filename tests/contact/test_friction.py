@@ -35,6 +35,7 @@ def block(integrator, friction, *, velocity=0.0, end=0.1, static=None, step=2e-4
     )
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences"])
 @pytest.mark.parametrize("friction", [0.0, 0.1, 0.3])
 def test_sliding_block(integrator, friction, comm, shared_tmp_path):
@@ -145,11 +146,6 @@ def test_bouncing(restitution, comm, shared_tmp_path):
         hit += flight
     if restitution == 0.0:
         assert z[time > fall + 0.01].max() < 1e-6
-
-
-@pytest.mark.parallel
-def test_sliding_on_ranks(comm, shared_tmp_path):
-    test_sliding_block("central_differences", 0.3, comm, shared_tmp_path)
 
 
 def guided(integrator, friction, wall, speed=0.0):

@@ -54,23 +54,11 @@ def collide(time, comm, shared_tmp_path, linear="auto", treatment="scheme"):
 
 
 @pytest.mark.slow
+@pytest.mark.parallel
+@pytest.mark.parametrize("linear", ["auto", "cg"])  # assembled, and matrix-free
 @pytest.mark.parametrize("time", [*EXPLICIT, *IMPLICIT], ids=label)
-def test_two_rods_are_the_symmetric_model(time, comm, shared_tmp_path):
-    collide(time, comm, shared_tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-@pytest.mark.parametrize("integrator", ["chung_lee", "newmark", "energy_momentum"])
-def test_two_rods_on_ranks(integrator, comm, shared_tmp_path):
-    collide({"integrator": integrator}, comm, shared_tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-@pytest.mark.parametrize("integrator", ["generalized_alpha"])
-def test_matrix_free_rods_are_the_symmetric_model(integrator, comm, shared_tmp_path):
-    collide({"integrator": integrator}, comm, shared_tmp_path, linear="cg")
+def test_two_rods_are_the_symmetric_model(time, linear, comm, shared_tmp_path):
+    collide(time, comm, shared_tmp_path, linear=linear)
 
 
 @pytest.mark.slow

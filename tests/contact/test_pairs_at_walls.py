@@ -64,9 +64,11 @@ WALLS = {
 }
 
 
+@pytest.mark.parallel
+@pytest.mark.parametrize("crowded", [False, True], ids=["in one pair", "in several pairs"])
 @pytest.mark.parametrize("supported", [False, True], ids=["free", "supported"])
 @pytest.mark.parametrize("name", WALLS)
-def test_explicit_steps_solve_the_variational_inequality(name, supported, comm, shared_tmp_path, crowded=False):
+def test_explicit_steps_solve_the_variational_inequality(name, supported, crowded, comm, shared_tmp_path):
     """Also where walls stop the nodes of pairs: two methods that share nothing, one answer."""
     supports = [{"node_set": "held", "fix": "y"}, {"node_set": "hinged", "fix": "xz"}] if supported else []
     options = {"solver": {"rtol": 1e-13}, "supports": supports}
@@ -105,19 +107,6 @@ def test_explicit_steps_solve_the_variational_inequality(name, supported, comm, 
     implicit.destroy()
     assert max(pressed) > 8 and max(worst) < 1e-13
     assert name == "no walls" or max(met) > 0
-
-
-@pytest.mark.parallel
-@pytest.mark.parametrize("name", ["no walls", "wedge"])
-def test_explicit_steps_on_ranks(name, comm, shared_tmp_path):
-    test_explicit_steps_solve_the_variational_inequality(name, True, comm, shared_tmp_path)
-
-
-@pytest.mark.parallel
-@pytest.mark.parametrize("name", ["no walls", "floor", "wedge"])
-def test_nodes_in_several_pairs(name, comm, shared_tmp_path):
-    """Groups of pairs that share nodes, in explicit and implicit steps."""
-    test_explicit_steps_solve_the_variational_inequality(name, True, comm, shared_tmp_path, crowded=True)
 
 
 def test_walls_stop_nodes_beside_pairs(tmp_path):

@@ -63,6 +63,7 @@ def plastic(integrator, parameters):
 
 @pytest.mark.few_sets
 @pytest.mark.slow
+@pytest.mark.parallel
 @pytest.mark.parametrize("integrator", SCHEMES)
 @pytest.mark.parametrize("problem", [rod, ring, plastic], ids=lambda f: f.__name__)
 def test_frame_does_not_matter(problem, integrator, comm, shared_tmp_path):
@@ -83,10 +84,3 @@ def test_frame_does_not_matter(problem, integrator, comm, shared_tmp_path):
     if comm.rank == 0:
         size = np.ptp(positions[0], axis=0).max()
         assert np.abs(positions[0] - positions[1]).max() < 1e-9 * size
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
-def test_frame_does_not_matter_on_ranks(integrator, comm, shared_tmp_path):
-    test_frame_does_not_matter(plastic, integrator, comm, shared_tmp_path)

@@ -76,6 +76,7 @@ def test_rectangle_beside_the_truss(integrator, parameters, comm, shared_tmp_pat
         assert x[:, 2].min() < -0.06 and (x[~over, 2] < -0.02).any()
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("integrator, parameters", [EXPLICIT, IMPLICIT])
 def test_ball_stays_on_the_surface(integrator, parameters, comm, shared_tmp_path):
     """While a lattice lies on a sphere, no node is inside of it, and those pressed are on it to 1e-12."""
@@ -92,11 +93,9 @@ def test_ball_stays_on_the_surface(integrator, parameters, comm, shared_tmp_path
     run = simulation(case, comm, shared_tmp_path)
     centre, most = np.array(wall["point"]), 0
     for step in run:
-        # central differences solve for the position after the next
-        ahead = run.state.position if integrator == "newmark" else None
         x = run.state.position
         assert (np.linalg.norm(x - centre, axis=1) >= 0.3 - 1e-12 * 0.2).all()
-        if ahead is not None:
+        if integrator == "newmark":  # central differences solve for the position after the next
             pressed = np.linalg.norm(run.state.contact, axis=1) > 0.0
             np.testing.assert_allclose(np.linalg.norm(x[pressed] - centre, axis=1), 0.3, atol=1e-12 * 0.2)
         most = max(most, step.row["wall/ball/contacts"])
@@ -127,6 +126,7 @@ def test_galilean_equivalence(kind, integrator, comm, shared_tmp_path):
         assert np.abs(x - 0.02 * speed - y).max() < 1e-10 * 0.2
 
 
+@pytest.mark.parallel
 def test_adjust_moves_nodes_onto_the_wall(comm, shared_tmp_path):
     """Nodes that start beyond the wall start on it, and their bars without stress."""
     walls = planes([[0.0, 0.1, 1.0]], [0.004], adjust=True, friction=0.1, restitution=0.2)
@@ -139,6 +139,7 @@ def test_adjust_moves_nodes_onto_the_wall(comm, shared_tmp_path):
     assert any("moved onto" in warning for warning in run.model.warnings)
 
 
+@pytest.mark.parallel
 def test_starting_beyond_a_wall_is_refused(comm, shared_tmp_path):
     with pytest.raises(InputError, match=r"wall 'wall1': node \d+ starts 0.01 m beyond the wall \(\d+ nodes in all\)"):
         simulation(lattice_case(planes([[0.0, 0.0, 1.0]], [0.01])), comm, shared_tmp_path)
@@ -159,6 +160,7 @@ def test_starting_exactly_on_walls(integrator, parameters, comm, shared_tmp_path
         assert x[:, 2].min() >= -1e-13
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("integrator, parameters", [EXPLICIT, IMPLICIT])
 def test_walls_that_leave_no_room(integrator, parameters, comm, shared_tmp_path):
     """Walls that close in on a node until they overlap: a failure that names it, step and time, on all ranks."""
@@ -198,6 +200,7 @@ def test_refusals(keys, message):
         Case.from_dict(lattice_case([wall]))
 
 
+@pytest.mark.parallel
 def test_reports_of_a_bounce(comm, shared_tmp_path):
     """Impulse, contact time and releases of a lattice that bounces off the floor."""
     case = lattice_case(box([-1.0, -1, -0.01], [1.0, 1, 5.0]), velocity=[0, 0, -2.0], step=2e-4, end=0.03)
@@ -213,18 +216,6 @@ def test_reports_of_a_bounce(comm, shared_tmp_path):
     assert sum(row["active_set_changes"] for row in rows) == 2 * last["wall/wall3/releases"]
     touching = rows[int(np.argmax(force[:, 2]))]
     assert touching["wall/wall3/moment"][1] == pytest.approx(-0.1 * touching["wall/wall3/force"][2], rel=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-def test_on_ranks(comm, shared_tmp_path):
-    """What needs the ranks to agree: starts, curved walls, walls without room, sums of the reports."""
-    test_adjust_moves_nodes_onto_the_wall(comm, shared_tmp_path / "adjust")
-    test_starting_beyond_a_wall_is_refused(comm, shared_tmp_path / "beyond")
-    test_ball_stays_on_the_surface("newmark", {}, comm, shared_tmp_path / "ball")
-    for integrator in ("central_differences", "newmark"):
-        test_walls_that_leave_no_room(integrator, {}, comm, shared_tmp_path / integrator)
-    test_reports_of_a_bounce(comm, shared_tmp_path / "bounce")
 
 
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.pages import assert_same_results, run
+from helpers.pages import run
+from helpers.stopped import assert_restart_is_bitwise
 
 from pfem_petsc import Case, open_result
 from pfem_petsc.errors import InputError
@@ -108,13 +109,11 @@ def test_tether_between_bodies(integrator, keys, examples, comm, shared_tmp_path
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_tether_restarts_to_the_last_bit(integrator, examples, comm, shared_tmp_path):
-    whole, parts, rope = shared_tmp_path / "whole", shared_tmp_path / "parts", tether("tip", "other", 0.2)
-    keys = rope, "solver.linear=cg"  # MUMPS, which small models take on several ranks, repeats to rounding only
-    run(two_rods(integrator, *keys), comm, whole)
-    pulls = np.flatnonzero(history_of(whole)["constraint/rope/force"].any(axis=1))
-    run(two_rods(integrator, *keys, f"time.end={0.02 * pulls[1]!r}"), comm, parts)
-    run(two_rods(integrator, *keys), comm, parts, restart=True)
-    assert_same_results(whole, parts, "velocity")
+    # MUMPS, which small models take on several ranks, repeats to rounding only
+    case = two_rods(integrator, tether("tip", "other", 0.2), "solver.linear=cg")
+    run(case, comm, shared_tmp_path / "first")
+    pulls = np.flatnonzero(history_of(shared_tmp_path / "first")["constraint/rope/force"].any(axis=1))
+    assert_restart_is_bitwise(case, comm, shared_tmp_path, pulls[1])
 
 
 @pytest.mark.slow

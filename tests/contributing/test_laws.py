@@ -9,7 +9,8 @@ import re
 import numpy as np
 import pytest
 from document_laws import text_of, undocumented
-from helpers.pages import assert_same_results, run
+from helpers.pages import run
+from helpers.stopped import assert_restart_is_bitwise
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.cli.main import main
@@ -119,15 +120,10 @@ def test_law_in_batches(examples, tmp_path):
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark", "chung_lee", "energy_momentum"])
 def test_law_restarts_to_the_last_bit(integrator, examples, comm, shared_tmp_path):
     """A chain that yields, stopped on the way: positions, and internal variables in snapshots and checkpoints."""
-    keys = ["mesh.elements=6", "output.checkpoint_every=20"]
-    base = one_bar(integrator, 2e-4, 60).to_dict()
-    whole, parts = shared_tmp_path / "whole", shared_tmp_path / "parts"
-    one = run(Case.from_dict(base, overrides=keys), comm, whole)
-    run(Case.from_dict(base, overrides=[*keys, "time.end=0.008"]), comm, parts)
-    other = run(Case.from_dict(base, overrides=keys), comm, parts, restart=True)
-    assert one.model.bars.kept_names == [*VARIABLES, "last_strain", "last_stress"]
-    assert one.model.bars.history().tobytes() == other.model.bars.history().tobytes()
-    assert_same_results(whole, parts, "stress", *VARIABLES)
+    case = Case.from_dict(one_bar(integrator, 2e-4, 60).to_dict(), overrides=["mesh.elements=6"])
+    assert_restart_is_bitwise(case, comm, shared_tmp_path, 40)
+    for name in VARIABLES:
+        assert np.abs(open_result(shared_tmp_path / "whole").field(name, -1)).max() > 0.0, name
 
 
 SCHEMES = ("chung_lee", "hulbert_chung", "souza_moura", "central_differences")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.pages import assert_same_results, run
+from helpers.pages import run
 from helpers.small_models import ARCH_AREA, ARCH_YOUNG, LIMIT, arch_of
+from helpers.stopped import assert_restart_is_bitwise
 
 from pfem_petsc import open_result
 from pfem_petsc.errors import InputError
@@ -34,11 +35,7 @@ def test_load_factors_are_those_listed_and_each_is_an_equilibrium(examples, comm
 
 @pytest.mark.parallel
 def test_restart_is_bitwise(examples, comm, shared_tmp_path):
-    whole, parts = shared_tmp_path / "whole", shared_tmp_path / "parts"
-    run(arch(shared_tmp_path, comm, FACTORS), comm, whole)
-    run(arch(shared_tmp_path, comm, FACTORS[:2]), comm, parts)
-    run(arch(shared_tmp_path, comm, FACTORS), comm, parts, restart=True)
-    assert_same_results(whole, parts, "displacement")
+    assert_restart_is_bitwise(arch(shared_tmp_path, comm, FACTORS), comm, shared_tmp_path, 2)
 
 
 def test_load_factors_that_do_not_increase_are_refused(examples, comm, shared_tmp_path):

@@ -6,9 +6,7 @@ import re
 import shlex
 from pathlib import Path
 
-import numpy as np
-
-from pfem_petsc import Simulation, open_result
+from pfem_petsc import Simulation
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -42,17 +40,6 @@ def program_lines(page: Path) -> list[list[str]]:
     lines = "".join(blocks(page, "", "sh", "bash")).splitlines()
     words = [shlex.split(line, comments=True) for line in lines if line.startswith("python -m pfem_petsc ")]
     return [line[3:] for line in words]
-
-
-def assert_same_results(whole, parts, *fields):
-    """The histories and the fields of the last snapshot of two runs agree to the last bit."""
-    one, other = open_result(whole), open_result(parts)
-    assert list(one.history) == list(other.history)
-    for name in one.history:
-        assert np.asarray(one.history[name]).tobytes() == np.asarray(other.history[name]).tobytes(), name
-    for name in fields:
-        assert one.field(name, -1).tobytes() == other.field(name, -1).tobytes(), name
-        assert np.abs(one.field(name, -1)).max() > 0.0, name
 
 
 def run(case, comm, folder, **options):

@@ -9,7 +9,6 @@ from pfem_petsc import Case
 
 OMEGA, RATIO, SPEED, END = 1.0, 0.2, 0.1, 4.0
 SCHEMES = {
-    "central_differences": {},
     "chung_lee": {},
     "hulbert_chung": {},
     "souza_moura": {},
@@ -18,6 +17,7 @@ SCHEMES = {
     "wilson": {},
     "generalized_alpha": {},
     "energy_momentum": {},
+    "central_differences": {},
 }
 NODES = {"root": [0], "tip": [1], "side": [2]}
 

@@ -82,7 +82,6 @@ def test_batches_are_single_steps(tmp_path):
         case = graded(
             file,
             {"s": {"area_field": "thickness", "material": "m"}},
-            PLASTIC,
             time={"integrator": "central_differences", "step": 2e-6, "end": 6e-4},
         )
         case.output.history_every = 7

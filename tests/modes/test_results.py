@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import signal
 
 import h5py
@@ -129,13 +130,17 @@ def test_a_request_to_stop_before_the_modes(tmp_path):
 
 def test_signals_end_the_program_while_modes_are_computed(tmp_path, monkeypatch):
     """The libraries do not look at requests to stop; the handler of before the run is in force again."""
-    from pfem_petsc.run import outputs
 
-    seen = []
-    monkeypatch.setattr(outputs, "record_modes", lambda *_: seen.append(signal.getsignal(signal.SIGTERM)))
-    before = signal.getsignal(signal.SIGTERM)
-    run(block(), tmp_path)
-    assert seen == [before]
+    class Screen(io.StringIO):
+        def write(self, text):
+            handlers[text] = signal.getsignal(signal.SIGTERM)
+            return len(text)
+
+    handlers, before = {}, signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr("sys.stdout", Screen())
+    Simulation(block(), MPI.COMM_SELF, output=tmp_path).run()
+    told = {handler for text, handler in handlers.items() if "frequenc" in text}
+    assert told == {before} < set(handlers.values())
 
 
 def test_modes_of_the_initial_state_again(tmp_path):

@@ -12,8 +12,6 @@ from helpers.synthetic import Truss, assert_history_is, options, write
 from mpi4py import MPI
 from test_interrupted import HERE, READER
 
-import pfem_petsc.output.vtkhdf as vtkhdf
-from pfem_petsc.output.hdf5 import OBJECTS
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.vtkhdf import ResultWriter
 
@@ -33,13 +31,15 @@ class Disk(io.FileIO):
 
 def states_before_each_write(path, truss, snapshots, monkeypatch):
     """Write 134 snapshots; {snapshot: states of the file before each of its writes}."""
-    disks = []
+    disks, opened = [], h5py.File
 
-    def open_counted(path, comm):
-        disks.append(Disk(path))
-        return h5py.File(disks[-1], "r+", libver=OBJECTS, rdcc_nbytes=1 << 16)
+    def watched(name, mode, locking=None, **options):
+        if mode != "r+":
+            return opened(name, mode, locking=locking, **options)
+        disks.append(Disk(name))
+        return opened(disks[-1], mode, **options)
 
-    monkeypatch.setattr(vtkhdf, "open_shared", open_counted)
+    monkeypatch.setattr(h5py, "File", watched)
     found = {}
     with ResultWriter(path, MPI.COMM_SELF, truss.mesh, **options()) as writer:
         for n in range(max(snapshots) + 1):

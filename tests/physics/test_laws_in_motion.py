@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.kills import differences
 from helpers.runs import run
-from helpers.stopped import assert_restart_is_bitwise
+from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
 
 from pfem_petsc import Case, Simulation, open_result
 
@@ -66,13 +66,13 @@ def tower(comm, shared_tmp_path):
     return case
 
 
-SCHEMES = {
-    "central_differences": {},
+SCHEMES = {  # by default without batches, whose loops take long to compile for each law
     "chung_lee": {},
     "newmark": {},
     "generalized_alpha": {},
     "energy_momentum": {},
     "matrix-free": {"integrator": "newmark", "operator": "matrix_free", "linear": "cg"},
+    "central_differences": {},
 }
 
 
@@ -90,7 +90,7 @@ def test_tower_of_all_laws(scheme, tower, comm, shared_tmp_path):
     for name in ("plastic_heat", "damage_dissipation"):
         assert (np.diff(history[name]) >= -1e-12 * energy).all() and history[name][-1] > 1e-3 * energy
     assert history["slack_bars"].max() >= 2 and history["slack_bars"].min() == 0
-    reference = run(tower("central_differences", 2e-4, 1500), shared_tmp_path / "fine", comm)
+    reference = run(tower("chung_lee", 2e-4, 1500), shared_tmp_path / "fine", comm)
     assert history["plastic_heat"][-1] == pytest.approx(reference["plastic_heat"][-1], rel=0.1)
     assert history["damage_dissipation"][-1] == pytest.approx(reference["damage_dissipation"][-1], rel=0.1)
 
@@ -98,17 +98,13 @@ def test_tower_of_all_laws(scheme, tower, comm, shared_tmp_path):
 @pytest.mark.slow
 @pytest.mark.parallel
 def test_ranks_agree(tower, comm, shared_tmp_path):
-    from mpi4py import MPI
-
-    keys = {"output": {"fields_every": 50, "fields": ["stress", "status", "hinge_rotation", "damage"]}}
-    together = run(tower("central_differences", **keys), shared_tmp_path / "together", comm)
+    fields = ["stress", "status", "hinge_rotation", "damage"]
+    case = tower("chung_lee", output={"fields_every": 50, "fields": fields})
+    together = run(case, shared_tmp_path / "together", comm)
+    assert_as_on_one_rank(together, case, comm, shared_tmp_path, "slack_bars", "elastic_energy", "damage_dissipation")
     if comm.rank == 0:
-        alone = run(tower("central_differences", **keys), shared_tmp_path / "alone", MPI.COMM_SELF)
-        assert (alone["slack_bars"] == together["slack_bars"]).all()
-        for name in ("kinetic_energy", "elastic_energy", "plastic_heat", "damage_dissipation"):
-            assert together[name] == pytest.approx(alone[name], rel=1e-9, abs=1e-9 * alone["kinetic_energy"][0])
         results = [open_result(shared_tmp_path / name) for name in ("alone", "together")]
-        for name in keys["output"]["fields"]:
+        for name in fields:
             one, other = (result.field(name, -1) for result in results)
             assert other == pytest.approx(one, rel=1e-8, abs=1e-8 * np.abs(one).max())
             assert np.abs(one).max() > 0.0, name
@@ -170,7 +166,7 @@ def test_heat_that_comes_and_goes_balances(law, comm, shared_tmp_path):
     assert max(history["plastic_heat"][-1], history["damage_dissipation"][-1]) > 1e-3 * energy
 
 
-RESTARTED = [("strut", "central_differences"), ("cable", "newmark"), ("damage", "energy_momentum")]
+RESTARTED = [("damage", "energy_momentum"), ("cable", "newmark"), ("strut", "central_differences")]
 RESTARTED += [("compaction", "newmark"), ("cable", "central_differences"), ("strut", "energy_momentum")]
 
 

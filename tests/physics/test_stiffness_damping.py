@@ -11,7 +11,7 @@ from pfem_petsc.errors import InputError
 YOUNG, AREA, DENSITY, LENGTH = 1e6, 1e-2, 1000.0, 1.0
 FREQUENCY = np.sqrt(YOUNG * AREA / LENGTH / (DENSITY * AREA * LENGTH / 2.0))
 """Of one bar with lumped mass, held at one end [rad/s]."""
-EXPLICIT = ["central_differences", "chung_lee", "hulbert_chung", "souza_moura"]
+EXPLICIT = ["chung_lee", "hulbert_chung", "souza_moura", "central_differences"]
 IMPLICIT = ["newmark", "houbolt", "wilson", "generalized_alpha", "energy_momentum"]
 
 
@@ -107,7 +107,7 @@ def test_stressing_and_cooling_of_damped_bars(integrator, tmp_path):
     assert np.abs(history["numerical_dissipation"]).max() < (1e-11 if exact else 0.03) * supplied
 
 
-@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+@pytest.mark.parametrize("integrator", ["newmark", "central_differences"])
 def test_rigid_rotation_is_not_damped(integrator, tmp_path):
     case = rod(
         0.5,
@@ -178,7 +178,7 @@ LAWS = {
 
 
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+@pytest.mark.parametrize("integrator", ["newmark", "central_differences"])
 def test_with_other_laws(law, integrator, tmp_path):
     section = {"s": {"area": AREA, "material": "m", "shape": "round"}}
     step = 0.05 / FREQUENCY

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.kills import differences
 from helpers.small_models import BLOCK, DOME, check_balances
-from helpers.stopped import everywhere
+from helpers.stopped import assert_restart_is_bitwise, everywhere
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
@@ -47,13 +47,8 @@ def test_four_stages_on_one_state(comm, shared_tmp_path):
 @pytest.mark.parallel
 def test_restart_in_any_stage_is_bitwise(comm, shared_tmp_path):
     # MUMPS, which small models take on several ranks, repeats to rounding only
-    data = {**BLOCK, "solver": {"linear": "cg"}}
-    whole, stopped = shared_tmp_path / "whole", shared_tmp_path / "stopped"
-    run(data, comm, whole)
-    for step in (3, 4, 10, 30, 57):
-        assert run(data, comm, stopped, step, restart=step > 3) == step
-    assert run(data, comm, stopped, restart=True) == 58
-    assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in (whole, stopped))) == {}
+    case = Case.from_dict({**BLOCK, "solver": {"linear": "cg"}})
+    assert_restart_is_bitwise(case, comm, shared_tmp_path, 3, 4, 10, 30, 57)
 
 
 @pytest.mark.slow

@@ -87,18 +87,6 @@ class WholeTruss:
         np.add.at(f, self.bars[:, 1], pull)
         return f
 
-    def lumped_mass(self, density: float) -> np.ndarray:
-        """(n,) [kg]."""
-        half = np.repeat(0.5 * density * self.area * self.rest, 2)
-        return np.bincount(self.bars.ravel(), half, len(self.points))
-
-    def consistent_mass(self, density: float) -> np.ndarray:
-        """(n, n) [kg], the same for each direction."""
-        m = np.zeros((len(self.points), len(self.points)))
-        for (a, b), whole in zip(self.bars, density * self.area * self.rest):
-            m[np.ix_([a, b], [a, b])] += whole / 6.0 * np.array([[2.0, 1.0], [1.0, 2.0]])
-        return m
-
 
 def whole_truss(model, area: float, law: Law) -> WholeTruss:
     """The twin of a model's mesh, the same on every rank. Collective."""
@@ -246,6 +234,7 @@ def solid(strut):
 YOUNG, DENSITY = 200e9, 7850.0
 STATIC = {"kinematic_hardening": 2e9, "isotropic_hardening": 1e9, "saturation_stress": 100e6, "saturation_rate": 30.0}
 KEYS = {
+    "elastoplastic": {"yield_stress": 250e6, "isotropic_hardening": 1e9, "kinematic_hardening": 2e9},
     "voce": {"yield_stress": 250e6, **STATIC},
     "ludwik": {
         "yield_stress": 250e6, "strength_coefficient": 400e6, "hardening_exponent": 0.3, "kinematic_hardening": 1e9
@@ -298,8 +287,8 @@ def yield_stress(name, a, keys):
     if name == "multilinear":
         strain, stress = np.array(keys["curve"]).T
         return float(np.interp(a, strain - stress / YOUNG, stress))
-    risen = keys["isotropic_hardening"] * a + keys["saturation_stress"] * (1.0 - math.exp(-keys["saturation_rate"] * a))
-    return keys["yield_stress"] + risen
+    saturated = 1.0 - math.exp(-keys.get("saturation_rate", 0.0) * a)
+    return keys["yield_stress"] + keys["isotropic_hardening"] * a + keys.get("saturation_stress", 0.0) * saturated
 
 
 def flow_stress(name, a, speed, temperature, keys):

@@ -8,9 +8,6 @@ from helpers.twins import KEYS, RATES, SOFTENING, YOUNG, cycles, flow_stress, fo
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
-from pfem_petsc.mechanics.materials.elastoplastic import Parameters as Elastoplastic
-from pfem_petsc.mechanics.materials.elastoplastic import response as elastoplastic
-
 STATIC = [name for name in KEYS if name not in RATES]
 SIXTH = tuple(zip((-3, -2, -1, 1, 2, 3), (-1 / 60, 3 / 20, -3 / 4, 3 / 4, -3 / 20, 1 / 60), strict=True))
 
@@ -80,12 +77,11 @@ def test_work_of_the_mean_stress_is_that_of_the_path(name):
         assert follow(name, ends, np.ones(len(ends)))[-1][4] == pytest.approx(trapezoidal, rel=3e-6)
 
 
-@pytest.mark.parametrize("name", [*KEYS, "elastic", "elastoplastic"])
+@pytest.mark.parametrize("name", [*KEYS, "elastic"])
 @pytest.mark.parametrize("softens", [False, True])
 def test_tangents_are_derivatives(name, softens):
     """Of stress and mean stress, at all points of the path away from kinks, by differences of sixth order."""
     keys = {"softening": SOFTENING} if softens else {}
-    keys |= {"yield_stress": 250e6, "isotropic_hardening": 1e9} if name == "elastoplastic" else {}
     if softens and name == "johnson_cook":
         pytest.skip("has a softening of its own")
     (material, law), (path, steps) = make(name, **keys), cycles(3)
@@ -217,21 +213,6 @@ def test_johnson_cook_at_a_constant_rate():
     expected = (250e6 + 400e6 * a[-1] ** 0.3) * (1.0 + 0.05 * math.log(speed)) * (1.0 - 0.2**0.8)
     assert rows[-1][0] == pytest.approx(expected, rel=1e-13)
     assert follow("johnson_cook", [0.01], [1e-3], 1500.0)[0][0] == pytest.approx(0.0, abs=1e-3)
-
-
-def test_voce_without_saturation_is_elastoplastic():
-    path, steps = cycles()
-    q = (0.0, 0.0)
-    p = Elastoplastic(
-        young_modulus=YOUNG, density=1.0, yield_stress=250e6, isotropic_hardening=1e9, kinematic_hardening=2e9
-    ).pack()
-    rows = follow("voce", path, steps, saturation_stress=0.0)
-    for strain, change, row in zip(path, np.diff([0.0, *path]), rows, strict=True):
-        stress, tangent, q, densities = elastoplastic(strain, 0.0, 0.0, 0.0, p, q)
-        assert row[0] == pytest.approx(stress, rel=1e-12)
-        assert not change or row[1] == pytest.approx(tangent, rel=1e-12)
-        assert row[2] == pytest.approx(q, rel=1e-11, abs=1e-17)
-        assert row[3] == pytest.approx(densities, rel=1e-11, abs=1e-4)
 
 
 @pytest.mark.filterwarnings("ignore:overflow")  # slopes at denormal plastic strains

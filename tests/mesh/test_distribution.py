@@ -4,20 +4,12 @@ from helpers.meshes import slab_from, whole
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.distribution import distribute
-from pfem_petsc.mesh.exchange import swap
-from pfem_petsc.mesh.generators import lattice, rod
+from pfem_petsc.mesh.generators import lattice
 from pfem_petsc.mesh.ordering import hilbert_keys, sweep_keys
 
 pytestmark = pytest.mark.parallel
 
 PARTITIONERS = ["coordinates", "ptscotch"]
-
-
-def five_nodes(comm):
-    """A square pyramid, its base, and one bar turned round; on 8 ranks some own nothing."""
-    points = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]]
-    bars = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 0], [1, 4], [2, 4], [3, 4], [0, 2]]
-    return slab_from(points, bars, comm, {"top": [4], "base": [0, 1, 2, 3]}, {"edges": [4, 5, 6, 7], "none": []})
 
 
 def irregular(comm):
@@ -37,7 +29,7 @@ def cube(comm):
     return lattice.generate(keys, comm.rank, comm.size)
 
 
-MESHES = {"five_nodes": five_nodes, "irregular": irregular, "cube": cube}
+MESHES = {"irregular": irregular, "cube": cube}
 
 
 @pytest.fixture(params=[(mesh, partitioner) for mesh in MESHES for partitioner in PARTITIONERS], ids="-".join)
@@ -51,70 +43,6 @@ def case(request, comm):
     mesh.close()
 
 
-def test_every_node_is_owned_once_and_numbered_in_order(comm, case):
-    original, _, mesh = case
-    owned = np.concatenate(comm.allgather(mesh.node_ids[: mesh.n_owned]))
-    np.testing.assert_array_equal(np.sort(owned), np.arange(original.n_nodes))
-    assert mesh.first_node == sum(comm.allgather(mesh.n_owned)[: comm.rank])
-    assert mesh.n_local == mesh.n_owned + len(mesh.ghost_numbers) == len(mesh.node_ids) == len(mesh.points)
-    np.testing.assert_array_equal(mesh.points, original.points[mesh.node_ids])
-    # A ghost's PETSc number is its place among all owned nodes.
-    np.testing.assert_array_equal(owned[mesh.ghost_numbers], mesh.node_ids[mesh.n_owned :])
-    assert (np.diff(mesh.ghost_numbers) > 0).all()
-
-
-def test_every_bar_is_counted_once_where_its_first_end_is_owned(comm, case):
-    original, sections, mesh = case
-    np.testing.assert_array_equal(mesh.node_ids[mesh.bars], original.bars[mesh.bar_ids])
-    counted = [np.empty(0, np.int64)]
-    at = 0
-    for block in mesh.blocks:
-        assert block.start == at <= block.counted <= block.stop
-        at = block.stop
-        counted.append(mesh.bar_ids[block.start : block.counted])
-        assert set(sections[mesh.bar_ids[block.start : block.stop]]) == {block.section}
-        assert (mesh.bars[block.start : block.counted, 0] < mesh.n_owned).all()
-        assert (mesh.bars[block.counted : block.stop, 0] >= mesh.n_owned).all()
-    assert at == len(mesh.bars)
-    everywhere = np.concatenate(comm.allgather(np.concatenate(counted)))
-    np.testing.assert_array_equal(np.sort(everywhere), np.arange(original.n_bars))
-
-
-def test_all_bars_of_owned_nodes_are_here_and_no_others(case):
-    original, _, mesh = case
-    is_owned = np.zeros(original.n_nodes, bool)
-    is_owned[mesh.node_ids[: mesh.n_owned]] = True
-    expected = np.flatnonzero(is_owned[original.bars].any(axis=1))
-    np.testing.assert_array_equal(np.sort(mesh.bar_ids), expected)
-    ends = np.unique(original.bars[expected])
-    np.testing.assert_array_equal(np.sort(mesh.node_ids[mesh.n_owned :]), ends[~is_owned[ends]])
-
-
-def test_groups_keep_their_members(comm, case):
-    original, _, mesh = case
-    assert list(mesh.node_groups) == list(original.node_groups)
-    for name, members in mesh.node_groups.items():
-        assert (members < mesh.n_owned).all()
-        found = np.concatenate(comm.allgather(mesh.node_ids[members]))
-        np.testing.assert_array_equal(np.sort(found), np.sort(original.node_groups[name]))
-    assert list(mesh.bar_groups) == list(original.bar_groups)
-    for name, members in mesh.bar_groups.items():
-        assert (np.diff(members) > 0).all()
-        here = np.intersect1d(original.bar_groups[name], mesh.bar_ids)
-        np.testing.assert_array_equal(np.sort(mesh.bar_ids[members]), here)
-
-
-@pytest.mark.parametrize("columns", [1, 3, 7])
-def test_ghosts_take_the_owners_values(case, columns):
-    _, _, mesh = case
-    wanted = mesh.node_ids[:, None] * 10.0 + np.arange(columns)
-    for offset in (0.0, 0.25):
-        values = np.full((mesh.n_local, columns), np.nan)
-        values[: mesh.n_owned] = wanted[: mesh.n_owned] + offset
-        mesh.update_ghosts(values)
-        np.testing.assert_array_equal(values, wanted + offset)
-
-
 def test_parts_are_balanced(comm, case):
     original, _, mesh = case
     if mesh.partitioner == "coordinates":
@@ -123,24 +51,6 @@ def test_parts_are_balanced(comm, case):
         assert abs(mine - works.sum() / comm.size) <= works.max()
     else:
         assert mesh.n_owned < 1.3 * original.n_nodes / comm.size + 2
-
-
-def test_the_result_is_the_same_each_time(comm):
-    slabs = irregular(comm), irregular(comm)
-    meshes = [distribute(slab, np.zeros(len(slab.bars), np.int32), comm, "coordinates") for slab in slabs]
-    for name in ("node_ids", "ghost_numbers", "bars", "bar_ids"):
-        np.testing.assert_array_equal(getattr(meshes[0], name), getattr(meshes[1], name))
-
-
-def test_ranks_own_nothing_when_there_are_more_ranks_than_nodes(comm):
-    slab = rod.generate(rod.Parameters(length=1.0, elements=1), comm.rank, comm.size)
-    mesh = distribute(slab, np.zeros(len(slab.bars), np.int32), comm)
-    assert comm.allreduce(mesh.n_owned) == 2
-    assert comm.allreduce(sum(block.counted - block.start for block in mesh.blocks)) == 1
-    values = np.zeros((mesh.n_local, 2))
-    values[: mesh.n_owned] = 1.0
-    mesh.update_ghosts(values)
-    assert (values == 1.0).all()
 
 
 def test_partitioner_is_chosen_by_the_mesh(comm):
@@ -199,16 +109,6 @@ def test_bars_lie_close_to_each_other_in_memory(comm):
     local = distribute(slab, np.zeros(len(slab.bars), np.int32), comm, "coordinates")
     span = np.abs(np.diff(local.bars[(local.bars < local.n_owned).all(axis=1)], axis=1))
     assert span.max() <= (n + 1) ** 2 + (n + 1)
-
-
-def test_rows_are_swapped(comm):
-    """Each two ranks send each other as many rows as their numbers say, in an order of their own."""
-    ranks = np.repeat(np.arange(comm.size), comm.rank + np.arange(comm.size) + 1)
-    ranks = np.random.default_rng(comm.rank).permutation(ranks)
-    place = np.array([np.sum(ranks[:k] == rank) for k, rank in enumerate(ranks)])
-    rows = np.column_stack([np.full(len(ranks), comm.rank), ranks, place]).astype(float)
-    expected = np.column_stack([ranks, np.full(len(ranks), comm.rank), place])
-    np.testing.assert_array_equal(swap(comm, ranks, rows), expected)
 
 
 @pytest.mark.parametrize("partitioner", ["auto", "coordinates"])

@@ -123,24 +123,6 @@ def test_eigenvalues_that_the_smoother_assumes(comm, tmp_path):
     assert np.abs(diagonal - np.diag(stiffness))[kept].max() < 1e-12 * diagonal.max()
 
 
-def test_diagonal_is_that_of_the_products(comm, tmp_path):
-    """By runs of bars and by stars, without supports."""
-    plain = {"node_set": {}, "initial": {"velocity": [0.0, 0.0, 1.0]}}
-    for mesh in (irregular(40), None):
-        tables = plain if mesh is not None else {}
-        product = made(simulation_of(comm, tmp_path / str(mesh is None), 2e-3, mesh=mesh, **tables)).product
-        product.extension.kept = None
-        unit, out = np.zeros((product.mesh.n_owned, 3)), np.zeros((product.mesh.n_owned, 3))
-        expected = np.zeros_like(unit)
-        for column in range(unit.size):
-            unit.reshape(-1)[column] = 1.0
-            product.extension.times(unit, out)
-            expected.reshape(-1)[column] = out.reshape(-1)[column]
-            unit.reshape(-1)[column] = 0.0
-        assert np.abs(product.diagonal() - expected).max() < 1e-12 * expected.max()
-        assert np.abs(product.blocks()[:, [0, 3, 5]] - expected).max() < 1e-12 * expected.max()
-
-
 def test_rigid_motions_are_interpolated(comm, tmp_path):
     """All fields that are linear in the positions, whatever the mesh."""
     simulation = simulation_of(comm, tmp_path, 2e-5, mesh=irregular(60), node_set={}, initial={"velocity": [0, 0, 1]})

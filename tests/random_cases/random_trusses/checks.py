@@ -28,7 +28,7 @@ from pfem_petsc.contact.walls.base import WallKeys
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
 
-from .draw import generated
+from .draw import generated, members_of
 
 Faults = list[tuple[str, str]]
 _ENDS = ("_energy", "_dissipation", "_work")
@@ -109,10 +109,10 @@ def _walls(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults
     for support in case.support:
         if support.fix is None or support.frame is not None:
             continue  # no wall stops its nodes
-        fixed[np.ix_(_members(case, support.node_set, result), ["xyz".index(c) for c in support.fix])] = True
+        fixed[np.ix_(_members(case, support.node_set), ["xyz".index(c) for c in support.fix])] = True
     carried = np.flatnonzero(fixed.all(axis=1))
     for wall in case.wall:
-        members = np.setdiff1d(_members(case, wall.node_set, result), carried)
+        members = np.setdiff1d(_members(case, wall.node_set), carried)
         moved = history.get(f"wall/{wall.name}/position")
         worst = (0.0, "")
         for i, step in enumerate(result.steps):
@@ -131,21 +131,10 @@ def _walls(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults
     return faults
 
 
-def _members(case: Case, name: str | None, result: Loaded) -> np.ndarray:
-    """Mesh numbers of the nodes that a wall stops; groups are read from the mesh."""
-    all_nodes = np.arange(result.positions.shape[1])
-    if name is None or case.node_set[name].all:
-        return all_nodes
-    table, points = case.node_set[name], result.positions[0]
-    if table.indices is not None:
-        return np.array(table.indices)
-    if table.group is not None:
-        return generated(case.to_dict()["mesh"]).node_groups[table.group]
-    if table.nearest is not None:
-        return np.array([np.linalg.norm(points - table.nearest, axis=1).argmin()])
-    low, high = np.array(table.box)
-    slack = 1e-6 * np.ptp(points, axis=0).max()
-    return np.flatnonzero(((points >= low + slack) & (points <= high - slack)).all(axis=1))
+def _members(case: Case, name: str | None) -> np.ndarray:
+    """Mesh numbers of the nodes of a node set, or of all."""
+    table = {} if name is None else case.node_set[name].as_table()
+    return members_of(generated(case.to_dict()["mesh"]), table)
 
 
 def _distances(wall: WallKeys, x: np.ndarray) -> np.ndarray:

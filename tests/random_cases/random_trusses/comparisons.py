@@ -29,7 +29,7 @@ from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
 
 from .checks import Loaded, check_result, distance, energy_scale
-from .draw import draw_case, generated
+from .draw import draw_case, generated, members_of
 from .running import case_text, clear, run_case, run_in_two_parts, steps_of
 
 CHAOS_OF_COPIES = 300.0
@@ -96,18 +96,9 @@ def _as_arrays(table: dict[str, Any]) -> dict[str, Any]:
     plain = copy.deepcopy(table)
     slab = generated(plain["mesh"])
     points = slab.points
-    for chosen in plain["node_set"].values():
-        if "group" in chosen:
-            members = np.asarray(slab.node_groups[chosen["group"]])
-        elif "nearest" in chosen:
-            members = np.array([np.linalg.norm(points - chosen["nearest"], axis=1).argmin()])
-        elif "box" in chosen:
-            low, high = np.array(chosen["box"])
-            members = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
-        else:
-            continue
-        chosen.clear()
-        chosen["indices"] = members.tolist()
+    for name, chosen in plain["node_set"].items():
+        if "all" not in chosen:
+            plain["node_set"][name] = {"indices": members_of(slab, chosen).tolist()}
     for kind in ("spring", "dashpot"):
         plain[kind] = [part for connector in plain.get(kind, ()) for part in _one_by_one(plain, connector, points)]
         if not plain[kind]:

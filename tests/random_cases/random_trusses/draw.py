@@ -27,34 +27,31 @@ def vector(chance: random.Random, length: float) -> np.ndarray:
     return length * vector / np.linalg.norm(vector)
 
 
-def draw_prestress(chance: random.Random, case: dict[str, Any], end: float) -> None:
-    """Prescribe rest lengths of a section, drawn on its own so that cases without them stay as they are."""
-    if chance.random() > 0.12:
-        return
+def draw_prestress(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Prescribe rest lengths of a section."""
     section = case["section"][chance.choice(sorted(case["section"]))]
     material = case["material"][section["material"]]
     young = material["young_modulus"]
     most = min(3e-3, 0.9 * material.get("yield_stress", young) / young)
+    least = 0.0 if material.get("law") == "cable" else -1.0  # cables are not pressed
     key = chance.choice(("pretension", "prestress", "rest_length"))
 
     def value() -> float:
-        strain = most * chance.uniform(-1.0, 1.0)
+        strain = most * chance.uniform(least, 1.0)
         return {"pretension": young * strain * section["area"], "prestress": young * strain}.get(key, 1.0 - strain)
 
     rows = sorted(chance.random() for _ in range(chance.randint(1, 4)))
-    section[key] = value() if chance.random() < 0.4 else [[row * end, value()] for row in rows]
+    section[key] = value() if chance.random() < 0.4 else [[row * motion.end, value()] for row in rows]
 
 
-def draw_bar_law(chance: random.Random, case: dict[str, Any], longest: float) -> None:
-    """Replace the law of a material, drawn on its own so that cases without it stay as they are."""
-    if chance.random() > 0.12:
-        return
+def draw_bar_law(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Replace the law of a material."""
     name = chance.choice(sorted(case["material"]))
     table = {key: value for key, value in case["material"][name].items() if not key.endswith(("_hardening", "_stress"))}
     young, law = table["young_modulus"], chance.choice(("cable", "strut", "strut", "damage", "compaction"))
     table["law"], strong = law, young * 10 ** chance.uniform(-3, -1.7)
     if law == "damage":
-        energy = 0.5 * strong**2 / young * longest * 10 ** chance.uniform(0.05, 1.0)
+        energy = 0.5 * strong**2 / young * (1.8 * body.size) * 10 ** chance.uniform(0.05, 1.0)
         table |= {"tensile_strength": strong, "fracture_energy": energy}
     elif law == "strut" or chance.random() < 0.6:
         table["yield_stress"] = strong
@@ -72,57 +69,54 @@ def draw_bar_law(chance: random.Random, case: dict[str, Any], longest: float) ->
             section["effective_length"] = chance.choice((1.0, 0.7, 0.5))
 
 
-def draw_loads_over_time(chance: random.Random, case: dict[str, Any], speed: float, end: float) -> None:
-    """Wind, gravity over time and smooth tables, drawn on their own so that cases without them stay as they are."""
-    if chance.random() > 0.12:
-        return
+def draw_loads_over_time(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Wind, gravity over time and smooth tables."""
 
     def rows(values: Any) -> list[list[float]]:
         times = sorted(chance.random() for _ in range(chance.randint(1, 5)))
-        return [[t * end, *(chance.uniform(-1.0, 1.0) * np.array(values))] for t in times]
+        return [[t * motion.end, *(chance.uniform(-1.0, 1.0) * np.array(values))] for t in times]
 
     smooth = {"interpolation": "smooth"} if chance.random() < 0.5 else {}
     if not any(wall.get("gravity") for wall in case.get("wall", ())) and chance.random() < 0.5:
-        strength = speed / end * vector(chance, chance.uniform(0.1, 2.0))
+        strength = motion.speed / motion.end * vector(chance, chance.uniform(0.1, 2.0))
         case["gravity"] = {"acceleration": rows(strength), **smooth}
     for load in case.get("load", ()):
         load |= smooth if "table" in load else {}
     # nodes without mass cannot follow wind, which is refused
     massless = case.get("contact", {}).get("treatment") == "mass_redistribution" and chance.random() > ODD
     if ("gravity" not in case or chance.random() < 0.6) and not massless:
-        wind = speed * vector(chance, chance.uniform(0.3, 1.5))
-        # drag that stops the lightest bars at twice the speed of the body in some part of the run
+        wind = motion.speed * vector(chance, chance.uniform(0.3, 1.5))
+        # drag that stops the lightest bars at twice the motion.speed of the body in some part of the run
         section = min(case["section"].values(), key=lambda s: case["material"][s["material"]]["density"] * s["area"])
         line = case["material"][section["material"]]["density"] * section["area"]
         widest = max(2.0 * np.sqrt(s["area"] / np.pi) for s in case["section"].values())
-        density = chance.uniform(0.02, 0.8) * line / (1.2 * widest * 2.0 * speed * end)
+        density = chance.uniform(0.02, 0.8) * line / (1.2 * widest * 2.0 * motion.speed * motion.end)
         steady = chance.random() < 0.4
         case["wind"] = {"velocity": wind if steady else rows(wind), "density": density, **({} if steady else smooth)}
         if chance.random() < 0.3:
             section["drag_coefficient"] = chance.uniform(0.0, 1.2)
 
 
-def draw_stiffness_damping(chance: random.Random, case: dict[str, Any], limit: float) -> None:
-    """Damp a material in proportion to its stiffness, drawn on its own; rest lengths that change exclude it."""
-    if chance.random() > 0.08 or any(isinstance(value, list) for s in case["section"].values() for value in s.values()):
+def draw_stiffness_damping(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Damp a material in proportion to its stiffness; rest lengths that change exclude it."""
+    if any(isinstance(value, list) for s in case["section"].values() for value in s.values()):
         return
     material = case["material"][chance.choice(sorted(case["material"]))]
-    material["stiffness_damping"] = limit * 10 ** chance.uniform(-3.0, -1.0)
+    material["stiffness_damping"] = body.limit * 10 ** chance.uniform(-3.0, -1.0)
 
 
 LAWS = ("voce", "ludwik", "ramberg_osgood", "multilinear", "cowper_symonds", "perzyna", "johnson_cook")
 HARDENING = ("isotropic_hardening", "kinematic_hardening")
 
 
-def draw_laws(chance: random.Random, case: dict[str, Any], end: float) -> None:
-    """Change the law of a material or let it soften, drawn on its own so that other cases stay as they are."""
-    if chance.random() > 0.12:
-        return
+def draw_laws(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Change the law of a material or let it soften."""
     table = case["material"][chance.choice(sorted(case["material"]))]
     if "law" in table:  # drawn elsewhere
         return
     if "temperature" not in case and chance.random() < 0.3:
-        case["temperature"] = [{"table": [[0.0, 0.0], [end * chance.uniform(0.1, 1.0), chance.uniform(-60.0, 60.0)]]}]
+        rows = [[0.0, 0.0], [motion.end * chance.uniform(0.1, 1.0), chance.uniform(-60.0, 60.0)]]
+        case["temperature"] = [{"table": rows}]
     softens = "temperature" in case and chance.random() < 0.7
     if not softens or chance.random() < 0.5:
         name = chance.choice(LAWS)
@@ -169,10 +163,8 @@ def _law_keys(chance: random.Random, name: str, table: dict[str, Any], yields: f
     return keys
 
 
-def draw_rupture(chance: random.Random, case: dict[str, Any], end: float) -> None:
-    """Let bars break, or remove a support, drawn on its own so that other cases stay as they are."""
-    if chance.random() > 0.12:
-        return
+def draw_rupture(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Let bars break, or remove a support."""
     table = case["material"][chance.choice(sorted(case["material"]))]
     small = 10 ** chance.uniform(-4, -2)
     limits = {"strain": small, "compressive_strain": small * chance.uniform(0.5, 2.0)}
@@ -186,19 +178,20 @@ def draw_rupture(chance: random.Random, case: dict[str, Any], end: float) -> Non
         table["rupture"]["steps"] = chance.randint(2, 8)
     if case.get("support") and "contact_pair" not in case and chance.random() < 0.5:
         case["support"][0]["name"] = "held"
-        removal = {"supports": "held", "time": chance.uniform(0.0, 1.0) * end}
-        case["remove"] = [removal | ({"duration": 0.3 * end} if chance.random() < 0.5 else {})]
+        removal = {"supports": "held", "time": chance.uniform(0.0, 1.0) * motion.end}
+        case["remove"] = [removal | ({"duration": 0.3 * motion.end} if chance.random() < 0.5 else {})]
 
 
-def draw_points(chance: random.Random, case: dict[str, Any], size: float) -> None:
-    """Give nodes masses, springs and dashpots, drawn on their own so that other cases stay as they are.
+def _largest(case: dict[str, Any], body: Body) -> tuple[float, float]:
+    """Largest stiffness [N/m] and mass [kg] of a bar of the size of the truss."""
+    sections = [(section["area"], case["material"][section["material"]]) for section in case["section"].values()]
+    stiffness = max(area * material["young_modulus"] for area, material in sections) / body.size
+    return stiffness, max(area * material["density"] for area, material in sections) * body.size
 
-    ``size`` : of the truss [m]; a mass is a part of that of a bar of this length.
-    """
-    sections = [
-        (section.get("area", 0.0), case["material"][section["material"]]) for section in case["section"].values()
-    ]
-    bar = max(area * material["density"] for area, material in sections) * size
+
+def draw_points(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Give nodes masses, springs and dashpots; a mass is a part of that of a bar of the size of the truss."""
+    stiffness, bar = _largest(case, body)
     if bar and math.isfinite(bar) and chance.random() < 0.15:
         node_sets = [chance.choice(sorted(case["node_set"])) for _ in range(chance.randint(1, 2))]
         case["mass"] = [{"node_set": name, "value": bar * 10 ** chance.uniform(-2, 1)} for name in node_sets]
@@ -207,7 +200,6 @@ def draw_points(chance: random.Random, case: dict[str, Any], size: float) -> Non
         case["time"]["damping_table"] = [[0.0, chance.uniform(0.0, 2.0)], [chance.uniform(0.1, 1.0) * end, 0.0]]
     if case.get("contact", {}).get("treatment") == "mass_redistribution":
         return  # refuses both
-    stiffness = max(area * material["young_modulus"] for area, material in sections) / size
     if stiffness and math.isfinite(stiffness) and chance.random() < 0.15:
         parts = [stiffness * 10 ** chance.uniform(-3, 1) if chance.random() < 0.7 else 0.0 for _ in range(3)]
         case["spring"] = [{"node_set": chance.choice(sorted(case["node_set"])), "stiffness": parts}]
@@ -218,10 +210,8 @@ def draw_points(chance: random.Random, case: dict[str, Any], size: float) -> Non
         case["spring"][0]["frame"] = [[chance.uniform(-1.0, 1.0) for _ in range(3)] for _ in range(2)]
 
 
-def draw_inclined(chance: random.Random, case: dict[str, Any]) -> None:
-    """Turn supports, or add a roller; drawn on their own so that other cases stay as they are."""
-    if chance.random() > 0.1:
-        return
+def draw_inclined(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Turn supports, or add a roller."""
     if case.get("wall") or case.get("contact_pair"):
         if chance.random() > 0.4:
             return
@@ -243,15 +233,9 @@ def draw_inclined(chance: random.Random, case: dict[str, Any]) -> None:
             case["remove"] = [{"supports": "roller", "time": chance.random() * case["time"]["end"]}]
 
 
-def draw_connectors(chance: random.Random, case: dict[str, Any], size: float) -> None:
-    """Connect nodes, drawn on their own so that other cases stay as they are; ``size`` of the truss [m]."""
-    if chance.random() > 0.08:
-        return
-    sections = [
-        (section.get("area", 0.0), case["material"][section["material"]]) for section in case["section"].values()
-    ]
-    stiffness = max(area * material["young_modulus"] for area, material in sections) / size
-    bar = max(area * material["density"] for area, material in sections) * size
+def draw_connectors(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Connect nodes."""
+    stiffness, bar = _largest(case, body)
     names = [name for name, chosen in case["node_set"].items() if "nearest" in chosen or "indices" in chosen]
     if not stiffness or not math.isfinite(stiffness + bar) or len(names) < 2:
         return
@@ -278,7 +262,7 @@ class Body:
     tables : the tables mesh, material, section and, where bars are heated, temperature
     points : (nodes, 3) [m]
     bars : (bars, 2)
-    groups : node groups of the mesh
+    node_groups : of the mesh
     limit : estimate of the stable step of central differences with lumped mass [s]
     wave : speed of waves in the fastest material [m/s]
     length : of the shortest bar [m]
@@ -290,7 +274,7 @@ class Body:
     tables: dict[str, Any]
     points: np.ndarray
     bars: np.ndarray
-    groups: dict[str, np.ndarray]
+    node_groups: dict[str, np.ndarray]
     limit: float = 0.0
     wave: float = 0.0
     length: float = 0.0
@@ -478,26 +462,27 @@ def _members(
         name = chance.choice(("g_start", "g_end") if pair["first"] == "g_first_end" else ("g_bottom", "g_top"))
     elif treatment == "mass_redistribution" or chance.random() < 0.5:
         # the group that is farthest ahead
-        ahead = {name: float((members_of(body, sets[name]) @ motion.way).mean()) for name in sorted(sets)}
+        ahead = {name: float((body.points[members_of(body, sets[name])] @ motion.way).mean()) for name in sorted(sets)}
         groups = [name for name in ahead if name.startswith("g_")]
         name = max(groups, key=ahead.get) if chance.random() < 0.8 else chance.choice(sorted(sets))
     else:
         return None, body.points
-    return name, members_of(body, sets[name])
+    return name, body.points[members_of(body, sets[name])]
 
 
-def members_of(body: Body, table: dict[str, Any]) -> np.ndarray:
-    """Positions (m, 3) of the nodes of a node set."""
+def members_of(mesh: MeshSlab | Body, table: dict[str, Any]) -> np.ndarray:
+    """Numbers of the nodes of a node set."""
+    points = mesh.points
     if "group" in table:
-        return body.points[body.groups[table["group"]]]
+        return np.asarray(mesh.node_groups[table["group"]])
     if "indices" in table:
-        return body.points[table["indices"]]
+        return np.asarray(table["indices"])
     if "nearest" in table:
-        return body.points[[np.linalg.norm(body.points - table["nearest"], axis=1).argmin()]]
+        return np.array([np.linalg.norm(points - table["nearest"], axis=1).argmin()])
     if "box" in table:
         low, high = np.array(table["box"])
-        return body.points[((body.points >= low) & (body.points <= high)).all(axis=1)]
-    return body.points
+        return np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    return np.arange(len(points))
 
 
 def _shape(
@@ -642,16 +627,25 @@ def draw_case(seed: int) -> dict[str, Any]:
     case["time"] = time
     case["output"] = _output(chance, motion, case["node_set"])
     case |= _solver(chance, time)
-    draw_bar_law(random.Random(f"bar law {seed}"), case, 1.8 * body.size)
-    draw_laws(random.Random(f"laws {seed}"), case, motion.end)
-    draw_prestress(random.Random(f"prestress {seed}"), case, motion.end)
-    draw_loads_over_time(random.Random(f"loads {seed}"), case, motion.speed, motion.end)
-    draw_stiffness_damping(random.Random(f"stiffness damping {seed}"), case, body.limit)
-    draw_rupture(random.Random(f"rupture {seed}"), case, motion.end)
-    draw_points(random.Random(f"points {seed}"), case, body.size)
-    draw_inclined(random.Random(f"inclined {seed}"), case)
-    draw_connectors(random.Random(f"connectors {seed}"), case, body.size)
+    for name, share, change in CHANGES:
+        own = random.Random(f"{name} {seed}")
+        if share is None or own.random() <= share:
+            change(own, case, body, motion)
     return _plain(case)
+
+
+CHANGES = (
+    ("bar law", 0.12, draw_bar_law),
+    ("laws", 0.12, draw_laws),
+    ("prestress", 0.12, draw_prestress),
+    ("loads", 0.12, draw_loads_over_time),
+    ("stiffness damping", 0.08, draw_stiffness_damping),
+    ("rupture", 0.12, draw_rupture),
+    ("points", None, draw_points),
+    ("inclined", 0.1, draw_inclined),
+    ("connectors", 0.08, draw_connectors),
+)
+"""What some cases have besides, with its share of them, drawn on its own so that other cases stay as they are."""
 
 
 def _time(chance: random.Random, body: Body) -> dict[str, Any]:
@@ -716,7 +710,9 @@ def _motion(chance: random.Random, body: Body, time: dict[str, Any]) -> Motion:
 
 
 def _node_sets(chance: random.Random, body: Body) -> dict[str, Any]:
-    sets: dict[str, Any] = {f"g_{name}": {"group": name} for name in sorted(body.groups) if len(body.groups[name])}
+    sets: dict[str, Any] = {
+        f"g_{name}": {"group": name} for name in sorted(body.node_groups) if len(body.node_groups[name])
+    }
     sets["every"] = {"all": True}
     low, high = body.points.min(axis=0), body.points.max(axis=0)
     sets["near"] = {"nearest": [chance.uniform(a, b) for a, b in zip(low, high, strict=True)]}

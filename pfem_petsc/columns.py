@@ -26,8 +26,8 @@ class Column(NamedTuple):
     source : of an energy, see :func:`energy`
     side : of an energy, of the balance: stored + lost - supplied is constant; ``part`` of another column
     parts : columns that a derived energy sums
-    value : its value at the time of a row from a :class:`~pfem_petsc.stepping.stepper.Stepper`, this rank's share if it
-        is summed over ranks; None if the ledger, the contact log or the recorder has it
+    value : its value at the state of a :class:`~pfem_petsc.stepping.stepper.Stepper`, this rank's share if it is summed
+        over ranks; None if the ledger, the contact log or the recorder has it
     stages : what a stage does with the value of the stage before: it goes on with a ``summed`` one, keeps a ``lasting``
         one that it does not have itself, and forgets others
     exists : whether the column is recorded, from a :class:`~pfem_petsc.stepping.model.Model`
@@ -94,9 +94,9 @@ BAR_ENERGIES = tuple(one.name for one in ENERGIES if one.source == "bars")
 """Energies whose densities material laws return, in the order of their sums."""
 
 OF_RUN = (
-    Column("time", "s", value=lambda now: now.place),
-    Column("step", kind=np.int64, value=lambda now: now.number),
-    Column("step_size", "s", value=lambda now: now.smallest),
+    Column("time", "s"),
+    Column("step", kind=np.int64),
+    Column("step_size", "s"),
 )
 """Equal on all ranks."""
 STAGE = Column("stage", kind=np.int64)
@@ -243,3 +243,31 @@ HEAD = _layout(*(one for one in ENERGIES if one.source != "derived"), *VECTORS, 
 """Sums of all cases."""
 WALL = _layout(*OF_WALLS)
 PAIR = _layout(*OF_PAIRS)
+
+
+def values_at_state(model: Any) -> list[tuple[int, Callable[[Any], float]]]:
+    """Return where numbers of the state of a stepper are in a share, and their values from the stepper."""
+    columns = (*ENERGIES, *VECTORS, *COUNTS)
+    return [(HEAD.first(one.name), one.value) for one in columns if one.value is not None and one.exists(model)]
+
+
+class Shares:
+    """This rank's shares of m rows.
+
+    Attributes
+    ----------
+    numbers : (m, width)
+    head : (m, width of HEAD)
+    changes : (m,) changes of the active set; (m, 0) without walls
+    walls : (m, walls, width of WALL)
+    tables : (m, tables, width of PAIR)
+    probes : (m, nodes, number of PROBED, 3)
+    """
+
+    def __init__(self, m: int, walls: int, tables: int, probes: int) -> None:
+        parts = (HEAD.width, int(walls > 0), walls * WALL.width, tables * PAIR.width, probes * len(PROBED) * 3)
+        self.numbers = np.zeros((m, sum(parts)))
+        self.head, self.changes, flat, pairs, probed = np.split(self.numbers, np.cumsum(parts)[:-1], axis=1)
+        self.walls = flat.reshape(m, walls, WALL.width)
+        self.tables = pairs.reshape(m, tables, PAIR.width)
+        self.probes = probed.reshape(m, probes, len(PROBED), 3)

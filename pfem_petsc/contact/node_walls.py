@@ -75,7 +75,8 @@ def held_by_supports(fixed: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return free_squares(fixed, normals) <= FREE_PART
 
 
-_PENDING = 4096  # steps whose contacts are buffered before ranks combine them
+NOTED = 4096
+"""Steps whose contacts are buffered before ranks combine them."""
 
 
 @kernel
@@ -125,6 +126,7 @@ class ContactLog:
     changes : number of contacts of this rank that closed or opened since the last row of the history
     last : (m,) nodes that touch any wall after the last step
     present : (owned,) bool, workspace of :func:`compare_contacts`
+    noted : number of steps whose touched walls are not in ``time`` yet
     time : (walls,) time during which any node of the model touched each wall [s]; the same on all ranks
     """
 
@@ -135,13 +137,13 @@ class ContactLog:
         self.time = np.zeros(n_walls)
         self.last = np.empty(0, dtype=np.int64)
         self.present = np.zeros(n_owned, dtype=bool)
-        self._pending = 0
-        self._steps = np.empty(_PENDING)
-        self._flags = np.empty((_PENDING, n_walls), dtype=np.uint8)
+        self.noted = 0
+        self._steps = np.empty(NOTED)
+        self._flags = np.empty((NOTED, n_walls), dtype=np.uint8)
 
     def book(self, walls: WallForces, step: float, comm: MPI.Comm) -> None:
         """Record the contacts of a step of size ``step`` [s]. Collective whenever the buffer is full."""
-        self.note(walls.contacts > 0, step, comm)
+        self.note(walls.contacts[None] > 0, step, comm)
         if len(walls.nodes) == 0 and len(self.last) == 0:
             return
         changes, self.last = compare_contacts(
@@ -149,27 +151,30 @@ class ContactLog:
         )
         self.changes += changes
 
-    def note(self, touched: np.ndarray, step: float, comm: MPI.Comm) -> None:
-        """Record the walls (walls,) bool that were touched in a step. Collective whenever the buffer is full."""
-        if self._pending >= _PENDING:
+    def note(self, touched: np.ndarray, step: float, comm: MPI.Comm) -> int:
+        """Record the walls (steps, walls) bool that were touched in some steps of one size; return how many steps were
+        noted before. Collective whenever the buffer is full."""
+        if self.noted + len(touched) > NOTED:
             self.meet(comm)
-        self._steps[self._pending] = step
-        self._flags[self._pending] = touched
-        self._pending += 1
+        begin, end = self.noted, self.noted + len(touched)
+        self._steps[begin:end], self._flags[begin:end], self.noted = step, touched, end
+        return begin
 
-    def meet(self, comm: MPI.Comm, contacts: np.ndarray | None = None) -> None:
-        """Update the contact times on all ranks. Collective.
+    def meet(self, comm: MPI.Comm, contacts: np.ndarray | None = None) -> np.ndarray:
+        """Update the contact times on all ranks; return those (noted + 1, walls) before and after each noted step [s].
+        Collective.
 
         ``contacts`` (walls,): number of nodes of all ranks in contact after the last step, if known.
         """
-        n, self._pending = self._pending, 0
+        n, self.noted = self.noted, 0
+        flags = self._flags[:n]
         if n == 1 and contacts is not None:
-            self.time += self._steps[0] * (contacts > 0)
-        elif n and len(self.time):
-            flags = self._flags[:n]
-            if comm.size > 1:
-                comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
-            self.time += self._steps[:n] @ flags
+            flags[0] = contacts > 0
+        elif comm.size > 1 and n and len(self.time):
+            comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
+        times = np.cumsum(np.vstack([self.time, self._steps[:n, None] * flags]), axis=0)
+        self.time[:] = times[-1]
+        return times
 
     def share(self) -> dict[str, Any]:
         """Return this rank's sums for a checkpoint."""
@@ -183,16 +188,16 @@ class ContactLog:
 
         Only :meth:`meet` adds them: other partial sums would round differently.
         """
-        flags = self._flags[: self._pending].copy()
+        flags = self._flags[: self.noted].copy()
         comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
-        return {"sum": self.time.tolist(), "steps": self._steps[: self._pending].tolist(), "flags": flags.tolist()}
+        return {"sum": self.time.tolist(), "steps": self._steps[: self.noted].tolist(), "flags": flags.tolist()}
 
     def load_state(self, share: dict[str, Any], times: dict[str, Any], touching: np.ndarray) -> None:
         """Restore this rank's sums, the contact times and the contacts from a checkpoint."""
         self.releases[:] = np.array(share["wall_releases"], dtype=np.int64)
         self.changes = int(share["contact_changes"])
         self.time[:] = times["sum"]
-        self._pending = n = len(times["steps"])
+        self.noted = n = len(times["steps"])
         self._steps[:n] = times["steps"]
         self._flags[:n] = np.array(times["flags"], dtype=np.uint8).reshape(n, len(self.time))
         self.touching = touching

@@ -20,7 +20,7 @@ from .compiled import borrowing, inlined, kernel
 from .materials.base import Law
 from .runs import Sweep, copy, end_differences, scatter_forces
 from .strips import add_rows, subtract_rows
-from .tuples import CHUNK, accumulate, bar_value, differ, put, take, take_from
+from .tuples import CHUNK, accumulate, bar_value, blend, differ, put, take, take_from
 
 COLLAPSED_STRETCH = 1e-3  # below this fraction of its rest length a bar is crushed, and no truss model applies
 SHORTENED_STRETCH = math.sqrt(0.8)  # only bars shorter than this are checked for passing through zero length
@@ -424,16 +424,50 @@ def _step_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     return {visit.__name__: _for_all(visit.__name__, visit) for visit in (step_forces, step_tangents)}
 
 
-def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
-    """Make the loops that evaluate chunks of runs, several bars at once: ``forces``, with its parts for batches
-    ``add_forces``, ``clear_energies``, ``sum_energies`` and the number ``work_rows`` of rows in their workspace; and
-    ``stiffnesses``."""
-    read, evaluate, stiffness = element.read, element.evaluate, element.stiffness
-    by_rate, last, n_rows = law.rate, len(law.internal), len(law.rows)
+def _energy_sums(law: Law) -> dict[str, Any]:
+    """Make ``sum_energies`` and ``clear_energies`` for the workspace of loops over chunks and over padded runs, in
+    which the sums of the energies follow four rows; and its number of rows, ``work_rows``."""
     places = tuple(BAR_ENERGIES.index(name) for name in law.energies)
     n_energies = len(places)
-    first_new = 4 + n_energies
-    add_energies, put_new, changes = accumulate(n_energies), put(len(law.internal)), differ(len(law.internal))
+
+    @inlined
+    def sum_energies(work, energies):
+        """Add the sums of ``work`` to ``energies``, see :data:`~pfem_petsc.columns.BAR_ENERGIES` [J]."""
+        for j in range(n_energies):
+            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0  # additions that do not wait for each other
+            for i in range((4 + j) * CHUNK, (5 + j) * CHUNK, 8):
+                s0 += work[i]
+                s1 += work[i + 1]
+                s2 += work[i + 2]
+                s3 += work[i + 3]
+                s4 += work[i + 4]
+                s5 += work[i + 5]
+                s6 += work[i + 6]
+                s7 += work[i + 7]
+            energies[places[j]] += ((s0 + s1) + (s2 + s3)) + ((s4 + s5) + (s6 + s7))
+
+    @inlined
+    def clear_energies(work):
+        """Set the sums of ``work`` to zero."""
+        sums = work[4 * CHUNK :]
+        for i in range(n_energies * CHUNK):  # much faster than an assignment to a slice
+            sums[i] = 0.0
+
+    return {
+        "sum_energies": sum_energies,
+        "clear_energies": clear_energies,
+        "work_rows": 4 + n_energies + len(law.rows),
+    }
+
+
+def _run_loops(law: Law, element: SimpleNamespace, sums: dict[str, Any]) -> dict[str, Any]:
+    """Make the loops that evaluate chunks of runs, several bars at once: ``forces``, with its part for batches
+    ``add_forces``; and ``stiffnesses``. ``sums``: see :func:`_energy_sums`."""
+    read, evaluate, stiffness = element.read, element.evaluate, element.stiffness
+    sum_energies, clear_energies, work_rows = sums["sum_energies"], sums["clear_energies"], sums["work_rows"]
+    by_rate, last, n_rows = law.rate, len(law.internal), len(law.rows)
+    first_new = work_rows - n_rows
+    add_energies, put_new, changes = accumulate(len(law.energies)), put(len(law.internal)), differ(len(law.internal))
     can_break, gone = law.rupture >= 0, max(law.rupture, 0)
 
     @borrowing
@@ -500,35 +534,12 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
             scatter_forces(f, bars.sweep, bars.far, chunk, work)
         return failed, shortened, broke
 
-    @inlined
-    def sum_energies(work, energies):
-        """Add the sums of ``work`` to ``energies``, see :data:`~pfem_petsc.columns.BAR_ENERGIES` [J]."""
-        for j in range(n_energies):
-            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0  # additions that do not wait for each other
-            for i in range((4 + j) * CHUNK, (5 + j) * CHUNK, 8):
-                s0 += work[i]
-                s1 += work[i + 1]
-                s2 += work[i + 2]
-                s3 += work[i + 3]
-                s4 += work[i + 4]
-                s5 += work[i + 5]
-                s6 += work[i + 6]
-                s7 += work[i + 7]
-            energies[places[j]] += ((s0 + s1) + (s2 + s3)) + ((s4 + s5) + (s6 + s7))
-
-    @inlined
-    def clear_energies(work):
-        """Set the sums of ``work`` to zero."""
-        sums = work[4 * CHUNK :]
-        for i in range(n_energies * CHUNK):  # much faster than an assignment to a slice
-            sums[i] = 0.0
-
     @kernel
     def forces(x, bars, commit, f, energies):
         """Add internal forces to ``f``, and sums over counted bars to ``energies``, see
         :data:`~pfem_petsc.columns.BAR_ENERGIES` [J]; return the first failed bar or -1, whether any bar is so short
         that it may be inverted, and how many bars have changed their state of rupture."""
-        work = np.empty((4 + n_energies + n_rows) * CHUNK)
+        work = np.empty(work_rows * CHUNK)
         failed = -1
         shortened = False
         broke = 0
@@ -562,21 +573,14 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
         for chunk in range(len(bars.sweep.diagonal)):
             linearise_chunk(x, bars, chunk, weight, stored, work)
 
-    return {
-        "forces": forces,
-        "add_forces": add_forces,
-        "clear_energies": clear_energies,
-        "sum_energies": sum_energies,
-        "work_rows": 4 + n_energies + n_rows,
-        "stiffnesses": stiffnesses,
-    }
+    return {"forces": forces, "add_forces": add_forces, "stiffnesses": stiffnesses}
 
 
 def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
-    """Make ``add_padded``, which adds internal forces of padded runs for batches of steps, and the number
-    ``padded_rows`` of rows in its workspace.
+    """Make ``add_padded`` and ``add_padded_energies``, which add internal forces of padded runs for batches of steps,
+    the latter with the sums of energies.
 
-    Laws of bars that can break have no such loop, since a step in which a bar breaks needs the energies: it is replaced
+    Laws of bars that can break have no such loops, since a step in which a bar breaks ends the batch: they are replaced
     by a function that does nothing.
     """
     evaluate, by_rate, last, n_rows, n_data = (
@@ -588,110 +592,127 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     )
     variables_of, data_of = take(len(law.internal)), take_from(n_data)
     put_force, put_new, put_last, changes = put(3), put(len(law.internal)), put(2), differ(len(law.internal))
+    n_energies = len(law.energies)
+    first_new = 4 + n_energies
+    add_energies, real_ones, nothing = accumulate(n_energies), blend(n_energies), (0.0,) * n_energies
     keeps = n_rows + n_data > 0
 
     @borrowing
     def add_none(x, bars, base, begun, ended, work):
-        """Replace :func:`add_padded` where it does not apply."""
+        """Replace the loops where they do not apply."""
         return -1, False
 
-    @borrowing
-    def add_padded(x, bars, base, begun, ended, work):
-        """Add the internal forces of the groups [begun, ended) of padded runs to ``bars.pulls`` (3 stride,), and update
-        the history in ``bars.columns.kept``; return the first failed bar, or -1, and whether any bar is so short that
-        it may be inverted.
+    def make(counts: bool) -> Callable[..., Any]:
+        @borrowing
+        def add_padded(x, bars, base, begun, ended, work):
+            """Add the internal forces of the groups [begun, ended) of padded runs to ``bars.pulls`` (3 stride,), and
+            update the history in ``bars.columns.kept``; return the first failed bar, or -1, and whether any bar is so
+            short that it may be inverted.
 
-        ``x`` (n, 3) positions, which are also in ``bars.planes`` (3 stride,) from node ``base`` on; ``work``
-        (``padded_rows`` CHUNK,): forces of a group by components, and its new history.
-        """
-        failed = -1
-        shortened = False
-        data, sweep, columns, planes, sums = bars.data, bars.data.sweep, bars.columns, bars.planes, bars.pulls
-        stride = len(planes) // 3
-        heads, fars, starts, runs = columns.heads, columns.fars, columns.starts, columns.runs
-        kept, step = columns.kept, data.step
-        for group in range(begun, ended):
-            first = starts[group]
-            n = starts[group + 1] - first
-            head, tail = heads[group] - base, fars[group] - base
-            x0, y0, z0 = planes[head:], planes[stride + head :], planes[2 * stride + head :]
-            x1, y1, z1 = planes[tail:], planes[stride + tail :], planes[2 * stride + tail :]
-            short = 0
-            changed = 0
-            for i in range(n):
-                rest = columns.rest[first + i]
-                real = rest > 0.0
-                rest = rest if real else 1.0
-                dx, dy, dz = x1[i] - x0[i], y1[i] - y0[i], z1[i] - z0[i]
-                squared = dx * dx + dy * dy + dz * dz
-                length = math.sqrt(squared if real else 1.0)
-                short += 0 if length / rest >= SHORTENED_STRETCH else 1  # NaN counts
-                q = variables_of(kept, first + i)
-                before = kept[last, first + i] if by_rate else 0.0
-                p = data.parameters + data_of(kept, n_rows, first + i) if n_data else data.parameters
-                area = bar_value(columns.area, first + i) if real else 0.0
-                bar = Bar(rest, 0.0, 0.0, area, p, before, 0.0, q)
-                strain, slope, _, stress, _, new, _ = evaluate(length, bar, step)
-                pull = area * stress * slope / length
-                if keeps:
-                    pull = pull if real else 0.0  # what a column without a bar keeps may be anything
-                put_force(work, i, (pull * dx, pull * dy, pull * dz))
-                if n_rows > 0:
-                    put_new(work, 3 * CHUNK + i, new)
-                    changed += 1 if real and (by_rate or changes(new, q)) else 0
-                if by_rate:
-                    put_last(work, (3 + last) * CHUNK + i, (strain, stress))
-            if n_rows > 0 and changed > 0:
-                for j in range(n_rows):
-                    copy(work[(3 + j) * CHUNK :], kept[j][first : first + n])
-            if short > 0:
-                for run in range(runs[group], runs[group + 1]):
-                    ahead = sweep.heads[run] - heads[group]
-                    for k in range(sweep.starts[run + 1] - sweep.starts[run]):
-                        i = ahead + k
-                        a, b = heads[group] + i, fars[group] + i
-                        dx, dy, dz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
-                        stretch = math.sqrt(dx * dx + dy * dy + dz * dz) / columns.rest[first + i]
-                        if stretch < SHORTENED_STRETCH:
-                            shortened = True
-                        if not (stretch > COLLAPSED_STRETCH):  # NaN fails this test too
-                            if failed < 0:
-                                failed = np.int64(sweep.starts[run] + k)  # signed, like -1
-                            for c in range(3):
-                                work[c * CHUNK + i] = 0.0
-            if columns.close[group]:
-                for run in range(runs[group], runs[group + 1]):
-                    at, count = sweep.heads[run] - heads[group], sweep.starts[run + 1] - sweep.starts[run]
-                    subtract_rows(sums, stride, head + at, count, work, at)
-                    add_rows(sums, stride, tail + at, count, work, at)
-            else:  # nodes that are both ends of bars receive forces by the number of the bar, as in single steps
-                add_rows(sums, stride, tail, n, work, 0)
-                subtract_rows(sums, stride, head, n, work, 0)
-        return failed, shortened
+            ``x`` (n, 3) positions, which are also in ``bars.planes`` (3 stride,) from node ``base`` on; ``work``: as
+            that of single steps, with forces of a group by components, the sums of energies if the loop ``counts``
+            them, and new history.
+            """
+            failed = -1
+            shortened = False
+            data, sweep, columns, planes, sums = bars.data, bars.data.sweep, bars.columns, bars.planes, bars.pulls
+            stride = len(planes) // 3
+            heads, fars, starts, runs = columns.heads, columns.fars, columns.starts, columns.runs
+            kept, step = columns.kept, data.step
+            for group in range(begun, ended):
+                first = starts[group]
+                n = starts[group + 1] - first
+                head, tail = heads[group] - base, fars[group] - base
+                x0, y0, z0 = planes[head:], planes[stride + head :], planes[2 * stride + head :]
+                x1, y1, z1 = planes[tail:], planes[stride + tail :], planes[2 * stride + tail :]
+                short = 0
+                changed = 0
+                for i in range(n):
+                    rest = columns.rest[first + i]
+                    real = rest > 0.0
+                    rest = rest if real else 1.0
+                    dx, dy, dz = x1[i] - x0[i], y1[i] - y0[i], z1[i] - z0[i]
+                    squared = dx * dx + dy * dy + dz * dz
+                    length = math.sqrt(squared if real else 1.0)
+                    short += 0 if length / rest >= SHORTENED_STRETCH else 1  # NaN counts
+                    q = variables_of(kept, first + i)
+                    before = kept[last, first + i] if by_rate else 0.0
+                    p = data.parameters + data_of(kept, n_rows, first + i) if n_data else data.parameters
+                    area = bar_value(columns.area, first + i) if real else 0.0
+                    bar = Bar(rest, 0.0, 0.0, area, p, before, 0.0, q)
+                    strain, slope, _, stress, _, new, densities = evaluate(length, bar, step)
+                    if counts:
+                        # what a column without a bar keeps may be anything
+                        some = real_ones(real, densities, nothing) if keeps else densities
+                        add_energies(work, 4 * CHUNK + i, area * rest, some)
+                    pull = area * stress * slope / length
+                    if keeps:
+                        pull = pull if real else 0.0
+                    put_force(work, i, (pull * dx, pull * dy, pull * dz))
+                    if n_rows > 0:
+                        put_new(work, first_new * CHUNK + i, new)
+                        changed += 1 if real and (by_rate or changes(new, q)) else 0
+                    if by_rate:
+                        put_last(work, (first_new + last) * CHUNK + i, (strain, stress))
+                if n_rows > 0 and changed > 0:
+                    for j in range(n_rows):
+                        copy(work[(first_new + j) * CHUNK :], kept[j][first : first + n])
+                if short > 0:
+                    for run in range(runs[group], runs[group + 1]):
+                        ahead = sweep.heads[run] - heads[group]
+                        for k in range(sweep.starts[run + 1] - sweep.starts[run]):
+                            i = ahead + k
+                            a, b = heads[group] + i, fars[group] + i
+                            dx, dy, dz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+                            stretch = math.sqrt(dx * dx + dy * dy + dz * dz) / columns.rest[first + i]
+                            if stretch < SHORTENED_STRETCH:
+                                shortened = True
+                            if not (stretch > COLLAPSED_STRETCH):  # NaN fails this test too
+                                if failed < 0:
+                                    failed = np.int64(sweep.starts[run] + k)  # signed, like -1
+                                for c in range(3):
+                                    work[c * CHUNK + i] = 0.0
+                if columns.close[group]:
+                    for run in range(runs[group], runs[group + 1]):
+                        at, count = sweep.heads[run] - heads[group], sweep.starts[run + 1] - sweep.starts[run]
+                        subtract_rows(sums, stride, head + at, count, work, at)
+                        add_rows(sums, stride, tail + at, count, work, at)
+                else:  # nodes that are both ends of bars receive forces by the number of the bar, as in single steps
+                    add_rows(sums, stride, tail, n, work, 0)
+                    subtract_rows(sums, stride, head, n, work, 0)
+            return failed, shortened
 
-    return {"add_padded": add_padded if law.rupture < 0 else add_none, "padded_rows": 3 + n_rows}
+        return add_padded
+
+    plain, counting = (add_none, add_none) if law.rupture >= 0 else (make(False), make(True))
+    return {"add_padded": plain, "add_padded_energies": counting}
 
 
 @cache
 def make_loops(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
     """Make all loops of a law and a strain measure; those of steps only if the law has a mean stress."""
     element = make_element(law, measure)
-    found = _state_loops(law, element, measure) | _run_loops(law, element) | _padded_loops(law, element)
+    sums = _energy_sums(law)
+    found = _state_loops(law, element, measure) | sums | _run_loops(law, element, sums) | _padded_loops(law, element)
     if law.mean_stress is not None:
         found |= _step_loops(law, element)
     return SimpleNamespace(**found)
 
 
-def batch_parts(loops: SimpleNamespace) -> tuple:
+class BatchParts(NamedTuple):
+    """What the loop of a batch is made from, see :func:`make_loops`."""
+
+    add_forces: Callable[..., Any]
+    add_padded: Callable[..., Any]
+    add_padded_energies: Callable[..., Any]
+    sum_energies: Callable[..., Any]
+    clear_energies: Callable[..., Any]
+    work_rows: int
+
+
+def batch_parts(loops: SimpleNamespace) -> BatchParts:
     """Return what :func:`~pfem_petsc.stepping.batch_loop.make_batch_loop` makes its loop from."""
-    return (
-        loops.add_forces,
-        loops.sum_energies,
-        loops.clear_energies,
-        loops.work_rows,
-        loops.add_padded,
-        loops.padded_rows,
-    )
+    return BatchParts(*(getattr(loops, name) for name in BatchParts._fields))
 
 
 @kernel

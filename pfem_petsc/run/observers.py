@@ -88,6 +88,7 @@ class History(Observer):
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
         self.ledger = stepper.ledger = Ledger(stepper)
         self.recorder = Recorder(stepper, stages.columns)
+        stepper.row_every, stepper.probed = self.every, self.recorder.probed
         inertial = stepper.scheme.inertial
         self.blow_up = BlowUp(model, inertial)
         # works over the increments of equilibria are quadratures, whose error is no energy that something has made
@@ -138,16 +139,24 @@ class History(Observer):
             "watch": None if watch is None else watch.start,
         }
 
+    def due(self, step: int) -> bool:
+        """Return whether there is a row to record: of this step or, in a batch, of one before."""
+        return super().due(step) or self._stepper.instants is not None
+
+    def steps_left(self, step: int) -> int:
+        """Never: batches of steps collect what rows need."""
+        return NEVER
+
     def observe(self, made: Step) -> None:
-        """Record a row."""
+        """Record rows."""
         self.record()
 
     def record(self) -> None:
-        """Record a row, unless a rank has a fault, which is raised on all ranks."""
-        row = self.recorder.row(alarm=self._synchroniser.alarm)
-        if self.recorder.alarmed:
-            self._synchroniser.synchronise()
-        self.take(row)
+        """Record the rows of the last step or batch, unless a rank has a fault, which is raised on all ranks."""
+        for row in self.recorder.rows(alarm=self._synchroniser.alarm):
+            if self.recorder.alarmed:
+                self._synchroniser.synchronise()
+            self.take(row)
 
     def take(self, row: Row) -> None:
         """Check a row, store it and add it to the history."""

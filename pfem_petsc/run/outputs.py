@@ -397,7 +397,7 @@ class Outputs:
             self.complete()
         elif last:
             self._complete_stage()
-        if recorded or last:
+        if history.row["step"] == step:
             made = made._replace(row=history.row)
         size, contacts = self._analysis.step_size, history.row["active_contacts"]
         self.progress.update(step, made.time, size, made.newton, made.linear, contacts, history.drift)

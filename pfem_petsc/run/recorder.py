@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,8 +28,11 @@ from ..columns import (
     WALL,
     Layout,
     Row,
+    Shares,
     declared,
+    values_at_state,
 )
+from ..stepping.stepper import Instants
 
 if TYPE_CHECKING:
     from ..integrators.base import State
@@ -79,9 +82,10 @@ class Probes:
         self.size = _NUMBERS * len(self.nodes)
         self.width = _NUMBERS * int(self._counts.sum())
 
-    def fill(self, share: np.ndarray, state: State, acceleration: np.ndarray, support: np.ndarray) -> None:
-        """Write this rank's share (size,), with acceleration and forces of supports (owned, 3) to record."""
-        values, nodes = share.reshape(-1, len(PROBED), 3), self.nodes
+    def fill(self, values: np.ndarray, state: State, acceleration: np.ndarray, support: np.ndarray) -> None:
+        """Write this rank's share (m, number of PROBED, 3), with acceleration and forces of supports (owned, 3) to
+        record."""
+        nodes = self.nodes
         values[:, 0], values[:, 1], values[:, 2] = state.x[nodes], state.v[nodes], acceleration[nodes]
         values[:, 3] = support[nodes] + state.contact[nodes]
 
@@ -104,8 +108,6 @@ _ADDED = [one for one in ENERGIES if one.source != "derived"]
 _SIDES = {one.name: one.side for one in ENERGIES} | {part: one.side for one in ENERGIES for part in one.parts}
 _SIGNS = np.array([{"supplied": -1.0, "part": 0.0}.get(_SIDES[one.name], 1.0) for one in _ADDED])
 _BARS, _ENERGIES = HEAD.indices(BAR_ENERGIES), HEAD.indices(one.name for one in _ADDED)
-_CHANGES = HEAD.width
-_WALLS = HEAD.width + 1
 
 
 class Recorder:
@@ -124,7 +126,7 @@ class Recorder:
     alarmed : whether any rank raised a fault flag with the last row
     carried : (width of a row of this stage,) sums of the stages before, added to its columns; None without
     rest : (width of a row of all stages,) values of the columns that this stage does not have; None without stages
-    width : number of sums in this rank's share of a row; those of probes are of its own nodes alone
+    probed : nodes of all probes on this rank
     probe_nodes : probe name to the mesh numbers of its nodes, ascending, the order of rows in a probe's columns
     """
 
@@ -137,7 +139,7 @@ class Recorder:
         model = self.model
         probes = {probe.name: model.nodes[probe.node_set] for probe in model.case.output.probe}
         self._probes = Probes(model.comm, probes, model.mesh.node_ids)
-        self.probe_nodes = self._probes.ids
+        self.probe_nodes, self.probed = self._probes.ids, self._probes.nodes
         self._layout = Layout(self._columns())
         self.columns = self._layout.columns if columns is None else columns
         self._whole, self.rest = self._layout, None
@@ -172,13 +174,7 @@ class Recorder:
         sums = Layout({name: declared(name).dtype for name in names})
         recorded = [name for name in names if name in layout.places]
         self._from, self._to = sums.indices(recorded), layout.indices(recorded)
-        at_state = [one for one in (*ENERGIES, *VECTORS, *COUNTS) if one.value is not None and one.exists(self.model)]
-        self._state = [(HEAD.first(one.name), one.value) for one in at_state]
-        # where the sums of links and probes begin
-        self._links = sums.width - PAIR.width * len(tables)
-        self._probed = sums.width
-        self.width = sums.width + self._probes.size
-        self._sums = np.zeros(self.width)
+        self._probed = sums.width  # where probes begin
         self._contact_times = layout.indices(wall + "contact_time" for wall in walls)
         moving = [wall + one.name for wall, moves in zip(walls, contact.moving, strict=True) if moves for one in MOTION]
         self._motion = layout.indices(moving)
@@ -188,70 +184,84 @@ class Recorder:
         ]
 
     def row(self, alarm: bool = False) -> Row:
-        """Return the history row of the present state. Collective.
+        """Return the history row of the present state. Collective; see :meth:`rows`."""
+        self.stepper.instants = None
+        return next(self.rows(alarm))
 
-        ``alarm``: whether this rank has a fault; :attr:`alarmed` is then true on all ranks.
+    def rows(self, alarm: bool) -> Iterator[Row]:
+        """Generate the rows of the batch of steps that has been made, or that of the present state. Collective.
+
+        ``alarm``: whether this rank has a fault at the end; :attr:`alarmed` is then true on all ranks with the last
+        row, and with those of steps that a rank has not made.
         """
-        self._fill(self._sums, alarm)
-        total = self._total(self._sums)
-        self.alarmed = total[HEAD.first("alarm")] > 0.0
-        contact = self.model.contact
-        contacts = self._of_walls(total)[:, WALL.first("contacts")] if contact.any else None
-        contact.log.meet(self.model.comm, contacts)
-        vector = self._unpack(total)
-        if self.rest is not None:
-            own, vector = vector, self.rest.copy()
-            vector[self._at] = own
-        return Row(self._whole, vector)
+        stepper, contact = self.stepper, self.model.contact
+        instants, stepper.instants = stepper.instants or self._present(), None
+        shares, at_alarm = instants.shares, HEAD.first("alarm")
+        shares.head[-1, at_alarm] = max(shares.head[-1, at_alarm], alarm)
+        total = self._total(shares.numbers)
+        contacts = None
+        if contact.any:
+            walls = total[-1, HEAD.width + 1 :][: shares.walls[0].size]
+            contacts = walls.reshape(-1, WALL.width)[:, WALL.first("contacts")]
+        times = contact.log.meet(self.model.comm, contacts)[instants.noted]
+        for row, number, place, time in zip(total, instants.number, instants.place, times, strict=True):
+            self.alarmed = row[at_alarm] > 0.0
+            vector = self._unpack(row, (place, number, stepper.smallest), time)
+            if self.rest is not None:
+                own, vector = vector, self.rest.copy()
+                vector[self._at] = own
+            yield Row(self._whole, vector)
 
-    def _total(self, sums: np.ndarray) -> np.ndarray:
-        """Return the sums over all ranks from this rank's share (width,), and the probes of all. Collective."""
+    def _total(self, shares: np.ndarray) -> np.ndarray:
+        """Return the sums over all ranks from this rank's shares (m, width), and the probes of all. Collective."""
         probes = self._probed
-        total = np.empty(probes + self._probes.width)
-        total[:probes] = sums[:probes]
+        total = np.empty((len(shares), probes + self._probes.width))
+        sums = np.ascontiguousarray(shares[:, :probes])
         if self.model.comm.size > 1:
-            self.model.comm.Allreduce(MPI.IN_PLACE, total[:probes])
-        self._probes.unite(sums[probes:], total[probes:])
+            self.model.comm.Allreduce(MPI.IN_PLACE, sums)
+        total[:, :probes] = sums
+        for share, out in zip(shares, total, strict=True):
+            self._probes.unite(share[probes:], out[probes:])
         return total
 
-    def _of_walls(self, sums: np.ndarray) -> np.ndarray:
-        return sums[_WALLS : self._links].reshape(-1, WALL.width)
-
-    def _fill(self, sums: np.ndarray, alarm: bool) -> None:
-        """Write this rank's share of a row."""
+    def _present(self) -> Instants:
+        """Return what a row needs of the present state."""
         stepper, state, contact = self.stepper, self.stepper.state, self.model.contact
-        ledger = stepper.ledger
-        solution = stepper.solution
-        ledger.complete()
-        sums[: HEAD.width] = ledger.sums
-        sums[_BARS] = stepper.energy.energies
-        sums[HEAD.first("alarm")] = alarm
-        for first, value in self._state:
-            sums[first] = value(stepper)
+        impulses, walls = stepper.ledger.impulses, stepper.solution.walls
+        shares = Shares(1, len(contact.names), len(self.model.links.columns), len(self._probes.nodes))
+        head = shares.head[0]
+        head[:] = stepper.ledger.sums
+        head[_BARS] = stepper.energy.energies
+        for first, value in values_at_state(self.model):
+            head[first] = value(stepper)
         if contact.any:
-            sums[_CHANGES], walls = contact.log.changes, self._of_walls(sums)
-            walls[:, WALL["force"]] = solution.walls.force
-            walls[:, WALL["moment"]] = solution.walls.moment
-            walls[:, WALL.first("contacts")] = solution.walls.contacts
-            walls[:, WALL.first("releases")] = contact.log.releases
-            ledger.impulses.fill_walls(walls)
-        ledger.impulses.fill_links(sums[self._links : self._probed].reshape(-1, PAIR.width))
+            shares.changes[:], contact.log.changes = contact.log.changes, 0
+            for name, values in (("force", walls.force), ("moment", walls.moment)):
+                shares.walls[0, :, WALL[name]] = values
+            shares.walls[0, :, WALL.first("contacts")] = walls.contacts
+            shares.walls[0, :, WALL.first("releases")] = contact.log.releases
+        shares.tables[0, :, PAIR["force"]] = self.model.links.totals()
+        impulses.fill_contact(shares, impulses.state.v[None])
         held = self.model.supports.any or self.model.bars.springs is not None
         reacts = held and not stepper.scheme.balance_at_endpoints
         if self.probe_nodes or reacts:
             acceleration, support = stepper.recorded()
-            self._probes.fill(sums[self._probed :], state, acceleration, support)
+            self._probes.fill(shares.probes[0], state, acceleration, support)
             if reacts:
-                sums[HEAD["support_force"]] = stepper.support_force(support)
+                head[HEAD["support_force"]] = stepper.support_force(support)
+        return Instants(np.array([stepper.number]), np.array([stepper.place]), shares, np.array([contact.log.noted]))
 
-    def _unpack(self, sums: np.ndarray) -> np.ndarray:
-        """Return the values of a row of this stage from the sums over ranks; begin those of the next row."""
+    def _unpack(self, sums: np.ndarray, of_run: tuple[float, ...], contact_times: np.ndarray) -> np.ndarray:
+        """Return the values of a row of this stage from the sums over ranks; begin those of the next row.
+
+        ``of_run``: values of the columns :data:`~pfem_petsc.columns.OF_RUN`; ``contact_times`` (walls,) [s].
+        """
         stepper, contact, layout = self.stepper, self.model.contact, self._layout
         vector, at = np.empty(layout.width), layout.first
         vector[self._to] = sums[self._from]
         vector[layout.width - self._probes.width :] = sums[self._probed :]
-        for column in OF_RUN:
-            vector[at(column.name)] = column.value(stepper)
+        for column, value in zip(OF_RUN, of_run, strict=True):
+            vector[at(column.name)] = value
         for name in stepper.columns:
             vector[at(name)] = getattr(stepper, name)
         vector[at("newton_iterations")], vector[at("linear_iterations")] = stepper.iterations
@@ -267,9 +277,7 @@ class Recorder:
         self.energy_scale = max(self.energy_scale, float(np.abs(energies).max()))
         vector[at("energy_imbalance")] = held - self.start_energy
         stepper.iterations = [0, 0]
-        if contact.any:
-            vector[self._contact_times] = contact.log.time
-            contact.log.changes = 0
+        vector[self._contact_times] = contact_times
         if len(self._motion):
             time = stepper.state.time
             motion = np.hstack([contact.positions(time), contact.motion.rates(time)])

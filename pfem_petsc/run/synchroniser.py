@@ -96,7 +96,7 @@ class Synchroniser:
 
     def due(self, step: int) -> bool:
         """Return whether all ranks synchronise after this step; equal on all ranks."""
-        return step >= self._next
+        return step >= self._next or (self.comm.size == 1 and self.alarm)
 
     def steps_left(self, step: int) -> int:
         """Return the number of steps to the next synchronisation."""

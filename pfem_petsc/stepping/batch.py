@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.node_walls import WallForces
+from ..columns import BAR_ENERGIES, HEAD, PAIR, WALL, Shares, values_at_state
+from ..contact.node_walls import NOTED, WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.elements import batch_parts
@@ -21,17 +22,25 @@ from .batch_loop import (
     ImpulseArrays,
     Made,
     NodeArrays,
+    ProbeArrays,
+    Records,
     StateArrays,
     WallArrays,
     make_batch_loop,
+    new_records,
 )
-from .stepper import Solution
+from .stepper import Instants, Solution
 
 if TYPE_CHECKING:
     from .stepper import Stepper
 
 
 _WINDOW = 4  # times the nodes of the blocks that bars of one block belong to
+
+
+def _starts(nodes: np.ndarray, owned: int) -> np.ndarray:
+    """Return the first of some nodes, ascending, in each block of the ``owned`` ones, and the end, (blocks + 1,)."""
+    return np.searchsorted(nodes, np.arange(0, owned + NODE_BLOCK, NODE_BLOCK)).astype(np.int64)
 
 
 class Batch:
@@ -45,10 +54,13 @@ class Batch:
     def __init__(self, stepper: Stepper) -> None:
         self.stepper, self.model, self.ledger = stepper, stepper.model, stepper.ledger
         block = self.model.bars.blocks[0]
-        self._loop = make_batch_loop(*batch_parts(block.loops))
+        self._loop = make_batch_loop(batch_parts(block.loops))
         self._bars, self._nodes, self._walls = self._bar_arrays(), self._node_arrays(), self._wall_arrays()
         self._messages = self.model.mesh.messages()
         self._stiffness = self._nodes.stiffness if self.model.links else np.empty(0)
+        order = np.argsort(stepper.probed, kind="stable")
+        probed = stepper.probed[order]
+        self._probes = ProbeArrays(probed, _starts(probed, len(self._nodes.mass)), order)
         state = stepper.state
         self._support, self._contact = np.zeros_like(state.v), np.zeros_like(state.v)
         if state.contact is not stepper.zero:
@@ -69,8 +81,7 @@ class Batch:
         damping = inertia.damping if inertia.damped else np.empty(0)
         order = np.argsort(supports.nodes, kind="stable")
         nodes, held = supports.nodes[order], supports.positions(0.0)[order]
-        limits = np.arange(0, len(inertia.mass) + NODE_BLOCK, NODE_BLOCK)
-        starts = np.searchsorted(nodes, limits).astype(np.int64)
+        starts = _starts(nodes, len(inertia.mass))
         stiffness = 1.0 / (h * h) * inertia.mass + (0.5 / h * inertia.damping if inertia.damped else 0.0)
         fixed = nodes, supports.components[order], held, starts
         return NodeArrays(inertia.mass, damping, stiffness, 1.0 / stiffness, external, *fixed)
@@ -136,21 +147,21 @@ class Batch:
         return model.comm.allreduce(serves, op=MPI.LAND)
 
     def make(self, count: int) -> None:
-        """Make up to ``count`` steps, the last of which remains to be counted.
+        """Make up to ``count`` steps, the last of which remains to be counted, and what rows of the history need of
+        those that are due: see :attr:`~pfem_petsc.stepping.stepper.Stepper.instants`.
 
         On one rank fewer steps are made if a bar breaks or something fails. With several ranks all make all steps, but
-        this rank's state remains that of a failure, and the stepper has a fault.
-
-        Raises
-        ------
-        SimulationFailure
-            On one rank, if a bar fails, a node is infeasible or the energy is not finite.
+        this rank's state remains that of a failure. The stepper then has a fault.
         """
         stepper, ledger, state, model = self.stepper, self.ledger, self.stepper.state, self.model
-        log, comm = model.contact.log, model.comm
+        log, comm, due = model.contact.log, model.comm, self._due(count)
+        count = len(due)
         begin, walls, impulses = state.step, model.contact.walls, ledger.impulses.state
-        energies, flags = np.array(stepper.energy.energies), np.zeros((count, len(walls)), dtype=bool)
+        ending, flags = due.copy(), np.zeros((count, len(walls)), dtype=bool)
+        ending[-1] = True
         rows = model.links.export_rows(self._stiffness)
+        sizes = len(walls), len(model.links.columns), len(impulses.v), len(self._probes.nodes)
+        records = new_records(int(ending.sum()), len(BAR_ENERGIES), *sizes)
         data = BatchData(
             stepper.h,
             state.x,
@@ -161,37 +172,83 @@ class Batch:
             self._walls,
             rows,
             self._messages,
-            StateArrays(state.f, state.a, state.v, self._support, self._contact, self._u, energies),
+            StateArrays(state.f, state.a, state.v, self._support, self._contact, self._u),
             ledger.sums,
-            np.stack([ledger.powers, ledger.powers]),
+            ledger.powers,
             ImpulseArrays(impulses.memory["half_velocity"], impulses.a, impulses.v),
+            self._probes,
+            records,
         )
-        made = self._loop(data, log.last, ledger.impacts.met, flags)
+        made = self._loop(data, log.last, ledger.impacts.met, ending, flags)
         if made.lost:
             raise MPI.Exception(made.lost)
         model.links.import_rows(rows)
         log.last, ledger.impacts.met = made.touched, made.met
-        for step in flags[: made.done if comm.size == 1 else count] if len(walls) else ():
-            log.note(step, stepper.h, comm)
-        log.changes += made.changes
         state.support = self._support if model.supports.any else stepper.zero
         state.contact = self._contact if made.pressing else stepper.zero
-        stepper.energy = StrainEnergy(tuple(energies.tolist()), made.failed)
+        stepper.energy = StrainEnergy(tuple(records.energies[made.recorded - 1].tolist()), made.failed)
         forces = WallForces(made.force, made.contacts, made.moment, made.near, made.touching, made.places)
         stepper.solution = Solution(
             self._u, state.f, forces if len(walls) else model.contact.nothing, contacts=made.pressing
         )
         state.step, state.time = begin + made.done - 1, (begin + made.done) * stepper.h
+        broken = stepper.ruptures.count
         if made.changed:
             stepper.ruptures.note(state.x, stepper.number + 1, stepper.arrived())
-        if stepper.fault is None:  # ranks that have not synchronised since may know of an earlier one
-            stepper.fault = self._failure(made)
+        # ranks that have not synchronised since may know of an earlier failure, and rows are those of sound steps
+        failure, sound = self._failure(made), made.done if stepper.fault is None else 0
+        if failure is not None and stepper.fault is None:
+            stepper.fault, sound = failure, made.done - 1
         if comm.size > 1:
             state.step, state.time = begin + count - 1, (begin + count) * stepper.h
-        elif stepper.fault is not None:
-            state.step += 1
-            raise stepper.fault
-        ledger.follow_batch(data.powers)
+        end = made.done if comm.size == 1 else count
+        noted = log.note(flags[:end], stepper.h, comm) + 1 if len(walls) else 0
+        sums = self._sums(Records(*(array[: made.recorded] for array in records)), broken)
+        steps = np.flatnonzero(due[:end])
+        if len(steps):
+            shares = self._shares(made, records, sums, steps, sound)
+            places = [model.origin + (begin + step + 1) * stepper.h for step in steps.tolist()]
+            number = model.first_step + begin + steps + 1
+            noted = noted + steps if len(walls) else np.zeros_like(steps)
+            stepper.instants = Instants(number, np.array(places), shares, noted)
+        else:
+            log.changes += made.changes
+
+    def _due(self, count: int) -> np.ndarray:
+        """Return which of up to ``count`` steps to come have a row of the history; a row of bars that slacken ends a
+        batch, since the number of slack bars is that of the state."""
+        every = self.stepper.row_every
+        numbers = self.stepper.number + 1 + np.arange(min(count, NOTED))
+        due = numbers % every == 0 if every else np.zeros(len(numbers), dtype=bool)
+        if self.model.bars.slackens and due.any():
+            due = due[: int(np.argmax(due)) + 1]
+        return due
+
+    def _sums(self, records: Records, broken: int) -> np.ndarray:
+        """Return the sums of rows (m, width of HEAD) from m records; ``broken``: bars before the batch, in whose last
+        step alone others can break."""
+        sums = self.ledger.follow_batch(records)
+        sums[:, HEAD.first("active_contacts")], sums[:, HEAD.first("broken_bars")] = records.pressing, broken
+        for at, value in values_at_state(self.model):
+            sums[-1, at] = value(self.stepper)
+        return sums
+
+    def _shares(self, made: Made, records: Records, sums: np.ndarray, steps: np.ndarray, sound: int) -> Shares:
+        """Return the shares of the rows of some ``steps``. Those from the step ``sound`` on raise an alarm."""
+        model, log, k = self.model, self.model.contact.log, int((steps < sound).sum())
+        shares = Shares(len(steps), len(model.contact.names), len(model.links.columns), len(self._probes.nodes))
+        shares.head[:k], shares.head[k:, HEAD.first("alarm")] = sums[:k], 1.0
+        shares.probes[:k], shares.tables[:k, :, PAIR["force"]] = records.probes[:k], records.tables[:k]
+        self.ledger.impulses.fill_contact(shares, records.impulses[:k])
+        walls = shares.walls[:k]
+        walls[..., WALL["force"]], walls[..., WALL["moment"]] = records.force[:k], records.moment[:k]
+        walls[..., WALL.first("contacts")] = records.contacts[:k]
+        walls[..., WALL.first("releases")] = records.releases[:k]
+        changes = np.append(records.changes[:k], made.changes)
+        if shares.changes.size:
+            shares.changes[:k, 0] = np.diff(changes[:k], prepend=-log.changes)
+        log.changes = int(made.changes - changes[k - 1]) if k else log.changes + made.changes
+        return shares
 
     def _failure(self, made: Made) -> SimulationFailure | None:
         """Return the failure in the last step, None for none."""
@@ -199,6 +256,6 @@ class Batch:
         if made.failed >= 0 or made.turned >= 0:
             return SimulationFailure(stepper.collapse(max(made.failed, made.turned)))
         if made.infeasible >= 0:
-            text = self.model.contact.infeasible_message(made.touching[made.infeasible], made.offsets)
+            text = self.model.contact.infeasible_message(made.near[made.infeasible], made.offsets)
             return SimulationFailure(f"{stepper.when(stepper.scheme.balance(stepper.state, stepper.h))}: {text}")
         return None

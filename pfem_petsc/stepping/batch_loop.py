@@ -21,30 +21,37 @@ from ..contact.fixed_rows import close_rows, solve_rows
 from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import accelerations, advance, advance_loaded, centre, kick, move
 from ..mechanics.compiled import borrowing, kernel
-from ..mechanics.elements import BarData, first_inverted
-from ..mechanics.runs import Columns, exchange_history, join_components, new_rows, slide_planes, split_components
-from ..mechanics.tuples import CHUNK
+from ..mechanics.elements import BarData, BatchParts, first_inverted
+from ..mechanics.runs import Columns, copy, exchange_history, join_components, new_rows, slide_planes, split_components
 from ..mesh.ordering import NODE_BLOCK
 from .impact import Approach, join_nodes, plane_gaps, stop_nodes, unpressed
 from .impulses import WALLS
 from .ledger_loops import (
     CONTACT,
+    DAMPING,
+    ENDS,
+    EXTERNAL,
     INTERNAL,
     LANES,
     REACTIONS,
+    WIDE,
     WORKS,
     Acting,
     add_drags,
+    add_ends,
     add_loads,
     add_powers,
     add_sparse_forces,
     add_sparse_powers,
+    clear_ends,
     clear_forces,
     clear_sums,
+    half_steps,
     new_sums,
     spread,
     start_of_step,
     sum_balance,
+    sum_ends,
 )
 
 
@@ -97,13 +104,24 @@ class WallArrays(NamedTuple):
     slack: float
 
 
+class EndArrays(NamedTuple):
+    """Room for the end of a step at the nodes of a block, (3 NODE_BLOCK,): increments, velocities, accelerations and
+    the half step before; and two arrays (WIDE,), room for :func:`~pfem_petsc.stepping.ledger_loops.add_ends`."""
+
+    u: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    way: np.ndarray
+    room: tuple[np.ndarray, np.ndarray]
+
+
 class BlockArrays(NamedTuple):
     """What the passes over blocks of nodes share: numbers of the scheme, see
     :mod:`~pfem_petsc.integrators._leapfrog`; positions ``x`` (local, 3) and velocities at half steps ``half`` (n, 3);
     ``inverses`` (n,) of the stiffness; ``factors``, ``speeds`` and ``drag``
     (3 NODE_BLOCK,) buffers of a block, the last one empty without damping; for prescribed components the increments
-    ``held`` (k,) [m] and ``load`` (k,), the forces that would move them [N]; reactions ``support`` (n, 3) [N]; and
-    ``lanes``, the sums of the balance, see :mod:`~pfem_petsc.stepping.ledger_loops`."""
+    ``held`` (k,) [m] and ``load`` (k,), the forces that would move them [N]; reactions ``support`` (n, 3) [N];
+    ``lanes``, the sums of the balance, see :mod:`~pfem_petsc.stepping.ledger_loops`; and room for ``ends`` of steps."""
 
     h: float
     alpha: float
@@ -118,6 +136,7 @@ class BlockArrays(NamedTuple):
     load: np.ndarray
     support: np.ndarray
     lanes: np.ndarray
+    ends: EndArrays
 
 
 class ImpulseArrays(NamedTuple):
@@ -129,8 +148,8 @@ class ImpulseArrays(NamedTuple):
 
 
 class StateArrays(NamedTuple):
-    """Arrays (n, 3) of the state, the increments ``u`` of the balance, and the energies of the bars [J]. Wall forces
-    are zero except at the nodes that touch walls; support forces are written at prescribed components alone."""
+    """Arrays (n, 3) of the state, and the increments ``u`` of the balance. Wall forces are zero except at the nodes
+    that touch walls; support forces are written at prescribed components alone."""
 
     f: np.ndarray
     a: np.ndarray
@@ -138,14 +157,71 @@ class StateArrays(NamedTuple):
     support: np.ndarray
     contact: np.ndarray
     u: np.ndarray
+
+
+class Records(NamedTuple):
+    """What rows of the history are made of, for m steps: of ``steps`` of the batch (m,), the last of which is its last
+    one; ``powers`` (m, 5), the works of all balances before that of the step, and ``ends`` (m, 6), those of the half
+    step before its end, and its kinetic energy [J], in the order of :mod:`~pfem_petsc.stepping.ledger_loops`;
+    ``momenta`` (m, 3, 3) and ``totals`` (m, 3, 3), see there; the dissipation by ``impact`` so far (m,) and
+    ``energies`` (m, k) of the bars [J]; of walls (m, w), ``force``, ``moment`` and ``contacts``, and ``releases`` so
+    far; ``changes`` of contacts in the batch so far, and nodes with contact forces, ``pressing`` (m,); ``impulses`` (m,
+    rows, 3); forces on the second nodes of ``tables`` (m, t, 3); and ``probes`` (m, p, 4, 3): positions, velocities,
+    accelerations, forces of supports and contact."""
+
+    steps: np.ndarray
+    powers: np.ndarray
+    ends: np.ndarray
+    momenta: np.ndarray
+    totals: np.ndarray
+    impact: np.ndarray
     energies: np.ndarray
+    force: np.ndarray
+    moment: np.ndarray
+    contacts: np.ndarray
+    releases: np.ndarray
+    changes: np.ndarray
+    pressing: np.ndarray
+    impulses: np.ndarray
+    tables: np.ndarray
+    probes: np.ndarray
+
+
+def new_records(m: int, energies: int, walls: int, tables: int, particles: int, probes: int) -> Records:
+    """Return room for ``m`` records."""
+    return Records(
+        steps=np.empty(m, dtype=np.int64),
+        powers=np.empty((m, len(WORKS))),
+        ends=np.empty((m, len(WORKS) + 1)),
+        momenta=np.empty((m, 3, 3)),
+        totals=np.empty((m, 3, 3)),
+        impact=np.empty(m),
+        energies=np.zeros((m, energies)),
+        force=np.empty((m, walls, 3)),
+        moment=np.empty((m, walls, 3)),
+        contacts=np.empty((m, walls), dtype=np.int64),
+        releases=np.empty((m, walls), dtype=np.int64),
+        changes=np.empty(m, dtype=np.int64),
+        pressing=np.empty(m, dtype=np.int64),
+        impulses=np.empty((m, particles, 3)),
+        tables=np.empty((m, tables, 3)),
+        probes=np.empty((m, probes, 4, 3)),
+    )
+
+
+class ProbeArrays(NamedTuple):
+    """Nodes (p,) of probes, ascending; the first one of each block of nodes, ``starts`` (blocks + 1,); and their places
+    in ``order`` (p,)."""
+
+    nodes: np.ndarray
+    starts: np.ndarray
+    order: np.ndarray
 
 
 class BatchData(NamedTuple):
     """All that a batch reads and writes: the step [s]; positions (local, 3), those of the previous step, which are
     computed for the last step alone, and velocities at half steps (n, 3); records of arrays; the sums of the ledger, of
-    which the dissipation by impact is added to; works (2, 5) of all balances, and of those before the last; and
-    particles of impulses."""
+    which the dissipation by impact is added to; works (5,) of all balances; and particles of impulses."""
 
     h: float
     x: np.ndarray
@@ -160,21 +236,24 @@ class BatchData(NamedTuple):
     ledger: np.ndarray
     powers: np.ndarray
     impulses: ImpulseArrays
+    probes: ProbeArrays
+    records: Records
 
 
 class Made(NamedTuple):
     """Outcome of a batch.
 
-    ``done``: number of steps made; ``lost``: error code of MPI. In the last step: ``changed``: number of bars that
-    changed their state of rupture; ``failed``, ``turned``: the first bar that collapsed, and that went through zero
-    length, or -1; ``infeasible``: index in ``near`` of a node that no position satisfies, or -1, with the ``offsets``
-    of its planes; ``force``, ``contacts``, ``moment``: sums of the walls; ``near``: nodes with wall forces, the walls
-    that they are ``touching``, and their ``places``; ``touched``, ``met``: nodes that touch walls, and that have
-    touched them and not left; ``pressing``: number of nodes with contact forces; and ``changes``: contacts that closed
-    or opened in all steps.
+    ``done``: number of steps made; ``recorded``: number of records; ``lost``: error code of MPI. In the last step:
+    ``changed``: number of bars that changed their state of rupture; ``failed``, ``turned``: the first bar that
+    collapsed, and that went through zero length, or -1; ``infeasible``: index in ``near`` of a node that no position
+    satisfies, or -1, with the ``offsets`` of its planes; ``force``, ``contacts``, ``moment``: sums of the walls;
+    ``near``: nodes with wall forces, the walls that they are ``touching``, and their ``places``; ``touched``, ``met``:
+    nodes that touch walls, and that have touched them and not left; ``pressing``: number of nodes with contact forces;
+    and ``changes``: contacts that closed or opened in all steps.
     """
 
     done: int
+    recorded: int
     lost: int
     changed: int
     failed: int
@@ -543,22 +622,100 @@ def push_particles(totals, force, links, alpha, h, impulses, u):
     kick(u.reshape(-1), alpha, h, impulses.half.reshape(-1))
 
 
-@kernel
-def complete(nodes, shared, state, alone):
-    """Compute the increments of blocks whose forces ``alone`` (blocks,) determine them, and accelerations and
-    velocities of all nodes."""
-    n, f, v, a, u, external = len(shared.half), state.f, state.v, state.a, state.u, nodes.external
-    half, held, inverses, loaded = shared.half, shared.held, shared.inverses, len(external) > 0
-    for block in range(len(alone)):
-        if not alone[block]:
-            continue
-        for i in range(NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)):
-            for c in range(3):
-                u[i, c] = ((external[i, c] - f[i, c]) if loaded else -f[i, c]) * inverses[i]
+@borrowing
+def end_block(block, alone, keep, nodes, shared, state, forces):
+    """Add what the ledger needs of the end of a step at the nodes of a block to the sums. ``forces`` (m, 3) are those
+    of the block, and ``alone`` if they determine the increments. To ``keep`` means to write increments, velocities and
+    accelerations to the state; they remain in ``shared.ends``."""
+    h, eta, alpha, ends, lanes = shared.h, shared.eta, shared.alpha, shared.ends, shared.lanes
+    first = NODE_BLOCK * block
+    last = min(first + NODE_BLOCK, len(shared.half))
+    wide = 3 * (last - first)
+    u, v, a, way, force = ends.u[:wide], ends.v[:wide], ends.a[:wide], ends.way[:wide], forces.reshape(-1)
+    if alone:
+        spread(shared.inverses[first:last], u)
+        if len(nodes.external) > 0:
+            load = nodes.external[first:last].reshape(-1)
+            for j in range(wide):
+                u[j] *= load[j] - force[j]
+        else:
+            for j in range(wide):
+                u[j] *= -force[j]
         for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
-            u[nodes.support_nodes[k], nodes.support_components[k]] = held[k]
-    centre(u.reshape(-1), shared.eta, half.reshape(-1), v.reshape(-1))
-    accelerations(u.reshape(-1), shared.alpha, a.reshape(-1))
+            u[3 * (nodes.support_nodes[k] - first) + nodes.support_components[k]] = shared.held[k]
+    else:
+        copy(state.u[first:last].reshape(-1), u)
+    centre(u, eta, shared.half[first:last].reshape(-1), v)
+    accelerations(u, alpha, a)
+    half_steps(h, v, a, way)
+    add_ends(shared.x[first:last].reshape(-1), nodes.mass[first:last], (v, a, way), force, ends.room, lanes)
+    if len(nodes.external) > 0:
+        add_powers(nodes.external[first:last].reshape(-1), way, lanes[ENDS + EXTERNAL])
+    if len(nodes.damping) > 0:
+        drag = shared.drag[:wide]
+        spread(nodes.damping[first:last], drag)
+        for j in range(wide):
+            drag[j] *= v[j]
+        add_powers(drag, way, lanes[ENDS + DAMPING])
+    if keep:
+        copy(u, state.u[first:last].reshape(-1))
+        copy(v, state.v[first:last].reshape(-1))
+        copy(a, state.a[first:last].reshape(-1))
+
+
+@borrowing
+def end_rows(block, shared, contact):
+    """Add the works of the forces of rows over the half step at the nodes of a block, after :func:`end_block`."""
+    first = NODE_BLOCK * block
+    forces = contact[first : min(first + NODE_BLOCK, len(shared.half))].reshape(-1)
+    add_powers(forces, shared.ends.way[: len(forces)], shared.lanes[ENDS + CONTACT])
+
+
+@borrowing
+def end_at_walls(near, shared, contact, u, v):
+    """Add the works of the forces of walls over the half step at the nodes that are ``near``."""
+    h, alpha, works = shared.h, shared.alpha, shared.lanes[ENDS + CONTACT]
+    for i in near:
+        at = 3 * (i % LANES)
+        for c in range(3):
+            works[at + c] += contact[i, c] * ((0.5 * h) * (v[i, c] - (0.5 * h) * (alpha * u[i, c])))
+
+
+@kernel
+def add_record(records, at, step, powers, totals, impact, changes, pressing):
+    """Write numbers of a step to a record."""
+    records.steps[at], records.impact[at] = step, impact
+    records.changes[at], records.pressing[at] = changes, pressing
+    records.powers[at], records.totals[at] = powers, totals
+
+
+@kernel
+def record_contact(records, at, pressed, walls, rows, impulses):
+    """Write sums of walls, tables and impulses to a record."""
+    records.force[at], records.moment[at] = pressed.force, pressed.moment
+    records.contacts[at], records.releases[at] = pressed.contacts, walls.releases
+    records.tables[at], records.impulses[at] = rows.totals, impulses.v
+
+
+@kernel
+def probe_forces(probes, support, contact, pressing, values):
+    """Write the forces of supports and contact at the probes."""
+    for k in range(len(probes.nodes)):
+        i, at = probes.nodes[k], probes.order[k]
+        for c in range(3):
+            values[at, 3, c] = support[i, c] + contact[i, c] if pressing > 0 else support[i, c]
+
+
+@borrowing
+def probe_block(block, probes, shared, values):
+    """Write positions, velocities and accelerations of the probes in a block to ``values`` (p, 4, 3), after
+    :func:`end_block`."""
+    first, ends = NODE_BLOCK * block, shared.ends
+    for k in range(probes.starts[block], probes.starts[block + 1]):
+        i, at = probes.nodes[k], probes.order[k]
+        for c in range(3):
+            j = 3 * (i - first) + c
+            values[at, 0, c], values[at, 1, c], values[at, 2, c] = shared.x[i, c], ends.v[j], ends.a[j]
 
 
 _INT, _SHORT, _BYTES = ir.IntType(64), ir.IntType(32), ir.IntType(8).as_pointer()
@@ -618,27 +775,17 @@ def finish_positions(messages, x, before, fill):
 
 
 @cache
-def make_batch_loop(
-    add_forces: Callable,
-    sum_energies: Callable,
-    clear_energies: Callable,
-    work_rows: int,
-    add_padded: Callable,
-    padded_rows: int,
-) -> Callable:
+def make_batch_loop(parts: BatchParts) -> Callable:
     """Return the loop for a law and strain measure.
 
-    ``add_forces`` is the bar loop over a part of a sweep, with the functions for its energies and the number of its
-    working arrays; ``add_padded``, with ``padded_rows`` working arrays, is the loop over columns, for steps
-    whose energies nothing reads; see
-    :func:`~pfem_petsc.mechanics.elements.make_loops`.
-
-    Its arguments are BatchData; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them; and
-    ``flags`` (count, walls) bool, which receives the walls that are touched in each step. Velocities, accelerations,
-    momenta and energies are computed after the last step alone. It returns Made: fewer steps on one rank where
-    something fails or bars change their state of rupture; several ranks make all steps, as others wait for their
-    messages.
+    Its arguments are BatchData; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them;
+    ``due`` (count,) bool, the steps with a record, of which the last step is one; and ``flags`` (count, walls) bool,
+    which receives the walls that are touched in each step. Velocities, accelerations and increments are written to the
+    state in the last step alone. It returns Made: fewer steps on one rank where something fails or bars change their
+    state of rupture; several ranks make all steps, as others wait for their messages.
     """
+    add_forces, add_padded, add_padded_energies = parts.add_forces, parts.add_padded, parts.add_padded_energies
+    sum_energies, clear_energies, work_rows = parts.sum_energies, parts.clear_energies, parts.work_rows
 
     @borrowing
     def pull(x, bars, begun, ended, f, work):
@@ -646,17 +793,24 @@ def make_batch_loop(
         return add_forces(x, bars.data, begun, ended, True, f, work)
 
     @borrowing
-    def pull_again(x, n, bars, f, work, aside):
+    def pull_padded(x, bars, base, begun, ended, work, counts):
+        """Add the forces of some groups of padded runs, and their energies to ``work`` if it ``counts`` them."""
+        if counts:
+            return add_padded_energies(x, bars, base, begun, ended, work)
+        return add_padded(x, bars, base, begun, ended, work)
+
+    @borrowing
+    def pull_again(x, n, bars, f, work):
         """Compute all forces in the order of a step."""
         flat = f.reshape(-1)
         for j in range(len(flat)):
             flat[j] = 0.0
         if len(x) > n:
-            pull(x, bars, bars.data.sweep.counted, len(bars.data.sweep.diagonal), f, aside)
+            pull(x, bars, bars.data.sweep.counted, len(bars.data.sweep.diagonal), f, work)
         pull(x, bars, 0, bars.data.sweep.counted, f, work)
 
     @kernel
-    def batch_loop(data, touched, met, flags):
+    def batch_loop(data, touched, met, due, flags):
         count, h, x, before, half = len(flags), data.h, data.x, data.before, data.half
         bars, nodes, walls, rows, messages, state = (
             data.bars,
@@ -666,11 +820,10 @@ def make_batch_loop(
             data.messages,
             data.state,
         )
-        ledger, powers, impulses = data.ledger, data.powers, data.impulses
+        ledger, powers, impulses, probes, records = data.ledger, data.powers, data.impulses, data.probes, data.records
         n = len(half)
         n_walls = len(walls.offsets)
-        f, a, v, support, contact = state.f, state.a, state.v, state.support, state.contact
-        energies, u = state.energies, state.u
+        f, a, v, support, contact, u = state.f, state.a, state.v, state.support, state.contact, state.u
         alpha = 1.0 / (h * h)
         eta = 0.5 / h
         supported, loaded = len(nodes.support_nodes) > 0, len(nodes.external) > 0
@@ -680,10 +833,17 @@ def make_batch_loop(
         increments, factors = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK)
         load, held = np.empty(len(nodes.support_nodes)), np.empty(len(nodes.support_nodes))
         speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
+        ends = EndArrays(
+            np.empty(3 * NODE_BLOCK),
+            np.empty(3 * NODE_BLOCK),
+            np.empty(3 * NODE_BLOCK),
+            np.empty(3 * NODE_BLOCK),
+            (np.empty(WIDE), np.empty(WIDE)),
+        )
         totals, lanes, after = np.zeros((3, 3)), new_sums(), np.empty(len(WORKS))
         numbers, buffers = (h, alpha, eta), (factors, speeds, drag)
-        shared = BlockArrays(*numbers, x, half, nodes.inverses, *buffers, held, load, support, lanes)
-        work, columns_work = np.empty(work_rows * CHUNK), new_rows(padded_rows)
+        shared = BlockArrays(*numbers, x, half, nodes.inverses, *buffers, held, load, support, lanes, ends)
+        work = new_rows(work_rows)
         pulled = np.empty((NODE_BLOCK, 3))  # forces of a block
         push_u = np.empty(impulses.v.shape)
         near = touched  # nodes with entries in the array of wall forces
@@ -702,11 +862,14 @@ def make_batch_loop(
         changed = 0
         touching = 0
         done = 0
+        recorded = 0
         changes = 0
         several = len(x) > n or messages.count > 0
         lost = 0  # error code of MPI
-        aside = np.empty(len(work) if several else 0)  # energies of bars that other ranks count
-        by_columns = False  # whether the history of the bars is that of the columns
+        aside = new_rows(work_rows)  # energies that are not counted
+        padded = len(parts) > 0
+        if padded:
+            exchange_history(bars.data.sweep, bars.columns, bars.data.history, False)
         shortened = False
         for step in range(count):
             if failed >= 0 or turned >= 0 or infeasible >= 0:
@@ -716,20 +879,18 @@ def make_batch_loop(
                 if lost != 0:
                     break
                 continue
+            last_one, ending, values = step == count - 1, due[step], records.probes[recorded]
             for i in near:
                 contact[i] = 0.0
             clear_forces(lanes, n, Acting(supported, loaded, False, damped))
+            if ending:
+                clear_ends(lanes, n)
             changed = 0
             moved = 0
             base = 0  # first node of the planes
-            # nothing reads the energies of other steps: a failure ends the run
-            light = len(parts) > 0 and step < count - 1
-            if light != by_columns:
-                exchange_history(bars.data.sweep, bars.columns, bars.data.history, by_columns)
-                by_columns = light
             # Forces that nothing reads stay in the cache. The check of shortened bars reads them, as the next one is
             # likely to; those of laws with history could not be computed again. Blocks that wait for rows need them.
-            brief = light and not shortened and len(bars.data.history) == 0 and not linked
+            brief = padded and not last_one and not shortened and len(bars.data.history) == 0 and not linked
             forces = pulled if brief else f
             shortened = False
             if several:
@@ -737,7 +898,8 @@ def make_batch_loop(
                 if lost != 0:
                     break
             waiting = several
-            clear_energies(work)
+            if ending or not padded:
+                clear_energies(work)
             count_near = 0
             finished, pressing, altered = 0, 0, 0  # blocks; rows with a force, and rows whose force begins or ends
             if linked:
@@ -752,7 +914,7 @@ def make_batch_loop(
             for block in range(n_blocks + 1):
                 if waiting and block == min(bars.meeting, n_blocks):
                     while moved < n_blocks:
-                        move_block(moved, shared, f, light, bars, base)
+                        move_block(moved, shared, f, padded, bars, base)
                         moved += 1
                     for i in range(n, len(x)):
                         f[i, 0] = f[i, 1] = f[i, 2] = 0.0
@@ -760,10 +922,10 @@ def make_batch_loop(
                     if lost != 0:
                         break
                     broke = 0
-                    if light:
+                    if padded:
                         split_block(n, len(x), x, planes, pulls, base)
                         groups = (bars.columns.counted, len(bars.columns.heads))
-                        at, short = add_padded(x, bars, base, *groups, columns_work)
+                        at, short = pull_padded(x, bars, base, *groups, aside, False)
                     else:
                         groups = (bars.data.sweep.counted, len(bars.data.sweep.diagonal))
                         at, short, broke = pull(x, bars, *groups, f, aside)
@@ -774,17 +936,17 @@ def make_batch_loop(
                 if block == n_blocks:
                     break
                 while moved < min(block + 1 + reach, n_blocks):
-                    if light and not several and room_for < NODE_BLOCK * (moved + 1) - base:
+                    if padded and not several and room_for < NODE_BLOCK * (moved + 1) - base:
                         live = NODE_BLOCK * block
                         slide_planes(planes, live - base, NODE_BLOCK * moved - live)
                         slide_planes(pulls, live - base, NODE_BLOCK * moved - live)
                         base = live
-                    move_block(moved, shared, f, light, bars, base)
+                    move_block(moved, shared, f, padded, bars, base)
                     moved += 1
                 start = NODE_BLOCK * block if brief else 0
-                if light:
+                if padded:
                     if block < len(parts) - 1:
-                        at, short = add_padded(x, bars, base, parts[block], parts[block + 1], columns_work)
+                        at, short = pull_padded(x, bars, base, parts[block], parts[block + 1], work, ending)
                         failed = at if failed < 0 else failed
                         shortened = shortened or short
                     join_block(block, n, pulls, base, forces, start)
@@ -793,31 +955,38 @@ def make_batch_loop(
                     failed = at if failed < 0 else failed
                     shortened = shortened or short
                     changed += broke
-                if plain:
-                    advance_block(block, nodes, shared, forces, start)
-                    continue
+                first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
                 if linked:
-                    arrays = (f, u, contact)
+                    ready = finished
                     finished, pressing, more = pass_block(
-                        block, (finished, pressing), rows, alone, nodes, shared, arrays
+                        block, (finished, pressing), rows, alone, nodes, shared, (f, u, contact)
                     )
                     altered += more
+                    for over in range(ready, finished if ending else ready):
+                        end = min(NODE_BLOCK * (over + 1), n)
+                        end_block(over, alone[over], last_one, nodes, shared, state, f[NODE_BLOCK * over : end])
+                        probe_block(over, probes, shared, values)
+                        if pressing > 0:
+                            end_rows(over, shared, contact)
                     continue
-                first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
-                free, here = speeds[: 3 * (last - first)], increments[: 3 * (last - first)]
-                solve_block(block, nodes, shared, forces, start, free, here)
-                found = find_pressed(block, walls, free) if n_walls > 0 else 0
-                if found > 0:
-                    counts, out = (found, count_near), (contact, pressed)
-                    at = press_block(block, counts, nodes, walls, shared, (free, here), out)
-                    infeasible = at if infeasible < 0 else infeasible
-                    count_near += found
-                finish_block(block, nodes, shared, forces, start, contact, here)
-                alone[block] = not (damped or on_walls[block] or found > 0)
-                if not alone[block]:
-                    kept = u[first:last].reshape(-1)
-                    for j in range(len(here)):
-                        kept[j] = here[j]
+                if plain:
+                    advance_block(block, nodes, shared, forces, start)
+                else:
+                    free, here = speeds[: 3 * (last - first)], increments[: 3 * (last - first)]
+                    solve_block(block, nodes, shared, forces, start, free, here)
+                    found = find_pressed(block, walls, free) if n_walls > 0 else 0
+                    if found > 0:
+                        counts, out = (found, count_near), (contact, pressed)
+                        at = press_block(block, counts, nodes, walls, shared, (free, here), out)
+                        infeasible = at if infeasible < 0 else infeasible
+                        count_near += found
+                    finish_block(block, nodes, shared, forces, start, contact, here)
+                    alone[block] = not (damped or on_walls[block] or found > 0)
+                    if not alone[block]:
+                        copy(here, u[first:last].reshape(-1))
+                if ending:
+                    end_block(block, alone[block], last_one, nodes, shared, state, forces[first - start : last - start])
+                    probe_block(block, probes, shared, values)
             if n_walls > 0:
                 mark_blocks(on_walls, touched, False)
                 mark_blocks(on_walls, met, False)
@@ -841,7 +1010,7 @@ def make_batch_loop(
                 impact += finish_rows(rows, altered, walls.slack, nodes, shared, state, u)
             sum_rows(rows, pressing)
             touching = len(near) + 2 * pressing
-            after[:] = powers[0]
+            after[:] = powers
             sum_balance(lanes, n, h, Acting(supported, loaded, touching > 0, damped), totals, after)
             push_particles(totals, pressed.force, rows.totals, alpha, h, impulses, push_u)
             ledger[_IMPACT] += impact
@@ -849,31 +1018,42 @@ def make_batch_loop(
                 flags[step, k] = pressed.contacts[k] > 0
             done += 1
             wrong = failed >= 0 or infeasible >= 0 or changed > 0 or not np.isfinite(after[INTERNAL])
-            if shortened or wrong or step == count - 1:
+            if shortened or wrong or last_one:
                 turned = -1
                 if brief:
-                    pull_again(x, n, bars, f, work, aside)
-                complete(nodes, shared, state, alone)
+                    pull_again(x, n, bars, f, aside)
+                if not last_one:  # the state does not have the end of this step yet
+                    clear_ends(lanes, n)
+                    for block in range(n_blocks):
+                        first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
+                        end_block(block, alone[block], True, nodes, shared, state, f[first:last])
+                        probe_block(block, probes, shared, values)
+                        if pressing > 0:
+                            end_rows(block, shared, contact)
                 start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
                 if failed < 0 and shortened:
                     turned = first_inverted(x, before, bars.data.ends, bars.watched)
                 wrong = wrong or turned >= 0
-            if wrong or step == count - 1:
-                if light:
-                    exchange_history(bars.data.sweep, bars.columns, bars.data.history, True)
-                    by_columns = False
-                else:
-                    for k in range(len(energies)):
-                        energies[k] = 0.0
-                    sum_energies(work, energies)
+            if ending or wrong:
+                if padded and not ending:
+                    clear_energies(work)  # a failure, whose energies nothing reads
+                end_at_walls(near, shared, contact, u, v)
+                sum_ends(lanes, n, h, records.ends[recorded], records.momenta[recorded])
+                sum_energies(work, records.energies[recorded])
                 centre(push_u.reshape(-1), eta, impulses.half.reshape(-1), impulses.v.reshape(-1))
                 accelerations(push_u.reshape(-1), alpha, impulses.a.reshape(-1))
-            powers[1] = powers[0]
-            powers[0] = after
+                add_record(records, recorded, step, powers, totals, ledger[_IMPACT], changes, touching)
+                record_contact(records, recorded, pressed, walls, rows, impulses)
+                probe_forces(probes, support, contact, touching, values)
+                recorded += 1
+            powers[:] = after
             if wrong and not several:
                 break
+        if padded:
+            exchange_history(bars.data.sweep, bars.columns, bars.data.history, True)
         return Made(
             done,
+            recorded,
             lost,
             changed,
             failed,

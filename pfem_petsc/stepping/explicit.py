@@ -103,8 +103,8 @@ class ExplicitStepper(Stepper):
         if self._batched is None:
             self._batched = ledger is not None and Batch.serves(self)
         if not self._batched or ledger.powers is None:
-            if ledger is not None:
-                ledger.complete()
+            if ledger is not None and ledger.powers is not None:
+                ledger.end_batches()
             self.step()
             if self._batched:
                 ledger.begin_batches()
@@ -112,8 +112,6 @@ class ExplicitStepper(Stepper):
         if self._batch is None:
             self._batch = Batch(self)
         self._batch.make(min(most, self.removals.steps_left(state.time, self.h)))
-        if self.model.case.remove:
-            ledger.complete()  # bars that are removed change the forces of the end of the step
         self.leave()
         state.step += 1
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..columns import HEAD, PAIR, WALL
+from ..columns import HEAD, PAIR, WALL, Shares
 from ..integrators.base import State
 from ..tolerances import RANK
 
@@ -129,20 +129,16 @@ class Impulses:
         # links conserve momentum except for the part that supports at their nodes receive
         particles[SUPPORT] += momentum.sum(axis=0)
 
-    def fill(self, head: np.ndarray) -> None:
-        """Write the impulses of support, external and damping forces into the sums of a row."""
-        head[_IMPULSES] = self.state.v[[EXTERNAL, SUPPORT, DAMPING]].reshape(-1)
+    def fill(self, head: np.ndarray, impulses: np.ndarray) -> None:
+        """Write the impulses (m, rows, 3) of support, external and damping forces into sums (m, width of HEAD)."""
+        head[:, _IMPULSES] = impulses[:, [EXTERNAL, SUPPORT, DAMPING]].reshape(len(head), -1)
 
-    def fill_walls(self, share: np.ndarray) -> None:
-        """Write the impulses of walls into (walls, width of WALL)."""
-        share[:, WALL["impulse"]] = self.state.v[WALLS : WALLS + self.n_walls]
-        share[:, WALL["jump_impulse"]] = self.state.v[self.jumps : self.jumps + self.n_walls]
-
-    def fill_links(self, share: np.ndarray) -> None:
-        """Write the impulses of links, and their forces in the last step, into (tables, width of PAIR)."""
-        share[:, PAIR["force"]] = self.links.totals()
-        share[:, PAIR["impulse"]] = self.state.v[WALLS + self.n_walls : self.jumps]
-        share[:, PAIR["jump_impulse"]] = self.state.v[self.jumps + self.n_walls :]
+    def fill_contact(self, shares: Shares, impulses: np.ndarray) -> None:
+        """Write the impulses (m, rows, 3) of walls and links into the shares of rows."""
+        shares.walls[..., WALL["impulse"]] = impulses[:, WALLS : WALLS + self.n_walls]
+        shares.walls[..., WALL["jump_impulse"]] = impulses[:, self.jumps : self.jumps + self.n_walls]
+        shares.tables[..., PAIR["impulse"]] = impulses[:, WALLS + self.n_walls : self.jumps]
+        shares.tables[..., PAIR["jump_impulse"]] = impulses[:, self.jumps + self.n_walls :]
 
     def kept(self) -> dict[str, Any]:
         """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..columns import ENERGIES, HEAD
+from ..columns import BAR_ENERGIES, ENERGIES, HEAD
 from ..mechanics.bars import StrainEnergy, state_before_rupture
 from ..mechanics.elements import MEASURES
 from ..mechanics.materials.base import SMALL
@@ -17,6 +17,7 @@ from .ledger_loops import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS,
 
 if TYPE_CHECKING:
     from ..mechanics.bars import BarBlock
+    from .batch_loop import Records
     from .stepper import Stepper
 
 
@@ -202,6 +203,7 @@ class BarChanges:
 
 
 _AT = {energy.name: HEAD.first(energy.name) for energy in ENERGIES if energy.source != "derived"}
+_BARS = HEAD.indices(BAR_ENERGIES)
 _TOTALS = slice(HEAD.first("momentum"), HEAD["support_force"].stop)
 
 
@@ -212,7 +214,7 @@ class Ledger:
     Attributes
     ----------
     sums : of a row, in the layout of :data:`~pfem_petsc.columns.HEAD`: works and dissipations since the start [J],
-        and totals of this rank's nodes at the present state; valid after :meth:`complete`
+        and totals of this rank's nodes at the present state
     impulses : Impulses
     impacts : Impacts
     powers : (5,) works of all balances of a leapfrog scheme up to the present one, in the order of ``WORKS`` [J]; at
@@ -225,7 +227,6 @@ class Ledger:
         self.model = stepper.model
         self.sums = np.zeros(HEAD.width)
         self.powers: np.ndarray | None = None
-        self._complete = True
         self._before = moment_of(self.stepper)
         self._sum_state(self._before, self._before)
         self._changes = BarChanges(stepper)
@@ -257,7 +258,7 @@ class Ledger:
         self.impulses.step(self._sum_state(present, second))
         if jump is not None:
             self.impulses.jump()
-        self.impulses.fill(self.sums)
+        self.impulses.fill(self.sums[None], self.impulses.state.v[None])
         stepper.step_changed = False
         impact, friction = self._dissipated(before)
         if jump is not None:
@@ -341,31 +342,29 @@ class Ledger:
         works[INERTIAL] = 0.125 * h * h * power(present.inertial, present.acceleration)
         return works
 
-    def follow_batch(self, powers: np.ndarray) -> None:
-        """Take the works (2, 5) [J] of all balances, and of those before the last, after a batch of steps;
-        :meth:`complete` computes the rest."""
-        self.powers, self._earlier = powers
-        self._complete = False
+    def follow_batch(self, records: Records) -> np.ndarray:
+        """Take the last of the ``records`` of a batch of steps; return the sums (m, width of HEAD) of all of them."""
+        powers, ends, count = records.powers, records.ends, len(records.steps)
+        sums = np.repeat(self.sums[None], count, axis=0)
+        sums[:, _AT["kinetic_energy"]] = ends[:, len(WORKS)]
+        sums[:, _TOTALS] = np.hstack([records.momenta, records.totals[:, :1]]).reshape(count, -1)
+        self.impulses.fill(sums, records.impulses)
+        works = powers + ends[:, : len(WORKS)]
+        sums[:, _AT["external_work"]] = works[:, EXTERNAL]
+        sums[:, _AT["damping_dissipation"]] = works[:, DAMPING]
+        sums[:, _AT["impact_dissipation"]] = records.impact
+        stored = np.array([sum(energies) for energies in records.energies.tolist()])
+        inertial = (works[:, INTERNAL] - stored) + powers[:, INERTIAL] - ends[:, INERTIAL]
+        sums[:, _AT["numerical_dissipation"]] = inertial - works[:, CONTACT] - records.impact
+        self.sums[:] = sums[-1]
+        self._before.energy = self.stepper.energy
+        sums[:, _BARS] = records.energies
+        return sums
 
-    def complete(self) -> None:
-        """Compute what only rows, checkpoints and other steps need of the last step of a batch."""
-        if self._complete:
-            return
-        self._complete = True
-        present = self._before = moment_of(self.stepper)
-        self._sum_state(present, present)
-        self.impulses.fill(self.sums)
-        sums, powers, ends = self.sums, self._earlier, self._half_works(present)
-        sums[_AT["external_work"]] = powers[EXTERNAL] + ends[EXTERNAL]
-        sums[_AT["damping_dissipation"]] = powers[DAMPING] + ends[DAMPING]
-        bars, contact = powers[INTERNAL] + ends[INTERNAL], powers[CONTACT] + ends[CONTACT]
-        sums[_AT["numerical_dissipation"]] = (
-            (bars - present.energy.total)
-            + powers[INERTIAL]
-            - ends[INERTIAL]
-            - contact
-            - sums[_AT["impact_dissipation"]]
-        )
+    def end_batches(self) -> None:
+        """Keep the present state, from which a step without batches goes on."""
+        self._before = moment_of(self.stepper)
+        self.powers = None
 
     def _damped(self) -> float:
         """Return the damping dissipation of the last step, C dx . dx / h [J]; never negative.
@@ -479,7 +478,6 @@ class Ledger:
 
     def kept(self) -> dict[str, Any]:
         """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""
-        self.complete()
         kept = {"sums": self.sums.tolist(), "pending": list(self._pending), "impulses": self.impulses.kept()}
         return kept | ({} if self.powers is None else {"powers": self.powers.tolist()})
 

@@ -17,7 +17,11 @@ WORKS = ("external", "contact", "damping", "inertial", "internal")
 
 EXTERNAL, CONTACT, DAMPING, INERTIAL, INTERNAL = range(len(WORKS))
 REACTIONS, _PUSHES, _DRAGS = (len(WORKS) + k for k in range(3))  # further lanes of a balance: sums of forces
-_ROWS = len(WORKS) + 3
+ENDS = _DRAGS + 1
+"""The first of the lanes of the works over the last half step, in the order of :data:`WORKS`."""
+_KINETIC = ENDS + len(WORKS)
+_MOMENTA = _KINETIC + 1  # the first of the lanes of :func:`add_momenta`
+_ROWS = _MOMENTA + 4
 
 LANES = 128
 """Nodes with sums of their own; blocks of nodes begin at multiples of it."""
@@ -85,27 +89,39 @@ def total(force):
 
 
 @kernel
+def add_momenta(place, masses, momentum, lanes):
+    """Add momentum, mass times position, and two parts of the angular momentum to ``lanes`` (4, WIDE); positions,
+    ``masses`` and ``momentum`` (3 n,) are those of at most :data:`LANES` consecutive nodes from a multiple of it on."""
+    moved, angular, crossed = lanes[1], lanes[2], lanes[3]
+    add_forces(momentum, lanes[0])
+    for j in range(len(place)):
+        moved[j] += masses[j] * place[j]
+    # x p_y - y p_x and y p_z - z p_y at the places of x and y, x p_z - z p_x at that of x; others are not used
+    for j in range(len(place) - 1):
+        angular[j] += place[j] * momentum[j + 1] - place[j + 1] * momentum[j]
+    for j in range(len(place) - 2):
+        crossed[j] += place[j] * momentum[j + 2] - place[j + 2] * momentum[j]
+
+
+@kernel
+def finish_momenta(lanes, wide, sums):
+    """Write momentum, angular momentum and mass times position (3, 3) from the lanes of :func:`add_momenta`."""
+    around_z, around_x, _ = sum_lane(lanes[2], wide)
+    sums[0, 0], sums[0, 1], sums[0, 2] = sum_lane(lanes[0], wide)
+    sums[1, 0], sums[1, 1], sums[1, 2] = around_x, -sum_lane(lanes[3], wide)[0], around_z
+    sums[2, 0], sums[2, 1], sums[2, 2] = sum_lane(lanes[1], wide)
+
+
+@kernel
 def sum_momenta(x, mass, momentum):
     """Return momentum, angular momentum and mass times position (3, 3) of nodes at ``x`` (n, 3) with ``momentum`` (n,
     3) and lumped ``mass`` (n,)."""
-    lanes, masses, sums = np.zeros((3, WIDE)), np.empty(WIDE), np.empty((3, 3))
-    moved, angular, crossed = lanes[0], lanes[1], lanes[2]
+    lanes, masses, sums = np.zeros((4, WIDE)), np.empty(WIDE), np.empty((3, 3))
     for first in range(0, len(x), LANES):
         last = min(first + LANES, len(x))
-        place, product = x[first:last].reshape(-1), momentum[first:last].reshape(-1)
         spread(mass[first:last], masses)
-        for j in range(len(place)):
-            moved[j] += masses[j] * place[j]
-        # x p_y - y p_x and y p_z - z p_y at the places of x and y, x p_z - z p_x at that of x; others are not used
-        for j in range(len(place) - 1):
-            angular[j] += place[j] * product[j + 1] - place[j + 1] * product[j]
-        for j in range(len(place) - 2):
-            crossed[j] += place[j] * product[j + 2] - place[j + 2] * product[j]
-    wide = min(3 * len(x), WIDE)
-    sums[0] = total(momentum)
-    around_z, around_x, _ = sum_lane(angular, wide)
-    sums[1, 0], sums[1, 1], sums[1, 2] = around_x, -sum_lane(crossed, wide)[0], around_z
-    sums[2, 0], sums[2, 1], sums[2, 2] = sum_lane(moved, wide)
+        add_momenta(x[first:last].reshape(-1), masses, momentum[first:last].reshape(-1), lanes)
+    finish_momenta(lanes, min(3 * len(x), WIDE), sums)
     return sums
 
 
@@ -134,6 +150,57 @@ def clear_forces(lanes, n, acting):
     if acting.damping:
         clear_sums(lanes[DAMPING], n)
         clear_sums(lanes[_DRAGS], n)
+
+
+@kernel
+def clear_ends(lanes, n):
+    """Set the sums of :func:`add_ends` to zero."""
+    for row in range(ENDS, len(lanes)):
+        clear_sums(lanes[row], n)
+
+
+@kernel
+def add_ends(x, mass, motion, force, room, lanes):
+    """Add what the ledger needs of the end of a step at consecutive nodes, from a multiple of :data:`LANES` on: the
+    works of inertia and of the internal ``force`` over half the step, kinetic energy and momenta.
+
+    ``motion``: velocities, accelerations, and half the step, see :func:`half_steps`; arrays (3 n,), but ``mass`` (n,).
+    ``room``: two arrays (WIDE,).
+    """
+    masses, product = room
+    v, a, way = motion
+    add_powers(force, way, lanes[ENDS + INTERNAL])
+    for first in range(0, len(v), WIDE):
+        last = min(first + WIDE, len(v))
+        speed, pull, moving = v[first:last], a[first:last], product[: last - first]
+        spread(mass[first // 3 : last // 3], masses)
+        for j in range(len(moving)):
+            moving[j] = masses[j] * pull[j]
+        add_powers(moving, pull, lanes[ENDS + INERTIAL])
+        for j in range(len(moving)):
+            moving[j] = masses[j] * speed[j]
+        add_powers(moving, speed, lanes[_KINETIC])
+        add_momenta(x[first:last], masses, moving, lanes[_MOMENTA:])
+
+
+@kernel
+def half_steps(h, v, a, way):
+    """Compute the last half of a step of h v - h^2 a/2; arrays (3 n,)."""
+    for j in range(len(way)):
+        way[j] = (0.5 * h) * (v[j] - (0.5 * h) * a[j])
+
+
+@kernel
+def sum_ends(lanes, n, h, ends, momenta):
+    """Write the works of :data:`WORKS` over the last half step, and at last the kinetic energy, to ``ends`` (6,) [J],
+    and the sums of :func:`add_momenta` (3, 3)."""
+    wide = min(3 * n, WIDE)
+    for k in range(len(ends)):
+        x, y, z = sum_lane(lanes[ENDS + k], wide)
+        ends[k] = x + y + z
+    ends[INERTIAL] *= 0.125 * h * h
+    ends[len(WORKS)] *= 0.5
+    finish_momenta(lanes[_MOMENTA:], wide, momenta)
 
 
 @kernel

@@ -7,11 +7,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from mpi4py import MPI
 
+from ..columns import Shares
 from ..contact.initial_equilibrium import start_at_rest
 from ..contact.monitoring import CarriedNodes
 from ..contact.node_walls import WallForces
@@ -45,8 +46,24 @@ class Accumulating(Protocol):
     def begin_batches(self) -> None:
         """Continue balance by balance."""
 
-    def complete(self) -> None:
-        """Compute what batches leave for rows, checkpoints and other steps."""
+    def end_batches(self) -> None:
+        """Keep the present state, from which a step without batches goes on."""
+
+
+class Instants(NamedTuple):
+    """What rows of the history need of the ends of m steps.
+
+    Attributes
+    ----------
+    number, place : (m,) numbers of the steps, and times in the results, over all stages [s]
+    shares : of this rank
+    noted : (m,) number of steps after each of which the contact log had noted the walls that were touched
+    """
+
+    number: np.ndarray
+    place: np.ndarray
+    shares: Shares
+    noted: np.ndarray
 
 
 class PrescribedMotion:
@@ -296,6 +313,9 @@ class Stepper(ABC):
         arrays with a row for each owned node, and for each local bar
     columns : names of attributes, numbers, that are columns of the history
     remedy : what the user can do against steps that are too large
+    row_every : steps between rows of the history, which batches of steps collect in ``instants``; 0: none
+    probed : nodes whose motion and forces these have
+    instants : of the last batch, until they are recorded, the same on all ranks; None without
     event_columns : columns of events and their types; empty for steppers without events
     events : found with the last step and not recorded yet, the same on all ranks; each has ``row()`` and a text
     """
@@ -315,6 +335,8 @@ class Stepper(ABC):
         self.treatment = None  # of impact; see pfem_petsc.contact.treatments
         self.ledger: Accumulating | None = None
         self.iterations = [0, 0]
+        self.row_every, self.probed = 0, np.empty(0, dtype=np.int64)
+        self.instants: Instants | None = None
         mesh = model.mesh
         owned = mesh.n_owned
         self.energy = StrainEnergy()

@@ -215,15 +215,16 @@ class Row(Mapping):
     vector : (width,) float64
     """
 
-    __slots__ = ("layout", "vector")
+    __slots__ = ("_numbers", "layout", "vector")
 
     def __init__(self, layout: Layout, vector: np.ndarray) -> None:
         self.layout = layout
         self.vector = vector
+        self._numbers = vector.tolist()
 
     def __getitem__(self, name: str) -> Any:
         first, end, shape, kind = self.layout.places[name]
-        return self.vector[first:end].reshape(shape) if shape else kind(self.vector[first])
+        return self.vector[first:end].reshape(shape) if shape else kind(self._numbers[first])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.layout.places)

@@ -191,25 +191,23 @@ class Recorder:
     def rows(self, alarm: bool) -> Iterator[Row]:
         """Generate the rows of the batch of steps that has been made, or that of the present state. Collective.
 
-        ``alarm``: whether this rank has a fault at the end; :attr:`alarmed` is then true on all ranks with the last
-        row, and with those of steps that a rank has not made.
+        ``alarm``: whether this rank has a fault in the present state; :attr:`alarmed` is then true on all ranks, as it
+        is with the rows of steps of a batch that a rank has not made.
         """
         stepper, contact = self.stepper, self.model.contact
-        instants, stepper.instants = stepper.instants or self._present(), None
-        shares, at_alarm = instants.shares, HEAD.first("alarm")
-        shares.head[-1, at_alarm] = max(shares.head[-1, at_alarm], alarm)
-        total = self._total(shares.numbers)
+        instants, stepper.instants = stepper.instants or self._present(alarm), None
+        total = self._total(instants.shares.numbers)
+        alarms = total[:, HEAD.first("alarm")] > 0.0
         contacts = None
         if contact.any:
-            walls = total[-1, HEAD.width + 1 :][: shares.walls[0].size]
+            walls = total[-1, HEAD.width + 1 :][: instants.shares.walls[0].size]
             contacts = walls.reshape(-1, WALL.width)[:, WALL.first("contacts")]
         times = contact.log.meet(self.model.comm, contacts)[instants.noted]
-        for row, number, place, time in zip(total, instants.number, instants.place, times, strict=True):
-            self.alarmed = row[at_alarm] > 0.0
-            vector = self._unpack(row, (place, number, stepper.smallest), time)
-            if self.rest is not None:
-                own, vector = vector, self.rest.copy()
-                vector[self._at] = own
+        vectors = self._unpack(total, (instants.place, instants.number, stepper.smallest), times)
+        if self.rest is not None:
+            own, vectors = vectors, np.repeat(self.rest[None], len(vectors), axis=0)
+            vectors[:, self._at] = own
+        for self.alarmed, vector in zip(alarms.tolist(), vectors, strict=True):
             yield Row(self._whole, vector)
 
     def _total(self, shares: np.ndarray) -> np.ndarray:
@@ -224,14 +222,14 @@ class Recorder:
             self._probes.unite(share[probes:], out[probes:])
         return total
 
-    def _present(self) -> Instants:
+    def _present(self, alarm: bool) -> Instants:
         """Return what a row needs of the present state."""
         stepper, state, contact = self.stepper, self.stepper.state, self.model.contact
         impulses, walls = stepper.ledger.impulses, stepper.solution.walls
         shares = Shares(1, len(contact.names), len(self.model.links.columns), len(self._probes.nodes))
         head = shares.head[0]
         head[:] = stepper.ledger.sums
-        head[_BARS] = stepper.energy.energies
+        head[_BARS], head[HEAD.first("alarm")] = stepper.energy.energies, alarm
         for first, value in values_at_state(self.model):
             head[first] = value(stepper)
         if contact.any:
@@ -241,7 +239,7 @@ class Recorder:
             shares.walls[0, :, WALL.first("contacts")] = walls.contacts
             shares.walls[0, :, WALL.first("releases")] = contact.log.releases
         shares.tables[0, :, PAIR["force"]] = self.model.links.totals()
-        impulses.fill_contact(shares, impulses.state.v[None])
+        impulses.fill_contact(shares.walls, shares.tables, impulses.state.v[None])
         held = self.model.supports.any or self.model.bars.springs is not None
         reacts = held and not stepper.scheme.balance_at_endpoints
         if self.probe_nodes or reacts:
@@ -251,38 +249,38 @@ class Recorder:
                 head[HEAD["support_force"]] = stepper.support_force(support)
         return Instants(np.array([stepper.number]), np.array([stepper.place]), shares, np.array([contact.log.noted]))
 
-    def _unpack(self, sums: np.ndarray, of_run: tuple[float, ...], contact_times: np.ndarray) -> np.ndarray:
-        """Return the values of a row of this stage from the sums over ranks; begin those of the next row.
+    def _unpack(self, sums: np.ndarray, of_run: tuple[Any, ...], contact_times: np.ndarray) -> np.ndarray:
+        """Return the values of m rows of this stage from the sums over ranks; begin those of the next row.
 
-        ``of_run``: values of the columns :data:`~pfem_petsc.columns.OF_RUN`; ``contact_times`` (walls,) [s].
+        ``of_run``: values of the columns :data:`~pfem_petsc.columns.OF_RUN`; ``contact_times`` (m, walls) [s].
         """
         stepper, contact, layout = self.stepper, self.model.contact, self._layout
-        vector, at = np.empty(layout.width), layout.first
-        vector[self._to] = sums[self._from]
-        vector[layout.width - self._probes.width :] = sums[self._probed :]
+        vectors, at = np.empty((len(sums), layout.width)), layout.first
+        vectors[:, self._to] = sums[:, self._from]
+        vectors[:, layout.width - self._probes.width :] = sums[:, self._probed :]
         for column, value in zip(OF_RUN, of_run, strict=True):
-            vector[at(column.name)] = value
+            vectors[:, at(column.name)] = value
         for name in stepper.columns:
-            vector[at(name)] = getattr(stepper, name)
-        vector[at("newton_iterations")], vector[at("linear_iterations")] = stepper.iterations
+            vectors[:, at(name)] = getattr(stepper, name)
+        vectors[:, at("newton_iterations")], vectors[:, at("linear_iterations")] = stepper.iterations
         for first, parts in self._parts:
-            vector[first] = sum(sums[part] for part in parts)
-        vector[layout["centre_of_mass"]] /= self.model.total_mass
-        energies = sums[_ENERGIES]
+            vectors[:, first] = sum(sums[:, part] for part in parts)
+        vectors[:, layout["centre_of_mass"]] /= self.model.total_mass
+        energies = sums[:, _ENERGIES]
         if self.carried is not None:
             energies = energies + self.carried[self._energies]
-        held = float(_SIGNS @ energies)
+        held = (energies * _SIGNS).sum(axis=1)
         if self.start_energy is None:
-            self.start_energy = held
+            self.start_energy = float(held[0])
         self.energy_scale = max(self.energy_scale, float(np.abs(energies).max()))
-        vector[at("energy_imbalance")] = held - self.start_energy
+        vectors[:, at("energy_imbalance")] = held - self.start_energy
         stepper.iterations = [0, 0]
-        vector[self._contact_times] = contact_times
+        vectors[:, self._contact_times] = contact_times
         if len(self._motion):
             time = stepper.state.time
             motion = np.hstack([contact.positions(time), contact.motion.rates(time)])
-            vector[self._motion] = motion[np.flatnonzero(contact.moving)].ravel()
-        return vector if self.carried is None else vector + self.carried
+            vectors[:, self._motion] = motion[np.flatnonzero(contact.moving)].ravel()
+        return vectors if self.carried is None else vectors + self.carried
 
     def begin_stage(self, before: Recorder, last: Row, kick: tuple[float, np.ndarray]) -> Row:
         """Go on after the stage that has ended; return the row of the start. Collective.

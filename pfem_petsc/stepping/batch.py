@@ -238,9 +238,9 @@ class Batch:
         model, log, k = self.model, self.model.contact.log, int((steps < sound).sum())
         shares = Shares(len(steps), len(model.contact.names), len(model.links.columns), len(self._probes.nodes))
         shares.head[:k], shares.head[k:, HEAD.first("alarm")] = sums[:k], 1.0
-        shares.probes[:k], shares.tables[:k, :, PAIR["force"]] = records.probes[:k], records.tables[:k]
-        self.ledger.impulses.fill_contact(shares, records.impulses[:k])
-        walls = shares.walls[:k]
+        walls, tables = shares.walls[:k], shares.tables[:k]
+        self.ledger.impulses.fill_contact(walls, tables, records.impulses[:k])
+        shares.probes[:k], tables[..., PAIR["force"]] = records.probes[:k], records.tables[:k]
         walls[..., WALL["force"]], walls[..., WALL["moment"]] = records.force[:k], records.moment[:k]
         walls[..., WALL.first("contacts")] = records.contacts[:k]
         walls[..., WALL.first("releases")] = records.releases[:k]

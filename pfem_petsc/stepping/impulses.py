@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..columns import HEAD, PAIR, WALL, Shares
+from ..columns import HEAD, PAIR, WALL
 from ..integrators.base import State
 from ..tolerances import RANK
 
@@ -133,12 +133,13 @@ class Impulses:
         """Write the impulses (m, rows, 3) of support, external and damping forces into sums (m, width of HEAD)."""
         head[:, _IMPULSES] = impulses[:, [EXTERNAL, SUPPORT, DAMPING]].reshape(len(head), -1)
 
-    def fill_contact(self, shares: Shares, impulses: np.ndarray) -> None:
-        """Write the impulses (m, rows, 3) of walls and links into the shares of rows."""
-        shares.walls[..., WALL["impulse"]] = impulses[:, WALLS : WALLS + self.n_walls]
-        shares.walls[..., WALL["jump_impulse"]] = impulses[:, self.jumps : self.jumps + self.n_walls]
-        shares.tables[..., PAIR["impulse"]] = impulses[:, WALLS + self.n_walls : self.jumps]
-        shares.tables[..., PAIR["jump_impulse"]] = impulses[:, self.jumps + self.n_walls :]
+    def fill_contact(self, walls: np.ndarray, tables: np.ndarray, impulses: np.ndarray) -> None:
+        """Write the impulses (m, rows, 3) of walls and links into shares of m rows, see
+        :class:`~pfem_petsc.columns.Shares`."""
+        walls[..., WALL["impulse"]] = impulses[:, WALLS : WALLS + self.n_walls]
+        walls[..., WALL["jump_impulse"]] = impulses[:, self.jumps : self.jumps + self.n_walls]
+        tables[..., PAIR["impulse"]] = impulses[:, WALLS + self.n_walls : self.jumps]
+        tables[..., PAIR["jump_impulse"]] = impulses[:, self.jumps + self.n_walls :]
 
     def kept(self) -> dict[str, Any]:
         """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""

@@ -247,7 +247,7 @@ def test_a_stopped_run_of_batches_goes_on_to_the_same_end(pairs, tmp_path):
     given = case(SMALL["yielding"])
     if pairs:
         given = Case.from_dict(two_lattices(tmp_path / "mesh.vtu", "central_differences"))
-        given.output.history_every = 7
+        given.output.history_every, given.output.fields_every = 7, 20
     whole, _ = made(given, tmp_path / "whole", "batches", MPI.COMM_SELF)
     stopped = Simulation(given, MPI.COMM_SELF, output=tmp_path / "part", quiet=True)
     with pytest.raises(EarlyStop):

@@ -269,7 +269,10 @@ class Recorder:
         energies = sums[:, _ENERGIES]
         if self.carried is not None:
             energies = energies + self.carried[self._energies]
-        held = (energies * _SIGNS).sum(axis=1)
+        # one after the other: the order of a sum over an axis depends on the number of rows
+        held = np.zeros(len(sums))
+        for sign, values in zip(_SIGNS, energies.T, strict=True):
+            held += sign * values
         if self.start_energy is None:
             self.start_energy = float(held[0])
         self.energy_scale = max(self.energy_scale, float(np.abs(energies).max()))

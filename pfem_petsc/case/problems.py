@@ -15,7 +15,7 @@ from ..registry import nearest
 from .base import StrictModel, WithFiles
 from .files import TableFile
 from .model import CaseModel, Chosen, Family, plain_type, shape_of
-from .toml import KeyPath, key_text, value_text
+from .toml import KeyPath, key_text, short_text
 
 MOST = 10
 """Maximum number of problems listed in a message; the others are counted."""
@@ -40,7 +40,7 @@ class Problems:
     def add(self, path: KeyPath, message: str, value: Any = None) -> None:
         """Add a problem; ``value`` is shown if given."""
         key = key_text(path)
-        shown = f"{key} = {_short(value)}" if value is not None else key
+        shown = f"{key} = {short_text(value)}" if value is not None else key
         origin = " (given by --set)" if any(path[: len(p)] == p for p in self.overridden) else ""
         line = f"{self.source}: {shown}{origin}: {message}" if key else f"{self.source}: {message}"
         if line not in self.lines:
@@ -179,11 +179,6 @@ def _item(data: Any, key: str | int) -> Any:
         return data[key]
     except (LookupError, TypeError):
         return None
-
-
-def _short(value: Any, most: int = 60) -> str:
-    text = value_text(value)
-    return text if len(text) <= most else f"{text[: most - 4]} ..."
 
 
 def _list_text(field: FieldInfo | None) -> str:

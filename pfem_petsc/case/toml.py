@@ -119,6 +119,12 @@ def value_text(value: Any) -> str:
     return repr(value) if isinstance(value, int | float) else str(value)
 
 
+def short_text(value: Any, most: int = 60) -> str:
+    """Return a value on one line of TOML, or its beginning, for messages."""
+    text = value_text(value)
+    return text if len(text) <= most else f"{text[: most - 4]} ..."
+
+
 def table_text(table: Mapping[str, Any], path: str = "") -> str:
     """Return a table as TOML lines: values first, then tables and lists of tables under their own headings."""
     blocks = []

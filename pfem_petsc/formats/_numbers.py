@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
+
+from ..errors import InputError
 
 
 def numbers_of(text: bytes) -> np.ndarray:
@@ -32,6 +35,14 @@ def number_of(text: str) -> float:
         return float(text.upper().replace("D", "E"))
     except ValueError:
         return float("nan")
+
+
+def whole_numbers(values: np.ndarray, first: int, end: int, refused: Callable[[str], str]) -> np.ndarray:
+    """Return numbers as int64, from ``first`` to ``end`` - 1; ``refused`` makes a message about another one."""
+    wrong = values[~((values >= first) & (values < end) & (values == np.rint(values)))]
+    if wrong.size:
+        raise InputError(refused("nothing" if np.isnan(wrong.flat[0]) else f"{wrong.flat[0]:g}"))
+    return values.astype(np.int64)
 
 
 def shown(text: bytes) -> str:

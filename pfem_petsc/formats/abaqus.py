@@ -23,7 +23,7 @@ import numpy as np
 from ..errors import InputError
 from ..files import readable_whole
 from ..mesh.whole import WholeMesh
-from ._numbers import number_of, numbers_of, shown
+from ._numbers import number_of, numbers_of, shown, whole_numbers
 
 SUFFIXES = (".inp",)
 
@@ -367,11 +367,8 @@ def _ends(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _labels(values: np.ndarray, block: _Block, what: str) -> np.ndarray:
-    wrong = values[~((values > 0.0) & (values < 2.0**53) & (values == np.rint(values)))]
-    if wrong.size:
-        text = "nothing" if np.isnan(wrong[0]) else f"{wrong[0]:g}"
-        raise InputError(f"{block.where}: {text} is not the label of a {what}: a whole number from 1 on")
-    return values.astype(np.int64)
+    refused = "{}: {} is not the label of a {}: a whole number from 1 on"
+    return whole_numbers(values, 1, 2**53, lambda found: refused.format(block.where, found, what))
 
 
 def _union(parts: list[np.ndarray]) -> np.ndarray:

@@ -25,7 +25,7 @@ from ..mesh.exchange import Router
 from ..mesh.slab import MeshSlab, check_memory, index_type, slab_of, slab_range
 from ..mesh.whole import WholeMesh, check_fields
 from ..parallel.agreement import on_root
-from ._numbers import numbers_of, shown
+from ._numbers import numbers_of, shown, whole_numbers
 
 SUFFIXES = (".msh",)
 
@@ -216,11 +216,10 @@ class _Section:
             raise InputError(f"{self._where}: contains text other than numbers") from None
 
     def _whole(self, values: np.ndarray) -> np.ndarray:
-        if values.dtype.kind == "f":
-            wrong = values[~((np.abs(values) < 2.0**53) & (values == np.rint(values)))]
-            if wrong.size:
-                raise InputError(f"{self._where}: {wrong.flat[0]:g} is not a count or a tag: a whole number")
-        return values.astype(np.int64)
+        if values.dtype.kind != "f":
+            return values.astype(np.int64)
+        refused = f"{self._where}: {{}} is not a count or a tag: a whole number"
+        return whole_numbers(values, 1 - 2**53, 2**53, refused.format)
 
 
 def _steps(n: int) -> Iterator[int]:

@@ -22,6 +22,7 @@ import numpy as np
 from ..errors import InputError
 from ..mesh.slab import check_memory
 from ..mesh.whole import WholeMesh
+from ._numbers import whole_numbers
 
 SUFFIXES = (".3mf",)
 
@@ -246,10 +247,9 @@ def _numbers(rows: Sequence[str | tuple[str | None, ...] | None], what: str, wid
 
 
 def _whole(values: np.ndarray, n: int, what: str) -> np.ndarray:
-    wrong = values[~((values >= 0.0) & (values < n) & (values == np.rint(values)))]
-    if wrong.size:
-        raise InputError(f"{what} {wrong.flat[0]:g} is not there; they are numbered from 0 to {n - 1}")
-    return values.astype(np.int64)
+    return whole_numbers(
+        values, 0, n, lambda found: f"{what} {found} is not there; they are numbered from 0 to {n - 1}"
+    )
 
 
 def _assembled(path: Path, model: _Model) -> WholeMesh:

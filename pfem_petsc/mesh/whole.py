@@ -290,12 +290,15 @@ def _lengths(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
 
 def _check_points(slab: MeshSlab, comm: MPI.Comm) -> None:
     bad = ~(np.abs(slab.points) < LARGE).all(axis=1)
-
-    def named(i: int) -> str:
-        return f"node {slab.first_node + i} at ({', '.join(f'{x:g}' for x in slab.points[i])})"
-
-    what = f"nodes have coordinates that are not numbers below {LARGE:g}"
-    _refuse(slab, comm, bad, named, what, "correct them", mended=False)
+    _refuse(
+        slab,
+        comm,
+        bad,
+        lambda i: f"node {slab.first_node + i} at ({', '.join(f'{x:g}' for x in slab.points[i])})",
+        f"nodes have coordinates that are not numbers below {LARGE:g}",
+        "correct them",
+        mended=False,
+    )
 
 
 def _check_ends(slab: MeshSlab, comm: MPI.Comm) -> None:
@@ -343,13 +346,14 @@ def _check_duplicates(slab: MeshSlab, comm: MPI.Comm) -> None:
     again = np.flatnonzero((ends[1:] == ends[:-1]).all(axis=1))
     again = again[np.argsort(numbers[again], kind="stable")]
 
-    def named(i: int) -> str:
-        return (
-            f"bars {numbers[again[i]]} and {numbers[again[i] + 1]} (nodes {ends[again[i], 0]} and {ends[again[i], 1]})"
-        )
-
-    what = "bars join the same two nodes as another bar"
-    _refuse(slab, comm, np.ones(len(again), bool), named, what, "keep one of each, with the sum of the areas")
+    _refuse(
+        slab,
+        comm,
+        np.ones(len(again), bool),
+        lambda k: "bars {} and {} (nodes {} and {})".format(*numbers[again[k] : again[k] + 2], *ends[again[k]]),
+        "bars join the same two nodes as another bar",
+        "keep one of each, with the sum of the areas",
+    )
 
 
 def _pairs_of_ends(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:

@@ -207,12 +207,12 @@ def _modes(result: Any) -> str:
 
 def _log(result: Any) -> dict[str, list[str]]:
     """Return warnings, closing lines and memory from the log beside the result."""
+    found: dict[str, list[str]] = {"warnings": [], "done": [], "memory": []}
     try:
         text = (Path(result.path).parent / "log.txt").read_text(encoding="utf-8", errors="replace")
     except OSError:
-        return {"warnings": [], "done": [], "memory": []}
+        return found
     entries = re.findall(r"^\S+ \S+ (\w+) +(.*(?:\n(?!\d{4}-\d\d-\d\d ).*)*)", text, flags=re.MULTILINE)
-    found: dict[str, list[str]] = {"warnings": [], "done": [], "memory": []}
     for level, message in entries:
         message = message.strip()
         if level in ("WARNING", "ERROR") and message not in found["warnings"]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
-from ..case.toml import split_key, value_text
+from ..case.toml import short_text, split_key
 from ..errors import InputError
 from ..output.checkpoint import (
     NAME,
@@ -95,10 +95,7 @@ def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def _text(values: Mapping[str, Any], key: str) -> str:
-    if key not in values:
-        return "absent"
-    text = value_text(values[key])
-    return text if len(text) <= 60 else text[:56] + " ..."
+    return short_text(values[key]) if key in values else "absent"
 
 
 ASIDE = "checkpoint-later.h5"

@@ -74,10 +74,13 @@ def sweep(
     InputError
         If no combination makes a valid case, no case has a named column, or the output folder cannot be written.
     """
+    from mpi4py import MPI
+
     changes = _combinations(vary)
     if not isinstance(processes, int) or isinstance(processes, bool) or processes < 1:
         raise InputError(f"sweep: processes = {processes!r}: give a positive whole number")
-    _require_one_rank()
+    if MPI.COMM_WORLD.size > 1:
+        raise InputError("sweep: each run has its own process on one rank: start the sweep without mpirun")
     if results is not None and not callable(results) and not isinstance(results, Mapping):
         raise InputError(f"sweep: results = {results!r:.60}: expected a function, or functions by name")
     asked = list(results) if isinstance(results, Mapping) else []
@@ -130,13 +133,6 @@ def _combinations(vary: Any) -> list[dict[str, Any]]:
         if key in _OWN:
             raise InputError(f"sweep: {key}: this is a column of the table, not a key of a case")
     return found
-
-
-def _require_one_rank() -> None:
-    from mpi4py import MPI
-
-    if MPI.COMM_WORLD.size > 1:
-        raise InputError("sweep: each run has its own process on one rank: start the sweep without mpirun")
 
 
 def _cases(case: Case, changes: list[dict[str, Any]]) -> tuple[dict[int, Case], dict[int, str]]:

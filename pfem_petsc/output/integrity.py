@@ -118,19 +118,13 @@ class RowDigests:
             words = words.copy()
         for place, kind in self._others:
             words[:, place] = rows[:, place].astype(kind).view(f"u{kind.itemsize}")
-        return self._sums(words, first)
-
-    def of_columns(self, columns: Mapping[str, np.ndarray], first: int) -> np.ndarray:
-        """Return the same from the columns as they are stored, name to values (n, ...)."""
-        words = np.empty((len(next(iter(columns.values()))), self._layout.width), dtype=np.uint64)
-        for name, values in columns.items():
-            stored = np.ascontiguousarray(values).view(f"u{values.dtype.itemsize}")
-            words[:, self._layout[name]] = stored.reshape(len(words), -1) if stored.size else 0
-        return self._sums(words, first)
-
-    def _sums(self, words: np.ndarray, first: int) -> np.ndarray:
         numbers = np.arange(first + 1, first + len(words) + 1, dtype=np.uint64)
         return numbers * _ODD + (words * self._multipliers).sum(axis=1, dtype=np.uint64)
+
+    def of_columns(self, columns: Mapping[str, np.ndarray], first: int) -> np.ndarray:
+        """Return the same from the columns, name to values (n, ...)."""
+        parts = [np.asarray(columns[name], dtype=np.float64) for name in self._layout.places]
+        return self.of_vectors(np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1), first)
 
 
 def stored_sum(dataset: h5py.Dataset, first: int, count: int) -> int:

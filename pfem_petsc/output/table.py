@@ -58,10 +58,7 @@ class Table(Mapping[str, np.ndarray]):
 
     def to_structured(self) -> np.ndarray:
         """Return a structured array (rows,) with a field for each column."""
-        made = np.empty(self.n_rows, [(name, values.dtype) for name, values in self.items()])
-        for name, values in self.items():
-            made[name] = values
-        return made
+        return np.rec.fromarrays(list(self.values()), names=list(self))
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a data frame.

@@ -14,11 +14,11 @@ therefore imports no MPI.
 from __future__ import annotations
 
 import os
+import pickle
 import resource
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -56,41 +56,39 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     """
     from ..mesh.whole import WholeMesh
 
-    with tempfile.TemporaryDirectory() as folder:
-        result = Path(folder, "mesh.npz")
-        command = [sys.executable, "-P", "-m", __name__, str(path.resolve()), str(result)]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)
-        if done.returncode == _REFUSED:
-            raise InputError(f"{path}: {done.stdout.strip()}")
-        if done.returncode < 0:
-            raise InputError(
-                f"{path}: VTK ended with signal {signal.Signals(-done.returncode).name} while reading it; "
-                "the file is damaged or too large for this machine: write it again"
-            )
-        if done.returncode:
-            last = done.stderr.strip().splitlines()[-1:] or ["no message"]
-            raise InputError(f"{path}: cannot be read with VTK ({last[0]}); is VTK 9.2 or newer installed?")
-        with np.load(result, allow_pickle=False) as arrays:
-            mesh = WholeMesh(points=arrays["points"], bars=arrays["bars"])
-            for key in arrays.files:
-                kind, slash, name = key.partition("/")
-                if slash:
-                    getattr(mesh, kind)[name] = arrays[key]
-            if arrays["left_out"]:
-                mesh.warnings.append(f"{path}: left out {arrays['left_out']} cells that are not lines")
-            if arrays["snapshots"] > 1:
-                text = f"has {arrays['snapshots']} snapshots: the mesh and its fields are those of the last one"
-                mesh.warnings.append(f"{path}: {text}")
+    command = [sys.executable, "-P", "-m", __name__, str(path.resolve())]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    if done.returncode == _REFUSED:
+        raise InputError(f"{path}: {done.stdout.decode(errors='replace').strip()}")
+    if done.returncode < 0:
+        raise InputError(
+            f"{path}: VTK ended with signal {signal.Signals(-done.returncode).name} while reading it; "
+            "the file is damaged or too large for this machine: write it again"
+        )
+    if done.returncode:
+        last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
+        raise InputError(f"{path}: cannot be read with VTK ({last[0]}); is VTK 9.2 or newer installed?")
+    arrays = pickle.loads(done.stdout)
+    left_out, snapshots = arrays.pop("left_out"), arrays.pop("snapshots")
+    mesh = WholeMesh(points=arrays.pop("points"), bars=arrays.pop("bars"))
+    for key, values in arrays.items():
+        kind, _, name = key.partition("/")
+        getattr(mesh, kind)[name] = values
+    if left_out:
+        mesh.warnings.append(f"{path}: left out {left_out} cells that are not lines")
+    if snapshots > 1:
+        text = f"has {snapshots} snapshots: the mesh and its fields are those of the last one"
+        mesh.warnings.append(f"{path}: {text}")
     return mesh
 
 
 # ---- the process that reads by VTK
 
 
-def _extract(path: str, result: str) -> int:
+def _extract(path: str) -> int:
     """Read ``path``; write ``points``, ``bars``, ``node_groups/NAME``, ``bar_groups/NAME``, ``bar_fields/NAME`` of
-    the last of several snapshots to ``result``."""
+    the last of several snapshots to stdout, as a pickled dictionary."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
     if path.lower().endswith(".vtu"):
@@ -122,11 +120,11 @@ def _extract(path: str, result: str) -> int:
     except ValueError as error:
         print(error)
         return _REFUSED
-    np.savez(result, snapshots=np.array(snapshots), **arrays)
+    pickle.dump({"snapshots": snapshots, **arrays}, sys.stdout.buffer)
     return 0
 
 
-def _arrays(grid: Any) -> Iterator[tuple[str, np.ndarray]]:
+def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     if grid is None or not grid.IsA("vtkUnstructuredGrid"):
@@ -150,7 +148,7 @@ def _arrays(grid: Any) -> Iterator[tuple[str, np.ndarray]]:
     place = np.arange(len(lines)) - np.repeat(np.cumsum(size - 1) - (size - 1), size - 1) + np.repeat(first, size - 1)
     yield "points", vtk_to_numpy(grid.GetPoints().GetData()).astype(np.float64)
     yield "bars", ends[place[:, None] + np.array([0, 1])].astype(np.int64)
-    yield "left_out", np.array(n_cells - len(cells))
+    yield "left_out", n_cells - len(cells)
     for kind, data, kept in (
         ("node_groups", grid.GetPointData(), slice(None)),
         ("bar_groups", grid.GetCellData(), lines),

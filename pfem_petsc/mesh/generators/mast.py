@@ -6,8 +6,8 @@ import numpy as np
 
 from ...case.base import PositiveInt, StrictModel
 from ...errors import InputError
-from ..slab import MeshSlab
-from .base import Length, Part
+from ..slab import MeshSlab, check_size, slab_of_whole
+from .base import Length
 
 
 class Parameters(StrictModel):
@@ -38,48 +38,30 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     p, n = parameters, parameters.bays
     if p.levels > n:
         raise InputError(f"mesh.levels = {p.levels} is more than mesh.bays = {n}: guys are attached at the bays' ends")
-    guys, inner = 3 * p.levels, p.elements - 1
-    mast_nodes, mast_bars = 3 * (n + 1), 9 * n + 3
-    n_nodes, n_bars = mast_nodes + 3 + guys * inner, mast_bars + guys * p.elements
-    part = Part(n_nodes, n_bars, rank, size, "mesh.bays")
-    numbers = part.nodes
-
-    def place(nodes: np.ndarray) -> np.ndarray:
-        """Points (k, 3) of mast nodes and anchors."""
-        level, leg = np.divmod(nodes, 3)
-        anchor = level > n
-        angle, distance = 2.0 * np.pi * leg / 3.0, np.where(anchor, p.radius, p.width / np.sqrt(3.0))
-        height = np.where(anchor, 0.0, p.height * level / n)
-        return np.stack([distance * np.cos(angle), distance * np.sin(angle), height], axis=1)
-
-    def ends(guy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Anchor and node of the mast of guys (k,): three at each level, from below."""
-        level, leg = np.divmod(guy, 3)
-        return mast_nodes + leg, 3 * ((level + 1) * n // p.levels) + leg
-
-    points = place(np.minimum(numbers, mast_nodes + 2))
-    within = numbers >= mast_nodes + 3
-    guy, k = np.divmod(numbers[within] - mast_nodes - 3, max(inner, 1))
-    low, high = (place(node) for node in ends(guy))
-    points[within] = low + (high - low) * ((k + 1) / p.elements)[:, None]
-
-    of_mast = part.bars < mast_bars
-    bay, kind = np.divmod(part.bars, 9)
-    leg = kind % 3
-    after, ground = (leg + 1) % 3, bay == n  # the last three bars of the mast: horizontals at the ground
-    # legs, diagonals that wind about the mast, horizontals; guys
-    kind = np.where(of_mast, np.where(ground, 2, kind // 3), 3)
-    bottom, top = np.where(ground, 0, 3 * bay), np.where(ground, 0, 3 * (bay + 1))
-    guy, k = np.divmod(part.bars - mast_bars, p.elements)
-    anchor, head = ends(guy)
-    before = mast_nodes + 3 + guy * inner + k - 1
-    first = np.choose(kind, [bottom + leg, bottom + leg, top + leg, np.where(k == 0, anchor, before)])
-    second = np.choose(kind, [top + leg, top + after, top + after, np.where(k == inner, head, before + 1)])
-    node_groups = {
-        "base": numbers < 3,
-        "top": (numbers >= mast_nodes - 3) & (numbers < mast_nodes),
-        "mast": numbers < mast_nodes,
-        "anchors": (numbers >= mast_nodes) & (numbers < mast_nodes + 3),
-    }
-    bar_groups = {name: kind == k for k, name in enumerate(("legs", "diagonals", "horizontals", "guys"))}
-    return part.slab("mast", points, (first, second), node_groups, bar_groups)
+    n_mast, n_guys = 3 * (n + 1), 3 * p.levels
+    check_size(n_mast + 3 + n_guys * (p.elements - 1), "mesh.bays", 9 * n + 3 + n_guys * p.elements)
+    leg = np.arange(3)
+    after, angle = (leg + 1) % 3, 2.0 * np.pi * leg / 3.0
+    way = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    mast = np.tile(p.width / np.sqrt(3.0) * way, (n + 1, 1, 1))  # (levels, legs, 3)
+    mast[..., 2] = (p.height * np.arange(n + 1) / n)[:, None]
+    ends = np.arange(1, p.levels + 1) * n // p.levels  # levels of the mast at which guys end
+    anchors, share = p.radius * way[:, None], (np.arange(1, p.elements) / p.elements)[:, None]
+    inner = anchors + (mast[ends][:, :, None] - anchors) * share
+    points = np.concatenate([mast.reshape(-1, 3), anchors[:, 0], inner.reshape(-1, 3)])
+    # legs, diagonals that wind about the mast, and horizontals of each bay; horizontals at the ground; guys
+    low = 3 * np.arange(n)[:, None]
+    sides = (low + leg, low + leg, low + 3 + leg), (low + 3 + leg, low + 3 + after, low + 3 + after)
+    within = n_mast + 3 + np.arange(n_guys * (p.elements - 1)).reshape(p.levels, 3, -1)
+    feet, heads = np.broadcast_to(n_mast + leg, (p.levels, 3)), 3 * ends[:, None] + leg
+    chain = np.concatenate([feet[..., None], within, heads[..., None]], axis=2)
+    guys = np.stack([chain[..., :-1], chain[..., 1:]], axis=-1)
+    of_bays = np.stack([np.stack(each, axis=1) for each in sides], axis=-1)
+    bars = np.concatenate([of_bays.reshape(-1, 2), np.stack([leg, after], axis=1), guys.reshape(-1, 2)])
+    number = np.arange(len(bars))
+    kind = np.where(number < 9 * n, number // 3 % 3, np.where(number < 9 * n + 3, 2, 3))
+    nodes = np.arange(n_mast + 3)
+    node_groups = {"base": nodes[:3], "top": nodes[-6:-3], "mast": nodes[:-3], "anchors": nodes[-3:]}
+    kinds = ("legs", "diagonals", "horizontals", "guys")
+    bar_groups = {name: np.flatnonzero(kind == k) for k, name in enumerate(kinds)}
+    return slab_of_whole(points, bars, node_groups, bar_groups, "generator mast", rank, size)

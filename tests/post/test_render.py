@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from helpers.pictures import drawing, pixels
 from helpers.synthetic import WALL, SyntheticResult, lattice, ring, rod, write_result
 from PIL import Image
 
@@ -18,21 +19,9 @@ from pfem_petsc.contact.walls.plane import Parameters
 from pfem_petsc.errors import InputError
 from pfem_petsc.post import scene
 from pfem_petsc.post.motion import walls_at
-from pfem_petsc.post.page import Page
 from pfem_petsc.post.render import render, render_modes
 
 SMALL = (480, 270)
-
-
-def pixels(file) -> np.ndarray:
-    return np.asarray(Image.open(file).convert("RGB")).astype(int)
-
-
-def drawing(file) -> np.ndarray:
-    """The part of a frame without title, time and colour bar."""
-    picture = pixels(file)
-    left, top, width, height = Page.region_of((picture.shape[1], picture.shape[0]))
-    return picture[top : top + height, left : left + width]
 
 
 def inked(picture: np.ndarray) -> np.ndarray:
@@ -59,8 +48,8 @@ def test_frames_film_and_poster_from_a_result_file(tmp_path):
     assert names == ["render.png", "render.mp4", "render.gif", *frames]
     for path in written:
         if path.suffix == ".png":
-            assert len(np.unique(pixels(path).reshape(-1, 3), axis=0)) > 100
-    assert pixels(written[-1]).shape == (270, 480, 3)
+            assert len(np.unique(pixels(path).reshape(-1, 4), axis=0)) > 100
+    assert pixels(written[-1]).shape[:2] == (270, 480)
     count, seconds = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "render.mp4"))
     assert count == 5 and seconds == pytest.approx(0.5, abs=0.01)
     assert Image.open(tmp_path / "render.gif").n_frames == 5

@@ -102,7 +102,8 @@ def test_laws_in_batches(law, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize(
-    ("law", "integrator"), [("johnson_cook", "newmark"), ("perzyna", "chung_lee"), ("voce", "central_differences")]
+    ("law", "integrator"),
+    [("johnson_cook", "newmark"), ("perzyna", "chung_lee"), ("voce", "houbolt"), ("voce", "central_differences")],
 )
 def test_restart_is_bitwise(law, integrator, comm, shared_tmp_path):
     """A chain that flows while its temperature changes and, where the law takes a table, softens."""

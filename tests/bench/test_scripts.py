@@ -45,6 +45,7 @@ def test_bare_loop_moves_as_the_program_does(mode):
     assert ours["bars"] == bare["bars"]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_implicit_operators_agree():
     tops = [driver("run_ours.py", 3, "implicit", 4, operator)["top"] for operator in ("matrix_free", "assembled")]

@@ -114,12 +114,3 @@ def test_result_that_is_none(verb, tmp_path, capsys):
     (tmp_path / "result.vtkhdf").write_text("this is no HDF5 file")
     assert main([verb, str(tmp_path)]) == 2
     assert str(tmp_path / "result.vtkhdf") in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_petsc_takes_its_options(on_ranks, tmp_path):
-    done = on_ranks(
-        2, "-m", "pfem_petsc", "rod_impact", "--quiet", "--set", "time.end=0.05", "--", "-log_view", cwd=tmp_path
-    )
-    assert done.returncode == 0, done.stderr
-    assert "PETSc Performance Summary" in done.stdout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shutil
 import signal
 
 import h5py
@@ -58,25 +59,31 @@ def test_files_of_any_number_of_ranks(mass, shared_tmp_path, comm):
         assert (steps.history["frequency"] == ours.modes.frequency).all()
 
 
-def test_a_reader_of_paraview_sees_a_step_a_mode(tmp_path):
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The results of the block."""
+    folder = tmp_path_factory.mktemp("block") / "out"
+    run(block(), folder)
+    return folder
+
+
+def test_a_reader_of_paraview_sees_a_step_a_mode(finished):
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkIOHDF import vtkHDFReader
 
-    run(block(), tmp_path)
     reader = vtkHDFReader()
-    reader.SetFileName(str(tmp_path / "modes.vtkhdf"))
+    reader.SetFileName(str(finished / "modes.vtkhdf"))
     reader.UpdateInformation()
     assert reader.GetNumberOfSteps() == 8
     reader.SetStep(7)
     reader.Update()
     data = reader.GetOutput().GetPointData()
-    assert (vtk_to_numpy(data.GetArray("displacement")) == open_result(tmp_path).modes.shape[7]).all()
+    assert (vtk_to_numpy(data.GetArray("displacement")) == open_result(finished).modes.shape[7]).all()
 
 
 @pytest.mark.slow
-def test_damage_is_found(tmp_path):
-    run(block(), tmp_path)
-    path = open_result(tmp_path).path
+def test_damage_is_found(tmp_path, finished):
+    path = open_result(shutil.copytree(finished, tmp_path / "out")).path
     with h5py.File(path, "r+") as file:
         file["modes/shape"][2, 5, 1] += 1e-12
         file["modes/frequency"][7] *= 1.0 + 1e-12
@@ -143,22 +150,21 @@ def test_signals_end_the_program_while_modes_are_computed(tmp_path, monkeypatch)
     assert told == {before} < set(handlers.values())
 
 
-def test_modes_of_the_initial_state_again(tmp_path):
-    run(block(), tmp_path / "out")
+def test_modes_of_the_initial_state_again(tmp_path, finished):
+    shutil.copytree(finished, tmp_path / "out")
     assert run(block(), tmp_path / "out", restart=True).finished
     run(block(count=7), tmp_path / "out", restart=True)
     assert open_result(tmp_path / "out").n_modes == 7
     assert open_result(tmp_path / "out.1").n_modes == 8
 
 
-def test_modes_at_the_end_of_time_stepping(tmp_path):
+def test_modes_at_the_end_of_time_stepping(tmp_path, finished):
     """A free block in flight: the frequencies are those of the block at rest, but for its strains."""
-    data = block(count=9).to_dict()
-    run(block(count=9), tmp_path / "rest")
+    data = block().to_dict()
     flight = {"time": {"integrator": "central_differences", "step": "auto", "end": 1e-3}, "output": {"fields_every": 0}}
     data |= flight | {"initial": {"velocity": [1.0, 0.0, 0.0]}}
     run(Case.from_dict(data), tmp_path / "flight")
-    rest, found = (open_result(tmp_path / name).modes.frequency for name in ("rest", "flight"))
+    rest, found = (open_result(folder).modes.frequency for folder in (finished, tmp_path / "flight"))
     assert found[6:] == pytest.approx(rest[6:], rel=1e-8)
 
 
@@ -175,14 +181,13 @@ def test_where_slepc_is_not_there(monkeypatch):
         Simulation(block(solver="slepc"), MPI.COMM_SELF, check_only=True)
 
 
-def test_check_and_info_tell_of_modes(tmp_path, capsys):
+def test_check_and_info_tell_of_modes(tmp_path, finished, capsys):
     (tmp_path / "block.toml").write_text(block().to_toml())
     assert main(["check", str(tmp_path / "block.toml")]) == 0
     assert "8 natural vibrations of the state at the end, lumped mass, solver dense" in capsys.readouterr().out
-    run(block(), tmp_path / "out")
-    assert main(["info", str(tmp_path / "out"), "--verify"]) == 0
+    assert main(["info", str(finished), "--verify"]) == 0
     told = capsys.readouterr().out
-    frequency = open_result(tmp_path / "out").modes.frequency
+    frequency = open_result(finished).modes.frequency
     assert "modes of vibration, frequency [Hz]:" in told and f"{frequency[7]:.6g}" in told
 
 
@@ -193,9 +198,8 @@ def test_initial_velocities_without_time_are_refused(key):
         Simulation(Case.from_dict(data), MPI.COMM_SELF, check_only=True)
 
 
-def test_frames_of_modes(tmp_path):
-    run(block(), tmp_path)
-    with open_result(tmp_path) as result:
+def test_frames_of_modes(finished):
+    with open_result(finished) as result:
         frames = ModeFrames(result, [7, 8], period=4)
         assert len(frames.times) == 8
         rest = result.positions(-1)
@@ -211,10 +215,10 @@ def test_frames_of_modes(tmp_path):
             ModeFrames(result, None, period=3)
 
 
-def test_pictures_of_modes(tmp_path):
-    run(block(), tmp_path)
-    written = render_modes(tmp_path, modes=[7], period=4, size=(320, 180), video="none", note=lambda text: None)
-    assert [path.relative_to(tmp_path / "modes").as_posix() for path in written] == [
+def test_pictures_of_modes(tmp_path, finished):
+    folder = shutil.copytree(finished, tmp_path / "out")
+    written = render_modes(folder, modes=[7], period=4, size=(320, 180), video="none", note=lambda text: None)
+    assert [path.relative_to(folder / "modes").as_posix() for path in written] == [
         "render.png",
         *(f"frames/frame_{k:04d}.png" for k in range(4)),
     ]

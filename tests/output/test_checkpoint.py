@@ -187,7 +187,7 @@ while True:
 
 @pytest.mark.slow
 def test_a_kill_leaves_a_complete_checkpoint(tmp_path, chance):
-    for _ in range(6):
+    for _ in range(3):
         writer = subprocess.Popen(
             [sys.executable, "-c", WRITER, HERE, str(tmp_path)],
             stdout=subprocess.PIPE,

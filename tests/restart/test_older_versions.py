@@ -92,15 +92,3 @@ def test_checkpoints_are_refused(version, tmp_path, capsys):
         f"restart with the version of pfem_petsc that wrote it ({version}), or start without --restart"
     ) in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-
-
-def test_checkpoint_of_older_version_is_refused_on_two_ranks(tmp_path, on_ranks):
-    """Once, not by each rank; the results stay as they are."""
-    folder = of_version("0.2.0", tmp_path)
-    case = tmp_path / "case.toml"
-    case.write_text(open_result(folder).case_text)
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    done = on_ranks(2, "-m", "pfem_petsc", case, "-o", folder, "--restart", "--set", "time.end=3e-5")
-    assert done.returncode == 2, done.stderr
-    assert done.stderr.count("checkpoint.h5: holds version 6 of a run's state") == 1
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before

@@ -12,6 +12,7 @@ import hashlib
 import re
 import zipfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -39,8 +40,7 @@ class Columns:
         self, names: list[str | None], values: Callable[[int], np.ndarray], where: Callable[[int], str]
     ) -> None:
         self.names, self.count = names, len(names)
-        self._values, self.where = values, where
-        self._read: dict[int, np.ndarray] = {}
+        self._values, self.where = cache(values), where
 
     def find(self, column: str | int) -> int:
         """Return the number of a column given by name or number.
@@ -64,10 +64,7 @@ class Columns:
 
     def values(self, column: str | int) -> np.ndarray:
         """Return the numbers (n,) of a column, which may be missing or not finite where a cell is."""
-        k = self.find(column)
-        if k not in self._read:
-            self._read[k] = self._values(k)
-        return self._read[k]
+        return self._values(self.find(column))
 
 
 def file_columns(path: Path) -> Columns:

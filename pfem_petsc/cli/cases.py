@@ -243,11 +243,6 @@ OF_CHECK = (
 )
 
 
-def _ranks_of_check(arguments: argparse.Namespace) -> str:
-    """Return which ranks the verb needs: the check of a machine must not start an MPI that may be broken."""
-    return "one, without MPI" if arguments.env else "all"
-
-
 def check(arguments: argparse.Namespace, comm: MPI.Comm | None = None) -> int:
     """Build the simulation without a step, and print its summary. Collective."""
     if arguments.env:
@@ -389,7 +384,8 @@ VERBS = (
         "check",
         "Check a case: read it, build its mesh and model, and summarise the run. Or, by --env, check this machine.",
         CHECK,
-        _ranks_of_check,
+        # the check of a machine must not start an MPI that may be broken
+        lambda arguments: "one, without MPI" if arguments.env else "all",
         OF_CHECK,
         check,
     ),

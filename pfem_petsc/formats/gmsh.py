@@ -282,7 +282,8 @@ def _parsed(path: Path, content: mmap.mmap, fields: Mapping[str, str] | None) ->
     numbers = section("Nodes")
     n_blocks, n_nodes = (0, numbers.count()) if layout.old else numbers.sizes(4)[:2].tolist()
     yield "nodes", n_nodes
-    yield from _batched(_nodes_2(numbers, n_nodes) if layout.old else _nodes_4(path, numbers, n_blocks, n_nodes))
+    plain = (piece for rows in numbers.rows(n_nodes, 3) for piece in zip(("tags", "points"), rows))
+    yield from _batched(plain if layout.old else _nodes_4(path, numbers, n_blocks, n_nodes))
     numbers.end()
     numbers = section("Elements")
     if layout.old:
@@ -368,11 +369,6 @@ def _entities(numbers: _Section) -> dict[tuple[int, int], list[int]]:
                 numbers.ints(int(numbers.sizes(1)[0]))
     # Surfaces and volumes follow, which have no bars.
     return groups
-
-
-def _nodes_2(numbers: _Section, n_nodes: int) -> Rows:
-    for tags, points in numbers.rows(n_nodes, 3):
-        yield from (("tags", tags), ("points", points))
 
 
 def _nodes_4(path: Path, numbers: _Section, n_blocks: int, n_nodes: int) -> Rows:

@@ -163,74 +163,67 @@ def fit(
     return Camera(towards, up, right, centre, distance, distance * slope, False)
 
 
-@dataclass(frozen=True)
-class Moves:
-    """The view of a film and its movement.
-
-    Parameters
-    ----------
-    view : name of a view, or the direction (3,) from the structure to the eye
-    zoom : factor on the size of the structure in the picture
-    orbit : angle [degrees] that the camera goes around the upward direction from the first frame to the last
-    path : (k, 4) times [s], azimuths and elevations [degrees], zooms; between these the camera moves smoothly
-    follow : "structure", or the name of a probe, that stays in the middle of the picture; None: nothing
+def check_moves(options: Any) -> None:
+    """Refuse ``zoom``, ``orbit`` and ``path`` of options that make no film.
 
     Raises
     ------
     InputError
-        For numbers that make no film.
     """
+    if not 1e-3 <= options.zoom <= 1e3:
+        raise InputError(f"render: zoom = {options.zoom:g} must be from 0.001 to 1000")
+    if not np.isfinite(options.orbit):
+        raise InputError(f"render: orbit = {options.orbit:g} is not a number of degrees")
+    if options.path is None:
+        return
+    if options.orbit:
+        raise InputError("render: orbit and path both move the camera; give one of the two")
+    path = np.asarray(options.path, dtype=float)
+    if path.ndim != 2 or path.shape[1] != 4 or not len(path) or not np.isfinite(path).all():
+        raise InputError("render: path takes rows of four numbers: time, azimuth, elevation, zoom")
+    if (np.diff(path[:, 0]) <= 0.0).any():
+        raise InputError("render: path: times must increase from row to row")
+    if (np.abs(path[:, 2]) > 89.0).any() or (path[:, 3] <= 0.0).any():
+        raise InputError("render: path: elevations go from -89 to 89 degrees, and zooms are positive")
 
-    view: str | Sequence[float] = "auto"
-    zoom: float = 1.0
-    orbit: float = 0.0
-    path: np.ndarray | None = None
-    follow: str | None = None
 
-    def __post_init__(self) -> None:
-        if not 1e-3 <= self.zoom <= 1e3:
-            raise InputError(f"render: zoom = {self.zoom:g} must be from 0.001 to 1000")
-        if not np.isfinite(self.orbit):
-            raise InputError(f"render: orbit = {self.orbit:g} is not a number of degrees")
-        if self.path is None:
-            return
-        if self.orbit:
-            raise InputError("render: orbit and path both move the camera; give one of the two")
-        path = np.asarray(self.path, dtype=float)
-        if path.ndim != 2 or path.shape[1] != 4 or not len(path) or not np.isfinite(path).all():
-            raise InputError("render: path takes rows of four numbers: time, azimuth, elevation, zoom")
-        if (np.diff(path[:, 0]) <= 0.0).any():
-            raise InputError("render: path: times must increase from row to row")
-        if (np.abs(path[:, 2]) > 89.0).any() or (path[:, 3] <= 0.0).any():
-            raise InputError("render: path: elevations go from -89 to 89 degrees, and zooms are positive")
-        object.__setattr__(self, "path", path)
+def cameras(options: Any, motion: Any, aspect: float) -> list[Camera]:
+    """Return the camera of each frame of a motion; all have the same scale, but for the zooms of a path.
 
-    def cameras(self, motion: Any, aspect: float) -> list[Camera]:
-        """Return the camera of each frame of a motion; all have the same scale, but for the zooms of a path."""
-        towards, up, parallel = direction(self.view, motion.bounds, motion.normals, motion.upward)
-        points, count = motion.surroundings, len(motion.frames)
-        if not self.orbit and self.path is None and self.follow is None:
-            return [fit(points, (towards, up, parallel), aspect).zoomed(self.zoom)] * count
-        ways, zooms = [(towards, up, parallel)] * count, np.full(count, self.zoom)
-        if self.orbit:
-            from scipy.spatial.transform import Rotation
+    Parameters
+    ----------
+    options : ``view``: name of a view, or the direction (3,) from the structure to the eye; ``zoom``: factor on the
+        size in the picture; ``orbit``: angle [degrees] that the camera goes around the upward direction from the first
+        frame to the last; ``path``: (k, 4) times [s], azimuths and elevations [degrees], zooms, between which it moves
+        smoothly; ``follow``: "structure" or the name of a probe that stays in the middle of the picture
+    motion : of the film
+    aspect : width of the picture over its height
+    """
+    towards, up, parallel = direction(options.view, motion.bounds, motion.normals, motion.upward)
+    points, count = motion.surroundings, len(motion.frames)
+    if not options.orbit and options.path is None and options.follow is None:
+        return [fit(points, (towards, up, parallel), aspect).zoomed(options.zoom)] * count
+    ways, zooms = [(towards, up, parallel)] * count, np.full(count, options.zoom)
+    if options.orbit:
+        from scipy.spatial.transform import Rotation
 
-            turns = np.linspace(0.0, np.radians(self.orbit), count)[:, None] * up / np.linalg.norm(up)
-            ways = [(each, up, parallel) for each in Rotation.from_rotvec(turns).apply(towards)]
-        if self.path is not None:
-            azimuths, elevations, factors = (_smooth(motion.times, self.path[:, 0], self.path[:, k]) for k in (1, 2, 3))
-            angles = zip(np.radians(azimuths), np.radians(elevations), strict=True)
-            ways = [(_towards(*each, motion.upward), motion.upward, False) for each in angles]
-            zooms = zooms * factors
-        if self.follow is None:
-            centre = motion.bounds.mean(axis=0)
-            made = [fit(points, way, aspect, centre=centre) for way in ways]
-        else:
-            centres = motion.boxes.mean(axis=1) if self.follow == "structure" else motion.probe(self.follow)
-            held = zip(ways, motion.hulls, centres, strict=True)
-            made = [fit(hull, way, aspect, margin=1.25, centre=centre) for way, hull, centre in held]
-        (made,) = at_one_scale([made])
-        return [camera.zoomed(zoom) for camera, zoom in zip(made, zooms, strict=True)]
+        turns = np.linspace(0.0, np.radians(options.orbit), count)[:, None] * up / np.linalg.norm(up)
+        ways = [(each, up, parallel) for each in Rotation.from_rotvec(turns).apply(towards)]
+    if options.path is not None:
+        when, *rest = np.asarray(options.path, dtype=float).T
+        azimuths, elevations, factors = (_smooth(motion.times, when, each) for each in rest)
+        angles = zip(np.radians(azimuths), np.radians(elevations), strict=True)
+        ways = [(_towards(*each, motion.upward), motion.upward, False) for each in angles]
+        zooms = zooms * factors
+    if options.follow is None:
+        centre = motion.bounds.mean(axis=0)
+        made = [fit(points, way, aspect, centre=centre) for way in ways]
+    else:
+        centres = motion.boxes.mean(axis=1) if options.follow == "structure" else motion.probe(options.follow)
+        held = zip(ways, motion.hulls, centres, strict=True)
+        made = [fit(hull, way, aspect, margin=1.25, centre=centre) for way, hull, centre in held]
+    (made,) = at_one_scale([made])
+    return [camera.zoomed(zoom) for camera, zoom in zip(made, zooms, strict=True)]
 
 
 def camera_path(file: Path | str) -> np.ndarray:

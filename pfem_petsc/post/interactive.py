@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, written
-from .camera import Camera
+from .camera import Camera, cameras
 from .chart import opened
 from .motion import chosen_frames
 from .options import Options
@@ -64,7 +64,7 @@ def _figure(film: Film) -> Any:
         raise InputError("render: --html needs plotly, which is not installed: pip install plotly") from error
 
     motion, colour, scale = film.motions[0], film.colours[0], film.scale
-    frame, camera = motion.frames[0], film.options.moves.cameras(motion, 1.6)[0]
+    frame, camera = motion.frames[0], cameras(film.options, motion, 1.6)[0]
     start, now, gone = motion.start, motion.positions(frame), motion.gone(frame)
     bars, radius = _bars(film, None, camera, 720)
     steps = np.linspace(0.0, 1.0, next((count for most, count in _SHAPES if motion.n_bars <= most), 2))
@@ -185,7 +185,7 @@ def plotter_of(
     last = len(result.times) - 1
     film = Film([result], Options(frames=range(last + 1), **options), note)
     motion, colour, scale = film.motions[0], film.colours[0], film.scale
-    camera = film.options.moves.cameras(motion, 4 / 3)[0]
+    camera = cameras(film.options, motion, 4 / 3)[0]
     plotter = pyvista.Plotter(off_screen=off_screen, title=film.title)
     plotter.background_color = "white"
     plotter.enable_anti_aliasing("msaa")

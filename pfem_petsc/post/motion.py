@@ -316,8 +316,6 @@ def even_times(times: np.ndarray, rate: float, span: Sequence[float] | None) -> 
     InputError
         For a rate that makes no film.
     """
-    if len(times) == 0:
-        raise InputError("render: the result holds no snapshots; set [output] fields_every and run again")
     if not (np.isfinite(rate) and rate > 0.0):
         raise InputError(f"render: rate = {rate:g} frames per simulated second must be positive")
     first, last = (times[0], times[-1]) if span is None else _checked(span, times)

@@ -5,12 +5,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..errors import InputError
-
-if TYPE_CHECKING:
-    from .camera import Moves
 
 STYLES = ("auto", "tubes", "lines")
 VIDEOS = {
@@ -146,7 +143,7 @@ class Options:
     title: str | None = _option(None, "title of the pictures; default: that of the case")
 
     def __post_init__(self) -> None:
-        from .camera import camera_path
+        from .camera import camera_path, check_moves
 
         video, size = self.video or ("webm" if self.transparent else "mp4"), self.size
         if video not in VIDEOS:
@@ -170,7 +167,7 @@ class Options:
             raise InputError(f"render: bar_width = {self.bar_width:g} must be positive, and 500 pixels at most")
         if isinstance(self.path, str):
             object.__setattr__(self, "path", camera_path(self.path))
-        assert self.moves  # refuses what makes no film
+        check_moves(self)
         if isinstance(self.frames, Iterable):
             object.__setattr__(self, "frames", list(self.frames))
 
@@ -178,13 +175,6 @@ class Options:
     def kinds(self) -> tuple[str, ...]:
         """The kinds of films to make."""
         return VIDEOS[self.video or ("webm" if self.transparent else "mp4")]
-
-    @property
-    def moves(self) -> Moves:
-        """The view and its movement."""
-        from .camera import Moves
-
-        return Moves(self.view, self.zoom, self.orbit, self.path, self.follow)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import InputError, written
 from ..parallel.agreement import agreed
-from .camera import at_one_scale
+from .camera import at_one_scale, cameras
 from .chart import opened
 from .colours import MARKS, ColourField, ColourScale, limits_of
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_times
@@ -276,7 +276,7 @@ class Film:
         """Make cameras, page and scenes for tiles of a page, in pixels."""
         self.close()
         options = self.options
-        self._cameras = [options.moves.cameras(motion, tile[0] / tile[1]) for motion in self.motions]
+        self._cameras = [cameras(options, motion, tile[0] / tile[1]) for motion in self.motions]
         if len(self.motions) > 1 and options.path is None:
             self._cameras = at_one_scale(self._cameras)
         marks = [MARKS[mark] for mark in options.marks]
@@ -300,7 +300,7 @@ class Film:
 
     def _aspect(self, motion: Motion) -> float:
         """Return the width of the motion over its height, in the picture."""
-        look, points = self.options.moves.cameras(motion, 1.0)[0], motion.surroundings
+        look, points = cameras(self.options, motion, 1.0)[0], motion.surroundings
         across, along = (float(np.ptp(points @ way)) for way in (look.right, look.up))
         return across / max(along, 1e-3 * across, 1e-300)
 

@@ -216,13 +216,9 @@ class ConstraintSet:
                 leaving[:, flags.stop :] = state.position[at]
             far = rows.partners.bring(leaving)
         free_positions(rows.where, balance.predictor, u, far, x)
-
-        def given() -> tuple[np.ndarray, np.ndarray | None]:
-            start = rows.spread(state.position, far[:, flags.stop :]) if turns else None
-            return rows.spread(stiffness, far[:, 3]), start
-
+        start = rows.spread(state.position, far[:, flags.stop :]) if turns else None
         planes = walls.planes(x, far[:, flags], balance.time) if walls.any else None
-        self.force, self.jacobian = rows.project(x, tolerance, given, planes)
+        self.force, self.jacobian = rows.project(x, rows.spread(stiffness, far[:, 3]), tolerance, start, planes)
         if not self.force.any():
             return none
         load, contact = rows.forces(self.jacobian, self.force), np.zeros(u.shape)

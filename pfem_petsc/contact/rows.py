@@ -236,9 +236,6 @@ _TAG = 7700  # of messages between ranks with nodes of the same rows, distinct f
 Planes = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Walls at nodes: ``plane``, ``normals`` and ``gaps`` of :class:`~pfem_petsc.contact.projection.System`."""
 
-Given = Callable[[], tuple[np.ndarray, np.ndarray | None]]
-"""See :meth:`RowSet.project`."""
-
 
 @dataclass(frozen=True)
 class Alike:
@@ -532,16 +529,20 @@ class RowSet:
         return ", ".join(str(number) for number in self.numbers[nodes[starts[group] : starts[group + 1]]][:6])
 
     def project(
-        self, x: np.ndarray, tolerance: float, given: Given, planes: Planes | None = None
+        self,
+        x: np.ndarray,
+        stiffness: np.ndarray,
+        tolerance: float,
+        start: np.ndarray | None = None,
+        planes: Planes | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return forces (r,) [N] that satisfy the rows, and the gradients (r, k, 3) along which they act.
 
         Parameters
         ----------
-        x : (n, 3) positions without rows [m]
+        x, stiffness : (n, 3), (n,) positions without rows, and forces for displacements of the nodes [m], [N/m]
         tolerance : [m]
-        given : asked if groups are to be solved; gives the stiffness (n,) of the nodes [N/m] and positions (n, 3) where
-            the forces act, None: at the solution
+        start : (n, 3) positions where the forces act, None: at the solution
         planes : of walls at the nodes, if there are any
 
         Raises
@@ -553,7 +554,7 @@ class RowSet:
         groups, tolerances = self._broken(values, planes or self._no_planes, x, tolerance)
         if len(groups) == 0:
             return force, jacobian
-        (stiffness, start), moves = given(), np.empty_like(x)
+        moves = np.empty_like(x)
         if not self._turning[groups].any():
             self._solve(groups, self.system(jacobian, values, stiffness, planes), tolerances, force, moves)
             return force, jacobian

@@ -160,7 +160,7 @@ class RowCoordinates:
         tolerance = PROJECTED * self.constraints.contact.size
         start = self._start if self._part == 0.0 else None
         with agreed(self.comm):
-            force, jacobian = rows.project(x, tolerance, lambda: (k, start))
+            force, jacobian = rows.project(x, k, tolerance, start)
         u[here] += (rows.forces(jacobian, force) * rows.free / k[:, None])[rows.mine]
 
     def forward(self, w: np.ndarray) -> None:
@@ -332,6 +332,7 @@ class Transform:
     Attributes
     ----------
     links : tuple of these
+    frames : of owned nodes whose coordinates are not those of x
     sliding : friction forces on slipping nodes; has no nodes without friction
     identity : whether w equals u and the residual is unchanged
     bounded : whether the solve has bounds
@@ -348,15 +349,10 @@ class Transform:
         self.bounded = frames is not None or bool(self.links)
         self.identity = not self._oblique and not self.links
         # frames along the axes change no coordinates
-        self._frames = frames if self._oblique else NodalFrames(np.empty(0, dtype=np.int64), walls)
-        self.sliding = self._frames.sliding
+        self.frames = frames if self._oblique else NodalFrames(np.empty(0, dtype=np.int64), walls)
+        self.sliding = self.frames.sliding
         if self._oblique:
             self._share_frames()
-
-    @property
-    def frames(self) -> NodalFrames:
-        """Frames of owned nodes whose coordinates are not those of x."""
-        return self._frames
 
     @cached_property
     def nodewise(self) -> bool:
@@ -364,7 +360,7 @@ class Transform:
         return not self.links and not self.mesh.comm.allreduce(int(len(self.sliding.nodes) > 0))
 
     def _share_frames(self) -> None:
-        mesh, frames = self.mesh, self._frames
+        mesh, frames = self.mesh, self.frames
         inverse = np.zeros((mesh.n_local, 10))
         inverse[frames.nodes, 0] = 1.0
         inverse[frames.nodes, 1:] = frames.inverse.reshape(-1, 9)
@@ -378,27 +374,27 @@ class Transform:
         """Transform w (owned, 3) to u, in place. Collective."""
         for link in reversed(self.links):
             link.forward(w)
-        at = self._frames.nodes
-        w[at] = np.einsum("nij,nj->ni", self._frames.inverse, w[at])
+        at = self.frames.nodes
+        w[at] = np.einsum("nij,nj->ni", self.frames.inverse, w[at])
 
     def inverse(self, u: np.ndarray) -> None:
         """Transform u (owned, 3) to w, in place. Collective."""
-        at = self._frames.nodes
-        u[at] = np.einsum("nij,nj->ni", self._frames.basis, u[at])
+        at = self.frames.nodes
+        u[at] = np.einsum("nij,nj->ni", self.frames.basis, u[at])
         for link in self.links:
             link.inverse(u)
 
     def residual(self, predictor: np.ndarray, u: np.ndarray, g: np.ndarray) -> None:
         """Transform the residual force (owned, 3) at predictor + u to the residual of w, in place. Collective."""
-        at, slipping = self._frames.nodes, self.sliding.nodes
-        g[at] = np.einsum("nji,nj->ni", self._frames.inverse, g[at])
+        at, slipping = self.frames.nodes, self.sliding.nodes
+        g[at] = np.einsum("nji,nj->ni", self.frames.inverse, g[at])
         g[slipping] = self.sliding.couple(predictor[slipping] + u[slipping], g[slipping])
         for link in self.links:
             link.adjoint(g)
 
     def left(self) -> np.ndarray:
         """Matrices (m, 3, 3) that map the residual force at framed nodes to the residual, at the last evaluation."""
-        left = self._frames.inverse.transpose(0, 2, 1).copy()
+        left = self.frames.inverse.transpose(0, 2, 1).copy()
         at = self.sliding.at
         left[at] = self.sliding.maps @ left[at]
         return left
@@ -408,7 +404,7 @@ class Transform:
 
         ``left`` : value of :meth:`left` where H was evaluated.
         """
-        at, slipping = self._frames.nodes, self.sliding.nodes
+        at, slipping = self.frames.nodes, self.sliding.nodes
         out[slipping] += np.einsum("nij,nj->ni", self.sliding.stiffness, u[slipping])
         out[at] = np.einsum("nij,nj->ni", left, out[at])
         for link in self.links:
@@ -416,16 +412,16 @@ class Transform:
 
     def diagonal(self, left: np.ndarray, blocks: BlocksOf, diagonal: np.ndarray) -> None:
         """Replace the diagonal (owned, 3) of H by that of the derivative of the residual. Collective."""
-        nodes = self._frames.nodes
+        nodes = self.frames.nodes
         full = blocks(nodes)
         full[self.sliding.at] += self.sliding.stiffness
-        diagonal[nodes] = np.einsum("nij,njk,nki->ni", left, full, self._frames.inverse)
+        diagonal[nodes] = np.einsum("nij,njk,nki->ni", left, full, self.frames.inverse)
         for link in self.links:
             link.diagonal(lambda some: self._in_frames(some, blocks(some)), diagonal)
 
     def _in_frames(self, nodes: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-        _, at, place = np.intersect1d(nodes, self._frames.nodes, return_indices=True)
-        inverse = self._frames.inverse[place]
+        _, at, place = np.intersect1d(nodes, self.frames.nodes, return_indices=True)
+        inverse = self.frames.inverse[place]
         blocks[at] = inverse.transpose(0, 2, 1) @ blocks[at] @ inverse
         return blocks
 

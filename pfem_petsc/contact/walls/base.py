@@ -144,10 +144,15 @@ def slab(name: str, face: np.ndarray, normal: np.ndarray, thickness: float) -> S
     )
 
 
+def perpendicular(axis: np.ndarray) -> np.ndarray:
+    """Return a unit vector across an axis."""
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    return across / np.linalg.norm(across)
+
+
 def revolved(name: str, profile: np.ndarray, centre: np.ndarray, axis: np.ndarray, segments: int = 48) -> Surface:
     """Return the surface of revolution of a profile (p, 2), radius and height [m], about an axis through ``centre``."""
-    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    first /= np.linalg.norm(first)
+    first = perpendicular(axis)
     second = np.cross(axis, first)
     angles = 2.0 * np.pi * np.arange(segments) / segments
     around = np.multiply.outer(np.cos(angles), first) + np.multiply.outer(np.sin(angles), second)

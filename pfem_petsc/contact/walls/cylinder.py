@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import field_validator
 
 from ...case.base import PositiveFloat, Vector3
-from .base import BaseWall, Surface, WallKeys, direction, revolved
+from .base import BaseWall, Surface, WallKeys, direction, perpendicular, revolved
 from .sphere import radial_planes
 
 
@@ -39,7 +39,7 @@ class Wall(BaseWall):
         self.axis = axis / np.linalg.norm(axis)
         self.radius = parameters.radius
         self.sign = 1.0 if parameters.side == "outside" else -1.0
-        self.across = _across(self.axis)
+        self.across = perpendicular(self.axis)
 
     def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         arm = x - self.centre
@@ -49,11 +49,6 @@ class Wall(BaseWall):
     def gaps(self, x: np.ndarray) -> np.ndarray:
         arm = x - self.centre
         return self.sign * (np.linalg.norm(arm - np.multiply.outer(arm @ self.axis, self.axis), axis=1) - self.radius)
-
-
-def _across(axis: np.ndarray) -> np.ndarray:
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    return across / np.linalg.norm(across)
 
 
 def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:

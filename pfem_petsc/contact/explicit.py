@@ -483,15 +483,19 @@ class ExplicitContact(NodeWalls):
         self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
     ) -> tuple:
         w = len(self.walls)
-        planes = self.normals, self.plane_offsets(time), self.all_nodes, self.members
-        walls = FlatWalls(self.fixed, *planes, tolerance, self._room)
-        sums = WallSums(np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3)))
+        walls, sums = self.flat_walls(time, tolerance), WallSums(np.zeros((w, 3)), np.zeros(w, int), np.zeros((w, 3)))
         nodes, infeasible, offsets, force, touching, places = press_planes(predictor, u, walls, stiffness, sums)
         if infeasible >= 0:
             raise SimulationFailure(self.infeasible_message(nodes[infeasible], offsets[infeasible]))
         if len(nodes) == 0:
             return nodes, force, self.nothing
         return nodes, force, WallForces(*sums, nodes, touching, places)
+
+    def flat_walls(self, time: float, tolerance: float) -> FlatWalls:
+        """Return plain walls at a time [s] for compiled passes; planes violated by at most the tolerance [m] count as
+        satisfied."""
+        planes = self.normals, self.plane_offsets(time), self.all_nodes, self.members
+        return FlatWalls(self.fixed, *planes, tolerance, self._room)
 
     def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
         """Find the final positions of walls with mass in an explicit step. Collective."""

@@ -29,6 +29,7 @@ from .batch_loop import (
     make_batch_loop,
     new_records,
 )
+from .impact import Touched
 from .stepper import Instants, Solution
 
 if TYPE_CHECKING:
@@ -88,10 +89,10 @@ class Batch:
 
     def _wall_arrays(self) -> WallArrays:
         contact, log = self.model.contact, self.model.contact.log
-        walls = (contact.fixed, contact.normals, contact.plane_offsets(0.0), contact.all_nodes, contact.members)
-        room = np.empty(len(contact.fixed), dtype=np.int64)
-        impact = self.stepper.closed, contact.restitution, self.ledger.impacts.slack
-        return WallArrays(*walls, PROJECTED * self.model.size, room, log.touching, log.present, log.releases, *impact)
+        touched = Touched(
+            log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.ledger.impacts.slack
+        )
+        return WallArrays(contact.flat_walls(0.0, PROJECTED * self.model.size), touched, log.present, log.releases)
 
     def _columns(self) -> Columns:
         """Return the columns of the bars, or none if bars are heated, can break or are not in diagonal runs."""

@@ -16,7 +16,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from ..columns import HEAD
-from ..contact.explicit import find_beyond, press_nodes
+from ..contact.explicit import FlatWalls, find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows, solve_rows
 from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import accelerations, advance, advance_loaded, centre, kick, move
@@ -24,7 +24,7 @@ from ..mechanics.compiled import borrowing, kernel
 from ..mechanics.elements import BarData, BatchParts, first_inverted
 from ..mechanics.runs import Columns, copy, exchange_history, join_components, new_rows, slide_planes, split_components
 from ..mesh.ordering import NODE_BLOCK
-from .impact import Approach, join_nodes, plane_gaps, stop_nodes, unpressed
+from .impact import Approach, Touched, join_nodes, plane_gaps, stop_nodes, unpressed
 from .impulses import WALLS
 from .ledger_loops import (
     CONTACT,
@@ -89,19 +89,10 @@ class NodeArrays(NamedTuple):
 class WallArrays(NamedTuple):
     """Flat walls and their log; see :mod:`~pfem_petsc.contact.explicit` and :mod:`~pfem_petsc.contact.node_walls`."""
 
-    fixed: np.ndarray
-    normals: np.ndarray
-    offsets: np.ndarray
-    all_nodes: np.ndarray
-    members: np.ndarray
-    tolerance: float
-    room: np.ndarray
-    touching: np.ndarray
+    flat: FlatWalls
+    touched: Touched
     present: np.ndarray
     releases: np.ndarray
-    closed: np.ndarray
-    restitution: np.ndarray
-    slack: float
 
 
 class EndArrays(NamedTuple):
@@ -539,9 +530,9 @@ def mark_blocks(marks, nodes, value):
 
 @borrowing
 def find_pressed(block, walls, free):
-    """Write the nodes of a block that lie beyond a plane at ``free`` (3 m,) to ``walls.room``; return their number."""
+    """Write the nodes of a block that lie beyond a plane at ``free`` (3 m,) to the walls' room; return their number."""
     first = NODE_BLOCK * block
-    return find_beyond(first, free, walls, walls.room)
+    return find_beyond(first, free, walls.flat, walls.flat.room)
 
 
 @kernel
@@ -556,14 +547,14 @@ def press_block(block, counts, nodes, walls, shared, places_of, out):
     free, u = places_of
     contact, pressed = out
     first = NODE_BLOCK * block
-    found = walls.room[:m].copy()
+    found = walls.flat.room[:m].copy()
     places, stiffness = np.empty((m, 3)), np.empty(m)
     for j in range(m):
         i = found[j]
         stiffness[j] = nodes.stiffness[i]
         for c in range(3):
             places[j, c] = free[3 * (i - first) + c]
-    infeasible, offsets, total, touching = press_nodes(found, places, walls, stiffness, pressed)
+    infeasible, offsets, total, touching = press_nodes(found, places, walls.flat, stiffness, pressed)
     for j in range(m):
         i = found[j]
         for c in range(3):
@@ -592,17 +583,17 @@ def stop_at_walls(nodes, walls, shared, state, u, touched, met):
     for i in around:
         centre(u[i], eta, half[i], v[i])
         accelerations(u[i], alpha, a[i])
-    all_normals, gaps = plane_gaps(around, x, walls.normals, walls.offsets)
+    all_normals, gaps = plane_gaps(around, x, walls.flat.normals, walls.flat.offsets)
     free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
     for j in range(len(around)):
         i = around[j]
         for c in range(3):
-            if walls.fixed[i, c]:  # wall forces do not change prescribed components
+            if walls.touched.fixed[i, c]:  # wall forces do not change prescribed components
                 free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
-    still = np.zeros(walls.normals.shape)
+    still = np.zeros(walls.flat.normals.shape)
     approach = Approach(all_normals, gaps, free_v, free_a, still, still)
-    counted = np.ones(len(walls.offsets), dtype=np.bool_)
-    return stop_nodes(around, approach, walls, nodes.mass, counted, np.empty(gaps.shape))
+    counted = np.ones(len(walls.flat.offsets), dtype=np.bool_)
+    return stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))
 
 
 @kernel
@@ -822,7 +813,7 @@ def make_batch_loop(parts: BatchParts) -> Callable:
         )
         ledger, powers, impulses, probes, records = data.ledger, data.powers, data.impulses, data.probes, data.records
         n = len(half)
-        n_walls = len(walls.offsets)
+        n_walls = len(walls.flat.offsets)
         f, a, v, support, contact, u = state.f, state.a, state.v, state.support, state.contact, state.u
         alpha = 1.0 / (h * h)
         eta = 0.5 / h
@@ -993,7 +984,7 @@ def make_batch_loop(parts: BatchParts) -> Callable:
                 near = pressed.nodes[:count_near]
                 if count_near > 0 or len(touched) > 0:
                     more, touched = compare_contacts(
-                        walls.touching, touched, near, pressed.touching, walls.present, walls.releases
+                        walls.touched.touching, touched, near, pressed.touching, walls.present, walls.releases
                     )
                     changes += more
             if lost != 0:
@@ -1007,7 +998,7 @@ def make_batch_loop(parts: BatchParts) -> Callable:
             if len(touched) > 0 or len(met) > 0:
                 impact, met = stop_at_walls(nodes, walls, shared, state, u, touched, met)
             if altered > 0:
-                impact += finish_rows(rows, altered, walls.slack, nodes, shared, state, u)
+                impact += finish_rows(rows, altered, walls.touched.slack, nodes, shared, state, u)
             sum_rows(rows, pressing)
             touching = len(near) + 2 * pressing
             after[:] = powers

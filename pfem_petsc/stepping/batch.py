@@ -184,36 +184,44 @@ class Batch:
         if made.lost:
             raise MPI.Exception(made.lost)
         model.links.import_rows(rows)
-        log.last, ledger.impacts.met = made.touched, made.met
+        end = made.done if comm.size == 1 else count
+        records, broken = Records(*(array[: made.recorded] for array in records)), stepper.ruptures.count
+        sound = self._take(made, records.energies[-1], end)
+        steps, noted = np.flatnonzero(due[:end]), np.zeros(end, dtype=np.int64)
+        if len(walls):
+            noted += log.note(flags[:end], stepper.h, comm) + 1 + np.arange(end)
+        sums = self._sums(records, broken)
+        if not len(steps):
+            log.changes += made.changes
+            return
+        shares = self._shares(made, records, sums, steps, sound)
+        number = begin + steps + 1
+        place = np.array([model.origin + at * stepper.h for at in number.tolist()])
+        stepper.instants = Instants(model.first_step + number, place, shares, noted[steps])
+
+    def _take(self, made: Made, energies: np.ndarray, end: int) -> int:
+        """Take the state after the last of ``end`` steps, with ``energies`` of the bars [J]; return how many of these
+        steps are sound."""
+        stepper, state, model = self.stepper, self.stepper.state, self.model
+        model.contact.log.last, self.ledger.impacts.met = made.touched, made.met
         state.support = self._support if model.supports.any else stepper.zero
         state.contact = self._contact if made.pressing else stepper.zero
-        stepper.energy = StrainEnergy(tuple(records.energies[made.recorded - 1].tolist()), made.failed)
-        forces = WallForces(made.force, made.contacts, made.moment, made.near, made.touching, made.places)
-        stepper.solution = Solution(
-            self._u, state.f, forces if len(walls) else model.contact.nothing, contacts=made.pressing
-        )
+        stepper.energy = StrainEnergy(tuple(energies.tolist()), made.failed)
+        walls = model.contact.nothing
+        if len(model.contact.walls):
+            walls = WallForces(made.force, made.contacts, made.moment, made.near, made.touching, made.places)
+        stepper.solution = Solution(self._u, state.f, walls, contacts=made.pressing)
+        begin = state.step
         state.step, state.time = begin + made.done - 1, (begin + made.done) * stepper.h
-        broken = stepper.ruptures.count
         if made.changed:
             stepper.ruptures.note(state.x, stepper.number + 1, stepper.arrived())
-        # ranks that have not synchronised since may know of an earlier failure, and rows are those of sound steps
-        failure, sound = self._failure(made), made.done if stepper.fault is None else 0
-        if failure is not None and stepper.fault is None:
+        sound = made.done
+        if stepper.fault is not None:  # that of an earlier batch, of which not all ranks know
+            sound = 0
+        elif (failure := self._failure(made)) is not None:
             stepper.fault, sound = failure, made.done - 1
-        if comm.size > 1:
-            state.step, state.time = begin + count - 1, (begin + count) * stepper.h
-        end = made.done if comm.size == 1 else count
-        noted = log.note(flags[:end], stepper.h, comm) + 1 if len(walls) else 0
-        sums = self._sums(Records(*(array[: made.recorded] for array in records)), broken)
-        steps = np.flatnonzero(due[:end])
-        if len(steps):
-            shares = self._shares(made, records, sums, steps, sound)
-            places = [model.origin + (begin + step + 1) * stepper.h for step in steps.tolist()]
-            number = model.first_step + begin + steps + 1
-            noted = noted + steps if len(walls) else np.zeros_like(steps)
-            stepper.instants = Instants(number, np.array(places), shares, noted)
-        else:
-            log.changes += made.changes
+        state.step, state.time = begin + end - 1, (begin + end) * stepper.h
+        return sound
 
     def _due(self, count: int) -> np.ndarray:
         """Return which of up to ``count`` steps to come have a row of the history; a row of bars that slacken ends a

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..tolerances import ON_BOUND
-from .explicit import Rubbing
+from .friction import Rubbing
 from .node_walls import WallForces
 from .projection import project
 

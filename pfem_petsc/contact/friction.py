@@ -1,0 +1,535 @@
+"""Coulomb friction of nodes at walls: the local problem of a node, solved by sweeps over its walls, nodes that friction
+jams, and which nodes of an implicit step stick or slip.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ..integrators.base import Balance, State
+from ..mechanics.compiled import inlined, kernel
+from ..tolerances import FREE_PART, ON_BOUND, PROJECTED
+from .frames import NodalFrames, Sliding
+from .node_walls import free_squares
+from .projection import project
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+    from .node_walls import NodeWalls
+
+_SWEEPS = 2000
+_SLIDES = 1e-13  # of the position: slips beyond are no rounding
+_OVERSHOOT = 0.9  # of the drag over the normal force, from which on sweeps go a part of the way
+
+
+class Rubbing(NamedTuple):
+    """Nodes (m,) at walls (w,) with friction in a step.
+
+    Attributes
+    ----------
+    before, way : (m, 3), (w, 3) positions of the nodes at its start, and displacements of the walls [m]
+    fixed : (m, 3) bool, components that supports prescribe
+    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; -inf where a wall does not apply
+    dynamic, static : (w,) coefficients of friction
+    stiffness : (m,) force for a displacement of a node [N/m]
+    """
+
+    before: np.ndarray
+    way: np.ndarray
+    fixed: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    dynamic: np.ndarray
+    static: np.ndarray
+    stiffness: np.ndarray
+
+    def of(self, some: np.ndarray, static: np.ndarray) -> Rubbing:
+        """Return some of the nodes (k,), with other static coefficients."""
+        nodes = {name: getattr(self, name)[some] for name in ("before", "fixed", "normals", "offsets", "stiffness")}
+        return self._replace(static=static, **nodes)
+
+    def apply(self, some: np.ndarray, static: np.ndarray, x: np.ndarray, normal: np.ndarray, drag: np.ndarray) -> None:
+        """See :func:`add_friction`, for some of the nodes (k,)."""
+        part = x[some], normal[some], drag[some]
+        add_friction(self.of(some, static), *part)
+        x[some], normal[some], drag[some] = part
+
+
+@inlined
+def slides_along_guide(i, rubbing, x, normal_forces, drag):
+    """Forces on a node that supports leave one component, pressed by one wall with friction: in closed form.
+
+    Where it is, and so its slip s, is decided by the wall alone. Along the free component f, with lambda_0 the normal
+    force without friction, lambda (n_f - mu s_f/|s|) = lambda_0 n_f: no sweeps are needed, which creep where the wall
+    is almost parallel to the guide.
+
+    Returns
+    -------
+    bool
+        Whether it is such a node, slides, and a normal force does it; otherwise nothing has changed.
+    """
+    before, way, fixed, normals, _, dynamic, _, _ = rubbing
+    free = -1
+    for c in range(3):
+        if not fixed[i, c]:
+            if free >= 0:
+                return False
+            free = c
+    if free < 0:
+        return False
+    wall = -1
+    for k in range(normal_forces.shape[1]):
+        if normal_forces[i, k] > 0.0:
+            if wall >= 0:
+                return False
+            wall = k
+    if wall < 0 or not dynamic[wall] > 0.0:
+        return False
+    n = normals[i, wall]
+    along = 0.0
+    for c in range(3):
+        along += (x[i, c] - before[i, c] - way[wall, c]) * n[c]
+    size, where = 0.0, 0.0
+    for c in range(3):
+        slip = x[i, c] - before[i, c] - way[wall, c] - along * n[c]
+        size += slip * slip
+        where += abs(x[i, c])
+    size = math.sqrt(size)
+    if not size > _SLIDES * where:
+        return False
+    slip = x[i, free] - before[i, free] - way[wall, free] - along * n[free]
+    helped = 1.0 - dynamic[wall] * slip / (size * n[free])
+    if not helped > _SLIDES:
+        return False
+    normal_forces[i, wall] /= helped
+    for c in range(3):
+        slip = x[i, c] - before[i, c] - way[wall, c] - along * n[c]
+        drag[i, wall, c] = -dynamic[wall] * normal_forces[i, wall] * slip / size
+    return True
+
+
+@kernel
+def add_friction(rubbing, x, normal_forces, drag):
+    """Apply friction forces to the nodes in contact with walls that have friction.
+
+    Parameters
+    ----------
+    rubbing : Rubbing
+    x : (m, 3) positions under the normal forces alone, changed in place [m]
+    normal_forces : (m, w) normal forces [N], changed in place
+    drag : (m, w, 3) friction forces, output [N]
+
+    Returns
+    -------
+    int
+        First node whose sweeps did not converge, or -1.
+    """
+    before, way, fixed, normals, offsets, dynamic, static, stiffness = rubbing
+    m, w = offsets.shape
+    trial = np.zeros(3)
+    unsettled = -1
+    for i in range(m):
+        pressed = False
+        for k in range(w):
+            for c in range(3):
+                drag[i, k, c] = 0.0
+            if normal_forces[i, k] > 0.0:
+                pressed = pressed or static[k] > 0.0
+        if not pressed or slides_along_guide(i, rubbing, x, normal_forces, drag):
+            continue
+        soft = 1.0 / stiffness[i]
+        reach = stiffness[i] * (
+            abs(x[i, 0]) + abs(x[i, 1]) + abs(x[i, 2])
+        )  # forces that correspond to the rounding of positions
+        # where supports leave little of a normal free, the friction force moves the node r times as far as the normal
+        # force; sweeps overshoot for r >= 1 unless they are underrelaxed
+        part = 1.0
+        for k in range(w):
+            if offsets[i, k] > -math.inf and static[k] > 0.0:
+                length = 0.0
+                for c in range(3):
+                    if not fixed[i, c]:
+                        length += normals[i, k, c] * normals[i, k, c]
+                if length >= 1e-12:
+                    ratio = static[k] * math.sqrt(max(1.0 - length, 0.0) / length)
+                    if ratio > _OVERSHOOT:
+                        part = min(part, 1.0 / (1.0 + ratio))
+        settled = False
+        for _ in range(_SWEEPS):
+            change = 0.0
+            largest = 0.0
+            least = 1.0  # where supports leave little of a normal free, rounding is amplified in forces
+            for k in range(w):
+                if offsets[i, k] == -math.inf:
+                    continue
+                length = 0.0
+                gap = -offsets[i, k]
+                for c in range(3):
+                    gap += normals[i, k, c] * x[i, c]
+                    if not fixed[i, c]:
+                        length += normals[i, k, c] * normals[i, k, c]
+                if length < 1e-12:
+                    continue
+                # normal
+                old = normal_forces[i, k]
+                new = max(0.0, old - gap * stiffness[i] / length)
+                if new == 0.0 and old == 0.0:
+                    continue
+                least = min(least, length)
+                change = max(change, abs(new - old))
+                if part < 1.0:
+                    new = old + part * (new - old)
+                for c in range(3):
+                    if not fixed[i, c]:
+                        x[i, c] += (new - old) * normals[i, k, c] * soft
+                normal_forces[i, k] = new
+                largest = max(largest, new)
+                # tangential: the force that would stop the slip, limited by Coulomb's law
+                if static[k] == 0.0:
+                    continue
+                slip = 0.0
+                for c in range(3):
+                    trial[c] = x[i, c] - before[i, c] - way[k, c]
+                    slip += trial[c] * normals[i, k, c]
+                size = 0.0
+                for c in range(3):
+                    trial[c] = drag[i, k, c] - stiffness[i] * (trial[c] - slip * normals[i, k, c])
+                    size += trial[c] * trial[c]
+                size = math.sqrt(size)
+                factor = 1.0
+                if size > static[k] * new:
+                    factor = dynamic[k] * new / size
+                for c in range(3):
+                    force = factor * trial[c]
+                    move = force - drag[i, k, c]
+                    change = max(change, abs(move))
+                    if part < 1.0:
+                        move *= part
+                        force = drag[i, k, c] + move
+                    drag[i, k, c] = force
+                    if not fixed[i, c]:
+                        x[i, c] += move * soft
+            if change <= 1e-15 * (largest + reach / least) or largest == 0.0:
+                settled = True
+                break
+        if not settled and unsettled < 0:
+            unsettled = i
+    return unsettled
+
+
+def jam(contact: NodeWalls, node: int, normals: np.ndarray) -> str:
+    """Return why the friction of an owned node has no solution, and the remedy; empty if the node is not jammed.
+
+    Parameters
+    ----------
+    contact : NodeWalls
+    normals : (w, 3) of the walls at the node
+    """
+    fixed = contact.fixed[node]
+    if not fixed.any():
+        return ""
+    square = free_squares(fixed, normals)
+    least = np.sqrt(square / np.maximum(1.0 - square, 1e-300))
+    jams = contact.members[node] & (square > FREE_PART) & (contact.static_friction >= np.maximum(least, 1e-300))
+    if not jams.any():
+        return ""
+    wall = int(np.flatnonzero(jams)[0])
+    return (
+        f"friction jams node {contact.mesh.node_ids[node]}: its supports let it move only at an angle at which wall "
+        f"{contact.names[wall]!r} cannot push it if the coefficient of friction is {least[wall]:.3g} or more, and it "
+        f"is {contact.static_friction[wall]:.3g}; reduce the friction, free the node, or name the nodes that the wall "
+        "stops with 'node_set'"
+    )
+
+
+class LocalSolution(NamedTuple):
+    """Solutions of the local problems of k nodes at w walls.
+
+    Attributes
+    ----------
+    moved : (k, 3) positions [m]
+    normal_forces, drag : (k, w), (k, w, 3) normal and friction forces [N]
+    stiffness : (k,) K of each node [N/m]
+    """
+
+    moved: np.ndarray
+    normal_forces: np.ndarray
+    drag: np.ndarray
+    stiffness: np.ndarray
+
+    def of(self, some: np.ndarray) -> LocalSolution:
+        """Return the solutions of some of the nodes."""
+        return LocalSolution(*(each[some] for each in self))
+
+
+def solve_locally(
+    rubbing: Rubbing, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray, size: float
+) -> LocalSolution:
+    """Solve the local problems of nodes (k,) at tangent planes.
+
+    Slipping nodes use the dynamic coefficient only; whether they stick is determined by a trial.
+
+    Parameters
+    ----------
+    rubbing : Rubbing
+    x, reaction : (k, 3) positions [m] and forces by walls [N]
+    slipping : (k,) bool
+    size : length that tolerances are relative to [m]
+    """
+    fixed, normals, offsets, stiffness = rubbing.fixed, rubbing.normals, rubbing.offsets, rubbing.stiffness
+    moved = x - np.where(fixed, 0.0, reaction) / stiffness[:, None]
+    normal_forces, drag = np.zeros(offsets.shape), np.zeros(normals.shape)
+    project(moved, fixed, normals, offsets, PROJECTED * size, normal_forces)
+    normal_forces *= stiffness[:, None]
+    for group, static in ((slipping, rubbing.dynamic), (~slipping, rubbing.static)):
+        rubbing.apply(np.flatnonzero(group), static, moved, normal_forces, drag)
+    return LocalSolution(moved, normal_forces, drag, stiffness)
+
+
+# Weight of the known direction relative to the one solved for, multiplied by ten after each failure. 0.01 saves a fifth
+# of the solves at first, but fails if nodes slip by micrometres.
+_FIRM = 0.1
+# The error of directions falls by about the weight from solve to solve. Once they are all that changes, the weight
+# falls as well, from this number of solves on.
+_STEADY = 2
+_SOFTER, _LEAST = 0.1, 1e-4
+
+
+class StepFriction:
+    """Friction in one implicit step.
+
+    Parameters
+    ----------
+    model : Model
+    state : at the start of the step
+    balance : of the step
+
+    Attributes
+    ----------
+    drag : (m, walls, 3) friction forces on the nodes of the frames, after :meth:`check` [N]
+    unsettled : owned nodes whose solution violated the law in :meth:`check`
+    """
+
+    def __init__(self, model: Model, state: State, balance: Balance) -> None:
+        self.model = model
+        self.contact = model.contact
+        self.state = state
+        displacements = self.contact.motion.displacements
+        self._way = displacements(balance.time) - displacements(state.time)
+        inertia = model.inertia
+        self._inertial = balance.alpha * inertia.mass + balance.eta * inertia.damping
+        self._stiffness = self._inertial + balance.weight * model.nodal_stiffness
+        owned, walls = self.contact.members.shape
+        owned *= self.contact.has_friction  # without friction no node sticks or slips
+        self._guessed = np.zeros(owned, dtype=bool)
+        self._sticks = np.full(owned, -1)  # the wall that a node sticks to, -1 for none
+        self._directions = np.zeros((owned, walls, 3))  # d a of slipping nodes
+        self._slips = np.zeros(owned, dtype=bool)  # known to slip along their direction
+        self._forces = np.zeros((owned, 3))  # friction force on each node in its last local solution
+        self._firmness = _FIRM
+        self._steady = 0  # solves in which no node has begun or ceased to stick or to slip
+        self._lagged = False  # friction is treated as a known force
+        self._failed = np.zeros(owned, dtype=bool)  # found not to stick
+        self.drag = np.zeros((0, walls, 3))
+        self.unsettled = np.empty(0, dtype=np.int64)
+
+    def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
+        """Add friction to the forces (m, walls, 3) on nodes (m,) at (m, 3) [N]; return the energy dissipated [J]."""
+        force += self.drag
+        slip = (x - self.state.position[nodes])[:, None, :] - self._way
+        return -float((self.drag * slip).sum())
+
+    def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
+        """Fix the sticking nodes of the frames and apply friction to the slipping ones, at a guess (owned, 3)."""
+        if not self.contact.has_friction:
+            return
+        nodes = frames.nodes
+        has_friction = self._has_friction(frames)
+        fresh = has_friction & ~self._guessed[nodes]
+        if fresh.any():
+            at = np.flatnonzero(fresh)
+            reaction = self.state.contact[nodes[at]]
+            none = np.zeros(len(at), dtype=bool)
+            own = self._local(frames, at, x[nodes[at]], reaction, none)
+            self._forces[nodes[at]] = own.drag.sum(axis=1)
+            self._decide(frames, at, x[nodes[at]], none, own)
+            self._guessed[nodes[at]] = True
+        self._hold(frames, np.flatnonzero(has_friction & (self._sticks[nodes] >= 0)))
+        moving = has_friction & (self._sticks[nodes] < 0) & (self._directions[nodes] != 0.0).any(axis=(1, 2))
+        frames.sliding = self._slide(frames, np.flatnonzero(moving))
+
+    def check(
+        self,
+        frames: NodalFrames,
+        x: np.ndarray,
+        reaction: np.ndarray,
+        strengths: np.ndarray,
+        noise: float,
+        tolerance: float,
+    ) -> np.ndarray:
+        """Find the nodes that violate the law; return normal forces (m, walls) of all nodes of the frames [N].
+
+        Parameters
+        ----------
+        x, reaction : (m, 3) positions and forces by walls of the frames' nodes [m], [N]
+        strengths : (m, walls) normal forces without friction; used for nodes at frictionless walls only
+        noise : force below which a force counts as zero [N]
+        tolerance : of the forces [N]
+        """
+        nodes, contact = frames.nodes, self.contact
+        self.drag = np.zeros((*strengths.shape, 3))
+        if not contact.has_friction:
+            return strengths
+        strengths = strengths.copy()
+        at = np.flatnonzero(self._has_friction(frames))
+        slipping = self._sticks[nodes[at]] < 0
+        own = self._local(frames, at, x[at], reaction[at], slipping)
+        moved, normal_forces, drag, stiffness = own
+        self._forces[nodes[at]] = drag.sum(axis=1)
+        before = self._sticks.copy(), self._slips.copy()
+        apart = stiffness * np.linalg.norm(moved - x[at], axis=1)
+        # rounding of positions, and of the frames' coordinates on the way to them
+        floor = 2e-14 * stiffness * (np.abs(x[at]).sum(axis=1) + contact.size)
+        kept = apart <= np.maximum(max(tolerance, 2.0 * noise), floor)
+        wrong = np.flatnonzero(~kept)
+        if len(wrong):
+            self._decide(frames, at[wrong], x[at[wrong]], slipping[wrong], own.of(wrong))
+        may = self._may_stick(nodes[at], slipping & kept, x[at], normal_forces, frames.normals[at])
+        trying = may.any(axis=1)
+        self._sticks[nodes[at[trying]]] = may[trying].argmax(axis=1)
+        self.unsettled = nodes[np.union1d(at[wrong], at[trying])]
+        self._soften(before)
+        none = normal_forces <= noise
+        normal_forces[none], drag[none] = 0.0, 0.0
+        strengths[at], self.drag[at] = normal_forces, drag
+        return strengths
+
+    def _soften(self, before: tuple[np.ndarray, np.ndarray]) -> None:
+        """Reduce the weight of known directions if statuses, ``before`` and now, are the same. Collective."""
+        changed = any((now != was).any() for now, was in zip((self._sticks, self._slips), before, strict=True))
+        self._steady = 0 if self.model.comm.allreduce(int(changed)) else self._steady + 1
+        if self._steady >= _STEADY:
+            self._firmness = max(_SOFTER * self._firmness, _LEAST)
+
+    def relax(self) -> bool:
+        """Simplify the next solve after a failure; return whether it could be simplified. Collective.
+
+        First the directions are fixed, then friction forces are fixed as well.
+        """
+        slips, moves = bool(self._slips.any()), bool((self._directions != 0.0).any())
+        turning, moving = self.model.comm.allreduce(np.array([slips, moves], dtype=np.int64)) > 0
+        self._slips[:] = False
+        self._firmness *= 10.0
+        self._steady = 0
+        if turning:
+            return True
+        lagged, self._lagged = self._lagged, True
+        return moving and not lagged
+
+    def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
+        """Return messages about nodes (k,) at (owned, 3) that are jammed in a self-locking wedge by friction."""
+        normals, _ = self.contact.planes(self.contact.members[nodes], x[nodes], displacements)
+        return [text for node, n in zip(nodes, normals, strict=True) if (text := jam(self.contact, node, n))]
+
+    def _has_friction(self, frames: NodalFrames) -> np.ndarray:
+        """Return (m,) bool: frames with a wall that has friction."""
+        return ((frames.rows >= 0) & (self.contact.static_friction > 0.0)).any(axis=1)
+
+    def _local(
+        self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray
+    ) -> LocalSolution:
+        """Solve the local problems of some nodes of the frames."""
+        nodes, contact = frames.nodes[at], self.contact
+        planes = contact.fixed[nodes], frames.normals[at], frames.offsets[at]
+        rough = contact.friction, contact.static_friction
+        rubbing = Rubbing(self.state.position[nodes], self._way, *planes, *rough, self._stiffness[nodes])
+        return solve_locally(rubbing, x, reaction, slipping, contact.size)
+
+    def _may_stick(
+        self, nodes: np.ndarray, slipping: np.ndarray, x: np.ndarray, normal_forces: np.ndarray, normals: np.ndarray
+    ) -> np.ndarray:
+        """Return (k, w) bool: walls whose static coefficient may stop slipping nodes, which is tried once."""
+        contact = self.contact
+        slip = self._slip(nodes, x, normals)
+        # if the rest of the truss moves along, inertia alone resists
+        needed = contact.friction * normal_forces + self._inertial[nodes, None] * np.linalg.norm(slip, axis=2)
+        may = (contact.static_friction > contact.friction) & (needed <= contact.static_friction * normal_forces)
+        return may & (normal_forces > 0.0) & (slipping & ~self._failed[nodes])[:, None]
+
+    def _slip(self, nodes: np.ndarray, x: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Return the slip of nodes at (k, 3) on their walls (k, w, 3) [m]."""
+        slip = x[:, None, :] - self.state.position[nodes][:, None, :] - self._way
+        return slip - np.einsum("kwi,kwi->kw", slip, normals)[:, :, None] * normals
+
+    def _decide(
+        self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, slipping: np.ndarray, own: LocalSolution
+    ) -> None:
+        """Decide which nodes stick or slip in the next solve, from positions x and the solutions of local problems."""
+        nodes, contact = frames.nodes[at], self.contact
+        moved, normal_forces, drag, stiffness = own
+        slip = self._slip(nodes, moved, frames.normals[at])
+        size = np.linalg.norm(drag, axis=2)
+        # a normal force within rounding neither sticks nor causes friction
+        least = 1e-9 * normal_forces.max(axis=1, initial=0.0)
+        rubbing = (normal_forces > least[:, None]) & (contact.static_friction > 0.0)
+        needed = np.linalg.norm(drag - stiffness[:, None, None] * slip, axis=2)
+        limit = np.where(slipping[:, None], contact.friction, contact.static_friction) * normal_forces
+        slips = rubbing & (needed > (1.0 + 1e-13) * limit)
+        was = self._sticks[nodes] >= 0
+        forwards = np.einsum("kwi,kwi->kw", self._slip(nodes, x, frames.normals[at]), self._directions[nodes])
+        # friction has reversed the slip, so it is large enough to stop it
+        slips &= (forwards >= 0.0) | was[:, None]
+        holds = rubbing & ~slips
+        infeasible = holds.any(axis=1)
+        unit = np.where(slips[:, :, None], -drag / np.maximum(size, 1e-300)[:, :, None], 0.0)
+        self._slips[nodes] = ~infeasible & ~was & (forwards > 0.0).any(axis=1)
+        self._failed[nodes] |= was & ~infeasible
+        self._sticks[nodes] = np.where(infeasible, holds.argmax(axis=1), -1)
+        self._directions[nodes] = unit * np.maximum(contact.friction * normal_forces, 1e-300)[:, :, None]
+
+    def _hold(self, frames: NodalFrames, at: np.ndarray) -> None:
+        """Fix sticking nodes at zero slip."""
+        nodes = frames.nodes[at]
+        wall = self._sticks[nodes]
+        row = frames.rows[at, wall]
+        place = self.state.position[nodes] + self._way[wall]
+        n = frames.normals[at, wall]
+        place += (frames.offsets[at, wall] - np.einsum("ki,ki->k", n, place))[:, None] * n
+        held = np.einsum("kij,kj->ki", frames.basis[at], place)
+        which = ~self.contact.fixed[nodes] & (np.arange(3) != row[:, None])
+        slack = ON_BOUND * self.contact.size
+        fits = (held >= frames.lower[at] - slack) & (held <= frames.upper[at] + slack)
+        # another wall pushes the node along, or its wall has no row: it cannot stick
+        possible = (fits | ~which).all(axis=1) & (row >= 0)
+        self._sticks[nodes[~possible]] = -1
+        frames.pin(at[possible], held[possible], which[possible])
+
+    def _slide(self, frames: NodalFrames, at: np.ndarray) -> Sliding:
+        nodes = frames.nodes[at]
+        friction = np.where((self._directions[nodes] != 0.0).any(axis=2), self.contact.friction, 0.0)
+        friction = np.where(frames.rows[at] >= 0, friction, 0.0)
+        for k in range(1, friction.shape[1]):
+            # where walls share a bound, one takes the force
+            shared = (frames.rows[at, :k] == frames.rows[at, k][:, None]) & (friction[:, :k] > 0.0)
+            friction[shared.any(axis=1), k] = 0.0
+        slips = self._slips[nodes]
+        known = np.zeros((len(at), 3))
+        if self._lagged:
+            known, friction = self._forces[nodes], np.zeros_like(friction)
+        start = np.where(slips[:, None, None], self._firmness, 1.0) * self._directions[nodes]
+        return Sliding(
+            nodes,
+            at,
+            known,
+            frames.inverse[at],
+            frames.rows[at],
+            frames.signs[at],
+            friction,
+            frames.normals[at],
+            self.state.position[nodes][:, None, :] + self._way,
+            start,
+            np.where(slips, self._stiffness[nodes], 0.0),
+        )

@@ -37,7 +37,11 @@ def _predict(x, h, v, c, a, predictor):
 
 
 @kernel
-def _complete(square, old, new, predictor, u, v, a, x, v1, a1):
+def _complete(factors, start, u, end):
+    """Write positions, velocities and accelerations of the ``end``; ``start``: predictor, velocities, accelerations."""
+    square, old, new = factors
+    predictor, v, a = start
+    x, v1, a1 = end
     for i in range(len(u)):
         x[i] = predictor[i] + u[i]
         a1[i] = u[i] / square
@@ -80,6 +84,7 @@ class Scheme(ExplicitScheme):
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
         v1, a1 = np.empty_like(u), np.empty_like(u)
-        arrays = (array.reshape(-1) for array in (balance.predictor, u, state.v, state.a, state.position, v1, a1))
-        _complete(self.beta * h * h, h * (1.0 - self.gamma), h * self.gamma, *arrays)
+        factors = self.beta * h * h, h * (1.0 - self.gamma), h * self.gamma
+        start = balance.predictor.reshape(-1), state.v.reshape(-1), state.a.reshape(-1)
+        _complete(factors, start, u.reshape(-1), (state.position.reshape(-1), v1.reshape(-1), a1.reshape(-1)))
         state.v, state.a = v1, a1

@@ -423,14 +423,24 @@ class Bars:
         return first_inverted(x, before, self.ends, self.watched)
 
     def tangents(
-        self, x: np.ndarray, weight: float, inertia: list[float], pattern: BlockPattern, values: np.ndarray
+        self,
+        x: np.ndarray,
+        weight: float,
+        inertia: list[float],
+        pattern: BlockPattern,
+        values: np.ndarray,
+        start: np.ndarray | None = None,
     ) -> None:
-        """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to the values of a matrix."""
+        """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to the values of a matrix; with
+        positions ``start``, the derivative of :meth:`step_forces` from there in the place of K_t."""
         for block, m in zip(self.blocks, inertia, strict=True):
             rows = MatrixRows(weight, m, self.mesh_lengths, pattern.ptr, pattern.slots, values)
-            block.loops.tangents(x, self.data(block), rows)
-        for family in self.families:
-            family.add_tangents(weight, pattern, values)
+            if start is None:
+                block.loops.tangents(x, self.data(block), rows)
+            else:
+                block.loops.step_tangents(x, self.data(block), (start, rows))
+        for family in self.families:  # in a step, their force is that at its middle
+            family.add_tangents(weight if start is None else 0.5 * weight, pattern, values)
 
     def linearise(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
         """Fill ``stored`` (5, b) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, for each bar at ``x``;
@@ -467,22 +477,6 @@ class Bars:
         self._for_blocks("step_forces", x, (x0, f))
         for family in self.families:
             family.add_step_forces(x0, x, f)
-
-    def step_tangents(
-        self,
-        x0: np.ndarray,
-        x: np.ndarray,
-        weight: float,
-        inertia: list[float],
-        pattern: BlockPattern,
-        values: np.ndarray,
-    ) -> None:
-        """As :meth:`tangents`, for :meth:`step_forces`."""
-        for block, m in zip(self.blocks, inertia, strict=True):
-            rows = MatrixRows(weight, m, self.mesh_lengths, pattern.ptr, pattern.slots, values)
-            block.loops.step_tangents(x, self.data(block), (x0, rows))
-        for family in self.families:  # the force at mid-step
-            family.add_tangents(0.5 * weight, pattern, values)
 
     def product(self, x: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
         """Compute ``out`` = K_t(x) u for local arrays (nodes, 3); valid for owned nodes."""

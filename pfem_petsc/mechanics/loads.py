@@ -50,10 +50,7 @@ class NodalLoads:
 
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> None:
         self.any = bool(case.load)
-        self._groups: list[Group] = []
-        self._members: list[np.ndarray] = []
-        self._forces: list[np.ndarray] = []
-        self._columns: list[int] = []
+        self._entries: list[tuple[np.ndarray, np.ndarray, int]] = []  # nodes, force, and column of its factor
         plain = [load for load in case.load if not isinstance(load, LoadFile)]
         tables = [(np.array(load.table), load.interpolation == "smooth") for load in plain if load.table is not None]
         self._groups, columns = grouped(tables)
@@ -65,23 +62,16 @@ class NodalLoads:
                 self._add_file(key, load, nodes, mesh)
             else:
                 column = -1 if load.table is None else next(left)
-                self._add(nodes[load.node_set], np.array(load.force), column)
+                self._entries.append((nodes[load.node_set], np.array(load.force), column))
         self.steady = not self._groups
         self._tables = TimeTables(self._groups)
-        sizes = np.array([len(each) for each in self._members], dtype=np.int64)
-        first = np.append(0, np.cumsum(sizes))
-        members = np.concatenate([np.zeros(0, dtype=np.int64), *self._members])
-        forces = np.array(self._forces).reshape(-1, 3)
+        first = np.cumsum([0, *(len(members) for members, _, _ in self._entries)])
+        members = np.concatenate([np.zeros(0, dtype=np.int64), *(members for members, _, _ in self._entries)])
+        forces = np.array([force for _, force, _ in self._entries]).reshape(-1, 3)
         # forces without a table are multiplied by the last value
-        which = np.array(self._columns, dtype=np.int64)
-        which[which < 0] = self._width
+        which = np.array([column if column >= 0 else self._width for _, _, column in self._entries], dtype=np.int64)
         self._arguments = first, members, forces, which
         self._values = np.empty(self._width + 1)
-
-    def _add(self, members: np.ndarray, force: np.ndarray, column: int) -> None:
-        self._members.append(np.asarray(members, dtype=np.int64))
-        self._forces.append(force)
-        self._columns.append(column)
 
     def _add_file(self, key: str, load: LoadFile, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> None:
         content = on_root(mesh.comm, _read, key, load)
@@ -99,7 +89,7 @@ class NodalLoads:
             self._width += len(mine)
         for member, column, force in zip(content.members.tolist(), columns.tolist(), content.forces, strict=True):
             if len(members[member]):
-                self._add(members[member], load.scale * force, column)
+                self._entries.append((members[member], load.scale * force, column))
 
     def add(self, time: float, constant: float, out: np.ndarray) -> None:
         """Add the forces at a time [s] to ``out`` (owned, 3) [N]; those without a table times ``constant``."""
@@ -117,25 +107,17 @@ def _read(key: str, load: LoadFile) -> Forces:
 
 def _members(key: str, content: Forces, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> list[np.ndarray]:
     """Return the owned local indices of each target."""
-    nothing = np.zeros(0, dtype=np.int64)
-    owned = mesh.node_ids[: mesh.n_owned]
-    order = np.argsort(owned)
     numbers = np.array([target for target in content.targets if isinstance(target, int)], dtype=np.int64)
     outside = numbers[(numbers < 0) | (numbers >= mesh.n_nodes)]
     if len(outside):
         raise InputError(f"{key}: there is no node {outside[0]}: the mesh has the nodes 0 to {mesh.n_nodes - 1}")
-    places = np.searchsorted(owned, numbers, sorter=order) if len(owned) else np.zeros(len(numbers), dtype=np.int64)
-    found, k = [], 0
     for target in content.targets:
-        if isinstance(target, str):
-            if target not in nodes:
-                raise InputError(f"{key}: there is no node set {target!r}{nearest(target, list(nodes))}")
-            found.append(nodes[target])
-            continue
-        at = order[places[k]] if places[k] < len(owned) else -1
-        found.append(np.array([at]) if at >= 0 and owned[at] == target else nothing)
-        k += 1
-    return found
+        if isinstance(target, str) and target not in nodes:
+            raise InputError(f"{key}: there is no node set {target!r}{nearest(target, list(nodes))}")
+    owned = mesh.node_ids[: mesh.n_owned]
+    mine = np.flatnonzero(np.isin(owned, numbers))
+    known = nodes | dict(zip(owned[mine].tolist(), mine[:, None], strict=True))
+    return [known.get(target, mine[:0]) for target in content.targets]
 
 
 @dataclass(frozen=True)
@@ -238,11 +220,7 @@ class Wind:
         wind = case.wind
         self.held: np.ndarray | None = None
         self._holds = case.holds("wind")
-        self._table, self._constant = None, np.zeros(3)
-        if wind.varies:
-            self._table = Table(wind.velocity, wind.interpolation == "smooth")
-        else:
-            self._constant = np.array(wind.velocity, dtype=np.float64)
+        self._table = Table(wind.velocity if wind.varies else [(0.0, *wind.velocity)], wind.interpolation == "smooth")
         mesh = bars.mesh
         self._bars, self._mesh, self._rate = bars, mesh, 0.0
         self._factor = np.zeros(len(mesh.bars))
@@ -265,7 +243,7 @@ class Wind:
         """Return the velocity of the wind (3,) [m/s] at a time [s]."""
         if self._holds and self.held is not None:
             return self.held
-        return self._constant if self._table is None else self._table(time)
+        return self._table(time)
 
     def add(self, time: float, state: ForceState, out: np.ndarray) -> None:
         """Add the drag at a time [s] to ``out`` (owned, 3) [N]. Collective."""
@@ -283,10 +261,8 @@ class Wind:
 
     def fastest(self) -> float:
         """Largest speed of the wind [m/s]."""
-        if self._holds and self.held is not None:
-            return float(np.linalg.norm(self.held))
-        rows = self._constant if self._table is None else self._table.values
-        return float(np.linalg.norm(np.atleast_2d(rows), axis=1).max())
+        rows = self._table.values if self.held is None or not self._holds else self.held[None]
+        return float(np.linalg.norm(rows, axis=1).max())
 
 
 class ExternalForce:

@@ -50,31 +50,22 @@ class PointInertia:
 
     Attributes
     ----------
-    mass, damping : (owned,) [kg], [kg/s]; None if the case has none
+    mass, damping : (owned,) [kg], [kg/s]
+    any : whether the case has any, the same on all ranks
     """
 
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> None:
-        self.mass: np.ndarray | None = None
-        self.damping: np.ndarray | None = None
-        if case.point_mass:
-            self.mass = np.zeros(mesh.n_owned)
-            for entry in case.point_mass:
-                self.mass[nodes[entry.node_set]] += entry.value
+        self.mass, self.damping = np.zeros((2, mesh.n_owned))
+        for entry in case.point_mass:
+            self.mass[nodes[entry.node_set]] += entry.value
         grounded = [entry for entry in case.dashpot if entry.node_set is not None]
-        if grounded:
-            self.damping = np.zeros(mesh.n_owned)
-            for entry in grounded:
-                self.damping[nodes[entry.node_set]] += entry.coefficient
-
-    @property
-    def any(self) -> bool:
-        """Whether the case has any, the same on all ranks."""
-        return self.mass is not None or self.damping is not None
+        for entry in grounded:
+            self.damping[nodes[entry.node_set]] += entry.coefficient
+        self.any = bool(case.point_mass or grounded)
 
     def nodal(self, alpha: float, eta: float) -> np.ndarray:
-        """Return alpha m + eta c (owned,) [N/m], if there are :attr:`any`."""
-        mass = 0.0 if self.mass is None else alpha * self.mass
-        return mass + (0.0 if self.damping is None else eta * self.damping)
+        """Return alpha m + eta c (owned,) [N/m]."""
+        return alpha * self.mass + eta * self.damping
 
 
 @kernel
@@ -110,14 +101,10 @@ class Inertia:
             _lump(bars.ends, bars.mesh_lengths, block.start, block.stop, block.density * block.area, mass)
             if block.damping:
                 _lump(bars.ends, bars.mesh_lengths, block.start, block.stop, block.damping * block.area, damping)
-        self.mass = mass[: mesh.n_owned].copy()
         self.points = points
-        if points.mass is not None:
-            self.mass += points.mass
-        self.damping = damping[: mesh.n_owned].copy()
-        self._of_bars = self.damping.copy()
-        if points.damping is not None:
-            self.damping += points.damping
+        self.mass = mass[: mesh.n_owned] + points.mass
+        self._of_bars = damping[: mesh.n_owned].copy()
+        self.damping = self._of_bars + points.damping
         self.damped = bool(mesh.comm.allreduce(float(self.damping.sum())) > 0.0)
         if consistent:
             self._u = np.zeros((mesh.n_local, 3))
@@ -144,13 +131,11 @@ class Inertia:
         if self._table is None:
             return
         self.factor = float(self._table(time)[0])
-        self.damping = self.factor * self._of_bars
-        if self.points.damping is not None:
-            self.damping += self.points.damping
+        self.damping = self.factor * self._of_bars + self.points.damping
 
     def damp(self, damping: np.ndarray) -> None:
         """Replace the damping, that of dashpots included, by values of nodes (owned,). Collective."""
-        self.damping, self.points.damping, self._table = damping, None, None
+        self.damping, self.points.damping, self._table = damping, np.zeros_like(damping), None
         self.damped = bool(self.mesh.comm.allreduce(float(damping.sum())) > 0.0)
 
     @property
@@ -161,7 +146,7 @@ class Inertia:
     def mass_times(self, a: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Compute ``out`` = M a for owned nodes, both (owned, 3). Collective with consistent mass."""
         self._times(a, out, self.mass, lambda block: block.density)
-        if self.consistent and self.points.mass is not None:
+        if self.consistent and self.points.any:
             out += self.points.mass[:, None] * a
         return out
 
@@ -171,7 +156,7 @@ class Inertia:
             out[:] = 0.0
             return out
         self._times(v, out, self.damping, lambda block: self.factor * block.damping)
-        if self.consistent and self.points.damping is not None:
+        if self.consistent and self.points.any:
             out += self.points.damping[:, None] * v
         return out
 

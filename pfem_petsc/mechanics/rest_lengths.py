@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,17 +47,15 @@ class RestLengths:
 
     def __init__(self, case: Case, bars: Bars) -> None:
         given = {name: section.prestressed for name, section in case.section.items()}
-        self.any = any(key is not None for key in given.values())
+        self.any, self.varying = any(key is not None for key in given.values()), False
         # in later stages they stay as they are, unless the stage gives those of a section
         held = {name for name in given if case.number > 0 and name not in case.stressed}
         self._bars = bars
         self._held = [slice(block.start, block.stop) for block in bars.blocks if block.section in held]
         self._entries: list[_Entry] = []
         if not self.any:
-            self.varying = False
             return
         bars.rest = bars.mesh_lengths.copy()
-        varies = False
         for name, key in given.items():
             if key is None:
                 continue
@@ -84,9 +80,8 @@ class RestLengths:
                 for entry in entries:
                     entry.apply(bars, math.inf)
                 continue
-            varies |= len(rows) > 1
+            self.varying |= len(rows) > 1
             self._entries += entries
-        self.varying = varies
         self.apply(0.0)
         if self.varying:
             bars.rest_at_start = bars.rest.copy()
@@ -104,17 +99,11 @@ class RestLengths:
         for entry in self._entries:
             entry.apply(self._bars, time)
 
-    @contextmanager
-    def shortest(self) -> Iterator[None]:
+    def shorten(self) -> None:
         """Give all bars the smallest rest lengths that they have at any time, which make them stiffest."""
-        kept = self._bars.rest.copy()
         for entry in self._entries:
             part = slice(entry.block.start, entry.block.stop)
             self._bars.rest[part] = self._bars.mesh_lengths[part] / entry.largest()
-        try:
-            yield
-        finally:
-            self._bars.rest[:] = kept
 
 
 class _Entry:
@@ -217,8 +206,8 @@ class Temperatures:
     """
 
     def __init__(self, case: Case, mesh: DistributedMesh, bars: Bars) -> None:
-        self.any = bool(case.temperature)
-        self.varying = any(entry.table is not None for entry in case.temperature)
+        self.any, self._holds = bool(case.temperature), case.holds("temperature")
+        self.varying = not self._holds and any(entry.table is not None for entry in case.temperature)
         self._case, self._bars = case, bars
         self._entries = []
         for index, entry in enumerate(case.temperature):
@@ -232,9 +221,6 @@ class Temperatures:
                 members = mesh.bar_groups[entry.bars]
             table = Table(entry.table, entry.interpolation == "smooth") if entry.table is not None else None
             self._entries.append((members, entry.value, table))
-        self._holds = case.holds("temperature")
-        if self._holds:
-            self.varying = False
         if self.any:
             bars.heat = np.zeros((2, len(mesh.bars)))
         self.values = bars.heat[1]
@@ -250,18 +236,12 @@ class Temperatures:
             self._bars.heat[:] = heat
             self._bars.heat_at_start = self._bars.heat.copy()
 
-    @contextmanager
-    def stiffest(self) -> Iterator[None]:
+    def stiffen(self) -> None:
         """Give bars that soften the temperature at which their modulus is largest."""
-        kept = self.values.copy()
         for block in self._bars.blocks:
             if block.law.modulus is not None:
                 rows = np.array(self._case.material[self._case.section[block.section].material].softening)
                 self.values[block.start : block.stop] = rows[np.argmax(rows[:, 1]), 0]
-        try:
-            yield
-        finally:
-            self.values[:] = kept
 
     def apply(self, time: float) -> None:
         """Set the thermal strains of the bars at a time [s]; later entries of the case override earlier ones."""

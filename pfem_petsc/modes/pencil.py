@@ -260,7 +260,7 @@ class StateMatrices:
             if springs and self.model.bars.springs is not None:
                 self.model.bars.springs.add_tangents(1.0, matrix.pattern, values)
             if added is not None:
-                matrix.add_blocks(*added, values)
+                matrix.pattern.add_blocks(*added, values)
 
         return self.holds.taken_out(matrix.fill(fill), diagonal)
 
@@ -274,7 +274,7 @@ class StateMatrices:
         def fill(values: np.ndarray) -> None:
             coefficients = inertia.coefficients(1.0, 0.0)
             self.model.bars.tangents(mesh.points, 0.0, coefficients, matrix.pattern, values)
-            if inertia.points.mass is not None:
+            if inertia.points.any:
                 matrix.add_lumped(inertia.points.mass, values)
 
         return self.holds.taken_out(matrix.fill(fill), inertia.mass)

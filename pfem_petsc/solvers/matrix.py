@@ -202,7 +202,7 @@ class HessianMatrix:
         """Transform the values to frame coordinates, without those of rows over several nodes."""
         turns = transform.turns()
         if turns is not None:
-            self.add_blocks(transform.sliding.nodes, transform.sliding.stiffness, values)
+            self.pattern.add_blocks(transform.sliding.nodes, transform.sliding.stiffness, values)
             turn_blocks(self.pattern.ptr, self.local_columns, *turns, values)
 
     def update(self, problem: Linearisable, w: np.ndarray) -> None:
@@ -257,17 +257,13 @@ class HessianMatrix:
         """Add the bars' stiffness from the data of :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`, (5, b)."""
         _add_bars(self.mesh.bars, stored, self.pattern.ptr, self.pattern.slots, values)
 
-    def add_blocks(self, nodes: np.ndarray, blocks: np.ndarray, values: np.ndarray) -> None:
-        """Add blocks (k, 3, 3) to the diagonal blocks of owned nodes (k,), which must be distinct."""
-        self.pattern.add_blocks(nodes, blocks, values)
-
     def constrain(self, scale: float, values: np.ndarray) -> None:
         """Replace rows and columns of prescribed components by ``scale`` on the diagonal."""
         if self.any_fixed:
             self.hold(self._fixed, scale, values)
         if self._projection is not None:
             self._projection.project(self.pattern.ptr, self.local_columns, values)
-            self.add_blocks(self._projection.nodes, scale * self._projection.held, values)
+            self.pattern.add_blocks(self._projection.nodes, scale * self._projection.held, values)
 
     def hold(self, held: np.ndarray, scale: float, values: np.ndarray) -> None:
         """Replace rows and columns of components (local nodes, 3) by ``scale`` on the diagonal."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
-from ..mechanics.compiled import inlined, kernel
+from ..mechanics.compiled import kernel
 from ..mechanics.mass import consistent_product
 from ..mechanics.strips import add_stiffness_diagonals, add_stiffness_products
 
@@ -166,50 +166,31 @@ def add_products(sweep, far, x, stored, u, out):
     """Add K u to ``out``, chunk by chunk of a :class:`~pfem_petsc.mechanics.runs.Sweep`."""
     heads, fars, starts, chunks = sweep.heads, sweep.fars, sweep.starts, sweep.chunks
     for chunk in range(len(sweep.diagonal)):
-        if not sweep.diagonal[chunk]:
-            _stars(chunk, heads, starts, chunks, far, x, stored, u, out)
-            continue
         for run in range(chunks[chunk], chunks[chunk + 1]):
-            at = starts[run]
-            add_stiffness_products(x, u, out, heads[run], fars[run], starts[run + 1] - at, stored[0], stored[1], at)
-
-
-@inlined
-def _stars(chunk, heads, starts, chunks, far, x, stored, u, out):
-    """Add the products of a chunk whose runs are stars."""
-    for run in range(chunks[chunk], chunks[chunk + 1]):
-        a = heads[run]
-        ax = x[a, 0]
-        ay = x[a, 1]
-        az = x[a, 2]
-        px = u[a, 0]
-        py = u[a, 1]
-        pz = u[a, 2]
-        sx = 0.0
-        sy = 0.0
-        sz = 0.0
-        for k in range(starts[run], starts[run + 1]):
-            b = far[k]
-            dx = x[b, 0] - ax
-            dy = x[b, 1] - ay
-            dz = x[b, 2] - az
-            ux = u[b, 0] - px
-            uy = u[b, 1] - py
-            uz = u[b, 2] - pz
-            c = stored[0, k] * (dx * ux + dy * uy + dz * uz)
-            g = stored[1, k]
-            fx = c * dx + g * ux
-            fy = c * dy + g * uy
-            fz = c * dz + g * uz
-            sx += fx
-            sy += fy
-            sz += fz
-            out[b, 0] += fx
-            out[b, 1] += fy
-            out[b, 2] += fz
-        out[a, 0] -= sx
-        out[a, 1] -= sy
-        out[a, 2] -= sz
+            a, at = heads[run], starts[run]
+            if sweep.diagonal[chunk]:
+                count = starts[run + 1] - at
+                add_stiffness_products(x, u, out, a, fars[run], count, stored[0], stored[1], at)
+                continue
+            ax, ay, az = x[a, 0], x[a, 1], x[a, 2]
+            px, py, pz = u[a, 0], u[a, 1], u[a, 2]
+            sx = sy = sz = 0.0
+            for k in range(at, starts[run + 1]):
+                b = far[k]
+                dx, dy, dz = x[b, 0] - ax, x[b, 1] - ay, x[b, 2] - az
+                ux, uy, uz = u[b, 0] - px, u[b, 1] - py, u[b, 2] - pz
+                c = stored[0, k] * (dx * ux + dy * uy + dz * uz)
+                g = stored[1, k]
+                fx, fy, fz = c * dx + g * ux, c * dy + g * uy, c * dz + g * uz
+                sx += fx
+                sy += fy
+                sz += fz
+                out[b, 0] += fx
+                out[b, 1] += fy
+                out[b, 2] += fz
+            out[a, 0] -= sx
+            out[a, 1] -= sy
+            out[a, 2] -= sz
 
 
 @kernel

@@ -149,7 +149,7 @@ class Stability:
                 matrix.add_bars(bars, values)
                 if model.bars.springs is not None:
                     model.bars.springs.add_tangents(1.0, matrix.pattern, values)
-            matrix.add_blocks(nodes, _RIGID * scale * blocks, values)
+            matrix.pattern.add_blocks(nodes, _RIGID * scale * blocks, values)
             matrix.constrain(scale, values)
 
         matrix.fill(add)

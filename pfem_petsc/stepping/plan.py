@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -244,22 +243,23 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
 def _highest_frequency(model: Model) -> Frequency:
     """Return bounds on the highest frequency of the model at any time, unstrained. Collective."""
     frequency = highest_frequency(model, model.mesh.points)
-    with ExitStack() as stack:
-        if model.rest_lengths.varying:
-            stack.enter_context(model.rest_lengths.shortest())
-        if model.temperatures.varying and any(law_of(m).modulus is not None for m in model.case.material.values()):
-            stack.enter_context(model.temperatures.stiffest())
-        elif not model.rest_lengths.varying:
-            return frequency
-        other = highest_frequency(model, model.mesh.points)
+    softens = model.temperatures.varying and any(law_of(m).modulus is not None for m in model.case.material.values())
+    if not (softens or model.rest_lengths.varying):
+        return frequency
+    bars = model.bars
+    kept = bars.rest.copy(), bars.heat.copy()
+    if model.rest_lengths.varying:
+        model.rest_lengths.shorten()
+    if softens:
+        model.temperatures.stiffen()
+    other = highest_frequency(model, model.mesh.points)
+    bars.rest[:], bars.heat[:] = kept
     return Frequency(min(frequency.lower, other.lower), max(frequency.upper, other.upper))
 
 
 def dashpot_rate(model: Model) -> float:
     """Return the largest c/m of dashpots [1/s]; at most three times as large with consistent mass. Collective."""
     inertia = model.inertia
-    if inertia.points.damping is None:
-        return 0.0
     factor = 3.0 if inertia.consistent else 1.0
     return factor * model.comm.allreduce(float((inertia.points.damping / inertia.mass).max(initial=0.0)), op=MPI.MAX)
 

@@ -120,14 +120,14 @@ class StepProblem:
             matrix.add_lumped(self.nodal, values)
             if inertia.redistribution is not None:
                 moved = inertia.redistribution
-                matrix.add_blocks(moved.touched, balance.alpha * moved.tensors, values)
+                matrix.pattern.add_blocks(moved.touched, balance.alpha * moved.tensors, values)
         elif inertia.points.any:
             matrix.add_lumped(inertia.points.nodal(balance.alpha, balance.eta), values)
         coefficients = inertia.coefficients(balance.alpha, balance.eta)
         if balance.weight or inertia.consistent:
             bars, arguments = self.model.bars, (balance.weight, coefficients, matrix.pattern, values)
             if balance.discrete_gradient:
-                bars.step_tangents(self.state.x, self.x, *arguments)
+                bars.tangents(self.x, *arguments, start=self.state.x)
             elif stored is not None:
                 bars.tangents(self.x, 0.0, *arguments[1:])
                 matrix.add_bars(stored, values)

@@ -9,67 +9,13 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ...case.base import NonNegativeFloat, PositiveFloat
+from ..compiled import kernel
 from .base import BarShapes, Law, MaterialKeys, UnsuitableBarError, mean_of_work, yield_texts
-
-_POINTS = 200  # at which the slope of a branch is looked at
-_AT_ONCE = 4096  # bars
-
-
-def folds(
-    ratio: np.ndarray, bending: np.ndarray, shortening: np.ndarray, inverse_yield: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest and smallest angle z (b,) between which the strain decreases with z; both zero without.
-
-    Parameters
-    ----------
-    ratio, bending, shortening : (b,) r, b and u of :mod:`~pfem_petsc.mechanics.materials.strut`
-    inverse_yield : Young's modulus over yield stress
-    """
-    # digits that differ by rounding must not make other bars of equal ones, or lattices would take long
-    numbers = np.stack([ratio, bending, shortening])
-    scale = 10.0 ** np.floor(np.log10(np.maximum(numbers, 1e-300)))
-    kinds, which = np.unique(np.round(numbers / scale, 9) * scale, axis=1, return_inverse=True)
-    found = np.zeros((2, kinds.shape[1]))
-    for begin in range(0, kinds.shape[1], _AT_ONCE):
-        part = slice(begin, begin + _AT_ONCE)
-        found[:, part] = _find(*kinds[:, part, None], 4.0 * inverse_yield)
-    return tuple(found[:, np.ravel(which)])
-
-
-def _slope(z: np.ndarray, r: np.ndarray, b: np.ndarray, u: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return dB/dz."""
-    sine, cosine = np.sin(z), np.cos(z)
-    shape = np.sin(2.0 * z) / (2.0 * z)
-    s = (1.0 - c * z * z) / (b * z * sine)
-    ds = (-2.0 * c * z - b * s * (sine + z * cosine)) / (b * z * sine)
-    bowing = 0.5 * s * ds * (1.0 + shape) + 0.25 * s * s * (np.cos(2.0 * z) - shape) / z
-    return -2.0 * u * (ds * cosine - s * sine) - 8.0 * r * z - bowing
-
-
-def _find(r: np.ndarray, b: np.ndarray, u: np.ndarray, inverse: float) -> np.ndarray:
-    """Return both angles (2, b) of bars with numbers (b, 1): sign changes on a grid, then bisection."""
-    c = inverse * r
-    most = np.minimum(0.5 * np.pi, 1.0 / np.sqrt(c))
-    share = np.linspace(0.0, 1.0, _POINTS + 1)[1:]
-    z = most * share
-    down = _slope(z, r, b, u, c) < 0.0
-    rows = np.arange(len(r))
-    first, last = down.argmax(axis=1), _POINTS - 1 - down[:, ::-1].argmax(axis=1)
-    any_down = down.any(axis=1)
-    ends = []
-    for inside, step in ((last, 1), (first, -1)):
-        outside = np.clip(inside + step, 0, _POINTS - 1)
-        low, high = z[rows, inside][:, None], z[rows, outside][:, None]
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            within = _slope(middle, r, b, u, c) < 0.0
-            low, high = np.where(within, middle, low), np.where(within, high, middle)
-        ends.append(np.where(any_down, low[:, 0], 0.0))
-    return np.array(ends)
-
 
 _QUARTER = 0.5 * math.pi
 _MOST = 100  # iterations of a root that is bracketed; about 6 are needed
+_POINTS = 200  # at which the slope of a branch is looked at, and bisections of a change of its sign
+_BISECTIONS = 60
 
 
 class Parameters(MaterialKeys):
@@ -205,25 +151,63 @@ def _closing(y, r, b, c, u):
     return value, slope, angle
 
 
+@kernel
+def _find_folds(numbers, inverse_yield, found):
+    """Write to ``found`` (2, b) the largest and smallest angle z between which the strain decreases with z, for bars
+    with the numbers r, b and u (3, b); both stay zero without."""
+    for k in range(found.shape[1]):
+        r, b, u = numbers[0, k], numbers[1, k], numbers[2, k]
+        c = 4.0 * inverse_yield * r
+        part = min(_QUARTER, 1.0 / math.sqrt(c)) / _POINTS
+        first = last = 0
+        for j in range(1, _POINTS + 1):
+            if _hinged(j * part, r, b, c, u)[1] < 0.0:
+                first, last = first or j, j
+        if not first:
+            continue
+        for end, inside, outside in ((0, last, min(last + 1, _POINTS)), (1, first, max(first - 1, 1))):
+            low, high = inside * part, outside * part
+            for _ in range(_BISECTIONS):
+                middle = 0.5 * (low + high)
+                within = _hinged(middle, r, b, c, u)[1] < 0.0
+                low, high = (middle, high) if within else (low, middle)
+            found[end, k] = low
+
+
+def folds(
+    ratio: np.ndarray, bending: np.ndarray, shortening: np.ndarray, inverse_yield: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest and smallest angle z (b,) between which the strain decreases with z; both zero without.
+
+    Parameters
+    ----------
+    ratio, bending, shortening : (b,) r, b and u of :mod:`~pfem_petsc.mechanics.materials.strut`
+    inverse_yield : Young's modulus over yield stress
+    """
+    # digits that differ by rounding must not make other bars of equal ones, or lattices would take long
+    numbers = np.stack([ratio, bending, shortening])
+    scale = 10.0 ** np.floor(np.log10(np.maximum(numbers, 1e-300)))
+    kinds, which = np.unique(np.round(numbers / scale, 9) * scale, axis=1, return_inverse=True)
+    found = np.zeros((2, kinds.shape[1]))
+    _find_folds(np.ascontiguousarray(kinds), inverse_yield, found)
+    return tuple(found[:, np.ravel(which)])
+
+
 @register_jitable
-def _root(target, low, high, compressed, of_angle, r, b, c, u):
-    """Return z in (low, high], where the branch is monotone, at which its strain B (or its angle) is the target."""
+def _root(target, low, high, compressed, of_angle, bar):
+    """Return z in (low, high], where the branch is monotone, at which its strain B (or its angle) is the target;
+    ``bar``: r, b, c and u."""
     z = high
     for _ in range(_MOST):
         if compressed:
-            value, slope, _, angle = _hinged(z, r, b, c, u)
+            value, slope, _, angle = _hinged(z, *bar)
         else:
-            value, slope, angle = _closing(z, r, b, c, u)
-        value -= target
-        if of_angle:
-            value = target - angle
-            low, high = (z, high) if value < 0.0 else (low, z)
+            value, slope, angle = _closing(z, *bar)
+        value = target - angle if of_angle else value - target
+        low, high = (z, high) if value < 0.0 else (low, z)
+        new = low if of_angle else z - value / slope
+        if not low < new < high:
             new = 0.5 * (low + high)
-        else:
-            low, high = (z, high) if value < 0.0 else (low, z)
-            new = z - value / slope
-            if not low < new < high:
-                new = 0.5 * (low + high)
         if abs(new - z) <= 2e-16 * z or high - low <= 4e-16 * high:
             break
         z = new
@@ -237,23 +221,24 @@ def _energy(z, s, young, r):
 
 
 @register_jitable
-def _opened(target, angle, young, yields, r, b, c, u, upper, lower):
+def _opened(target, angle, young, yields, bar, upper, lower):
     """Return z on the branch of an opening hinge at a strain, and the energy density that a snap has set free."""
+    r, _, c, u = bar
     most = min(_QUARTER, 1.0 / math.sqrt(c))
     if upper <= lower:
-        return _root(target, 0.0, most, True, False, r, b, c, u), 0.0
-    _, _, _, first = _hinged(upper, r, b, c, u)
-    _, _, _, last = _hinged(lower, r, b, c, u)
+        return _root(target, 0.0, most, True, False, bar), 0.0
+    _, _, _, first = _hinged(upper, *bar)
+    _, _, _, last = _hinged(lower, *bar)
     if angle >= last:
-        return _root(target, 0.0, lower, True, False, r, b, c, u), 0.0
-    start = upper if angle <= first else _root(angle, lower, upper, True, True, r, b, c, u)
-    strain, _, slope, turned = _hinged(start, r, b, c, u)
+        return _root(target, 0.0, lower, True, False, bar), 0.0
+    start = upper if angle <= first else _root(angle, lower, upper, True, True, bar)
+    strain, _, slope, turned = _hinged(start, *bar)
     if target >= strain and angle <= first:
-        return _root(target, upper, most, True, False, r, b, c, u), 0.0
-    landed = _root(strain, 0.0, lower, True, False, r, b, c, u)
-    _, _, bowed, after = _hinged(landed, r, b, c, u)
+        return _root(target, upper, most, True, False, bar), 0.0
+    landed = _root(strain, 0.0, lower, True, False, bar)
+    _, _, bowed, after = _hinged(landed, *bar)
     free = _energy(start, slope, young, r) - _energy(landed, bowed, young, r) - yields * u * (after - turned)
-    return _root(target, 0.0, lower, True, False, r, b, c, u), max(free, 0.0)
+    return _root(target, 0.0, lower, True, False, bar), max(free, 0.0)
 
 
 @register_jitable
@@ -272,7 +257,7 @@ def response(strain, rate, step, temperature, p, q):
         stiffness = 4.0 * young * r * rise
         if b * z * s * math.sin(z) + c * z * z > 1.0:
             target = strain - plastic - base - u * angle
-            z, free = _opened(target, angle, young, yields, r, b, c, u, upper, lower)
+            z, free = _opened(target, angle, young, yields, (r, b, c, u), upper, lower)
             _, slope, s, after = _hinged(z, r, b, c, u)
             flow = max(after - angle, 0.0)
             turned, plastic, accumulated = turned + flow, plastic - u * flow, accumulated + u * flow
@@ -290,7 +275,7 @@ def response(strain, rate, step, temperature, p, q):
                 y, stiffness, after = end, 0.0, 0.0
                 new = strain - base - yields / young
             else:
-                y = _root(target, 0.0, end, False, False, r, b, c, u)
+                y = _root(target, 0.0, end, False, False, (r, b, c, u))
                 _, slope, after = _closing(y, r, b, c, u)
                 after = min(after, angle)
                 new = plastic + u * (angle - after)

@@ -10,7 +10,6 @@ from typing import Any, Self
 import numpy as np
 from mpi4py import MPI
 
-from .analysis import Analysis, Step
 from .case.schema import Case
 from .contact.contact import check_start
 from .errors import EarlyStop, InputError, PfemError
@@ -29,7 +28,7 @@ from .run.stages import Stages
 from .run.synchroniser import StopRequest, Synchroniser
 from .statics.equilibrium import WithEquations
 from .stepping.model import Model
-from .stepping.stepper import Stepper
+from .stepping.stepper import Step, Stepper
 
 __all__ = ["Simulation", "Step"]
 
@@ -38,7 +37,7 @@ class Simulation(WithEquations):
     """Simulation of a case on a communicator, and context manager that closes it.
 
     Only one run at a time can write to an output folder: the folder is locked from :meth:`start` to the end of the
-    iteration or to :meth:`close`. The ``analysis`` advances the state, and the ``outputs`` write the results.
+    iteration or to :meth:`close`. The ``stepper`` advances the state, and the ``outputs`` write the results.
 
     Parameters
     ----------
@@ -141,7 +140,7 @@ class Simulation(WithEquations):
             self._finish("stopped")
         finally:
             self._free_equations()
-            self.analysis.close()
+            self.stepper.destroy()
 
     def _usable(self) -> None:
         if self._closed:
@@ -150,19 +149,17 @@ class Simulation(WithEquations):
             )
 
     @property
-    def analysis(self) -> Analysis:
-        """The analysis that advances the state, in the current stage."""
-        return self._stages.analysis
+    def stepper(self) -> Stepper:
+        """What advances the state, in the current stage."""
+        return self._stages.stepper
+
+    analysis = stepper
+    """Its former name."""
 
     @property
     def model(self) -> Model:
         """The model of the current stage."""
-        return self.analysis.model
-
-    @property
-    def stepper(self) -> Stepper:
-        """The stepper of the current stage."""
-        return self.analysis.stepper
+        return self.stepper.model
 
     @property
     def finished(self) -> bool:
@@ -172,7 +169,7 @@ class Simulation(WithEquations):
     @property
     def state(self) -> State:
         """The state of this rank's nodes: :class:`~pfem_petsc.integrators.base.State`."""
-        return self.analysis.state
+        return self.stepper.state
 
     @property
     def row(self) -> dict[str, Any] | None:
@@ -194,13 +191,13 @@ class Simulation(WithEquations):
         self._usable()
         entries, warnings = inspect(self.model.case, self.model)
         entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, self.columns)
-        before = warnings_before(self.model.case, self.model, self.analysis.plan)
+        before = warnings_before(self.model.case, self.model, self.stepper.plan)
         return entries, self.model.warnings + before + warnings
 
     def obstacle(self) -> str:
         """Return why the run cannot make its first step, as far as it is known before; empty otherwise. Collective."""
         self._usable()
-        return self.analysis.obstacle()
+        return self.stepper.obstacle()
 
     def on_step(self, function: Callable[[Step], object], every: int = 1) -> None:
         """Register a function to be called on all ranks after each step whose number is a multiple of ``every``.
@@ -277,7 +274,7 @@ class Simulation(WithEquations):
             return
         stages, outputs = self._stages, self.outputs
         if self._started and not outputs.is_open:
-            if stages.at_last and self.state.step >= self.analysis.last_step:
+            if stages.at_last and self.state.step >= self.stepper.last_step:
                 return
             raise InputError(
                 f"{self.folder}: the results of this simulation were closed at step {self.stepper.number}, "
@@ -289,7 +286,7 @@ class Simulation(WithEquations):
                 self._synchroniser.synchronise()
                 outputs.stop_early()
                 while True:
-                    while self.state.step < self.analysis.last_step:
+                    while self.state.step < self.stepper.last_step:
                         yield self._advance(outputs.steps_left(self.stepper.number) if batches else 1)
                         outputs.stop_early()
                     if stages.at_last:
@@ -315,7 +312,7 @@ class Simulation(WithEquations):
     def _advance(self, most: int = 1) -> Step:
         """Make one step, or a batch of at most ``most``, and serve the outputs that are due after it. Collective."""
         self._usable()
-        made = self.analysis.advance(most)
+        made = self.stepper.advance(most)
         self._synchroniser.stop.stepped = True
         return self.outputs.after(made)
 

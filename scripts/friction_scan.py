@@ -20,8 +20,7 @@ from pages import insert, markdown
 from pfem_petsc import Case
 from pfem_petsc.errors import InputError
 from pfem_petsc.stepping.model import Model
-from pfem_petsc.stepping.plan import make_plan
-from pfem_petsc.stepping.time_stepping import make_stepper
+from pfem_petsc.stepping.plan import make_plan, make_stepper
 
 START, END = "<!-- table: scripts/friction_scan.py -->\n", "<!-- end of friction -->"
 PHASES, BEFORE, STEPS, LAST = 12, 3, 12, 4  # steps before the impact, of the run, and that are compared

@@ -46,9 +46,8 @@ from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.integrators.base import Scheme
 from pfem_petsc.registry import lookup
 from pfem_petsc.stepping.model import Model
-from pfem_petsc.stepping.plan import make_plan
+from pfem_petsc.stepping.plan import make_plan, make_stepper
 from pfem_petsc.stepping.stepper import Stepper
-from pfem_petsc.stepping.time_stepping import make_stepper
 
 START, END = "<!-- table: scripts/impact_phases.py -->\n", "<!-- end of phases -->"
 START_REBOUNDS, END_REBOUNDS = "<!-- table: scripts/impact_phases.py, restitution -->\n", "<!-- end of rebounds -->"

@@ -26,7 +26,6 @@ FLOORS = (
     ("mesh",),
     ("mechanics",),
     ("integrators",),
-    ("analysis",),
     ("solvers",),
     ("output",),
     ("contact",),
@@ -49,7 +48,6 @@ LATER = {("output/result.py", "case")}
 """Imports that may climb: a result reads its case when it is asked for."""
 
 ANNOTATED = {
-    "analysis": {"case", "output", "solvers"},
     "contact": {"case", "stepping"},
     "mechanics": {"case", "contact"},
     "mesh": {"case"},

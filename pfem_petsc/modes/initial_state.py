@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..analysis import Analysis, PlanAtRest, Step, refuse_motion
 from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..output.units import TIME
+from ..stepping.plan import PlanAtRest, refuse_motion
 from ..stepping.stepper import NoRates, Solution, Stepper
 
 if TYPE_CHECKING:
@@ -29,11 +29,20 @@ class _Nothing(Scheme):
         raise NotImplementedError
 
 
-class _InitialStepper(Stepper):
-    """Initialises internal forces, loads and supports at time zero; makes no steps."""
+class InitialState(Stepper):
+    """The initial state, which is also the last one: forces, loads and supports at time zero, without steps.
+    Construction is collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, if the case has initial velocities.
+    """
 
     def __init__(self, model: Model) -> None:
+        refuse_motion(model.case, "a case with [modes] alone")
         super().__init__(model, _Nothing(NoParameters()), 0.0)
+        self.plan = PlanAtRest(self.scheme, TIME, {"analysis": "none: modes of the initial state"}, steps=0)
         self.prescribed = NoRates(self)
 
     def start(self) -> None:
@@ -45,30 +54,3 @@ class _InitialStepper(Stepper):
 
     def solve(self, balance: Balance) -> Solution:
         raise NotImplementedError
-
-
-class InitialState(Analysis):
-    """The initial state, which is also the last one. Construction is collective.
-
-    Parameters
-    ----------
-    model : Model
-
-    Raises
-    ------
-    InputError
-        On all ranks, if the case has initial velocities.
-    """
-
-    last_step = 0
-    step_size = 0.0
-
-    def __init__(self, model: Model) -> None:
-        refuse_motion(model.case, "a case with [modes] alone")
-        self.model = model
-        self.stepper = _InitialStepper(model)
-        texts = {"analysis": "none: modes of the initial state"}
-        self.plan = PlanAtRest(self.stepper.scheme, TIME, texts, steps=0)
-
-    def advance(self) -> Step:
-        raise NotImplementedError("the initial state has no steps")

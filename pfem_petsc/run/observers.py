@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..analysis import Analysis, Step
 from ..columns import Row
 from ..contact.monitoring import Piercing, check_positions
 from ..fields import Fields, Snapshot
@@ -19,6 +18,7 @@ from ..output.vtkhdf import ResultWriter
 from ..restart.state import STATE_VERSION, RunState
 from ..stepping.bar_events import MOST_TOLD
 from ..stepping.ledger import Ledger
+from ..stepping.stepper import Step, Stepper
 from ..version import __version__
 from .monitors import BlowUp, ContactWatch, Doubts
 from .recorder import Recorder
@@ -83,7 +83,7 @@ class History(Observer):
     """
 
     def __init__(self, stages: Stages, synchroniser: Synchroniser, warn: Callable[[str], None]) -> None:
-        stepper, model = stages.analysis.stepper, stages.model
+        stepper, model = stages.stepper, stages.model
         self.every = model.case.output.history_every
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
         self.ledger = stepper.ledger = Ledger(stepper)
@@ -92,7 +92,7 @@ class History(Observer):
         inertial = stepper.scheme.inertial
         self.blow_up = BlowUp(model, inertial)
         # works over the increments of equilibria are quadratures, whose error is no energy that something has made
-        self._contact_watch = ContactWatch(model, warn, stages.analysis.plan) if inertial else None
+        self._contact_watch = ContactWatch(model, warn, stages.stepper.plan) if inertial else None
         self.row: Mapping[str, Any] | None = None
         self.writer: ResultWriter | None = None
 
@@ -206,7 +206,7 @@ class Snapshots(Observer):
 
     Parameters
     ----------
-    analysis : Analysis
+    stepper : Stepper
     fields : Fields
     warn : receives a warning
 
@@ -218,10 +218,9 @@ class Snapshots(Observer):
 
     needs_agreement = True
 
-    def __init__(self, analysis: Analysis, fields: Fields, warn: Callable[[str], None]) -> None:
-        stepper = analysis.stepper
+    def __init__(self, stepper: Stepper, fields: Fields, warn: Callable[[str], None]) -> None:
         self.every = stepper.model.case.output.fields_every
-        self._analysis, self._stepper, self._fields, self._warn = analysis, stepper, fields, warn
+        self._stepper, self._fields, self._warn = stepper, fields, warn
         self._piercing = Piercing(stepper.model)
         self._doubts = Doubts(stepper.model, warn)
         self.last = -1
@@ -234,7 +233,7 @@ class Snapshots(Observer):
     def write(self) -> None:
         """Check the nodes against the walls, then write a snapshot of the present state."""
         state, fields = self._stepper.state, self._fields
-        if not self.every and 0 < state.step < self._analysis.last_step:
+        if not self.every and 0 < state.step < self._stepper.last_step:
             return
         number, place = self._stepper.number, self._stepper.place
         held = self._stepper.held_by_contact()
@@ -245,8 +244,8 @@ class Snapshots(Observer):
         self.last = number
         for text in self._piercing.look(state.x, state.time):
             self._warn(text)
-        at = f"step {number}, {self._analysis.plan.axis.exact(place)}"
-        self._doubts.look(state.x, at, last=state.step >= self._analysis.last_step)
+        at = f"step {number}, {self._stepper.plan.axis.exact(place)}"
+        self._doubts.look(state.x, at, last=state.step >= self._stepper.last_step)
 
     def kept(self) -> dict[str, Any]:
         """Return what a restart and the next stage go on with: the step of the last snapshot, and counts."""

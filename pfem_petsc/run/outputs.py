@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from ..analysis import Analysis, Step
 from ..case.schema import Case
 from ..columns import declared
 from ..errors import EarlyStop, SimulationFailure, printable
@@ -29,6 +28,7 @@ from ..restart.checkpoints import Restart, prepare_folder
 from ..restart.state import RunState
 from ..signals import early
 from ..stepping.model import Model
+from ..stepping.stepper import Step, Stepper
 from .observers import Checkpointing, Events, History, Observer, RuptureReport, Snapshots
 from .stages import Stages
 from .synchroniser import Synchroniser
@@ -201,7 +201,7 @@ class Outputs:
     ) -> None:
         self._stages, self._synchroniser, self._folder, self._quiet = stages, synchroniser, folder, quiet
         self._compilation = compilation
-        self.fields = Fields(self._analysis.model, stages.fields)
+        self.fields = Fields(self._stepper.model, stages.fields)
         self.progress: Progress | None = None
         self.history: History | None = None
         self.snapshots: Snapshots | None = None
@@ -214,8 +214,8 @@ class Outputs:
         self._continues = False
 
     @property
-    def _analysis(self) -> Analysis:
-        return self._stages.analysis
+    def _stepper(self) -> Stepper:
+        return self._stages.stepper
 
     @property
     def is_open(self) -> bool:
@@ -235,8 +235,8 @@ class Outputs:
             On all ranks.
         """
         stages, folder, plan = self._stages, self._folder, self._stages.plan
-        analysis, model = stages.analysis, stages.model
-        state = RunState(analysis.stepper)
+        stepper, model = stages.stepper, stages.model
+        state = RunState(stepper)
         if restart is not None:
             # before any change to the folder, because the checkpoint may be refused
             state.restore(restart.file, stages.case.source)
@@ -245,7 +245,8 @@ class Outputs:
         notes = [*notes, *([] if aside is None else [f"{folder}: earlier results were moved to {aside}"])]
         self.progress = self._compilation.progress = self._open_progress(notes)
         if restart is None:
-            analysis.start()
+            stepper.start()
+            stepper.leave()
             self._synchroniser.synchronise()
         self._observe(state)
         if restart is not None:
@@ -258,13 +259,13 @@ class Outputs:
         kept = None
         if self._continues:
             self.checkpointing.last_step = restart.step
-            kept = Kept(analysis.stepper.number, *restart.last)
+            kept = Kept(stepper.number, *restart.last)
         self._write_to(ResultWriter(folder / RESULT_NAME, model.comm, model.mesh, self._contents(), kept))
 
     def _open_progress(self, notes: Iterable[str]) -> Progress:
         """Open the progress report and write summary, warnings and notes. Collective."""
         stages, plan = self._stages, self._stages.plan
-        case, model, stepper = stages.case, stages.model, stages.analysis.stepper
+        case, model, stepper = stages.case, stages.model, stages.stepper
         progress = Progress(
             model.comm,
             printable(case.title),
@@ -273,7 +274,7 @@ class Outputs:
             self._folder / "log.txt",
         )
         progress.summary(summarise(case, model, plan))
-        warnings = warnings_before(model.case, model, stages.analysis.plan)
+        warnings = warnings_before(model.case, model, stages.stepper.plan)
         for warning in model.warnings + warnings:
             progress.warning(warning)
         for text in (*([plan.scheme.notice] if plan.scheme.notice else []), *notes):
@@ -282,7 +283,7 @@ class Outputs:
 
     def _tell_restart(self, restart: Restart) -> None:
         """Report from where the run continues, what has changed, and missing functions. Collective."""
-        stepper, functions = self._analysis.stepper, self._stages.model.external.functions
+        stepper, functions = self._stepper, self._stages.model.external.functions
         place = f"step {stepper.number}, {self._stages.plan.axis.place(stepper.place)}"
         changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
         self.progress.message(f"restart from {restart.path}: {place}{changes}")
@@ -329,14 +330,13 @@ class Outputs:
 
     def _observe(self, state: RunState) -> None:
         """Make the observers of the present stage. Collective."""
-        stages, analysis, warn, tell = self._stages, self._analysis, self.progress.warning, self.progress.message
-        stepper = analysis.stepper
+        stages, stepper, warn, tell = self._stages, self._stepper, self.progress.warning, self.progress.message
         self.history = History(stages, self._synchroniser, warn)
         if hasattr(stepper, "message"):
             stepper.message = warn
         self.events = Events(stepper, tell)
         self.ruptures = RuptureReport(stepper, self.history, tell)
-        self.snapshots = Snapshots(analysis, self.fields, warn)
+        self.snapshots = Snapshots(stepper, self.fields, warn)
         saved = self.history, self.snapshots, self._synchroniser
         self.checkpointing = Checkpointing(stages, self._folder / CHECKPOINT, state, *saved)
         self._observers = self.history, self.events, self.ruptures, self.snapshots, self.checkpointing
@@ -354,7 +354,7 @@ class Outputs:
         self.tell_remarks()
         row = history.recorder.row()
         kick = stages.advance()
-        stepper = stages.analysis.stepper
+        stepper = stages.stepper
         self.progress.message(
             f"stage {stages.model.case.name!r} ({stages.number + 1} of {len(stages.case.stage)}) begins after step "
             f"{stepper.number}, {stages.plan.axis.place(stepper.place)}"
@@ -381,7 +381,7 @@ class Outputs:
     def after(self, made: Step) -> Step:
         """Serve the observers that are due after a step; return the step with its row. Collective."""
         step, synchroniser = made.step, self._synchroniser
-        last = self._analysis.state.step == self._analysis.last_step
+        last = self._stepper.state.step == self._stepper.last_step
         history, *others = self._observers
         recorded = history.due(step)
         if recorded:
@@ -399,7 +399,7 @@ class Outputs:
             self._complete_stage()
         if history.row["step"] == step:
             made = made._replace(row=history.row)
-        size, contacts = self._analysis.step_size, history.row["active_contacts"]
+        size, contacts = self._stepper.h, history.row["active_contacts"]
         self.progress.update(step, made.time, size, made.newton, made.linear, contacts, history.drift)
         for function, every in self._callbacks:
             if step % every == 0:
@@ -420,13 +420,13 @@ class Outputs:
         EarlyStop
             On all ranks.
         """
-        code, analysis = self._synchroniser.request, self._analysis
-        if not code or (self._stages.at_last and analysis.state.step >= analysis.last_step):
+        code, stepper = self._synchroniser.request, self._stepper
+        if not code or (self._stages.at_last and stepper.state.step >= stepper.last_step):
             return
         self.checkpointing.write()
-        place = self._stages.plan.axis.exact(analysis.stepper.place)
+        place = self._stages.plan.axis.exact(stepper.place)
         raise EarlyStop(
-            f"{self._synchroniser.stop.reason(code)}; step {analysis.stepper.number} is finished, {place}, and "
+            f"{self._synchroniser.stop.reason(code)}; step {stepper.number} is finished, {place}, and "
             f"a checkpoint written: continue with --restart (results in {self._folder})"
         )
 
@@ -449,10 +449,10 @@ class Outputs:
         PfemError
             On all ranks.
         """
-        if self._analysis.model.case.modes is None or not self.is_open:
+        if self._stepper.model.case.modes is None or not self.is_open:
             return
         code, stop = self._synchroniser.synchronise(), self._synchroniser.stop
-        if code and self._analysis.state.step:
+        if code and self._stepper.state.step:
             if not self.checkpointing.at_end:
                 self.checkpointing.write()
             raise EarlyStop(
@@ -463,14 +463,14 @@ class Outputs:
         # the libraries for eigenvalues do not return to look at requests: from here on a signal ends the program
         stop.release()
         early().release()
-        record_modes(self._analysis.stepper, self._writer, self._folder, self.progress)
+        record_modes(self._stepper, self._writer, self._folder, self.progress)
 
     def tell_remarks(self) -> None:
         """Report the observers' remarks, such as walls that were never touched, and doubtful results. Collective."""
         for observer in self._observers:
             for text in observer.remarks():
                 self.progress.message(text)
-        for text in (self.snapshots.doubts() if self._stages.at_last else []) + self._analysis.stepper.doubts():
+        for text in (self.snapshots.doubts() if self._stages.at_last else []) + self._stepper.doubts():
             self.progress.warning(text)
 
     def close(self, outcome: str) -> None:

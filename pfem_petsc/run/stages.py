@@ -1,14 +1,19 @@
-"""The stages of a case and their analyses: planned before the first step, begun one after the other."""
+"""The stages of a case and their steppers: planned before the first step, begun one after the other.
+
+Within a stage time is counted from its start, for its tables and for its steps; ``StageStart`` says where that lies on
+the axis of the results. Positions, velocities, internal variables, temperatures, contact pairs and who touches which
+wall go over to the next one; the scheme starts again from them, as at the start of a run.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
-from ..analysis import Analysis
 from ..columns import declared
 from ..contact.contact import check_start
 from ..errors import InputError, SimulationFailure
@@ -17,11 +22,10 @@ from ..modes.find import describe_modes
 from ..modes.initial_state import InitialState
 from ..output.units import TIME as AXIS
 from ..preflight.checks import warnings_before
-from ..statics.analysis import StaticAnalysis
-from ..stepping.model import Model
+from ..statics.analysis import make_stepper as static_stepper
+from ..stepping.model import Model, StageStart
 from ..stepping.plan import make_plan
-from ..stepping.stage import end_of_stage, hand_over
-from ..stepping.time_stepping import TimeStepping
+from ..stepping.plan import make_stepper as time_stepper
 from ..tolerances import TIME
 from .recorder import Recorder
 
@@ -30,17 +34,17 @@ if TYPE_CHECKING:
     from ..stepping.stepper import Stepper
 
 
-def _make_analysis(model: Model, recorded: Mapping[str, Any] | None) -> Analysis:
-    """Create the analysis of a model's case. Collective.
+def _make_stepper(model: Model, recorded: Mapping[str, Any] | None) -> Stepper:
+    """Create the stepper of a model's case, with its plan. Collective.
 
     ``recorded``: record of the plan of the continued run, None for a new run
     """
     describe_modes(model)  # refuses at the start modes that cannot be computed at the end
     if model.case.static is not None:
-        return StaticAnalysis(model, recorded)
+        return static_stepper(model)
     if model.case.time is None:
         return InitialState(model)
-    return TimeStepping(model, make_plan(model, recorded))
+    return time_stepper(model, make_plan(model, recorded))
 
 
 class StagedPlan:
@@ -92,7 +96,7 @@ class Stages:
 
     Attributes
     ----------
-    analysis : of the present stage
+    stepper : of the present stage
     plan : of the whole run
     functions : that give forces in the present stage and in those after it, see :meth:`call`
     columns : of the history, name to type with the shape of a value, None for a case without stages
@@ -109,15 +113,15 @@ class Stages:
         self.case, self.comm = case, comm
         self._cases = case.stages
         self.functions: list[Callable[..., Any]] = []
-        self.analysis: Analysis
+        self.stepper: Stepper
         self.columns: dict[str, np.dtype] | None = None
         self.fields: list[str] | None = None
         self.events: dict[str, Any] = {}
         first = Model(self._cases[0], comm, later=self._cases[1:])
         if not case.stage:
-            self.analysis = _make_analysis(first, recorded)
-            self.plan = self.analysis.plan
-            self.events |= self.analysis.stepper.event_columns
+            self.stepper = _make_stepper(first, recorded)
+            self.plan = self.stepper.plan
+            self.events |= self.stepper.event_columns
             return
         records = [None] * len(case.stage) if recorded is None else recorded["stages"]
         self.columns = {name: declared(name).dtype for name in ("time", "step", "stage")}
@@ -125,23 +129,23 @@ class Stages:
         points, cells = {}, {}
         for k, (stage, record) in enumerate(zip(self._cases, records, strict=True)):
             model = first if k == 0 else Model(stage, comm, first.mesh)
-            analysis = _make_analysis(model, record)
-            plans.append(analysis.plan)
-            self.columns |= Recorder(analysis.stepper).columns
-            self.events |= analysis.stepper.event_columns
+            stepper = _make_stepper(model, record)
+            plans.append(stepper.plan)
+            self.columns |= Recorder(stepper).columns
+            self.events |= stepper.event_columns
             fields = Fields(model)
             points |= dict.fromkeys(fields.points)
             cells |= dict.fromkeys(fields.cells)
             warnings += [f"stage {stage.name!r}: {text}" for text in model.warnings]
             if k >= number:
-                found = warnings_before(stage, model, analysis.plan, first=False)
+                found = warnings_before(stage, model, stepper.plan, first=False)
                 new = [text for text in found if text not in told]
                 warnings += [f"stage {stage.name!r}: {text}" for text in new if k > number]
                 told += new
             if k == number:
-                self.analysis = analysis
+                self.stepper = stepper
             else:
-                analysis.close()
+                stepper.destroy()
         self.plan = StagedPlan(tuple(plans), tuple(stage.name for stage in self._cases))
         self.fields = [*points, *cells]
         self.model.warnings = warnings
@@ -149,7 +153,7 @@ class Stages:
     @property
     def model(self) -> Model:
         """Of the present stage."""
-        return self.analysis.model
+        return self.stepper.model
 
     @property
     def number(self) -> int:
@@ -195,24 +199,25 @@ class Stages:
         SimulationFailure
             On all ranks, where the stage cannot begin there.
         """
-        old, number = self.analysis, self.number + 1
+        old, number = self.stepper, self.number + 1
         stage = self._cases[number]
-        where = f"stage {stage.name!r}, begun after step {old.stepper.number}, t = {old.stepper.place:.6g} s"
-        old.stepper.settle()
+        where = f"stage {stage.name!r}, begun after step {old.number}, t = {old.place:.6g} s"
+        old.settle()
         try:
             model = Model(stage, self.comm, old.model.mesh)
-            model.begin_stage(end_of_stage(old.stepper))
+            model.begin_stage(_end_of_stage(old))
             for function in self.functions if stage.time is not None else ():
                 model.external.call(function)
             check_start(model.contact, old.state.position, model.size)
-            analysis = _make_analysis(model, self.plan.plans[number].record())
+            stepper = _make_stepper(model, self.plan.plans[number].record())
         except InputError as error:
             raise SimulationFailure(f"{where}: {error}") from error
-        hand_over(old.stepper, analysis.stepper)
-        old.close()
-        self.analysis = analysis
-        kick = _kick(analysis.stepper)
-        analysis.start()
+        _hand_over(old, stepper)
+        old.destroy()
+        self.stepper = stepper
+        kick = _kick(stepper)
+        stepper.start()
+        stepper.leave()
         return kick
 
 
@@ -224,3 +229,72 @@ def _kick(stepper: Stepper) -> tuple[float, np.ndarray]:
     mean = stepper.state.v + 0.5 * added
     sums = model.comm.allreduce(np.append(momentum.sum(axis=0), (momentum * mean).sum()))
     return float(sums[3]), sums[:3]
+
+
+def _end_of_stage(stepper: Stepper) -> StageStart:
+    """What the next stage starts from, at the end of a stage."""
+    model, state = stepper.model, stepper.state
+    external, time = model.external, state.time
+    return StageStart(
+        step=stepper.number,
+        time=stepper.place,
+        position=state.position.copy(),
+        force=external.loads_at(time),
+        gravity=np.array(external.gravity_at(time)),
+        wind=np.array(external.wind_at(time)),
+        walls=model.contact.motion.displacements(time),
+    )
+
+
+def _hand_over(old: Stepper, new: Stepper) -> None:
+    """Give the state of a finished stage to the stepper of the next, before its start. Collective."""
+    before, state = old.state, new.state
+    state.x[:] = before.x
+    new.before[:] = before.x
+    state.v = before.v.copy()
+    if not new.scheme.inertial:  # others find the forces of their start
+        state.support, state.contact = old.recorded()[1].copy(), before.contact.copy()
+    new.model.bars.put_history(old.model.bars.history())
+    new.model.bars.forget_rates()
+    new.follow_removals(old.removals)
+    new.ruptures.begin()
+    new.model.temperatures.hold(old.model.bars.heat)
+    new.model.rest_lengths.hold(old.model.bars.rest)
+    new.model.links.take_over(old.model.links)
+    _hand_over_contact(old, new)
+
+
+def _hand_over_contact(old: Stepper, new: Stepper) -> None:
+    """Who touches walls of the same name, their forces, times and ties; walls with mass that stay in force go on."""
+    before, contact = old.model.contact, new.model.contact
+    pairs = [(before.names.index(name), k) for k, name in enumerate(contact.names) if name in before.names]
+    if pairs:
+        from_, to = np.array(pairs, dtype=np.int64).T
+        new.touching[:, to] = old.touching[:, from_] & contact.members[:, to]
+        new.closed[:, to] = old.closed[:, from_] & contact.members[:, to]
+        contact.log.last = np.flatnonzero(new.touching.any(axis=1))
+        contact.log.time[to] = before.log.time[from_]
+    if pairs and not new.scheme.inertial:
+        force = contact.nothing.force.copy()
+        force[to] = old.solution.walls.force[from_]
+        new.solution.walls = dataclasses.replace(contact.nothing, force=force)
+    if new.model.case.holds("wall"):
+        bodies, earlier = contact.motion.bodies, before.motion.bodies
+        bodies.state.x, bodies.state.v = earlier.state.x.copy(), earlier.state.v.copy()
+    _hand_over_ties(old, new, dict(pairs))
+
+
+def _hand_over_ties(old: Stepper, new: Stepper, walls: dict[int, int]) -> None:
+    """Nodes tied to walls that tie still are tied to them, where they are."""
+    before, contact = old.model.contact, new.model.contact
+    if not (before.ties.any and contact.ties.any):
+        return
+    nodes, tied = before.ties.nodes()
+    owned = len(new.state.v)
+    tied_to, tied_at = np.zeros(owned, dtype=np.int64), np.zeros((owned, 3))
+    displacements = contact.motion.displacements(0.0)
+    for node, wall in zip(nodes, tied, strict=True):
+        k = walls.get(int(wall), -1)
+        if k >= 0 and contact.ties.tying[k] and contact.members[node, k]:
+            tied_to[node], tied_at[node] = k + 1, new.state.x[node] - displacements[k]
+    new.state.memory["tied_to"], new.state.memory["tied_at"] = tied_to, tied_at

@@ -92,7 +92,7 @@ class Synchroniser:
     @property
     def alarm(self) -> bool:
         """Whether this rank has a fault."""
-        return self._stages.analysis.fault is not None or self.stop.code != 0
+        return self._stages.stepper.fault is not None or self.stop.code != 0
 
     def due(self, step: int) -> bool:
         """Return whether all ranks synchronise after this step; equal on all ranks."""
@@ -110,9 +110,9 @@ class Synchroniser:
         PfemError
             On all ranks: the earliest fault, of the lowest rank that has one; later ones may be its consequences.
         """
-        analysis = self._stages.analysis
-        fault, step = analysis.fault, analysis.stepper.number
-        since = analysis.stepper.fault_step if fault is not None else step
+        stepper = self._stages.stepper
+        fault, step = stepper.fault, stepper.number
+        since = stepper.fault_step if fault is not None else step
         try:
             self.lock.renew()
         except SimulationFailure as lost:

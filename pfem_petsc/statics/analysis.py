@@ -1,76 +1,57 @@
-"""The static analysis of a case with a table ``[static]``: its plan, checks and steps."""
+"""The static analysis of a case with a table ``[static]``: its checks, plan and stepper."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..analysis import Analysis, PlanAtRest, refuse_motion
 from ..errors import InputError
 from ..mechanics.materials.base import law_name, law_of
 from ..output.units import LOAD_FACTOR, POINT
 from ..registry import lookup
 from ..solvers.background_grid import fills_block
 from ..solvers.linear import Demand, LinearChoice, choose_linear
+from ..stepping.plan import PlanAtRest, refuse_motion
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
+    from .stepper import StaticStepper
 
-__all__ = ["METHODS", "StaticAnalysis"]
+__all__ = ["METHODS", "make_stepper"]
 
 METHODS = "pfem_petsc.statics.methods"
-NEVER = 2**62
 
 _DIRECT_UP_TO = 30_000  # unknowns; beyond, multigrid takes less time and memory than a factorisation
 # 101,376 octet bars that yield: up to 300 conjugate gradient iterations a Newton step, and none that converges at 2 %
 _DIRECT_YIELDING_UP_TO = 200_000
 
 
-class StaticAnalysis(Analysis):
-    """Advances a state from equilibrium to equilibrium. Construction is collective.
-
-    Parameters
-    ----------
-    model : Model
-    recorded : ``PlanAtRest.record`` of the run that is continued
+def make_stepper(model: Model) -> StaticStepper:
+    """Create the stepper of a case, which goes from equilibrium to equilibrium, with its plan. Collective.
 
     Raises
     ------
     InputError
         On all ranks, if the case has features that a static analysis does not support.
     """
-
-    def __init__(self, model: Model, recorded: Mapping[str, Any] | None = None) -> None:
-        case = model.case
-        _check(model)
-        self.model = model
-        parameters = case.static.parameters
-        choice = _linear(model)
-        self.step_size = parameters.step
-        self.stepper = lookup(METHODS, case.static.method, "static.method").make_stepper(model, parameters, choice)
-        points = getattr(parameters, "max_points", None)
-        words = ", ".join(f"{key} = {value}" for key, value in parameters.model_dump(exclude_none=True).items())
-        self.plan = PlanAtRest(
-            self.stepper.scheme,
-            LOAD_FACTOR if points is None else POINT,
-            {"static analysis": f"{case.static.method} ({words})"},
-            parameters.step,
-            self.stepper.end,
-            choice,
-            points,
-        )
-
-    @property
-    def last_step(self) -> int:
-        """Number of the last step once it is reached, before that a number larger than any step."""
-        return self.stepper.state.step if self.stepper.done else NEVER
-
-    def obstacle(self) -> str:
-        """See :class:`~pfem_petsc.analysis.Analysis`: motions without stiffness."""
-        return self.stepper.obstacle()
+    _check(model)
+    case = model.case
+    parameters, choice = case.static.parameters, _linear(model)
+    stepper = lookup(METHODS, case.static.method, "static.method").make_stepper(model, parameters, choice)
+    points = getattr(parameters, "max_points", None)
+    words = ", ".join(f"{key} = {value}" for key, value in parameters.model_dump(exclude_none=True).items())
+    stepper.plan = PlanAtRest(
+        stepper.scheme,
+        LOAD_FACTOR if points is None else POINT,
+        {"static analysis": f"{case.static.method} ({words})"},
+        parameters.step,
+        stepper.end,
+        choice,
+        points,
+    )
+    return stepper
 
 
 def _linear(model: Model) -> LinearChoice:

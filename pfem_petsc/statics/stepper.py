@@ -32,6 +32,7 @@ _STRONGER = 10.0  # factor on the viscosity where an increment fails
 _TRIED = 0.1  # of an increment, to which it is halved before the viscosity grows
 _WEAKER = 0.5  # the same after an increment
 _RELEASES = 20  # attempts to find the equilibrium at the end
+NEVER = 2**62
 UNCOUNTED = -2
 """Of negative eigenvalues: there are some, whose number is unknown."""
 _RESISTANCE = 1e-3  # viscosity over stiffness with which a truss that nothing holds yet is moved against walls
@@ -93,6 +94,11 @@ class StaticStepper(ImplicitStepper):
     def done(self) -> bool:
         """Whether the last load factor is reached."""
         return self.state.time >= self.end * (1.0 - TIME)
+
+    @property
+    def last_step(self) -> int:
+        """Number of the last step once it is reached, before that a number larger than any step."""
+        return self.state.step if self.done else NEVER
 
     def when(self, balance: Balance) -> str:
         return f"step {self.number + 1}, load factor {balance.time:.6g}"

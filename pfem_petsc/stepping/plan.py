@@ -1,28 +1,34 @@
-"""The plan of a run: scheme, time step and linear solver, resolved once before the first step."""
+"""The plan of a run: scheme, time step and linear solver, resolved once before the first step; and its stepper."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
+from ..contact.impact_gains import warn_of_gain
+from ..contact.treatments.base import Restitution, Treatment
+from ..contact.wall_motion import FreeWalls
 from ..errors import InputError
 from ..integrators.base import Scheme
 from ..mechanics.bars import viscous_rate
 from ..mechanics.materials.base import law_name, law_of
 from ..output.units import TIME as AXIS
 from ..output.units import Axis, engineering
-from ..registry import lookup
+from ..registry import choices, lookup
 from ..solvers.background_grid import fills_block
 from ..solvers.linear import Demand, LinearChoice, choose_linear
 from ..tolerances import TIME
+from .explicit import ExplicitStepper, RedistributedStepper
+from .implicit import ImplicitStepper
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from .model import Model
+    from .stepper import Stepper
 
 
 _LARGEST = 1e150  # squared frequencies [rad2/s2] whose squares do not overflow
@@ -162,6 +168,53 @@ class Plan:
         """Return the numbers that a restart must not compute again, exact to the last bit."""
         linear = None if self.linear is None else {"asked": list(self.asked), "choice": asdict(self.linear)}
         return {"step": self.step, "frequency": list(self.frequency), "linear": linear}
+
+
+@dataclass(frozen=True)
+class PlanAtRest:
+    """The plan of a run without motion, for which nothing is computed before.
+
+    Attributes
+    ----------
+    scheme : the balance without inertia
+    axis : of the times in the results
+    texts : summary for the user before a run, by label
+    step : first increment on the axis
+    end : last place on the axis, None where it is not known before
+    linear : linear solver, None without equations
+    steps : largest number of steps, None where it is not known before
+    """
+
+    scheme: Scheme
+    axis: Axis
+    texts: dict[str, str] = field(default_factory=dict)
+    step: float = 0.0
+    end: float | None = 0.0
+    linear: LinearChoice | None = None
+    steps: int | None = None
+
+    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Return which of the recorded steps and times are beyond the end."""
+        return times > (np.inf if self.end is None else self.end * (1.0 + TIME))
+
+    def entries(self, case: Case) -> dict[str, str]:
+        """Return label and text of a summary for the user before a run."""
+        return self.texts
+
+    def record(self) -> dict[str, Any]:
+        """Return the numbers that a restart must not compute again."""
+        return {}
+
+
+def refuse_motion(case: Case, what: str) -> None:
+    """Refuse initial velocities and treatments of impact, which ``what`` does not have."""
+    if any(any(entry.velocity) or any(entry.angular_velocity) for entry in case.initial):
+        raise InputError(f"{case.source}: initial: {what} has no velocities; remove the table [initial], or use [time]")
+    if case.contact.treatment != "scheme":
+        raise InputError(
+            f'{case.source}: contact.treatment = "{case.contact.treatment}" treats impacts, and {what} has none; '
+            "remove the key"
+        )
 
 
 def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
@@ -312,3 +365,139 @@ def _steps_to(end: float, step: float, source: str) -> int:
             "time.step or a smaller time.end"
         )
     return max(int(np.ceil(end / step * (1.0 - 1e-12) - 1e-9)), 1)
+
+
+_DAMPED = 0.2  # largest damping rate times step for an accurate ledger; at the rate 1/s a velocity decays to 1/e in 1 s
+
+TREATMENTS = "pfem_petsc.contact.treatments"
+
+
+def make_stepper(model: Model, plan: Plan) -> Stepper:
+    """Create the stepper of a plan, with the case's treatment of impact. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, if the scheme is not compatible with the treatment.
+    """
+    treatment = _treatment(model, plan)
+    _check_walls(model, plan, treatment)
+    _warn_of_damping(model, plan)
+    _warn_of_drag(model, plan)
+    if treatment is not None:
+        treatment.prepare(model)
+    if plan.linear is not None:
+        stepper: Stepper = ImplicitStepper(model, plan.scheme, plan.step, plan.linear)
+    else:
+        explicit = ExplicitStepper if model.inertia.redistribution is None else RedistributedStepper
+        stepper = explicit(model, plan.scheme, plan.step)
+    stepper.plan = plan
+    if treatment is not None:
+        stepper.treatment = treatment(stepper)
+    elif model.contact.restitution.any() and not model.contact.rebounds:
+        stepper.treatment = Restitution(stepper)
+    if model.can_touch:
+        _warn_of_gain(model, plan)
+    return stepper
+
+
+def _treatment(model: Model, plan: Plan) -> type[Treatment] | None:
+    """Return the treatment of the case; None for the formulas of the scheme, and if nothing can touch."""
+    name = model.case.contact.treatment
+    if name == "scheme" or not model.can_touch:
+        return None
+    treatment = lookup(TREATMENTS, name, "contact.treatment").Treatment
+    key = f'{model.case.source}: contact.treatment = "{name}"'
+    if model.inertia.consistent:
+        raise InputError(f'{key}: needs time.mass = "lumped"')
+    reason = treatment.refuses(plan.scheme)
+    if reason is not None:
+        raise InputError(f"{key}: {reason}")
+    return treatment
+
+
+def _warn_of_gain(model: Model, plan: Plan) -> None:
+    """Warn if contact gains energy with this scheme, treatment, mass and step."""
+    fastest = plan.frequency.upper / (np.sqrt(3.0) if model.inertia.consistent else 1.0)
+    across = 0.5 * fastest * model.length / model.wave_speed
+    warning = warn_of_gain(model.case, 0.5 * fastest * plan.step, across)
+    if warning:
+        model.warnings.append(warning)
+
+
+def _warn_of_damping(model: Model, plan: Plan) -> None:
+    """Warn if damping stops nodes within a few steps, when no rule over steps gives its dissipation accurately."""
+    rate = max(material.damping / material.density for material in model.case.material.values())
+    rate = max(model.inertia.largest_factor * rate, dashpot_rate(model))
+    if rate * plan.step > _DAMPED:
+        model.warnings.append(
+            f"time.step = {plan.step:.4g} s: damping stops nodes within a few steps (material.damping / density, or "
+            f"dashpot.coefficient / mass, * step = {rate * plan.step:.2g}), so the recorded damping dissipation has "
+            f"an error of this order; use "
+            f"a time.step of at most {_DAMPED / rate:.2g} s, or less damping"
+        )
+
+
+def _warn_of_drag(model: Model, plan: Plan) -> None:
+    """Warn if drag stops bars within a few steps: by predicted velocities it is stable up to a rate of 2/3 a step."""
+    wind = model.external.wind
+    if wind is None:
+        return
+    rate = wind.rate(wind.fastest())
+    if rate * plan.step > _DAMPED:
+        model.warnings.append(
+            f"time.step = {plan.step:.4g} s: the drag of [wind] stops bars within a few steps (rho C_d d U / (density "
+            f"area) * step = {rate * plan.step:.2g}), which its explicit evaluation does not follow; use a time.step "
+            f"of at most {_DAMPED / rate:.2g} s"
+        )
+
+
+def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) -> None:
+    """Refuse features of walls that the scheme does not support."""
+    walls = model.case.wall
+    if any(wall.mass is not None for wall in walls):
+        if treatment is not None:
+            raise InputError(
+                f'{model.case.source}: wall.mass needs contact.treatment = "scheme": other '
+                "treatments change velocities by jumps"
+            )
+        if model.external.gravity_varies and any(wall.gravity for wall in walls):
+            raise InputError(
+                f"{model.case.source}: gravity.acceleration: walls with gravity = true need a constant gravity, "
+                "not rows over time"
+            )
+        model.contact.motion.bodies = FreeWalls(walls, plan.scheme, model.comm, tuple(model.external.gravity))
+    model.links.check(model.case.contact.treatment, model.size)
+    for k, name in enumerate(model.contact.names):
+        key = f"{model.case.source}: wall {name!r}"
+        if model.contact.restitution[k]:
+            _check_restitution(model, plan, treatment, k, key)
+        if model.contact.ties.tying[k]:
+            _check_serves(treatment, "tied", key)
+        if model.contact.static_friction[k]:
+            _check_serves(treatment, "friction", key)
+
+
+def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> None:
+    """Refuse a key of walls that the treatment does not support."""
+    if treatment is None or what in treatment.serves:
+        return
+    known = {name: lookup(TREATMENTS, name, "").Treatment for name in choices(TREATMENTS)}
+    served = ['"scheme"', *(f'"{name}"' for name, other in known.items() if what in other.serves)]
+    raise InputError(f"{key}: {what} needs contact.treatment = {' or '.join(served)}")
+
+
+def _check_restitution(model: Model, plan: Plan, treatment: type[Treatment] | None, k: int, key: str) -> None:
+    if model.inertia.consistent:
+        raise InputError(f'{key}: restitution needs time.mass = "lumped": one node\'s velocity jumps')
+    if plan.scheme.solves_next_position:
+        model.contact.rebounds = True
+        if treatment is not None:
+            raise InputError(f'{key}: with {model.case.time.integrator} restitution needs contact.treatment = "scheme"')
+        return
+    _check_serves(treatment, "restitution", key)
+    # the impulse of a velocity jump causes no friction and does not move walls with mass
+    if model.contact.static_friction[k]:
+        raise InputError(f"{key}: restitution together with friction needs central_differences")
+    if model.case.wall[k].mass is not None:
+        raise InputError(f"{key}: restitution of a wall with mass needs central_differences")

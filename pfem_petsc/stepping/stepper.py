@@ -66,6 +66,23 @@ class Instants(NamedTuple):
     noted: np.ndarray
 
 
+class Step(NamedTuple):
+    """Report of a finished step.
+
+    Attributes
+    ----------
+    step, time : number and time [s] of the state after the step
+    newton, linear : numbers of iterations
+    row : of the history, None if the step has none
+    """
+
+    step: int
+    time: float
+    newton: int
+    linear: int
+    row: dict[str, Any] | None
+
+
 class PrescribedMotion:
     """Sets prescribed components in the balances and the state of a stepper.
 
@@ -284,8 +301,13 @@ class Solution:
 class Stepper(ABC):
     """Advances the state by the scheme; subclasses solve the balance.
 
+    Examples are explicit and implicit time steps and static paths, whose time is the load factor. Recording,
+    checkpoints, requests to stop and progress use :attr:`plan`, :attr:`last_step`, :meth:`start`, :meth:`leave`,
+    :meth:`obstacle`, :meth:`advance` and :meth:`destroy`, and do not depend on the analysis.
+
     Attributes
     ----------
+    plan : resolved settings of the run: ``end``, ``steps``, ``linear``, ``entries``, ``beyond``, ``record``
     state : State
     energy : StrainEnergy of this rank's bars at the state's positions
     solution : of the last balance
@@ -320,6 +342,7 @@ class Stepper(ABC):
     events : found with the last step and not recorded yet, the same on all ranks; each has ``row()`` and a text
     """
 
+    plan: Any
     kept_numbers: tuple[str, ...] = ("part", "smallest", "removal_times", "removed_supports")
     kept_arrays: tuple[str, ...] = ("touching", "closed", "removed_reactions")
     kept_bars: tuple[str, ...] = ()
@@ -534,6 +557,27 @@ class Stepper(ABC):
     def clock(self) -> float:
         """Time of the state in the results, from the start of the stage; increases from step to step."""
         return self.state.time
+
+    @property
+    def last_step(self) -> int:
+        """Number of the last step; larger than any step while it is unknown."""
+        return self.plan.steps
+
+    def obstacle(self) -> str:
+        """Return why no step can be made, as far as it is known before the first; empty otherwise. Collective."""
+        return ""
+
+    def advance(self, most: int = 1) -> Step:
+        """Make one step, or up to ``most`` if nothing needs Python between them, and return the last one; its ``row``
+        is None, because rows are made by recording. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks; the state is the last complete one, or undefined.
+        """
+        self.steps(min(most, self.last_step - self.state.step))
+        return Step(self.number, self.place, self.solution.newton, self.solution.linear, None)
 
     def steps(self, most: int) -> None:
         """Make at least one step, and at most ``most`` if nothing needs Python between them. Collective."""

@@ -7,8 +7,7 @@ from mpi4py import MPI
 
 from pfem_petsc import Case
 from pfem_petsc.stepping.model import Model
-from pfem_petsc.stepping.plan import make_plan
-from pfem_petsc.stepping.time_stepping import make_stepper
+from pfem_petsc.stepping.plan import make_plan, make_stepper
 
 LENGTH, YOUNG, DENSITY, AREA = 1.0, 1e10, 1000.0, 1e-4
 SPIN = 2.0 * np.pi  # a turn a second

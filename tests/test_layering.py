@@ -51,6 +51,7 @@ ANNOTATED = {
     "contact": {"case", "stepping"},
     "mechanics": {"case", "contact"},
     "mesh": {"case"},
+    "solvers": {"contact", "stepping"},
     "stepping": {"case"},
     "__init__": {"studies"},
 }

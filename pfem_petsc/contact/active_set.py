@@ -22,8 +22,8 @@ from .projection import project
 from .transform import RowCoordinates, Transform
 
 if TYPE_CHECKING:
+    from ..solvers.problem import StepProblem
     from ..stepping.model import Model
-    from ..stepping.problem import StepProblem
     from .contact import Contact
 
 

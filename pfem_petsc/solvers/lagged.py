@@ -14,7 +14,8 @@ from .matrix_free import MatrixFreeHessian
 from .multigrid import GridMultigrid
 
 if TYPE_CHECKING:
-    from .problem import Linearisable, Mechanics
+    from ..stepping.model import Model
+    from .problem import StepProblem
 
 
 # Nodes a rank. Aggregates of fewer unknowns than rigid body modes make PETSc 3.18 fail on several ranks, and let solves
@@ -35,7 +36,7 @@ class AssembledPreconditioner:
 
     Parameters
     ----------
-    model : Mechanics
+    model : Model
     kind : ``gamg``, ``lu`` or ``mumps``
     symmetric : whether the Hessian, including friction, is symmetric
     definite : whether the Hessian without friction is symmetric, and thus has a definite part
@@ -43,7 +44,7 @@ class AssembledPreconditioner:
         saves a third of the time
     """
 
-    def __init__(self, model: Mechanics, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
+    def __init__(self, model: Model, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
         self.mesh, self.kind = model.mesh, kind
         # for symmetric schemes: the stiffness of the bars and its products
         self.product = MatrixFreeHessian(model) if definite else None
@@ -56,7 +57,7 @@ class AssembledPreconditioner:
         """Set the coordinates of links for steps with bounds. Collective."""
         self.matrix.couple(links)
 
-    def make(self, problem: Linearisable, held: np.ndarray) -> None:
+    def make(self, problem: StepProblem, held: np.ndarray) -> None:
         """Set up at the positions of a problem; ``held`` (local, 3): nonzero for active unknowns, ghosts not yet up to
         date. Collective."""
         matrix = self.matrix
@@ -67,11 +68,9 @@ class AssembledPreconditioner:
             self.product.make_definite()
             stored = self._vectors()
             self.product.extension.kept = np.flatnonzero(held[: self.mesh.n_owned] == 0.0)
-
-        def add(values: np.ndarray) -> None:
-            problem.hessian_here(matrix, values, stored)
-
-        final = matrix.fill_held(add, held, problem.scale, problem.transform)
+        final = matrix.fill_held(
+            lambda values: matrix.add(problem, values, stored), held, problem.scale, problem.transform
+        )
         self._set_up(final, problem)
         if self._inner.getType() == "gamg" and self.fill() > _DENSE:
             # the independent sets of PETSc 3.18 hardly coarsen a body-centred lattice: set-up and steps take 5 x as
@@ -97,7 +96,7 @@ class AssembledPreconditioner:
         entries = [solver.getOperators()[1].getInfo()["nz_used"] for solver in solvers]
         return sum(entries[:-1]) / max(entries[-1], 1.0)
 
-    def _set_up(self, matrix: PETSc.Mat, problem: Linearisable) -> None:
+    def _set_up(self, matrix: PETSc.Mat, problem: StepProblem) -> None:
         # from scratch: a reused hierarchy would differ from that after a restart
         self._new_inner(matrix)
         x = problem.x[: self.mesh.n_owned]
@@ -145,7 +144,7 @@ class LaggedPreconditioner:
 
     Parameters
     ----------
-    model : Mechanics
+    model : Model
     kind : of preconditioner: ``gamg``, ``lu``, ``mumps``; ``multigrid``
     symmetric, definite, matrix_free : see :class:`~pfem_petsc.solvers.lagged.AssembledPreconditioner`
 
@@ -160,7 +159,7 @@ class LaggedPreconditioner:
     carried : whether it was set up for an earlier problem
     """
 
-    def __init__(self, model: Mechanics, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
+    def __init__(self, model: Model, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
         mesh = model.mesh
         self.mesh = mesh
         self.kind = kind
@@ -191,12 +190,12 @@ class LaggedPreconditioner:
         self._problem = None
         self.place = self.place[:, :0]
 
-    def renew(self, problem: Linearisable, kept: np.ndarray | None) -> None:
+    def renew(self, problem: StepProblem, kept: np.ndarray | None) -> None:
         """Set the preconditioner up again if necessary; called at each Newton iteration. Collective.
 
         Parameters
         ----------
-        problem : Linearisable, at the positions at which the Hessian is required
+        problem : StepProblem, at the positions at which the Hessian is required
         kept : this rank's unknowns in the system, local and ascending; None for all
         """
         *coefficients, first, beyond, last = self.count
@@ -230,7 +229,7 @@ class LaggedPreconditioner:
         self._problem = problem
         self.count = [*wanted, first, beyond, 0.0]
 
-    def _make_again(self, problem: Linearisable) -> None:
+    def _make_again(self, problem: StepProblem) -> None:
         """Recreate the preconditioner after a restart, from the Hessian at its last set-up."""
         here, owned = problem.x.copy(), self.mesh.n_owned
         held = np.zeros((self.mesh.n_local, 3))
@@ -244,7 +243,7 @@ class LaggedPreconditioner:
         if self.remembers:
             self.bars.put_history(history)
 
-    def _make(self, problem: Linearisable, held: np.ndarray) -> None:
+    def _make(self, problem: StepProblem, held: np.ndarray) -> None:
         self.inner.make(problem, held)
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:

@@ -16,7 +16,7 @@ from ..errors import InputError, SimulationFailure
 from .matrix import HessianMatrix
 
 if TYPE_CHECKING:
-    from .problem import Mechanics
+    from ..stepping.model import Model
 
 
 DIRECT = ("lu", "mumps")
@@ -279,11 +279,11 @@ class MassSolver:
 
     Parameters
     ----------
-    model : Mechanics
+    model : Model
         With consistent mass.
     """
 
-    def __init__(self, model: Mechanics) -> None:
+    def __init__(self, model: Model) -> None:
         self._supports = model.supports
         self._matrix = matrix = HessianMatrix(model.mesh, model.supports)
 

@@ -13,9 +13,10 @@ from ..mechanics.block_pattern import BlockPattern
 from ..mechanics.compiled import kernel
 
 if TYPE_CHECKING:
+    from ..contact.transform import Transform
     from ..mechanics.supports import Directions, Supports
     from ..mesh.distribution import DistributedMesh
-    from .problem import Coordinates, Linearisable
+    from .problem import StepProblem
 
 
 @kernel
@@ -198,25 +199,52 @@ class HessianMatrix:
             self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
             self._chain.append((link, matrix, self.bounded))
 
-    def turn(self, transform: Coordinates, values: np.ndarray) -> None:
+    def _turn(self, transform: Transform, values: np.ndarray) -> None:
         """Transform the values to frame coordinates, without those of rows over several nodes."""
         turns = transform.turns()
         if turns is not None:
             self.pattern.add_blocks(transform.sliding.nodes, transform.sliding.stiffness, values)
             turn_blocks(self.pattern.ptr, self.local_columns, *turns, values)
 
-    def update(self, problem: Linearisable, w: np.ndarray) -> None:
+    def update(self, problem: StepProblem, w: np.ndarray) -> None:
         """Assemble the Hessian of a problem at ``w``. Collective."""
-        self.fill(lambda values: problem.hessian(w, self, values))
+        problem.place(problem.increment(w))
+        self.fill(lambda values: self.add(problem, values))
         if problem.transform.bounded:
             self._change_coordinates(problem.transform)
 
-    def put(self, problem: Linearisable, bars: np.ndarray) -> None:
+    def put(self, problem: StepProblem, bars: np.ndarray) -> None:
         """Assemble at the predictor of a problem, with the stiffness (5, b) of ``Bars.linearise``. Collective."""
         problem.place(np.zeros_like(problem.u))
-        self.fill(lambda values: problem.hessian_here(self, values, bars))
+        self.fill(lambda values: self.add(problem, values, bars))
 
-    def _change_coordinates(self, transform: Coordinates) -> None:
+    def add(self, problem: StepProblem, values: np.ndarray, stored: np.ndarray | None = None) -> None:
+        """Add dg/dw of a problem at its positions, ghosts included, without the coordinates of links. Collective.
+
+        With ``stored`` (5, b) the stiffness of the bars is computed from these data, see ``Bars.linearise``.
+        """
+        inertia, bars, balance = problem.model.inertia, problem.model.bars, problem.balance
+        if not inertia.consistent:
+            self.add_lumped(problem.nodal, values)
+            if inertia.redistribution is not None:
+                moved = inertia.redistribution
+                self.pattern.add_blocks(moved.touched, balance.alpha * moved.tensors, values)
+        elif inertia.points.any:
+            self.add_lumped(inertia.points.nodal(balance.alpha, balance.eta), values)
+        coefficients = inertia.coefficients(balance.alpha, balance.eta)
+        if balance.weight or inertia.consistent:
+            apart = stored is not None and not balance.discrete_gradient
+            start = problem.state.x if balance.discrete_gradient else None
+            weight = 0.0 if apart else balance.weight
+            bars.tangents(problem.x, weight, coefficients, self.pattern, values, start)
+            if apart:
+                self.add_bars(stored, values)
+                for family in bars.families:
+                    family.add_tangents(balance.weight, self.pattern, values)
+        self._turn(problem.transform, values)
+        self.constrain(problem.scale, values)
+
+    def _change_coordinates(self, transform: Transform) -> None:
         """Compute ``bounded`` from ``mat``. Collective."""
         last = self.mat
         for link, matrix, product in self._chain:
@@ -228,25 +256,22 @@ class HessianMatrix:
                 last.copy(product, PETSc.Mat.Structure.DIFFERENT)
             last = product
 
-    def fill_held(
-        self, add: Callable[[np.ndarray], None], held: np.ndarray, scale: float, transform: Coordinates
-    ) -> PETSc.Mat:
-        """Assemble in the coordinates of a transform; rows and columns of components (local nodes, 3) with nonzero
-        ``held`` are replaced by ``scale`` on the diagonal. Collective."""
-        if not transform.links:
+    def fill_held(self, problem: StepProblem, held: np.ndarray, stored: np.ndarray | None) -> PETSc.Mat:
+        """Assemble as :meth:`add`, in the coordinates of the problem; rows and columns of components (local nodes, 3)
+        with nonzero ``held`` are replaced by the scale of the problem on the diagonal. Collective."""
 
-            def add_held(values: np.ndarray) -> None:
-                add(values)
-                if held.any():
-                    self.hold(held, scale, values)
+        def add(values: np.ndarray) -> None:
+            self.add(problem, values, stored)
+            if held.any() and not problem.transform.links:
+                self.hold(held, problem.scale, values)
 
-            return self.fill(add_held)
         self.fill(add)
-        self._change_coordinates(transform)
-        first, owned = 3 * self.mesh.first_node, self.mesh.n_owned
-        rows = np.flatnonzero(held[:owned]) + first
+        if not problem.transform.links:
+            return self.mat
+        self._change_coordinates(problem.transform)
+        rows = np.flatnonzero(held[: self.mesh.n_owned]) + 3 * self.mesh.first_node
         self.bounded.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
-        self.bounded.zeroRowsColumns(rows.astype(PETSc.IntType), scale)
+        self.bounded.zeroRowsColumns(rows.astype(PETSc.IntType), problem.scale)
         return self.bounded
 
     def add_lumped(self, inertia: np.ndarray, values: np.ndarray) -> None:

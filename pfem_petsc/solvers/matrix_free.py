@@ -16,7 +16,8 @@ from ..mechanics.mass import consistent_product
 from ..mechanics.strips import add_stiffness_diagonals, add_stiffness_products
 
 if TYPE_CHECKING:
-    from .problem import Linearisable, Mechanics
+    from ..stepping.model import Model
+    from .problem import StepProblem
 
 
 _NUMBERS = itertools.count()
@@ -262,7 +263,7 @@ class MatrixFreeHessian:
 
     _extension: Extension | None = None
 
-    def __init__(self, model: Mechanics) -> None:
+    def __init__(self, model: Model) -> None:
         self.model = model
         mesh = model.mesh
         self.mesh = mesh
@@ -278,20 +279,20 @@ class MatrixFreeHessian:
         self._out = np.zeros((mesh.n_local, 3))
         self._problem = None
 
-    def update(self, problem: Linearisable, w: np.ndarray) -> None:
+    def update(self, problem: StepProblem, w: np.ndarray) -> None:
         """Linearise at ``w``. Collective."""
         problem.place(problem.increment(w))
         self.linearise(problem)
         self.mat.stateIncrease()
 
-    def linearise(self, problem: Linearisable) -> None:
+    def linearise(self, problem: StepProblem) -> None:
         """As :meth:`update`, at the current positions of the problem."""
         self._problem = problem
         self._left = problem.transform.left()
         self.x[:] = problem.x
         self.model.bars.stiffnesses(self.x, problem.balance.weight, self.stored)
 
-    def put(self, problem: Linearisable, bars: np.ndarray) -> None:
+    def put(self, problem: StepProblem, bars: np.ndarray) -> None:
         """Linearise at the predictor of a problem, with the stiffness (5, b) of ``Bars.linearise``. Collective."""
         self.update(problem, np.zeros_like(problem.u))
         self.stored[0], self.stored[1] = bars[3] / self.model.bars.lengths(self.x) ** 2, bars[4]

@@ -15,7 +15,8 @@ from .linear import reproducible_products
 from .matrix_free import MatrixFreeHessian, full_blocks
 
 if TYPE_CHECKING:
-    from .problem import Linearisable, Mechanics
+    from ..stepping.model import Model
+    from .problem import StepProblem
 
 
 _SHIFT = 1e-8  # of the diagonal: corners that few nodes depend on may have functions that depend on each other
@@ -137,7 +138,7 @@ class GridMultigrid:
     reduced : whether the last :meth:`make` was for such a solve
     """
 
-    def __init__(self, model: Mechanics) -> None:
+    def __init__(self, model: Model) -> None:
         self.model, self.mesh = model, model.mesh
         self.product = MatrixFreeHessian(model)
         self.grid = BackgroundGrid(model.mesh)
@@ -159,7 +160,7 @@ class GridMultigrid:
     def couple(self, links: object) -> None:
         """Do nothing: with coordinates of links the diagonal is the preconditioner."""
 
-    def make(self, problem: Linearisable, held: np.ndarray) -> None:
+    def make(self, problem: StepProblem, held: np.ndarray) -> None:
         """Set up at the positions of a problem; ``held`` (local, 3) nonzero for active unknowns, ghosts not yet up to
         date. Collective."""
         owned = self.mesh.n_owned
@@ -213,7 +214,7 @@ class GridMultigrid:
         nodes = np.flatnonzero(shared[:, 0])
         return nodes, np.ascontiguousarray(shared[nodes, 1:]).reshape(-1, 3, 3)
 
-    def _make_coarse(self, problem: Linearisable, nodes: np.ndarray, turned: np.ndarray) -> None:
+    def _make_coarse(self, problem: StepProblem, nodes: np.ndarray, turned: np.ndarray) -> None:
         mesh, product = self.mesh, self.product
         extra_nodes, extra = product.extra_blocks()
         every = np.union1d(nodes, extra_nodes)
@@ -231,7 +232,7 @@ class GridMultigrid:
         with reproducible_products(mesh.comm):
             self._solver.setUp()
 
-    def _positions(self, problem: Linearisable) -> np.ndarray:
+    def _positions(self, problem: StepProblem) -> np.ndarray:
         """Return positions (local corners, 3) of the corners, moved by the affine map that fits the nodes best, with
         origin at the centre. Collective."""
         mesh, owned = self.mesh, self.mesh.n_owned

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import weakref
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -20,8 +20,9 @@ from .matrix_free import MatrixFreeHessian, at_exit, outlive
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
+    from .problem import StepProblem
 
-__all__ = ["STAGNATION", "NewtonReport", "NewtonSolver", "Problem", "Tolerance", "zero_tolerance"]
+__all__ = ["STAGNATION", "NewtonReport", "NewtonSolver", "Tolerance", "zero_tolerance"]
 
 STAGNATION = 100.0
 """A residual within this many rounding errors that no longer falls has converged."""
@@ -33,6 +34,13 @@ _PREFIXES = "pfem_", "pfem_contact_"  # of steps without bounds, and with bounds
 def zero_tolerance(length: float) -> float:
     """Return the distance from a bound [m] that counts as zero for a model of ``length`` [m]: rounding of positions."""
     return ROUNDING * length
+
+
+def largest_at_node(mesh: DistributedMesh, vectors: np.ndarray) -> tuple[float, int]:
+    """Return the 2-norm of the largest of vectors (owned, 3), and the mesh number of its node. Collective."""
+    size = np.linalg.norm(np.nan_to_num(vectors, nan=np.inf), axis=1)
+    at = int(np.argmax(size)) if len(size) else 0
+    return max(mesh.comm.allgather((float(size[at]), int(mesh.node_ids[at])) if len(size) else (0.0, -1)))
 
 
 class Tolerance(NamedTuple):
@@ -61,13 +69,6 @@ class Tolerance(NamedTuple):
             return False
         beyond = np.maximum(np.linalg.norm(g, axis=1) - factor * self.nodes, 0.0)
         return comm.allreduce(float((beyond**2).sum())) <= self.residual**2
-
-
-class Problem(Protocol):
-    """The problem g(u) = 0, or g(u) complementary to bounds on u."""
-
-    def residual(self, u: np.ndarray, g: np.ndarray) -> None:
-        """Write g(u) (owned, 3) [N]."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ class NewtonSolver:
         self._lower = self._u.duplicate()
         self._upper = self._u.duplicate()
         self._solvers: dict[tuple[bool, bool], PETSc.SNES] = {}
-        self.problem: Problem | None = None
+        self.problem: StepProblem | None = None
         self._ours: dict[tuple[bool, bool], Preconditioning] = {}
         self._previous = self._longest = np.inf
         self._full = False
@@ -135,7 +136,7 @@ class NewtonSolver:
 
     def solve(
         self,
-        problem: Problem,
+        problem: StepProblem,
         u: np.ndarray,
         tolerance: Tolerance,
         bounds: tuple[np.ndarray, np.ndarray] | None = None,
@@ -144,7 +145,7 @@ class NewtonSolver:
 
         Parameters
         ----------
-        problem : Problem
+        problem : StepProblem
         u : (owned, 3) float64
             Guess on entry, solution on exit [m].
         tolerance : Tolerance
@@ -170,6 +171,21 @@ class NewtonSolver:
             report = report.then(self._search(start, contact, careful=True))
         u[:] = self._u.array.reshape(u.shape)
         return report
+
+    def failure_message(self, w: np.ndarray, report: NewtonReport, remedy: str) -> str:
+        """Return the message about a solve that did not converge, with the last iterate (owned, 3) in the coordinates
+        of the problem: iterations, reason, worst node, and what the user can do. Collective."""
+        g = np.empty_like(w)
+        self.problem.residual(w, g)
+        if self._bounds is not None:  # forces on active bounds are not part of the error
+            lower, upper = self._bounds
+            g[((w <= lower) & (g > 0.0)) | ((w >= upper) & (g < 0.0))] = 0.0
+        residual, node = largest_at_node(self.mesh, g)
+        return (
+            f"no convergence after {report.newton} Newton iterations: {report.why}; residual {report.norm:.3g} N, "
+            f"required {self._tolerance.residual:.3g} N; worst at node {node} ({residual:.3g} N). "
+            f"{remedy[0].upper()}{remedy[1:]}"
+        )
 
     def prepare(self, contact: bool) -> None:
         """Create the solvers of free steps and, if ``contact``, of steps with bounds in advance. Collective.

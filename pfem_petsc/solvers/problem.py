@@ -1,101 +1,109 @@
-"""What solvers ask of a model, and of the balance of a step that they linearise."""
+"""The balance of one step as a function of the position increment."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
-from mpi4py import MPI
 
-from ..integrators.base import Balance
-from ..mechanics.bars import Bars
-from ..mechanics.mass import Inertia
-from ..mechanics.supports import Supports
-from ..mesh.distribution import DistributedMesh
+if TYPE_CHECKING:
+    from ..contact.transform import Transform
+    from ..integrators.base import Balance, State
+    from ..stepping.model import Model
 
 
-class Mechanics(Protocol):
-    """The truss without contact: the mesh, and what acts at its bars and nodes.
+class StepProblem:
+    """Residual g(w) of one step, where w is the increment u from the predictor in transformed coordinates, u = T w.
 
-    Attributes
-    ----------
-    bars_vary : whether temperatures or rest lengths of bars change over time
-    """
-
-    comm: MPI.Comm
-    mesh: DistributedMesh
-    bars: Bars
-    inertia: Inertia
-    supports: Supports
-
-    @property
-    def bars_vary(self) -> bool: ...
-
-
-class Coordinates(Protocol):
-    """Coordinates w of a solve, u = T w, in which each row of contact is a bound on one unknown.
-
-    Implemented by :class:`~pfem_petsc.contact.transform.Transform`, which describes the methods.
+    Friction is part of g (see :mod:`pfem_petsc.contact.frames`) and makes its derivative unsymmetric. Prescribed
+    components have a zero residual and a unit row; the guess contains their values.
 
     Attributes
     ----------
-    identity : whether w equals u and the residual is unchanged
-    bounded : whether the solve has bounds
-    nodewise : whether w differs from u by ``frames`` of nodes only, and the Hessian is symmetric
-    links : coordinates of links that may close in the step
-    """
-
-    identity: bool
-    bounded: bool
-    links: Iterable[Any]
-
-    @property
-    def nodewise(self) -> bool: ...
-
-    @property
-    def frames(self) -> Any: ...
-
-    @property
-    def sliding(self) -> Any: ...
-
-    def turns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None: ...
-
-    def forward(self, w: np.ndarray) -> None: ...
-
-    def left(self) -> np.ndarray: ...
-
-    def linear(self, left: np.ndarray, u: np.ndarray, out: np.ndarray) -> None: ...
-
-    def diagonal(self, left: np.ndarray, blocks: Callable[[np.ndarray], np.ndarray], diagonal: np.ndarray) -> None: ...
-
-
-class Linearisable(Protocol):
-    """The balance of a step as a function of w.
-
-    Implemented by :class:`~pfem_petsc.stepping.problem.StepProblem`, which describes the methods.
-
-    Attributes
-    ----------
-    balance : coefficients of the integrator
-    transform : coordinates of w
     x : (local, 3) positions [m]
     u : (owned, 3) increment of the last evaluation [m]
     nodal : (owned,) diagonal of inertia and damping [N/m]
     scale : entry on the diagonal at prescribed components [N/m]
+    target : (k,) prescribed components of u where some are along no axis: these are mixed into unknowns that linear
+        solvers change, and components of w along them are ignored
     """
 
-    balance: Balance
-    transform: Coordinates
-    x: np.ndarray
-    u: np.ndarray
-    nodal: np.ndarray
-    scale: float
+    def __init__(
+        self,
+        model: Model,
+        state: State,
+        balance: Balance,
+        external: np.ndarray,
+        transform: Transform,
+    ) -> None:
+        self.transform = transform
+        self.model = model
+        self.state = state
+        self.balance = balance
+        self.external = external
+        mesh, inertia = model.mesh, model.inertia
+        self.x = np.zeros((mesh.n_local, 3))
+        self.f = np.zeros((mesh.n_local, 3))
+        self.u = np.zeros((mesh.n_owned, 3))
+        self._work = np.zeros((mesh.n_owned, 3))
+        self.nodal = balance.alpha * inertia.mass + balance.eta * inertia.damping
+        self.scale = float((self.nodal if balance.alpha else model.nodal_stiffness).max(initial=0.0))
+        # the part independent of u: M a_hat + C v_hat + (1 - w) f_n - f_ext
+        known = -external
+        if balance.a_hat is not None:
+            known = known + inertia.mass_times(balance.a_hat, np.zeros_like(known))
+        if inertia.damped and balance.v_hat is not None:
+            known = known + inertia.damping_times(balance.v_hat, np.zeros_like(known))
+        if balance.weight < 1.0:
+            known = known + (1.0 - balance.weight) * state.f[: mesh.n_owned]
+        self.known = known
+        supports = model.supports
+        self.target = None if supports.inclined is None else supports.lacking(balance.predictor, balance.time)
 
-    def increment(self, w: np.ndarray) -> np.ndarray: ...
+    def increment(self, w: np.ndarray) -> np.ndarray:
+        """Return u (owned, 3) for w. Collective."""
+        self.u[:] = w
+        self.transform.forward(self.u)
+        if self.target is not None:
+            self.model.supports.put(self.u, self.target)
+        return self.u
 
-    def place(self, u: np.ndarray) -> None: ...
+    def coordinates(self, u: np.ndarray) -> np.ndarray:
+        """Return w (owned, 3) for u. Collective."""
+        w = u.copy()
+        self.transform.inverse(w)
+        return w
 
-    def hessian(self, w: np.ndarray, matrix: Any, values: np.ndarray) -> None: ...
+    def imbalance(self, u: np.ndarray, g: np.ndarray) -> None:
+        """Write g = M a + C v + f_int - f_ext at u, in x, without supports and walls [N]. Collective."""
+        mesh, inertia, balance = self.model.mesh, self.model.inertia, self.balance
+        owned = mesh.n_owned
+        if inertia.consistent:
+            g[:] = inertia.mass_times(balance.alpha * u, self._work)
+            if inertia.damped and balance.eta:
+                g += inertia.damping_times(balance.eta * u, self._work)
+        else:
+            np.multiply(self.nodal[:, None], u, out=g)
+            if inertia.redistribution is not None:
+                moved = inertia.redistribution
+                g[moved.touched] += balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
+        g += self.known
+        if balance.weight:
+            self.place(u)
+            if balance.discrete_gradient:
+                self.model.bars.step_forces(self.state.x, self.x, self.f)
+            else:
+                self.model.bars.forces(self.x, self.f, commit=False)
+            g += balance.weight * self.f[:owned]
 
-    def hessian_here(self, matrix: Any, values: np.ndarray, stored: np.ndarray | None = None) -> None: ...
+    def residual(self, w: np.ndarray, g: np.ndarray) -> None:
+        """Write g(w) (owned, 3) [N]. Collective."""
+        self.imbalance(self.increment(w), g)
+        self.transform.residual(self.balance.predictor, self.u, g)
+        if self.model.supports.any:
+            self.model.supports.clear(g)
+
+    def place(self, u: np.ndarray) -> None:
+        """Set the positions of all local nodes to the predictor plus u. Collective."""
+        np.add(self.balance.predictor, u, out=self.x[: self.model.mesh.n_owned])
+        self.model.mesh.update_ghosts(self.x)

@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..parallel.agreement import agreed
 from ..solvers.matrix import HessianMatrix
-from ..stepping.problem import StepProblem
+from ..solvers.problem import StepProblem
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -179,7 +179,7 @@ class WithEquations:
                 self._stiffness = stepper, stepper.support_changes, made
             matrix = self._stiffness[2]
             problem.place(positions - problem.balance.predictor)
-            return matrix.fill(lambda values: problem.hessian_here(matrix, values))
+            return matrix.fill(lambda values: matrix.add(problem, values))
 
     @contextmanager
     def _problem(self, x: Any, at: float | None) -> Iterator[tuple[float, np.ndarray, StepProblem]]:

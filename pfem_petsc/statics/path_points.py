@@ -16,7 +16,7 @@ from ..solvers.linear import LinearChoice, configure, is_failed_factorisation, l
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import at_exit
 from ..solvers.newton import STAGNATION, Tolerance
-from ..stepping.problem import StepProblem
+from ..solvers.problem import StepProblem
 from .stability import Stability
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from ..integrators.base import Balance
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.compiled import kernel
 from ..parallel.agreement import agreed
-from ..solvers.newton import Tolerance
+from ..solvers.newton import Tolerance, largest_at_node
 from ..stepping.stepper import Solution
 from ..tolerances import PROJECTED, TIME
 from .stability import LARGEST, Stability
@@ -380,15 +380,6 @@ class PseudoMotion:
                 raise SimulationFailure(f"{when}: positions or forces are not finite; reduce static.step")
         raise SimulationFailure(f"{when}: sums of forces overflow double precision; correct loads and stiffness")
 
-    def worst(self) -> tuple[float, int]:
-        """Return the largest residual of a node [N], and its mesh number. Collective."""
-        size = np.linalg.norm(self.residual, axis=1)
-        mine = (0.0, -1)
-        if len(size):
-            at = int(np.argmax(size))
-            mine = (float(size[at]), int(self.model.mesh.node_ids[at]))
-        return max(self.model.comm.allgather(mine))
-
     def potential(self, x: np.ndarray, energy: StrainEnergy) -> tuple[float, float]:
         """Return the strain energy minus the work of the loads from the current positions to ``x`` (owned, 3), and the
         sum of their magnitudes [J]. Collective."""
@@ -536,7 +527,7 @@ class RelaxationStepper(StaticStepper):
     def _unfinished(self) -> SimulationFailure:
         """Return the message about an increment without convergence."""
         motion, most = self.motion, self.parameters.max_iterations
-        size, node = motion.worst()
+        size, node = largest_at_node(self.model.mesh, motion.residual)
         return SimulationFailure(
             f"load factor {motion.time:.6g}: relaxation has not converged in {most} pseudo-steps: residual "
             f"{motion.norm:.3g} N, required {self.parameters.tolerance * motion.load:.3g} N; worst at node {node} "

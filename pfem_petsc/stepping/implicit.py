@@ -23,9 +23,9 @@ from ..solvers.linear import LinearChoice, MassSolver, unsymmetric
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
 from ..solvers.newton import NewtonSolver, Tolerance, zero_tolerance
+from ..solvers.problem import StepProblem
 from ..tolerances import ON_BOUND
 from .guard import StepGuard
-from .problem import Resolution, StepProblem, failure_message, force_scale, residual_tolerance
 from .stepper import Solution, Stepper
 
 if TYPE_CHECKING:
@@ -34,6 +34,45 @@ if TYPE_CHECKING:
 
 
 _HALVINGS = 10  # most halvings of a step: to 1/1024
+
+
+_MASS_RTOL = 1e-3  # factor on solver.rtol for systems with the mass matrix only
+_DOUBTFUL = 1e-3  # share of the forces in a residual due to rounding, from which on users are told
+
+
+class Resolution:
+    """Whether the forces of a run are larger than what rounding of positions leaves of them out of balance.
+
+    Attributes
+    ----------
+    numbers : largest 2-norms [N] so far, of forces and of residuals that rounding has left
+    """
+
+    def __init__(self) -> None:
+        self.numbers = [0.0, 0.0]
+
+    def note(self, model: Model, x: np.ndarray, scale: float, residual: float, tolerance: float) -> None:
+        """Take account of a balance at local positions (nodes, 3), with a scale of its forces, the 2-norm of its
+        residual, and the tolerance of that [N]. Collective."""
+        forces, left = self.numbers
+        lacking = residual if residual > tolerance else 0.0
+        if lacking > _DOUBTFUL * max(scale, forces):  # the forces of bars may balance each other
+            bars = model.bars.state_stiffness(x)[4] * model.bars.lengths(x)
+            scale = max(scale, float(np.sqrt(model.comm.allreduce(float((bars[model.mesh.counted] ** 2).sum())))))
+        self.numbers = [max(forces, scale), max(left, lacking)]
+
+    def doubts(self, model: Model) -> list[str]:
+        """Return a text if the residuals are a noticeable share of the forces."""
+        forces, residual = self.numbers
+        if not residual > _DOUBTFUL * forces:
+            return []
+        share = f"{100.0 * residual / forces:.2g} % of" if forces else "all"
+        return [
+            f"forces of {forces:.3g} N are balanced to {residual:.2g} N only, {share} the forces: coordinates of "
+            f"{model.reach:.3g} m are rounded to {np.finfo(float).eps * model.reach:.1g} m, which strains the stiffest "
+            "bars as much as the forces do, and smaller displacements are not resolved. Scale the forces up, make very "
+            "stiff bars less stiff, or move the truss to the origin"
+        ]
 
 
 class HalvedSteps(Stepper):
@@ -184,7 +223,7 @@ class ImplicitStepper(HalvedSteps):
 
     @property
     def resolved(self) -> list[float]:
-        """See :class:`~pfem_petsc.stepping.problem.Resolution`."""
+        """See :class:`~pfem_petsc.stepping.implicit.Resolution`."""
         return self.resolution.numbers
 
     @resolved.setter
@@ -290,8 +329,10 @@ class ImplicitStepper(HalvedSteps):
             model.change_bars(balance.time)
         if model.bars.viscous and balance.weight and self.scheme.inertial and not balance.discrete_gradient:
             self._set_rates(balance)
-        scale = force_scale(model, state, self.part)
-        tolerance = self.accuracy * residual_tolerance(model, balance, scale)
+        scale = self._force_scale()
+        # an explicit scheme's balance is a well-conditioned linear system, and its residual would act as an impulse
+        rtol = model.case.solver.rtol * (1.0 if balance.weight else _MASS_RTOL)
+        tolerance = self.accuracy * max(rtol * scale, model.case.solver.atol or 0.0)
         ends = self._tolerance(tolerance)
         model.links.expect(state, balance)
         if self.links and self.links[0].rows is not model.links.rows:
@@ -321,7 +362,7 @@ class ImplicitStepper(HalvedSteps):
             if not report.converged:
                 exact = self._choice.krylov == "preonly"
                 remedy = self.remedy if exact else f'{self.remedy}, or set solver.linear = "mumps"'
-                text = failure_message(problem, w, bounds.arrays, report, tolerance, remedy)
+                text = self.newton.failure_message(w, report, remedy)
                 raise NotConverged(f"{self.when(balance)}: {text}")
             bounds.project(w, 2.0 * zero_tolerance(model.size))
             u = problem.increment(w).copy()
@@ -343,6 +384,15 @@ class ImplicitStepper(HalvedSteps):
         if self.accuracy:
             self.resolution.note(model, problem.x, scale, report.norm, tolerance)
         return Solution(u, internal, walls, newton, linear, held)
+
+    def _force_scale(self) -> float:
+        """Return the largest 2-norm [N] of momentum per part of a step, loads and internal forces. Collective."""
+        state, model = self.state, self.model
+        momentum = ((model.inertia.mass[:, None] * state.v) ** 2).sum() if state.v.any() else 0.0
+        internal = state.f[: model.mesh.n_owned]
+        sums = np.array([momentum / self.part**2, (state.external**2).sum(), (internal**2).sum()])
+        model.comm.Allreduce(MPI.IN_PLACE, sums)
+        return float(np.sqrt(sums.max()))
 
     def _set_rates(self, balance: Balance) -> None:
         """Give viscous bars the strain rates of a balance, affine in its unknowns like the velocities. Collective.

@@ -60,7 +60,6 @@ class AssembledPreconditioner:
     def make(self, problem: StepProblem, held: np.ndarray) -> None:
         """Set up at the positions of a problem; ``held`` (local, 3): nonzero for active unknowns, ghosts not yet up to
         date. Collective."""
-        matrix = self.matrix
         self.mesh.update_ghosts(held)
         stored = None
         if self.product is not None:
@@ -68,9 +67,7 @@ class AssembledPreconditioner:
             self.product.make_definite()
             stored = self._vectors()
             self.product.extension.kept = np.flatnonzero(held[: self.mesh.n_owned] == 0.0)
-        final = matrix.fill_held(
-            lambda values: matrix.add(problem, values, stored), held, problem.scale, problem.transform
-        )
+        final = self.matrix.fill_held(problem, held, stored)
         self._set_up(final, problem)
         if self._inner.getType() == "gamg" and self.fill() > _DENSE:
             # the independent sets of PETSc 3.18 hardly coarsen a body-centred lattice: set-up and steps take 5 x as

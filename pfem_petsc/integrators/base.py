@@ -160,9 +160,12 @@ class Scheme(ABC):
     def balance(self, state: State, h: float) -> Balance:
         """Return the affine form of the step that starts from ``state``."""
 
-    @abstractmethod
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
-        """Advance v, a, memory and (unless :attr:`solves_next_position`) the owned x of ``state`` after the solve."""
+        """Advance v, a, memory and (unless :attr:`solves_next_position`) the owned x of ``state`` after the solve; by
+        default x, v and a are those of a balance without a_hat."""
+        state.position[:] = balance.predictor + u
+        state.a = balance.alpha * u
+        state.v = balance.v_hat + balance.eta * u
 
 
 class ExplicitScheme(Scheme):

@@ -61,6 +61,4 @@ class Scheme(Base):
             moved = 1.5 * state.memory["d0"] - 0.5 * state.memory["d1"] + u
             state.memory["d1"] = state.memory["d0"]
         state.memory["d0"] = moved
-        state.position[:] = balance.predictor + u
-        state.a = balance.alpha * u
-        state.v = balance.v_hat + balance.eta * u
+        super().finish(state, balance, u, h)

@@ -51,8 +51,3 @@ class Scheme(Base):
             loads=((1.0, state.time + h),),
             weight=1.0,
         )
-
-    def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
-        state.position[:] = balance.predictor + u
-        state.a = balance.alpha * u
-        state.v = balance.v_hat + balance.eta * u

@@ -166,8 +166,7 @@ class Inertia:
         if not self.consistent:
             _scale(lumped, u, out)
             if self.redistribution is not None and lumped is self.mass:
-                at = self.redistribution.touched
-                out[at] += np.einsum("kij,kj->ki", self.redistribution.tensors, u[at])
+                self.redistribution.add_times(1.0, u, out)
             return out
         owned = self.mesh.n_owned
         self._u[:owned] = u

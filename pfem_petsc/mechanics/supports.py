@@ -313,8 +313,7 @@ class Supports:
 
         At velocity jumps (linear interpolation) the acceleration is the mean over the preceding ``span`` [s].
         """
-        _, v, a = self._at(time, span)
-        return v, a
+        return tuple(self._at(time, span)[1:])
 
     def _at(self, time: float, span: float) -> np.ndarray:
         along_axes = np.zeros((3, len(self.nodes)))  # displacements, velocities, accelerations

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..output.units import TIME
 from ..stepping.plan import PlanAtRest, refuse_motion
-from ..stepping.stepper import NoRates, Solution, Stepper
+from ..stepping.stepper import Solution, Stepper
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -23,9 +21,6 @@ class _Nothing(Scheme):
     inertial = False
 
     def balance(self, state: State, h: float) -> Balance:
-        raise NotImplementedError
-
-    def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
         raise NotImplementedError
 
 
@@ -43,14 +38,10 @@ class InitialState(Stepper):
         refuse_motion(model.case, "a case with [modes] alone")
         super().__init__(model, _Nothing(NoParameters()), 0.0)
         self.plan = PlanAtRest(self.scheme, TIME, {"analysis": "none: modes of the initial state"}, steps=0)
-        self.prescribed = NoRates(self)
 
     def start(self) -> None:
         self.start_without_motion()
         self.totals_at_start = self.totals()
-
-    def accelerate(self, load: np.ndarray) -> np.ndarray:
-        return np.zeros_like(load)
 
     def solve(self, balance: Balance) -> Solution:
         raise NotImplementedError

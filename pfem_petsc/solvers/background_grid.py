@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
 
 
-_RECENT = 8192  # boxes that are remembered while bars are visited, a power of two
-
-
 @inlined
 def corner_weights(t, node, base, box, weights, first):
     """Write the eight weights of a node in a box to ``weights`` from ``first``; z varies fastest."""
@@ -57,64 +54,6 @@ def bar_boxes(t, shape, bars, start, stop, out):
             low[i] = max(min(int(min(p, q)), shape[i] - 2), 0)
             fits &= max(p, q) <= low[i] + 1.0
         out[k] = _box(low, shape) if fits else -1
-
-
-@kernel
-def distinct(values, out):
-    """Return the number of values >= 0 without those seen shortly before; write them unless ``out`` is empty."""
-    seen = np.full(_RECENT, -1, np.int64)
-    count = 0
-    for value in values:
-        if value >= 0 and seen[value % _RECENT] != value:
-            seen[value % _RECENT] = value
-            if len(out) > 0:
-                out[count] = value
-            count += 1
-    return count
-
-
-@kernel
-def find(sorted_values, values, out):
-    """Write the places of values among sorted ones, -1 for negative values."""
-    seen = np.full(_RECENT, -1, np.int64)
-    places = np.zeros(_RECENT, np.int64)
-    for k in range(len(values)):
-        value = values[k]
-        if value < 0:
-            out[k] = -1
-            continue
-        at = value % _RECENT
-        if seen[at] != value:
-            seen[at] = value
-            places[at] = np.searchsorted(sorted_values, value)
-        out[k] = places[at]
-
-
-@kernel
-def pair_keys(bars, own, boxes, n, out):
-    """Write the key of the pair of boxes of each bar that has no own one, else -1."""
-    for k in range(len(bars)):
-        out[k] = -1
-        if own[k] == -1:
-            one, other = boxes[bars[k, 0]], boxes[bars[k, 1]]
-            out[k] = min(one, other) * n + max(one, other)
-
-
-@kernel
-def sort_by_count(numbers, starts, order):
-    """Sort by counting: write the indices of numbers 0, 1, ..., without negative ones, and where each starts."""
-    for number in numbers:
-        if number >= 0:
-            starts[number + 1] += 1
-    for k in range(1, len(starts)):
-        starts[k] += starts[k - 1]
-    for k in range(len(numbers)):
-        if numbers[k] >= 0:
-            order[starts[numbers[k]]] = k
-            starts[numbers[k]] += 1
-    for k in range(len(starts) - 1, 0, -1):
-        starts[k] = starts[k - 1]
-    starts[0] = 0
 
 
 @kernel
@@ -315,7 +254,7 @@ class BackgroundGrid:
         bar_box = np.full(len(mesh.bars), -2, np.int64)  # not counted here
         for block in mesh.blocks:
             bar_boxes(self.t, shape, mesh.bars, block.start, block.counted, bar_box)
-        boxes = np.unique(np.concatenate([_few(node_box), _few(bar_box)]))
+        boxes = np.unique(np.concatenate([np.unique(node_box), np.unique(bar_box[bar_box >= 0])]))
         self._make_elements(mesh, boxes, node_box, bar_box)
         low = np.stack([boxes // (shape[1] * shape[2]), boxes // shape[2] % shape[1], boxes % shape[2]], axis=1)
         self.base = low.astype(np.int32)
@@ -334,19 +273,14 @@ class BackgroundGrid:
     def _make_elements(
         self, mesh: DistributedMesh, boxes: np.ndarray, node_box: np.ndarray, bar_box: np.ndarray
     ) -> None:
-        place = np.empty(len(node_box), np.int32)
-        find(boxes, node_box, place)
+        place = np.searchsorted(boxes, node_box).astype(np.int32)
         self.box = place[: mesh.n_owned].copy()
         n = max(len(boxes), 1)
-        keys = np.empty(len(bar_box), np.int64)
-        pair_keys(mesh.bars, bar_box, place, n, keys)
-        pairs = np.unique(_few(keys))
-        element = np.empty(len(bar_box), np.int32)
-        find(boxes, bar_box, element)
-        second = np.empty(len(bar_box), np.int32)
-        find(pairs, keys, second)
-        crossing = second >= 0
-        element[crossing] = len(boxes) + second[crossing]
+        element = np.where(bar_box >= 0, np.searchsorted(boxes, bar_box), -1).astype(np.int32)
+        crossing = np.flatnonzero(bar_box == -1)
+        ends = np.sort(place[mesh.bars[crossing]], axis=1).astype(np.int64)
+        pairs, second = np.unique(ends[:, 0] * n + ends[:, 1], return_inverse=True)
+        element[crossing] = len(boxes) + second
         both = np.full((len(boxes) + len(pairs), 2), -1, np.int32)
         both[: len(boxes), 0] = np.arange(len(boxes))
         both[len(boxes) :, 0], both[len(boxes) :, 1] = pairs // n, pairs % n
@@ -407,19 +341,11 @@ class BackgroundGrid:
         self._give.close()
 
 
-def _few(values: np.ndarray) -> np.ndarray:
-    """Return the distinct values >= 0, some of them several times."""
-    out = np.empty(distinct(values, np.empty(0, np.int64)), np.int64)
-    if len(out):
-        distinct(values, out)
-    return np.unique(out)
-
-
 def _sorted(numbers: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    starts = np.zeros(count + 1, np.int64)
-    order = np.empty(int(np.count_nonzero(numbers >= 0)), np.int32)
-    sort_by_count(numbers, starts, order)
-    return order, starts
+    """Return the indices of numbers 0, 1, ... ``count`` - 1 in their order, without negative ones, and where each
+    number starts."""
+    order = np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :].astype(np.int32)
+    return order, np.searchsorted(numbers[order], np.arange(count + 1))
 
 
 @kernel

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+import weakref
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from petsc4py import PETSc
@@ -195,7 +196,7 @@ class LaggedPreconditioner:
         problem : StepProblem, at the positions at which the Hessian is required
         kept : this rank's unknowns in the system, local and ascending; None for all
         """
-        *coefficients, first, beyond, last = self.count
+        *coefficients, first, beyond, last = self.count or [0.0] * 6
         if last and not first:
             first = last
         else:
@@ -216,7 +217,7 @@ class LaggedPreconditioner:
             if kept is not None:
                 held[: self.mesh.n_owned] = 1.0
                 held[: self.mesh.n_owned].reshape(-1)[kept] = 0.0
-            self._make(problem, held)
+            self.inner.make(problem, held)
             first = beyond = 0.0
             owned = self.mesh.n_owned
             self.place = np.hstack([problem.x[:owned], held[:owned]]) if usable else np.zeros((owned, 0))
@@ -235,13 +236,10 @@ class LaggedPreconditioner:
         if self.remembers:
             history = self.bars.history()
             self.bars.put_history(self.history)
-        self._make(problem, held)
+        self.inner.make(problem, held)
         problem.x[:] = here
         if self.remembers:
             self.bars.put_history(history)
-
-    def _make(self, problem: StepProblem, held: np.ndarray) -> None:
-        self.inner.make(problem, held)
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Compute y = P x for the unknowns kept, see :meth:`renew`. Collective."""
@@ -268,3 +266,29 @@ class LaggedPreconditioner:
         self._problem = None
         for thing in (self.inner, self._right, self._left):
             thing.destroy()
+
+
+class Preconditioning:
+    """Python preconditioner of a solver of PETSc; all of them share the lagged preconditioner.
+
+    Parameters
+    ----------
+    shared : the lagged preconditioner
+    owner : of the solver of PETSc, which owns this object; has ``problem``, the current one or None
+    inactive : function that returns this rank's unknowns in the system, local and ascending; None for all
+    """
+
+    def __init__(
+        self, shared: LaggedPreconditioner, owner: Any, inactive: Callable[[], np.ndarray] | None = None
+    ) -> None:
+        self.shared, self.owner, self.inactive = shared, weakref.ref(owner), inactive
+
+    def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
+        """Handle a change of the operator; called by PETSc."""
+        problem = self.owner().problem
+        if problem is not None:
+            self.shared.renew(problem, None if self.inactive is None else self.inactive())
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Compute y = P x; called by PETSc."""
+        self.shared.apply(x, y)

@@ -241,13 +241,9 @@ _LINEAR = {
 }
 
 
-def _name(table: type, reason: int) -> str:
-    names = [name for name in dir(table) if not name.startswith("_") and getattr(table, name) == reason]
-    return next(iter(sorted(names, key=lambda name: not name.startswith(("DIVERGED", "CONVERGED")))), str(reason))
-
-
 def _words(table: type, known: dict[str, str], reason: int) -> str:
-    name = _name(table, reason)
+    names = [name for name in dir(table) if not name.startswith("_") and getattr(table, name) == reason]
+    name = min(names, key=lambda name: (not name.startswith(("DIVERGED", "CONVERGED")), name), default=str(reason))
     return f"{known[name]} [{name}]" if name in known else name
 
 

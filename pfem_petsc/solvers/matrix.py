@@ -53,28 +53,15 @@ def turn_blocks(ptr, local_columns, place, left, right, values):
                     values[at + i * width + j] = block[i, j]
 
 
-class Projection:
-    """Projections on the free directions of local nodes. Construction is collective.
-
-    Attributes
-    ----------
-    nodes : (m,) owned nodes; held : (m, 3, 3) projections on their prescribed directions
-    """
-
-    def __init__(self, mesh: DistributedMesh, directions: Directions) -> None:
-        self.nodes, self.held = directions.nodes, np.eye(3) - directions.free
-        shared = np.zeros((mesh.n_local, 10))
-        shared[self.nodes, 0] = 1.0
-        shared[self.nodes, 1:] = directions.free.reshape(-1, 9)
-        mesh.update_ghosts(shared)
-        nodes = np.flatnonzero(shared[:, 0])
-        self._place = np.full(mesh.n_local, -1, dtype=np.int32)
-        self._place[nodes] = np.arange(len(nodes), dtype=np.int32)
-        self._free = np.ascontiguousarray(shared[nodes, 1:]).reshape(-1, 3, 3)
-
-    def project(self, ptr: np.ndarray, local_columns: np.ndarray, values: np.ndarray) -> None:
-        """Project the values of a matrix, without its new diagonal blocks."""
-        turn_blocks(ptr, local_columns, self._place, self._free, self._free, values)
+def with_ghosts(mesh: DistributedMesh, nodes: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the local nodes that have matrices (m, 3, 3), ghosts included, and these, from those of owned nodes.
+    Collective."""
+    shared = np.zeros((mesh.n_local, 10))
+    shared[nodes, 0] = 1.0
+    shared[nodes, 1:] = matrices.reshape(-1, 9)
+    mesh.update_ghosts(shared)
+    every = np.flatnonzero(shared[:, 0])
+    return every, np.ascontiguousarray(shared[every, 1:]).reshape(-1, 3, 3)
 
 
 @kernel
@@ -163,13 +150,16 @@ class HessianMatrix:
         self._chain: list[tuple[object, PETSc.Mat, PETSc.Mat]] = []  # coordinates, T, and the product with T
         self._symmetric = symmetric
         self.any_fixed = supports is not None and supports.any
-        self._projection: Projection | None = None
+        self._inclined: Directions | None = None
         if self.any_fixed:
             self._fixed = np.zeros((mesh.n_local, 3))
             self._fixed[: mesh.n_owned] = supports.fixed
             mesh.update_ghosts(self._fixed)
-            if supports.inclined is not None:
-                self._projection = Projection(mesh, supports.inclined)
+            self._inclined = supports.inclined
+        if self._inclined is not None:
+            nodes, self._free = with_ghosts(mesh, self._inclined.nodes, self._inclined.free)
+            self._place = np.full(mesh.n_local, -1, dtype=np.int32)  # of a node among these
+            self._place[nodes] = np.arange(len(nodes), dtype=np.int32)
 
     @cached_property
     def local_columns(self) -> np.ndarray:
@@ -286,9 +276,9 @@ class HessianMatrix:
         """Replace rows and columns of prescribed components by ``scale`` on the diagonal."""
         if self.any_fixed:
             self.hold(self._fixed, scale, values)
-        if self._projection is not None:
-            self._projection.project(self.pattern.ptr, self.local_columns, values)
-            self.pattern.add_blocks(self._projection.nodes, scale * self._projection.held, values)
+        if self._inclined is not None:
+            turn_blocks(self.pattern.ptr, self.local_columns, self._place, self._free, self._free, values)
+            self.pattern.add_blocks(self._inclined.nodes, scale * (np.eye(3) - self._inclined.free), values)
 
     def hold(self, held: np.ndarray, scale: float, values: np.ndarray) -> None:
         """Replace rows and columns of components (local nodes, 3) by ``scale`` on the diagonal."""

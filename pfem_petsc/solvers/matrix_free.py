@@ -16,6 +16,7 @@ from ..mechanics.mass import consistent_product
 from ..mechanics.strips import add_stiffness_diagonals, add_stiffness_products
 
 if TYPE_CHECKING:
+    from ..mesh.distribution import DistributedMesh
     from ..stepping.model import Model
     from .problem import StepProblem
 
@@ -42,18 +43,34 @@ def _call_all() -> None:
 
 
 def outlive(reference: weakref.ref) -> None:
-    """Prevent PETSc from freeing operators that are Python objects; to be called when Python exits.
+    """Prevent PETSc from freeing or calling Python objects; to be called when Python exits.
 
     Parameters
     ----------
-    reference : to a matrix, or to a SNES, whose operators include the last restriction to inactive unknowns
+    reference : to a matrix, or to a linear or nonlinear solver, whose operators include the last restriction to
+        inactive unknowns, and which may have a preconditioner in Python
     """
     thing = reference()
     if not thing:
         return
-    for matrix in thing.getKSP().getOperators() if isinstance(thing, PETSc.SNES) else (thing,):
+    matrices = (thing,)
+    if not isinstance(thing, PETSc.Mat):
+        solver = thing.getKSP() if isinstance(thing, PETSc.SNES) else thing
+        matrices = solver.getOperators()
+        if solver.getPC().getType() == "python":
+            solver.getPC().setType("none")
+    for matrix in matrices:
         if matrix and matrix.getType() == "python":
             matrix.incRef()
+
+
+def python_matrix(context: object, mesh: DistributedMesh, local: int | None = None) -> PETSc.Mat:
+    """Create a symmetric matrix of all unknowns, or of ``local`` ones on this rank, whose products a Python object
+    computes. Collective."""
+    size = (3 * mesh.n_owned, 3 * mesh.n_nodes) if local is None else (local, None)
+    matrix = PETSc.Mat().createPython((size, size), context, comm=mesh.comm)
+    matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    return matrix
 
 
 class Restriction:
@@ -69,9 +86,7 @@ class Restriction:
 
     def matrix(self) -> PETSc.Mat:
         """Create a PETSc matrix for it. Collective."""
-        n = len(self.kept)
-        matrix = PETSc.Mat().createPython(((n, None), (n, None)), self, comm=self.whole.mesh.comm)
-        matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        matrix = python_matrix(self, self.whole.mesh, len(self.kept))
         matrix.setUp()
         return matrix
 
@@ -97,7 +112,8 @@ class Context:
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = H x; called by PETSc."""
-        self.operator().mult(mat, x, y)
+        with y as out:
+            self.operator().times(x.getArray(readonly=True).reshape(-1, 3), out.reshape(-1, 3))
 
     def getDiagonal(self, mat: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802 - PETSc's name
         """Write the diagonal of H; called by PETSc."""
@@ -117,30 +133,17 @@ class Extension:
     def __init__(self, whole: MatrixFreeHessian) -> None:
         self.whole = whole
         self.kept: np.ndarray | None = None
-        local, total = 3 * whole.mesh.n_owned, 3 * whole.mesh.n_nodes
-        context = Context(self)
-        self.mat = PETSc.Mat().createPython(((local, total), (local, total)), context, comm=whole.mesh.comm)
+        self.mat = python_matrix(Context(self), whole.mesh)
         self.mat.setBlockSize(3)
-        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.mat.setUp()
         at_exit(outlive, self.mat)
-
-    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = H x; called by PETSc."""
-        if self.kept is None:
-            self.whole.mult(mat, x, y)
-            return
-        with y as out:
-            self.times(x.getArray(readonly=True).reshape(-1, 3), out.reshape(-1, 3))
 
     def times(self, given: np.ndarray, out: np.ndarray) -> None:
         """Compute ``out`` = H ``given``, both (owned, 3) and contiguous. Collective."""
         whole, kept = self.whole, self.kept
         owned = whole.mesh.n_owned
         if kept is None:
-            whole._u[:owned] = given
-            whole.apply()
-            out[:] = whole._out[:owned]
+            whole.times(given, out)
             return
         u = whole._u[:owned].reshape(-1)
         u[:] = 0.0
@@ -267,9 +270,7 @@ class MatrixFreeHessian:
         self.model = model
         mesh = model.mesh
         self.mesh = mesh
-        local, total = 3 * mesh.n_owned, 3 * mesh.n_nodes
-        self.mat = PETSc.Mat().createPython(((local, total), (local, total)), Context(self), comm=mesh.comm)
-        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.mat = python_matrix(Context(self), mesh)
         self.mat.setUp()
         at_exit(outlive, self.mat)
         self.bounded = self.mat
@@ -308,13 +309,11 @@ class MatrixFreeHessian:
             self._extension = Extension(self)
         return self._extension
 
-    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = H x; called by PETSc."""
-        owned = self.mesh.n_owned
-        self._u[:owned] = x.getArray(readonly=True).reshape(owned, 3)
+    def times(self, given: np.ndarray, out: np.ndarray) -> None:
+        """Compute ``out`` = H ``given``, both (owned, 3) and contiguous. Collective."""
+        self._u[: len(given)] = given
         self.apply()
-        with y as out:
-            out[:] = self._out[:owned].reshape(-1)
+        out[:] = self._out[: len(given)]
 
     def apply(self) -> None:
         """Apply H to the owned rows of :attr:`_u`, and write those of :attr:`_out`. Collective."""
@@ -337,8 +336,7 @@ class MatrixFreeHessian:
         else:
             inertia_products(problem.nodal, u, out)
             if inertia.redistribution is not None:
-                moved = inertia.redistribution
-                out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
+                inertia.redistribution.add_times(problem.balance.alpha, u, out)
         for block in bars.blocks:
             add_products(block.sweep, bars.far, self.x, self.stored, u, out)
         for family in bars.families:

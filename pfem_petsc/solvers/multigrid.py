@@ -12,6 +12,7 @@ from ..mechanics.compiled import kernel
 from ..mesh.exchange import Router
 from .background_grid import BackgroundGrid, Summands, arrange, assemble, interpolate, neighbours, restrict, stabilise
 from .linear import reproducible_products
+from .matrix import with_ghosts
 from .matrix_free import MatrixFreeHessian, full_blocks
 
 if TYPE_CHECKING:
@@ -187,7 +188,7 @@ class GridMultigrid:
         invert(blocks)
         self._inverse = blocks
         self._special, self._turned = at, kept @ basis
-        self._make_coarse(problem, *self._shared(at, to_x @ basis))
+        self._make_coarse(problem, *with_ghosts(self.mesh, at, to_x @ basis))
 
     def _free_parts(self, active: np.ndarray, framed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the owned nodes with prescribed or active components or frames (k,), ascending, and the projections
@@ -204,15 +205,6 @@ class GridMultigrid:
         if inclined is not None:
             kept[np.searchsorted(nodes, inclined.nodes)] = inclined.free
         return nodes, kept
-
-    def _shared(self, nodes: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the local nodes with matrices, ghosts included, and these, from those of owned nodes. Collective."""
-        shared = np.zeros((self.mesh.n_local, 10))
-        shared[nodes, 0] = 1.0
-        shared[nodes, 1:] = matrices.reshape(-1, 9)
-        self.mesh.update_ghosts(shared)
-        nodes = np.flatnonzero(shared[:, 0])
-        return nodes, np.ascontiguousarray(shared[nodes, 1:]).reshape(-1, 3, 3)
 
     def _make_coarse(self, problem: StepProblem, nodes: np.ndarray, turned: np.ndarray) -> None:
         mesh, product = self.mesh, self.product

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from ..errors import InputError
 from ..tolerances import ROUNDING
-from .lagged import LaggedPreconditioner
+from .lagged import LaggedPreconditioner, Preconditioning
 from .linear import LinearChoice, configure, is_failed_factorisation, linear_reason, newton_reason
 from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian, at_exit, outlive
@@ -288,7 +288,9 @@ class NewtonSolver:
             # PETSc's default of 1e-8 is absolute: a node that close to its bound would be fixed there, off the bound
             defaults["snes_vi_zero_tolerance"] = zero_tolerance(self.length)
         if self.lagged is not None:
-            self._ours[key] = Preconditioning(self.lagged, self, snes, bounded=contact)
+            solver, first = weakref.ref(snes), 3 * self.mesh.first_node
+            inactive = (lambda: solver().getVIInactiveSet().getIndices() - first) if contact else None
+            self._ours[key] = Preconditioning(self.lagged, self, inactive)
         configure(snes.getKSP(), self.bounded if contact else self.choice, contact, self._ours.get(key))
         # options are global to the process, but the next solver has other defaults
         options = PETSc.Options(_PREFIXES[contact])
@@ -358,32 +360,3 @@ class NewtonSolver:
             along[k] = (g * step).sum()
         self.mesh.comm.Allreduce(MPI.IN_PLACE, along)
         return bool((np.diff(along) > 0.0).all())
-
-
-class Preconditioning:
-    """Python preconditioner of one nonlinear solver; all solvers share the lagged preconditioner."""
-
-    def __init__(self, shared: LaggedPreconditioner, solver: NewtonSolver, snes: PETSc.SNES, bounded: bool) -> None:
-        self.shared = shared
-        self.first = 3 * shared.mesh.first_node
-        # PETSc's solver owns this object
-        self.solver = weakref.ref(solver)
-        self.snes = weakref.ref(snes)
-        self.bounded = bounded
-        at_exit(_let_go, snes)
-
-    def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
-        """Handle a change of the operator; called by PETSc."""
-        kept = self.snes().getVIInactiveSet().getIndices() - self.first if self.bounded else None
-        self.shared.renew(self.solver().problem, kept)
-
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Compute y = P x; called by PETSc."""
-        self.shared.apply(x, y)
-
-
-def _let_go(reference: weakref.ref) -> None:
-    """Detach the preconditioner from a solver that still exists when Python exits; PETSc 3.18 would call it later."""
-    snes = reference()
-    if snes:
-        snes.getKSP().getPC().setType("none")

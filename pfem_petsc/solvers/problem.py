@@ -85,8 +85,7 @@ class StepProblem:
         else:
             np.multiply(self.nodal[:, None], u, out=g)
             if inertia.redistribution is not None:
-                moved = inertia.redistribution
-                g[moved.touched] += balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
+                inertia.redistribution.add_times(balance.alpha, u, g)
         g += self.known
         if balance.weight:
             self.place(u)

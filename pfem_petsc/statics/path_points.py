@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -12,9 +11,10 @@ from petsc4py import PETSc
 
 from ..contact.transform import Transform
 from ..errors import NotConverged, SimulationFailure
+from ..solvers.lagged import Preconditioning
 from ..solvers.linear import LinearChoice, configure, is_failed_factorisation, linear_reason
 from ..solvers.matrix import HessianMatrix
-from ..solvers.matrix_free import at_exit
+from ..solvers.matrix_free import at_exit, outlive
 from ..solvers.newton import STAGNATION, Tolerance
 from ..solvers.problem import StepProblem
 from .stability import Stability
@@ -77,18 +77,18 @@ class BorderedSystem:
         self._x = self._b.duplicate()
         # beyond a critical point the stiffness is indefinite
         self._choice = choice if self.direct else LinearChoice("gmres", choice.preconditioner, "indefinite")
-        self._ksp = self._solver()
         self.problem: StepProblem | None = None
+        self._ksp = self._solver()
 
     def _solver(self) -> PETSc.KSP:
         ksp = PETSc.KSP().create(self.model.mesh.comm)
         ksp.setOptionsPrefix(_PREFIX)
-        configure(ksp, self._choice, False, None if self.lagged is None else _Preconditioning(self))
+        configure(ksp, self._choice, False, None if self.lagged is None else Preconditioning(self.lagged, self))
         if not self.direct:
             ksp.setTolerances(rtol=_RTOL, max_it=2000)
         ksp.setOperators(self.hessian.mat, self.hessian.mat)
         ksp.setFromOptions()
-        at_exit(_let_go, ksp)
+        at_exit(outlive, ksp)
         return ksp
 
     def begin(self, state: State) -> None:
@@ -200,41 +200,6 @@ class BorderedSystem:
             thing.destroy()
 
 
-def _let_go(reference: weakref.ref) -> None:
-    """Detach Python objects from a solver that outlives the interpreter, because PETSc would call them."""
-    ksp = reference()
-    if ksp:
-        ksp.getPC().setType("none")
-        for matrix in ksp.getOperators():
-            if matrix and matrix.getType() == "python":
-                matrix.incRef()
-
-
-class _Preconditioning:
-    """Callbacks of PETSc for the preconditioner that is reused over steps."""
-
-    def __init__(self, system: BorderedSystem) -> None:
-        self._system = weakref.ref(system)
-
-    def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
-        """Update the preconditioner after a change of the stiffness; called by PETSc."""
-        system = self._system()
-        if system.problem is not None:
-            system.lagged.renew(system.problem, None)
-
-    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Compute y = P x; called by PETSc."""
-        self._system().lagged.apply(x, y)
-
-
-class Terms(NamedTuple):
-    """A constraint c(u, change of load factor) = 0: its value, and its derivatives by u (owned, 3) and load factor."""
-
-    value: float
-    by_u: np.ndarray
-    by_load: float
-
-
 @dataclass
 class Metric:
     """Length of (u, change): cylindrical, sqrt(w u.u), or spherical, sqrt((w u.u + change^2)/2).
@@ -261,17 +226,17 @@ class Metric:
 
 
 class Arc:
-    """The point at a distance: (|(u, change)|^2 - s^2)/(2 s) = 0."""
+    """The constraint of a path c(u, change of load factor) = 0 that gives the point at a distance: (|(u, change)|^2 - s^2)/(2 s) = 0."""
 
     def __init__(self, metric: Metric, size: float) -> None:
         self.metric, self.size = metric, size
 
-    def terms(self, u: np.ndarray, change: float) -> Terms:
-        """Return value and derivatives. Collective."""
+    def terms(self, u: np.ndarray, change: float) -> tuple[float, np.ndarray, float]:
+        """Return the value, and its derivatives by u (owned, 3) and by the load factor. Collective."""
         metric, s = self.metric, self.size
         value = (metric.product(u, change, u, change) - s * s) / (2.0 * s)
         share = 0.5 if metric.spherical else 1.0
-        return Terms(value, (share * metric.weight / s) * u, share * change / s if metric.spherical else 0.0)
+        return value, (share * metric.weight / s) * u, share * change / s if metric.spherical else 0.0
 
 
 class Direction:
@@ -326,10 +291,10 @@ class Linear:
     scale: float = 1.0
     by_load: float = 0.0
 
-    def terms(self, u: np.ndarray, change: float) -> Terms:
-        """Return value and derivatives. Collective."""
+    def terms(self, u: np.ndarray, change: float) -> tuple[float, np.ndarray, float]:
+        """Return the value, and its derivatives by u (owned, 3) and by the load factor. Collective."""
         value = (dot(self.comm, self.weights, u) + self.by_load * change - self.target) / self.scale
-        return Terms(value, self.weights / self.scale, self.by_load)
+        return value, self.weights / self.scale, self.by_load
 
 
 _ITERATIONS = 20  # Newton iterations of a point: more are no sign of a path
@@ -502,11 +467,11 @@ class PointSolver:
         for iteration in range(most + 1):
             system.residual(u, load_factor, g)
             norm = float(np.sqrt(dot(comm, g, g)))
-            terms = constraint.terms(u, load_factor - start)
-            if not np.isfinite(norm + terms.value):
+            value, by_u, by_load = constraint.terms(u, load_factor - start)
+            if not np.isfinite(norm + value):
                 raise NotConverged(f"{self.place}: Newton's method diverged: the residual is not finite")
             stagnant = iteration >= 1 and norm > 0.5 * previous and tolerance.rounded(norm, g, STAGNATION, comm)
-            off = abs(terms.value) / constraint.size
+            off = abs(value) / constraint.size
             # beside a bifurcation rounding moves iterates along its modes, and no iteration brings them closer
             near = off <= _CLOSE or (iteration >= 2 and off <= _NEAR and off > 0.5 * before)
             balanced = norm <= tolerance.residual or tolerance.rounded(norm, g, 1.0, comm)
@@ -517,11 +482,11 @@ class PointSolver:
                 break
             system.linearise(u)
             r, v = system.solve(-g), system.response(u, load_factor)
-            along = comm.allreduce(np.array([(terms.by_u * r).sum(), (terms.by_u * v).sum()]))
-            rate = float(along[1]) + terms.by_load
+            along = comm.allreduce(np.array([(by_u * r).sum(), (by_u * v).sum()]))
+            rate = float(along[1]) + by_load
             if rate == 0.0:
                 raise NotConverged(f"{self.place}: the load does not move the truss in the direction of the path")
-            change = -(terms.value + along[0]) / rate
+            change = -(value + along[0]) / rate
             u += r + change * v
             load_factor += float(change)
             system.prescribe(u, load_factor)

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
-from ..stepping.stepper import Solution
+from ..stepping.stepper import Part, Solution
 from ..tolerances import TIME
 from .critical import EVENTS, CriticalPoints, Event
 from .equilibrium import PathEquilibrium
@@ -73,6 +73,7 @@ class PathStepper(StaticStepper):
         "outcome",
     )
     kept_arrays = (*StaticStepper.kept_arrays, "mode")
+    scale = Part("control.scale")
     event_columns = EVENTS
     remedy = "reduce static.max_step or static.step; if such jumps are intended, set solver.guard = false"
 
@@ -115,15 +116,6 @@ class PathStepper(StaticStepper):
     def clock(self) -> float:
         """Number of the point, as the load factor need not increase."""
         return float(self.state.step)
-
-    @property
-    def scale(self) -> float:
-        """See :class:`~pfem_petsc.statics.path_points.ArcControl`."""
-        return self.control.scale
-
-    @scale.setter
-    def scale(self, value: float) -> None:
-        self.control.scale = value
 
     @property
     def done(self) -> bool:

@@ -14,7 +14,7 @@ from ..integrators.base import Balance
 from ..solvers.linear import DIRECT, LinearChoice
 from ..solvers.newton import Tolerance
 from ..stepping.implicit import ImplicitStepper
-from ..stepping.stepper import NoRates, Solution
+from ..stepping.stepper import Solution
 from ..tolerances import TIME
 from .equilibrium import Equilibrium, problem_at_rest
 from .path_points import BorderedSystem
@@ -78,7 +78,6 @@ class StaticStepper(ImplicitStepper):
         lack = np.empty_like(model.inertia.mass) if stabilise else None
         super().__init__(model, Equilibrium(lack), limits.step, choice)
         model.bars.step = np.inf  # laws that depend on the rate are at their limit of slow loading
-        self.prescribed = NoRates(self)
         self.stabilise, self.share = stabilise, share
         self.viscosity, self.dissipated, self.exceeded = _LEAST, 0.0, False
         self.negatives = -1
@@ -459,10 +458,6 @@ class StaticStepper(ImplicitStepper):
             stability.destroy()
         return "the stiffness shows no limit point: a smaller static.min_step or a larger solver.max_newton may help"
 
-    def _guess(self, balance: Balance) -> np.ndarray:
-        """Return the increment proportional to the last one, with prescribed components at exact positions."""
-        guess = self.scheme.expected_move(self.state, balance.time - self.state.time)
-        supports = self.model.supports
-        if supports.any:
-            supports.put(guess, supports.lacking(balance.predictor, balance.time))
-        return guess
+    def _free_guess(self, balance: Balance) -> np.ndarray:
+        """Return the increment proportional to the last one."""
+        return self.scheme.expected_move(self.state, balance.time - self.state.time)

@@ -21,45 +21,23 @@ if TYPE_CHECKING:
 
 
 @kernel
-def explicit_increments(forces, inertia, factors, known, stiffness, u):
+def explicit_increments(external, f, a_hat, v_hat, inertia, stiffness, u):
     """Solve (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat for every node.
 
-    ``forces``: f_ext and f_int; ``inertia``: m and c (owned,); ``factors``: alpha and eta; ``known``: a_hat and v_hat.
-    The first, a_hat and v_hat are (owned, 3), or (0, 3) for zero; ``stiffness`` (owned,) and ``u`` (owned, 3) are
-    written.
+    ``inertia``: m and c (owned,); ``stiffness`` (owned,): alpha m + eta c. The external force, a_hat and v_hat are
+    (owned, 3), or None for zero: the loop is compiled for those that there are, and without conditions is vectorised.
+    ``u`` (owned, 3) is written.
     """
-    external, f = forces
     mass, damping = inertia
-    alpha, eta = factors
-    a_hat, v_hat = known
-    loaded = len(external) > 0
-    carried = len(a_hat) > 0
-    damped = len(v_hat) > 0
-    for i in range(len(u)):
-        stiffness[i] = alpha * mass[i] + (eta * damping[i] if damped else 0.0)
-    if not (loaded or carried or damped):  # apart, because only loops without conditions are vectorised
-        for i in range(len(u)):
-            inverse = 1.0 / stiffness[i]
-            u[i, 0] = -f[i, 0] * inverse
-            u[i, 1] = -f[i, 1] * inverse
-            u[i, 2] = -f[i, 2] * inverse
-        return
-    if not (carried or damped):
-        for i in range(len(u)):
-            inverse = 1.0 / stiffness[i]
-            u[i, 0] = (external[i, 0] - f[i, 0]) * inverse
-            u[i, 1] = (external[i, 1] - f[i, 1]) * inverse
-            u[i, 2] = (external[i, 2] - f[i, 2]) * inverse
-        return
     for i in range(len(u)):
         inverse = 1.0 / stiffness[i]
         for c in range(3):
             load = -f[i, c]
-            if loaded:
+            if external is not None:
                 load += external[i, c]
-            if carried:
+            if a_hat is not None:
                 load -= mass[i] * a_hat[i, c]
-            if damped:
+            if v_hat is not None:
                 load -= damping[i] * v_hat[i, c]
             u[i, c] = load * inverse
 
@@ -90,11 +68,10 @@ class ExplicitStepper(Stepper):
 
     def __init__(self, model: Model, scheme: Scheme, h: float) -> None:
         super().__init__(model, scheme, h)
-        self._none = np.empty((0, 3))
         self._nobody = np.empty(0, dtype=np.int64)
         self._batch: Batch | None = None
         self._batched: bool | None = None  # whether batches apply; None until it is known
-        self._stiffness = np.empty_like(model.inertia.mass)
+        self._stiffness, self._stiffness_of = np.empty(0), (0.0, 0.0, None)
 
     def steps(self, most: int) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. The first step is made alone: the start may have stopped
@@ -119,11 +96,6 @@ class ExplicitStepper(Stepper):
         super().supports_changed()
         self._batch, self._batched = None, None
 
-    def accelerate(self, load: np.ndarray) -> np.ndarray:
-        a = load / self.model.inertia.mass[:, None]
-        self.model.supports.clear(a)
-        return a
-
     @contextmanager
     def _faults(self, balance: Balance) -> Iterator[None]:
         """Record the first failure of this rank until ranks synchronise."""
@@ -133,17 +105,23 @@ class ExplicitStepper(Stepper):
             if self.fault is None:
                 self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
 
+    def _stiffness_for(self, balance: Balance) -> np.ndarray:
+        """Return alpha m + eta c (owned,), computed again where it changes."""
+        alpha, eta, damping = self._stiffness_of
+        inertia = self.model.inertia
+        if (alpha, eta) != (balance.alpha, balance.eta) or damping is not inertia.damping:
+            self._stiffness_of = balance.alpha, balance.eta, inertia.damping
+            self._stiffness = balance.alpha * inertia.mass
+            if inertia.damped:
+                self._stiffness += balance.eta * inertia.damping
+        return self._stiffness
+
     def solve(self, balance: Balance) -> Solution:
         model, state = self.model, self.state
         inertia = model.inertia
-        u, stiffness = np.empty_like(state.v), self._stiffness
-        forces = state.external if model.external.active else self._none, state.f
-        known = (
-            balance.a_hat if balance.a_hat is not None else self._none,
-            balance.v_hat if inertia.damped else self._none,
-        )
-        factors = balance.alpha, balance.eta
-        explicit_increments(forces, (inertia.mass, inertia.damping), factors, known, stiffness, u)
+        u, stiffness = np.empty_like(state.v), self._stiffness_for(balance)
+        external, v_hat = state.external if model.external.active else None, balance.v_hat if inertia.damped else None
+        explicit_increments(external, state.f, balance.a_hat, v_hat, (inertia.mass, inertia.damping), stiffness, u)
         supports = model.supports
         state.contact = self.zero
         if supports.any:
@@ -192,16 +170,8 @@ class RedistributedStepper(Stepper):
 
     def __init__(self, model: Model, scheme: Scheme, h: float) -> None:
         super().__init__(model, scheme, h)
-        moved = model.inertia.redistribution
-        self.moved = moved
-        self._inverse = moved.inverse(model.inertia.mass, model.supports.fixed)
+        self.moved = model.inertia.redistribution
         self._trial = np.zeros_like(self.state.x)
-
-    def accelerate(self, load: np.ndarray) -> np.ndarray:
-        a = load / self.model.inertia.mass[:, None]
-        a[self.moved.touched] = np.einsum("kij,kj->ki", self._inverse, load[self.moved.touched])
-        a[self.model.supports.fixed] = 0.0
-        return a
 
     def solve(self, balance: Balance) -> Solution:
         model, state, moved = self.model, self.state, self.moved

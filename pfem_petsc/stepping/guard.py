@@ -38,7 +38,7 @@ or barriers of two to seven times the available energy.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -70,16 +70,6 @@ def _along(bars: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     vectors = x[bars[:, 1]] - x[bars[:, 0]]
     lengths = np.linalg.norm(vectors, axis=1)
     return vectors / np.maximum(lengths, 1e-300)[:, None], lengths
-
-
-class _Worst(NamedTuple):
-    """The bar of a rank with the largest unpredicted change: value in lengths, bar, nodes, change, turn [degrees]."""
-
-    value: float
-    bar: int = -1
-    nodes: tuple[int, int] = (-1, -1)
-    change: float = 0.0
-    turn: float = 0.0
 
 
 @kernel
@@ -155,23 +145,24 @@ class StepGuard:
         self._predicted[: mesh.n_owned] = predicted
         mesh.update_ghosts(self._predicted)
         worst = self._unpredicted(before, after)
-        largest = comm.allreduce(worst.value, op=MPI.MAX)
+        largest = comm.allreduce(worst[0], op=MPI.MAX)
         if not largest > NOTICEABLE:
             return None
         if largest > LARGEST:
-            worst = max(comm.allgather(worst))
+            value, bar, nodes, change, turn = max(comm.allgather(worst))
             return (
-                f"the solution is too far from the previous state: bar {worst.bar} between nodes "
-                f"{worst.nodes[0]} and {worst.nodes[1]} changes by {worst.change:.3g} of its length and turns by "
-                f"{worst.turn:.3g} degrees, {worst.value:.3g} lengths from the predicted position"
+                f"the solution is too far from the previous state: bar {bar} between nodes {nodes[0]} and {nodes[1]} "
+                f"changes by {change:.3g} of its length and turns by {turn:.3g} degrees, {value:.3g} lengths from the "
+                "predicted position"
             )
         return self._barrier(before, after, energy)
 
-    def _unpredicted(self, before: np.ndarray, after: np.ndarray) -> _Worst:
-        """Return the bar of this rank with the largest unpredicted change."""
+    def _unpredicted(self, before: np.ndarray, after: np.ndarray) -> tuple[float, int, tuple[int, int], float, float]:
+        """Return the largest unpredicted change of a bar of this rank, and of that bar number, nodes, change and turn:
+        changes in lengths, turn in degrees."""
         mesh, rest = self.model.mesh, self.model.bars.rest
         if len(mesh.bars) == 0:
-            return _Worst(0.0)
+            return 0.0, -1, (-1, -1), 0.0, 0.0
         value, k = _largest_miss(mesh.bars, self.model.bars.watched, before, after, self._predicted)
         a, b = mesh.bars[k]
         start, end = before[b] - before[a], after[b] - after[a]
@@ -179,7 +170,7 @@ class StepGuard:
         turn = np.degrees(np.arccos(np.clip(start @ end / max(lengths, 1e-300), -1.0, 1.0)))
         nodes = int(mesh.node_ids[a]), int(mesh.node_ids[b])
         change = float(np.linalg.norm(end - start) / rest[k])
-        return _Worst(float(value), int(mesh.bar_ids[k]), nodes, change, float(turn))
+        return float(value), int(mesh.bar_ids[k]), nodes, change, float(turn)
 
     def _barrier(self, before: np.ndarray, after: np.ndarray, energy: float) -> str | None:
         """Check energies of bars at both ends and at mid-path, with the initial internal variables. Collective."""

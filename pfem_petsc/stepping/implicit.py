@@ -26,7 +26,7 @@ from ..solvers.newton import NewtonSolver, Tolerance, zero_tolerance
 from ..solvers.problem import StepProblem
 from ..tolerances import ON_BOUND
 from .guard import StepGuard
-from .stepper import Solution, Stepper
+from .stepper import Part, Solution, Stepper
 
 if TYPE_CHECKING:
     from ..integrators.base import Scheme
@@ -160,6 +160,9 @@ class ImplicitStepper(HalvedSteps):
     kept_numbers = (*HalvedSteps.kept_numbers, "lagged_count", "resolved")
     kept_arrays = (*HalvedSteps.kept_arrays, "held", "lagged_place")
     kept_bars = ("lagged_history",)
+    resolved = Part("resolution.numbers")
+    lagged_count = Part("lagged.count", [])
+    lagged_place, lagged_history = (Part(f"lagged.{name}", np.empty((0, 0))) for name in ("place", "history"))
 
     def __init__(self, model: Model, scheme: Scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
@@ -221,55 +224,9 @@ class ImplicitStepper(HalvedSteps):
             if owner is not None:
                 owner.destroy()
 
-    @property
-    def resolved(self) -> list[float]:
-        """See :class:`~pfem_petsc.stepping.implicit.Resolution`."""
-        return self.resolution.numbers
-
-    @resolved.setter
-    def resolved(self, numbers: list[float]) -> None:
-        self.resolution.numbers = [float(number) for number in numbers]
-
-    @property
-    def lagged_count(self) -> list[float]:
-        """See :class:`~pfem_petsc.solvers.lagged.LaggedPreconditioner`."""
-        return self.lagged.count if self.lagged is not None else []
-
-    @lagged_count.setter
-    def lagged_count(self, count: list[float]) -> None:
-        # solver settings may change at a restart
-        if self.lagged is not None and count:
-            self.lagged.count = count
-
-    @property
-    def lagged_history(self) -> np.ndarray:
-        """See :class:`~pfem_petsc.solvers.lagged.LaggedPreconditioner`."""
-        return self.lagged.history if self.lagged is not None else np.empty((len(self.model.mesh.bars), 0))
-
-    @lagged_history.setter
-    def lagged_history(self, history: np.ndarray) -> None:
-        if self.lagged is not None:
-            self.lagged.history = history
-
-    @property
-    def lagged_place(self) -> np.ndarray:
-        """See :class:`~pfem_petsc.solvers.lagged.LaggedPreconditioner`."""
-        return self.lagged.place if self.lagged is not None else np.empty((self.model.mesh.n_owned, 0))
-
-    @lagged_place.setter
-    def lagged_place(self, place: np.ndarray) -> None:
-        if self.lagged is not None:
-            self.lagged.place = place
-
     def accelerate(self, load: np.ndarray) -> np.ndarray:
-        inertia, fixed = self.model.inertia, self.model.supports.fixed
-        if not inertia.consistent:
-            a = load / inertia.mass[:, None]
-            if inertia.redistribution is not None:
-                at = inertia.redistribution.touched
-                a[at] = np.einsum("kij,kj->ki", inertia.redistribution.inverse(inertia.mass, fixed), load[at])
-            self.model.supports.clear(a)
-            return a
+        if not self.model.inertia.consistent:
+            return super().accelerate(load)
         if self._mass is None:
             self._mass = MassSolver(self.model)
         return self._mass.solve(load)
@@ -429,9 +386,13 @@ class ImplicitStepper(HalvedSteps):
         u -= shift
         g -= problem.nodal[:, None] * shift
 
+    def _free_guess(self, balance: Balance) -> np.ndarray:
+        """Return increments for an unchanged acceleration."""
+        return self.state.a / balance.alpha
+
     def _guess(self, balance: Balance) -> np.ndarray:
-        """Return increments for an unchanged acceleration, with prescribed components at their exact positions."""
-        guess = self.state.a / balance.alpha
+        """Return the increments with which solves begin, prescribed components at their exact positions."""
+        guess = self._free_guess(balance)
         supports = self.model.supports
         if supports.any:
             supports.put(guess, supports.lacking(balance.predictor, balance.time))

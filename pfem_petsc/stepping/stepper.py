@@ -7,7 +7,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -25,29 +25,6 @@ from .bar_events import Collapse, Removals, Ruptures, collapse_message
 
 if TYPE_CHECKING:
     from .model import Model
-
-
-class Accumulating(Protocol):
-    """What accumulates the works of a stepper: :class:`~pfem_petsc.stepping.ledger.Ledger`.
-
-    Attributes
-    ----------
-    powers : (5,) works of all balances of a leapfrog scheme so far [J]; None if the last step was not made in a batch
-    """
-
-    powers: np.ndarray | None
-
-    def update(self) -> None:
-        """Add the last part of a step."""
-
-    def follow_removal(self) -> None:
-        """Start the next step from the energies of the bars after some were removed."""
-
-    def begin_batches(self) -> None:
-        """Continue balance by balance."""
-
-    def end_batches(self) -> None:
-        """Keep the present state, from which a step without batches goes on."""
 
 
 class Instants(NamedTuple):
@@ -84,7 +61,8 @@ class Step(NamedTuple):
 
 
 class PrescribedMotion:
-    """Sets prescribed components in the balances and the state of a stepper.
+    """Sets prescribed components in the balances and the state of a stepper. Supports in balances without inertia
+    prescribe positions alone, which are part of the guess.
 
     Attributes
     ----------
@@ -94,7 +72,7 @@ class PrescribedMotion:
 
     def __init__(self, stepper: Stepper) -> None:
         self.stepper, self.supports = stepper, stepper.model.supports
-        self.moving = self.supports.moving
+        self.moving = self.supports.moving and stepper.scheme.inertial
         self.change: dict[str, np.ndarray] = {}
 
     def place(self, end: float) -> None:
@@ -121,16 +99,11 @@ class PrescribedMotion:
 
         This is the rule by which forces become impulses.
         """
-        supports, state = self.supports, self.stepper.state
-
-        def pick(array: np.ndarray | None) -> np.ndarray | None:
-            return None if array is None else supports.get(array)[:, None]
-
-        memory = {name: pick(state.memory[name]) for name in self.stepper.scheme.remembers if name in state.memory}
-        fields = (pick(array) for array in (state.position, state.v, state.a))
-        ruled = State(*fields, *(np.zeros((len(a), 1)) for _ in range(4)), memory=memory)
-        known = {name: pick(getattr(balance, name)) for name in ("predictor", "v_hat", "a_hat")}
-        own = replace(balance, **known)
+        supports, ruled = self.supports, self._along()
+        known = {name: getattr(balance, name) for name in ("predictor", "v_hat", "a_hat")}
+        own = replace(
+            balance, **{name: None if each is None else supports.get(each)[:, None] for name, each in known.items()}
+        )
         u = (a[:, None] if own.a_hat is None else a[:, None] - own.a_hat) / own.alpha
         self.stepper.scheme.finish(ruled, own, u, self.stepper.part)
         return ruled
@@ -154,21 +127,18 @@ class PrescribedMotion:
         if supports.inclined is None:
             scheme.restart(state, supports.at, self.stepper.part)
             return
-        names = [name for name in scheme.remembers if name in state.memory]
-        fields = (supports.get(array)[:, None] for array in (state.position, state.v, state.a))
-        memory = {name: supports.get(state.memory[name])[:, None] for name in names}
-        along = State(*fields, *(np.zeros((supports.number, 1)) for _ in range(4)), memory=memory)
+        along = self._along()
         scheme.restart(along, np.arange(supports.number), self.stepper.part)
-        for name in names:
-            supports.put(state.memory[name], memory[name][:, 0])
+        for name, values in along.memory.items():
+            supports.put(state.memory[name], values[:, 0])
 
-
-class NoRates(PrescribedMotion):
-    """For balances without inertia, where supports prescribe positions alone: these are part of the guess."""
-
-    def __init__(self, stepper: Stepper) -> None:
-        super().__init__(stepper)
-        self.moving = False
+    def _along(self) -> State:
+        """Return the state (k, 1) of the prescribed components."""
+        stepper, memory = self.stepper, self.stepper.state.memory
+        names = [name for name in stepper.scheme.remembers if name in memory]
+        arrays = stepper.state.position, stepper.state.v, stepper.state.a, *(memory[name] for name in names)
+        x, v, a, *kept = (self.supports.get(array)[:, None] for array in arrays)
+        return State(x, v, a, *np.zeros((4, *x.shape)), memory=dict(zip(names, kept, strict=True)))
 
 
 _ITERATIONS = 200
@@ -298,6 +268,24 @@ class Solution:
     contacts: int = 0
 
 
+class Part:
+    """An attribute of a part of a stepper, by its path, that checkpoints keep as one of the stepper. Of a part that is
+    None, it is ``absent`` and nothing is set: a restart may have other settings."""
+
+    def __init__(self, path: str, absent: Any = None) -> None:
+        self._part, self._name = path.split(".")
+        self._absent = absent
+
+    def __get__(self, stepper: Stepper, owner: type | None = None) -> Any:
+        part = getattr(stepper, self._part)
+        return self._absent if part is None else getattr(part, self._name)
+
+    def __set__(self, stepper: Stepper, value: Any) -> None:
+        part = getattr(stepper, self._part)
+        if part is not None:
+            setattr(part, self._name, value)
+
+
 class Stepper(ABC):
     """Advances the state by the scheme; subclasses solve the balance.
 
@@ -316,7 +304,8 @@ class Stepper(ABC):
     fault_step : number of the last finished step when the fault was found
     h : the case's time step [s]; ``part`` the size of the current part, ``smallest`` the smallest part of the last step
     treatment : of impact, None for the scheme's own formulas
-    ledger : what accumulates each part of a step; None for steps that nothing records
+    ledger : :class:`~pfem_petsc.stepping.ledger.Ledger`, which accumulates each part of a step; None for steps that
+        nothing records
     iterations : numbers of Newton and linear iterations since the last row of the history
     before : (local, 3) positions at the start of the last part, with ghosts [m]
     massless : MasslessNodes if contact nodes are massless along their walls' normals, else None
@@ -348,6 +337,8 @@ class Stepper(ABC):
     kept_bars: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     remedy = "reduce time.step"
+    removal_times, removed_supports = Part("removals.times"), Part("removals.gone")
+    removed_reactions = Part("removals.released")
     event_columns: Mapping[str, Any] = {}
     events: Sequence[Any] = ()
 
@@ -356,7 +347,7 @@ class Stepper(ABC):
         self.scheme = scheme
         self.h = self.part = self.smallest = h
         self.treatment = None  # of impact; see pfem_petsc.contact.treatments
-        self.ledger: Accumulating | None = None
+        self.ledger: Any = None
         self.iterations = [0, 0]
         self.row_every, self.probed = 0, np.empty(0, dtype=np.int64)
         self.instants: Instants | None = None
@@ -637,33 +628,6 @@ class Stepper(ABC):
         if self.removals.gone:
             self.supports_changed()
 
-    @property
-    def removal_times(self) -> list[float]:
-        """See :class:`~pfem_petsc.stepping.bar_events.Removals`, as the next two."""
-        return self.removals.times
-
-    @removal_times.setter
-    def removal_times(self, times: list[float]) -> None:
-        self.removals.times = [float(time) for time in times]
-
-    @property
-    def removed_supports(self) -> list[str]:
-        """Names of the supports that are gone."""
-        return self.removals.gone
-
-    @removed_supports.setter
-    def removed_supports(self, names: list[str]) -> None:
-        self.removals.gone = list(names)
-
-    @property
-    def removed_reactions(self) -> np.ndarray:
-        """Reactions of removed supports (owned, 3 k) [N]."""
-        return self.removals.released
-
-    @removed_reactions.setter
-    def removed_reactions(self, forces: np.ndarray) -> None:
-        self.removals.released[:] = forces
-
     def _make_part(self, end: float) -> None:
         """Advance by ``part`` to the time ``end`` [s]."""
         for phase in self._phases():
@@ -852,9 +816,14 @@ class Stepper(ABC):
         implicit = not self.scheme.explicit and self.scheme.inertial
         return collapse_message(self.model, found, self.arrived(), (self.remedy, implicit))
 
-    @abstractmethod
     def accelerate(self, load: np.ndarray) -> np.ndarray:
         """Return the acceleration (owned, 3) with M a = load [N], zero on prescribed components. Collective."""
+        inertia = self.model.inertia
+        a, moved = load / inertia.mass[:, None], inertia.redistribution
+        if moved is not None:
+            a[moved.touched] = np.einsum("kij,kj->ki", moved.inverses, load[moved.touched])
+        self.model.supports.clear(a)
+        return a
 
     @abstractmethod
     def solve(self, balance: Balance) -> Solution:

@@ -42,6 +42,7 @@ class Redistribution:
         ``across`` d
     touched : (k,) owned nodes whose mass is a matrix, ascending
     tensors : (k, 3, 3) the matrix minus mass times identity [kg]
+    inverses : (k, 3, 3) inverse of the matrix on the free components [1/kg]; zero on others, and where there is no mass
     """
 
     nodes: np.ndarray
@@ -50,17 +51,11 @@ class Redistribution:
     across: np.ndarray
     touched: np.ndarray
     tensors: np.ndarray
+    inverses: np.ndarray
 
-    def inverse(self, mass: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-        """Return the inverses (k, 3, 3) of the mass matrices of the touched nodes on their free components [1/kg].
-
-        ``mass`` (owned,) [kg], ``fixed`` (owned, 3) bool. The inverse is zero on other components and along directions
-        without mass.
-        """
-        free = ~fixed[self.touched]
-        matrices = mass[self.touched, None, None] * np.eye(3) + self.tensors
-        matrices *= free[:, :, None] & free[:, None, :]
-        return np.linalg.pinv(matrices, rcond=1e-10, hermitian=True)
+    def add_times(self, factor: float, u: np.ndarray, out: np.ndarray) -> None:
+        """Add the product of the tensors with vectors ``u`` (owned, 3), times a factor."""
+        out[self.touched] += factor * np.einsum("kij,kj->ki", self.tensors, u[self.touched])
 
 
 def redistribute(model: Model) -> Redistribution:
@@ -131,7 +126,11 @@ def redistribute(model: Model) -> Redistribution:
         n = normals[here[give]]
         np.add.at(tensors, there[give], share[:, None, None] * n[:, :, None] * n[:, None, :])
     touched = np.flatnonzero(np.abs(tensors).max(axis=(1, 2), initial=0.0) > 0.0)
-    return Redistribution(nodes, walls, free, across, touched, tensors[touched])
+    movable = ~model.supports.fixed[touched]
+    matrices = inertia.mass[touched, None, None] * np.eye(3) + tensors[touched]
+    matrices *= movable[:, :, None] & movable[:, None, :]
+    inverses = np.linalg.pinv(matrices, rcond=1e-10, hermitian=True)
+    return Redistribution(nodes, walls, free, across, touched, tensors[touched], inverses)
 
 
 def _movable(contact: Contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -226,7 +226,8 @@ class Metric:
 
 
 class Arc:
-    """The constraint of a path c(u, change of load factor) = 0 that gives the point at a distance: (|(u, change)|^2 - s^2)/(2 s) = 0."""
+    """The point of a path at a distance, by the constraint (|(u, change)|^2 - s^2)/(2 s) = 0, where ``change`` is that
+    of the load factor."""
 
     def __init__(self, metric: Metric, size: float) -> None:
         self.metric, self.size = metric, size

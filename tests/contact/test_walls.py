@@ -212,6 +212,12 @@ def test_reports_of_a_bounce(comm, shared_tmp_path):
     assert last["wall/wall3/impulse"][2] == pytest.approx(2e-4 * force[:, 2].sum(), rel=1e-12)
     assert last["wall/wall3/impulse"][2] == pytest.approx(change, rel=0.02)
     assert last["wall/wall3/contact_time"] == pytest.approx(2e-4 * (contacts > 0).sum())
+    case["output"] = case.get("output", {}) | {"history_every": 7}
+    seldom, _, _ = run_of(case, comm, shared_tmp_path, "seldom")
+    assert [seldom[k]["wall/wall3/contact_time"] for k in (6, -1)] == [
+        rows[6]["wall/wall3/contact_time"],
+        last["wall/wall3/contact_time"],
+    ]
     assert last["wall/wall3/releases"] >= contacts.max()
     assert sum(row["active_set_changes"] for row in rows) == 2 * last["wall/wall3/releases"]
     touching = rows[int(np.argmax(force[:, 2]))]

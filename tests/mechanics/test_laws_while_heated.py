@@ -1,11 +1,13 @@
 """Bars whose laws depend on temperature, while they are heated: energy balance and thermal work."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.runs import run
 from helpers.twins import AREA, SOFTENING, STEP, YOUNG, one_bar, pulled
 
-from pfem_petsc import Case
+from pfem_petsc import Case, Simulation
 
 
 @pytest.mark.slow
@@ -32,6 +34,27 @@ def test_heated_bar_with_a_rate_keeps_its_balance(tmp_path):
     start = history["kinetic_energy"][0]
     assert history["plastic_heat"][-1] > 0.3 * start and abs(history["thermal_work"]).max() > 1e-2 * start
     assert abs(history["numerical_dissipation"]).max() < 1e-11 * start
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law, keys", [("elastic", {"softening": SOFTENING}), ("perzyna", {}), ("voce", {})])
+def test_halved_steps_keep_the_balance_of_heat(law, keys, comm, tmp_path):
+    """Whole steps are refused: temperatures, also those of the failed solve, are taken at the ends of the halves."""
+    case = one_bar(law, "energy_momentum", steps=60, elements=2, thermal_expansion=1.2e-5, **keys)
+    case["temperature"] = [{"table": [[0.0, 0.0], [6e-4, 400.0]]}]
+    run = Simulation(Case.from_dict(case), comm, output=tmp_path / "out", quiet=True)
+    solve = run.stepper.newton.solve
+
+    def refuse_whole_steps(*arguments):
+        report = solve(*arguments)
+        return replace(report, converged=report.converged and run.stepper.part < STEP, why="refused")
+
+    run.stepper.newton.solve = refuse_whole_steps
+    rows = [step.row for step in run]
+    assert run.stepper.smallest == 0.5 * STEP and rows[-1]["newton_iterations"] > 2
+    start = rows[0]["kinetic_energy"]
+    assert max(abs(row["thermal_work"]) for row in rows) > 1e-2 * start
+    assert max(abs(row["numerical_dissipation"]) for row in rows) < 1e-11 * start
 
 
 @pytest.mark.slow

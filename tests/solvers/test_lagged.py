@@ -28,8 +28,8 @@ def simulate(comm, folder, solver, step, steps, **tables):
     made = []
     lagged = simulation.stepper.lagged
     if lagged is not None:
-        make = lagged._make
-        lagged._make = lambda *arguments: (made.append(simulation.state.step), make(*arguments))
+        make = lagged.inner.make
+        lagged.inner.make = lambda *arguments: (made.append(simulation.state.step), make(*arguments))
     newton = linear = 0
     simulation.most_held = 0
     for done in simulation:

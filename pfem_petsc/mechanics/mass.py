@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
     from .bars import BarBlock, Bars
 
-__all__ = ["Inertia", "PointInertia", "consistent_product"]
+__all__ = ["Inertia", "PointInertia", "add_at_ends", "consistent_product"]
 
 
 @kernel
-def _lump(bars, lengths, start, stop, density, out):
-    for k in range(start, stop):
-        half = 0.5 * bar_value(density, k - start) * lengths[k]
-        out[bars[k, 0]] += half
-        out[bars[k, 1]] += half
+def add_at_ends(bars, values, out):
+    """Add the value (b,) of each bar at both of its ends to ``out`` (local nodes,)."""
+    for k in range(len(bars)):
+        out[bars[k, 0]] += values[k]
+        out[bars[k, 1]] += values[k]
 
 
 @kernel
@@ -98,9 +98,10 @@ class Inertia:
         mass = np.zeros(mesh.n_local)
         damping = np.zeros(mesh.n_local)
         for block in bars.blocks:
-            _lump(bars.ends, bars.mesh_lengths, block.start, block.stop, block.density * block.area, mass)
+            ends, lengths = bars.ends[block.start : block.stop], bars.mesh_lengths[block.start : block.stop]
+            add_at_ends(ends, 0.5 * (block.density * block.area) * lengths, mass)
             if block.damping:
-                _lump(bars.ends, bars.mesh_lengths, block.start, block.stop, block.damping * block.area, damping)
+                add_at_ends(ends, 0.5 * (block.damping * block.area) * lengths, damping)
         self.points = points
         self.mass = mass[: mesh.n_owned] + points.mass
         self._of_bars = damping[: mesh.n_owned].copy()

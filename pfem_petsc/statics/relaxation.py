@@ -80,15 +80,6 @@ def move_freely(r, mass, factors, reach, v, u):
 
 
 @kernel
-def shortest_bars(bars, rest, share, reach):
-    """Share of the shortest bar of each node into ``reach`` (local,) [m]."""
-    for k in range(len(bars)):
-        for end in range(2):
-            i = bars[k, end]
-            reach[i] = min(reach[i], share * rest[k])
-
-
-@kernel
 def node_stiffness(x, bars, stored, axial, counted, blocks, bound):
     """Upper bound of the eigenvalues of each node's diagonal block of the stiffness into ``bound`` (owned,) [N/m].
 
@@ -225,15 +216,12 @@ class PseudoMotion:
         self.damping = DAMPINGS[damping]()
         self._u = np.zeros((owned, 3))
         self._stored = np.zeros((5, len(mesh.bars)))
-        self._axial = np.empty(len(mesh.bars))
-        for block in model.bars.blocks:
-            part = slice(block.start, block.stop)
-            self._axial[part] = block.area * block.modulus / model.bars.rest[part]
+        self._axial = model.bars.stiffness
         self._counted = np.zeros(len(mesh.bars), dtype=bool)
         self._counted[mesh.counted] = True
         self._blocks = np.zeros((local, 6))
         reach = np.full(local, np.inf)
-        shortest_bars(mesh.bars, model.bars.rest, _REACH, reach)
+        np.minimum.at(reach, mesh.bars.ravel(), np.repeat(_REACH * model.bars.rest, 2))
         self._reach = reach[:owned].copy()
         self._tolerance = PROJECTED * model.size
         self._failure: SimulationFailure | None = None

@@ -75,8 +75,14 @@ class Resolution:
         ]
 
 
-class HalvedSteps(Stepper):
-    """Makes a step in halves of halves where its solve fails.
+# PETSc is finalised after Python and can no longer call it, so matrices and preconditioners written in Python that are
+# held by reference cycles are freed first.
+atexit.register(gc.collect)
+
+
+class ImplicitStepper(Stepper):
+    """Solves steps by Newton's method, or as a variational inequality if contact is possible; a step whose solve fails
+    is made in halves of halves.
 
     Attributes
     ----------
@@ -85,13 +91,26 @@ class HalvedSteps(Stepper):
     failures : number of failed solves of each kind in this run
     """
 
-    kept_numbers = (*Stepper.kept_numbers, "level")
+    kept_numbers = (*Stepper.kept_numbers, "level", "lagged_count", "resolved")
+    kept_arrays = (*Stepper.kept_arrays, "held", "lagged_place")
+    kept_bars = ("lagged_history",)
+    resolved = Part("resolution.numbers")
+    lagged_count = Part("lagged.count", [])
+    lagged_place, lagged_history = (Part(f"lagged.{name}", np.empty((0, 0))) for name in ("place", "history"))
 
-    def __init__(self, model: Model, scheme: Scheme, h: float) -> None:
+    def __init__(self, model: Model, scheme: Scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
         self.level = 0
         self.message: Callable[[str], None] = lambda text: None
         self.failures: Counter[str] = Counter()
+        _free_left_over(model.comm)
+        self._choice = choice
+        self._make_solvers()
+        self.guard = StepGuard(model) if model.case.solver.guard else None
+        self._after = np.zeros_like(self.state.x)
+        self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes in contact with walls in the last step
+        self.accuracy = 1.0  # of a solve, as a factor on the tolerance of steps; zero: to rounding
+        self.resolution = Resolution()
 
     def tell_failure(self, failure: NotConverged, remedy: str) -> None:
         """Tell the first failure of each kind and what is done about it; others are counted."""
@@ -147,33 +166,6 @@ class HalvedSteps(Stepper):
             self.step_changed = True
             self.part = part
         self.smallest = min(self.smallest, part)
-
-
-# PETSc is finalised after Python and can no longer call it, so matrices and preconditioners written in Python that are
-# held by reference cycles are freed first.
-atexit.register(gc.collect)
-
-
-class ImplicitStepper(HalvedSteps):
-    """Solves steps by Newton's method, or as a variational inequality if contact is possible."""
-
-    kept_numbers = (*HalvedSteps.kept_numbers, "lagged_count", "resolved")
-    kept_arrays = (*HalvedSteps.kept_arrays, "held", "lagged_place")
-    kept_bars = ("lagged_history",)
-    resolved = Part("resolution.numbers")
-    lagged_count = Part("lagged.count", [])
-    lagged_place, lagged_history = (Part(f"lagged.{name}", np.empty((0, 0))) for name in ("place", "history"))
-
-    def __init__(self, model: Model, scheme: Scheme, h: float, choice: LinearChoice) -> None:
-        super().__init__(model, scheme, h)
-        _free_left_over(model.comm)
-        self._choice = choice
-        self._make_solvers()
-        self.guard = StepGuard(model) if model.case.solver.guard else None
-        self._after = np.zeros_like(self.state.x)
-        self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes in contact with walls in the last step
-        self.accuracy = 1.0  # of a solve, as a factor on the tolerance of steps; zero: to rounding
-        self.resolution = Resolution()
 
     def _make_solvers(self) -> None:
         """Create matrices and solvers for the supports as they are. Collective."""

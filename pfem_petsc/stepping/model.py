@@ -13,13 +13,11 @@ from ..contact.constraint_set import ConstraintSet
 from ..contact.contact import Contact, adjust_start
 from ..errors import InputError
 from ..mechanics.bars import Bars, area_fields, check_areas, named_groups, section_of_bars
-from ..mechanics.compiled import kernel
 from ..mechanics.loads import ExternalForce
-from ..mechanics.mass import Inertia, PointInertia
+from ..mechanics.mass import Inertia, PointInertia, add_at_ends
 from ..mechanics.rest_lengths import RestLengths, Temperatures
 from ..mechanics.springs import add_connectors, connected, make_springs, with_connectors
 from ..mechanics.supports import Supports
-from ..mechanics.tuples import bar_value
 from ..mesh import load_slab
 from ..mesh.distribution import distribute
 from ..mesh.node_sets import resolve_node_sets
@@ -61,13 +59,7 @@ class StageStart:
 
     def scalars(self) -> dict[str, Any]:
         """The rest of it."""
-        return {
-            "step": self.step,
-            "time": self.time,
-            "gravity": self.gravity.tolist(),
-            "wind": self.wind.tolist(),
-            "walls": self.walls.tolist(),
-        }
+        return {name: np.asarray(value).tolist() for name, value in vars(self).items() if name not in self.ARRAYS}
 
     @classmethod
     def restored(cls, scalars: dict[str, Any], arrays: dict[str, np.ndarray]) -> StageStart:
@@ -103,14 +95,6 @@ def refuse_inclined(
                 f"{source}: contact_pair, constraint: {what} {both[0]}, which is part of one: these require "
                 "supports along axes"
             )
-
-
-@kernel
-def _node_stiffness(bars, rest, start, stop, axial, out):
-    for k in range(start, stop):
-        stiffness = bar_value(axial, k - start) / rest[k]
-        out[bars[k, 0]] += stiffness
-        out[bars[k, 1]] += stiffness
 
 
 class Model:
@@ -170,9 +154,7 @@ class Model:
         self.reach = float(max(np.abs(low).max(), np.abs(high).max()))
         self.size = self.contact.size
         stiffness = np.zeros(mesh.n_local)
-        for block in self.bars.blocks:
-            axial = block.area * block.modulus
-            _node_stiffness(mesh.bars, self.bars.rest, block.start, block.stop, axial, stiffness)
+        add_at_ends(mesh.bars, self.bars.stiffness, stiffness)
         self.nodal_stiffness = stiffness[: mesh.n_owned].copy()
         with np.errstate(over="ignore"):  # stiffness that overflows is refused by the plan
             self.node_rounding = 4.0 * np.finfo(float).eps * self.reach * self.nodal_stiffness

@@ -237,12 +237,9 @@ class MasslessNodes:
         normal[self.moved.nodes] = self.moved.normals
         way = x[b] - x[a]
         length = np.linalg.norm(way, axis=1)
-        axial = np.concatenate(
-            [np.full(k.stop - k.start, k.area * k.modulus) for k in model.bars.blocks] or [np.zeros(0)]
-        )
         for end in (a, b):
             along = np.einsum("bi,bi->b", way, normal[end]) / length
-            np.add.at(total, end, axial / model.bars.rest * np.maximum(along * along, _STEEPEST))
+            np.add.at(total, end, model.bars.stiffness * np.maximum(along * along, _STEEPEST))
             np.minimum.at(shortest, end, model.bars.rest)
         return total[self.moved.nodes], _FARTHEST * shortest[self.moved.nodes]
 

@@ -362,6 +362,8 @@ class Supports:
 
     def clear(self, vectors: np.ndarray) -> None:
         """Set the prescribed components of vectors (owned, 3) to zero."""
+        if not self.any:
+            return
         vectors[self.fixed] = 0.0
         if self.inclined is not None:
             self.inclined.clear(vectors)

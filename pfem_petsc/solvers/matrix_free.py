@@ -359,8 +359,7 @@ class MatrixFreeHessian:
             blocks = self.blocks()
             diagonal = blocks[:, [0, 3, 5]]
             problem.transform.diagonal(self._left, lambda nodes: full_blocks(blocks[nodes]), diagonal)
-        if supports.any:
-            diagonal[supports.fixed] = problem.scale
+        diagonal[supports.fixed] = problem.scale
         if supports.inclined is not None:
             at, free = supports.inclined.nodes, supports.inclined.free
             full = free @ full_blocks(blocks[at]) @ free + problem.scale * (np.eye(3) - free)

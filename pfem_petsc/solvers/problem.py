@@ -99,8 +99,7 @@ class StepProblem:
         """Write g(w) (owned, 3) [N]. Collective."""
         self.imbalance(self.increment(w), g)
         self.transform.residual(self.balance.predictor, self.u, g)
-        if self.model.supports.any:
-            self.model.supports.clear(g)
+        self.model.supports.clear(g)
 
     def place(self, u: np.ndarray) -> None:
         """Set the positions of all local nodes to the predictor plus u. Collective."""

@@ -130,8 +130,7 @@ class WithEquations:
         """
         self._usable()
         position, supports = self.stepper.state.position.copy(), self.stepper.model.supports
-        if supports.any:
-            supports.place(position, supports.positions(self._place(at)))
+        supports.place(position, supports.positions(self._place(at)))
         made = self._vector()
         made.array[:] = position.ravel()
         return made
@@ -159,8 +158,7 @@ class WithEquations:
         with self._problem(x, at) as (place, positions, problem):
             g = np.empty_like(positions)
             problem.imbalance(positions - problem.balance.predictor, g)
-        if supports.any:
-            supports.put(g, problem.scale * (supports.coordinates(positions) - supports.positions(place)))
+        supports.put(g, problem.scale * (supports.coordinates(positions) - supports.positions(place)))
         out = self._vector() if out is None else out
         out.setArray(g.ravel())
         return out
@@ -201,12 +199,10 @@ class WithEquations:
             model.external.at(place, external)
         problem = problem_at_rest(model, state, external)
         try:
-            if model.bars_vary:
-                model.change_bars(place)
+            model.change_bars(place)
             yield place, positions, problem
         finally:
-            if model.bars_vary:
-                model.change_bars(state.time)
+            model.change_bars(state.time)
 
     def _place(self, at: float | None) -> float:
         """The load factor or time that ``at`` means."""

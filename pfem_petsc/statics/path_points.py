@@ -103,25 +103,21 @@ class BorderedSystem:
 
     def prescribe(self, u: np.ndarray, load_factor: float) -> None:
         """Set the prescribed components of displacements (owned, 3)."""
-        supports = self.model.supports
-        if supports.any:
-            values = supports.lacking(self.problem.balance.predictor, load_factor)
-            supports.put(u, values)
-            if self.problem.target is not None:
-                self.problem.target = values
+        values = self.model.supports.lacking(self.problem.balance.predictor, load_factor)
+        self.model.supports.put(u, values)
+        if self.problem.target is not None:
+            self.problem.target = values
 
     def imbalance(self, u: np.ndarray, load_factor: float, g: np.ndarray) -> None:
         """Compute g = f_int - f_ext (owned, 3) [N], including reactions of supports. Collective."""
-        if self.model.bars_vary:
-            self.model.change_bars(load_factor)
+        self.model.change_bars(load_factor)
         self.problem.known = -self.external(load_factor)
         self.problem.imbalance(u, g)
 
     def residual(self, u: np.ndarray, load_factor: float, g: np.ndarray) -> None:
         """Compute :meth:`imbalance` with zeros at prescribed components. Collective."""
         self.imbalance(u, load_factor, g)
-        if self.model.supports.any:
-            self.model.supports.clear(g)
+        self.model.supports.clear(g)
 
     def rate(self, u: np.ndarray, load_factor: float) -> np.ndarray:
         """Return -dg/d(load factor) (owned, 3) [N] at free components, by central differences. Collective."""
@@ -138,8 +134,7 @@ class BorderedSystem:
             self.residual(there, end, g)
             ends.append(g)
         self.prescribe(u.copy(), load_factor)
-        if model.bars_vary:
-            model.change_bars(load_factor)
+        model.change_bars(load_factor)
         return (ends[1] - ends[0]) / (2.0 * h)
 
     def linearise(self, u: np.ndarray) -> None:
@@ -156,8 +151,7 @@ class BorderedSystem:
             On all ranks, if K is singular or the linear solver does not converge.
         """
         self._b.array[:] = b.ravel()
-        if self.model.supports.any:
-            self.model.supports.clear(self._b.array.reshape(-1, 3))
+        self.model.supports.clear(self._b.array.reshape(-1, 3))
         reason = self._attempt()
         if reason < 0 and self.lagged is not None and self.lagged.carried:
             self.lagged.drop()

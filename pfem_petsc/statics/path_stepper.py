@@ -171,7 +171,7 @@ class PathStepper(StaticStepper):
                 break
             except NotConverged as failure:
                 self.name_obstacle(failure)
-                self._restore_bars()
+                self.model.change_bars(self.state.time)  # as the failed solve has changed them
                 if 0.5 * size < self.keys.smallest:
                     raise self._no_path(failure) from failure
                 size *= 0.5
@@ -255,11 +255,6 @@ class PathStepper(StaticStepper):
         self._turn = 1 if wanted[0] > 0 else -1
         self.mode = choices[chosen - 1]
         return True
-
-    def _restore_bars(self) -> None:
-        if self.model.bars_vary:
-            # the failed solve has changed the bars
-            self.model.change_bars(self.state.time)
 
     def _no_path(self, failure: NotConverged) -> SimulationFailure:
         """Return the message about a path that cannot be continued."""

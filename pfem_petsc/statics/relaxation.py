@@ -241,11 +241,10 @@ class PseudoMotion:
     def _lead_supports(self, start: np.ndarray, end: np.ndarray) -> None:
         """Move prescribed components (k,) to their positions in enough pseudo-steps to avoid crushed bars."""
         supports = self.model.supports
-        self._start, self._end, self._arrival = start, end, 0
-        if supports.any:
-            needed = float((np.abs(end - start) / self._reach[supports.every_node]).max(initial=0.0))
-            self._arrival = int(np.ceil(_UNHURRIED * self.model.comm.allreduce(needed, op=MPI.MAX)))
-            self._place_supports()
+        self._start, self._end = start, end
+        needed = float((np.abs(end - start) / self._reach[supports.every_node]).max(initial=0.0))
+        self._arrival = int(np.ceil(_UNHURRIED * self.model.comm.allreduce(needed, op=MPI.MAX)))
+        self._place_supports()
 
     def _place_supports(self) -> None:
         part = min(self.steps / self._arrival, 1.0) if self._arrival else 1.0
@@ -446,8 +445,7 @@ class RelaxationStepper(StaticStepper):
     def solve(self, balance: Balance) -> Solution:
         """See :meth:`~pfem_petsc.stepping.stepper.Stepper.solve`."""
         model, motion, parameters = self.model, self.motion, self.parameters
-        if model.bars_vary:
-            model.change_bars(balance.time)
+        model.change_bars(balance.time)
         motion.begin(self.state, balance.time, self.state.external)
         stages = [share for share in self._handovers if share > parameters.tolerance]
         for share in (*stages, parameters.tolerance):

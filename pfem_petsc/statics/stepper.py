@@ -147,9 +147,8 @@ class StaticStepper(ImplicitStepper):
                 break
             except NotConverged as failure:
                 self.name_obstacle(failure)
-                if self.model.bars_vary:
-                    # the failed solve has applied the temperatures and rest lengths of its end
-                    self.model.change_bars(state.time)
+                # the failed solve has applied the temperatures and rest lengths of its end
+                self.model.change_bars(state.time)
                 smallest = 0.5 * size < self.limits.smallest
                 if self.stabilise and self.viscosity < 1.0 and (smallest or size < first * _TRIED):
                     self.viscosity = min(_STRONGER * self.viscosity, 1.0)

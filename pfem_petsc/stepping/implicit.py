@@ -147,9 +147,8 @@ class ImplicitStepper(Stepper):
                 state.external = external
                 if size == 1:
                     raise NotConverged(f"{failure} (the step was bisected {_HALVINGS} times)") from failure
-                if self.model.bars_vary:
-                    # the failed solve has applied the temperatures and rest lengths of its end
-                    self.model.change_bars(self.state.time)
+                # the failed solve has applied the temperatures and rest lengths of its end
+                self.model.change_bars(self.state.time)
                 size //= 2
                 self.level += 1
                 self.tell_failure(failure, f"bisecting the step, to {self.h * size / ticks:.4g} s")
@@ -274,8 +273,7 @@ class ImplicitStepper(Stepper):
 
     def _solve(self, balance: Balance, guess: np.ndarray) -> Solution:
         model, state = self.model, self.state
-        if model.bars_vary:
-            model.change_bars(balance.time)
+        model.change_bars(balance.time)
         if model.bars.viscous and balance.weight and self.scheme.inertial and not balance.discrete_gradient:
             self._set_rates(balance)
         scale = self._force_scale()
@@ -385,9 +383,7 @@ class ImplicitStepper(Stepper):
     def _guess(self, balance: Balance) -> np.ndarray:
         """Return the increments with which solves begin, prescribed components at their exact positions."""
         guess = self._free_guess(balance)
-        supports = self.model.supports
-        if supports.any:
-            supports.put(guess, supports.lacking(balance.predictor, balance.time))
+        self.model.supports.put(guess, self.model.supports.lacking(balance.predictor, balance.time))
         return guess
 
 

@@ -168,8 +168,7 @@ class MasslessNodes:
         external = np.zeros((owned, 3))
         if model.external.active:
             model.external.at(time, external)
-        if model.bars_vary:
-            model.change_bars(time)
+        model.change_bars(time)
         model.mesh.update_ghosts(x)  # a scheme predicts owned nodes alone
         elastic, farthest = self._stiffness(x)
         stiffness, force, step = elastic, np.full(len(nodes), np.nan), np.zeros(len(nodes))
@@ -195,8 +194,7 @@ class MasslessNodes:
             if largest <= ROUNDING * model.size:
                 break
         model.mesh.update_ghosts(x)
-        if model.bars_vary:
-            model.change_bars(now)
+        model.change_bars(now)
         return largest
 
     def gaps(self, x: np.ndarray, time: float) -> np.ndarray:
@@ -397,9 +395,8 @@ class Stepper(ABC):
         velocity = model.initial_velocity()
         state.v = velocity if model.start is None else state.v + velocity
         supports = model.supports
-        if supports.any:
-            supports.place(state.position, supports.positions(0.0))
-            supports.put(state.v, supports.rates(0.0, 0.0)[0])
+        supports.place(state.position, supports.positions(0.0))
+        supports.put(state.v, supports.rates(0.0, 0.0)[0])
         if model.external.state_forces:
             model.external.follow(state.position, state.v)
         if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.size:
@@ -450,8 +447,7 @@ class Stepper(ABC):
         state, model = self.state, self.model
         state.v = np.zeros_like(self.zero)
         state.a = np.zeros_like(self.zero)
-        if model.supports.any:
-            model.supports.place(state.position, model.supports.positions(0.0))
+        model.supports.place(state.position, model.supports.positions(0.0))
         self.evaluate(commit=True)
         if model.external.active:
             state.external = model.external.at(0.0, np.empty_like(state.v))
@@ -659,8 +655,7 @@ class Stepper(ABC):
         if self.scheme.inertial:  # static steps are infinitely long for material laws
             model.bars.step = self.part
         self.state.time = end
-        if model.bars_vary:
-            model.change_bars(end)
+        model.change_bars(end)
         self.evaluate(commit=True)
 
     def _set_balance(self, end: float) -> None:

@@ -24,7 +24,7 @@ from .springs import Springs, connected, connector_modulus
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..case.tables import Section
-    from ..mesh.distribution import Block, DistributedMesh
+    from ..mesh.distribution import DistributedMesh
     from ..mesh.slab import MeshSlab
     from .block_pattern import BlockPattern
 
@@ -62,13 +62,6 @@ def named_groups(case: Case) -> set[str]:
     names += [node_set.group for node_set in case.node_set.values()]
     names += [entry.bars for entry in (*case.temperature, *case.remove)]
     return {name for name in names if name is not None}
-
-
-def areas_of(section: Section, block: Block, mesh: DistributedMesh) -> float | np.ndarray:
-    """Return the area of the bars of a block [m2]: a number, or (stop - start,)."""
-    if section.area_field is None:
-        return float(section.area)
-    return np.ascontiguousarray(mesh.bar_fields[section.area_field][block.start : block.stop])
 
 
 def check_areas(case: Case, slab: MeshSlab, sections: np.ndarray) -> None:
@@ -186,26 +179,21 @@ def laws_of(case: Case) -> dict[str, Law]:
     return laws
 
 
-def make_blocks(mesh: DistributedMesh, case: Case, lengths: np.ndarray) -> list[BarBlock]:
-    """Return the blocks of this rank; ``lengths`` (b,): of the bars in the mesh [m].
-
-    Raises
-    ------
-    InputError
-        On this rank, if a law cannot describe one of its bars.
-    """
+def make_blocks(mesh: DistributedMesh, case: Case) -> list[BarBlock]:
+    """Return the blocks of this rank, without data of single bars."""
     laws, names, blocks = laws_of(case), list(case.section), []
     for block in mesh.blocks:
         section = case.section[names[block.section]]
         material = case.material[section.material]
         law, measure = laws[section.material], MEASURES[material.strain]
+        area = section.area if section.area_field is None else mesh.bar_fields[section.area_field]
         blocks.append(
             BarBlock(
                 section=names[block.section],
                 start=block.start,
                 counted=block.counted,
                 stop=block.stop,
-                area=areas_of(section, block, mesh),
+                area=float(area) if section.area_field is None else area[block.start : block.stop].copy(),
                 density=material.density,
                 damping=material.damping,
                 thermal_expansion=material.thermal_expansion,
@@ -219,24 +207,7 @@ def make_blocks(mesh: DistributedMesh, case: Case, lengths: np.ndarray) -> list[
                 release=make_release(law_of(material), measure) if law.rupture >= 0 else None,
             )
         )
-    for block in blocks:
-        if block.law.bar_data:
-            _fill_bar_data(mesh, case, block, lengths[block.start : block.stop])
     return blocks
-
-
-def _fill_bar_data(mesh: DistributedMesh, case: Case, block: BarBlock, lengths: np.ndarray) -> None:
-    """Give the law of a block what it reads of each bar."""
-    section = case.section[block.section]
-    shapes = bar_shapes(section, lengths, np.broadcast_to(block.area, block.stop - block.start))
-    try:
-        data = case.material[section.material].pack_bars(shapes)
-    except UnsuitableBarError as error:
-        bar = mesh.bar_ids[block.start + error.bar]
-        raise InputError(
-            f"{case.source}: section.{block.section} with material.{section.material}: bar {bar}: {error.reason}"
-        ) from error
-    block.history[len(block.law.rows) :] = data
 
 
 _LOADING = 1e-8  # relative change of all lengths that distinguishes the tangents of loading and unloading
@@ -298,7 +269,10 @@ class Bars:
         self.heat_at_start = self.heat
         self.step = 0.0
         self.internal = internal_variables(case.material)
-        self.blocks = make_blocks(mesh, case, self.mesh_lengths)
+        self.blocks = make_blocks(mesh, case)
+        for block in self.blocks:
+            if block.law.bar_data:
+                self._fill_bar_data(block)
         self.viscous_blocks = [block for block in self.blocks if block.law.known_rate >= 0]
         laws = laws_of(case).values()
         self.can_break = any(law.rupture >= 0 for law in laws)
@@ -490,6 +464,17 @@ class Bars:
         lengths = np.empty_like(self.rest)
         bar_lengths(x, self.ends, lengths)
         return lengths
+
+    def _fill_bar_data(self, block: BarBlock) -> None:
+        """Give the law of a block what it reads of each bar."""
+        material = self.case.section[block.section].material
+        try:
+            block.history[len(block.law.rows) :] = self.case.material[material].pack_bars(self._shapes(block))
+        except UnsuitableBarError as error:
+            bar = self.mesh.bar_ids[block.start + error.bar]
+            raise InputError(
+                f"{self.case.source}: section.{block.section} with material.{material}: bar {bar}: {error.reason}"
+            ) from error
 
     def _shapes(self, block: BarBlock) -> BarShapes:
         lengths = self.mesh_lengths[block.start : block.stop]

@@ -6,7 +6,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -143,29 +143,21 @@ class ForceState:
         return self.v
 
 
-class StateForce(Protocol):
-    """A force that depends on the motion.
+class FunctionForce:
+    """The force that a function of time and state returns.
 
     Attributes
     ----------
     failure : why the last force could not be evaluated on this rank, None if it could
     """
 
-    failure: str | None
-
-    def add(self, time: float, state: ForceState, out: np.ndarray) -> None:
-        """Add the force at a time [s] to ``out`` (owned, 3) [N]. Collective."""
-
-
-class FunctionForce:
-    """The force that a function of time and state returns."""
-
     def __init__(self, function: Callable[[float, ForceState], Any], mesh: DistributedMesh) -> None:
         self.function, self.failure = function, None
         self._shape = mesh.n_owned, 3
 
     def add(self, time: float, state: ForceState, out: np.ndarray) -> None:
-        """See :class:`StateForce`; what is wrong with a force becomes the failure, so that no rank is left alone."""
+        """Add the force at a time [s] to ``out`` (owned, 3) [N]; what is wrong with it becomes the failure, so that no rank
+        is left alone."""
         try:
             force = np.asarray(self.function(time, state), dtype=np.float64)
         except Exception as error:  # noqa: BLE001 - of a user; the other ranks would wait
@@ -207,7 +199,7 @@ def _add_drag(bars, x, v, factor, wind, owned, out):
 
 
 class Wind:
-    """The drag of all bars; a :class:`~pfem_petsc.mechanics.loads.StateForce`.
+    """The drag of all bars.
 
     Attributes
     ----------
@@ -283,7 +275,7 @@ class ExternalForce:
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], inertia: Inertia) -> None:
         self.inertia = inertia
         self._nodes = nodes
-        self.state_forces: list[StateForce] = []
+        self.state_forces: list[Wind | FunctionForce] = []
         self._state: ForceState | None = None
         self.wind = Wind(case, inertia.bars) if case.wind is not None else None
         if self.wind is not None and case.time is not None:

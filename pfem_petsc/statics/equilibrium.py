@@ -51,10 +51,10 @@ class Equilibrium(Scheme):
         self.lack, self.releases, self.creeps = lack, False, False
 
     def start(self, state: State, h: float) -> None:
-        state.memory["rate"] = np.zeros_like(state.v)
+        state.memory[self.remembers[0]] = np.zeros_like(state.v)
 
     def expected_move(self, state: State, h: float) -> np.ndarray:
-        return h * state.memory["rate"]
+        return h * state.memory[self.remembers[0]]
 
     def balance(self, state: State, h: float) -> Balance:
         end = state.time if self.releases or self.creeps else state.time + h
@@ -93,12 +93,6 @@ class PathEquilibrium(Equilibrium):
     def balance(self, state: State, h: float) -> Balance:
         """Return the balance at the load factor reached; ``h`` is a length, not an increment of the load factor."""
         return replace(super().balance(state, 0.0), time=self.reached, loads=((1.0, self.reached),))
-
-    def start(self, state: State, h: float) -> None:
-        state.memory["tangent"] = np.zeros_like(state.v)
-
-    def expected_move(self, state: State, h: float) -> np.ndarray:
-        return h * state.memory["tangent"]
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
         state.position[:] = balance.predictor + u

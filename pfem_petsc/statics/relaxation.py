@@ -416,15 +416,8 @@ class RelaxationStepper(StaticStepper):
         SimulationFailure
             On all ranks, if relaxation does not converge in ``max_iterations`` pseudo-steps.
         """
-        state, end = self.state, min(self.end, self.removals.ends(self.state.time))
-        left = end - state.time
-        last = left <= self.limits.step * (1.0 + TIME)
-        size = left if last else self.limits.step
-        self._set_part(size)
-        self.smallest = size
-        self._make_part(end if last else state.time + size)
-        self.leave()
-        state.step += 1
+        self.increment = self.limits.step
+        super().step()
 
     def obstacle(self) -> str:
         """See :class:`StaticStepper`: relaxation needs no stiffness. Collective."""

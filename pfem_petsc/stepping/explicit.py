@@ -102,8 +102,7 @@ class ExplicitStepper(Stepper):
         try:
             yield
         except SimulationFailure as failure:
-            if self.fault is None:
-                self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
+            self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
 
     def _stiffness_for(self, balance: Balance) -> np.ndarray:
         """Return alpha m + eta c (owned,), computed again where it changes."""
@@ -205,7 +204,7 @@ class RedistributedStepper(Stepper):
         x = self._trial
         x[: model.mesh.n_owned] = balance.predictor + u
         largest = self.massless.settle(x, balance.time, self.state.time)
-        if not largest <= BEYOND * model.size and self.fault is None:
+        if not largest <= BEYOND * model.size:
             self.fault = SimulationFailure(
                 f"{self.when(balance)}: contact nodes without mass found no equilibrium (last move {largest:.3g} "
                 "m); reduce time.step or use another contact.treatment"

@@ -382,12 +382,13 @@ class Stepper(ABC):
 
     @property
     def fault(self) -> SimulationFailure | None:
-        """A failure that only this rank knows; setting it stores the number of the last finished step."""
+        """The first failure that only this rank knows; setting it stores the number of the last finished step."""
         return self._fault
 
     @fault.setter
     def fault(self, fault: SimulationFailure | None) -> None:
-        self._fault, self.fault_step = fault, self.number
+        if self._fault is None:
+            self._fault, self.fault_step = fault, self.number
 
     def start(self) -> None:
         """Initialise velocity, internal force and acceleration of the state. Collective."""
@@ -707,9 +708,11 @@ class Stepper(ABC):
 
     def _check(self, end: float) -> None:
         """Find nodes that supports have carried through a rectangle."""
-        if self.carried.of and self.fault is None:
-            crossing = self.carried.crossing(self.state.position, end, self.at(self.state.step + 1, end))
-            self.fault = SimulationFailure(crossing) if crossing else None
+        crossing = self.carried.of and self.carried.crossing(
+            self.state.position, end, self.at(self.state.step + 1, end)
+        )
+        if crossing:
+            self.fault = SimulationFailure(crossing)
 
     def load_of(self, balance: Balance) -> np.ndarray:
         """Return the external force (owned, 3) [N] of a balance that is not solved yet. Collective."""
@@ -743,8 +746,7 @@ class Stepper(ABC):
         return force
 
     def _fail_load(self, where: str) -> None:
-        if self.fault is None:
-            self.fault = SimulationFailure(f"{where}: external_force: the function {self.model.external.failure}")
+        self.fault = SimulationFailure(f"{where}: external_force: the function {self.model.external.failure}")
 
     def _expected(self, balance: Balance, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities (owned, 3) at a time [s] of a balance that is not solved yet.
@@ -792,7 +794,7 @@ class Stepper(ABC):
         failed = self.energy.failed
         if failed < 0 and self.energy.shortened:
             failed = bars.first_inverted(state.x, self.before)
-        if failed >= 0 and self.fault is None:
+        if failed >= 0:
             self.fault = SimulationFailure(self.collapse(failed))
 
     def on_all(self, values: np.ndarray) -> np.ndarray:

@@ -156,8 +156,8 @@ class FunctionForce:
         self._shape = mesh.n_owned, 3
 
     def add(self, time: float, state: ForceState, out: np.ndarray) -> None:
-        """Add the force at a time [s] to ``out`` (owned, 3) [N]; what is wrong with it becomes the failure, so that no rank
-        is left alone."""
+        """Add the force at a time [s] to ``out`` (owned, 3) [N]; what is wrong with it becomes the failure, so that no
+        rank is left alone."""
         try:
             force = np.asarray(self.function(time, state), dtype=np.float64)
         except Exception as error:  # noqa: BLE001 - of a user; the other ranks would wait

@@ -100,7 +100,7 @@ _FILLED = 0.5
 
 def grid_planes(mesh: DistributedMesh) -> list[np.ndarray]:
     """Return the coordinates [m] of the planes along x, y and z, ascending. Collective."""
-    low, high = _extremes(mesh)
+    low, high = mesh.extremes()
     spacing = max(_SPACING * _mean_length(mesh), _least(high - low, mesh.n_nodes))
     points = mesh.points[: mesh.n_owned]
     return [_planes(mesh.comm, points[:, axis], low[axis], high[axis], spacing) for axis in range(3)]
@@ -109,18 +109,10 @@ def grid_planes(mesh: DistributedMesh) -> list[np.ndarray]:
 def fills_block(mesh: DistributedMesh) -> bool:
     """Whether a truss is several bars thick in all directions and has nodes everywhere between its extremes, so that
     the functions of the grid describe its soft motions. Slender and hollow trusses bend within a box. Collective."""
-    low, high = _extremes(mesh)
+    low, high = mesh.extremes()
     length = _mean_length(mesh)
     extents = high - low
     return bool(extents.min() >= _THICK * length and mesh.n_nodes * length**3 >= _FILLED * np.prod(extents))
-
-
-def _extremes(mesh: DistributedMesh) -> tuple[np.ndarray, np.ndarray]:
-    points = mesh.points[: mesh.n_owned]
-    low, high = np.empty(3), np.empty(3)
-    mesh.comm.Allreduce(points.min(axis=0, initial=np.inf), low, op=MPI.MIN)
-    mesh.comm.Allreduce(points.max(axis=0, initial=-np.inf), high, op=MPI.MAX)
-    return low, high
 
 
 def _mean_length(mesh: DistributedMesh) -> float:
@@ -136,13 +128,10 @@ def _mean_length(mesh: DistributedMesh) -> float:
 def _least(extents: np.ndarray, n_nodes: int) -> float:
     """Return the spacing [m] with which the boxes that fill the extents are fewer than the nodes."""
     filled = extents[extents > 0.0]
-    boxes = n_nodes / _FINEST
-    spacing = 0.0
-    if len(filled):
-        spacing = float((np.prod(filled) / boxes) ** (1.0 / len(filled)))
-        # a truss that fills little of its extents has fewer boxes than these
-        spacing *= 0.5
-    return spacing
+    if not len(filled):
+        return 0.0
+    # a truss that fills little of its extents has fewer boxes than these
+    return 0.5 * float((np.prod(filled) / (n_nodes / _FINEST)) ** (1.0 / len(filled)))
 
 
 def _planes(comm: MPI.Comm, x: np.ndarray, low: float, high: float, spacing: float) -> np.ndarray:
@@ -161,15 +150,7 @@ def _planes(comm: MPI.Comm, x: np.ndarray, low: float, high: float, spacing: flo
 def _layers(comm: MPI.Comm, x: np.ndarray, low: float, spacing: float, most: int) -> np.ndarray | None:
     """Return the coordinates that nodes have, None if they are more than ``most``. Collective."""
     close = _CLOSE * spacing
-    some = _merged(np.sort(x[: 4 * most]), close)
-    few = comm.allreduce(len(some), op=MPI.MAX) <= most
-    if not few:
-        return None
-    mine = some
-    for first in range(0, len(x), 1 << 18):
-        mine = _merged(np.unique(np.concatenate([mine, x[first : first + (1 << 18)]])), close)
-        if len(mine) > most:
-            break
+    mine = _merged(np.unique(x), close)
     if comm.allreduce(len(mine), op=MPI.MAX) > most:
         return None
     layers = _merged(np.sort(np.concatenate(comm.allgather(mine))), close)

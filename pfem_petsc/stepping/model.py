@@ -145,11 +145,7 @@ class Model:
         if self.supports.inclined is not None:
             refuse_inclined(case.source, mesh, self.supports.inclined.nodes, self.contact, self.links)
 
-        points = mesh.points[: mesh.n_owned]
-        low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
-        comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-        comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-        self.low, self.high = low, high
+        self.low, self.high = low, high = mesh.extremes()
         self.length = float((high - low).max())
         self.reach = float(max(np.abs(low).max(), np.abs(high).max()))
         self.size = self.contact.size

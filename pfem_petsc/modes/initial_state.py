@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..output.units import TIME
-from ..stepping.plan import PlanAtRest, refuse_motion
+from ..stepping.plan import Plan, refuse_motion
 from ..stepping.stepper import Solution, Stepper
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class InitialState(Stepper):
     def __init__(self, model: Model) -> None:
         refuse_motion(model.case, "a case with [modes] alone")
         super().__init__(model, _Nothing(NoParameters()), 0.0)
-        self.plan = PlanAtRest(self.scheme, TIME, {"analysis": "none: modes of the initial state"}, steps=0)
+        self.plan = Plan(self.scheme, TIME, {"analysis": "none: modes of the initial state"}, steps=0)
 
     def start(self) -> None:
         self.start_without_motion()

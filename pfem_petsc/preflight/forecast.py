@@ -150,7 +150,7 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         **_density(model),
         "mass": engineering(model.total_mass, "kg") + f" ({case.mass})",
         "wave speed": engineering(model.wave_speed, "m/s"),
-        **plan.entries(case),
+        **plan.texts,
         **describe_modes(model),
         "linear solver": plan.linear.why if plan.linear is not None else "none: nodes are solved independently",
         "walls": ", ".join(walls) or "none",

@@ -211,9 +211,9 @@ def _refuse_other(restart: Restart) -> None:
 def _refuse_loss(path: Path, plan: Plan) -> None:
     """Refuse a restart that would truncate results beyond the end of the run."""
     with open_result(path) as result:
-        steps, times = result.history["step"], result.history["time"]
-        snapshots = int(plan.beyond(result.steps, result.times).sum())
-    rows = int(plan.beyond(steps, times).sum())
+        times = result.history["time"]
+        snapshots = int(plan.beyond(result.times).sum())
+    rows = int(plan.beyond(times).sum())
     if rows or snapshots:
         reached = max([*times[-1:], *result.times[-1:]])
         raise InputError(

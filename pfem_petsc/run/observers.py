@@ -336,7 +336,7 @@ class Checkpointing(Observer):
                 "name": case.name,
                 "overrides": list(case.overrides),
                 "case": case.to_dict(),
-                "plan": self._stages.plan.record(),
+                "plan": self._stages.plan.record,
                 "mesh_mark": state.mesh_mark,
                 "external_functions": self._stages.model.external.functions,
             }

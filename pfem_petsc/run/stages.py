@@ -24,9 +24,8 @@ from ..output.units import TIME as AXIS
 from ..preflight.checks import warnings_before
 from ..statics.analysis import make_stepper as static_stepper
 from ..stepping.model import Model, StageStart
-from ..stepping.plan import make_plan
+from ..stepping.plan import Plan, make_plan
 from ..stepping.plan import make_stepper as time_stepper
-from ..tolerances import TIME
 from .recorder import Recorder
 
 if TYPE_CHECKING:
@@ -47,38 +46,21 @@ def _make_stepper(model: Model, recorded: Mapping[str, Any] | None) -> Stepper:
     return time_stepper(model, make_plan(model, recorded))
 
 
-class StagedPlan:
-    """The plans of all stages on one axis; see :class:`~pfem_petsc.stepping.plan.Plan`.
+def _join(plans: list[Plan], names: list[str]) -> Plan:
+    """Return the plan of all stages: steps, end and axis are those of all together, others those of the first stage.
 
-    Attributes
-    ----------
-    plans, names : of the stages
-    scheme, linear, step : of the first stage
-    steps, end : of all stages together; None where that of one is not known before
-    axis : time [s]; a static stage takes as much of it as its load factor or points count
+    A static stage takes as much of the axis, time [s], as its load factor or points count.
     """
-
-    def __init__(self, plans: tuple[Any, ...], names: tuple[str, ...]) -> None:
-        self.plans, self.names = plans, names
-        self.scheme, self.linear, self.step = plans[0].scheme, plans[0].linear, plans[0].step
-        counts, ends = [plan.steps for plan in plans], [plan.end for plan in plans]
-        self.steps: int | None = None if None in counts else sum(counts)
-        self.end: float | None = None if None in ends else sum(ends)
-        self.axis = AXIS._replace(key=f"stage[{len(plans) - 1}].{plans[-1].axis.key}")
-
-    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Return which of the recorded steps and times are beyond the end."""
-        return times > (np.inf if self.end is None else self.end * (1.0 + TIME))
-
-    def entries(self, case: Case) -> dict[str, str]:
-        """Label and text of what a user checks before a run."""
-        texts = [plan.entries(stage) for plan, stage in zip(self.plans, case.stages, strict=True)]
-        lines = ["; ".join(f"{label}: {text}" for label, text in each.items()) for each in texts]
-        return {f"stage {name}": line for name, line in zip(self.names, lines, strict=True)}
-
-    def record(self) -> dict[str, Any]:
-        """Choices that a restart must keep."""
-        return {"stages": [plan.record() for plan in self.plans]}
+    lines = ["; ".join(f"{label}: {text}" for label, text in plan.texts.items()) for plan in plans]
+    counts, ends = [plan.steps for plan in plans], [plan.end for plan in plans]
+    return dataclasses.replace(
+        plans[0],
+        steps=None if None in counts else sum(counts),
+        end=None if None in ends else sum(ends),
+        axis=AXIS._replace(key=f"stage[{len(plans) - 1}].{plans[-1].axis.key}"),
+        texts={f"stage {name}": line for name, line in zip(names, lines, strict=True)},
+        record={"stages": [plan.record for plan in plans]},
+    )
 
 
 class Stages:
@@ -146,7 +128,7 @@ class Stages:
                 self.stepper = stepper
             else:
                 stepper.destroy()
-        self.plan = StagedPlan(tuple(plans), tuple(stage.name for stage in self._cases))
+        self.plan = _join(plans, [stage.name for stage in self._cases])
         self.fields = [*points, *cells]
         self.model.warnings = warnings
 
@@ -209,7 +191,7 @@ class Stages:
             for function in self.functions if stage.time is not None else ():
                 model.external.call(function)
             check_start(model.contact, old.state.position, model.size)
-            stepper = _make_stepper(model, self.plan.plans[number].record())
+            stepper = _make_stepper(model, self.plan.record["stages"][number])
         except InputError as error:
             raise SimulationFailure(f"{where}: {error}") from error
         _hand_over(old, stepper)

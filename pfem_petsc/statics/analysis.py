@@ -13,7 +13,7 @@ from ..output.units import LOAD_FACTOR, POINT
 from ..registry import lookup
 from ..solvers.background_grid import fills_block
 from ..solvers.linear import Demand, LinearChoice, choose_linear
-from ..stepping.plan import PlanAtRest, refuse_motion
+from ..stepping.plan import Plan, refuse_motion
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -42,7 +42,7 @@ def make_stepper(model: Model) -> StaticStepper:
     stepper = lookup(METHODS, case.static.method, "static.method").make_stepper(model, parameters, choice)
     points = getattr(parameters, "max_points", None)
     words = ", ".join(f"{key} = {value}" for key, value in parameters.model_dump(exclude_none=True).items())
-    stepper.plan = PlanAtRest(
+    stepper.plan = Plan(
         stepper.scheme,
         LOAD_FACTOR if points is None else POINT,
         {"static analysis": f"{case.static.method} ({words})"},

@@ -126,84 +126,32 @@ class Plan:
 
     Attributes
     ----------
-    scheme : the integrator
-    step : time step [s]
-    steps : number of steps to the end
-    critical_step : largest stable step of the scheme [s], infinite if unconditionally stable
-    frequency : bounds on the highest natural frequency [rad/s]
-    linear : linear solver, None where every node is solved on its own
-    asked : what the case asks for of it, ``solver.linear`` and ``solver.operator``
-    axis : of the times in the results
-    """
-
-    scheme: Scheme
-    step: float
-    steps: int
-    critical_step: float
-    frequency: Frequency
-    linear: LinearChoice | None
-    asked: tuple[str, str] = ("auto", "auto")
-    axis: Axis = AXIS
-
-    @property
-    def end(self) -> float:
-        """Time of the last step [s]."""
-        return self.step * self.steps
-
-    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Return which of the recorded steps and times are beyond the end."""
-        return steps > self.steps
-
-    def entries(self, case: Case) -> dict[str, str]:
-        """Label and text of what a user checks before a run."""
-        parameters = ", ".join(f"{k} = {v:g}" for k, v in case.time.scheme.model_dump().items())
-        critical = engineering(self.critical_step, "s") if np.isfinite(self.critical_step) else "none (implicit)"
-        return {
-            "integrator": case.time.integrator + (f" ({parameters})" if parameters else ""),
-            "critical step": critical,
-            "time step": f"{engineering(self.step, 's', 6)}, {self.steps:,} steps to {engineering(self.end, 's')}",
-        }
-
-    def record(self) -> dict[str, Any]:
-        """Return the numbers that a restart must not compute again, exact to the last bit."""
-        linear = None if self.linear is None else {"asked": list(self.asked), "choice": asdict(self.linear)}
-        return {"step": self.step, "frequency": list(self.frequency), "linear": linear}
-
-
-@dataclass(frozen=True)
-class PlanAtRest:
-    """The plan of a run without motion, for which nothing is computed before.
-
-    Attributes
-    ----------
-    scheme : the balance without inertia
+    scheme : the integrator, or the balance without inertia
     axis : of the times in the results
     texts : summary for the user before a run, by label
-    step : first increment on the axis
+    step : time step [s], or first increment on the axis
     end : last place on the axis, None where it is not known before
-    linear : linear solver, None without equations
+    linear : linear solver, None where every node is solved on its own
     steps : largest number of steps, None where it is not known before
+    critical_step : largest stable step of the scheme [s], infinite if unconditionally stable
+    frequency : bounds on the highest natural frequency [rad/s], None without motion
+    record : the numbers that a restart must not compute again, exact to the last bit
     """
 
     scheme: Scheme
     axis: Axis
-    texts: dict[str, str] = field(default_factory=dict)
+    texts: dict[str, str]
     step: float = 0.0
     end: float | None = 0.0
     linear: LinearChoice | None = None
     steps: int | None = None
+    critical_step: float = np.inf
+    frequency: Frequency | None = None
+    record: dict[str, Any] = field(default_factory=dict)
 
-    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Return which of the recorded steps and times are beyond the end."""
+    def beyond(self, times: np.ndarray) -> np.ndarray:
+        """Return which of the recorded times are beyond the end."""
         return times > (np.inf if self.end is None else self.end * (1.0 + TIME))
-
-    def entries(self, case: Case) -> dict[str, str]:
-        """Return label and text of a summary for the user before a run."""
-        return self.texts
-
-    def record(self) -> dict[str, Any]:
-        """Return the numbers that a restart must not compute again."""
-        return {}
 
 
 def refuse_motion(case: Case, what: str) -> None:
@@ -223,7 +171,7 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     Parameters
     ----------
     model : Model
-    recorded : :meth:`Plan.record` of the run that is continued, whose time step and frequencies are kept
+    recorded : :attr:`Plan.record` of the run that is continued, whose time step and frequencies are kept
 
     Raises
     ------
@@ -290,7 +238,15 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
             linear = LinearChoice(**kept["choice"])
         else:
             linear = _linear(model, scheme, 0.0 if scheme.explicit else step * frequency.upper / 2.0, steps)
-    return Plan(scheme, step, steps, critical, frequency, linear, asked)
+    parameters = ", ".join(f"{key} = {value:g}" for key, value in time.scheme.model_dump().items())
+    texts = {
+        "integrator": time.integrator + (f" ({parameters})" if parameters else ""),
+        "critical step": engineering(critical, "s") if np.isfinite(critical) else "none (implicit)",
+        "time step": f"{engineering(step, 's', 6)}, {steps:,} steps to {engineering(step * steps, 's')}",
+    }
+    choice = None if linear is None else {"asked": list(asked), "choice": asdict(linear)}
+    record = {"step": step, "frequency": list(frequency), "linear": choice}
+    return Plan(scheme, AXIS, texts, step, step * steps, linear, steps, critical, frequency, record)
 
 
 def _highest_frequency(model: Model) -> Frequency:

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
-from ..stepping.stepper import Part, Solution
+from ..stepping.stepper import AttributeOf, Solution
 from ..tolerances import TIME
 from .critical import EVENTS, CriticalPoints, Event
 from .equilibrium import PathEquilibrium
@@ -73,7 +73,7 @@ class PathStepper(StaticStepper):
         "outcome",
     )
     kept_arrays = (*StaticStepper.kept_arrays, "mode")
-    scale = Part("control.scale")
+    scale = AttributeOf("control.scale")
     event_columns = EVENTS
     remedy = "reduce static.max_step or static.step; if such jumps are intended, set solver.guard = false"
 

@@ -26,7 +26,7 @@ from ..solvers.newton import NewtonSolver, Tolerance, zero_tolerance
 from ..solvers.problem import StepProblem
 from ..tolerances import ON_BOUND
 from .guard import StepGuard
-from .stepper import Part, Solution, Stepper
+from .stepper import AttributeOf, Solution, Stepper
 
 if TYPE_CHECKING:
     from ..integrators.base import Scheme
@@ -94,9 +94,9 @@ class ImplicitStepper(Stepper):
     kept_numbers = (*Stepper.kept_numbers, "level", "lagged_count", "resolved")
     kept_arrays = (*Stepper.kept_arrays, "held", "lagged_place")
     kept_bars = ("lagged_history",)
-    resolved = Part("resolution.numbers")
-    lagged_count = Part("lagged.count", [])
-    lagged_place, lagged_history = (Part(f"lagged.{name}", np.empty((0, 0))) for name in ("place", "history"))
+    resolved = AttributeOf("resolution.numbers")
+    lagged_count = AttributeOf("lagged.count", [])
+    lagged_place, lagged_history = (AttributeOf(f"lagged.{name}", np.empty((0, 0))) for name in ("place", "history"))
 
     def __init__(self, model: Model, scheme: Scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)

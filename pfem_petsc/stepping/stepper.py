@@ -263,7 +263,7 @@ class Solution:
     contacts: int = 0
 
 
-class Part:
+class AttributeOf:
     """An attribute of a part of a stepper, by its path, that checkpoints keep as one of the stepper. Of a part that is
     None, it is ``absent`` and nothing is set: a restart may have other settings."""
 
@@ -332,8 +332,8 @@ class Stepper(ABC):
     kept_bars: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     remedy = "reduce time.step"
-    removal_times, removed_supports = Part("removals.times"), Part("removals.gone")
-    removed_reactions = Part("removals.released")
+    removal_times, removed_supports = AttributeOf("removals.times"), AttributeOf("removals.gone")
+    removed_reactions = AttributeOf("removals.released")
     event_columns: Mapping[str, Any] = {}
     events: Sequence[Any] = ()
 

@@ -75,30 +75,6 @@ class _End(NamedTuple):
     negatives: int
 
 
-class _Interval(NamedTuple):
-    first: _End
-    second: _End
-
-    @property
-    def turned(self) -> bool:
-        """Whether the slope of the load factor changes sign."""
-        return self.first.slope * self.second.slope < 0.0
-
-    @property
-    def change(self) -> int:
-        """Change of the number of negative eigenvalues."""
-        known = self.first.negatives >= 0 and self.second.negatives >= 0
-        return self.second.negatives - self.first.negatives if known else 0
-
-
-class Critical(NamedTuple):
-    """A critical point that was located: its kind, and the number of eigenvalues that change sign."""
-
-    kind: str
-    point: Point
-    multiplicity: int
-
-
 class CriticalPoints:
     """The search for critical points between two points of a path. Methods are collective.
 
@@ -113,8 +89,8 @@ class CriticalPoints:
         self.points, self.control, self.first, self.last = points, control, first, last
         self.size = control.measure(last)
 
-    def __iter__(self) -> Iterator[Critical]:
-        """Locate the critical points in their order.
+    def __iter__(self) -> Iterator[tuple[str, Point, int]]:
+        """Locate the critical points in their order: kind, point, and number of eigenvalues that change sign.
 
         Raises
         ------
@@ -122,23 +98,26 @@ class CriticalPoints:
             On all ranks, if one cannot be located between the points: the last may lie on another path.
         """
         start = _End(0.0, self.first.slope, self.first.negatives)
-        yield from self._look(_Interval(start, self._end(self.last)), 0)
+        yield from self._look(start, self._end(self.last), 0)
 
-    def _look(self, interval: _Interval, depth: int) -> Iterator[Critical]:
+    def _look(self, first: _End, second: _End, depth: int) -> Iterator[tuple[str, Point, int]]:
         """Locate the critical points of an interval, starting from its first end."""
-        if not (interval.turned or interval.change):
+        turned = first.slope * second.slope < 0.0  # the load factor
+        known = first.negatives >= 0 and second.negatives >= 0
+        change = second.negatives - first.negatives if known else 0
+        if not (turned or change):
             return
-        first, second = interval
-        limit = abs(interval.change) == 1 or first.negatives < 0
-        if interval.turned and (limit or depth == _DEPTH):
+        limit = abs(change) == 1 or first.negatives < 0
+        if turned and (limit or depth == _DEPTH):
             # the load factor turns without a change of sign of an eigenvalue where two paths meet
-            point = self._locate(interval, lambda point: point.slope, _FLAT)
-            yield Critical("limit" if limit else "bifurcation", point, max(abs(interval.change), 1))
+            sign = np.sign(first.slope)
+            point = self._locate(first, second, lambda point: sign * point.slope, _FLAT)
+            yield "limit" if limit else "bifurcation", point, max(abs(change), 1)
             return
-        if interval.turned:
+        if turned:
             middle = self._end(self._at(0.5 * (first.size + second.size)))
-            yield from self._look(_Interval(first, middle), depth + 1)
-            yield from self._look(_Interval(middle, second), depth + 1)
+            yield from self._look(first, middle, depth + 1)
+            yield from self._look(middle, second, depth + 1)
             return
         before = first.negatives
 
@@ -147,17 +126,19 @@ class CriticalPoints:
 
         tried: list[tuple[float, float]] = []
         try:
-            size = self.control.measure(self._locate(interval, distance, 0.0, tried))
+            size = self.control.measure(self._locate(first, second, distance, 0.0, tried))
         except NotConverged:
-            size = self._between(interval, distance, tried)
+            size = self._between(first, second, distance, tried)
         beyond = self._at(size + _BESIDE * self.size)
         many = abs(beyond.negatives - before) or 1
-        yield Critical("bifurcation", self._crossing(size, beyond), many)
+        yield "bifurcation", self._crossing(size, beyond), many
         end = self._end(beyond)._replace(negatives=before + (many if second.negatives > before else -many))
         if end.size < second.size:
-            yield from self._look(_Interval(end, second), depth + 1)
+            yield from self._look(end, second, depth + 1)
 
-    def _between(self, interval: _Interval, value: Callable[[Point], float], tried: list[tuple[float, float]]) -> float:
+    def _between(
+        self, first: _End, second: _End, value: Callable[[Point], float], tried: list[tuple[float, float]]
+    ) -> float:
         """Return the zero of a value by inverse interpolation of trials (length, value).
 
         At a bifurcation the equations are singular, and Newton's method needs too many iterations; beside it the value
@@ -165,8 +146,8 @@ class CriticalPoints:
         """
         before = [trial for trial in tried if trial[1] > 0.0]
         beyond = [trial for trial in tried if trial[1] <= 0.0]
-        low = max(before)[0] if before else interval.first.size
-        high = min(beyond)[0] if beyond else interval.second.size
+        low = max(before)[0] if before else first.size
+        high = min(beyond)[0] if beyond else second.size
         guess = 0.5 * (low + high)
         if before and beyond:
             (a, fa), (b, fb) = max(before), min(beyond)
@@ -227,16 +208,17 @@ class CriticalPoints:
 
     def _locate(
         self,
-        interval: _Interval,
+        first: _End,
+        second: _End,
         value: Callable[[Point], float],
         zero: float,
         tried: list[tuple[float, float]] | None = None,
     ) -> Point:
-        """Return the point where a value changes sign: regula falsi (Illinois), with bisection where that is slow.
+        """Return the point where a value becomes negative: regula falsi (Illinois), with bisection where that is slow.
 
         ``tried`` receives length and value of the trials.
         """
-        a, b = interval.first.size, interval.second.size
+        a, b = first.size, second.size
         fa = fb = None
         size, side, point, previous = 0.5 * (a + b), 0, None, None
         for trial in range(_TRIALS):
@@ -254,7 +236,7 @@ class CriticalPoints:
                 break
             previous = size
             width = b - a
-            if f * (interval.first.slope if interval.turned else 1.0) > 0.0:  # before the critical point
+            if f > 0.0:  # before the critical point
                 a, fa = size, f
                 fb = 0.5 * fb if side == -1 and fb is not None else fb
                 side = -1

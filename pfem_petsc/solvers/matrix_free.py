@@ -6,6 +6,7 @@ import atexit
 import itertools
 import weakref
 from collections.abc import Callable, Iterable
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -149,7 +150,7 @@ class Extension:
         u[:] = 0.0
         u[kept] = given.reshape(-1)[kept]
         whole.apply()
-        np.multiply(whole.scale, given, out=out)
+        np.multiply(whole.problem.scale, given, out=out)
         out.reshape(-1)[kept] = whole._out[:owned].reshape(-1)[kept]
 
 
@@ -260,11 +261,10 @@ class MatrixFreeHessian:
     ----------
     mat : PETSc matrix of type python
     bounded : the matrix of steps with bounds, equal to ``mat``
-    x : (local, 3) positions at the last :meth:`linearise` [m]
+    problem : of the last :meth:`linearise`
+    x : (local, 3) positions there [m]
     stored : (2, b) data of each bar for the product, see :meth:`~pfem_petsc.mechanics.bars.Bars.stiffnesses`
     """
-
-    _extension: Extension | None = None
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -278,7 +278,7 @@ class MatrixFreeHessian:
         self.x = np.zeros((mesh.n_local, 3))
         self._u = np.zeros((mesh.n_local, 3))
         self._out = np.zeros((mesh.n_local, 3))
-        self._problem = None
+        self.problem = None
 
     def update(self, problem: StepProblem, w: np.ndarray) -> None:
         """Linearise at ``w``. Collective."""
@@ -288,7 +288,7 @@ class MatrixFreeHessian:
 
     def linearise(self, problem: StepProblem) -> None:
         """As :meth:`update`, at the current positions of the problem."""
-        self._problem = problem
+        self.problem = problem
         self._left = problem.transform.left()
         self.x[:] = problem.x
         self.model.bars.stiffnesses(self.x, problem.balance.weight, self.stored)
@@ -302,12 +302,10 @@ class MatrixFreeHessian:
         """Drop negative eigenvalues of the bars' stiffness, due to compression or softening laws."""
         drop_negative(self.mesh.bars, self.x, self.stored)
 
-    @property
+    @cached_property
     def extension(self) -> Extension:
-        """Return the operator with rows and columns of the identity for active unknowns."""
-        if self._extension is None:
-            self._extension = Extension(self)
-        return self._extension
+        """The operator with rows and columns of the identity for active unknowns."""
+        return Extension(self)
 
     def times(self, given: np.ndarray, out: np.ndarray) -> None:
         """Compute ``out`` = H ``given``, both (owned, 3) and contiguous. Collective."""
@@ -317,7 +315,7 @@ class MatrixFreeHessian:
 
     def apply(self) -> None:
         """Apply H to the owned rows of :attr:`_u`, and write those of :attr:`_out`. Collective."""
-        problem, owned = self._problem, self.mesh.n_owned
+        problem, owned = self.problem, self.mesh.n_owned
         u, out = self._u, self._out
         supports = self.model.supports
         if supports.any:
@@ -345,14 +343,9 @@ class MatrixFreeHessian:
         if supports.any:
             supports.put(out, held)
 
-    @property
-    def scale(self) -> float:
-        """Return the entry on the diagonal of rows of prescribed components."""
-        return self._problem.scale
-
     def diagonal(self) -> np.ndarray:
         """Return the diagonal of H (owned, 3)."""
-        problem, supports = self._problem, self.model.supports
+        problem, supports = self.problem, self.model.supports
         if problem.transform.identity and supports.inclined is None:
             diagonal = self._plain_diagonal()
         else:
@@ -393,7 +386,7 @@ class MatrixFreeHessian:
 
     def _nodal(self) -> np.ndarray:
         """Return what inertia adds to the diagonal (owned,)."""
-        problem, inertia = self._problem, self.model.inertia
+        problem, inertia = self.problem, self.model.inertia
         if not inertia.consistent:
             return problem.nodal
         nodal = 2.0 / 3.0 * problem.nodal  # the diagonal of the bars' consistent mass is two thirds of the lumped one
@@ -404,7 +397,7 @@ class MatrixFreeHessian:
     def _additions(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return owned nodes (k,) and what they add to their blocks on the diagonal (k, 3, 3), besides bars and
         inertia: springs, and masses that contact has moved."""
-        balance, springs, moved = self._problem.balance, self.model.bars.springs, self.model.inertia.redistribution
+        balance, springs, moved = self.problem.balance, self.model.bars.springs, self.model.inertia.redistribution
         found = [] if springs is None else [(springs.nodes, balance.weight * springs.stiffness)]
         return found if moved is None else [*found, (moved.touched, balance.alpha * moved.tensors)]
 
@@ -423,8 +416,8 @@ class MatrixFreeHessian:
 
     def destroy(self) -> None:
         """Free the PETSc matrices."""
-        if self._extension is not None:
-            self._extension.mat.destroy()
+        if "extension" in vars(self):
+            self.extension.mat.destroy()
         self.mat.destroy()
 
 

@@ -1,5 +1,5 @@
 """Natural frequencies, or linear buckling factors, of the state of a model, with unique vectors on any number of
-ranks.
+ranks; and the state of a case without an analysis, whose modes are wanted.
 """
 
 from __future__ import annotations
@@ -15,13 +15,50 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..errors import InputError, SimulationFailure
+from ..integrators.base import Balance, NoParameters, Scheme, State
+from ..output.units import TIME
+from ..stepping.plan import Plan, refuse_motion
+from ..stepping.stepper import Solution, Stepper
 from .pencil import Holds, Pencil, StateMatrices, buckling_bars, join
 from .solvers import SOLVERS, Dense, Lanczos, Slepc
 
 if TYPE_CHECKING:
     from ..case.tables import Modes
-    from ..integrators.base import State
     from ..stepping.model import Model
+
+
+class _Nothing(Scheme):
+    """A scheme that makes no steps."""
+
+    inertial = False
+
+    def balance(self, state: State, h: float) -> Balance:
+        raise NotImplementedError
+
+
+class InitialState(Stepper):
+    """The initial state, which is also the last one: forces, loads and supports at time zero, without steps.
+    Construction is collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, if the case has initial velocities.
+    """
+
+    def __init__(self, model: Model) -> None:
+        refuse_motion(model.case, "a case with [modes] alone")
+        super().__init__(model, _Nothing(NoParameters()), 0.0)
+        self.plan = Plan(self.scheme, TIME, {"analysis": "none: modes of the initial state"}, steps=0)
+
+    def start(self) -> None:
+        """Evaluate the state. Collective."""
+        self.start_without_motion()
+        self.totals_at_start = self.totals()
+
+    def solve(self, balance: Balance) -> Solution:
+        """There is no balance."""
+        raise NotImplementedError
 
 
 _EQUAL = 1e-9  # relative difference below which eigenvalues count as equal

@@ -18,11 +18,10 @@ from ..columns import declared
 from ..contact.contact import check_start
 from ..errors import InputError, SimulationFailure
 from ..fields import Fields
-from ..modes.find import describe_modes
-from ..modes.initial_state import InitialState
+from ..modes.find import InitialState, describe_modes
 from ..output.units import TIME as AXIS
 from ..preflight.checks import warnings_before
-from ..statics.analysis import make_stepper as static_stepper
+from ..statics.stepper import make_stepper as static_stepper
 from ..stepping.model import Model, StageStart
 from ..stepping.plan import Plan, make_plan
 from ..stepping.plan import make_stepper as time_stepper

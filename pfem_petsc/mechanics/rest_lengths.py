@@ -9,22 +9,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..mesh.node_sets import group_hint
+from ..mesh.node_sets import bars_of_group
 from .elements import COLLAPSED_STRETCH, MEASURES, virgin
 from .materials.base import law_of
 from .motion import Table
 from .rupture import intact
 
 if TYPE_CHECKING:
-    from ..case.schema import Case
-    from ..mesh.distribution import DistributedMesh
-    from .bars import Bars
-
-
-if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
     from .bars import BarBlock, Bars
     from .materials.base import Law
 
@@ -213,14 +208,9 @@ class Temperatures:
         for index, entry in enumerate(case.temperature):
             members = slice(None)
             if entry.bars is not None:
-                if entry.bars not in mesh.bar_groups:
-                    hint = group_hint(case, entry.bars, sorted(mesh.bar_groups), "Curve")
-                    raise InputError(
-                        f"{case.source}: temperature[{index}].bars = {entry.bars!r}: no such group of bars{hint}"
-                    )
-                members = mesh.bar_groups[entry.bars]
-            table = Table(entry.table, entry.interpolation == "smooth") if entry.table is not None else None
-            self._entries.append((members, entry.value, table))
+                members = bars_of_group(case, mesh, f"temperature[{index}].bars", entry.bars)
+            rows = [(0.0, entry.value)] if entry.table is None else entry.table
+            self._entries.append((members, Table(rows, entry.interpolation == "smooth")))
         if self.any:
             bars.heat = np.zeros((2, len(mesh.bars)))
         self.values = bars.heat[1]
@@ -245,8 +235,8 @@ class Temperatures:
 
     def apply(self, time: float) -> None:
         """Set the thermal strains of the bars at a time [s]; later entries of the case override earlier ones."""
-        for members, value, table in self._entries:
-            self.values[members] = value if table is None else table(time)[0]
+        for members, table in self._entries:
+            self.values[members] = table(time)[0]
         for block in self._bars.blocks:
             part = slice(block.start, block.stop)
             self._bars.heat[0, part] = block.thermal_expansion * self.values[part]

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ..case.tables import NodeSet
     from .distribution import DistributedMesh
 
-__all__ = ["group_hint", "resolve_node_sets"]
+__all__ = ["bars_of_group", "group_hint", "resolve_node_sets"]
 
 
 def resolve_node_sets(case: Case, mesh: DistributedMesh) -> dict[str, np.ndarray]:
@@ -41,6 +41,20 @@ def group_hint(case: Case, name: str, known: list[str], entity: str = "Point") -
         return nearest(name, known)
     example = f' (in Gmsh: Physical {entity}("{name}") = {{...}};)' if str(case.mesh.file).endswith(".msh") else ""
     return ("; the mesh has no groups" if entity == "Point" else "; the mesh has no bar groups") + example
+
+
+def bars_of_group(case: Case, mesh: DistributedMesh, key: str, name: str) -> np.ndarray:
+    """Return the local bars (k,) of a group that a key of the case names.
+
+    Raises
+    ------
+    InputError
+        If the mesh has no such group.
+    """
+    if name not in mesh.bar_groups:
+        hint = group_hint(case, name, sorted(mesh.bar_groups), "Curve")
+        raise InputError(f"{case.source}: {key} = {name!r}: no such group of bars{hint}")
+    return mesh.bar_groups[name]
 
 
 def _members(case: Case, where: str, node_set: NodeSet, mesh: DistributedMesh) -> np.ndarray:

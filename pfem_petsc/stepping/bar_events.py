@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import InputError
 from ..mechanics.bars import state_before_rupture
 from ..mechanics.rupture import variable_of
-from ..mesh.node_sets import group_hint
+from ..mesh.node_sets import bars_of_group
 from ..output.units import engineering
 from ..tolerances import TIME
 
@@ -200,7 +200,7 @@ class Removals:
 
     def __init__(self, model: Model) -> None:
         self._model, self._entries = model, list(model.case.remove)
-        mesh, source = model.mesh, model.case.source
+        mesh = model.mesh
         self._complete = [False] * len(self._entries)
         self.times = [_NEVER] * len(self._entries)
         self.gone: list[str] = []
@@ -209,17 +209,13 @@ class Removals:
         self._columns = {entry.supports: 3 * k for k, entry in enumerate(supports)}
         self.members: dict[str, np.ndarray] = {}
         for index, entry in enumerate(self._entries):
-            key = f"{source}: remove[{index}]"
             if entry.bars is not None:
-                if entry.bars not in mesh.bar_groups:
-                    hint = group_hint(model.case, entry.bars, sorted(mesh.bar_groups), "Curve")
-                    raise InputError(f"{key}.bars = {entry.bars!r}: no such group of bars{hint}")
-                self.members[entry.bars] = mesh.bar_groups[entry.bars]
+                self.members[entry.bars] = bars_of_group(model.case, mesh, f"remove[{index}].bars", entry.bars)
             elif model.links or model.inertia.redistribution is not None:
                 what = "contact pairs and constraints" if model.links else "massless contact nodes"
                 raise InputError(
-                    f"{key}.supports = {entry.supports!r}: {what} require supports that remain; remove bars "
-                    "instead, or leave them out"
+                    f"{model.case.source}: remove[{index}].supports = {entry.supports!r}: {what} require supports that "
+                    "remain; remove bars instead, or leave them out"
                 )
 
     def _done(self, k: int, now: float) -> bool:

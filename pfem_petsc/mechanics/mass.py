@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
     from .bars import BarBlock, Bars
 
-__all__ = ["Inertia", "PointInertia", "add_at_ends", "consistent_product"]
+__all__ = ["Inertia", "PointInertia", "add_at_ends", "consistent_product", "scale_rows"]
 
 
 @kernel
@@ -69,7 +69,7 @@ class PointInertia:
 
 
 @kernel
-def _scale(factors, vectors, out):
+def scale_rows(factors, vectors, out):
     """Write each vector times its factor; NumPy takes several times as long for rows of three."""
     for i in range(len(factors)):
         for c in range(3):
@@ -165,7 +165,7 @@ class Inertia:
         self, u: np.ndarray, out: np.ndarray, lumped: np.ndarray, density: Callable[[BarBlock], float]
     ) -> np.ndarray:
         if not self.consistent:
-            _scale(lumped, u, out)
+            scale_rows(lumped, u, out)
             if self.redistribution is not None and lumped is self.mass:
                 self.redistribution.add_times(1.0, u, out)
             return out

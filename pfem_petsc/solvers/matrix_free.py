@@ -13,7 +13,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from ..mechanics.compiled import kernel
-from ..mechanics.mass import consistent_product
+from ..mechanics.mass import consistent_product, scale_rows
 from ..mechanics.strips import add_stiffness_diagonals, add_stiffness_products
 
 if TYPE_CHECKING:
@@ -152,18 +152,6 @@ class Extension:
         whole.apply()
         np.multiply(whole.problem.scale, given, out=out)
         out.reshape(-1)[kept] = whole._out[:owned].reshape(-1)[kept]
-
-
-@kernel
-def inertia_products(nodal, u, out):
-    """Write the products of nodal inertia (owned,) to ``out`` (local, 3), zeros for ghosts."""
-    owned = len(nodal)
-    for k in range(owned):
-        for i in range(3):
-            out[k, i] = nodal[k] * u[k, i]
-    for k in range(owned, len(out)):
-        for i in range(3):
-            out[k, i] = 0.0
 
 
 @kernel
@@ -332,7 +320,8 @@ class MatrixFreeHessian:
             if inertia.points.any:
                 out[:owned] += inertia.points.nodal(problem.balance.alpha, problem.balance.eta)[:, None] * u[:owned]
         else:
-            inertia_products(problem.nodal, u, out)
+            scale_rows(problem.nodal, u, out)
+            out[owned:] = 0.0
             if inertia.redistribution is not None:
                 inertia.redistribution.add_times(problem.balance.alpha, u, out)
         for block in bars.blocks:

@@ -51,7 +51,7 @@ def test_halved_steps_keep_the_balance_of_heat(law, keys, comm, tmp_path):
 
     run.stepper.newton.solve = refuse_whole_steps
     rows = [step.row for step in run]
-    assert run.stepper.smallest == 0.5 * STEP and rows[-1]["newton_iterations"] > 2
+    assert run.stepper.smallest == 0.5 * STEP and rows[-1]["newton_iterations"] >= 2
     start = rows[0]["kinetic_energy"]
     assert max(abs(row["thermal_work"]) for row in rows) > 1e-2 * start
     assert max(abs(row["numerical_dissipation"]) for row in rows) < 1e-11 * start

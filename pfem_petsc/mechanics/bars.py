@@ -480,7 +480,7 @@ class Bars:
         lengths = self.mesh_lengths[block.start : block.stop]
         return bar_shapes(self.case.section[block.section], lengths, np.broadcast_to(block.area, lengths.shape))
 
-    def _of_blocks(self, value: Callable[[BarBlock], Any]) -> np.ndarray:
+    def of_blocks(self, value: Callable[[BarBlock], Any]) -> np.ndarray:
         """Return values (b,) of all local bars from those of each block, a number or (stop - start,)."""
         out = np.empty(len(self.ends))
         for block in self.blocks:
@@ -489,7 +489,7 @@ class Bars:
 
     def radii(self) -> np.ndarray:
         """Return the outer radius (b,) [m] of each local bar: of its shape, else of the circle of its area."""
-        return self._of_blocks(lambda block: self._shapes(block).radius)
+        return self.of_blocks(lambda block: self._shapes(block).radius)
 
     def euler_loads(self) -> np.ndarray:
         """Return pi^2 E I/(K L)^2 (b,) [N] of each local bar, with its length L in the mesh and I, K of its section;
@@ -502,7 +502,7 @@ class Bars:
                 force = np.pi**2 * young * shapes.second_moment / shapes.effective_length**2
             return np.where(shapes.second_moment > 0.0, force, np.inf)
 
-        return self._of_blocks(load)
+        return self.of_blocks(load)
 
     def fields(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Return, per local bar at the end of the last step, ``strain``, ``stress`` [Pa], ``axial_force`` [N],
@@ -533,7 +533,7 @@ class Bars:
 
     def rupture(self) -> np.ndarray:
         """Return the state of rupture (b,) of all local bars, see :mod:`~pfem_petsc.mechanics.rupture`."""
-        return self._of_blocks(lambda block: block.history[block.law.rupture] if block.law.rupture >= 0 else 0.0)
+        return self.of_blocks(lambda block: block.history[block.law.rupture] if block.law.rupture >= 0 else 0.0)
 
     @property
     def watched(self) -> np.ndarray:
@@ -546,7 +546,7 @@ class Bars:
     @property
     def stiffness(self) -> np.ndarray:
         """Largest axial stiffness (b,) of all local bars [N/m]; zero for bars that have left the model."""
-        rest, axial = self.watched, self._of_blocks(lambda block: block.area * block.modulus)
+        rest, axial = self.watched, self.of_blocks(lambda block: block.area * block.modulus)
         return np.divide(axial, rest, out=np.zeros_like(axial), where=rest > 0.0)
 
     def put_history(self, history: np.ndarray) -> None:

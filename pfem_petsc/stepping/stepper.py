@@ -235,9 +235,10 @@ class MasslessNodes:
         normal[self.moved.nodes] = self.moved.normals
         way = x[b] - x[a]
         length = np.linalg.norm(way, axis=1)
+        stiffness = model.bars.of_blocks(lambda block: block.area * block.modulus) / model.bars.rest
         for end in (a, b):
             along = np.einsum("bi,bi->b", way, normal[end]) / length
-            np.add.at(total, end, model.bars.stiffness * np.maximum(along * along, _STEEPEST))
+            np.add.at(total, end, stiffness * np.maximum(along * along, _STEEPEST))
             np.minimum.at(shortest, end, model.bars.rest)
         return total[self.moved.nodes], _FARTHEST * shortest[self.moved.nodes]
 

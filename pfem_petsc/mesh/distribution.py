@@ -121,9 +121,7 @@ class DistributedMesh:
         self._exchange.close()
 
 
-def distribute(
-    slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitioner: str = "auto", keep: bool = True
-) -> DistributedMesh:
+def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, keep: bool = True) -> DistributedMesh:
     """Distribute a mesh over the ranks. Collective; no rank ever has the whole mesh.
 
     Parameters
@@ -133,25 +131,23 @@ def distribute(
     bar_section : (bars of the slab,) int32
         Section of each bar.
     comm : MPI.Comm
-    partitioner : str
-        ``"auto"``, ``"ptscotch"`` or ``"coordinates"``; see :func:`~pfem_petsc.mesh.ordering.partition`.
     keep : bool
         False: the slab loses its points and bars on the way, which saves memory.
 
     Returns
     -------
     DistributedMesh
-        Reproducible for the same mesh, number of ranks and partitioner.
+        Reproducible for the same mesh and number of ranks.
     """
     mesh = DistributedMesh()
     mesh.comm = comm
     mesh.n_nodes, mesh.n_bars, mesh.volume = slab.n_nodes, slab.n_bars, slab.volume
     bar_section = np.asarray(bar_section, dtype=np.int32)
     if comm.size == 1:
-        mesh.partitioner = partition(slab, comm, partitioner)[1]
+        mesh.partitioner = "none (one rank)"
         _alone(mesh, slab, bar_section, keep)
     else:
-        owners, mesh.partitioner = partition(slab, comm, partitioner)
+        owners, mesh.partitioner = partition(slab, comm)
         _among_ranks(mesh, slab, bar_section, owners, keep)
     return mesh
 

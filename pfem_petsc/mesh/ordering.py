@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 from mpi4py import MPI
 
-from ..errors import InputError
 from .exchange import Router
 from .slab import MeshSlab, slab_of
 
@@ -254,10 +253,8 @@ def _scattered(key: np.ndarray, block: np.ndarray, least: float) -> np.ndarray:
     return np.flatnonzero(np.bincount(block, minlength=last) < least * np.bincount(block[fresh], minlength=last))
 
 
-PARTITIONERS = ("auto", "ptscotch", "coordinates")
-
 UNEVEN = 1.1
-"""Ratio of the largest to the mean work of the ranks that the partitioner ``"auto"`` accepts."""
+"""Ratio of the largest to the mean work of the ranks that is accepted of PT-Scotch."""
 
 _OF_NODE = 4  # work of a node in an explicit step, where that of a bar is 2
 
@@ -267,36 +264,24 @@ _CANDIDATES = 256
 _BARS_SENT = 1 << 18  # number of bars whose ends are sent at a time, to keep temporary arrays small
 
 
-def partition(slab: MeshSlab, comm: MPI.Comm, partitioner: str = "auto") -> tuple[np.ndarray, str]:
-    """Compute the owner of every node of this rank's slab. Collective.
+def partition(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, str]:
+    """Compute the owner, among several ranks, of every node of this rank's slab. Collective.
 
-    Parameters
-    ----------
-    slab : MeshSlab
-    comm : MPI.Comm
-    partitioner : str
-        ``"ptscotch"`` cuts few bars (PETSc must have been built with it), for equal numbers of nodes;
-        ``"coordinates"`` divides a space-filling curve into parts of equal work, independent of the slabs; ``"auto"``
-        uses the second for structured meshes, if PETSc lacks PT-Scotch, and if a rank would have over :data:`UNEVEN`
-        times the mean work, because nodes have very different numbers of bars. Both are reproducible from run to run;
-        ``"ptscotch"`` uses random numbers that continue from call to call, so a second call in one process may differ.
+    PT-Scotch cuts few bars, for equal numbers of nodes. A space-filling curve through the nodes divided into parts of
+    equal work, independent of the slabs, serves structured meshes, a PETSc without PT-Scotch, and meshes of which a
+    rank would have over :data:`UNEVEN` times the mean work, because nodes have very different numbers of bars. Both are
+    reproducible from run to run; PT-Scotch uses random numbers that continue from call to call, so a second call in one
+    process may differ.
 
     Returns
     -------
     owners : (nodes of the slab,) int32
     used : str
-        The partitioner used, for the log.
+        ``"ptscotch"`` or ``"coordinates"``, for the log.
     """
-    if partitioner not in PARTITIONERS:
-        raise InputError(f"partitioner: unknown value {partitioner!r}; known: {', '.join(PARTITIONERS)}")
-    if comm.size == 1:
-        return np.zeros(len(slab.points), np.int32), "none (one rank)"
-    if partitioner == "ptscotch" or (partitioner == "auto" and not slab.structured):
-        owners = _by_graph(slab, comm)
-        if owners is not None and (partitioner == "ptscotch" or _is_even(owners, slab, comm)):
-            return owners, "ptscotch"
-        if partitioner == "ptscotch":
-            raise InputError("partitioner: this PETSc was built without PT-Scotch; use 'coordinates'")
+    owners = None if slab.structured else _by_graph(slab, comm)
+    if owners is not None and _is_even(owners, slab, comm):
+        return owners, "ptscotch"
     return _by_coordinates(slab, _works(slab, comm), comm), "coordinates"
 
 

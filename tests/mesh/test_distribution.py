@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from helpers.meshes import slab_from, whole
 
-from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.distribution import distribute
 from pfem_petsc.mesh.generators import lattice
 from pfem_petsc.mesh.ordering import hilbert_keys, sweep_keys
@@ -38,7 +37,8 @@ def case(request, comm):
     name, partitioner = request.param
     slab = MESHES[name](comm)
     section = ((np.arange(len(slab.bars)) + slab.first_bar) % 3).astype(np.int32)
-    mesh = distribute(slab, section, comm, partitioner)
+    slab.structured = partitioner == "coordinates"
+    mesh = distribute(slab, section, comm)
     yield whole(slab, comm), np.arange(slab.n_bars) % 3, mesh
     mesh.close()
 
@@ -59,8 +59,6 @@ def test_partitioner_is_chosen_by_the_mesh(comm):
         mesh = distribute(slab, np.zeros(len(slab.bars), np.int32), comm)
         assert mesh.partitioner in (used, one_rank, "coordinates")
         assert (mesh.partitioner == one_rank) == (comm.size == 1)
-    with pytest.raises(InputError, match="unknown value 'metis'"):
-        distribute(slab, np.zeros(len(slab.bars), np.int32), comm, "metis")
 
 
 def test_hilbert_curve_visits_neighbour_after_neighbour():
@@ -106,13 +104,14 @@ def test_bars_lie_close_to_each_other_in_memory(comm):
     points = np.empty_like(mesh.points)
     points[shuffled] = mesh.points
     slab = slab_from(points, shuffled[mesh.bars], comm)
-    local = distribute(slab, np.zeros(len(slab.bars), np.int32), comm, "coordinates")
+    slab.structured = True
+    local = distribute(slab, np.zeros(len(slab.bars), np.int32), comm)
     span = np.abs(np.diff(local.bars[(local.bars < local.n_owned).all(axis=1)], axis=1))
     assert span.max() <= (n + 1) ** 2 + (n + 1)
 
 
-@pytest.mark.parametrize("partitioner", ["auto", "coordinates"])
-def test_ranks_have_equal_work_where_nodes_have_different_numbers_of_bars(comm, partitioner):
+@pytest.mark.parametrize("structured", [False, True])
+def test_ranks_have_equal_work_where_nodes_have_different_numbers_of_bars(comm, structured):
     """A chain joined to a block: as many nodes, far fewer bars."""
     block = whole(
         lattice.generate(lattice.Parameters(kind="octet", cells=[6, 6, 6], pitch=1.0), comm.rank, comm.size), comm
@@ -121,8 +120,8 @@ def test_ranks_have_equal_work_where_nodes_have_different_numbers_of_bars(comm, 
     chain = np.column_stack([np.arange(1, n + 1) + block.points[-1, 0], np.full((n, 2), block.points[-1, 1])])
     links = np.column_stack([np.arange(n - 1, 2 * n - 1), np.arange(n, 2 * n)])
     slab = slab_from(np.concatenate([block.points, chain]), np.concatenate([block.bars, links]), comm)
-    slab.structured = False
-    mesh = distribute(slab, np.zeros(len(slab.bars), np.int32), comm, partitioner)
+    slab.structured = structured
+    mesh = distribute(slab, np.zeros(len(slab.bars), np.int32), comm)
     work = np.array(comm.allgather(len(mesh.bars) + 2 * mesh.n_owned))
     assert work.max() <= 1.25 * work.mean()  # bars between ranks are evaluated on both
     mesh.close()

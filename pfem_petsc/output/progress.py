@@ -182,11 +182,11 @@ class Progress:
         self._compiling += seconds
         self._marked = (self._marked[0] + seconds, *self._marked[1:])
 
-    def message(self, text: str, level: str = "INFO") -> None:
-        """Print a text between the reports and log it with its level."""
+    def message(self, text: str) -> None:
+        """Print a text between the reports, and log it."""
         if self._root:
             for line in text.splitlines():
-                self._write(line, level)
+                self._write(line)
 
     def warning(self, text: str) -> None:
         """Log a warning and print it on stderr (above the bar, if there is one), even if quiet."""
@@ -276,9 +276,9 @@ class Progress:
             remaining = max(left, 0.0) * wall / done if done > 0.0 else remaining
         return "  ".join([*parts, f"ETA {duration(remaining)}"])
 
-    def _write(self, text: str, level: str = "INFO") -> None:
+    def _write(self, text: str) -> None:
         """Write a line to stdout (above the bar, if there is one) and to the log."""
-        self._log_line(text, level)
+        self._log_line(text)
         if self._stream is None:
             return
         try:

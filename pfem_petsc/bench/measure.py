@@ -160,7 +160,6 @@ ASSUMED = {
     "plastic bar": 16,  # plastic and accumulated plastic strain
     "explicit node": 4 * _VECTOR + 8,  # x, v read and written; mass read
     "kept force": 2 * _VECTOR,  # f written and read
-    "node of a row": 2 * _VECTOR,  # velocity and acceleration written
     "residual node": 4 * _VECTOR + 8,  # increment, predictor, known terms read, residual written; mass read
     "linearised bar": 16,  # two stiffnesses
     "ends of a linearised bar": 8,
@@ -180,7 +179,6 @@ class Work(NamedTuple):
     implicit, assembled, plastic : kind of the step
     newton, linear : iterations of an implicit step
     runs : share of the bars that go by runs of constant offset
-    rows : rows of the history a step
     """
 
     bars: int
@@ -191,7 +189,6 @@ class Work(NamedTuple):
     newton: float = 0.0
     linear: float = 0.0
     runs: float = 0.0
-    rows: float = 0.0
 
     @property
     def entries(self) -> int:
@@ -203,10 +200,9 @@ class Work(NamedTuple):
         size, bars, nodes = ASSUMED, self.bars, self.nodes
         far = (1.0 - self.runs) * (size["other bar"] - size["bar in a run"])
         bar = size["bar in a run"] + far + self.plastic * size["plastic bar"]
-        # forces that no row reads stay in the cache, if all bars go by runs and keep nothing
+        # forces stay in the cache, if all bars go by runs and keep nothing
         unread = self.runs == 1.0 and not self.plastic and not self.implicit
-        node = size["explicit node"] + self.rows * size["node of a row"]
-        node += size["kept force"] * (self.rows if unread else 1.0)
+        node = size["explicit node"] + (0.0 if unread else size["kept force"])
         if self.assembled:
             matrix = self.entries * size["matrix entry"]
             update = bars * (bar + 16) + 8 * self.entries  # indices of a bar's four blocks, and their values
@@ -227,8 +223,7 @@ def share_in_runs(bars: Bars) -> float:
     here = 0
     for block in bars.blocks:
         sweep = block.sweep
-        firsts = sweep.bars if hasattr(sweep, "bars") else sweep.starts[sweep.chunks[:-1]]
-        sizes = np.diff(np.append(firsts, block.stop).astype(np.int64))
+        sizes = np.diff(sweep.starts[sweep.chunks].astype(np.int64))
         here += int(sizes[sweep.diagonal].sum())
     return here / max(len(bars.ends), 1)
 
@@ -355,7 +350,6 @@ def time_job(
         newton=newton / len(times),
         linear=linear / len(times),
         runs=comm.allreduce(share_in_runs(simulation.model.bars)) / comm.size,
-        rows=1.0 / job.history_every,
     )
     return Record(
         job=job.name,

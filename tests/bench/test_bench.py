@@ -28,13 +28,12 @@ def test_nearest_lattice():
 
 
 def test_explicit_bytes_by_hand():
-    # rest length 8 B a bar, and 4 B of an end where it is in no run; x, v, f read and written and mass read a node; v
-    # and a written in a row
+    # rest length 8 B a bar, and 4 B of an end where it is in no run; x, v, f read and written and mass read a node
     nodes = 10 * (2 * 3 * 24 + 8)
     assert Work(100, 10).bytes() == 100 * 12 + nodes
-    assert Work(100, 10, runs=0.75, rows=0.1).bytes() == 75 * 8 + 25 * 12 + nodes + 0.1 * 10 * 48
-    # forces of bars in runs are kept where a row reads them
-    assert Work(100, 10, runs=1.0, rows=0.1).bytes() == 100 * 8 + 10 * (104 + 0.1 * (48 + 48))
+    assert Work(100, 10, runs=0.75).bytes() == 75 * 8 + 25 * 12 + nodes
+    # forces of bars in runs stay in the cache
+    assert Work(100, 10, runs=1.0).bytes() == 100 * 8 + 10 * 104
     assert Work(100, 10, runs=1.0, plastic=True).bytes() == 100 * 24 + nodes
 
 

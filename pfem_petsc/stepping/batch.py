@@ -23,13 +23,12 @@ from .batch_loop import (
     Made,
     NodeArrays,
     ProbeArrays,
-    Records,
     StateArrays,
     WallArrays,
     make_batch_loop,
-    new_records,
 )
 from .impact import Touched
+from .ledger_loops import Records, new_records
 from .stepper import Instants, Solution
 
 if TYPE_CHECKING:

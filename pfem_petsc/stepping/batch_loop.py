@@ -37,6 +37,7 @@ from .ledger_loops import (
     WIDE,
     WORKS,
     Acting,
+    Records,
     add_drags,
     add_ends,
     add_loads,
@@ -148,56 +149,6 @@ class StateArrays(NamedTuple):
     support: np.ndarray
     contact: np.ndarray
     u: np.ndarray
-
-
-class Records(NamedTuple):
-    """What rows of the history are made of, for m steps: of ``steps`` of the batch (m,), the last of which is its last
-    one; ``powers`` (m, 5), the works of all balances before that of the step, and ``ends`` (m, 6), those of the half
-    step before its end, and its kinetic energy [J], in the order of :mod:`~pfem_petsc.stepping.ledger_loops`;
-    ``momenta`` (m, 3, 3) and ``totals`` (m, 3, 3), see there; the dissipation by ``impact`` so far (m,) and
-    ``energies`` (m, k) of the bars [J]; of walls (m, w), ``force``, ``moment`` and ``contacts``, and ``releases`` so
-    far; ``changes`` of contacts in the batch so far, and nodes with contact forces, ``pressing`` (m,); ``impulses`` (m,
-    rows, 3); forces on the second nodes of ``tables`` (m, t, 3); and ``probes`` (m, p, 4, 3): positions, velocities,
-    accelerations, forces of supports and contact."""
-
-    steps: np.ndarray
-    powers: np.ndarray
-    ends: np.ndarray
-    momenta: np.ndarray
-    totals: np.ndarray
-    impact: np.ndarray
-    energies: np.ndarray
-    force: np.ndarray
-    moment: np.ndarray
-    contacts: np.ndarray
-    releases: np.ndarray
-    changes: np.ndarray
-    pressing: np.ndarray
-    impulses: np.ndarray
-    tables: np.ndarray
-    probes: np.ndarray
-
-
-def new_records(m: int, energies: int, walls: int, tables: int, particles: int, probes: int) -> Records:
-    """Return room for ``m`` records."""
-    return Records(
-        steps=np.empty(m, dtype=np.int64),
-        powers=np.empty((m, len(WORKS))),
-        ends=np.empty((m, len(WORKS) + 1)),
-        momenta=np.empty((m, 3, 3)),
-        totals=np.empty((m, 3, 3)),
-        impact=np.empty(m),
-        energies=np.zeros((m, energies)),
-        force=np.empty((m, walls, 3)),
-        moment=np.empty((m, walls, 3)),
-        contacts=np.empty((m, walls), dtype=np.int64),
-        releases=np.empty((m, walls), dtype=np.int64),
-        changes=np.empty(m, dtype=np.int64),
-        pressing=np.empty(m, dtype=np.int64),
-        impulses=np.empty((m, particles, 3)),
-        tables=np.empty((m, tables, 3)),
-        probes=np.empty((m, probes, 4, 3)),
-    )
 
 
 class ProbeArrays(NamedTuple):
@@ -673,10 +624,10 @@ def end_at_walls(near, shared, contact, u, v):
 
 
 @kernel
-def add_record(records, at, step, powers, totals, impact, changes, pressing):
-    """Write numbers of a step to a record."""
-    records.steps[at], records.impact[at] = step, impact
-    records.changes[at], records.pressing[at] = changes, pressing
+def record_step(records, at, numbers, powers, totals):
+    """Write ``numbers`` of a step, its own, those of changes of contacts and of nodes in contact, and the sums of its
+    balance to a record."""
+    records.steps[at], records.changes[at], records.pressing[at] = numbers
     records.powers[at], records.totals[at] = powers, totals
 
 
@@ -1033,7 +984,8 @@ def make_batch_loop(parts: BatchParts) -> Callable:
                 sum_energies(work, records.energies[recorded])
                 centre(push_u.reshape(-1), eta, impulses.half.reshape(-1), impulses.v.reshape(-1))
                 accelerations(push_u.reshape(-1), alpha, impulses.a.reshape(-1))
-                add_record(records, recorded, step, powers, totals, ledger[_IMPACT], changes, touching)
+                record_step(records, recorded, (step, changes, touching), powers, totals)
+                records.impact[recorded] = ledger[_IMPACT]
                 record_contact(records, recorded, pressed, walls, rows, impulses)
                 probe_forces(probes, support, contact, touching, values)
                 recorded += 1

@@ -17,7 +17,7 @@ from .ledger_loops import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS,
 
 if TYPE_CHECKING:
     from ..mechanics.bars import BarBlock
-    from .batch_loop import Records
+    from .ledger_loops import Records
     from .stepper import Stepper
 
 

@@ -10,11 +10,10 @@ from helpers.stopped import assert_restart_is_bitwise
 from pfem_petsc import Case, Simulation, write_mesh
 from pfem_petsc.errors import InputError
 
-HEIGHT, MASS = 2.0, None
+HEIGHT = 2.0
 STIFF = YOUNG * AREA * HEIGHT**2 / (HEIGHT**2 + 1.0) ** 1.5  # of a leg, vertically [N/m]
 WEIGHT = 1e-5 * STIFF
 NODE_MASS = 3 * 0.5 * MATERIAL["density"] * AREA * np.sqrt(HEIGHT**2 + 1.0)
-SCHEME = {"integrator": "energy_momentum", "step": 4e-5}
 
 
 def tower(folder, comm, **tables):

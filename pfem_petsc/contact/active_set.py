@@ -215,7 +215,7 @@ class ActiveSet:
         self.balance = balance
         self._iterations = self._link_iterations = 0
         self._displacements = self.contact.motion.displacements(balance.time)
-        self.friction = StepFriction(model, state, balance)
+        self.friction = StepFriction(model.contact, model.inertia, model.nodal_stiffness, state, balance)
         self.candidates = expected_candidates(model.contact, state, balance, held, self._displacements)
         move, slack = (balance.time - state.time) * state.v, BEYOND * model.size
         self._all_links = tuple(links)

@@ -17,7 +17,7 @@ from .node_walls import free_squares
 from .projection import project
 
 if TYPE_CHECKING:
-    from ..stepping.model import Model
+    from ..mechanics.mass import Inertia
     from .node_walls import NodeWalls
 
 _SWEEPS = 2000
@@ -303,7 +303,9 @@ class StepFriction:
 
     Parameters
     ----------
-    model : Model
+    contact : walls
+    inertia : of the nodes
+    stiffness : (owned,) of the bars at each node [N/m]
     state : at the start of the step
     balance : of the step
 
@@ -313,15 +315,15 @@ class StepFriction:
     unsettled : owned nodes whose solution violated the law in :meth:`check`
     """
 
-    def __init__(self, model: Model, state: State, balance: Balance) -> None:
-        self.model = model
-        self.contact = model.contact
+    def __init__(
+        self, contact: NodeWalls, inertia: Inertia, stiffness: np.ndarray, state: State, balance: Balance
+    ) -> None:
+        self.contact, self.comm = contact, contact.mesh.comm
         self.state = state
         displacements = self.contact.motion.displacements
         self._way = displacements(balance.time) - displacements(state.time)
-        inertia = model.inertia
         self._inertial = balance.alpha * inertia.mass + balance.eta * inertia.damping
-        self._stiffness = self._inertial + balance.weight * model.nodal_stiffness
+        self._stiffness = self._inertial + balance.weight * stiffness
         owned, walls = self.contact.members.shape
         owned *= self.contact.has_friction  # without friction no node sticks or slips
         self._guessed = np.zeros(owned, dtype=bool)
@@ -410,7 +412,7 @@ class StepFriction:
     def _soften(self, before: tuple[np.ndarray, np.ndarray]) -> None:
         """Reduce the weight of known directions if statuses, ``before`` and now, are the same. Collective."""
         changed = any((now != was).any() for now, was in zip((self._sticks, self._slips), before, strict=True))
-        self._steady = 0 if self.model.comm.allreduce(int(changed)) else self._steady + 1
+        self._steady = 0 if self.comm.allreduce(int(changed)) else self._steady + 1
         if self._steady >= _STEADY:
             self._firmness = max(_SOFTER * self._firmness, _LEAST)
 
@@ -420,7 +422,7 @@ class StepFriction:
         First the directions are fixed, then friction forces are fixed as well.
         """
         slips, moves = bool(self._slips.any()), bool((self._directions != 0.0).any())
-        turning, moving = self.model.comm.allreduce(np.array([slips, moves], dtype=np.int64)) > 0
+        turning, moving = self.comm.allreduce(np.array([slips, moves], dtype=np.int64)) > 0
         self._slips[:] = False
         self._firmness *= 10.0
         self._steady = 0

@@ -148,8 +148,10 @@ class History(Observer):
         return NEVER
 
     def observe(self, made: Step) -> None:
-        """Record rows."""
+        """Record rows: of a batch, and of the present state if it is due and not among them."""
         self.record()
+        if super().due(made.step) and self.row["step"] != made.step:
+            self.record()
 
     def record(self) -> None:
         """Record the rows of the last step or batch, unless a rank has a fault, which is raised on all ranks."""

@@ -146,16 +146,18 @@ class Batch:
         )
         return model.comm.allreduce(serves, op=MPI.LAND)
 
-    def make(self, count: int) -> None:
-        """Make up to ``count`` steps, the last of which remains to be counted, and what rows of the history need of
-        those that are due: see :attr:`~pfem_petsc.stepping.stepper.Stepper.instants`.
+    def make(self, most: int, left: int) -> None:
+        """Make up to ``most`` steps, and up to the one after which bars or supports are removed, of which there are
+        ``left``; the last one remains to be counted. What rows of the history need of those that are due is collected,
+        see :attr:`~pfem_petsc.stepping.stepper.Stepper.instants`, except for a step with a removal, which changes it.
 
         On one rank fewer steps are made if a bar breaks or something fails. With several ranks all make all steps, but
         this rank's state remains that of a failure. The stepper then has a fault.
         """
         stepper, ledger, state, model = self.stepper, self.ledger, self.stepper.state, self.model
-        log, comm, due = model.contact.log, model.comm, self._due(count)
+        log, comm, due = model.contact.log, model.comm, self._due(min(most, left))
         count = len(due)
+        due[-1] = due[-1] and count < left
         begin, walls, impulses = state.step, model.contact.walls, ledger.impulses.state
         ending, flags = due.copy(), np.zeros((count, len(walls)), dtype=bool)
         ending[-1] = True

@@ -88,7 +88,7 @@ class ExplicitStepper(Stepper):
             return
         if self._batch is None:
             self._batch = Batch(self)
-        self._batch.make(min(most, self.removals.steps_left(state.time, self.h)))
+        self._batch.make(most, self.removals.steps_left(state.time, self.h))
         self.leave()
         state.step += 1
 

@@ -73,8 +73,10 @@ def advance(f, inverse, alpha, eta, h, half, sums):
 
 
 @kernel
-def advance_loaded(f, external, inverse, alpha, eta, h, half, v, sums):
-    """As :func:`advance` with external forces, u = (``external`` - f) ``inverse``; writes ``v``."""
+def advance_loaded(f, external, inverse, numbers, half, v, sums):
+    """As :func:`advance` with external forces, u = (``external`` - f) ``inverse``, and alpha, eta and h as ``numbers``;
+    writes ``v``."""
+    alpha, eta, h = numbers
     wide = len(sums)
     for first in range(0, len(half), wide):
         last = min(first + wide, len(half))

@@ -198,7 +198,7 @@ def end_differences(x, sweep, far, chunk, work):
     for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
         at = starts[run]
         if sweep.diagonal[chunk]:
-            differences(x, heads[run], fars[run], starts[run + 1] - at, xs, ys, zs, at - first)
+            differences(x, heads[run], fars[run], starts[run + 1] - at, work, at - first)
             continue
         a = heads[run]
         ax = x[a, 0]
@@ -223,7 +223,7 @@ def scatter_forces(f, sweep, far, chunk, work):
     for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
         at = starts[run]
         if sweep.diagonal[chunk]:
-            add_strips(f, heads[run], fars[run], starts[run + 1] - at, xs, ys, zs, cs, at - first)
+            add_strips(f, heads[run], fars[run], starts[run + 1] - at, work, at - first)
             continue
         fx = 0.0
         fy = 0.0

@@ -157,13 +157,13 @@ class Arguments:
 
 
 @intrinsic
-def differences(typingctx, x, low, high, count, dx, dy, dz, first):  # noqa: ANN001, ANN201 - Numba's types
-    """Write x[high + i] - x[low + i] for ``count`` nodes of ``x`` (n, 3) to ``dx``, ``dy``, ``dz`` from ``first``."""
+def differences(typingctx, x, low, high, count, work, first):  # noqa: ANN001, ANN201 - Numba's types
+    """Write x[high + i] - x[low + i] for ``count`` nodes of ``x`` (n, 3) to rows of a workspace from ``first`` on."""
 
     def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
         given = Arguments(context, builder, signature, values)
         ends = [given.numbers(0, given.index(k), 3) for k in (1, 2)]
-        rows = [given.numbers(k, given.index(7)) for k in (4, 5, 6)]
+        rows = [given.row(4, given.index(5), c) for c in range(3)]
 
         def body(at: Any, strip: Strip) -> None:
             one, other = (strip.load_nodes(end, at) for end in ends)
@@ -175,7 +175,7 @@ def differences(typingctx, x, low, high, count, dx, dy, dz, first):  # noqa: ANN
         for_strips(builder, given.index(3), body)
         return context.get_dummy_value()
 
-    return types.void(x, low, high, count, dx, dy, dz, first), generate
+    return types.void(x, low, high, count, work, first), generate
 
 
 def add_to_both(builder: Any, ends: list[Any], distance: Any, count: Any, pull: Callable[[Any, Strip], Any]) -> None:
@@ -200,14 +200,14 @@ def add_to_both(builder: Any, ends: list[Any], distance: Any, count: Any, pull: 
 
 
 @intrinsic
-def add_strips(typingctx, f, low, high, count, dx, dy, dz, c, first):  # noqa: ANN001, ANN201
-    """Subtract c (dx, dy, dz) of ``count`` bars, from ``first`` on, from the nodes of ``f`` (n, 3) from ``low`` on, and
-    add it to those from ``high`` on."""
+def add_strips(typingctx, f, low, high, count, work, first):  # noqa: ANN001, ANN201
+    """Subtract three rows of a workspace times the fourth one, for ``count`` bars from ``first`` on, from the nodes of
+    ``f`` (n, 3) from ``low`` on, and add them to those from ``high`` on."""
 
     def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
         given = Arguments(context, builder, signature, values)
-        low, high, first = given.index(1), given.index(2), given.index(8)
-        rows = [given.numbers(k, first) for k in (4, 5, 6, 7)]
+        low, high, first = given.index(1), given.index(2), given.index(5)
+        rows = [given.row(4, first, c) for c in range(4)]
 
         def pull(at: Any, strip: Strip) -> list[Any]:
             *components, factor = (strip.load(row, at) for row in rows)
@@ -217,7 +217,7 @@ def add_strips(typingctx, f, low, high, count, dx, dy, dz, c, first):  # noqa: A
         add_to_both(builder, ends, builder.sub(high, low), given.index(3), pull)
         return context.get_dummy_value()
 
-    return types.void(f, low, high, count, dx, dy, dz, c, first), generate
+    return types.void(f, low, high, count, work, first), generate
 
 
 def _spread(builder: Any, values: Any) -> list[Any]:

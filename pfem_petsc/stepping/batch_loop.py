@@ -286,7 +286,7 @@ def advance_block(block, nodes, shared, f, start):
     force, ahead = forces.reshape(-1), half[first:last].reshape(-1)
     if len(nodes.external) > 0:
         load = nodes.external[first:last].reshape(-1)
-        advance_loaded(force, load, factor, alpha, eta, h, ahead, here, lanes[INTERNAL])
+        advance_loaded(force, load, factor, (alpha, eta, h), ahead, here, lanes[INTERNAL])
         add_loads(load, here, lanes)
     else:
         advance(force, factor, alpha, eta, h, ahead, lanes[INTERNAL])

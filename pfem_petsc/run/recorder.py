@@ -203,7 +203,8 @@ class Recorder:
             walls = total[-1, HEAD.width + 1 :][: instants.shares.walls[0].size]
             contacts = walls.reshape(-1, WALL.width)[:, WALL.first("contacts")]
         times = contact.log.meet(self.model.comm, contacts)[instants.noted]
-        vectors = self._unpack(total, (instants.place, instants.number, stepper.smallest), times)
+        with np.errstate(invalid="ignore", over="ignore"):  # sums that are not finite are told by the checks of rows
+            vectors = self._unpack(total, (instants.place, instants.number, stepper.smallest), times)
         if self.rest is not None:
             own, vectors = vectors, np.repeat(self.rest[None], len(vectors), axis=0)
             vectors[:, self._at] = own

@@ -191,7 +191,8 @@ class Batch:
         steps, noted = np.flatnonzero(due[:end]), np.zeros(end, dtype=np.int64)
         if len(walls):
             noted += log.note(flags[:end], stepper.h, comm) + 1 + np.arange(end)
-        sums = self._sums(records, broken)
+        with np.errstate(invalid="ignore", over="ignore"):  # a motion that diverges is told with its row
+            sums = self._sums(records, broken)
         if not len(steps):
             log.changes += made.changes
             return

@@ -150,7 +150,7 @@ def test_every_process_finds_the_fused_loop_of_another():
         "from pfem_petsc.mechanics.elements import engineering\n"
         "from pfem_petsc.stepping.batch_loop import make_batch_loop\n"
         "loops = make_loops(LAW, engineering)\n"
-        "loop = make_batch_loop(*batch_parts(loops))\n"
+        "loop = make_batch_loop(batch_parts(loops))\n"
         "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
     )
     keys = set()
@@ -170,7 +170,7 @@ def test_loops_of_all_laws_have_names_of_their_own():
             for measure in MEASURES.values():
                 loops = make_loops(variant, measure)
                 names.append(_variant(loops.forces.py_func))
-                fused = make_batch_loop(*batch_parts(loops))
+                fused = make_batch_loop(batch_parts(loops))
                 longest = fused._cache._cache_file._data_path("x")
                 assert len(Path(longest).name) < 220
     assert len(names) > 40 and len(set(names)) == len(names)
@@ -245,7 +245,7 @@ def test_functions_of_one_name_have_the_same_code():
         for measure in MEASURES.values():
             loops = make_loops(law, measure)
             made = [value for value in vars(loops).values() if not isinstance(value, int)]
-            for loop in (*made, make_batch_loop(*batch_parts(loops))):
+            for loop in (*made, make_batch_loop(batch_parts(loops))):
                 closures(loop, found)
     digests = {}
     for function in found:

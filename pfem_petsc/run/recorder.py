@@ -217,7 +217,8 @@ class Recorder:
         total = np.empty((len(shares), probes + self._probes.width))
         sums = np.ascontiguousarray(shares[:, :probes])
         if self.model.comm.size > 1:
-            self.model.comm.Allreduce(MPI.IN_PLACE, sums)
+            for row in sums:  # the order of the sum over ranks depends on the length of a message
+                self.model.comm.Allreduce(MPI.IN_PLACE, row)
         total[:, :probes] = sums
         for share, out in zip(shares, total, strict=True):
             self._probes.unite(share[probes:], out[probes:])

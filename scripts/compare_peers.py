@@ -66,6 +66,7 @@ AMGCL = Code("Kratos, AMGCL", "kratos", "run_kratos.py")
 MODES = {
     "explicit": ("explicit, elastic, foot held", (OURS, BARE, LAMMPS, KRATOS, OPENSEES)),
     "explicit_ranks": ("explicit, elastic, foot held, wall time on two ranks", (OURS_2, LAMMPS_2)),
+    "explicit_rows": ("explicit, elastic, foot held, a row in every one of many steps", (OURS, LAMMPS)),
     "explicit_long": ("explicit, elastic, foot held, a row every 500 steps", (OURS, BARE, LAMMPS)),
     "explicit_long_ranks": (
         "explicit, elastic, foot held, a row every 500 steps, wall time on two ranks",
@@ -133,7 +134,7 @@ def steps_of(mode: str, bars: int) -> int:
     """Return the number of timed steps: enough for the clock, few enough for the slowest code."""
     if mode == "static":
         return 5 if bars < 50_000 else 3 if bars < 500_000 else 1
-    if "_long" in mode:
+    if "_long" in mode or "_rows" in mode:
         return 4000 if bars < 500_000 else 1600
     if mode.startswith("implicit"):
         return 5 if bars < 50_000 else 3

@@ -259,7 +259,7 @@ class Shares:
     ----------
     numbers : (m, width)
     head : (m, width of HEAD)
-    changes : (m,) changes of the active set; (m, 0) without walls
+    changes : (m, 1) changes of the active set; (m, 0) without walls
     walls : (m, walls, width of WALL)
     tables : (m, tables, width of PAIR)
     probes : (m, nodes, number of PROBED, 3)

@@ -218,13 +218,13 @@ _IMPACT = HEAD.first("impact_dissipation")  # a constant of the machine code
 
 
 @borrowing
-def move_block(block, shared, f, light, bars, base):
-    """Move the nodes of a block, and set their forces to zero; in ``light`` steps those of :func:`split_block`."""
+def move_block(block, shared, f, padded, bars, base):
+    """Move the nodes of a block, and set their forces to zero; with ``padded`` runs those of :func:`split_block`."""
     first = NODE_BLOCK * block
     last = min(first + NODE_BLOCK, len(shared.half))
     where = shared.x[first:last].reshape(-1)
     move(where, shared.h, shared.half[first:last].reshape(-1))
-    if light:
+    if padded:
         split_block(first, last, shared.x, bars.planes, bars.pulls, base)
         return
     sums = f[first:last].reshape(-1)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..columns import PROBED
 from ..mechanics.compiled import inlined, kernel
 
 WORKS = ("external", "contact", "damping", "inertial", "internal")
@@ -33,12 +34,12 @@ WIDE = 3 * LANES
 class Records(NamedTuple):
     """What rows of the history are made of, for m steps: of ``steps`` of the batch (m,), the last of which is its last
     one; ``powers`` (m, 5), the works of all balances before that of the step, and ``ends`` (m, 6), those of the half
-    step before its end, and its kinetic energy [J], in the order of :data:`WORKS`;
-    ``momenta`` (m, 3, 3) and ``totals`` (m, 3, 3), see there; the dissipation by ``impact`` so far (m,) and
-    ``energies`` (m, k) of the bars [J]; of walls (m, w), ``force``, ``moment`` and ``contacts``, and ``releases`` so
-    far; ``changes`` of contacts in the batch so far, and nodes with contact forces, ``pressing`` (m,); ``impulses`` (m,
-    rows, 3); forces on the second nodes of ``tables`` (m, t, 3); and ``probes`` (m, p, 4, 3): positions, velocities,
-    accelerations, forces of supports and contact."""
+    step before its end, in the order of :data:`WORKS`, and its kinetic energy [J]; ``momenta`` (m, 3, 3), see
+    :func:`add_momenta`, and ``totals`` (m, 3, 3), see :func:`sum_balance`; the dissipation by ``impact`` so far (m,)
+    and ``energies`` (m, k) of the bars [J]; of walls (m, w), ``force``, ``moment`` and ``contacts``, and ``releases``
+    so far; ``changes`` of contacts in the batch so far, and nodes with contact forces, ``pressing`` (m,); ``impulses``
+    (m, rows, 3); forces on the second nodes of ``tables`` (m, t, 3); and ``probes`` (m, p, 4, 3): positions,
+    velocities, accelerations, forces of supports and contact."""
 
     steps: np.ndarray
     powers: np.ndarray
@@ -76,7 +77,7 @@ def new_records(m: int, energies: int, walls: int, tables: int, particles: int, 
         pressing=np.empty(m, dtype=np.int64),
         impulses=np.empty((m, particles, 3)),
         tables=np.empty((m, tables, 3)),
-        probes=np.empty((m, probes, 4, 3)),
+        probes=np.empty((m, probes, len(PROBED), 3)),
     )
 
 

@@ -252,23 +252,23 @@ def values_at_state(model: Any) -> list[tuple[int, Callable[[Any], float]]]:
     return [(HEAD.first(one.name), one.value) for one in columns if one.value is not None and one.exists(model)]
 
 
-class Shares:
-    """This rank's shares of m rows.
+class Share:
+    """This rank's share of a row with some walls, tables and nodes of probes, zero.
 
     Attributes
     ----------
-    numbers : (m, width)
-    head : (m, width of HEAD)
-    changes : (m, 1) changes of the active set; (m, 0) without walls
-    walls : (m, walls, width of WALL)
-    tables : (m, tables, width of PAIR)
-    probes : (m, nodes, number of PROBED, 3)
+    numbers : (width,)
+    head : (width of HEAD,)
+    changes : (1,) changes of the active set; (0,) without walls
+    walls : (walls, width of WALL)
+    tables : (tables, width of PAIR)
+    probes : (nodes, number of PROBED, 3)
     """
 
-    def __init__(self, m: int, walls: int, tables: int, probes: int) -> None:
+    def __init__(self, walls: int, tables: int, probes: int) -> None:
         parts = (HEAD.width, int(walls > 0), walls * WALL.width, tables * PAIR.width, probes * len(PROBED) * 3)
-        self.numbers = np.zeros((m, sum(parts)))
-        self.head, self.changes, flat, pairs, probed = np.split(self.numbers, np.cumsum(parts)[:-1], axis=1)
-        self.walls = flat.reshape(m, walls, WALL.width)
-        self.tables = pairs.reshape(m, tables, PAIR.width)
-        self.probes = probed.reshape(m, probes, len(PROBED), 3)
+        self.numbers = np.zeros(sum(parts))
+        self.head, self.changes, flat, pairs, probed = np.split(self.numbers, np.cumsum(parts)[:-1])
+        self.walls = flat.reshape(walls, WALL.width)
+        self.tables = pairs.reshape(tables, PAIR.width)
+        self.probes = probed.reshape(probes, len(PROBED), 3)

@@ -167,6 +167,8 @@ class ContactLog:
         ``contacts`` (walls,): number of nodes of all ranks in contact after the last step, if known.
         """
         n, self.noted = self.noted, 0
+        if not len(self.time):
+            return np.empty((n + 1, 0))
         flags = self._flags[:n]
         if n == 1 and contacts is not None:
             flags[0] = contacts > 0

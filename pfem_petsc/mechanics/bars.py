@@ -17,7 +17,7 @@ from ..fields import STATUS
 from ..mesh.node_sets import group_hint
 from .elements import MEASURES, BarData, ElementFamily, MatrixRows, bar_lengths, first_inverted, make_loops
 from .materials.base import BarShapes, Law, UnsuitableBarError, internal_variables, law_of
-from .runs import Sweep, make_sweep
+from .runs import Columns, Sweep, exchange_history, make_sweep
 from .rupture import breakable, limit_values, make_release
 from .springs import Springs, connected, connector_modulus
 
@@ -137,7 +137,7 @@ class BarBlock:
     """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank.
 
     ``area`` [m2] is a number, or (stop - start,) if it differs from bar to bar. ``modulus`` is the largest tangent
-    modulus of the law [Pa]; ``history`` (rows, stop - start) holds ``law.rows`` and, after them, ``law.bar_data``;
+    modulus of the law [Pa]; ``own`` is the array of :attr:`history`, and ``lent`` the columns that have it now, if any;
     ``release`` removes bars, if they can leave the model.
     """
 
@@ -153,10 +153,25 @@ class BarBlock:
     measure: Callable
     parameters: tuple[float, ...]
     modulus: float
-    history: np.ndarray
+    own: np.ndarray
     sweep: Sweep
     loops: SimpleNamespace
     release: Callable | None
+    lent: Columns | None = None
+
+    @property
+    def history(self) -> np.ndarray:
+        """Data kept from step to step (rows, stop - start): ``law.rows`` and, after them, ``law.bar_data``."""
+        if self.lent is not None:
+            columns, self.lent = self.lent, None
+            exchange_history(self.sweep, columns, self.own, True)
+        return self.own
+
+    def lend(self, columns: Columns) -> None:
+        """Leave the history to loops over padded runs, which update that of the columns, until someone needs it."""
+        if self.lent is not columns and columns.kept.size:
+            exchange_history(self.sweep, columns, self.history, False)
+            self.lent = columns
 
     @property
     def counted_area(self) -> float | np.ndarray:
@@ -201,7 +216,7 @@ def make_blocks(mesh: DistributedMesh, case: Case) -> list[BarBlock]:
                 measure=measure,
                 parameters=(*(limit_values(material.rupture) if law.rupture >= 0 else ()), *material.numbers()),
                 modulus=material.upper_modulus(),
-                history=np.zeros((len(law.rows) + len(law.bar_data), block.stop - block.start)),
+                own=np.zeros((len(law.rows) + len(law.bar_data), block.stop - block.start)),
                 sweep=make_sweep(mesh.bars, block.start, block.counted, block.stop),
                 loops=make_loops(law, measure),
                 release=make_release(law_of(material), measure) if law.rupture >= 0 else None,

@@ -28,7 +28,7 @@ from ..columns import (
     WALL,
     Layout,
     Row,
-    Shares,
+    Share,
     declared,
     values_at_state,
 )
@@ -196,12 +196,12 @@ class Recorder:
         """
         stepper, contact = self.stepper, self.model.contact
         instants, stepper.instants = stepper.instants or self._present(alarm), None
-        total = self._total(instants.shares.numbers)
+        total = self._total(instants.shares)
         alarms = total[:, HEAD.first("alarm")] > 0.0
         contacts = None
         if contact.any:
-            walls = total[-1, HEAD.width + 1 :][: instants.shares.walls[0].size]
-            contacts = walls.reshape(-1, WALL.width)[:, WALL.first("contacts")]
+            walls = total[-1, HEAD.width + 1 :][: WALL.width * len(contact.names)]
+            contacts = walls[WALL.first("contacts") :: WALL.width]
         times = contact.log.meet(self.model.comm, contacts)[instants.noted]
         with np.errstate(invalid="ignore", over="ignore"):  # sums that are not finite are told by the checks of rows
             vectors = self._unpack(total, (instants.place, instants.number, stepper.smallest), times)
@@ -228,28 +228,29 @@ class Recorder:
         """Return what a row needs of the present state."""
         stepper, state, contact = self.stepper, self.stepper.state, self.model.contact
         impulses, walls = stepper.ledger.impulses, stepper.solution.walls
-        shares = Shares(1, len(contact.names), len(self.model.links.columns), len(self._probes.nodes))
-        head = shares.head[0]
+        share = Share(len(contact.names), len(self.model.links.columns), len(self._probes.nodes))
+        head = share.head
         head[:] = stepper.ledger.sums
         head[_BARS], head[HEAD.first("alarm")] = stepper.energy.energies, alarm
         for first, value in values_at_state(self.model):
             head[first] = value(stepper)
         if contact.any:
-            shares.changes[:], contact.log.changes = contact.log.changes, 0
+            share.changes[:], contact.log.changes = contact.log.changes, 0
             for name, values in (("force", walls.force), ("moment", walls.moment)):
-                shares.walls[0, :, WALL[name]] = values
-            shares.walls[0, :, WALL.first("contacts")] = walls.contacts
-            shares.walls[0, :, WALL.first("releases")] = contact.log.releases
-        shares.tables[0, :, PAIR["force"]] = self.model.links.totals()
-        impulses.fill_contact(shares.walls, shares.tables, impulses.state.v[None])
+                share.walls[:, WALL[name]] = values
+            share.walls[:, WALL.first("contacts")] = walls.contacts
+            share.walls[:, WALL.first("releases")] = contact.log.releases
+        share.tables[:, PAIR["force"]] = self.model.links.totals()
+        impulses.fill_contact(share)
         held = self.model.supports.any or self.model.bars.springs is not None
         reacts = held and not stepper.scheme.balance_at_endpoints
         if self.probe_nodes or reacts:
             acceleration, support = stepper.recorded()
-            self._probes.fill(shares.probes[0], state, acceleration, support)
+            self._probes.fill(share.probes, state, acceleration, support)
             if reacts:
                 head[HEAD["support_force"]] = stepper.support_force(support)
-        return Instants(np.array([stepper.number]), np.array([stepper.place]), shares, np.array([contact.log.noted]))
+        number, place, noted = (np.array([of]) for of in (stepper.number, stepper.place, contact.log.noted))
+        return Instants(number, place, share.numbers[None], noted)
 
     def _unpack(self, sums: np.ndarray, of_run: tuple[Any, ...], contact_times: np.ndarray) -> np.ndarray:
         """Return the values of m rows of this stage from the sums over ranks; begin those of the next row.
@@ -266,15 +267,13 @@ class Recorder:
             vectors[:, at(name)] = getattr(stepper, name)
         vectors[:, at("newton_iterations")], vectors[:, at("linear_iterations")] = stepper.iterations
         for first, parts in self._parts:
-            vectors[:, first] = sum(sums[:, part] for part in parts)
+            vectors[:, first] = np.cumsum(sums[:, parts], axis=1)[:, -1]
         vectors[:, layout["centre_of_mass"]] /= self.model.total_mass
         energies = sums[:, _ENERGIES]
         if self.carried is not None:
             energies = energies + self.carried[self._energies]
-        # one after the other: the order of a sum over an axis depends on the number of rows
-        held = np.zeros(len(sums))
-        for sign, values in zip(_SIGNS, energies.T, strict=True):
-            held += sign * values
+        # the order of a sum over an axis depends on the number of rows, that of sums so far does not
+        held = np.cumsum(_SIGNS * energies, axis=1)[:, -1]
         if self.start_energy is None:
             self.start_energy = float(held[0])
         self.energy_scale = max(self.energy_scale, float(np.abs(energies).max()))

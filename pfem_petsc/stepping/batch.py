@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from ..columns import BAR_ENERGIES, HEAD, PAIR, WALL, Shares, values_at_state
+from ..columns import BAR_ENERGIES, HEAD, Share, values_at_state
 from ..contact.node_walls import NOTED, WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
@@ -28,13 +28,13 @@ from .batch_loop import (
     make_batch_loop,
 )
 from .impact import Touched
-from .ledger_loops import Records, new_records
 from .stepper import Instants, Solution
 
 if TYPE_CHECKING:
     from .stepper import Stepper
 
 
+_BARS, _BROKEN = HEAD.indices(BAR_ENERGIES), HEAD.first("broken_bars")
 _WINDOW = 4  # times the nodes of the blocks that bars of one block belong to
 
 
@@ -66,6 +66,8 @@ class Batch:
         if state.contact is not stepper.zero:
             self._contact[:] = state.contact
         self._u = np.zeros_like(state.v)
+        share = Share(len(self.model.contact.names), len(self.model.links.columns), len(probed))
+        self._width, self._at_state = len(share.numbers), values_at_state(self.model)
         return_freed_memory()
 
     def _bar_arrays(self) -> BarArrays:
@@ -158,12 +160,13 @@ class Batch:
         log, comm, due = model.contact.log, model.comm, self._due(min(most, left))
         count = len(due)
         due[-1] = due[-1] and count < left
-        begin, walls, impulses = state.step, model.contact.walls, ledger.impulses.state
-        ending, flags = due.copy(), np.zeros((count, len(walls)), dtype=bool)
-        ending[-1] = True
+        steps = np.flatnonzero(due)
+        shares = np.zeros((len(steps) + (0 if due[-1] else 1), self._width))
+        begin, impulses = state.step, ledger.impulses.state
+        flags = np.zeros((count, len(log.releases)), dtype=bool)
         rows = model.links.export_rows(self._stiffness)
-        sizes = len(walls), len(model.links.columns), len(impulses.v), len(self._probes.nodes)
-        records = new_records(int(ending.sum()), len(BAR_ENERGIES), *sizes)
+        model.bars.blocks[0].lend(self._bars.columns)
+        ledger.sums[_BROKEN] = stepper.ruptures.count  # others can break in the last step alone
         data = BatchData(
             stepper.h,
             state.x,
@@ -179,27 +182,29 @@ class Batch:
             ledger.powers,
             ImpulseArrays(impulses.memory["half_velocity"], impulses.a, impulses.v),
             self._probes,
-            records,
+            log.changes,
+            shares,
         )
-        made = self._loop(data, log.last, ledger.impacts.met, ending, flags)
+        made = self._loop(data, log.last, ledger.impacts.met, due, flags)
         if made.lost:
             raise MPI.Exception(made.lost)
         model.links.import_rows(rows)
-        end = made.done if comm.size == 1 else count
-        records, broken = Records(*(array[: made.recorded] for array in records)), stepper.ruptures.count
-        sound = self._take(made, records.energies[-1], end)
-        steps, noted = np.flatnonzero(due[:end]), np.zeros(end, dtype=np.int64)
-        if len(walls):
+        end, row = made.done if comm.size == 1 else count, shares[made.recorded - 1]
+        sound = self._take(made, row[_BARS], end)
+        for at, value in self._at_state:
+            row[at] = value(stepper)
+        ledger.follow_batch(row[: HEAD.width])
+        log.changes, noted = made.changes, np.zeros(end, dtype=np.int64)
+        if len(log.releases):
             noted += log.note(flags[:end], stepper.h, comm) + 1 + np.arange(end)
-        with np.errstate(invalid="ignore", over="ignore"):  # a motion that diverges is told with its row
-            sums = self._sums(records, broken)
-        if not len(steps):
-            log.changes += made.changes
-            return
-        shares = self._shares(made, records, sums, steps, sound)
-        number = begin + steps + 1
-        place = np.array([model.origin + at * stepper.h for at in number.tolist()])
-        stepper.instants = Instants(model.first_step + number, place, shares, noted[steps])
+        steps = steps[steps < end]
+        if len(steps):
+            shares, unsound = shares[: len(steps)], steps >= sound
+            shares[unsound] = 0.0
+            shares[unsound, HEAD.first("alarm")] = 1.0
+            number = begin + steps + 1
+            place = model.origin + number * stepper.h
+            stepper.instants = Instants(model.first_step + number, place, shares, noted[steps])
 
     def _take(self, made: Made, energies: np.ndarray, end: int) -> int:
         """Take the state after the last of ``end`` steps, with ``energies`` of the bars [J]; return how many of these
@@ -234,32 +239,6 @@ class Batch:
         if self.model.bars.slackens and due.any():
             due = due[: int(np.argmax(due)) + 1]
         return due
-
-    def _sums(self, records: Records, broken: int) -> np.ndarray:
-        """Return the sums of rows (m, width of HEAD) from m records; ``broken``: bars before the batch, in whose last
-        step alone others can break."""
-        sums = self.ledger.follow_batch(records)
-        sums[:, HEAD.first("active_contacts")], sums[:, HEAD.first("broken_bars")] = records.pressing, broken
-        for at, value in values_at_state(self.model):
-            sums[-1, at] = value(self.stepper)
-        return sums
-
-    def _shares(self, made: Made, records: Records, sums: np.ndarray, steps: np.ndarray, sound: int) -> Shares:
-        """Return the shares of the rows of some ``steps``. Those from the step ``sound`` on raise an alarm."""
-        model, log, k = self.model, self.model.contact.log, int((steps < sound).sum())
-        shares = Shares(len(steps), len(model.contact.names), len(model.links.columns), len(self._probes.nodes))
-        shares.head[:k], shares.head[k:, HEAD.first("alarm")] = sums[:k], 1.0
-        walls, tables = shares.walls[:k], shares.tables[:k]
-        self.ledger.impulses.fill_contact(walls, tables, records.impulses[:k])
-        shares.probes[:k], tables[..., PAIR["force"]] = records.probes[:k], records.tables[:k]
-        walls[..., WALL["force"]], walls[..., WALL["moment"]] = records.force[:k], records.moment[:k]
-        walls[..., WALL.first("contacts")] = records.contacts[:k]
-        walls[..., WALL.first("releases")] = records.releases[:k]
-        changes = np.append(records.changes[:k], made.changes)
-        if shares.changes.size:
-            shares.changes[:k, 0] = np.diff(changes[:k], prepend=-log.changes)
-        log.changes = int(made.changes - changes[k - 1]) if k else log.changes + made.changes
-        return shares
 
     def _failure(self, made: Made) -> SimulationFailure | None:
         """Return the failure in the last step, None for none."""

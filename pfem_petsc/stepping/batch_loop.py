@@ -15,29 +15,29 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from ..columns import HEAD
+from ..columns import BAR_ENERGIES, HEAD, PAIR, PROBED, WALL
 from ..contact.explicit import FlatWalls, find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows, solve_rows
 from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import accelerations, advance, advance_loaded, centre, kick, move
 from ..mechanics.compiled import borrowing, kernel
 from ..mechanics.elements import BarData, BatchParts, first_inverted
-from ..mechanics.runs import Columns, copy, exchange_history, join_components, new_rows, slide_planes, split_components
+from ..mechanics.runs import Columns, copy, join_components, new_rows, slide_planes, split_components
 from ..mesh.ordering import NODE_BLOCK
 from .impact import Approach, Touched, join_nodes, plane_gaps, stop_nodes, unpressed
-from .impulses import WALLS
+from .impulses import IN_COLUMNS, WALLS
 from .ledger_loops import (
     CONTACT,
     DAMPING,
     ENDS,
     EXTERNAL,
+    INERTIAL,
     INTERNAL,
     LANES,
     REACTIONS,
     WIDE,
     WORKS,
     Acting,
-    Records,
     add_drags,
     add_ends,
     add_loads,
@@ -163,7 +163,9 @@ class ProbeArrays(NamedTuple):
 class BatchData(NamedTuple):
     """All that a batch reads and writes: the step [s]; positions (local, 3), those of the previous step, which are
     computed for the last step alone, and velocities at half steps (n, 3); records of arrays; the sums of the ledger, of
-    which the dissipation by impact is added to; works (5,) of all balances; and particles of impulses."""
+    which the dissipation by impact is added to; works (5,) of all balances; particles of impulses; contacts that have
+    changed since the last row; and this rank's shares (m, width) of the rows of the steps that are due, and at last of
+    the last step if it is not, see :class:`~pfem_petsc.columns.Share`."""
 
     h: float
     x: np.ndarray
@@ -179,19 +181,20 @@ class BatchData(NamedTuple):
     powers: np.ndarray
     impulses: ImpulseArrays
     probes: ProbeArrays
-    records: Records
+    changes: int
+    shares: np.ndarray
 
 
 class Made(NamedTuple):
     """Outcome of a batch.
 
-    ``done``: number of steps made; ``recorded``: number of records; ``lost``: error code of MPI. In the last step:
-    ``changed``: number of bars that changed their state of rupture; ``failed``, ``turned``: the first bar that
+    ``done``: number of steps made; ``recorded``: number of shares of rows; ``lost``: error code of MPI. In the last
+    step: ``changed``: number of bars that changed their state of rupture; ``failed``, ``turned``: the first bar that
     collapsed, and that went through zero length, or -1; ``infeasible``: index in ``near`` of a node that no position
     satisfies, or -1, with the ``offsets`` of its planes; ``force``, ``contacts``, ``moment``: sums of the walls;
     ``near``: nodes with wall forces, the walls that they are ``touching``, and their ``places``; ``touched``, ``met``:
     nodes that touch walls, and that have touched them and not left; ``pressing``: number of nodes with contact forces;
-    and ``changes``: contacts that closed or opened in all steps.
+    and ``changes``: contacts that closed or opened since the last row.
     """
 
     done: int
@@ -214,7 +217,26 @@ class Made(NamedTuple):
     changes: int
 
 
-_IMPACT = HEAD.first("impact_dissipation")  # a constant of the machine code
+# constants of the machine code
+_KINETIC, _EXTERNAL, _DAMPING, _IMPACT, _NUMERICAL, _MOMENTA, _SUPPORT, _IMPULSES, _PRESSING = map(
+    HEAD.first,
+    (
+        "kinetic_energy",
+        "external_work",
+        "damping_dissipation",
+        "impact_dissipation",
+        "numerical_dissipation",
+        "momentum",  # followed by angular momentum and centre of mass
+        "support_force",
+        "external_impulse",  # followed by those of supports and damping
+        "active_contacts",
+    ),
+)
+_BARS, _CHANGES, _WALL, _PAIR, _PROBED = HEAD.indices(BAR_ENERGIES), HEAD.width, WALL.width, PAIR.width, len(PROBED)
+_WALL_FORCE, _WALL_MOMENT, _WALL_IMPULSE, _WALL_JUMP, _CONTACTS, _RELEASES = map(
+    WALL.first, ("force", "moment", "impulse", "jump_impulse", "contacts", "releases")
+)
+_PAIR_FORCE, _PAIR_IMPULSE, _PAIR_JUMP = map(PAIR.first, ("force", "impulse", "jump_impulse"))
 
 
 @borrowing
@@ -624,19 +646,50 @@ def end_at_walls(near, shared, contact, u, v):
 
 
 @kernel
-def record_step(records, at, numbers, powers, totals):
-    """Write ``numbers`` of a step, its own, those of changes of contacts and of nodes in contact, and the sums of its
-    balance to a record."""
-    records.steps[at], records.changes[at], records.pressing[at] = numbers
-    records.powers[at], records.totals[at] = powers, totals
+def record_sums(row, ledger, powers, ends, totals, particles, energies):
+    """Write the sums of a step to this rank's share of its row: those of the ``ledger`` before it; the works of all
+    ``powers`` before its balance, with those of the half step before its end, and kinetic energy and momenta, ``ends``
+    of :func:`~pfem_petsc.stepping.ledger_loops.sum_ends`; ``totals`` (3, 3) of its balance; impulses of ``particles``
+    (rows, 3) [N s]; ``energies`` of the bars [J]."""
+    works, momenta = ends
+    for k in range(len(ledger)):
+        row[k] = ledger[k]
+    stored = 0.0
+    for k in range(len(energies)):
+        row[_BARS[k]] = energies[k]
+        stored += energies[k]
+    row[_KINETIC] = works[len(WORKS)]
+    row[_EXTERNAL] = powers[EXTERNAL] + works[EXTERNAL]
+    row[_DAMPING] = powers[DAMPING] + works[DAMPING]
+    inertial = ((powers[INTERNAL] + works[INTERNAL]) - stored) + powers[INERTIAL] - works[INERTIAL]
+    row[_NUMERICAL] = inertial - (powers[CONTACT] + works[CONTACT]) - ledger[_IMPACT]
+    for c in range(3):
+        for k in range(3):
+            row[_MOMENTA + 3 * k + c] = momenta[k, c]
+        row[_SUPPORT + c] = totals[0, c]
+        for k in range(3):
+            row[_IMPULSES + 3 * k + c] = particles[IN_COLUMNS[k], c]
 
 
 @kernel
-def record_contact(records, at, pressed, walls, rows, impulses):
-    """Write sums of walls, tables and impulses to a record."""
-    records.force[at], records.moment[at] = pressed.force, pressed.moment
-    records.contacts[at], records.releases[at] = pressed.contacts, walls.releases
-    records.tables[at], records.impulses[at] = rows.totals, impulses.v
+def record_contact(row, pressed, walls, rows, particles):
+    """Write sums of walls, tables and impulses (rows, 3) to this rank's share of a row."""
+    w, t = len(pressed.contacts), len(rows.totals)
+    at, jumps = _CHANGES + (1 if w > 0 else 0), WALLS + w + t
+    for k in range(w):
+        for c in range(3):
+            row[at + _WALL_FORCE + c] = pressed.force[k, c]
+            row[at + _WALL_MOMENT + c] = pressed.moment[k, c]
+            row[at + _WALL_IMPULSE + c] = particles[WALLS + k, c]
+            row[at + _WALL_JUMP + c] = particles[jumps + k, c]
+        row[at + _CONTACTS], row[at + _RELEASES] = pressed.contacts[k], walls.releases[k]
+        at += _WALL
+    for k in range(t):
+        for c in range(3):
+            row[at + _PAIR_FORCE + c] = rows.totals[k, c]
+            row[at + _PAIR_IMPULSE + c] = particles[WALLS + w + k, c]
+            row[at + _PAIR_JUMP + c] = particles[jumps + w + k, c]
+        at += _PAIR
 
 
 @kernel
@@ -721,8 +774,8 @@ def make_batch_loop(parts: BatchParts) -> Callable:
     """Return the loop for a law and strain measure.
 
     Its arguments are BatchData; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them;
-    ``due`` (count,) bool, the steps with a record, of which the last step is one; and ``flags`` (count, walls) bool,
-    which receives the walls that are touched in each step. Velocities, accelerations and increments are written to the
+    ``due`` (count,) bool, the steps with a row; and ``flags`` (count, walls) bool, which receives the walls that are
+    touched in each step. Velocities, accelerations and increments are written to the
     state in the last step alone. It returns Made: fewer steps on one rank where something fails or bars change their
     state of rupture; several ranks make all steps, as others wait for their messages.
     """
@@ -762,7 +815,7 @@ def make_batch_loop(parts: BatchParts) -> Callable:
             data.messages,
             data.state,
         )
-        ledger, powers, impulses, probes, records = data.ledger, data.powers, data.impulses, data.probes, data.records
+        ledger, powers, impulses, probes, shares = data.ledger, data.powers, data.impulses, data.probes, data.shares
         n = len(half)
         n_walls = len(walls.flat.offsets)
         f, a, v, support, contact, u = state.f, state.a, state.v, state.support, state.contact, state.u
@@ -783,6 +836,8 @@ def make_batch_loop(parts: BatchParts) -> Callable:
             (np.empty(WIDE), np.empty(WIDE)),
         )
         totals, lanes, after = np.zeros((3, 3)), new_sums(), np.empty(len(WORKS))
+        sums, energies = (np.empty(len(WORKS) + 1), np.empty((3, 3))), np.empty(len(_BARS))
+        probed = len(probes.nodes)
         numbers, buffers = (h, alpha, eta), (factors, speeds, drag)
         shared = BlockArrays(*numbers, x, half, nodes.inverses, *buffers, held, load, support, lanes, ends)
         work = new_rows(work_rows)
@@ -805,13 +860,11 @@ def make_batch_loop(parts: BatchParts) -> Callable:
         touching = 0
         done = 0
         recorded = 0
-        changes = 0
+        changes = data.changes
         several = len(x) > n or messages.count > 0
         lost = 0  # error code of MPI
         aside = new_rows(work_rows)  # energies that are not counted
         padded = len(parts) > 0
-        if padded:
-            exchange_history(bars.data.sweep, bars.columns, bars.data.history, False)
         shortened = False
         for step in range(count):
             if failed >= 0 or turned >= 0 or infeasible >= 0:
@@ -821,7 +874,9 @@ def make_batch_loop(parts: BatchParts) -> Callable:
                 if lost != 0:
                     break
                 continue
-            last_one, ending, values = step == count - 1, due[step], records.probes[recorded]
+            last_one, row = step == count - 1, shares[recorded]
+            ending = due[step] or last_one
+            values = row[len(row) - 3 * _PROBED * probed :].reshape(probed, _PROBED, 3)
             for i in near:
                 contact[i] = 0.0
             clear_forces(lanes, n, Acting(supported, loaded, False, damped))
@@ -980,20 +1035,23 @@ def make_batch_loop(parts: BatchParts) -> Callable:
                 if padded and not ending:
                     clear_energies(work)  # a failure, whose energies nothing reads
                 end_at_walls(near, shared, contact, u, v)
-                sum_ends(lanes, n, h, records.ends[recorded], records.momenta[recorded])
-                sum_energies(work, records.energies[recorded])
+                sum_ends(lanes, n, h, *sums)
+                energies[:] = 0.0
+                sum_energies(work, energies)
                 centre(push_u.reshape(-1), eta, impulses.half.reshape(-1), impulses.v.reshape(-1))
                 accelerations(push_u.reshape(-1), alpha, impulses.a.reshape(-1))
-                record_step(records, recorded, (step, changes, touching), powers, totals)
-                records.impact[recorded] = ledger[_IMPACT]
-                record_contact(records, recorded, pressed, walls, rows, impulses)
+                record_sums(row, ledger, powers, sums, totals, impulses.v, energies)
+                row[_PRESSING] = touching
+                record_contact(row, pressed, walls, rows, impulses.v)
                 probe_forces(probes, support, contact, touching, values)
+                if n_walls > 0:
+                    row[_CHANGES] = changes
+                if due[step]:
+                    changes = 0
                 recorded += 1
             powers[:] = after
             if wrong and not several:
                 break
-        if padded:
-            exchange_history(bars.data.sweep, bars.columns, bars.data.history, True)
         return Made(
             done,
             recorded,

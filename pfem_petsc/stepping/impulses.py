@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..columns import HEAD, PAIR, WALL
+from ..columns import HEAD, PAIR, WALL, Share
 from ..integrators.base import State
 from ..tolerances import RANK
 
@@ -31,6 +31,9 @@ __all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "NoImpulses", 
 SUPPORT, EXTERNAL, DAMPING, WALLS = 0, 1, 2, 3
 """Rows of the particles: three in the order of the totals of :mod:`~pfem_petsc.stepping.ledger_loops`, then walls and
 pairs, then the jumps of walls and pairs."""
+
+IN_COLUMNS = (EXTERNAL, SUPPORT, DAMPING)
+"""The first rows of the particles in the order of the columns of the history."""
 
 _IMPULSES = slice(HEAD["external_impulse"].start, HEAD["damping_impulse"].stop)
 
@@ -129,17 +132,17 @@ class Impulses:
         # links conserve momentum except for the part that supports at their nodes receive
         particles[SUPPORT] += momentum.sum(axis=0)
 
-    def fill(self, head: np.ndarray, impulses: np.ndarray) -> None:
-        """Write the impulses (m, rows, 3) of support, external and damping forces into sums (m, width of HEAD)."""
-        head[:, _IMPULSES] = impulses[:, [EXTERNAL, SUPPORT, DAMPING]].reshape(len(head), -1)
+    def fill(self, head: np.ndarray) -> None:
+        """Write the impulses of support, external and damping forces into sums (width of HEAD,)."""
+        head[_IMPULSES] = self.state.v[list(IN_COLUMNS)].ravel()
 
-    def fill_contact(self, walls: np.ndarray, tables: np.ndarray, impulses: np.ndarray) -> None:
-        """Write the impulses (m, rows, 3) of walls and links into shares of m rows, see
-        :class:`~pfem_petsc.columns.Shares`."""
-        walls[..., WALL["impulse"]] = impulses[:, WALLS : WALLS + self.n_walls]
-        walls[..., WALL["jump_impulse"]] = impulses[:, self.jumps : self.jumps + self.n_walls]
-        tables[..., PAIR["impulse"]] = impulses[:, WALLS + self.n_walls : self.jumps]
-        tables[..., PAIR["jump_impulse"]] = impulses[:, self.jumps + self.n_walls :]
+    def fill_contact(self, share: Share) -> None:
+        """Write the impulses of walls and links into a share of a row."""
+        impulses, walls, tables = self.state.v, share.walls, share.tables
+        walls[:, WALL["impulse"]] = impulses[WALLS : WALLS + self.n_walls]
+        walls[:, WALL["jump_impulse"]] = impulses[self.jumps : self.jumps + self.n_walls]
+        tables[:, PAIR["impulse"]] = impulses[WALLS + self.n_walls : self.jumps]
+        tables[:, PAIR["jump_impulse"]] = impulses[self.jumps + self.n_walls :]
 
     def kept(self) -> dict[str, Any]:
         """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..columns import BAR_ENERGIES, ENERGIES, HEAD
+from ..columns import BAR_ENERGIES, COUNTS, ENERGIES, HEAD
 from ..mechanics.bars import StrainEnergy, state_before_rupture
 from ..mechanics.elements import MEASURES
 from ..mechanics.materials.base import SMALL
@@ -17,7 +17,6 @@ from .ledger_loops import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS,
 
 if TYPE_CHECKING:
     from ..mechanics.bars import BarBlock
-    from .ledger_loops import Records
     from .stepper import Stepper
 
 
@@ -203,7 +202,7 @@ class BarChanges:
 
 
 _AT = {energy.name: HEAD.first(energy.name) for energy in ENERGIES if energy.source != "derived"}
-_BARS = HEAD.indices(BAR_ENERGIES)
+_AT_STATE = HEAD.indices((*BAR_ENERGIES, *(one.name for one in COUNTS), "alarm"))  # of which the ledger has no sums
 _TOTALS = slice(HEAD.first("momentum"), HEAD["support_force"].stop)
 
 
@@ -258,7 +257,7 @@ class Ledger:
         self.impulses.step(self._sum_state(present, second))
         if jump is not None:
             self.impulses.jump()
-        self.impulses.fill(self.sums[None], self.impulses.state.v[None])
+        self.impulses.fill(self.sums)
         stepper.step_changed = False
         impact, friction = self._dissipated(before)
         if jump is not None:
@@ -342,24 +341,11 @@ class Ledger:
         works[INERTIAL] = 0.125 * h * h * power(present.inertial, present.acceleration)
         return works
 
-    def follow_batch(self, records: Records) -> np.ndarray:
-        """Take the last of the ``records`` of a batch of steps; return the sums (m, width of HEAD) of all of them."""
-        powers, ends, count = records.powers, records.ends, len(records.steps)
-        sums = np.repeat(self.sums[None], count, axis=0)
-        sums[:, _AT["kinetic_energy"]] = ends[:, len(WORKS)]
-        sums[:, _TOTALS] = np.hstack([records.momenta, records.totals[:, :1]]).reshape(count, -1)
-        self.impulses.fill(sums, records.impulses)
-        works = powers + ends[:, : len(WORKS)]
-        sums[:, _AT["external_work"]] = works[:, EXTERNAL]
-        sums[:, _AT["damping_dissipation"]] = works[:, DAMPING]
-        sums[:, _AT["impact_dissipation"]] = records.impact
-        stored = np.array([sum(energies) for energies in records.energies.tolist()])
-        inertial = (works[:, INTERNAL] - stored) + powers[:, INERTIAL] - ends[:, INERTIAL]
-        sums[:, _AT["numerical_dissipation"]] = inertial - works[:, CONTACT] - records.impact
-        self.sums[:] = sums[-1]
+    def follow_batch(self, sums: np.ndarray) -> None:
+        """Take the sums (width of HEAD,) at the end of a batch of steps."""
+        self.sums[:] = sums
+        self.sums[_AT_STATE] = 0.0
         self._before.energy = self.stepper.energy
-        sums[:, _BARS] = records.energies
-        return sums
 
     def end_batches(self) -> None:
         """Keep the present state, from which a step without batches goes on."""

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..columns import PROBED
 from ..mechanics.compiled import inlined, kernel
 
 WORKS = ("external", "contact", "damping", "inertial", "internal")
@@ -29,56 +28,6 @@ LANES = 128
 
 WIDE = 3 * LANES
 """Components of these nodes."""
-
-
-class Records(NamedTuple):
-    """What rows of the history are made of, for m steps: of ``steps`` of the batch (m,), the last of which is its last
-    one; ``powers`` (m, 5), the works of all balances before that of the step, and ``ends`` (m, 6), those of the half
-    step before its end, in the order of :data:`WORKS`, and its kinetic energy [J]; ``momenta`` (m, 3, 3), see
-    :func:`add_momenta`, and ``totals`` (m, 3, 3), see :func:`sum_balance`; the dissipation by ``impact`` so far (m,)
-    and ``energies`` (m, k) of the bars [J]; of walls (m, w), ``force``, ``moment`` and ``contacts``, and ``releases``
-    so far; ``changes`` of contacts in the batch so far, and nodes with contact forces, ``pressing`` (m,); ``impulses``
-    (m, rows, 3); forces on the second nodes of ``tables`` (m, t, 3); and ``probes`` (m, p, 4, 3): positions,
-    velocities, accelerations, forces of supports and contact."""
-
-    steps: np.ndarray
-    powers: np.ndarray
-    ends: np.ndarray
-    momenta: np.ndarray
-    totals: np.ndarray
-    impact: np.ndarray
-    energies: np.ndarray
-    force: np.ndarray
-    moment: np.ndarray
-    contacts: np.ndarray
-    releases: np.ndarray
-    changes: np.ndarray
-    pressing: np.ndarray
-    impulses: np.ndarray
-    tables: np.ndarray
-    probes: np.ndarray
-
-
-def new_records(m: int, energies: int, walls: int, tables: int, particles: int, probes: int) -> Records:
-    """Return room for ``m`` records."""
-    return Records(
-        steps=np.empty(m, dtype=np.int64),
-        powers=np.empty((m, len(WORKS))),
-        ends=np.empty((m, len(WORKS) + 1)),
-        momenta=np.empty((m, 3, 3)),
-        totals=np.empty((m, 3, 3)),
-        impact=np.empty(m),
-        energies=np.zeros((m, energies)),
-        force=np.empty((m, walls, 3)),
-        moment=np.empty((m, walls, 3)),
-        contacts=np.empty((m, walls), dtype=np.int64),
-        releases=np.empty((m, walls), dtype=np.int64),
-        changes=np.empty(m, dtype=np.int64),
-        pressing=np.empty(m, dtype=np.int64),
-        impulses=np.empty((m, particles, 3)),
-        tables=np.empty((m, tables, 3)),
-        probes=np.empty((m, probes, len(PROBED), 3)),
-    )
 
 
 class Acting(NamedTuple):

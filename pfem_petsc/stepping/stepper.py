@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..columns import Shares
 from ..contact.initial_equilibrium import start_at_rest
 from ..contact.massless import MasslessNodes
 from ..contact.monitoring import CarriedNodes
@@ -33,13 +32,13 @@ class Instants(NamedTuple):
     Attributes
     ----------
     number, place : (m,) numbers of the steps, and times in the results, over all stages [s]
-    shares : of this rank
+    shares : (m, width) of this rank, see :class:`~pfem_petsc.columns.Share`
     noted : (m,) number of steps after each of which the contact log had noted the walls that were touched
     """
 
     number: np.ndarray
     place: np.ndarray
-    shares: Shares
+    shares: np.ndarray
     noted: np.ndarray
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-COMPILED = {"kernel", "inlined", "borrowing", "intrinsic", "njit", "overload", "register_jitable"}
+COMPILED = {"kernel", "inlined", "borrowing", "borrowing_kernel", "intrinsic", "njit", "overload", "register_jitable"}
 """Decorators of functions whose types Numba infers."""
 
 

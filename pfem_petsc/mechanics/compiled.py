@@ -15,10 +15,10 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba.core import event
+from numba.core import errors, event, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
-from numba.extending import _Intrinsic, register_jitable
+from numba.extending import _Intrinsic, intrinsic, register_jitable
 
 
 def code_digest(function: Callable[..., Any]) -> str:
@@ -106,9 +106,9 @@ _FAST = {"nsz"}
 _LONGEST = 130  # characters in the names of cached files for a variant of a loop; file systems take 255 in all
 
 
-def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a loop; the machine code is cached on disk if a folder for it is writable."""
-    options: dict[str, Any] = {"fastmath": _FAST, "error_model": "numpy", "nogil": True}
+def kernel(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:
+    """Compile a loop; the machine code is cached on disk if a folder for it is writable. ``more`` options of Numba."""
+    options: dict[str, Any] = {"fastmath": _FAST, "error_model": "numpy", "nogil": True, **more}
     try:
         compiled = numba.njit(cache=True, **options)(function)
     except RuntimeError as error:
@@ -192,6 +192,52 @@ def borrowing(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     _distinguish(function)
     return register_jitable(fastmath=_FAST, error_model="numpy", _nrt=False)(function)
+
+
+def borrowing_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a loop that others call by its address, see :func:`calls`, without counting references."""
+    return kernel(function, _nrt=False)
+
+
+def calls(result: types.Tuple) -> Callable[..., Any]:
+    """Make a function ``call(address, arguments)`` for compiled loops that calls the machine code at an address with a
+    tuple of arguments and returns its ``result``.
+
+    A loop that calls others in this way does not depend on which they are, and is compiled once for all of them.
+    """
+
+    @intrinsic
+    def call(typingctx: Any, address: Any, arguments: Any) -> Any:  # noqa: ARG001
+        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            kinds, convention = signature.args[1].types, context.call_conv
+            kind = convention.get_function_type(result, kinds)
+            function = builder.inttoptr(values[0], kind.as_pointer())
+            given = [builder.extract_value(values[1], k) for k in range(len(kinds))]
+            _, found = convention.call_function(builder, function, result, kinds, given)
+            return found
+
+        if any(isinstance(kind, types.Integer) and kind != types.int64 for kind in arguments.types):
+            raise errors.TypingError(f"integers must be of 64 bits and signed, not {arguments}")
+        return result(types.int64, arguments), generate
+
+    return call
+
+
+def address_of(function: Callable[..., Any], arguments: tuple[Any, ...], result: types.Tuple) -> int:
+    """Return the address of the machine code of a :func:`borrowing_kernel` for the types of some ``arguments``; the
+    loop must be kept as long as it is used.
+
+    Raises
+    ------
+    TypeError
+        If its result is not the one that the caller reads.
+    """
+    kinds = tuple(numba.typeof(value) for value in arguments)
+    function.compile(kinds)
+    compiled = function.overloads[kinds]
+    if compiled.signature.return_type != result:
+        raise TypeError(f"{function.__name__} returns {compiled.signature.return_type}, not {result}")
+    return compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name)
 
 
 class _Cache(FunctionCache):

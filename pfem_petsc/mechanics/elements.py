@@ -13,10 +13,11 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numba.core import types
 from numba.extending import register_jitable
 
 from ..columns import BAR_ENERGIES
-from .compiled import borrowing, inlined, kernel
+from .compiled import borrowing, borrowing_kernel, inlined, kernel
 from .materials.base import Law
 from .runs import Sweep, copy, end_differences, scatter_forces
 from .strips import add_rows, subtract_rows
@@ -424,49 +425,40 @@ def _step_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     return {visit.__name__: _for_all(visit.__name__, visit) for visit in (step_forces, step_tangents)}
 
 
-def _energy_sums(law: Law) -> dict[str, Any]:
-    """Make ``sum_energies`` and ``clear_energies`` for the workspace of loops over chunks and over padded runs, in
-    which the sums of the energies follow four rows; and its number of rows, ``work_rows``."""
-    places = tuple(BAR_ENERGIES.index(name) for name in law.energies)
-    n_energies = len(places)
-
-    @inlined
-    def sum_energies(work, energies):
-        """Add the sums of ``work`` to ``energies``, see :data:`~pfem_petsc.columns.BAR_ENERGIES` [J]."""
-        for j in range(n_energies):
-            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0  # additions that do not wait for each other
-            for i in range((4 + j) * CHUNK, (5 + j) * CHUNK, 8):
-                s0 += work[i]
-                s1 += work[i + 1]
-                s2 += work[i + 2]
-                s3 += work[i + 3]
-                s4 += work[i + 4]
-                s5 += work[i + 5]
-                s6 += work[i + 6]
-                s7 += work[i + 7]
-            energies[places[j]] += ((s0 + s1) + (s2 + s3)) + ((s4 + s5) + (s6 + s7))
-
-    @inlined
-    def clear_energies(work):
-        """Set the sums of ``work`` to zero."""
-        sums = work[4 * CHUNK :]
-        for i in range(n_energies * CHUNK):  # much faster than an assignment to a slice
-            sums[i] = 0.0
-
-    return {
-        "sum_energies": sum_energies,
-        "clear_energies": clear_energies,
-        "work_rows": 4 + n_energies + len(law.rows),
-    }
+@inlined
+def sum_energies(work, places, energies):
+    """Add the sums of the workspace of loops over chunks and over padded runs, which follow four rows, to ``energies``
+    [J] at ``places`` (k,), see :data:`~pfem_petsc.columns.BAR_ENERGIES`."""
+    for j in range(len(places)):
+        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0  # additions that do not wait for each other
+        for i in range((4 + j) * CHUNK, (5 + j) * CHUNK, 8):
+            s0 += work[i]
+            s1 += work[i + 1]
+            s2 += work[i + 2]
+            s3 += work[i + 3]
+            s4 += work[i + 4]
+            s5 += work[i + 5]
+            s6 += work[i + 6]
+            s7 += work[i + 7]
+        energies[places[j]] += ((s0 + s1) + (s2 + s3)) + ((s4 + s5) + (s6 + s7))
 
 
-def _run_loops(law: Law, element: SimpleNamespace, sums: dict[str, Any]) -> dict[str, Any]:
+@inlined
+def clear_energies(work, places):
+    """Set the sums of :func:`sum_energies` to zero."""
+    sums = work[4 * CHUNK :]
+    for i in range(len(places) * CHUNK):  # much faster than an assignment to a slice
+        sums[i] = 0.0
+
+
+def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     """Make the loops that evaluate chunks of runs, several bars at once: ``forces``, with its part for batches
-    ``add_forces``; and ``stiffnesses``. ``sums``: see :func:`_energy_sums`."""
+    ``add_forces``; and ``stiffnesses``; ``places`` and ``work_rows`` of the workspace, see :func:`sum_energies`."""
     read, evaluate, stiffness = element.read, element.evaluate, element.stiffness
-    sum_energies, clear_energies, work_rows = sums["sum_energies"], sums["clear_energies"], sums["work_rows"]
+    places = np.array([BAR_ENERGIES.index(name) for name in law.energies], dtype=np.int64)
     by_rate, last, n_rows = law.rate, len(law.internal), len(law.rows)
-    first_new = work_rows - n_rows
+    first_new = 4 + len(places)
+    work_rows = first_new + n_rows
     add_energies, put_new, changes = accumulate(len(law.energies)), put(len(law.internal)), differ(len(law.internal))
     can_break, gone = law.rupture >= 0, max(law.rupture, 0)
 
@@ -545,12 +537,12 @@ def _run_loops(law: Law, element: SimpleNamespace, sums: dict[str, Any]) -> dict
         broke = 0
         limits = (bars.sweep.counted, len(bars.sweep.diagonal), 0, bars.sweep.counted)
         for side in range(0, 4, 2):  # first the bars that are counted on other ranks
-            clear_energies(work)
+            clear_energies(work, places)
             at, short, more = add_forces(x, bars, limits[side], limits[side + 1], commit, f, work)
             failed = at if failed < 0 else failed
             shortened = shortened or short
             broke += more
-        sum_energies(work, energies)
+        sum_energies(work, places, energies)
         return failed, shortened, broke
 
     @borrowing
@@ -573,7 +565,13 @@ def _run_loops(law: Law, element: SimpleNamespace, sums: dict[str, Any]) -> dict
         for chunk in range(len(bars.sweep.diagonal)):
             linearise_chunk(x, bars, chunk, weight, stored, work)
 
-    return {"forces": forces, "add_forces": add_forces, "stiffnesses": stiffnesses}
+    return {
+        "forces": forces,
+        "add_forces": add_forces,
+        "stiffnesses": stiffnesses,
+        "places": places,
+        "work_rows": work_rows,
+    }
 
 
 def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
@@ -598,13 +596,13 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     keeps = n_rows + n_data > 0
 
     @borrowing
-    def add_none(x, bars, base, begun, ended, work):
+    def add_none(x, bars, parameters, base, begun, ended, work):
         """Replace the loops where they do not apply."""
         return -1, False
 
     def make(counts: bool) -> Callable[..., Any]:
         @borrowing
-        def add_padded(x, bars, base, begun, ended, work):
+        def add_padded(x, bars, parameters, base, begun, ended, work):
             """Add the internal forces of the groups [begun, ended) of padded runs to ``bars.pulls`` (3 stride,), and
             update the history in ``bars.columns.kept``; return the first failed bar, or -1, and whether any bar is so
             short that it may be inverted.
@@ -637,7 +635,7 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                     short += 0 if length / rest >= SHORTENED_STRETCH else 1  # NaN counts
                     q = variables_of(kept, first + i)
                     before = kept[last, first + i] if by_rate else 0.0
-                    p = data.parameters + data_of(kept, n_rows, first + i) if n_data else data.parameters
+                    p = parameters + data_of(kept, n_rows, first + i) if n_data else parameters
                     area = bar_value(columns.area, first + i) if real else 0.0
                     bar = Bar(rest, 0.0, 0.0, area, p, before, 0.0, q)
                     strain, slope, _, stress, _, new, densities = evaluate(length, bar, step)
@@ -692,27 +690,46 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
 def make_loops(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
     """Make all loops of a law and a strain measure; those of steps only if the law has a mean stress."""
     element = make_element(law, measure)
-    sums = _energy_sums(law)
-    found = _state_loops(law, element, measure) | sums | _run_loops(law, element, sums) | _padded_loops(law, element)
+    found = _state_loops(law, element, measure) | _run_loops(law, element) | _padded_loops(law, element)
     if law.mean_stress is not None:
         found |= _step_loops(law, element)
     return SimpleNamespace(**found)
 
 
-class BatchParts(NamedTuple):
-    """What the loop of a batch is made from, see :func:`make_loops`."""
-
-    add_forces: Callable[..., Any]
-    add_padded: Callable[..., Any]
-    add_padded_energies: Callable[..., Any]
-    sum_energies: Callable[..., Any]
-    clear_energies: Callable[..., Any]
-    work_rows: int
+PULLED = types.Tuple((types.int64, types.boolean, types.int64))
+"""Results of the loops that batches call by their addresses: the first failed bar, or -1, whether any bar is so short
+that it may be inverted, and the number of bars that have changed their state of rupture."""
 
 
-def batch_parts(loops: SimpleNamespace) -> BatchParts:
-    """Return what :func:`~pfem_petsc.stepping.batch_loop.make_batch_loop` makes its loop from."""
-    return BatchParts(*(getattr(loops, name) for name in BatchParts._fields))
+@cache
+def batch_pulls(law: Law, measure: Callable[..., Any], count: int) -> SimpleNamespace:
+    """Make the loops that batches call by their addresses, for a law with ``count`` parameters: ``chunks``, which adds
+    the forces of some chunks of bars, and ``padded``, which adds those of some groups of padded runs, and their
+    energies if it ``counts`` them.
+
+    Their ``bars`` are a :class:`~pfem_petsc.stepping.batch_loop.BarArrays`, whose types do not depend on the law.
+    """
+    loops, parameters_of = make_loops(law, measure), take(count)
+    add_forces, add_padded, add_padded_energies = loops.add_forces, loops.add_padded, loops.add_padded_energies
+
+    @borrowing_kernel
+    def chunks(x, bars, begun, ended, f, work):
+        d = bars.data
+        of_bars = (d.start, d.stop, d.ends, d.far, d.sweep, d.rest, d.heat, d.rest_at_start, d.heat_at_start)
+        data = BarData(*of_bars, parameters_of(bars.parameters, 0), d.area, d.step, d.history)
+        failed, shortened, broke = add_forces(x, data, begun, ended, True, f, work)
+        return np.int64(failed), bool(shortened), np.int64(broke)
+
+    @borrowing_kernel
+    def padded(x, bars, base, begun, ended, work, counts):
+        parameters = parameters_of(bars.parameters, 0)
+        if counts:
+            failed, shortened = add_padded_energies(x, bars, parameters, base, begun, ended, work)
+        else:
+            failed, shortened = add_padded(x, bars, parameters, base, begun, ended, work)
+        return np.int64(failed), bool(shortened), np.int64(0)
+
+    return SimpleNamespace(chunks=chunks, padded=padded)
 
 
 @kernel

@@ -11,7 +11,8 @@ from ..columns import BAR_ENERGIES, HEAD, Share, values_at_state
 from ..contact.node_walls import NOTED, WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
-from ..mechanics.elements import batch_parts
+from ..mechanics.compiled import address_of
+from ..mechanics.elements import PULLED, batch_pulls
 from ..mechanics.runs import Columns, make_columns, new_planes, no_columns
 from ..mesh.ordering import NODE_BLOCK
 from ..parallel.heap import return_freed_memory
@@ -25,7 +26,7 @@ from .batch_loop import (
     ProbeArrays,
     StateArrays,
     WallArrays,
-    make_batch_loop,
+    batch_loop,
 )
 from .impact import Touched
 from .stepper import Instants, Solution
@@ -53,8 +54,6 @@ class Batch:
 
     def __init__(self, stepper: Stepper) -> None:
         self.stepper, self.model, self.ledger = stepper, stepper.model, stepper.ledger
-        block = self.model.bars.blocks[0]
-        self._loop = make_batch_loop(batch_parts(block.loops))
         self._bars, self._nodes, self._walls = self._bar_arrays(), self._node_arrays(), self._wall_arrays()
         self._messages = self.model.mesh.messages()
         self._stiffness = self._nodes.stiffness if self.model.links else np.empty(0)
@@ -71,10 +70,16 @@ class Batch:
         return_freed_memory()
 
     def _bar_arrays(self) -> BarArrays:
-        bars = self.model.bars
-        reach, columns = self._reach(), self._columns()
-        data = bars.data(bars.blocks[0])._replace(step=self.stepper.h)
-        return BarArrays(data, bars.watched, reach, self._meeting(), columns, *self._planes(reach, columns))
+        bars, state = self.model.bars, self.stepper.state
+        block, reach, columns = bars.blocks[0], self._reach(), self._columns()
+        data = bars.data(block)._replace(step=self.stepper.h, parameters=())
+        sizes = np.array(block.parameters).reshape(-1, 1), block.loops.places, block.loops.work_rows
+        arrays = BarArrays(data, bars.watched, reach, self._meeting(), columns, *self._planes(reach, columns), *sizes)
+        self._pulls = batch_pulls(block.law, block.measure, len(block.parameters))
+        work = np.empty(0)
+        pull = address_of(self._pulls.chunks, (state.x, arrays, 0, 0, state.f, work), PULLED)
+        padded = address_of(self._pulls.padded, (state.x, arrays, 0, 0, 0, work, False), PULLED)
+        return arrays._replace(pull=pull, pull_padded=padded)
 
     def _node_arrays(self) -> NodeArrays:
         model, h = self.model, self.stepper.h
@@ -185,7 +190,7 @@ class Batch:
             log.changes,
             shares,
         )
-        made = self._loop(data, log.last, ledger.impacts.met, due, flags)
+        made = batch_loop(data, log.last, ledger.impacts.met, due, flags)
         if made.lost:
             raise MPI.Exception(made.lost)
         model.links.import_rows(rows)

@@ -6,8 +6,6 @@ those of the order of nodes; the bars of a block reach its own nodes and those o
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +18,8 @@ from ..contact.explicit import FlatWalls, find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows, solve_rows
 from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import accelerations, advance, advance_loaded, centre, kick, move
-from ..mechanics.compiled import borrowing, kernel
-from ..mechanics.elements import BarData, BatchParts, first_inverted
+from ..mechanics.compiled import borrowing, calls, kernel
+from ..mechanics.elements import PULLED, BarData, clear_energies, first_inverted, sum_energies
 from ..mechanics.runs import Columns, copy, join_components, new_rows, slide_planes, split_components
 from ..mesh.ordering import NODE_BLOCK
 from .impact import Approach, Touched, join_nodes, plane_gaps, stop_nodes, unpressed
@@ -59,8 +57,10 @@ from .ledger_loops import (
 class BarArrays(NamedTuple):
     """The bars of a batch: ``data`` of all of them; ``watched``, see ``Bars``; ``reach``: how many blocks of nodes
     beyond its own the bars of a block reach; ``meeting``: the first block that waits for messages; ``columns`` of the
-    bars, or none; ``planes`` and ``pulls`` (3 stride,): positions and forces by components, of a window of the
-    nodes."""
+    bars, or none; ``planes`` and ``pulls`` (3 stride,): positions and forces by components, of a window of the nodes;
+    ``parameters`` (k, 1) of the law, of which ``data`` has none; ``places`` and ``work_rows`` of the workspace, see
+    :func:`~pfem_petsc.mechanics.elements.sum_energies`; and the addresses of the loops of the law, see
+    :func:`~pfem_petsc.mechanics.elements.batch_pulls`."""
 
     data: BarData
     watched: np.ndarray
@@ -69,6 +69,11 @@ class BarArrays(NamedTuple):
     columns: Columns
     planes: np.ndarray
     pulls: np.ndarray
+    parameters: np.ndarray
+    places: np.ndarray
+    work_rows: int
+    pull: int = 0
+    pull_padded: int = 0
 
 
 class NodeArrays(NamedTuple):
@@ -769,308 +774,305 @@ def finish_positions(messages, x, before, fill):
     return failed
 
 
-@cache
-def make_batch_loop(parts: BatchParts) -> Callable:
-    """Return the loop for a law and strain measure.
+_pull = calls(PULLED)
+
+
+@borrowing
+def pull(x, bars, begun, ended, f, work):
+    """Add the forces of some chunks of bars."""
+    return _pull(bars.pull, (x, bars, np.int64(begun), np.int64(ended), f, work))
+
+
+@borrowing
+def pull_padded(x, bars, base, begun, ended, work, counts):
+    """Add the forces of some groups of padded runs, and their energies to ``work`` if it ``counts`` them."""
+    return _pull(bars.pull_padded, (x, bars, np.int64(base), np.int64(begun), np.int64(ended), work, counts))
+
+
+@borrowing
+def pull_again(x, n, bars, f, work):
+    """Compute all forces in the order of a step."""
+    flat = f.reshape(-1)
+    for j in range(len(flat)):
+        flat[j] = 0.0
+    if len(x) > n:
+        pull(x, bars, bars.data.sweep.counted, len(bars.data.sweep.diagonal), f, work)
+    pull(x, bars, 0, bars.data.sweep.counted, f, work)
+
+
+@kernel
+def batch_loop(data, touched, met, due, flags):
+    """Make a batch of steps, with bars of any law.
 
     Its arguments are BatchData; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them;
     ``due`` (count,) bool, the steps with a row; and ``flags`` (count, walls) bool, which receives the walls that are
-    touched in each step. Velocities, accelerations and increments are written to the
-    state in the last step alone. It returns Made: fewer steps on one rank where something fails or bars change their
-    state of rupture; several ranks make all steps, as others wait for their messages.
+    touched in each step. Velocities, accelerations and increments are written to the state in the last step alone. It
+    returns Made: fewer steps on one rank where something fails or bars change their state of rupture; several ranks
+    make all steps, as others wait for their messages.
     """
-    add_forces, add_padded, add_padded_energies = parts.add_forces, parts.add_padded, parts.add_padded_energies
-    sum_energies, clear_energies, work_rows = parts.sum_energies, parts.clear_energies, parts.work_rows
-
-    @borrowing
-    def pull(x, bars, begun, ended, f, work):
-        """Add the forces of some chunks of bars."""
-        return add_forces(x, bars.data, begun, ended, True, f, work)
-
-    @borrowing
-    def pull_padded(x, bars, base, begun, ended, work, counts):
-        """Add the forces of some groups of padded runs, and their energies to ``work`` if it ``counts`` them."""
-        if counts:
-            return add_padded_energies(x, bars, base, begun, ended, work)
-        return add_padded(x, bars, base, begun, ended, work)
-
-    @borrowing
-    def pull_again(x, n, bars, f, work):
-        """Compute all forces in the order of a step."""
-        flat = f.reshape(-1)
-        for j in range(len(flat)):
-            flat[j] = 0.0
-        if len(x) > n:
-            pull(x, bars, bars.data.sweep.counted, len(bars.data.sweep.diagonal), f, work)
-        pull(x, bars, 0, bars.data.sweep.counted, f, work)
-
-    @kernel
-    def batch_loop(data, touched, met, due, flags):
-        count, h, x, before, half = len(flags), data.h, data.x, data.before, data.half
-        bars, nodes, walls, rows, messages, state = (
-            data.bars,
-            data.nodes,
-            data.walls,
-            data.rows,
-            data.messages,
-            data.state,
-        )
-        ledger, powers, impulses, probes, shares = data.ledger, data.powers, data.impulses, data.probes, data.shares
-        n = len(half)
-        n_walls = len(walls.flat.offsets)
-        f, a, v, support, contact, u = state.f, state.a, state.v, state.support, state.contact, state.u
-        alpha = 1.0 / (h * h)
-        eta = 0.5 / h
-        supported, loaded = len(nodes.support_nodes) > 0, len(nodes.external) > 0
-        damped = len(nodes.damping) > 0
-        linked = len(rows.ready) > 0
-        plain = n_walls == 0 and not damped and not linked  # forces alone determine increments
-        increments, factors = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK)
-        load, held = np.empty(len(nodes.support_nodes)), np.empty(len(nodes.support_nodes))
-        speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
-        ends = EndArrays(
-            np.empty(3 * NODE_BLOCK),
-            np.empty(3 * NODE_BLOCK),
-            np.empty(3 * NODE_BLOCK),
-            np.empty(3 * NODE_BLOCK),
-            (np.empty(WIDE), np.empty(WIDE)),
-        )
-        totals, lanes, after = np.zeros((3, 3)), new_sums(), np.empty(len(WORKS))
-        sums, energies = (np.empty(len(WORKS) + 1), np.empty((3, 3))), np.empty(len(_BARS))
-        probed = len(probes.nodes)
-        numbers, buffers = (h, alpha, eta), (factors, speeds, drag)
-        shared = BlockArrays(*numbers, x, half, nodes.inverses, *buffers, held, load, support, lanes, ends)
-        work = new_rows(work_rows)
-        pulled = np.empty((NODE_BLOCK, 3))  # forces of a block
-        push_u = np.empty(impulses.v.shape)
-        near = touched  # nodes with entries in the array of wall forces
-        pressed = new_pressed(n, n_walls)
-        n_blocks = (n + NODE_BLOCK - 1) // NODE_BLOCK
-        # blocks whose forces alone determine their increments; blocks with nodes that touch walls or have touched them
-        alone, on_walls = np.ones(n_blocks, dtype=np.bool_), np.zeros(n_blocks, dtype=np.bool_)
-        for block in range(n_blocks if linked else 0):
-            alone[block] = not (damped or rows.near[block])
-        # fields that loops over blocks would count references to
-        planes, pulls, parts, chunks = bars.planes, bars.pulls, bars.columns.parts, bars.data.sweep.parts
-        room_for, reach = len(planes) // 3, bars.reach
-        failed = -1
-        turned = -1
-        infeasible = -1
-        changed = 0
-        touching = 0
-        done = 0
-        recorded = 0
-        changes = data.changes
-        several = len(x) > n or messages.count > 0
-        lost = 0  # error code of MPI
-        aside = new_rows(work_rows)  # energies that are not counted
-        padded = len(parts) > 0
-        shortened = False
-        for step in range(count):
-            if failed >= 0 or turned >= 0 or infeasible >= 0:
-                # the other ranks still need messages, until all know of the failure
-                lost = start_positions(messages, x, h, half)
-                lost = finish_positions(messages, x, before, False) if lost == 0 else lost
-                if lost != 0:
-                    break
-                continue
-            last_one, row = step == count - 1, shares[recorded]
-            ending = due[step] or last_one
-            values = row[len(row) - 3 * _PROBED * probed :].reshape(probed, _PROBED, 3)
-            for i in near:
-                contact[i] = 0.0
-            clear_forces(lanes, n, Acting(supported, loaded, False, damped))
-            if ending:
-                clear_ends(lanes, n)
-            changed = 0
-            moved = 0
-            base = 0  # first node of the planes
-            # Forces that nothing reads stay in the cache. The check of shortened bars reads them, as the next one is
-            # likely to; those of laws with history could not be computed again. Blocks that wait for rows need them.
-            brief = padded and not last_one and not shortened and len(bars.data.history) == 0 and not linked
-            forces = pulled if brief else f
-            shortened = False
-            if several:
-                lost = start_positions(messages, x, h, half)
-                if lost != 0:
-                    break
-            waiting = several
-            if ending or not padded:
-                clear_energies(work)
-            count_near = 0
-            finished, pressing, altered = 0, 0, 0  # blocks; rows with a force, and rows whose force begins or ends
-            if linked:
-                clear_sums(lanes[CONTACT], n)
-            if n_walls > 0:
-                pressed.force[:], pressed.contacts[:], pressed.moment[:] = 0.0, 0, 0.0
-                mark_blocks(on_walls, touched, True)
-                mark_blocks(on_walls, met, True)
-            # Blocks of nodes pass once through the cache: each moves shortly before its first bar, and is finished
-            # after its last one, which belongs to its own block or to one before. Messages are on their way until the
-            # first block that needs ghosts.
-            for block in range(n_blocks + 1):
-                if waiting and block == min(bars.meeting, n_blocks):
-                    while moved < n_blocks:
-                        move_block(moved, shared, f, padded, bars, base)
-                        moved += 1
-                    for i in range(n, len(x)):
-                        f[i, 0] = f[i, 1] = f[i, 2] = 0.0
-                    lost = finish_positions(messages, x, before, True)
-                    if lost != 0:
-                        break
-                    broke = 0
-                    if padded:
-                        split_block(n, len(x), x, planes, pulls, base)
-                        groups = (bars.columns.counted, len(bars.columns.heads))
-                        at, short = pull_padded(x, bars, base, *groups, aside, False)
-                    else:
-                        groups = (bars.data.sweep.counted, len(bars.data.sweep.diagonal))
-                        at, short, broke = pull(x, bars, *groups, f, aside)
-                    failed = at if at >= 0 else failed
-                    shortened = shortened or short
-                    changed += broke
-                    waiting = False
-                if block == n_blocks:
-                    break
-                while moved < min(block + 1 + reach, n_blocks):
-                    if padded and not several and room_for < NODE_BLOCK * (moved + 1) - base:
-                        live = NODE_BLOCK * block
-                        slide_planes(planes, live - base, NODE_BLOCK * moved - live)
-                        slide_planes(pulls, live - base, NODE_BLOCK * moved - live)
-                        base = live
-                    move_block(moved, shared, f, padded, bars, base)
-                    moved += 1
-                start = NODE_BLOCK * block if brief else 0
-                if padded:
-                    if block < len(parts) - 1:
-                        at, short = pull_padded(x, bars, base, parts[block], parts[block + 1], work, ending)
-                        failed = at if failed < 0 else failed
-                        shortened = shortened or short
-                    join_block(block, n, pulls, base, forces, start)
-                elif block < len(chunks) - 1:
-                    at, short, broke = pull(x, bars, chunks[block], chunks[block + 1], f, work)
-                    failed = at if failed < 0 else failed
-                    shortened = shortened or short
-                    changed += broke
-                first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
-                if linked:
-                    ready = finished
-                    finished, pressing, more = pass_block(
-                        block, (finished, pressing), rows, alone, nodes, shared, (f, u, contact)
-                    )
-                    altered += more
-                    for over in range(ready, finished if ending else ready):
-                        end = min(NODE_BLOCK * (over + 1), n)
-                        end_block(over, alone[over], last_one, nodes, shared, state, f[NODE_BLOCK * over : end])
-                        probe_block(over, probes, shared, values)
-                        if pressing > 0:
-                            end_rows(over, shared, contact)
-                    continue
-                if plain:
-                    advance_block(block, nodes, shared, forces, start)
-                else:
-                    free, here = speeds[: 3 * (last - first)], increments[: 3 * (last - first)]
-                    solve_block(block, nodes, shared, forces, start, free, here)
-                    found = find_pressed(block, walls, free) if n_walls > 0 else 0
-                    if found > 0:
-                        counts, out = (found, count_near), (contact, pressed)
-                        at = press_block(block, counts, nodes, walls, shared, (free, here), out)
-                        infeasible = at if infeasible < 0 else infeasible
-                        count_near += found
-                    finish_block(block, nodes, shared, forces, start, contact, here)
-                    alone[block] = not (damped or on_walls[block] or found > 0)
-                    if not alone[block]:
-                        copy(here, u[first:last].reshape(-1))
-                if ending:
-                    end_block(block, alone[block], last_one, nodes, shared, state, forces[first - start : last - start])
-                    probe_block(block, probes, shared, values)
-            if n_walls > 0:
-                mark_blocks(on_walls, touched, False)
-                mark_blocks(on_walls, met, False)
-                near = pressed.nodes[:count_near]
-                if count_near > 0 or len(touched) > 0:
-                    more, touched = compare_contacts(
-                        walls.touched.touching, touched, near, pressed.touching, walls.present, walls.releases
-                    )
-                    changes += more
+    count, h, x, before, half = len(flags), data.h, data.x, data.before, data.half
+    bars, nodes, walls, rows, messages, state = (
+        data.bars,
+        data.nodes,
+        data.walls,
+        data.rows,
+        data.messages,
+        data.state,
+    )
+    ledger, powers, impulses, probes, shares = data.ledger, data.powers, data.impulses, data.probes, data.shares
+    n = len(half)
+    n_walls = len(walls.flat.offsets)
+    f, a, v, support, contact, u = state.f, state.a, state.v, state.support, state.contact, state.u
+    alpha = 1.0 / (h * h)
+    eta = 0.5 / h
+    supported, loaded = len(nodes.support_nodes) > 0, len(nodes.external) > 0
+    damped = len(nodes.damping) > 0
+    linked = len(rows.ready) > 0
+    plain = n_walls == 0 and not damped and not linked  # forces alone determine increments
+    increments, factors = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK)
+    load, held = np.empty(len(nodes.support_nodes)), np.empty(len(nodes.support_nodes))
+    speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
+    ends = EndArrays(
+        np.empty(3 * NODE_BLOCK),
+        np.empty(3 * NODE_BLOCK),
+        np.empty(3 * NODE_BLOCK),
+        np.empty(3 * NODE_BLOCK),
+        (np.empty(WIDE), np.empty(WIDE)),
+    )
+    totals, lanes, after = np.zeros((3, 3)), new_sums(), np.empty(len(WORKS))
+    sums, energies = (np.empty(len(WORKS) + 1), np.empty((3, 3))), np.empty(len(_BARS))
+    probed = len(probes.nodes)
+    numbers, buffers = (h, alpha, eta), (factors, speeds, drag)
+    shared = BlockArrays(*numbers, x, half, nodes.inverses, *buffers, held, load, support, lanes, ends)
+    work, places = new_rows(bars.work_rows), bars.places
+    pulled = np.empty((NODE_BLOCK, 3))  # forces of a block
+    push_u = np.empty(impulses.v.shape)
+    near = touched  # nodes with entries in the array of wall forces
+    pressed = new_pressed(n, n_walls)
+    n_blocks = (n + NODE_BLOCK - 1) // NODE_BLOCK
+    # blocks whose forces alone determine their increments; blocks with nodes that touch walls or have touched them
+    alone, on_walls = np.ones(n_blocks, dtype=np.bool_), np.zeros(n_blocks, dtype=np.bool_)
+    for block in range(n_blocks if linked else 0):
+        alone[block] = not (damped or rows.near[block])
+    # fields that loops over blocks would count references to
+    planes, pulls, parts, chunks = bars.planes, bars.pulls, bars.columns.parts, bars.data.sweep.parts
+    room_for, reach = len(planes) // 3, bars.reach
+    failed = -1
+    turned = -1
+    infeasible = -1
+    changed = 0
+    touching = 0
+    done = 0
+    recorded = 0
+    changes = data.changes
+    several = len(x) > n or messages.count > 0
+    lost = 0  # error code of MPI
+    aside = new_rows(bars.work_rows)  # energies that are not counted
+    padded = len(parts) > 0
+    shortened = False
+    for step in range(count):
+        if failed >= 0 or turned >= 0 or infeasible >= 0:
+            # the other ranks still need messages, until all know of the failure
+            lost = start_positions(messages, x, h, half)
+            lost = finish_positions(messages, x, before, False) if lost == 0 else lost
             if lost != 0:
                 break
-            impact = 0.0
-            if len(near) > 0:
-                for i in near:
-                    centre(u[i], eta, half[i], v[i])
-                clear_sums(lanes[CONTACT], n)
-                add_sparse_powers(near, contact, v, lanes[CONTACT])
-            if len(touched) > 0 or len(met) > 0:
-                impact, met = stop_at_walls(nodes, walls, shared, state, u, touched, met)
-            if altered > 0:
-                impact += finish_rows(rows, altered, walls.touched.slack, nodes, shared, state, u)
-            sum_rows(rows, pressing)
-            touching = len(near) + 2 * pressing
-            after[:] = powers
-            sum_balance(lanes, n, h, Acting(supported, loaded, touching > 0, damped), totals, after)
-            push_particles(totals, pressed.force, rows.totals, alpha, h, impulses, push_u)
-            ledger[_IMPACT] += impact
-            for k in range(n_walls):
-                flags[step, k] = pressed.contacts[k] > 0
-            done += 1
-            wrong = failed >= 0 or infeasible >= 0 or changed > 0 or not np.isfinite(after[INTERNAL])
-            if shortened or wrong or last_one:
-                turned = -1
-                if brief:
-                    pull_again(x, n, bars, f, aside)
-                if not last_one:  # the state does not have the end of this step yet
-                    clear_ends(lanes, n)
-                    for block in range(n_blocks):
-                        first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
-                        end_block(block, alone[block], True, nodes, shared, state, f[first:last])
-                        probe_block(block, probes, shared, values)
-                        if pressing > 0:
-                            end_rows(block, shared, contact)
-                start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
-                if failed < 0 and shortened:
-                    turned = first_inverted(x, before, bars.data.ends, bars.watched)
-                wrong = wrong or turned >= 0
-            if ending or wrong:
-                if padded and not ending:
-                    clear_energies(work)  # a failure, whose energies nothing reads
-                end_at_walls(near, shared, contact, u, v)
-                sum_ends(lanes, n, h, *sums)
-                energies[:] = 0.0
-                sum_energies(work, energies)
-                centre(push_u.reshape(-1), eta, impulses.half.reshape(-1), impulses.v.reshape(-1))
-                accelerations(push_u.reshape(-1), alpha, impulses.a.reshape(-1))
-                record_sums(row, ledger, powers, sums, totals, impulses.v, energies)
-                row[_PRESSING] = touching
-                record_contact(row, pressed, walls, rows, impulses.v)
-                probe_forces(probes, support, contact, touching, values)
-                if n_walls > 0:
-                    row[_CHANGES] = changes
-                if due[step]:
-                    changes = 0
-                recorded += 1
-            powers[:] = after
-            if wrong and not several:
+            continue
+        last_one, row = step == count - 1, shares[recorded]
+        ending = due[step] or last_one
+        values = row[len(row) - 3 * _PROBED * probed :].reshape(probed, _PROBED, 3)
+        for i in near:
+            contact[i] = 0.0
+        clear_forces(lanes, n, Acting(supported, loaded, False, damped))
+        if ending:
+            clear_ends(lanes, n)
+        changed = 0
+        moved = 0
+        base = 0  # first node of the planes
+        # Forces that nothing reads stay in the cache. The check of shortened bars reads them, as the next one is
+        # likely to; those of laws with history could not be computed again. Blocks that wait for rows need them.
+        brief = padded and not last_one and not shortened and len(bars.data.history) == 0 and not linked
+        forces = pulled if brief else f
+        shortened = False
+        if several:
+            lost = start_positions(messages, x, h, half)
+            if lost != 0:
                 break
-        return Made(
-            done,
-            recorded,
-            lost,
-            changed,
-            failed,
-            turned,
-            infeasible,
-            pressed.offsets,
-            pressed.force,
-            pressed.contacts,
-            pressed.moment,
-            near.copy(),
-            pressed.touching[: len(near)].copy(),
-            pressed.places[: len(near)].copy(),
-            touched,
-            met,
-            touching,
-            changes,
-        )
-
-    return batch_loop
+        waiting = several
+        if ending or not padded:
+            clear_energies(work, places)
+        count_near = 0
+        finished, pressing, altered = 0, 0, 0  # blocks; rows with a force, and rows whose force begins or ends
+        if linked:
+            clear_sums(lanes[CONTACT], n)
+        if n_walls > 0:
+            pressed.force[:], pressed.contacts[:], pressed.moment[:] = 0.0, 0, 0.0
+            mark_blocks(on_walls, touched, True)
+            mark_blocks(on_walls, met, True)
+        # Blocks of nodes pass once through the cache: each moves shortly before its first bar, and is finished
+        # after its last one, which belongs to its own block or to one before. Messages are on their way until the
+        # first block that needs ghosts.
+        for block in range(n_blocks + 1):
+            if waiting and block == min(bars.meeting, n_blocks):
+                while moved < n_blocks:
+                    move_block(moved, shared, f, padded, bars, base)
+                    moved += 1
+                for i in range(n, len(x)):
+                    f[i, 0] = f[i, 1] = f[i, 2] = 0.0
+                lost = finish_positions(messages, x, before, True)
+                if lost != 0:
+                    break
+                broke = 0
+                if padded:
+                    split_block(n, len(x), x, planes, pulls, base)
+                    groups = (bars.columns.counted, len(bars.columns.heads))
+                    at, short, _ = pull_padded(x, bars, base, *groups, aside, False)
+                else:
+                    groups = (bars.data.sweep.counted, len(bars.data.sweep.diagonal))
+                    at, short, broke = pull(x, bars, *groups, f, aside)
+                failed = at if at >= 0 else failed
+                shortened = shortened or short
+                changed += broke
+                waiting = False
+            if block == n_blocks:
+                break
+            while moved < min(block + 1 + reach, n_blocks):
+                if padded and not several and room_for < NODE_BLOCK * (moved + 1) - base:
+                    live = NODE_BLOCK * block
+                    slide_planes(planes, live - base, NODE_BLOCK * moved - live)
+                    slide_planes(pulls, live - base, NODE_BLOCK * moved - live)
+                    base = live
+                move_block(moved, shared, f, padded, bars, base)
+                moved += 1
+            start = NODE_BLOCK * block if brief else 0
+            if padded:
+                if block < len(parts) - 1:
+                    at, short, _ = pull_padded(x, bars, base, parts[block], parts[block + 1], work, ending)
+                    failed = at if failed < 0 else failed
+                    shortened = shortened or short
+                join_block(block, n, pulls, base, forces, start)
+            elif block < len(chunks) - 1:
+                at, short, broke = pull(x, bars, chunks[block], chunks[block + 1], f, work)
+                failed = at if failed < 0 else failed
+                shortened = shortened or short
+                changed += broke
+            first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
+            if linked:
+                ready = finished
+                finished, pressing, more = pass_block(
+                    block, (finished, pressing), rows, alone, nodes, shared, (f, u, contact)
+                )
+                altered += more
+                for over in range(ready, finished if ending else ready):
+                    end = min(NODE_BLOCK * (over + 1), n)
+                    end_block(over, alone[over], last_one, nodes, shared, state, f[NODE_BLOCK * over : end])
+                    probe_block(over, probes, shared, values)
+                    if pressing > 0:
+                        end_rows(over, shared, contact)
+                continue
+            if plain:
+                advance_block(block, nodes, shared, forces, start)
+            else:
+                free, here = speeds[: 3 * (last - first)], increments[: 3 * (last - first)]
+                solve_block(block, nodes, shared, forces, start, free, here)
+                found = find_pressed(block, walls, free) if n_walls > 0 else 0
+                if found > 0:
+                    counts, out = (found, count_near), (contact, pressed)
+                    at = press_block(block, counts, nodes, walls, shared, (free, here), out)
+                    infeasible = at if infeasible < 0 else infeasible
+                    count_near += found
+                finish_block(block, nodes, shared, forces, start, contact, here)
+                alone[block] = not (damped or on_walls[block] or found > 0)
+                if not alone[block]:
+                    copy(here, u[first:last].reshape(-1))
+            if ending:
+                end_block(block, alone[block], last_one, nodes, shared, state, forces[first - start : last - start])
+                probe_block(block, probes, shared, values)
+        if n_walls > 0:
+            mark_blocks(on_walls, touched, False)
+            mark_blocks(on_walls, met, False)
+            near = pressed.nodes[:count_near]
+            if count_near > 0 or len(touched) > 0:
+                more, touched = compare_contacts(
+                    walls.touched.touching, touched, near, pressed.touching, walls.present, walls.releases
+                )
+                changes += more
+        if lost != 0:
+            break
+        impact = 0.0
+        if len(near) > 0:
+            for i in near:
+                centre(u[i], eta, half[i], v[i])
+            clear_sums(lanes[CONTACT], n)
+            add_sparse_powers(near, contact, v, lanes[CONTACT])
+        if len(touched) > 0 or len(met) > 0:
+            impact, met = stop_at_walls(nodes, walls, shared, state, u, touched, met)
+        if altered > 0:
+            impact += finish_rows(rows, altered, walls.touched.slack, nodes, shared, state, u)
+        sum_rows(rows, pressing)
+        touching = len(near) + 2 * pressing
+        after[:] = powers
+        sum_balance(lanes, n, h, Acting(supported, loaded, touching > 0, damped), totals, after)
+        push_particles(totals, pressed.force, rows.totals, alpha, h, impulses, push_u)
+        ledger[_IMPACT] += impact
+        for k in range(n_walls):
+            flags[step, k] = pressed.contacts[k] > 0
+        done += 1
+        wrong = failed >= 0 or infeasible >= 0 or changed > 0 or not np.isfinite(after[INTERNAL])
+        if shortened or wrong or last_one:
+            turned = -1
+            if brief:
+                pull_again(x, n, bars, f, aside)
+            if not last_one:  # the state does not have the end of this step yet
+                clear_ends(lanes, n)
+                for block in range(n_blocks):
+                    first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
+                    end_block(block, alone[block], True, nodes, shared, state, f[first:last])
+                    probe_block(block, probes, shared, values)
+                    if pressing > 0:
+                        end_rows(block, shared, contact)
+            start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
+            if failed < 0 and shortened:
+                turned = first_inverted(x, before, bars.data.ends, bars.watched)
+            wrong = wrong or turned >= 0
+        if ending or wrong:
+            if padded and not ending:
+                clear_energies(work, places)  # a failure, whose energies nothing reads
+            end_at_walls(near, shared, contact, u, v)
+            sum_ends(lanes, n, h, *sums)
+            energies[:] = 0.0
+            sum_energies(work, places, energies)
+            centre(push_u.reshape(-1), eta, impulses.half.reshape(-1), impulses.v.reshape(-1))
+            accelerations(push_u.reshape(-1), alpha, impulses.a.reshape(-1))
+            record_sums(row, ledger, powers, sums, totals, impulses.v, energies)
+            row[_PRESSING] = touching
+            record_contact(row, pressed, walls, rows, impulses.v)
+            probe_forces(probes, support, contact, touching, values)
+            if n_walls > 0:
+                row[_CHANGES] = changes
+            if due[step]:
+                changes = 0
+            recorded += 1
+        powers[:] = after
+        if wrong and not several:
+            break
+    return Made(
+        done,
+        recorded,
+        lost,
+        changed,
+        failed,
+        turned,
+        infeasible,
+        pressed.offsets,
+        pressed.force,
+        pressed.contacts,
+        pressed.moment,
+        near.copy(),
+        pressed.touching[: len(near)].copy(),
+        pressed.places[: len(near)].copy(),
+        touched,
+        met,
+        touching,
+        changes,
+    )

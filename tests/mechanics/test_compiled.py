@@ -13,12 +13,11 @@ import pytest
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.mechanics.compiled import Compilation, _variant, code_digest
-from pfem_petsc.mechanics.elements import MEASURES, batch_parts, make_loops
+from pfem_petsc.mechanics.elements import MEASURES, batch_pulls, make_loops
 from pfem_petsc.mechanics.materials import elastic, elastoplastic
 from pfem_petsc.mechanics.materials.base import LAWS, damped, softened
 from pfem_petsc.mechanics.rupture import breakable
 from pfem_petsc.registry import choices, lookup
-from pfem_petsc.stepping.batch_loop import make_batch_loop
 
 MODULE = """
 from pfem_petsc.mechanics.compiled import kernel
@@ -142,15 +141,13 @@ def test_every_process_finds_the_machine_code_of_another():
 
 
 @pytest.mark.slow
-def test_every_process_finds_the_fused_loop_of_another():
+def test_every_process_finds_the_loop_of_batches_of_another():
     """Keys of loops that are made of other loops are the same in all processes: a start must not compile them anew."""
     program = (
-        "from pfem_petsc.mechanics.elements import batch_parts, make_loops\n"
+        "from pfem_petsc.mechanics.elements import batch_pulls\n"
         "from pfem_petsc.mechanics.materials.elastic import LAW\n"
         "from pfem_petsc.mechanics.elements import engineering\n"
-        "from pfem_petsc.stepping.batch_loop import make_batch_loop\n"
-        "loops = make_loops(LAW, engineering)\n"
-        "loop = make_batch_loop(batch_parts(loops))\n"
+        "loop = batch_pulls(LAW, engineering, 1).padded\n"
         "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
     )
     keys = set()
@@ -170,8 +167,7 @@ def test_loops_of_all_laws_have_names_of_their_own():
             for measure in MEASURES.values():
                 loops = make_loops(variant, measure)
                 names.append(_variant(loops.forces.py_func))
-                fused = make_batch_loop(batch_parts(loops))
-                longest = fused._cache._cache_file._data_path("x")
+                longest = batch_pulls(variant, measure, 1).padded._cache._cache_file._data_path("x")
                 assert len(Path(longest).name) < 220
     assert len(names) > 40 and len(set(names)) == len(names)
 
@@ -244,8 +240,8 @@ def test_functions_of_one_name_have_the_same_code():
     for law in (elastic.LAW, elastoplastic.LAW, softened(elastic.LAW), softened(elastoplastic.LAW)):
         for measure in MEASURES.values():
             loops = make_loops(law, measure)
-            made = [value for value in vars(loops).values() if not isinstance(value, int)]
-            for loop in (*made, make_batch_loop(batch_parts(loops))):
+            made = [value for value in vars(loops).values() if callable(value)]
+            for loop in (*made, *vars(batch_pulls(law, measure, 1)).values()):
                 closures(loop, found)
     digests = {}
     for function in found:

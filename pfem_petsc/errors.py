@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ __all__ = [
     "SimulationFailure",
     "numpy_is_too_new",
     "printable",
+    "raised",
     "written",
 ]
 
@@ -33,6 +35,12 @@ def numpy_is_too_new(error: BaseException) -> bool:
     return isinstance(error, ValueError | ImportError) and (
         "numpy.dtype size changed" in text or "compiled using NumPy 1" in text
     )
+
+
+def raised(error: BaseException) -> str:
+    """Return what a function of a user raised, and where: ``raised ValueError: no such node (my.py, line 7)``."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"raised {type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
 
 
 class PfemError(Exception):

@@ -204,7 +204,8 @@ class Simulation(WithEquations):
 
         It receives the finished :class:`Step`, and may read :attr:`state` and call collective functions; its result is
         ignored. With a large ``every``, :meth:`run` still makes the steps in between in batches. Functions are called
-        in the order of registration.
+        in the order of registration. What one raises ends the run: if only some ranks raise, all of them get a
+        :class:`~pfem_petsc.errors.SimulationFailure` that names the exception.
 
         Raises
         ------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from ..case.files import Forces, read_forces
 from ..case.tables import LoadFile
-from ..errors import InputError
+from ..errors import InputError, raised
 from ..parallel.agreement import on_root
 from ..registry import nearest
 from .bars import bar_shapes
@@ -160,9 +159,8 @@ class FunctionForce:
         rank is left alone."""
         try:
             force = np.asarray(self.function(time, state), dtype=np.float64)
-        except Exception as error:  # noqa: BLE001 - of a user; the other ranks would wait
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            self.failure = f"raised {type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
+        except BaseException as error:  # noqa: BLE001 - of a user; the other ranks would wait
+            self.failure = raised(error)
             return
         if force.shape != self._shape:
             self.failure = (

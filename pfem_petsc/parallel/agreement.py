@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+import numpy as np
 from mpi4py import MPI
 
-from ..errors import PfemError
+from ..errors import PfemError, SimulationFailure, raised
 
-__all__ = ["agreed", "on_root"]
+__all__ = ["agreed", "agreed_call", "on_root"]
 
 T = TypeVar("T")
 
@@ -28,6 +29,31 @@ def agreed(comm: MPI.Comm) -> Iterator[None]:
         error = caught
     first = comm.allreduce(comm.rank if error is not None else comm.size, op=MPI.MIN)
     if first < comm.size:
+        raise comm.bcast(error, root=first)
+
+
+@contextmanager
+def agreed_call(comm: MPI.Comm, what: str) -> Iterator[None]:
+    """Context in which all ranks call a function of a user; whatever it raises on some ranks ends the call on all.
+
+    If all ranks raise, each raises its own exception. Otherwise all raise that of the lowest rank that has one, a
+    :class:`PfemError` as it is, and others as a :class:`SimulationFailure` about ``what``. Collective; the function may
+    communicate, but then must not raise an exception while others wait for its rank.
+    """
+    error: BaseException | None = None
+    try:
+        yield
+    except BaseException as caught:  # noqa: BLE001 - of a user; the other ranks would wait
+        error = caught
+    outcome = np.array([comm.size if error is None else comm.rank, error is not None])
+    comm.Allreduce(MPI.IN_PLACE, outcome, op=MPI.MIN)
+    first, everywhere = outcome.tolist()
+    if everywhere:
+        raise error
+    if first < comm.size:
+        if error is not None and not isinstance(error, PfemError):
+            failure = SimulationFailure(f"{what}: the function {raised(error)} on rank {comm.rank}")
+            failure.__cause__, error = error, failure
         raise comm.bcast(error, root=first)
 
 

@@ -21,7 +21,7 @@ from ..output.progress import Progress, Span
 from ..output.result import RESULT_NAME
 from ..output.units import MODE
 from ..output.vtkhdf import ResultWriter
-from ..parallel.agreement import on_root
+from ..parallel.agreement import agreed_call, on_root
 from ..preflight.checks import warnings_before
 from ..preflight.forecast import summarise
 from ..restart.checkpoints import Restart, prepare_folder
@@ -403,7 +403,8 @@ class Outputs:
         self.progress.update(step, made.time, size, made.newton, made.linear, contacts, history.drift)
         for function, every in self._callbacks:
             if step % every == 0:
-                function(made)
+                with agreed_call(self._stages.comm, f"step {step}: on_step"):
+                    function(made)
         return made
 
     def steps_left(self, step: int) -> int:

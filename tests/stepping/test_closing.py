@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.errors import InputError
+from pfem_petsc.errors import InputError, SimulationFailure
 
 
 def simulate(comm, folder, *overrides, **options):
@@ -78,3 +78,27 @@ def test_functions_after_steps(comm, shared_tmp_path):
         for _ in simulation.batches():
             pass
     assert calls == [("b", 7, 7), ("b", 14, 14), ("a", 14, 14)]
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("error", [ValueError("no node"), KeyboardInterrupt("no node"), SimulationFailure("no node")])
+@pytest.mark.parametrize("everywhere", [False, True])
+def test_exception_of_a_function_after_steps(comm, shared_tmp_path, error, everywhere):
+    """All ranks end; those without an exception are told of it."""
+
+    def fail(step):
+        if everywhere or comm.rank == comm.size - 1:
+            raise error
+
+    own = everywhere or comm.size == 1 or isinstance(error, SimulationFailure)
+    told = rf"step 5: on_step: .*{type(error).__name__}: no node .*, line \d+.* on rank {comm.size - 1}"
+    text = "no node" if own else told
+    with pytest.raises(type(error) if own else SimulationFailure, match=text), simulate(comm, shared_tmp_path) as one:
+        one.on_step(fail, every=5)
+        one.run()
+    del one
+    comm.Barrier()
+    assert everywhere or not (shared_tmp_path / "out.lock").exists()
+    if comm.rank == 0:
+        with open_result(shared_tmp_path / "out") as result:
+            assert everywhere or result.history["step"][-1] == 5

@@ -33,12 +33,12 @@ def agreed(comm: MPI.Comm) -> Iterator[None]:
 
 
 @contextmanager
-def agreed_call(comm: MPI.Comm, what: str) -> Iterator[None]:
-    """Context in which all ranks call a function of a user; whatever it raises on some ranks ends the call on all.
+def agreed_call(comm: MPI.Comm, step: int) -> Iterator[None]:
+    """Context in which all ranks call a function of a user after a step; what it raises on some ranks, all ranks raise.
 
-    If all ranks raise, each raises its own exception. Otherwise all raise that of the lowest rank that has one, a
-    :class:`PfemError` as it is, and others as a :class:`SimulationFailure` about ``what``. Collective; the function may
-    communicate, but then must not raise an exception while others wait for its rank.
+    If all ranks raise, each raises its own exception. Otherwise all raise that of the lowest rank that has one: a
+    :class:`PfemError` as it is, any other as a :class:`SimulationFailure`. Collective; a function that communicates
+    must not raise while others wait for its rank.
     """
     error: BaseException | None = None
     try:
@@ -52,7 +52,7 @@ def agreed_call(comm: MPI.Comm, what: str) -> Iterator[None]:
         raise error
     if first < comm.size:
         if error is not None and not isinstance(error, PfemError):
-            failure = SimulationFailure(f"{what}: the function {raised(error)} on rank {comm.rank}")
+            failure = SimulationFailure(f"step {step}: on_step: the function {raised(error)} on rank {comm.rank}")
             failure.__cause__, error = error, failure
         raise comm.bcast(error, root=first)
 

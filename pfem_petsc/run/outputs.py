@@ -403,7 +403,7 @@ class Outputs:
         self.progress.update(step, made.time, size, made.newton, made.linear, contacts, history.drift)
         for function, every in self._callbacks:
             if step % every == 0:
-                with agreed_call(self._stages.comm, f"step {step}: on_step"):
+                with agreed_call(self._stages.comm, step):
                     function(made)
         return made
 

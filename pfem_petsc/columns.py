@@ -134,7 +134,7 @@ OF_WALLS = (
     Column("contact_time", "s", stages=LASTING),
     Column("releases", kind=np.int64, stages=SUMMED),
 )
-MOTION = (Column("position", "m", 3), Column("velocity", "m/s", 3))
+MOTION = (Column("position", "m", 3, stages=LASTING), Column("velocity", "m/s", 3))
 """Of walls that move."""
 OF_PAIRS = tuple(column for column in OF_WALLS if column.name in ("force", "impulse", "jump_impulse"))
 PROBED = (*MOTION, Column("acceleration", "m/s²", 3), Column("reaction", "N", 3))

@@ -72,7 +72,7 @@ def describe(result: Result) -> list[str]:
         lines += _energies(history)
     broken = history["broken_bars"] if len(time) and "broken_bars" in names else [0]
     if broken[-1]:
-        first = axis.place(float(time[(broken > 0).argmax()]))
+        first = result.place(float(time[(broken > 0).argmax()]))
         lines.append(f"{int(broken[-1]):,} of {result.n_bars:,} bars broke, the first at {first}")
     return lines
 

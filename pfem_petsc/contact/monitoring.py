@@ -159,7 +159,7 @@ class Piercing:
     Attributes
     ----------
     walls : indices of the walls that are checked
-    first : wall to the time [s] of the first snapshot with a bar across it
+    first : wall to the step and time of the first snapshot with a bar across it, as texts
     seen : wall to the number of snapshots with bars across it
     looks : number of snapshots checked
     """
@@ -167,7 +167,7 @@ class Piercing:
     def __init__(self, model: Model) -> None:
         self._model = model
         self.walls = small_walls(model.contact.walls)
-        self.first: dict[int, float] = {}
+        self.first: dict[int, str] = {}
         self.seen = dict.fromkeys(self.walls, 0)
         self.looks = 0
         if not self.walls:
@@ -179,8 +179,11 @@ class Piercing:
         self._bars = mesh.bars[mesh.counted]
         self._applicable = (members[self._bars[:, 0]] > 0.0) & (members[self._bars[:, 1]] > 0.0)
 
-    def look(self, x: np.ndarray, time: float) -> list[str]:
-        """Return new messages about bars at positions (local, 3), ghosts included. Collective."""
+    def look(self, x: np.ndarray, time: float, at: str) -> list[str]:
+        """Return new messages about bars at positions (local, 3), ghosts included. Collective.
+
+        ``time`` is that of the stage [s], ``at`` the step and the time for messages.
+        """
         if not self.walls:
             return []
         self.looks += 1
@@ -194,10 +197,10 @@ class Piercing:
         for count, bar, k in zip(counts.tolist(), lowest.tolist(), self.walls, strict=True):
             self.seen[k] += count > 0
             if count and k not in self.first:
-                self.first[k] = time = self._model.origin + time
+                self.first[k] = at
                 bars = f"bar {bar} intersects" if count == 1 else f"{count} bars, including bar {bar}, intersect"
                 told.append(
-                    f"t = {time:.6g} s: {bars} wall {self._model.contact.names[k]!r}: only nodes touch walls; "
+                    f"{at}: {bars} wall {self._model.contact.names[k]!r}: only nodes touch walls; "
                     "use shorter bars or a larger wall"
                 )
         return told
@@ -218,8 +221,8 @@ class Piercing:
         """Return messages for the end of the run."""
         names = self._model.contact.names
         return [
-            f"bars intersected wall {names[k]!r} in {self.seen[k]} of {self.looks} snapshots, first at t = "
-            f"{self.first[k]:.6g} s: only nodes touch walls"
+            f"bars intersected wall {names[k]!r} in {self.seen[k]} of {self.looks} snapshots, first at "
+            f"{self.first[k]}: only nodes touch walls"
             for k in self.walls
             if k in self.first
         ]

@@ -105,6 +105,11 @@ class Progress:
     log_path : file of the log, None for no log; one that cannot be opened is an
         :class:`~pfem_petsc.errors.InputError` on all ranks (the constructor is collective)
     stream, clock : stdout and the wall clock [s], replaceable in tests
+
+    Attributes
+    ----------
+    axis : of the times of the current stage
+    warnings : texts of the warnings so far
     """
 
     def __init__(
@@ -118,7 +123,7 @@ class Progress:
         clock: Callable[[], float] = perf_counter,
     ) -> None:
         self._root = comm.rank == 0
-        self._title, self._span, self._clock = title, span, clock
+        self._title, self._span, self._clock, self.axis = title, span, clock, span.axis
         self._stream = None if quiet else (stream or sys.stdout)
         self._log: LogFile | None = None
         with agreed(comm):
@@ -126,6 +131,7 @@ class Progress:
                 self._log = LogFile(log_path)
         self._begin = clock()
         self._newton = self._linear = 0
+        self.warnings: list[str] = []
         self._last = (span.first_step, span.start, 0.0, 0, None)
         self._marked = (self._begin, span.first_step, 0, 0, span.start)  # state at the last line, for rates and means
         self._interval = FIRST_LINE
@@ -192,6 +198,7 @@ class Progress:
         """Log a warning and print it on stderr (above the bar, if there is one), even if quiet."""
         if not self._root:
             return
+        self.warnings.append(text)
         self._log_line(text, "WARNING")
         with contextlib.suppress(OSError):  # it is in the log
             self._show(f"warning: {text}", sys.stderr, style="yellow")
@@ -216,7 +223,7 @@ class Progress:
             text += f", including {duration(self._compiling)} for compiling"
         if steps and wall > self._compiling:
             text += f" ({_speed(steps / (wall - self._compiling))})"
-        text += f", {self._span.axis.place(time)}"
+        text += f", {self.axis.place(time)}"
         if self._newton:
             text += f", {self._newton:,} Newton and {self._linear:,} linear iterations"
         self._write(text)
@@ -249,7 +256,7 @@ class Progress:
             return
         step, time, _, contacts, _ = self._last
         total = f"/{self._span.steps}" if self._span.steps is not None else ""
-        text = f"{step}{total}  {self._span.axis.place(time)}" + (f"  contacts {contacts:,}" if contacts else "")
+        text = f"{step}{total}  {self.axis.place(time)}" + (f"  contacts {contacts:,}" if contacts else "")
         try:
             self._bar.update(self._bar.task_ids[0], completed=self._done(), state=text)
             self._bar.refresh()
@@ -260,7 +267,7 @@ class Progress:
         """Return the state, means and rates since the last line, and the remaining wall time."""
         step, time, dt, contacts, drift = self._last
         begin, before, newton, linear, start = self._marked
-        n_steps, axis, wall, made = self._span.steps, self._span.axis, now - begin, step - before
+        n_steps, axis, wall, made = self._span.steps, self.axis, now - begin, step - before
         width = len(str(n_steps)) if n_steps is not None else 8
         total = f"/{n_steps}" if n_steps is not None else ""
         parts = [f"step {step:>{width}}{total} {100 * self._done():3.0f} %", axis.place(time)]

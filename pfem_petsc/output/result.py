@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,7 +27,7 @@ from .layout import (
     read_attributes,
 )
 from .table import Table, flat_columns
-from .units import AXES, TIME, Axis
+from .units import AXES, LOAD_FACTOR, TIME, Axis
 
 if TYPE_CHECKING:
     import pyvista
@@ -44,11 +45,6 @@ class History(Mapping[str, np.ndarray]):
         self.n_rows = n_rows
         self._result, self._columns, self._prefix = result, columns, prefix
         self._names = [name.removeprefix(prefix) for name in columns if name.startswith(prefix)]
-
-    @property
-    def axis(self) -> Axis:
-        """What the times of its rows are."""
-        return self._result.axis
 
     def __getitem__(self, name: str) -> Any:
         if name in self._names:
@@ -211,8 +207,36 @@ class Result:
 
     @property
     def axis(self) -> Axis:
-        """What its times are: time, load factor, or points of a path."""
-        return AXES[self.attributes.get("axis", TIME.symbol)]
+        """What its times are: time, load factor, or points of a path; with static stages, time and load factors."""
+        axis = AXES[self.attributes.get("axis", TIME.symbol)]
+        return axis._replace(staged=True) if any(self._static_stages) else axis
+
+    @property
+    def _static_stages(self) -> list[bool]:
+        """Whether each stage is static; empty without stages."""
+        return ["static" in stage for stage in tomllib.loads(self.case_text).get("stage", [])]
+
+    @property
+    def stretches(self) -> list[slice]:
+        """The rows of the history that are of motion, those that follow each other together; none of static analyses.
+
+        Only in these are times those of a clock, which spectra and filters need.
+        """
+        static = self._static_stages
+        if not any(static):
+            return [slice(0, self._n_rows)] if self.axis is TIME else []
+        moving = np.concatenate([[False], ~np.array(static)[self.history["stage"]], [False]])
+        ends = np.flatnonzero(np.diff(moving)).reshape(-1, 2)
+        return [slice(first, end) for first, end in ends.tolist()]
+
+    def place(self, time: float) -> str:
+        """Text of one of its times: ``t = 1.000 s``, in static analyses and stages ``load factor 0.25``."""
+        static = self._static_stages
+        if any(static):
+            row = min(int(np.searchsorted(self.history["time"], time)), self._n_rows - 1)
+            if static[self.history["stage"][row]]:
+                return LOAD_FACTOR.place(float(self.history["load_factor"][row]))
+        return self.axis.place(time)
 
     @property
     def history(self) -> History:

@@ -40,28 +40,41 @@ class Axis(NamedTuple):
     ----------
     symbol, unit : of a place on the axis, ``t = 1.000 s``; the unit is empty for pure numbers
     key : of the case file that says where it ends
+    start : where places are counted from, as load factors are from the start of their stage
+    staged : whether it has static stages, whose load factors are added to the times of the others
     """
 
     symbol: str
     unit: str
     key: str
+    start: float = 0.0
+    staged: bool = False
 
     def place(self, value: float, digits: int = 4) -> str:
         """Text of a place."""
+        value = value - self.start
         return f"{self.symbol} = {engineering(value, self.unit, digits)}" if self.unit else f"{self.symbol} {value:.6g}"
+
+    def scale(self, largest: float) -> tuple[float, str]:
+        """Return factor and unit of numbers up to the largest; those that are load factors too have no prefix."""
+        return (1.0, self.unit) if self.staged else prefix_for(largest, self.unit)
 
     def span(self, first: float, last: float) -> str:
         """Text of a part of the axis."""
+        if self.staged:
+            return f"{first:.6g} to {last:.6g} ({self.label(self.unit)})"
         if self.unit:
             return f"{engineering(first, self.unit)} to {engineering(last, self.unit)}"
         return f"{self.symbol} {first:.6g} to {last:.6g}"
 
     def label(self, unit: str) -> str:
-        """Label of an axis whose numbers are in a unit that :func:`prefix_for` gave."""
-        return f"{'time' if self.symbol == 't' else self.symbol} [{unit}]" if unit else self.symbol
+        """Label of an axis whose numbers are in a unit that :meth:`scale` gave."""
+        label = f"{'time' if self.symbol == 't' else self.symbol} [{unit}]" if unit else self.symbol
+        return f"{label}, in static stages load factor" if self.staged else label
 
     def exact(self, value: float) -> str:
-        """The same with a plain number, for messages."""
+        """The same as :meth:`place` with a plain number, for messages."""
+        value = value - self.start
         return f"{self.symbol} = {value:.6g} {self.unit}" if self.unit else f"{self.symbol} {value:.6g}"
 
 

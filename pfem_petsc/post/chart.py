@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import InputError, written
-from ..output.units import TIME, Axis, common_prefix, prefix_for
+from ..output.units import TIME, Axis, common_prefix
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6b7280", "#000000")
 """For colour-blind eyes (Okabe and Ito 2008), without their yellow, which is too pale for lines on white."""
@@ -252,7 +252,7 @@ class Chart:
     def _draw(self, axes: Any, panel: Panel, lowest: bool) -> None:
         """Draw a panel; only the lowest one of a column has a label of the common axis."""
         if panel.over is None:
-            along, places = prefix_for(largest(self.time), self._axis.unit), self._axis.label(self._axis.unit)
+            along, places = self._axis.scale(largest(self.time)), self._axis.label(self._axis.unit)
             label = self._axis.label(along[1])
         else:
             name, unit = panel.over

@@ -79,6 +79,18 @@ def _position(name: str) -> str:
     return name.removesuffix(_DISPLACEMENT) + ("/position" if name.startswith("probe/") else "")
 
 
+def smoothed(result: Any, chosen: Filter, values: np.ndarray, touch: bool = False) -> np.ndarray:
+    """Return values (rows,) of a history after a filter of each stretch of motion; those of static stages are kept.
+
+    ``touch``: whether the quantity is zero before the run, as contact forces are.
+    """
+    time, made = read(result.history, "time"), np.array(values, dtype=float)
+    for rows in result.stretches:
+        zero_before = touch and (rows.start == 0 or made[rows.start - 1] == 0.0)
+        made[rows] = chosen.apply(time[rows], made[rows], zero_before)
+    return made
+
+
 def exact_curves(exact: ClosedForm | None, names: Sequence[str], place: np.ndarray | None = None) -> list[Curve]:
     """Return the closed forms of curves of :func:`column`, where they are known."""
     curves: list[Curve] = []
@@ -106,7 +118,7 @@ def usual_curves(results: Sequence[Any]) -> list[str]:
                 [moved] if any(np.any(np.concatenate([*column(r.history, moved).values()])) for r in results) else []
             )
     # over load factors, the load factor is a straight line; it is a curve over the points of a path
-    paths = "load_factor" in common and results[0].axis is not TIME
+    paths = "load_factor" in common and results[0].axis.symbol != TIME.symbol
     chosen += ["load_factor"] if paths and not all(_is_axis(r.history, "load_factor") for r in results) else []
     if not chosen:
         raise InputError("plot: the results have no columns in common that change; name some as curves")
@@ -137,7 +149,7 @@ def draw_curves(
     first, labels = results[0], labels_of(results)
     if not names:
         raise InputError("plot: no curves named; columns: " + ", ".join(first.history))
-    if len({result.axis for result in results}) > 1 and against is None:
+    if len({result.axis.symbol for result in results}) > 1 and against is None:
         raise InputError("plot: the results are over different axes: " + ", ".join({r.axis.symbol for r in results}))
     exact = closed_form(first) if closed_forms and against is None else None
     times = [read(result.history, "time") for result in results]
@@ -149,10 +161,10 @@ def draw_curves(
         found = [column(result.history, name) for result in results]
         parts = list(dict.fromkeys(part for curves in found for part in curves))
         curves = []
-        for number, (each, label, time, place) in enumerate(zip(found, labels, times, places, strict=True)):
+        for number, (each, label, result, place) in enumerate(zip(found, labels, results, places, strict=True)):
             for part, values in each.items():
                 touch = part.startswith(("wall/", "pair/", "constraint/")) and "/force" in part  # zero before the run
-                shown = chosen.apply(time, values, touch) if chosen is not None else values
+                shown = smoothed(result, chosen, values, touch) if chosen is not None else values
                 k = number * len(parts) + parts.index(part)
                 style = {"color": COLOURS[k % len(COLOURS)], "linestyle": DASHES[number % len(DASHES)]}
                 words_of = (label if len(found) > 1 else "", part if len(parts) > 1 else "")
@@ -166,7 +178,8 @@ def draw_curves(
         panels.append(
             Panel(words(name.rsplit("/", 1)[-1]), unit_of_curve(name), curves, title, 0.9, over, None, legend)
         )
-    return Chart(panels, first.case.title or first.case.name, np.concatenate(times), first.axis)
+    axis = max((result.axis for result in results), key=lambda axis: axis.staged)
+    return Chart(panels, first.case.title or first.case.name, np.concatenate(times), axis)
 
 
 def unit_of_curve(name: str) -> str:
@@ -201,7 +214,7 @@ def draw_spectra(
 
     Parameters
     ----------
-    results : open results of runs over time
+    results : open results of runs over time; with static stages, the longest part without them is taken
     names : columns, or components of them
     window : see :func:`~pfem_petsc.post.filters.amplitude_spectrum`
     highest : frequency at which the picture ends [Hz]; None: half the sampling rate
@@ -212,7 +225,7 @@ def draw_spectra(
     if highest is not None and not highest > 0.0:
         raise InputError(f"plot: highest frequency = {highest:g} Hz must be positive")
     for result in results:
-        if result.axis is not TIME:
+        if not result.stretches:
             raise InputError(f"{result.path}: spectra need a run over time, not a static analysis")
     panels = []
     for name in names:
@@ -221,7 +234,9 @@ def draw_spectra(
         for label, result in zip(labels_of(results), results, strict=True):
             for part, values in column(result.history, name).items():
                 key = f"{part}: {label}" if len(results) > 1 else part
-                frequency, amplitude = amplitude_spectrum(read(result.history, "time"), values, window)
+                rows = _longest(result)
+                time = read(result.history, "time")[rows]
+                frequency, amplitude = amplitude_spectrum(time, values[rows], window)
                 curves.append(Curve(key, amplitude, place=frequency))
         label = f"amplitude of\n{words(name.rsplit('/', 1)[-1])}"
         legend = "beside" if len(curves) > 1 else "none"
@@ -245,6 +260,12 @@ def draw_spectra(
             if 0.0 < value <= end:
                 axes.axvline(value * factor, color="#6b7280", linewidth=0.8, linestyle=":", zorder=0)
     return chart
+
+
+def _longest(result: Any) -> slice:
+    """Return the rows of the longest stretch of motion."""
+    time = read(result.history, "time")
+    return max(result.stretches, key=lambda rows: float(np.ptp(time[rows])))
 
 
 def _natural(result: Any) -> np.ndarray:

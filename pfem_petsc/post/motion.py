@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..fields import STATUS
 from ..mechanics.bars import area_fields, bar_shapes, named_groups, section_of_bars
 from ..mesh import load_slab
-from ..output.units import MODE, Axis, prefix_for
+from ..output.units import MODE, Axis
 from ..registry import choices, lookup, nearest
 from .camera import Camera
 from .colours import GHOST, MARKS, TRAILS
@@ -89,7 +89,7 @@ class Motion:
         self.surfaces = self._moved(walls)
         self.normals = [wall.normal / np.linalg.norm(wall.normal) for wall in walls if hasattr(wall, "normal")]
         every = np.asarray(result.times, dtype=float)
-        self.time_factor, self.time_unit = prefix_for(float(np.abs(every).max()), result.axis.unit)
+        self.time_factor, self.time_unit = result.axis.scale(float(np.abs(every).max()))
         self._decimals = _decimals(self.time_factor * every)
 
     def _check_marks(self) -> None:
@@ -177,6 +177,8 @@ class Motion:
         if hasattr(self.result, "caption"):
             return self.result.caption(frame)
         axis, time = self.result.axis, self.result.times[frame]
+        if axis.staged:
+            return self.result.place(time)
         if not axis.unit:
             return axis.place(time)
         return f"{axis.symbol} = {time * self.time_factor:.{self._decimals}f} {self.time_unit}"

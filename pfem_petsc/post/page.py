@@ -284,7 +284,7 @@ class Inset:
         curves = [(np.asarray(r.history["time"], dtype=float), history_curve(r.history, name)) for r in results]
         factor, unit = prefix_for(max(largest(values) for _, values in curves), unit_of(name.partition(".")[0]))
         axis = results[shown].axis
-        time_factor, time_unit = prefix_for(max(largest(times) for times, _ in curves), axis.unit)
+        time_factor, time_unit = axis.scale(max(largest(times) for times, _ in curves))
         scale = size[1] / 180.0
         with rc_context({**STYLE, "font.size": 9.0 * scale, "lines.linewidth": 1.3 * scale}), boxes_allowed():
             figure = _figure(size, 0.88, layout="constrained")

@@ -12,11 +12,11 @@ import numpy as np
 
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.units import TIME, engineering, unit_of
+from ..output.units import engineering, unit_of
 from .chart import COLOURS, REFERENCE, STYLE, Chart, Curve, Panel, largest, opened
 from .closed_forms import ClosedForm, closed_form
-from .curves import History, column, draw_curves, draw_spectra, exact_curves, read, usual_curves, words
-from .filters import AS_COMPUTED, Filter, make_filter
+from .curves import History, column, draw_curves, draw_spectra, exact_curves, read, smoothed, usual_curves, words
+from .filters import AS_COMPUTED, Filter, make_filter, window_mean
 from .options import PlotOptions
 
 WINDOW = 0.02  # width of the moving average of forces, relative to the run
@@ -66,7 +66,7 @@ def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | Non
                 raise InputError(
                     f"{result.path}: the history is empty: nothing to plot; set [output] history_every >= 1"
                 )
-            if chosen is not None and result.axis is not TIME:
+            if chosen is not None and not result.stretches:
                 raise InputError(
                     f"{result.path}: filter = {given.force_filter!r} needs a run over time, not a static analysis"
                 )
@@ -89,10 +89,10 @@ def _usual(
     """The pictures of a single result."""
     history, title = result.history, result.case.title or result.case.name
     exact = closed_form(result) if closed_forms else None
-    forces = chosen or _usual_filter(history)
+    forces = chosen or _usual_filter(result)
     drawn = {
         "energies": energies(history, exact),
-        "momentum": momentum(history, exact) if result.axis is TIME else [],
+        "momentum": momentum(history, exact) if result.stretches else [],
         "probes": probes(history, exact),
         "walls": force_panels(result, "wall", forces, exact),
         "pairs": force_panels(result, "pair", forces),
@@ -286,7 +286,7 @@ def force_panels(
         values, label = _pressing(read(history, key), normal)
         forms = {AS_COMPUTED: (values, 0.9)}
         if felt:
-            forms.setdefault(smoothing.name, (smoothing.apply(read(history, "time"), values, True), 1.6))
+            forms.setdefault(smoothing.name, (smoothed(result, smoothing, values, True), 1.6))
         for form, (drawn, width) in forms.items():
             curves = [Curve(form, drawn, {"linewidth": width}, f"{key} {label}, {form}")]
             if exact is not None and key in exact.columns:
@@ -311,11 +311,11 @@ def force_displacement(result: Any, smoothing: Filter, exact: ClosedForm | None 
     passed the filter, so that neither is late.
     """
     panels = []
-    if "load_factor" in result.history and result.axis is not TIME:
+    if "load_factor" in result.history and not result.axis.unit:
         panels += _load_paths(result.history, exact)
     for wall in result.case.every_wall:
         if hasattr(wall, "normal") and np.any(result.history.get(f"wall/{wall.name}/force", 0.0)):
-            panels += _wall_path(result.history, wall, smoothing, exact)
+            panels += _wall_path(result, wall, smoothing, exact)
     return panels
 
 
@@ -346,16 +346,17 @@ def _load_paths(history: History, exact: ClosedForm | None) -> list[Panel]:
     return panels
 
 
-def _wall_path(history: History, wall: Any, smoothing: Filter, exact: ClosedForm | None) -> list[Panel]:
+def _wall_path(result: Any, wall: Any, smoothing: Filter, exact: ClosedForm | None) -> list[Panel]:
+    history = result.history
     key, place = f"wall/{wall.name}/force", f"wall/{wall.name}/position"
-    normal, time = np.asarray(wall.normal, dtype=float) / np.linalg.norm(wall.normal), read(history, "time")
+    normal = np.asarray(wall.normal, dtype=float) / np.linalg.norm(wall.normal)
     force, sign, over = read(history, key) @ normal, 1.0, "displacement of the wall since contact"
     if place not in history or not np.any(np.ptp(read(history, place), axis=0) > 0.0):
         place, sign, over = "centre_of_mass", -1.0, "displacement of the centre of mass since contact"
     if place not in history:
         return []
-    moved = smoothing.apply(time, sign * read(history, place) @ normal)
-    smooth = smoothing.apply(time, force, True)
+    moved = smoothed(result, smoothing, sign * read(history, place) @ normal)
+    smooth = smoothed(result, smoothing, force, True)
     shown, begin = _touching(force, smooth)
     values = np.where(_near(force, smooth), smooth, np.nan)[shown]
     curves = [Curve(smoothing.name, values, place=(moved - moved[begin])[shown])]
@@ -381,13 +382,15 @@ def _touching(force: np.ndarray, smooth: np.ndarray) -> tuple[slice, int]:
     return slice(near[0], near[-1] + 1), max(0, int(np.flatnonzero(force)[0]) - 1)
 
 
-def _usual_filter(history: History) -> Filter:
-    time = read(history, "time")
+def _usual_filter(result: Any) -> Filter:
+    times = [read(result.history, "time")[rows] for rows in result.stretches]
+    length = sum(float(time[-1] - time[0]) for time in times)
     # of a window shorter than the interval of the rows, nothing would be left of a spike
-    width = max(WINDOW * float(time[-1] - time[0]), float(np.diff(time).max(initial=0.0)))
-    if getattr(history, "axis", TIME) is not TIME or width <= 0.0:
+    width = max([WINDOW * length, *(float(np.diff(time).max(initial=0.0)) for time in times)])
+    if width <= 0.0:
         return make_filter("none")
-    return make_filter(f"mean:{width!r}")
+    # a short stretch may end within the window
+    return make_filter(f"mean:{width!r}")._replace(apply=lambda *curve: window_mean(*curve[:2], width, *curve[2:]))
 
 
 def _pressing(force: np.ndarray, normal: Sequence[float] | None) -> tuple[np.ndarray, str]:

@@ -312,7 +312,7 @@ def _nothing(text: str) -> None:
 def _timed(results: Sequence[Any], options: Options, note: Callable[[str], None]) -> tuple[list[Any], list[int]]:
     """Return the results at common times, and the numbers of those that are drawn."""
     times = np.asarray(results[0].times, dtype=float)
-    if len({result.axis for result in results}) > 1:
+    if len({result.axis.symbol for result in results}) > 1:
         names = ", ".join(dict.fromkeys(result.axis.symbol for result in results))
         raise InputError(f"render: the results are over different axes ({names}): draw them one by one")
     if any(len(result.times) == 0 for result in results):

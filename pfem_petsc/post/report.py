@@ -18,7 +18,7 @@ from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError, written
 from ..output.layout import EVENT, MODE_VALUES
 from ..output.result import peak_force, touch_impulse
-from ..output.units import engineering, prefix_for
+from ..output.units import engineering
 from .plot import balance_error, plot
 
 NAME = "report.html"
@@ -134,7 +134,9 @@ def _span(result: Any) -> str:
 
 def _place(result: Any, time: float) -> str:
     """Return a time in the unit of the end of the run, so that times of a report can be compared."""
-    factor, unit = prefix_for(float(result.history["time"][-1]), result.axis.unit)
+    if result.axis.staged:
+        return result.place(time)
+    factor, unit = result.axis.scale(float(result.history["time"][-1]))
     return f"{result.axis.symbol} = {time * factor:.4g} {unit}" if unit else result.axis.place(time)
 
 

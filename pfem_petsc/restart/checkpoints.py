@@ -190,9 +190,17 @@ def finished_message(folder: Path, reached: float, plan: Plan) -> str:
     """Return the message about a run whose results have ``reached`` its end [s]."""
     if not plan.end:
         return f"{folder}: finished already: the results have the modes of the initial state"
-    axis = plan.axis
-    beyond = f", beyond {axis.key} = {engineering(plan.end, axis.unit)}" if reached > plan.end * (1.0 + TIME) else ""
-    return f"{folder}: finished already: the results have {axis.place(reached)}{beyond}"
+    beyond = f", {_beyond(plan)}" if reached > plan.end * (1.0 + TIME) else ""
+    return f"{folder}: finished already: the results have {_place(reached, plan)}{beyond}"
+
+
+def _place(reached: float, plan: Plan) -> str:
+    """Text of a time of the results, of cases with stages counted as the key that ends the last one."""
+    return plan.axis.place(reached) + (" of the last stage" if plan.axis.start else "")
+
+
+def _beyond(plan: Plan) -> str:
+    return f"beyond {plan.axis.key} = {engineering(plan.end - plan.axis.start, plan.axis.unit)}"
 
 
 def _continues(folder: Path, path: Path) -> bool:
@@ -217,11 +225,10 @@ def _refuse_loss(path: Path, plan: Plan) -> None:
     if rows or snapshots:
         reached = max([*times[-1:], *result.times[-1:]])
         raise InputError(
-            f"{path}: the results reach {plan.axis.place(reached)}, beyond {plan.axis.key} = "
-            f"{engineering(plan.end, plan.axis.unit)}: continuing from the checkpoint up to there would remove "
-            f"{rows} rows of the history and {snapshots} snapshots; set a later end (--set "
-            f"{plan.axis.key}={reached:.6g} or more), choose another folder (-o), or start without --restart, which "
-            "moves the results aside"
+            f"{path}: the results reach {_place(reached, plan)}, {_beyond(plan)}: continuing from the checkpoint up to "
+            f"there would remove {rows} rows of the history and {snapshots} snapshots; set a later end (--set "
+            f"{plan.axis.key}={reached - plan.axis.start:.6g} or more), choose another folder (-o), or start without "
+            "--restart, which moves the results aside"
         )
 
 

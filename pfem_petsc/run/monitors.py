@@ -11,6 +11,7 @@ import numpy as np
 from ..columns import STORED, SUPPLIED
 from ..contact.monitoring import CrossingBars
 from ..errors import SimulationFailure
+from ..output.units import LOAD_FACTOR, TIME
 
 if TYPE_CHECKING:
     from ..integrators.base import State
@@ -63,7 +64,9 @@ class BlowUp:
             On all ranks, if the energy is not finite, or the energy created exceeds the input several times.
         """
         held = row["kinetic_energy"] + row["elastic_energy"]
-        when = f"step {row['step']}, t = {row['time']:.6g} s"
+        static = not self.inertial and "load_factor" in row
+        place = LOAD_FACTOR.exact(row["load_factor"]) if static else TIME.exact(row["time"])
+        when = f"step {row['step']}, {place}"
         if not np.isfinite(held) and row["step"] == 0:
             raise SimulationFailure(
                 f"{when}: the energy is not finite at the start{self._where(state)}: correct loads, velocities and "

@@ -88,6 +88,7 @@ class History(Observer):
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
         self.ledger = stepper.ledger = Ledger(stepper)
         self.recorder = Recorder(stepper, stages.columns)
+        self.recorder.put(stages.wall_positions)
         stepper.row_every, stepper.probed = self.every, self.recorder.probed
         inertial = stepper.scheme.inertial
         self.blow_up = BlowUp(model, inertial)
@@ -238,15 +239,15 @@ class Snapshots(Observer):
         if not self.every and 0 < state.step < self._stepper.last_step:
             return
         number, place = self._stepper.number, self._stepper.place
+        at = f"step {number}, {self._stepper.axis.exact(place)}"
         held = self._stepper.held_by_contact()
         if held is not None:
-            check_positions(self._stepper.model, *held, f"step {number}, t = {place:.6g} s")
+            check_positions(self._stepper.model, *held, at)
         now = Snapshot(self._stepper.model, state, self._stepper.acceleration)
         self.writer.write_snapshot(place, number, state.position, fields.at("nodes", now), fields.at("bars", now))
         self.last = number
-        for text in self._piercing.look(state.x, state.time):
+        for text in self._piercing.look(state.x, state.time, at):
             self._warn(text)
-        at = f"step {number}, {self._stepper.plan.axis.exact(place)}"
         self._doubts.look(state.x, at, last=state.step >= self._stepper.last_step)
 
     def kept(self) -> dict[str, Any]:

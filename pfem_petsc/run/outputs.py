@@ -19,7 +19,7 @@ from ..output.checkpoint import NAME as CHECKPOINT
 from ..output.layout import MODE_VALUES, Contents, Kept
 from ..output.progress import Progress, Span
 from ..output.result import RESULT_NAME
-from ..output.units import MODE
+from ..output.units import MODE, TIME
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import agreed_call, on_root
 from ..preflight.checks import warnings_before
@@ -269,7 +269,7 @@ class Outputs:
         progress = Progress(
             model.comm,
             printable(case.title),
-            Span(plan.steps, plan.end or 0.0, plan.axis, stepper.number, stepper.place),
+            Span(plan.steps, plan.end or 0.0, stepper.axis, stepper.number, stepper.place),
             self._quiet,
             self._folder / "log.txt",
         )
@@ -284,7 +284,7 @@ class Outputs:
     def _tell_restart(self, restart: Restart) -> None:
         """Report from where the run continues, what has changed, and missing functions. Collective."""
         stepper, functions = self._stepper, self._stages.model.external.functions
-        place = f"step {stepper.number}, {self._stages.plan.axis.place(stepper.place)}"
+        place = f"step {stepper.number}, {stepper.axis.place(stepper.place)}"
         changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
         self.progress.message(f"restart from {restart.path}: {place}{changes}")
         before = int(restart.file.attributes.get("external_functions", 0))
@@ -303,7 +303,7 @@ class Outputs:
             "name": case.name,
             "folder": str(case.folder.resolve()),
             "overrides": list(case.overrides),
-            "axis": plan.axis.symbol,
+            "axis": TIME.symbol if case.stage else plan.axis.symbol,
             "time_step": plan.step,
             "linear_solver": plan.linear.why if plan.linear is not None else "none",
             "partitioner": model.mesh.partitioner,
@@ -353,12 +353,13 @@ class Outputs:
         self._complete_stage()
         self.tell_remarks()
         row = history.recorder.row()
+        ended = f"step {self._stepper.number}, {self._stepper.axis.place(self._stepper.place)}"
         kick = stages.advance()
         stepper = stages.stepper
         self.progress.message(
-            f"stage {stages.model.case.name!r} ({stages.number + 1} of {len(stages.case.stage)}) begins after step "
-            f"{stepper.number}, {stages.plan.axis.place(stepper.place)}"
+            f"stage {stages.model.case.name!r} ({stages.number + 1} of {len(stages.case.stage)}) begins after {ended}"
         )
+        self.progress.axis = stepper.axis
         self.fields = Fields(stages.model, stages.fields)
         self._observe(RunState(stepper))
         self.checkpointing.last_step = last_step
@@ -425,7 +426,7 @@ class Outputs:
         if not code or (self._stages.at_last and stepper.state.step >= stepper.last_step):
             return
         self.checkpointing.write()
-        place = self._stages.plan.axis.exact(stepper.place)
+        place = stepper.axis.exact(stepper.place)
         raise EarlyStop(
             f"{self._synchroniser.stop.reason(code)}; step {stepper.number} is finished, {place}, and "
             f"a checkpoint written: continue with --restart (results in {self._folder})"

@@ -286,6 +286,11 @@ class Recorder:
             vectors[:, self._motion] = motion[np.flatnonzero(contact.moving)].ravel()
         return vectors if self.carried is None else vectors + self.carried
 
+    def put(self, values: Mapping[str, np.ndarray]) -> None:
+        """Set values of columns that this stage may not have."""
+        for name, value in values.items():
+            self.rest[self._whole[name]] = value
+
     def begin_stage(self, before: Recorder, last: Row, kick: tuple[float, np.ndarray]) -> Row:
         """Go on after the stage that has ended; return the row of the start. Collective.
 

@@ -19,7 +19,6 @@ from ..contact.contact import check_start
 from ..errors import InputError, SimulationFailure
 from ..fields import Fields
 from ..modes.find import InitialState, describe_modes
-from ..output.units import TIME as AXIS
 from ..preflight.checks import warnings_before
 from ..statics.stepper import make_stepper as static_stepper
 from ..stepping.model import Model, StageStart
@@ -48,15 +47,17 @@ def _make_stepper(model: Model, recorded: Mapping[str, Any] | None) -> Stepper:
 def _join(plans: list[Plan], names: list[str]) -> Plan:
     """Return the plan of all stages: steps, end and axis are those of all together, others those of the first stage.
 
-    A static stage takes as much of the axis, time [s], as its load factor or points count.
+    A static stage takes as much time [s] of the results as its load factor or points count. The axis is that of the
+    last stage, from where it begins in the results.
     """
     lines = ["; ".join(f"{label}: {text}" for label, text in plan.texts.items()) for plan in plans]
     counts, ends = [plan.steps for plan in plans], [plan.end for plan in plans]
+    last, before = plans[-1].axis, 0.0 if None in ends else sum(ends[:-1])
     return dataclasses.replace(
         plans[0],
         steps=None if None in counts else sum(counts),
         end=None if None in ends else sum(ends),
-        axis=AXIS._replace(key=f"stage[{len(plans) - 1}].{plans[-1].axis.key}"),
+        axis=last._replace(key=f"stage[{len(plans) - 1}].{last.key}", start=before),
         texts={f"stage {name}": line for name, line in zip(names, lines, strict=True)},
         record={"stages": [plan.record for plan in plans]},
     )
@@ -82,6 +83,8 @@ class Stages:
     functions : that give forces in the present stage and in those after it, see :meth:`call`
     columns : of the history, name to type with the shape of a value, None for a case without stages
     fields : names of the fields to write, None for a case without stages
+    wall_positions : of moving walls before the first stage that has them, by their columns of the history; empty for a
+        case without stages
     events : columns of events and their types
 
     Raises
@@ -97,6 +100,7 @@ class Stages:
         self.stepper: Stepper
         self.columns: dict[str, np.dtype] | None = None
         self.fields: list[str] | None = None
+        self.wall_positions: dict[str, np.ndarray] = {}
         self.events: dict[str, Any] = {}
         first = Model(self._cases[0], comm, later=self._cases[1:])
         if not case.stage:
@@ -114,6 +118,10 @@ class Stages:
             plans.append(stepper.plan)
             self.columns |= Recorder(stepper).columns
             self.events |= stepper.event_columns
+            positions = zip(model.contact.names, model.contact.positions(0.0), strict=True)
+            started = {f"wall/{name}/position": position for name, position in positions}
+            moving = self.columns.keys() & started.keys()
+            self.wall_positions = {name: started[name] for name in moving} | self.wall_positions
             fields = Fields(model)
             points |= dict.fromkeys(fields.points)
             cells |= dict.fromkeys(fields.cells)
@@ -182,7 +190,7 @@ class Stages:
         """
         old, number = self.stepper, self.number + 1
         stage = self._cases[number]
-        where = f"stage {stage.name!r}, begun after step {old.number}, t = {old.place:.6g} s"
+        where = f"stage {stage.name!r}, begun after step {old.number}, {old.axis.exact(old.place)}"
         old.settle()
         try:
             model = Model(stage, self.comm, old.model.mesh)

@@ -19,6 +19,8 @@ from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy, release
 from ..mechanics.materials.base import EXTRAPOLATED
+from ..output.units import LOAD_FACTOR, Axis
+from ..output.units import TIME as AXIS
 from ..tolerances import BEYOND, ON_BOUND, TIME
 from .bar_events import Collapse, Removals, Ruptures, collapse_message
 
@@ -424,7 +426,8 @@ class Stepper(ABC):
 
     def at(self, step: int, time: float) -> str:
         """A step and a time of the stage as they are counted in the results, for messages."""
-        return f"step {self.model.first_step + step}, t = {self.model.origin + time:.6g} s"
+        place = AXIS.exact(self.model.origin + time) if self.plan.axis.unit else LOAD_FACTOR.exact(time)
+        return f"step {self.model.first_step + step}, {place}"
 
     @property
     def number(self) -> int:
@@ -435,6 +438,12 @@ class Stepper(ABC):
     def place(self) -> float:
         """Time of the state in the results, over all stages."""
         return self.model.origin + self.clock
+
+    @property
+    def axis(self) -> Axis:
+        """What :attr:`place` is in this stage: load factors and points of a path are counted from its start."""
+        axis = self.plan.axis
+        return axis if axis.unit else axis._replace(start=self.model.origin)
 
     @property
     def clock(self) -> float:

@@ -17,6 +17,7 @@ def result(history, times=(0.0, 0.5, 1.0), **attributes):
         n_bars=5,
         times=np.array(times),
         axis=TIME,
+        place=TIME.place,
         n_modes=0,
         attributes=attributes,
         history={name: np.array(values) for name, values in history.items()},

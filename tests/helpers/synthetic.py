@@ -61,7 +61,7 @@ class SyntheticCase(SimpleNamespace):
 class SyntheticResult:
     """Interface of :func:`pfem_petsc.open_result` over made-up motion along -``normal`` and back."""
 
-    axis = TIME
+    axis, stretches = TIME, (slice(0, None),)
 
     def __init__(self, path, points, bars, walls=(WALL,), snapshots=13, end=0.05, title="Ring against a rigid wall"):
         self.path = Path(path)

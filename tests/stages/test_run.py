@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from helpers.kills import differences
@@ -41,6 +43,10 @@ def test_four_stages_on_one_state(comm, shared_tmp_path):
     assert (history["wall/plate/force"][1:17, 2] < 0.0).all()
     assert not history["wall/plate/force"][17:].any()
     assert result.attributes["stages"] == ["press", "shake", "fly", "settle"]
+    log = (shared_tmp_path / "out" / "log.txt").read_text()
+    for end in ("4, load factor 1", "16, t = 1.000 s", "56, t = 1.000 s"):
+        assert f"begins after step {end}\n" in log
+    assert re.search(r"done: 58 steps.*, load factor 1, ", log)
 
 
 @pytest.mark.slow
@@ -52,7 +58,7 @@ def test_restart_in_any_stage_is_bitwise(comm, shared_tmp_path):
 
 
 @pytest.mark.slow
-def test_a_later_end_of_the_last_stage_continues_it(comm, shared_tmp_path):
+def test_a_later_end_of_the_last_stage_continues_it(comm, shared_tmp_path, capsys):
     data = {**BLOCK, "solver": {"linear": "cg"}, "output": {**BLOCK["output"], "checkpoint_every": 1000}}
     first, last = BLOCK["stage"][0], BLOCK["stage"][2]
     cases = [{**data, "stage": [first, {**last, "time": {**last["time"], "end": end}}]} for end in (4e-5, 9e-5)]
@@ -64,6 +70,10 @@ def test_a_later_end_of_the_last_stage_continues_it(comm, shared_tmp_path):
     finished = Simulation(Case.from_dict(cases[1], name="block"), comm, output=continued, quiet=True, restart=True)
     assert finished.finished
     finished.close()
+    with Simulation(Case.from_dict(cases[0], name="block"), comm, output=continued, restart=True) as finished:
+        assert finished.run() == 0
+    if comm.rank == 0:
+        assert "t = 90.00 µs of the last stage, beyond stage[1].time.end = 40.00 µs" in capsys.readouterr().out
     other = {**cases[1], "stage": [{**first, "static": {"step": 0.5}}, cases[1]["stage"][1]]}
     with pytest.raises(InputError, match=r"stage\[0\]\.static\.step: 0\.25 -> 0\.5"):
         run(other, comm, continued, restart=True)

@@ -18,6 +18,7 @@ import numpy as np
 from numba.core import errors, event, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
+from numba.core.registry import cpu_target
 from numba.extending import _Intrinsic, intrinsic, register_jitable
 
 
@@ -201,7 +202,7 @@ def borrowing_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def calls(result: types.Tuple) -> Callable[..., Any]:
     """Make a function ``call(address, arguments)`` for compiled loops that calls the machine code at an address with a
-    tuple of arguments and returns its ``result``.
+    tuple of arguments and returns its ``result``; an address among the arguments may stand for a pointer.
 
     A loop that calls others in this way does not depend on which they are, and is compiled once for all of them.
     """
@@ -223,21 +224,42 @@ def calls(result: types.Tuple) -> Callable[..., Any]:
     return call
 
 
-def address_of(function: Callable[..., Any], arguments: tuple[Any, ...], result: types.Tuple) -> int:
-    """Return the address of the machine code of a :func:`borrowing_kernel` for the types of some ``arguments``; the
-    loop must be kept as long as it is used.
+def address_of(function: Callable[..., Any], kinds: tuple[types.Type, ...], result: types.Tuple) -> int:
+    """Return the address of the machine code of a :func:`borrowing_kernel` for arguments of some types; the loop must
+    be kept as long as it is used.
 
     Raises
     ------
     TypeError
         If its result is not the one that the caller reads.
     """
-    kinds = tuple(numba.typeof(value) for value in arguments)
     function.compile(kinds)
     compiled = function.overloads[kinds]
     if compiled.signature.return_type != result:
         raise TypeError(f"{function.__name__} returns {compiled.signature.return_type}, not {result}")
     return compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name)
+
+
+@intrinsic
+def _store(typingctx: Any, value: Any, room: Any) -> Any:  # noqa: ARG001
+    """Write a tuple to the memory of an array."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        kind, array = signature.args
+        place = context.make_array(array)(context, builder, values[1]).data
+        builder.store(values[0], builder.bitcast(place, context.get_value_type(kind).as_pointer()))
+        return context.get_dummy_value()
+
+    return types.void(value, room), generate
+
+
+def packed(value: tuple[Any, ...]) -> tuple[np.ndarray, types.Type]:
+    """Return a tuple of arrays and numbers as it lies in the memory of compiled loops, int64, and the type of a pointer
+    to it: loops that are called by their address read it there. Both must be kept as long as these loops use it."""
+    kind, context = numba.typeof(value), cpu_target.target_context
+    room = np.zeros(-(-context.get_abi_sizeof(context.get_value_type(kind)) // 8), dtype=np.int64)
+    _write(value, room)
+    return room, types.CPointer(kind)
 
 
 class _Cache(FunctionCache):
@@ -371,3 +393,8 @@ class Compilation(event.Listener):
             self._patience -= seconds
             self._stop_timer()
             self._took(seconds)
+
+
+@kernel
+def _write(value: Any, room: Any) -> None:
+    _store(value, room)

@@ -17,9 +17,9 @@ from numba.core import types
 from numba.extending import register_jitable
 
 from ..columns import BAR_ENERGIES
-from .compiled import borrowing, borrowing_kernel, inlined, kernel
+from .compiled import address_of, borrowing, borrowing_kernel, inlined, kernel
 from .materials.base import Law
-from .runs import Sweep, copy, end_differences, scatter_forces
+from .runs import Columns, Sweep, copy, end_differences, scatter_forces
 from .strips import add_rows, subtract_rows
 from .tuples import CHUNK, accumulate, bar_value, blend, differ, put, take, take_from
 
@@ -596,13 +596,13 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     keeps = n_rows + n_data > 0
 
     @borrowing
-    def add_none(x, bars, parameters, base, begun, ended, work):
+    def add_none(x, bars, base, begun, ended, work):
         """Replace the loops where they do not apply."""
         return -1, False
 
     def make(counts: bool) -> Callable[..., Any]:
         @borrowing
-        def add_padded(x, bars, parameters, base, begun, ended, work):
+        def add_padded(x, bars, base, begun, ended, work):
             """Add the internal forces of the groups [begun, ended) of padded runs to ``bars.pulls`` (3 stride,), and
             update the history in ``bars.columns.kept``; return the first failed bar, or -1, and whether any bar is so
             short that it may be inverted.
@@ -635,7 +635,7 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                     short += 0 if length / rest >= SHORTENED_STRETCH else 1  # NaN counts
                     q = variables_of(kept, first + i)
                     before = kept[last, first + i] if by_rate else 0.0
-                    p = parameters + data_of(kept, n_rows, first + i) if n_data else parameters
+                    p = data.parameters + data_of(kept, n_rows, first + i) if n_data else data.parameters
                     area = bar_value(columns.area, first + i) if real else 0.0
                     bar = Bar(rest, 0.0, 0.0, area, p, before, 0.0, q)
                     strain, slope, _, stress, _, new, densities = evaluate(length, bar, step)
@@ -701,35 +701,47 @@ PULLED = types.Tuple((types.int64, types.boolean, types.int64))
 that it may be inverted, and the number of bars that have changed their state of rupture."""
 
 
-@cache
-def batch_pulls(law: Law, measure: Callable[..., Any], count: int) -> SimpleNamespace:
-    """Make the loops that batches call by their addresses, for a law with ``count`` parameters: ``chunks``, which adds
-    the forces of some chunks of bars, and ``padded``, which adds those of some groups of padded runs, and their
-    energies if it ``counts`` them.
+class PulledBars(NamedTuple):
+    """The bars of a section as the loops of batches read them: ``columns``, or none, and ``planes`` and ``pulls``
+    (3 stride,), positions and forces of nodes by components."""
 
-    Their ``bars`` are a :class:`~pfem_petsc.stepping.batch_loop.BarArrays`, whose types do not depend on the law.
-    """
-    loops, parameters_of = make_loops(law, measure), take(count)
+    data: BarData
+    columns: Columns
+    planes: np.ndarray
+    pulls: np.ndarray
+
+
+@cache
+def batch_pulls(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
+    """Make the loops of a law that batches call by their addresses: ``chunks``, which adds the forces of some chunks of
+    bars, and ``padded``, which adds those of some groups of padded runs, and their energies if it ``counts`` them. Both
+    get a pointer to :class:`PulledBars`."""
+    loops = make_loops(law, measure)
     add_forces, add_padded, add_padded_energies = loops.add_forces, loops.add_padded, loops.add_padded_energies
 
     @borrowing_kernel
     def chunks(x, bars, begun, ended, f, work):
-        d = bars.data
-        of_bars = (d.start, d.stop, d.ends, d.far, d.sweep, d.rest, d.heat, d.rest_at_start, d.heat_at_start)
-        data = BarData(*of_bars, parameters_of(bars.parameters, 0), d.area, d.step, d.history)
-        failed, shortened, broke = add_forces(x, data, begun, ended, True, f, work)
+        failed, shortened, broke = add_forces(x, bars[0].data, begun, ended, True, f, work)
         return np.int64(failed), bool(shortened), np.int64(broke)
 
     @borrowing_kernel
     def padded(x, bars, base, begun, ended, work, counts):
-        parameters = parameters_of(bars.parameters, 0)
         if counts:
-            failed, shortened = add_padded_energies(x, bars, parameters, base, begun, ended, work)
+            failed, shortened = add_padded_energies(x, bars[0], base, begun, ended, work)
         else:
-            failed, shortened = add_padded(x, bars, parameters, base, begun, ended, work)
+            failed, shortened = add_padded(x, bars[0], base, begun, ended, work)
         return np.int64(failed), bool(shortened), np.int64(0)
 
     return SimpleNamespace(chunks=chunks, padded=padded)
+
+
+def pull_addresses(law: Law, measure: Callable[..., Any], pointer: types.Type) -> tuple[int, int]:
+    """Return the addresses of the loops of :func:`batch_pulls` for a pointer of a type."""
+    loops, vectors, numbers, at = batch_pulls(law, measure), types.float64[:, ::1], types.float64[::1], types.int64
+    return (
+        address_of(loops.chunks, (vectors, pointer, at, at, vectors, numbers), PULLED),
+        address_of(loops.padded, (vectors, pointer, at, at, at, numbers, types.boolean), PULLED),
+    )
 
 
 @kernel

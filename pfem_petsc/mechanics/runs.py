@@ -254,7 +254,7 @@ _MOST = 1.25  # columns for each bar; beyond, they cost more than the begin and 
 
 
 class Columns(NamedTuple):
-    """Columns of all bars of a sweep that begins at bar 0, in groups of one offset and one block of nodes.
+    """Columns of all bars of a sweep, in groups of one offset and one block of nodes.
 
     Attributes
     ----------
@@ -301,8 +301,8 @@ def no_columns(area: float | np.ndarray, rows: int) -> Columns:
 
 
 def make_columns(sweep: Sweep, rest: np.ndarray, area: float | np.ndarray, rows: int) -> Columns:
-    """Make the columns of a sweep of diagonal chunks, with room for ``rows`` of a history; ``rest`` (b,) [m],
-    ``area`` [m2] a number or (b,)."""
+    """Make the columns of a sweep of diagonal chunks over b bars, with room for ``rows`` of a history; ``rest`` (b,)
+    [m], ``area`` [m2] a number or (b,)."""
     n = len(sweep.heads)
     firsts = np.append(sweep.chunks[sweep.parts].astype(np.int64), n)  # runs that begin a part, or are not counted
     fresh = np.zeros(n + 1, dtype=np.bool_)
@@ -370,8 +370,8 @@ def _spread(values, sweep, groups, none, spread):
     for g in range(len(heads)):
         for run in range(runs[g], runs[g + 1]):
             at = starts[g] + sweep.heads[run] - heads[g]
-            begin = sweep.starts[run]
-            for k in range(sweep.starts[run + 1] - begin):
+            begin = sweep.starts[run] - sweep.starts[0]
+            for k in range(sweep.starts[run + 1] - sweep.starts[run]):
                 spread[at + k] = values[begin + k]
 
 
@@ -381,7 +381,7 @@ def exchange_history(sweep, columns, history, back):
     or ``back``."""
     for group in range(len(columns.heads) if len(history) > 0 else 0):
         for run in range(columns.runs[group], columns.runs[group + 1]):
-            begin, count = sweep.starts[run], sweep.starts[run + 1] - sweep.starts[run]
+            begin, count = sweep.starts[run] - sweep.starts[0], sweep.starts[run + 1] - sweep.starts[run]
             at = columns.starts[group] + sweep.heads[run] - columns.heads[group]
             for j in range(len(history)):
                 if back:

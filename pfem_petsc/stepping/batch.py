@@ -11,8 +11,8 @@ from ..columns import BAR_ENERGIES, HEAD, Share, values_at_state
 from ..contact.node_walls import NOTED, WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
-from ..mechanics.compiled import address_of
-from ..mechanics.elements import PULLED, batch_pulls
+from ..mechanics.compiled import packed
+from ..mechanics.elements import PulledBars, pull_addresses
 from ..mechanics.runs import Columns, make_columns, new_planes, no_columns
 from ..mesh.ordering import NODE_BLOCK
 from ..parallel.heap import return_freed_memory
@@ -70,16 +70,47 @@ class Batch:
         return_freed_memory()
 
     def _bar_arrays(self) -> BarArrays:
-        bars, state = self.model.bars, self.stepper.state
-        block, reach, columns = bars.blocks[0], self._reach(), self._columns()
-        data = bars.data(block)._replace(step=self.stepper.h, parameters=())
-        sizes = np.array(block.parameters).reshape(-1, 1), block.loops.places, block.loops.work_rows
-        arrays = BarArrays(data, bars.watched, reach, self._meeting(), columns, *self._planes(reach, columns), *sizes)
-        self._pulls = batch_pulls(block.law, block.measure, len(block.parameters))
-        work = np.empty(0)
-        pull = address_of(self._pulls.chunks, (state.x, arrays, 0, 0, state.f, work), PULLED)
-        padded = address_of(self._pulls.padded, (state.x, arrays, 0, 0, 0, work, False), PULLED)
-        return arrays._replace(pull=pull, pull_padded=padded)
+        bars, blocks = self.model.bars, self.model.bars.blocks
+        reach, columns = self._reach(), self._columns()
+        planes = self._planes(reach, bool(columns))
+        self._packed, self._columns_of, sections = [], [], []
+        for k, block in enumerate(blocks):
+            data = bars.data(block)._replace(step=self.stepper.h)
+            of = columns[k] if columns else no_columns(block.area, len(block.history))
+            room, pointer = packed(PulledBars(data, of, *planes))
+            sections.append((room.ctypes.data, *pull_addresses(block.law, block.measure, pointer)))
+            self._packed.append((room, data))  # what the addresses point to
+            self._columns_of.append(of)
+        loops = [block.loops for block in blocks]
+        places = np.zeros((len(blocks), len(BAR_ENERGIES)), dtype=np.int64)
+        for k, of in enumerate(loops):
+            places[k, : len(of.places)] = of.places
+        sweeps = [block.sweep for block in blocks]
+        chunks = [(sweep.parts, len(sweep.diagonal)) for sweep in sweeps]
+        groups = [(of.parts, len(of.heads)) for of in columns]
+        return BarArrays(
+            np.array(sections, dtype=np.int64).reshape(-1, 3),
+            self._parts(chunks),
+            self._parts(groups) if columns else np.empty((len(blocks), 0), dtype=np.int64),
+            places,
+            np.array([len(of.places) for of in loops], dtype=np.int64),
+            max((of.work_rows for of in loops), default=0),
+            any(len(block.history) for block in blocks),
+            reach,
+            self._meeting(),
+            bars.ends,
+            bars.watched,
+            *planes,
+        )
+
+    def _parts(self, of_sections: list[tuple[np.ndarray, int]]) -> np.ndarray:
+        """Return ``parts`` of BarArrays from the parts of sweeps or columns, which end with the last block that has
+        bars, and their ends."""
+        blocks = -(-len(self.model.inertia.mass) // NODE_BLOCK)
+        parts = np.empty((len(of_sections), blocks + 2), dtype=np.int64)
+        for row, (own, end) in zip(parts, of_sections, strict=True):
+            row[: len(own)], row[len(own) :], row[-1] = own, own[-1], end
+        return parts
 
     def _node_arrays(self) -> NodeArrays:
         model, h = self.model, self.stepper.h
@@ -100,17 +131,20 @@ class Batch:
         )
         return WallArrays(contact.flat_walls(0.0, PROJECTED * self.model.size), touched, log.present, log.releases)
 
-    def _columns(self) -> Columns:
-        """Return the columns of the bars, or none if bars are heated, can break or are not in diagonal runs."""
+    def _columns(self) -> list[Columns]:
+        """Return the columns of the bars of each section; empty if bars are heated, can break or are not all in
+        diagonal runs."""
         bars = self.model.bars
-        block = bars.blocks[0]
-        if bars.can_break or bars.heat.size or not len(bars.rest) or not block.sweep.diagonal.all():
-            return no_columns(block.area, len(block.history))
-        return make_columns(block.sweep, bars.rest, block.area, len(block.history))
+        if bars.can_break or bars.heat.size or not all(block.sweep.diagonal.all() for block in bars.blocks):
+            return []
+        return [
+            make_columns(block.sweep, bars.rest[block.start : block.stop], block.area, len(block.history))
+            for block in bars.blocks
+        ]
 
-    def _planes(self, reach: int, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
+    def _planes(self, reach: int, padded: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return planes for all nodes; on one rank for a window of them, which stays in the cache."""
-        nodes = len(self.model.mesh.points) if len(columns.parts) else 0
+        nodes = len(self.model.mesh.points) if padded else 0
         if self.model.comm.size == 1:
             nodes = min(nodes, _WINDOW * (reach + 1) * NODE_BLOCK)
         return new_planes(nodes)
@@ -127,10 +161,10 @@ class Batch:
         Forces of these bars come first at each node: a block before must neither have nor reach such a node.
         """
         ends, n_owned = self.model.bars.ends, len(self.model.inertia.mass)
-        block = self.model.bars.blocks[0]
         late = np.zeros(len(self.model.mesh.points), dtype=bool)
         late[n_owned:] = True
-        late[ends[block.counted - block.start :].reshape(-1)] = True
+        for block in self.model.bars.blocks:
+            late[ends[block.counted : block.stop].reshape(-1)] = True
         reached = ends[late[ends].any(axis=1)]
         return int(reached.min(initial=n_owned)) // NODE_BLOCK
 
@@ -170,7 +204,8 @@ class Batch:
         begin, impulses = state.step, ledger.impulses.state
         flags = np.zeros((count, len(log.releases)), dtype=bool)
         rows = model.links.export_rows(self._stiffness)
-        model.bars.blocks[0].lend(self._bars.columns)
+        for block, columns in zip(model.bars.blocks, self._columns_of, strict=True):
+            block.lend(columns)
         ledger.sums[_BROKEN] = stepper.ruptures.count  # others can break in the last step alone
         data = BatchData(
             stepper.h,

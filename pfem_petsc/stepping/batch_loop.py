@@ -19,8 +19,9 @@ from ..contact.fixed_rows import close_rows, solve_rows
 from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import accelerations, advance, advance_loaded, centre, kick, move
 from ..mechanics.compiled import borrowing, calls, kernel
-from ..mechanics.elements import PULLED, BarData, clear_energies, first_inverted, sum_energies
-from ..mechanics.runs import Columns, copy, join_components, new_rows, slide_planes, split_components
+from ..mechanics.elements import PULLED, clear_energies, first_inverted, sum_energies
+from ..mechanics.runs import copy, join_components, new_rows, slide_planes, split_components
+from ..mechanics.tuples import CHUNK
 from ..mesh.ordering import NODE_BLOCK
 from .impact import Approach, Touched, join_nodes, plane_gaps, stop_nodes, unpressed
 from .impulses import IN_COLUMNS, WALLS
@@ -55,25 +56,37 @@ from .ledger_loops import (
 
 
 class BarArrays(NamedTuple):
-    """The bars of a batch: ``data`` of all of them; ``watched``, see ``Bars``; ``reach``: how many blocks of nodes
-    beyond its own the bars of a block reach; ``meeting``: the first block that waits for messages; ``columns`` of the
-    bars, or none; ``planes`` and ``pulls`` (3 stride,): positions and forces by components, of a window of the nodes;
-    ``parameters`` (k, 1) of the law, of which ``data`` has none; ``places`` and ``work_rows`` of the workspace, see
-    :func:`~pfem_petsc.mechanics.elements.sum_energies`; and the addresses of the loops of the law, see
-    :func:`~pfem_petsc.mechanics.elements.batch_pulls`."""
+    """The bars of a batch, by sections.
 
-    data: BarData
-    watched: np.ndarray
+    Attributes
+    ----------
+    sections : (s, 3) int64, addresses of the :class:`~pfem_petsc.mechanics.elements.PulledBars` of each section, and of
+        the loops of its law, see :func:`~pfem_petsc.mechanics.elements.batch_pulls`
+    parts : (s, blocks + 2) int64, the first chunk of each block of nodes, of the bars that other ranks count, and the
+        end
+    padded_parts : the same of groups of padded runs; (s, 0) if not all sections have such
+    places, n_energies : (s, k) and (s,) int64, see :func:`~pfem_petsc.mechanics.elements.sum_energies`
+    work_rows : number of rows of the largest workspace
+    keeps : whether laws have a history
+    reach : how many blocks of nodes beyond its own the bars of a block reach
+    meeting : the first block that waits for messages
+    ends, watched : see ``Bars``
+    planes, pulls : (3 stride,), positions and forces by components, of a window of the nodes
+    """
+
+    sections: np.ndarray
+    parts: np.ndarray
+    padded_parts: np.ndarray
+    places: np.ndarray
+    n_energies: np.ndarray
+    work_rows: int
+    keeps: bool
     reach: int
     meeting: int
-    columns: Columns
+    ends: np.ndarray
+    watched: np.ndarray
     planes: np.ndarray
     pulls: np.ndarray
-    parameters: np.ndarray
-    places: np.ndarray
-    work_rows: int
-    pull: int = 0
-    pull_padded: int = 0
 
 
 class NodeArrays(NamedTuple):
@@ -778,26 +791,66 @@ _pull = calls(PULLED)
 
 
 @borrowing
-def pull(x, bars, begun, ended, f, work):
-    """Add the forces of some chunks of bars."""
-    return _pull(bars.pull, (x, bars, np.int64(begun), np.int64(ended), f, work))
+def pull(x, bars, block, f, work):
+    """Add the forces of the bars of a block of nodes, or, after the last one, of those that other ranks count; results
+    as those of :data:`~pfem_petsc.mechanics.elements.PULLED`."""
+    failed, shortened, broke = -1, False, 0
+    for s in range(len(bars.sections)):
+        begun, ended = bars.parts[s, block], bars.parts[s, block + 1]
+        if begun < ended:
+            address, loop = bars.sections[s, 0], bars.sections[s, 1]
+            at, short, more = _pull(loop, (x, address, begun, ended, f, work[s]))
+            failed = at if failed < 0 else failed
+            shortened = shortened or short
+            broke += more
+    return failed, shortened, broke
 
 
 @borrowing
-def pull_padded(x, bars, base, begun, ended, work, counts):
-    """Add the forces of some groups of padded runs, and their energies to ``work`` if it ``counts`` them."""
-    return _pull(bars.pull_padded, (x, bars, np.int64(base), np.int64(begun), np.int64(ended), work, counts))
+def pull_padded(x, bars, base, block, work, counts):
+    """Add the same forces by padded runs to ``bars.pulls``, and energies to ``work`` if it ``counts`` them; ``base`` is
+    the first node there."""
+    failed, shortened = -1, False
+    for s in range(len(bars.sections)):
+        begun, ended = bars.padded_parts[s, block], bars.padded_parts[s, block + 1]
+        if begun < ended:
+            address, loop = bars.sections[s, 0], bars.sections[s, 2]
+            at, short, _ = _pull(loop, (x, address, np.int64(base), begun, ended, work[s], counts))
+            failed = at if failed < 0 else failed
+            shortened = shortened or short
+    return failed, shortened
 
 
 @borrowing
-def pull_again(x, n, bars, f, work):
+def pull_again(x, n_blocks, bars, f, work):
     """Compute all forces in the order of a step."""
     flat = f.reshape(-1)
     for j in range(len(flat)):
         flat[j] = 0.0
-    if len(x) > n:
-        pull(x, bars, bars.data.sweep.counted, len(bars.data.sweep.diagonal), f, work)
-    pull(x, bars, 0, bars.data.sweep.counted, f, work)
+    pull(x, bars, n_blocks, f, work)
+    for block in range(n_blocks):
+        pull(x, bars, block, f, work)
+
+
+@kernel
+def new_work(sections, rows):
+    """Return workspaces of some rows for each section, aligned; not initialised."""
+    return new_rows(sections * rows)[: sections * rows * CHUNK].reshape(sections, rows * CHUNK)
+
+
+@borrowing
+def clear_all_energies(bars, work):
+    """Set the sums of energies of all sections to zero."""
+    for s in range(len(bars.sections)):
+        clear_energies(work[s], bars.places[s, : bars.n_energies[s]])
+
+
+@borrowing
+def sum_all_energies(bars, work, energies):
+    """Write the energies of the bars of all sections."""
+    energies[:] = 0.0
+    for s in range(len(bars.sections)):
+        sum_energies(work[s], bars.places[s, : bars.n_energies[s]], energies)
 
 
 @kernel
@@ -844,7 +897,7 @@ def batch_loop(data, touched, met, due, flags):
     probed = len(probes.nodes)
     numbers, buffers = (h, alpha, eta), (factors, speeds, drag)
     shared = BlockArrays(*numbers, x, half, nodes.inverses, *buffers, held, load, support, lanes, ends)
-    work, places = new_rows(bars.work_rows), bars.places
+    work = new_work(len(bars.sections), bars.work_rows)
     pulled = np.empty((NODE_BLOCK, 3))  # forces of a block
     push_u = np.empty(impulses.v.shape)
     near = touched  # nodes with entries in the array of wall forces
@@ -855,7 +908,7 @@ def batch_loop(data, touched, met, due, flags):
     for block in range(n_blocks if linked else 0):
         alone[block] = not (damped or rows.near[block])
     # fields that loops over blocks would count references to
-    planes, pulls, parts, chunks = bars.planes, bars.pulls, bars.columns.parts, bars.data.sweep.parts
+    planes, pulls = bars.planes, bars.pulls
     room_for, reach = len(planes) // 3, bars.reach
     failed = -1
     turned = -1
@@ -867,8 +920,8 @@ def batch_loop(data, touched, met, due, flags):
     changes = data.changes
     several = len(x) > n or messages.count > 0
     lost = 0  # error code of MPI
-    aside = new_rows(bars.work_rows)  # energies that are not counted
-    padded = len(parts) > 0
+    aside = new_work(len(bars.sections), bars.work_rows)  # energies that are not counted
+    padded = bars.padded_parts.shape[1] > 0
     shortened = False
     for step in range(count):
         if failed >= 0 or turned >= 0 or infeasible >= 0:
@@ -891,7 +944,7 @@ def batch_loop(data, touched, met, due, flags):
         base = 0  # first node of the planes
         # Forces that nothing reads stay in the cache. The check of shortened bars reads them, as the next one is
         # likely to; those of laws with history could not be computed again. Blocks that wait for rows need them.
-        brief = padded and not last_one and not shortened and len(bars.data.history) == 0 and not linked
+        brief = padded and not last_one and not shortened and not bars.keeps and not linked
         forces = pulled if brief else f
         shortened = False
         if several:
@@ -900,7 +953,7 @@ def batch_loop(data, touched, met, due, flags):
                 break
         waiting = several
         if ending or not padded:
-            clear_energies(work, places)
+            clear_all_energies(bars, work)
         count_near = 0
         finished, pressing, altered = 0, 0, 0  # blocks; rows with a force, and rows whose force begins or ends
         if linked:
@@ -925,11 +978,9 @@ def batch_loop(data, touched, met, due, flags):
                 broke = 0
                 if padded:
                     split_block(n, len(x), x, planes, pulls, base)
-                    groups = (bars.columns.counted, len(bars.columns.heads))
-                    at, short, _ = pull_padded(x, bars, base, *groups, aside, False)
+                    at, short = pull_padded(x, bars, base, n_blocks, aside, False)
                 else:
-                    groups = (bars.data.sweep.counted, len(bars.data.sweep.diagonal))
-                    at, short, broke = pull(x, bars, *groups, f, aside)
+                    at, short, broke = pull(x, bars, n_blocks, f, aside)
                 failed = at if at >= 0 else failed
                 shortened = shortened or short
                 changed += broke
@@ -946,13 +997,12 @@ def batch_loop(data, touched, met, due, flags):
                 moved += 1
             start = NODE_BLOCK * block if brief else 0
             if padded:
-                if block < len(parts) - 1:
-                    at, short, _ = pull_padded(x, bars, base, parts[block], parts[block + 1], work, ending)
-                    failed = at if failed < 0 else failed
-                    shortened = shortened or short
+                at, short = pull_padded(x, bars, base, block, work, ending)
+                failed = at if failed < 0 else failed
+                shortened = shortened or short
                 join_block(block, n, pulls, base, forces, start)
-            elif block < len(chunks) - 1:
-                at, short, broke = pull(x, bars, chunks[block], chunks[block + 1], f, work)
+            else:
+                at, short, broke = pull(x, bars, block, f, work)
                 failed = at if failed < 0 else failed
                 shortened = shortened or short
                 changed += broke
@@ -1022,7 +1072,7 @@ def batch_loop(data, touched, met, due, flags):
         if shortened or wrong or last_one:
             turned = -1
             if brief:
-                pull_again(x, n, bars, f, aside)
+                pull_again(x, n_blocks, bars, f, aside)
             if not last_one:  # the state does not have the end of this step yet
                 clear_ends(lanes, n)
                 for block in range(n_blocks):
@@ -1033,15 +1083,14 @@ def batch_loop(data, touched, met, due, flags):
                         end_rows(block, shared, contact)
             start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
             if failed < 0 and shortened:
-                turned = first_inverted(x, before, bars.data.ends, bars.watched)
+                turned = first_inverted(x, before, bars.ends, bars.watched)
             wrong = wrong or turned >= 0
         if ending or wrong:
             if padded and not ending:
-                clear_energies(work, places)  # a failure, whose energies nothing reads
+                clear_all_energies(bars, work)  # a failure, whose energies nothing reads
             end_at_walls(near, shared, contact, u, v)
             sum_ends(lanes, n, h, *sums)
-            energies[:] = 0.0
-            sum_energies(work, places, energies)
+            sum_all_energies(bars, work, energies)
             centre(push_u.reshape(-1), eta, impulses.half.reshape(-1), impulses.v.reshape(-1))
             accelerations(push_u.reshape(-1), alpha, impulses.a.reshape(-1))
             record_sums(row, ledger, powers, sums, totals, impulses.v, energies)

@@ -130,7 +130,7 @@ DEEP = 0.25
 
 def small_walls(walls: Sequence[BaseWall]) -> list[int]:
     """Return the indices of the walls that a bar can cross while its nodes satisfy them."""
-    return [k for k, wall in enumerate(walls) if wall.partial or getattr(wall, "sign", -1.0) > 0.0]
+    return [k for k, wall in enumerate(walls) if np.isfinite(wall.width)]
 
 
 def distances(starts: np.ndarray, ends: np.ndarray, point: np.ndarray, axis: np.ndarray | None) -> np.ndarray:

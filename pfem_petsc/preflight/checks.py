@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
+from ..contact.monitoring import small_walls
 from ..output.units import engineering
 from ..statics.stability import names_motions
 from .forecast import memory_warning
@@ -33,6 +34,9 @@ _PRESTRAINS = 1e-6, 0.2
 
 _STRENGTHS = ("yield_stress", "proof_stress", "tensile_strength")
 
+_OPENING = math.sqrt(2.0)
+"""Widest body that passes between the nodes of a square mesh of bars, over the length of these."""
+
 _HINT = "case files are in SI units (m, kg, s, N, Pa)"
 
 
@@ -44,7 +48,8 @@ def warnings_before(case: Case, model: Model, plan: Plan, first: bool = True) ->
     """
     geometry, source = Geometry(model), f"{case.source}: " if first else ""
     texts = [f"{source}{text}" for text in odd_numbers(case, model)]
-    texts += memory_warning(model, plan, source) + idle_walls(model) + (wall_gaps(model)[1] if first else [])
+    texts += memory_warning(model, plan, source) + idle_walls(model) + narrow_walls(model)
+    texts += wall_gaps(model)[1] if first else []
     if first:
         count, nodes, lowest = geometry.parts()
         if count > 1 and not model.links:  # links connect bodies
@@ -220,6 +225,25 @@ def idle_walls(model: Model) -> list[str]:
         for name, count in zip(model.contact.names, members, strict=True)
         if not count
     ]
+
+
+def narrow_walls(model: Model) -> list[str]:
+    """Warn of walls that can pass between the nodes of the bars there. Collective."""
+    contact, mesh, texts = model.contact, model.mesh, []
+    real = mesh.bar_ids < mesh.n_bars - mesh.n_connectors
+    for k in small_walls(contact.walls):
+        members = np.zeros(mesh.n_local, dtype=bool)
+        members[: mesh.n_owned] = contact.members[:, k]
+        near = real & members[mesh.bars].any(axis=1)
+        longest = model.comm.allreduce(float(model.bars.mesh_lengths[near].max(initial=0.0)), op=MPI.MAX)
+        width = contact.walls[k].width
+        if width < _OPENING * longest:
+            texts.append(
+                f"wall {contact.names[k]!r} is {engineering(width, 'm')} wide, and the bars of its nodes are up to "
+                f"{engineering(longest, 'm')} long: only nodes touch walls, so that it can pass between them; use a "
+                f"wall wider than {_OPENING:.2f} times the bars that it meets, or shorter bars"
+            )
+    return texts
 
 
 def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:

@@ -1,10 +1,11 @@
-"""Bars that walls pass through between their nodes are reported at snapshots and at the end of the run."""
+"""Bars that walls pass through between their nodes are reported before the run, at snapshots, and at its end."""
 
 import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.contact.monitoring import distances
+from pfem_petsc.preflight.checks import warnings_before
 
 pytestmark = pytest.mark.parallel
 
@@ -42,6 +43,9 @@ def bar(shape, **keys):
 def test_wall_that_flies_through_a_bar(shape, comm, shared_tmp_path, capfd):
     case = bar(shape)
     run = Simulation(case, comm, output=shared_tmp_path / "it", quiet=True)
+    (told,) = [text for text in warnings_before(case, run.model, run.plan) if "only nodes touch walls" in text]
+    width = "200.0 mm" if shape == "rectangle" else "800.0 mm"
+    assert told.startswith(f"wall 'it' is {width} wide, and the bars of its nodes are up to 2.000 m long")
     assert run.run() == 0
     error = capfd.readouterr().err
     if comm.rank == 0:
@@ -55,6 +59,16 @@ def test_wall_that_flies_through_a_bar(shape, comm, shared_tmp_path, capfd):
         assert len(found) == 1
         count = int(found[0].split(" snapshots")[0].split()[-3])
         assert abs(count - seen) <= 2 and "of 13 snapshots" in found[0]
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [{"radius": 1.45, "point": [1.0, 0.0, 1.6]}, {"side": "inside", "radius": 3.0}],
+    ids=["larger than the bar", "around the bar"],
+)
+def test_no_warning_of_walls_that_nodes_cannot_pass(keys, comm):
+    run = Simulation(bar("sphere", **keys), comm, check_only=True)
+    assert not any("only nodes touch" in text for text in warnings_before(run.case, run.model, run.plan))
 
 
 def test_a_chord_of_a_wall_is_no_defect(comm, shared_tmp_path, capfd):

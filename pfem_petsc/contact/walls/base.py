@@ -77,11 +77,13 @@ class BaseWall(ABC):
     ----------
     flat : whether the tangent plane is the same everywhere; then ``normal`` (3,) and ``offset`` [m] are that plane
     partial : whether nodes can pass beside it, so that their previous positions matter (:meth:`stops`)
+    width : smallest extent [m] of a wall that bars can cross between their nodes, infinite for others
     centre : (3,) [m], the point whose position is recorded if the wall moves
     """
 
     flat = False
     partial = False
+    width = np.inf
     centre: np.ndarray
 
     @abstractmethod

@@ -39,6 +39,7 @@ class Wall(BaseWall):
         self.axis = axis / np.linalg.norm(axis)
         self.radius = parameters.radius
         self.sign = 1.0 if parameters.side == "outside" else -1.0
+        self.width = 2.0 * self.radius if self.sign > 0.0 else np.inf
         self.across = perpendicular(self.axis)
 
     def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

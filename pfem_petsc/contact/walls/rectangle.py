@@ -46,6 +46,7 @@ class Wall(Plane):
         self.first = along / np.linalg.norm(along)
         self.second = np.cross(self.normal, self.first)
         self.half = 0.5 * np.array(parameters.size)
+        self.width = min(parameters.size)
 
     def stops(self, before: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
         start = before @ self.normal - self.offset

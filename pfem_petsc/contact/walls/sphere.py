@@ -41,6 +41,7 @@ class Wall(BaseWall):
         self.centre = np.array(parameters.point, dtype=np.float64)
         self.radius = parameters.radius
         self.sign = 1.0 if parameters.side == "outside" else -1.0
+        self.width = 2.0 * self.radius if self.sign > 0.0 else np.inf
 
     def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         centres = np.broadcast_to(self.centre, x.shape)

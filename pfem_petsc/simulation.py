@@ -19,7 +19,7 @@ from .output.lock import FolderLock
 from .parallel.agreement import on_root
 from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
-from .preflight.checks import inspect, warnings_before
+from .preflight.checks import inspect, later_gaps, warnings_before
 from .preflight.forecast import forecast, summarise
 from .restart.checkpoints import find_restart, finished, finished_message
 from .run.outputs import Outputs, ReportedCompilation
@@ -190,6 +190,9 @@ class Simulation(WithEquations):
         """Return further checks and a forecast of the run (text by label), and warnings. Collective."""
         self._usable()
         entries, warnings = inspect(self.model.case, self.model)
+        for stage in self.case.stages[self._stages.number + 1 :]:
+            if not stage.holds("wall"):
+                entries |= later_gaps(Model(stage, self.comm, self.mesh))
         entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, self.columns)
         before = warnings_before(self.model.case, self.model, self.stepper.plan)
         return entries, self.model.warnings + before + warnings

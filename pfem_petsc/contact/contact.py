@@ -230,8 +230,10 @@ def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh
     return mesh.comm.allreduce(len(moved))
 
 
-def check_start(contact: Contact, x: np.ndarray, length: float) -> None:
+def check_start(contact: Contact, x: np.ndarray, length: float, adjusts: bool = True) -> None:
     """Check that no node starts beyond a wall by more than rounding of the model's size ``length`` [m]. Collective.
+
+    ``adjusts``: whether ``adjust = true`` moves nodes at this start, as it does at that of the run.
 
     Raises
     ------
@@ -241,9 +243,9 @@ def check_start(contact: Contact, x: np.ndarray, length: float) -> None:
     found = contact.deepest(x, 0.0, ON_BOUND * length) if contact.any else None
     if found is not None:
         depth, node, wall, count = found
+        remedy = "let 'adjust = true' move the nodes" if adjusts else "let an earlier stage move the nodes"
         raise InputError(
             f"{contact.source}: wall {contact.names[wall]!r}: node {node} starts {depth:.6g} "
             f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "
-            "turn the normal to the allowed side, name the nodes that it applies to with 'node_set', or let "
-            "'adjust = true' move the nodes"
+            f"turn the normal to the allowed side, name the nodes that it applies to with 'node_set', or {remedy}"
         )

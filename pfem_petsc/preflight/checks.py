@@ -15,6 +15,7 @@ from mpi4py import MPI
 from ..contact.monitoring import small_walls
 from ..output.units import engineering
 from ..statics.stability import names_motions
+from ..tolerances import ON_BOUND
 from .forecast import memory_warning
 from .geometry import Geometry
 
@@ -246,6 +247,28 @@ def narrow_walls(model: Model) -> list[str]:
     return texts
 
 
+def _nearest(model: Model, gaps: np.ndarray) -> Iterator[tuple[float, int]]:
+    """Yield for each wall the least of the gaps (owned, walls) [m], and the lowest node that has it. Collective."""
+    for each in gaps.T:
+        least, node = _extreme(model, -each)
+        yield -least, node
+
+
+def later_gaps(model: Model) -> dict[str, str]:
+    """Return, by wall of a later stage, the gap of the nearest node in the mesh, before stages move it. Collective."""
+    told, stage = {}, model.case.name
+    gaps = model.contact.gaps(model.mesh.points[: model.mesh.n_owned], 0.0)
+    for name, (gap, node) in zip(model.contact.names, _nearest(model, gaps), strict=True):
+        text = f"gap {engineering(gap, 'm')} at node {node} in the mesh, before earlier stages move it"
+        if gap < -ON_BOUND * model.size:
+            text = (
+                f"node {node} is {engineering(-gap, 'm')} beyond it in the mesh: the stage cannot begin unless earlier "
+                "stages move such nodes to the allowed side"
+            )
+        told[f"wall {name}, stage {stage}"] = text if np.isfinite(gap) else "applies to no node"
+    return told
+
+
 def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
     """Return, by wall name, nearest node, gap and approach velocity at the start; and warnings. Collective."""
     contact, mesh, comm = model.contact, model.mesh, model.comm
@@ -267,9 +290,7 @@ def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
     comm.Allreduce(MPI.IN_PLACE, rate, op=MPI.MIN)
     # a moving wall, or the other node of a link, may push the truss against this wall
     pushed = model.external.active or contact.moving.any() or bool(model.links) or model.supports.any
-    for k, name in enumerate(contact.names):
-        at = int(np.argmin(now[:, k])) if len(now) else -1
-        gap, node = min(comm.allgather((float(now[at, k]), int(mesh.node_ids[at])) if at >= 0 else (np.inf, -1)))
+    for k, (name, (gap, node)) in enumerate(zip(contact.names, _nearest(model, now), strict=True)):
         if not np.isfinite(gap):
             told[name] = "applies to no node"
             continue

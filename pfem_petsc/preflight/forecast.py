@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,34 +52,42 @@ def forecast(
     columns: Mapping[str, np.dtype],
 ) -> dict[str, str]:
     """Return label and text of the estimates of memory and, if the steps are known, of time and disk. Collective."""
-    held = model.comm.allreduce(_needed(model, plan))
+    plans = plan.stages or (plan,)
+    held = model.comm.allreduce(max(_needed(model, each) for each in plans))
     entries = {"memory needed": f"about {engineering(held, 'B', 3)} on all ranks"}
-    if plan.steps is not None:
-        size = result_bytes(case, model.mesh, plan.steps, fields.points, fields.cells, columns)
+    known = [(stage, each) for stage, each in zip(case.stages, plans, strict=True) if each.steps is not None]
+    if known:
+        seconds = sum(_seconds(model, each) for _, each in known)
+        size = result_bytes(known, model.mesh, fields.points, fields.cells, columns)
+        counted = [stage for stage, _ in known]
+        unknown = [f"stage {stage.name!r}" for stage in case.stages if stage not in counted]
         entries["run time"] = (
-            f"about {duration(_seconds(model, plan))} of steps on idle cores, within a factor of 3; start, "
+            f"about {duration(seconds)} of steps on idle cores, within a factor of 3; start, "
             "compilation and output are extra"
         )
         most = "at most " if case.output.compression != "none" else "about "
         entries["result file"] = f"{most}{engineering(size, 'B', 3)}"
+        if unknown:
+            entries["not included"] = f"run time and results of {', '.join(unknown)}: the number of steps is not known"
     if case.output.checkpoint_every or case.output.checkpoint_minutes:
         entries["checkpoints"] = f"two of about {engineering(checkpoint_bytes(model), 'B', 3)}"
     return entries
 
 
 def result_bytes(
-    case: Case,
+    stages: Sequence[tuple[Case, Plan]],
     mesh: DistributedMesh,
-    steps: int,
     point_fields: Collection[str],
     cell_fields: Collection[str],
     columns: Mapping[str, np.dtype],
 ) -> float:
     """Return the size of the result file [B]: snapshots, history rows, and the structure of the file."""
-    output = case.output
-    item = 4 if output.precision == "float32" else 8
-    snapshots = 2 + (steps - 1) // output.fields_every if output.fields_every else 2
-    rows = 2 + (steps - 1) // output.history_every
+    item = 4 if stages[0][0].output.precision == "float32" else 8
+    snapshots = rows = 1
+    for case, plan in stages:
+        every = case.output.fields_every
+        snapshots += 1 + ((plan.steps - 1) // every if every else 0)
+        rows += 1 + (plan.steps - 1) // case.output.history_every
     a_snapshot = mesh.n_nodes * (24 + 3 * item * len(point_fields)) + mesh.n_bars * item * len(cell_fields)
     a_row = sum(dtype.itemsize for dtype in columns.values())
     # a chunk of the history is allocated as a whole

@@ -58,6 +58,7 @@ def _join(plans: list[Plan], names: list[str]) -> Plan:
         steps=None if None in counts else sum(counts),
         end=None if None in ends else sum(ends),
         axis=last._replace(key=f"stage[{len(plans) - 1}].{last.key}", start=before),
+        stages=tuple(plans),
         texts={f"stage {name}": line for name, line in zip(names, lines, strict=True)},
         record={"stages": [plan.record for plan in plans]},
     )
@@ -197,7 +198,7 @@ class Stages:
             model.begin_stage(_end_of_stage(old))
             for function in self.functions if stage.time is not None else ():
                 model.external.call(function)
-            check_start(model.contact, old.state.position, model.size)
+            check_start(model.contact, old.state.position, model.size, adjusts=False)
             stepper = _make_stepper(model, self.plan.record["stages"][number])
         except InputError as error:
             raise SimulationFailure(f"{where}: {error}") from error

@@ -136,6 +136,7 @@ class Plan:
     critical_step : largest stable step of the scheme [s], infinite if unconditionally stable
     frequency : bounds on the highest natural frequency [rad/s], None without motion
     record : the numbers that a restart must not compute again, exact to the last bit
+    stages : the plans of the stages that this one joins; empty without stages
     """
 
     scheme: Scheme
@@ -148,6 +149,7 @@ class Plan:
     critical_step: float = np.inf
     frequency: Frequency | None = None
     record: dict[str, Any] = field(default_factory=dict)
+    stages: tuple[Plan, ...] = ()
 
     def beyond(self, times: np.ndarray) -> np.ndarray:
         """Return which of the recorded times are beyond the end."""

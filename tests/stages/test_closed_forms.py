@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.runs import inspected
 from helpers.small_models import check_balances
 
 from pfem_petsc import Case, Simulation, open_result
@@ -182,10 +183,32 @@ def test_a_wall_that_nodes_are_beyond_when_its_stage_begins_is_refused(run):
         {"name": "pull", "static": {"step": 0.5}, "load": [pull(100.0)]},
         {"name": "fly", "time": FLY, "wall": [RIGHT]},
     ]
-    with pytest.raises(
-        SimulationFailure, match=r"stage 'fly', begun after step 2.*wall 'right': node 1 starts 0\.01 m"
-    ):
+    told = r"stage 'fly', begun after step 2.*wall 'right': node 1 starts 0\.01 m.*let an earlier stage move the nodes$"
+    with pytest.raises(SimulationFailure, match=told):
         run(bar(stages))
+
+
+@pytest.mark.parallel
+def test_walls_and_steps_of_later_stages_are_told_before_the_run(comm):
+    """Walls where the mesh is, 0.2 m in it, and 0.3 m away from it; the steps of a static stage are not known."""
+    fast, near = FLY | {"step": 5e-5}, RIGHT | {"point": [0.8, 0.0, 0.0]}
+    stages = [
+        {"name": "push", "static": {"step": 0.5}, "load": [pull(-100.0)]},
+        {"name": "fly", "time": FLY, "wall": [RIGHT, near | {"name": "near"}], "output": {"fields_every": 20}},
+        {"name": "stays", "time": fast},
+        {"name": "caught", "time": FLY, "wall": [LEFT | {"point": [-0.3, 0.0, 0.0]}]},
+    ]
+    entries, _ = inspected(bar(stages), comm)
+    walls = {label: text for label, text in entries.items() if label.startswith("wall ")}
+    assert walls == {
+        "wall right, stage fly": "gap 0 m at node 1 in the mesh, before earlier stages move it",
+        "wall near, stage fly": "node 1 is 200.0 mm beyond it in the mesh: the stage cannot begin unless earlier "
+        "stages move such nodes to the allowed side",
+        "wall left, stage caught": "gap 300.0 mm at node 0 in the mesh, before earlier stages move it",
+    }
+    assert "'push'" in entries["not included"] and "'fly'" not in entries["not included"]
+    alone, _ = inspected(bar(stages[2:3]), comm)
+    assert float(entries["run time"].split()[1]) == pytest.approx(2.0 * float(alone["run time"].split()[1]), rel=0.02)
 
 
 @pytest.mark.slow

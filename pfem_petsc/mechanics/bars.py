@@ -319,6 +319,22 @@ class Bars:
         slack = self.status() == STATUS.index("slack")
         return sum(int(np.count_nonzero(slack[b.start : b.counted])) for b in self.blocks)
 
+    def tighten(self) -> bool:
+        """Make bars that are slack in the mesh just taut there; return whether there are any on this rank."""
+        found = False
+        for block in self.blocks:
+            if block.law.slack_row < 0:
+                continue
+            part = slice(block.start, block.stop)
+            heat, rest = self.heat[:, part], self.rest[part]
+            shift = heat[0] if heat.shape[1] else 0.0
+            slack = self.mesh_lengths[part] < (1.0 - 1e-12) * (1.0 + shift) * rest
+            rest[slack] = self.mesh_lengths[part][slack]
+            if heat.shape[1]:
+                heat[0, slack] = 0.0
+            found |= bool(slack.any())
+        return found
+
     def status(self) -> np.ndarray:
         """Return the status (b,) of each local bar, of :data:`~pfem_petsc.fields.STATUS`."""
         status = np.full(len(self.ends), float(STATUS.index("intact")))

@@ -194,13 +194,10 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
             "young_modulus, density and area (SI units)"
         )
     # mass-proportional damping: xi = c_m / (2 rho omega) is largest for the largest c_m / rho
-    ratio = (
-        model.inertia.largest_factor
-        * max(m.damping / m.density for m in case.material.values())
-        / (2.0 * max(frequency.lower, 1e-300))
-    )
+    least = max(frequency.lower or frequency.upper, 1e-300)
+    ratio = model.inertia.largest_factor * max(m.damping / m.density for m in case.material.values()) / (2.0 * least)
     limit = scheme.limit(min(ratio, 1e3))
-    local = dashpot_rate(model) / (2.0 * max(frequency.lower, 1e-300))  # of single nodes, not of all modes
+    local = dashpot_rate(model) / (2.0 * least)  # of single nodes, not of all modes
     if limit == 0.0:
         raise InputError(
             f"{case.source}: time: {time.integrator} with these parameters is unstable at any step; use gamma >= 1/2"
@@ -215,7 +212,8 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     elif time.step == "auto":
         if not np.isfinite(critical):
             raise InputError(
-                f'{case.source}: time.step = "auto": {time.integrator} has no critical step here; give time.step [s]'
+                f'{case.source}: time.step = "auto": {time.integrator} has no critical step here, as neither bars nor '
+                "springs resist the free nodes; give time.step [s]"
             )
         steps = _steps_to(time.end, time.safety * critical, case.source)
         step = time.end / steps
@@ -255,17 +253,20 @@ def _highest_frequency(model: Model) -> Frequency:
     """Return bounds on the highest frequency of the model at any time, unstrained. Collective."""
     frequency = highest_frequency(model, model.mesh.points)
     softens = model.temperatures.varying and any(law_of(m).modulus is not None for m in model.case.material.values())
-    if not (softens or model.rest_lengths.varying):
-        return frequency
     bars = model.bars
+    varying = softens or model.rest_lengths.varying
+    if not (varying or bars.slackens):
+        return frequency
     kept = bars.rest.copy(), bars.heat.copy()
     if model.rest_lengths.varying:
         model.rest_lengths.shorten()
     if softens:
         model.temperatures.stiffen()
-    other = highest_frequency(model, model.mesh.points)
+    if model.comm.allreduce(bars.tighten(), op=MPI.LOR) or varying:
+        other = highest_frequency(model, model.mesh.points)
+        frequency = Frequency(min(frequency.lower, other.lower), max(frequency.upper, other.upper))
     bars.rest[:], bars.heat[:] = kept
-    return Frequency(min(frequency.lower, other.lower), max(frequency.upper, other.upper))
+    return frequency
 
 
 def dashpot_rate(model: Model) -> float:

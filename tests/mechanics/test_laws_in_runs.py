@@ -236,6 +236,27 @@ def test_critical_step_is_that_of_the_largest_modulus(tmp_path):
     assert found[0] / found[1] == pytest.approx(2.0, rel=1e-3)
 
 
+@pytest.mark.parametrize("damping", [0.0, 50.0])
+def test_critical_step_of_slack_cables_is_that_of_taut_ones(damping):
+    """Cables that are too long, or hot: they become taut during the run."""
+    found = []
+    for rest_length, temperature in ((1.0, 0.0), (1.05, 0.0), ([[0.0, 1.05], [1.0, 1.02]], 0.0), (1.0, 100.0)):
+        material = {"law": "cable", "young_modulus": 1e6, "density": 1000.0, "thermal_expansion": 1e-4}
+        case = {
+            "mesh": {"generator": "rod", "length": 1.0, "elements": 3},
+            "node_set": {"end": {"indices": [0]}},
+            "material": {"m": material | {"damping": damping}},
+            "section": {"s": {"area": 1e-4, "material": "m", "rest_length": rest_length}},
+            "support": [{"node_set": "end", "fix": "xyz"}],
+            "temperature": [{"value": temperature}],
+            "time": {"integrator": "central_differences", "step": "auto", "end": 0.1},
+        }
+        simulation = Simulation(Case.from_dict(case), check_only=True)
+        found.append(simulation.plan.critical_step)
+        np.testing.assert_allclose(simulation.model.bars.heat[0], 1e-4 * temperature)
+    assert found == pytest.approx(4 * found[:1], rel=1e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "integrator", "keys"),

@@ -206,7 +206,7 @@ examples:
   {PROGRAM} check my_case.toml --set time.step=1e-5
   {PROGRAM} check --env
 
-exit status: 0 it can run, 2 invalid input, or something that runs need is missing here"""
+exit status: 0 it can run, 2 invalid input, a first step that would fail, or something that runs need is missing here"""
 
 LIST = f"""\
 example:

@@ -144,9 +144,9 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
     peak = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0)
     ranks = f"{comm.size}"
     if comm.size > 1:
-        ranks += (
-            f", owning {owned.min():,} to {owned.max():,} nodes ({mesh.partitioner}), at most {ghosts.max():,} ghosts"
-        )
+        most = f"{owned.max():,} nodes"
+        own = f"{most} each" if owned.min() == owned.max() else f"{owned.min():,} to {most}"
+        ranks += f", owning {own} ({mesh.partitioner}), at most {ghosts.max():,} ghosts"
     walls = [
         wall.name if wall.mass is None else f"{wall.name} ({engineering(wall.mass, 'kg')})" for wall in case.every_wall
     ]

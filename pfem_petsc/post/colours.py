@@ -81,14 +81,15 @@ class ColourField:
         return np.linalg.norm(values, axis=1) if self._component is None else values[:, self._component]
 
     def limits(self, indices: Iterable[int]) -> tuple[float, float]:
-        """Return the range for all frames, symmetric about zero for signed fields.
+        """Return the range for all frames: from zero, or symmetric about zero if there are negative values of more than
+        a hundredth of it.
 
         In each snapshot one value in a hundred may lie outside (a spike at an impact would leave the rest without
         contrast), unless the full range is not much larger.
         """
         indices = list(indices)
         chosen = [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, _SAMPLES).astype(int))]
-        bulk, largest, signed = 0.0, 0.0, self.name in _SIGNED
+        bulk, largest, lowest = 0.0, 0.0, 0.0
         for index in chosen:
             values = self.values(index)
             values = values[np.isfinite(values)]
@@ -97,12 +98,12 @@ class ColourField:
             sizes = np.abs(values)
             bulk = max(bulk, float(np.quantile(sizes, 0.99)))
             largest = max(largest, float(sizes.max()))
-            # not for rounding in a field that cannot be negative
-            signed = signed or bool((values < -1e-9 * sizes.max()).any())
+            lowest = min(lowest, float(values.min()))
         limit = largest if largest <= 2.0 * bulk or bulk == 0.0 else bulk
         self.rounded = 0.0 < largest <= self._rounding
-        limit = 1.0 if self.rounded or limit == 0.0 else limit
-        return (-limit, limit) if signed else (0.0, limit)
+        if self.rounded or limit == 0.0:
+            return (-1.0 if self.name in _SIGNED else 0.0), 1.0
+        return (-limit if lowest < -0.01 * limit else 0.0), limit
 
 
 def _rounding_of(result: Any, name: str) -> float:

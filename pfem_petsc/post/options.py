@@ -90,7 +90,7 @@ class Options:
     poster: bool = _option(True, "write no page of six instants", flag="--no-poster", action="store_false")
     clim: tuple[float, float] | None = _option(
         None,
-        "range of the colours [SI]; default: of the values, symmetric for signed fields",
+        "range of the colours [SI]; default: from zero, symmetric if values are negative",
         metavar=("LOW", "HIGH"),
         nargs=2,
         type=float,

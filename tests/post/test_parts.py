@@ -90,6 +90,13 @@ def test_range_is_symmetric_for_signed_fields_and_fixed_over_time():
     assert ColourField(Values([0.0, 0.0]), "stress").limits([0]) == (-1.0, 1.0)
 
 
+def test_range_of_one_sign_begins_at_zero():
+    """Tension of cables, also with a compression that no colour would tell from zero."""
+    assert ColourField(Values([0.0, 2.0], [-0.01, 3.0]), "stress").limits(range(2)) == (0.0, 3.0)
+    assert ColourField(Values([-0.1, 2.0], [0.0, 3.0]), "stress").limits(range(2)) == (-3.0, 3.0)
+    assert ColourField(Values([-2.0, -3.0]), "stress").limits([0]) == (-3.0, 3.0)
+
+
 def test_a_spike_does_not_take_the_contrast():
     values = np.concatenate([np.linspace(-1, 1, 1000), [500.0]])
     low, high = ColourField(Values(np.zeros(1001), values), "stress").limits(range(2))

@@ -167,9 +167,13 @@ class Family(Chosen):
         """Return the model of a table that is validated: in results, one without module where there is none."""
         found, name = self.found(table), self.name(table)
         if found is None and name is not None and getattr(info.context, "lenient", False):
-            info.context.missing.append(self.taker.format(name))
+            info.context.missing.append(self.called(name))
             return self.unknown
         return found or self.model_of(table)  # which says what is wrong
+
+    def called(self, name: str) -> str:
+        """Return what a module is, for the message where it is not there."""
+        return self.taker.format(name)
 
     def keys(self) -> dict[str, list[str]]:
         """Return the keys of all modules by name, without common ones."""
@@ -230,6 +234,10 @@ class WithParameters(StrictModel):
 
 class _Parameters(Family):
     """The family of a :class:`WithParameters`, which has the key that names the module."""
+
+    def called(self, name: str) -> str:
+        """Return what a module is: ``the integrator newmark``."""
+        return f"the {self.key} {name}"
 
     def read(self, table: Any, info: ValidationInfo) -> Any:
         """Validate the keys of the module that the table names; a table that names none is refused for that."""

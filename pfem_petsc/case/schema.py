@@ -59,6 +59,7 @@ class Case(_Tables):
     source : file of the case as given, for messages
     folder : to which the case's relative file names refer
     overrides : texts ``KEY=VALUE`` that override its values
+    added : files of plugins that were given in addition to its own
     mesh : :class:`~pfem_petsc.case.model.Mesh`: generator with parameters, or file
     node_set, material, section : tables by name, in file order
     initial, support, load, temperature, wall, contact_pair, constraint, remove : lists of tables
@@ -182,15 +183,8 @@ class Case(_Tables):
             Names all invalid keys.
         """
         path = built_in_path(str(path_or_name)) or Path(path_or_name)
-        data = parse_toml(read_text(path), str(path))
-        if plugins:
-            own = data.get("plugins", [])
-            data["plugins"] = [
-                *(own if isinstance(own, list) else [own]),
-                *(str(Path(each).resolve()) for each in plugins),
-            ]
         named: dict[str, Any] = {"name": path.stem, "source": str(path), "overrides": overrides, "mesh": mesh}
-        return cls.from_dict(data, folder=path.parent, **named)
+        return cls.from_dict(parse_toml(read_text(path), str(path)), folder=path.parent, plugins=plugins, **named)
 
     from_file = load
 
@@ -223,6 +217,7 @@ class Case(_Tables):
         folder: str | Path = ".",
         overrides: Iterable[str] = (),
         mesh: Any = None,
+        plugins: Iterable[str | Path] = (),
         lenient: bool = False,
     ) -> Case:
         """Validate a case given as nested tables with the keys of the case file; see :meth:`load`.
@@ -243,6 +238,10 @@ class Case(_Tables):
             raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
         overrides, folder = tuple(overrides), Path(folder)
         problems = Problems(source, apply_overrides(data, overrides))
+        added = tuple(str(Path(each).resolve()) for each in plugins)
+        if added:
+            own = data.get("plugins", [])
+            data["plugins"] = [*(own if isinstance(own, list) else [own]), *added]
         stages = stages_of(data, problems) if "stage" in data else []
         if not lenient:
             _add_plugins(data.get("plugins"), folder, problems)
@@ -254,11 +253,14 @@ class Case(_Tables):
         problems.raise_if_any()
         missing = dict.fromkeys(text for each in reading for text in each.missing)
         if missing:
-            text = f"{', '.join(missing)}: not there, as the plugin or package that has it; what needs it is left out"
-            warnings.warn(f"{source}: {text}", stacklevel=2)
+            warnings.warn(
+                f"{source}: parts of the case are unknown: {', '.join(missing)}; what depends on them is left out. "
+                "Name the files that define them by --plugin, or install their packages",
+                stacklevel=2,
+            )
         name = Path(source).stem if name is None else _checked_name(name, source)
         title = name if model.title is None else model.title
-        common = {"title": title, "folder": folder, "overrides": overrides}
+        common = {"title": title, "folder": folder, "overrides": overrides, "added": added}
         case = cls._of(model, name=name, source=source, **common)
         case.__dict__["stage"] = tuple(
             cls._of(
@@ -354,7 +356,7 @@ class Case(_Tables):
     def copy(self, changes: Mapping[str, Any] | None = None, /, *, fixed: bool = False, **named: Any) -> Self:
         """Return a copy, with changes as for :meth:`update`; if ``fixed``, the copy cannot be changed."""
         made = self._reread(tables_of(self, given=True))
-        made.__dict__["overrides"] = self.overrides
+        made.__dict__.update({"overrides": self.overrides, "added": self.added})
         made.update(changes, **named)
         made.__dict__["fixed"] = fixed
         return made

@@ -32,7 +32,6 @@ exit status: 0 done, 2 invalid input, 3 the simulation failed, 4 stopped early w
 
 OF_RUN = (
     *CASE,
-    PLUGINS,
     argument("-o", "--output", metavar="DIR", type=Path, help="output folder; default: results/NAME OF THE CASE"),
     argument(
         "--restart",
@@ -40,7 +39,7 @@ OF_RUN = (
         nargs="?",
         const=True,
         help="continue from a checkpoint, or the newest of a folder; default: of the output folder; earlier "
-        "--set values stay in force",
+        "--set values and plugins stay in force",
     ),
     argument("--quiet", action="store_true", help="print no progress"),
     argument(
@@ -64,9 +63,11 @@ def run_case(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
         with Simulation(
             case, comm, output=output, restart=restart, quiet=arguments.quiet, wall_time=arguments.wall_time
         ) as simulation:
-            kept = [text for text in case.overrides if text not in arguments.overrides]
-            if kept:
-                simulation.notes.append(f"as in the run that is continued: --set {shlex.join(kept)}")
+            given = {str(Path(file).resolve()) for file in arguments.plugins}.union(arguments.overrides)
+            for option, values in (("--set", case.overrides), ("--plugin", case.added)):
+                kept = [text for text in values if text not in given]
+                if kept:
+                    simulation.notes.append(f"as in the run that is continued: {option} {shlex.join(kept)}")
             return simulation.run() or 0
     except (EarlyStop, SimulationFailure) as error:
         if "continue with --restart" in str(error):
@@ -77,7 +78,7 @@ def run_case(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
 def load_case(arguments: argparse.Namespace, comm: MPI.Comm) -> Case:
     """Return the case of the command line, read by rank 0; start PETSc with its options. Collective.
 
-    A restart applies the ``--set`` values of the continued run, overridden by those given now.
+    A restart applies the ``--set`` values of the continued run, overridden by those given now, and uses its plugins.
     """
     start_petsc(arguments.petsc_options, comm.rank)
     from ..parallel.agreement import on_root
@@ -89,15 +90,15 @@ def _load(arguments: argparse.Namespace) -> Case:
     from ..case.schema import Case
     from ..case.toml import built_in_path
 
-    overrides = arguments.overrides
+    overrides, plugins = arguments.overrides, arguments.plugins
     restart = getattr(arguments, "restart", None)
     if restart is not None:
-        from ..restart.checkpoints import joined_overrides, kept_overrides
+        from ..restart.checkpoints import joined_overrides, joined_plugins, kept_arguments
 
         name = (built_in_path(arguments.case) or Path(arguments.case)).stem
-        kept = kept_overrides(name, arguments.output or Path("results", name), restart)
-        overrides = joined_overrides(kept, overrides)
-    return Case.load(arguments.case, overrides, plugins=arguments.plugins)
+        kept, files = kept_arguments(name, arguments.output or Path("results", name), restart)
+        overrides, plugins = joined_overrides(kept, overrides), joined_plugins(files, plugins)
+    return Case.load(arguments.case, overrides, plugins=plugins)
 
 
 def _command(arguments: argparse.Namespace, case: Case, ranks: int) -> str:
@@ -156,7 +157,7 @@ def run_sweep(arguments: argparse.Namespace) -> int:
     for key, values in map(_values, arguments.vary):
         if vary.setdefault(key, values) is not values:
             raise InputError(f"--vary {key}=...: given twice; give all its values in one list, {key}=VALUE,VALUE,VALUE")
-    case = Case.load(arguments.case, arguments.overrides)
+    case = Case.load(arguments.case, arguments.overrides, plugins=arguments.plugins)
     output = arguments.output or Path("results") / f"{case.name}-sweep"
     table = sweep(
         case,
@@ -234,7 +235,6 @@ KINDS = {
 OF_CHECK = (
     argument("case", **{**CASE[0].settings, "nargs": "?"}),
     CASE[1],
-    PLUGINS,
     argument(
         "--env",
         action="store_true",
@@ -319,7 +319,7 @@ def completion(arguments: argparse.Namespace) -> int:
     }
     verbs = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction)).choices
     verbs |= dict.fromkeys(built_in_cases(), verbs["run"])
-    fill(parser, OF_RUN)
+    fill(parser, (*OF_RUN, PLUGINS))
     for each in _parsers(parser):
         for action in each._actions:
             if action.dest in ("overrides", "vary"):

@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING
 
 from ..case.toml import built_in_cases
 from ..errors import NUMPY_REMEDY, EarlyStop, InputError, PfemError, SimulationFailure, numpy_is_too_new, printable
+from ..registry import add_plugin
 from ..signals import give_back_early
-from .parser import PROGRAM, Parser, Verb, fill
+from .parser import PLUGINS, PROGRAM, Parser, Verb, fill
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -66,7 +67,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in words[:cut]
     # overflows are reported by their consequences
     warnings.filterwarnings("default" if debug else "ignore", category=RuntimeWarning)
-    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
+    told: set[str] = set()
+
+    def once(message: Warning | str, *_: object, **__: object) -> str:
+        text = f"warning: {message}\n"
+        new = text not in told
+        told.add(text)
+        return text if new else ""
+
+    warnings.formatwarning = once
     try:
         arguments, verb = _parse(words[:cut], words[cut + 1 :])
     except InputError as error:
@@ -77,6 +86,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     def run_verb(*comm: MPI.Comm) -> int:
         if arguments.verb != "run":
             give_back_early()
+        for file in arguments.plugins:
+            try:
+                add_plugin(file)
+            except InputError as error:
+                raise InputError(f"--plugin {file}: {error}") from error
         return verb.run(arguments, *comm)
 
     if arguments.ranks == "all":
@@ -135,11 +149,11 @@ def make_parser() -> tuple[Parser, dict[str, Verb]]:
             epilog=verb.example,
             prog=f"{PROGRAM} {name}",
         )
-        fill(sub, verb.arguments)
+        fill(sub, verb.arguments if verb.actions else (*verb.arguments, PLUGINS))
         actions = sub.add_subparsers(dest="action", metavar="ACTION", required=True) if verb.actions else None
         for action, text, arguments in verb.actions:
             prog = f"{PROGRAM} {name} {action}"
-            fill(actions.add_parser(action, help=text, description=text, prog=prog), arguments)
+            fill(actions.add_parser(action, help=text, description=text, prog=prog), (*arguments, PLUGINS))
     return parser, verbs
 
 

@@ -6,6 +6,7 @@ A wall module may define ``surface(parameters, bounds)``, which returns what is 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -116,9 +117,11 @@ class Motion:
                 if wall.name not in still or not present[row, k]:
                     continue
                 surface, shift = still[wall.name], shifts[row, k]
-                if shift.any():
+                if shift.any() and hasattr(wall, "point"):  # a plane is drawn beside the structure, wherever it is
                     point = tuple((np.asarray(wall.point) + shift).tolist())
                     (surface,) = wall_surfaces([wall.model_copy(update={"point": point})], self.bounds)
+                elif shift.any():
+                    surface = replace(surface, points=surface.points + shift)
                 surfaces[frame].append(surface)
         return surfaces
 
@@ -534,11 +537,12 @@ def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str]
     """
     drawn = []
     for wall in walls:
-        kinds = choices("pfem_petsc.contact.walls")
-        module = lookup("pfem_petsc.contact.walls", wall.type, "wall.type") if wall.type in kinds else None
+        known = wall.type in choices("pfem_petsc.contact.walls")
+        module = lookup("pfem_petsc.contact.walls", wall.type, "wall.type") if known else None
         draw = getattr(module, "surface", plane if wall.type == "plane" else None)
         if draw is None:
-            note(f"wall '{wall.name}' is left out of the picture: type '{wall.type}' has no drawing")
+            why = "defines no function surface" if known else "is unknown; name the file that defines it by --plugin"
+            note(f"wall '{wall.name}' is left out of the picture: its type '{wall.type}' {why}")
             continue
         shape = draw(wall, bounds)
         if not isinstance(shape, Surface):

@@ -290,12 +290,12 @@ def prepare_folder(folder: Path, restart: Restart | None, plan: Plan) -> Path | 
     return aside
 
 
-def kept_overrides(name: str, folder: Path, restart: bool | Path) -> list[str]:
-    """Return the texts ``KEY=VALUE`` of the run that a restart continues. Not collective.
+def kept_arguments(name: str, folder: Path, restart: bool | Path) -> tuple[list[str], list[str]]:
+    """Return the texts ``KEY=VALUE`` and the added plugins of the run that a restart continues. Not collective.
 
     Parameters
     ----------
-    name : of the case; texts of a run of another case are not kept
+    name : of the case; of a run of another case, nothing is kept
     folder : of the output
     restart : True for the newest checkpoint of the folder, else its file or folder
 
@@ -314,8 +314,11 @@ def kept_overrides(name: str, folder: Path, restart: bool | Path) -> list[str]:
             with open_result(folder / RESULT) as result:
                 found = result.attributes
         except InputError:
-            return []
-    return [str(text) for text in found.get("overrides", [])] if found.get("name") == name else []
+            return [], []
+    if found.get("name") != name:
+        return [], []
+    overrides, plugins = ([str(text) for text in found.get(key, [])] for key in ("overrides", "plugins"))
+    return overrides, plugins
 
 
 def joined_overrides(kept: Iterable[str], given: Iterable[str]) -> list[str]:
@@ -323,6 +326,26 @@ def joined_overrides(kept: Iterable[str], given: Iterable[str]) -> list[str]:
     given = list(given)
     keys = {_key(text) for text in given}
     return [*(text for text in kept if _key(text) not in keys), *given]
+
+
+def joined_plugins(kept: Iterable[str], given: Iterable[str]) -> list[str]:
+    """Return the kept files, except those with the name of one that is given again, followed by the given files.
+
+    Raises
+    ------
+    InputError
+        If a kept file is missing.
+    """
+    given = list(given)
+    names = {Path(file).name for file in given}
+    left = [file for file in kept if Path(file).name not in names]
+    for file in left:
+        if not Path(file).is_file():
+            raise InputError(
+                f"--restart: the run that is continued was given the plugin {file}, which is not there: give the file "
+                f"with --plugin .../{Path(file).name}"
+            )
+    return [*left, *given]
 
 
 def _key(text: str) -> tuple[str, ...]:

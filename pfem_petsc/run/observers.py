@@ -338,6 +338,7 @@ class Checkpointing(Observer):
                 "pfem_petsc": __version__,
                 "name": case.name,
                 "overrides": list(case.overrides),
+                "plugins": list(case.added),
                 "case": case.to_dict(),
                 "plan": self._stages.plan.record,
                 "mesh_mark": state.mesh_mark,

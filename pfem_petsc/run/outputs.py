@@ -303,6 +303,7 @@ class Outputs:
             "name": case.name,
             "folder": str(case.folder.resolve()),
             "overrides": list(case.overrides),
+            "plugins": list(case.added),
             "axis": TIME.symbol if case.stage else plan.axis.symbol,
             "time_step": plan.step,
             "linear_solver": plan.linear.why if plan.linear is not None else "none",

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
+
 import pytest
+from helpers.launch import environment
 from helpers.pages import EXAMPLES
 
 from pfem_petsc import Case, InputError, registry
@@ -40,8 +45,53 @@ def test_results_open_without_the_plugins_of_their_case(
     for verb in ("info", "report", "plot", "render"):
         assert main([verb, "out", *(["--size", "160x120"] if verb == "render" else [])]) == 0
         text = " ".join([*capsys.readouterr(), *(str(recwarn.pop().message) for _ in recwarn.list)])
-        assert "a wall of type funnel" in text and "the law viscoplastic" in text and "not there" in text, verb
+        for part in ("parts of the case are unknown: ", "law viscoplastic, a wall of type funnel", "integrator bdf2"):
+            assert part in text, verb
+        assert ("wall 'funnel' is left out of the picture: its type 'funnel' is unknown" in text) == (verb == "render")
     assert list((plugin_files / "out").glob("*.png"))
+
+
+@pytest.mark.slow
+def test_every_verb_takes_plugins(plugin_files, forgotten, monkeypatch, capfd):
+    """A restart has those of its checkpoint; pictures show their walls; sweeps and meshes are made with them."""
+    monkeypatch.chdir(plugin_files)
+    forgotten()
+    assert main(["polygon_spin.toml", "--quiet", "--plugin", *FILES, "--set", "time.end=0.01"]) == 0
+    forgotten()
+    assert main(["polygon_spin.toml", "--restart", "--set", "time.end=0.02"]) == 0
+    kept = " ".join(str(plugin_files / name) for name in FILES)
+    assert f"as in the run that is continued: --plugin {kept}" in capfd.readouterr().out
+    (plugin_files / "cases").mkdir()
+    for path in ("funnel.py", "polygon.py"):
+        (plugin_files / path).rename(plugin_files / "cases" / path)
+    forgotten()
+    draw = ["render", "results/polygon_spin", "--frames", "2", "--video", "none", "--size", "160x120"]
+    command = [sys.executable, "-m", "pfem_petsc", *draw]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, check=True)
+    assert done.stderr.count("a wall of type funnel") == 1
+    bare = (plugin_files / "results/polygon_spin/render.png").read_bytes()
+    assert main([*draw, "--plugin", "cases/funnel.py"]) == 0
+    said, told = capfd.readouterr()
+    assert "left out" not in said and "funnel" not in told
+    assert (plugin_files / "results/polygon_spin/render.png").read_bytes() != bare
+    forgotten()
+    again = ["polygon_spin.toml", "--quiet", "--restart", "--set", "time.end=0.03"]
+    assert main(again) == 2
+    missing = r"was given the plugin \S+/funnel.py, which is not there: give the file with --plugin \.\.\./funnel.py"
+    assert re.search(missing, capfd.readouterr().err)
+    moved = ["cases/funnel.py", "cases/polygon.py"]
+    assert main([*again, "--plugin", *moved]) == 0
+    forgotten()
+    files = [name for name in FILES if not (plugin_files / "cases" / name).exists()]
+    vary = ["--vary", "time.step=1e-3,2e-3", "--set", "time.end=0.01"]
+    assert main(["sweep", "polygon_spin.toml", "--quiet", *vary, "--plugin", *files, *moved]) == 0
+    forgotten()
+    make = ["mesh", "generate", "polygon", "ring.h5", "--set", "radius=1", "sides=5"]
+    assert main(make) == 2
+    assert main([*make, "--plugin", *moved]) == 0
+    assert "ring.h5: 5 nodes, 5 bars" in capfd.readouterr().out
+    assert main(["list", "--plugin", "none.py"]) == 2
+    assert "error: --plugin none.py: this plugin cannot be read: " in capfd.readouterr().err
 
 
 def test_a_case_names_its_plugins(plugin_files, examples, forgotten):
@@ -53,7 +103,9 @@ def test_a_case_names_its_plugins(plugin_files, examples, forgotten):
     assert Case.from_toml(case.to_toml(), "/elsewhere") == case == case.copy()
     assert case.wall[0].half_angle == 45.0
     again = Case.load(plugin_files / "polygon_spin.toml", plugins=[plugin_files / name for name in FILES])
-    assert again == case
+    assert again == case and again.added == again.copy().added == case.plugins
+    listed = ["plugins=['bdf2.py']"]
+    assert Case.load(plugin_files / "polygon_spin.toml", listed, plugins=case.plugins).plugins[1:] == case.plugins
 
 
 @pytest.mark.parametrize(

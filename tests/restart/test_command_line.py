@@ -13,7 +13,7 @@ from helpers.stopped import rod, steps
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.result import open_result
-from pfem_petsc.restart.checkpoints import kept_overrides
+from pfem_petsc.restart.checkpoints import kept_arguments
 
 
 @pytest.fixture(scope="module")
@@ -177,12 +177,12 @@ def test_values_of_set_are_kept_by_a_restart(tmp_path, capsys):
 
 
 def test_values_of_another_case_are_not_kept(copy):
-    assert kept_overrides("rod_impact", copy, True) == ["output.checkpoint_every=20", "time.end=0.5"]
-    assert kept_overrides("pendulum", copy, True) == []
+    assert kept_arguments("rod_impact", copy, True) == (["output.checkpoint_every=20", "time.end=0.5"], [])
+    assert kept_arguments("pendulum", copy, True) == ([], [])
     for path in copy.glob("*.h5"):
         path.unlink()
-    assert kept_overrides("rod_impact", copy, True) == ["output.checkpoint_every=20", "time.end=0.5"]
-    assert kept_overrides("pendulum", copy, True) == []
+    assert kept_arguments("rod_impact", copy, True) == (["output.checkpoint_every=20", "time.end=0.5"], [])
+    assert kept_arguments("pendulum", copy, True) == ([], [])
 
 
 @pytest.mark.parametrize("fields_every", [10, 0])

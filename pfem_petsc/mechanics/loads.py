@@ -267,7 +267,7 @@ class ExternalForce:
         loads, else taken away, at once over time and in proportion with a load factor
     held_gravity : (3,) the same of gravity [m/s2]
     state_forces : that depend on the motion, which :meth:`follow` gives
-    reactions : forces (owned, 3) of supports that are removed gradually [N], with begin and duration of the removal
+    reactions : of supports that are being removed, by their names: forces (owned, 3) [N], begin and duration [s]
     """
 
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], inertia: Inertia) -> None:
@@ -290,15 +290,15 @@ class ExternalForce:
         self.active = bool(case.load) or bool(self.gravity.any()) or varies or bool(self.state_forces)
         self.held: np.ndarray | None = None
         self.held_gravity = np.zeros(3)
-        self.reactions: list[tuple[np.ndarray, float, float]] = []
+        self.reactions: dict[str, tuple[np.ndarray, float, float]] = {}
         changes = (self._loads is not None and not self._loads.steady) or (varies and not self._keeps[1])
         self._steady = not self.ramped and not changes
         self._constant: np.ndarray | None = None
 
     @property
     def steady(self) -> bool:
-        """Whether the forces are constant."""
-        return self._steady and not self.state_forces
+        """Whether the forces are constant from now on."""
+        return self._steady and not self.state_forces and not self.reactions
 
     def call(self, function: Callable[[float, ForceState], Any]) -> None:
         """Add the forces that a function returns."""
@@ -336,7 +336,7 @@ class ExternalForce:
 
     def constant(self) -> np.ndarray | None:
         """(owned, 3) [N], which must not be changed, if the forces are the same at all times, else None."""
-        if not self.steady or self.reactions:
+        if not self.steady:
             return None
         if self._constant is None:
             self._constant = self.at(0.0, np.empty((len(self.inertia.mass), 3)))
@@ -359,7 +359,7 @@ class ExternalForce:
     def _add_loads(self, time: float, out: np.ndarray) -> np.ndarray:
         if self._loads is not None and self._loads.any:
             self._loads.add(time, time if self.ramped else 1.0, out)
-        for force, begin, duration in self.reactions:
+        for force, begin, duration in self.reactions.values():
             if time < begin + duration:
                 out += (1.0 - (time - begin) / duration) * force
         if self.held is not None:

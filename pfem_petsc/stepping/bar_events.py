@@ -220,7 +220,9 @@ class Removals:
 
     def _done(self, k: int, now: float) -> bool:
         entry = self._entries[k]
-        return self.times[k] >= 0.0 and now >= (entry.time + entry.duration) * (1.0 - TIME)
+        # the reaction of a support decreases from the end of the step that has reached the time
+        begin = entry.time if entry.bars is not None else self.times[k]
+        return self.times[k] >= 0.0 and now >= (begin + entry.duration) * (1.0 - TIME)
 
     def _left(self, now: float) -> list[Remove]:
         """Return what is not removed yet."""
@@ -256,11 +258,15 @@ class Removals:
         self._replace(entry, now)
         self.gone.append(entry.supports)
 
+    def finish(self, entry: Remove) -> None:
+        """End the load that a support has left."""
+        self._model.external.reactions.pop(entry.supports, None)
+
     def resume(self, now: float) -> None:
         """Continue after times and reactions were restored."""
         for k, entry in enumerate(self._entries):
             self._complete[k] = self._done(k, now)
-            if entry.supports in self.gone and self.times[k] >= 0.0:
+            if entry.supports in self.gone and self.times[k] >= 0.0 and not self._complete[k]:
                 self._replace(entry, self.times[k])
         if self.gone:
             self._model.supports.release(self.gone)
@@ -275,5 +281,5 @@ class Removals:
         """Let the reaction of a support act as a load that decreases."""
         external, column = self._model.external, self._columns[entry.supports]
         if entry.duration:
-            external.reactions.append((self.released[:, column : column + 3], begin, entry.duration))
+            external.reactions[entry.supports] = self.released[:, column : column + 3], begin, entry.duration
             external.active = True

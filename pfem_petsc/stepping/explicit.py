@@ -94,6 +94,9 @@ class ExplicitStepper(Stepper):
 
     def supports_changed(self) -> None:
         super().supports_changed()
+        self.load_ended()
+
+    def load_ended(self) -> None:
         self._batch, self._batched = None, None
 
     @contextmanager

@@ -350,6 +350,7 @@ class Ledger:
     def end_batches(self) -> None:
         """Keep the present state, from which a step without batches goes on."""
         self._before = moment_of(self.stepper)
+        self._before.kinetic = self.sums[_AT["kinetic_energy"]]
         self.powers = None
 
     def _damped(self) -> float:

@@ -498,6 +498,9 @@ class Stepper(ABC):
             elif begins:
                 self.removals.release(entry, self.recorded()[1], self.state.time)
                 self.supports_changed()
+            elif share == 1.0:
+                self.removals.finish(entry)
+                self.load_ended()
         return changed
 
     def follow_removals(self, before: Removals) -> None:
@@ -520,6 +523,9 @@ class Stepper(ABC):
     def supports_changed(self) -> None:
         """Take account of components that are no longer prescribed, or now are. Collective."""
         self.support_changes += 1
+
+    def load_ended(self) -> None:  # noqa: B027 - most steppers evaluate loads in each step
+        """Take account of a load that has ended. Collective."""
 
     def resume(self) -> None:
         """Continue from a state that was restored from a checkpoint. Collective."""

@@ -6,6 +6,7 @@ from helpers.kills import differences
 from helpers.runs import run
 from helpers.small_models import AREA, MATERIAL, YOUNG
 from helpers.stopped import assert_restart_is_bitwise
+from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, write_mesh
 from pfem_petsc.errors import InputError
@@ -109,6 +110,29 @@ def test_a_support_is_taken_away_in_equilibrium(method, comm, tmp_path):
     np.testing.assert_allclose(down[first], factor[first] * WEIGHT / (3.0 * STIFF), rtol=1e-4, atol=1e-15)
     np.testing.assert_allclose(down[last], factor[last] * WEIGHT / (2.0 * STIFF), rtol=1e-4)
     assert np.abs(history["energy_imbalance"]).max() < 1e-7 * history["external_work"][-1]
+
+
+@pytest.mark.parametrize("scheme", ["central_differences", "chung_lee", "newmark"])
+def test_what_a_support_leaves_decreases_over_its_duration(scheme, tmp_path):
+    """A bar under F at both ends, whose supports go from t = 0.1 over D = 0.5: momentum 2 F s^2/(2 D), s = t - 0.1, up
+    to F D, and 2 F more per time after it."""
+    case = Case.from_dict(
+        {
+            "mesh": {"generator": "rod", "length": 1.0, "elements": 1},
+            "node_set": {"all": {"all": True}},
+            "material": {"it": {"young_modulus": 1e4, "density": 1.0}},
+            "section": {"it": {"area": 1.0, "material": "it"}},
+            "support": [{"name": "held", "node_set": "all", "fix": "xyz"}],
+            "load": [{"node_set": "all", "force": [1.0, 0.0, 0.0]}],
+            "remove": [{"supports": "held", "time": 0.1, "duration": 0.5}],
+            "time": {"integrator": scheme, "step": 1e-3, "end": 2.0},
+        }
+    )
+    history = run(case, tmp_path, MPI.COMM_SELF)
+    since = np.clip(history["time"] - 0.1, 0.0, None)
+    expected = np.where(since < 0.5, 2.0 * since**2, 2.0 * since - 0.5)
+    # a step and what is left at its end: the sum of forces is taken at its beginning, middle or end
+    np.testing.assert_allclose(history["momentum"][:, 0], expected, atol=2.5e-3)
 
 
 @pytest.mark.slow

@@ -38,8 +38,16 @@ class SignalNotes:
         if threading.current_thread() is not threading.main_thread() or self._before:
             return
         for number in SIGNALS:
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            if number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN:
+                signal.signal(number, signal.SIG_IGN)  # a library may have installed its own handler below Python
+            else:
                 self._before[number] = signal.signal(number, self._note)
+
+    def keep_watching(self) -> None:
+        """Install the handlers again, below Python, after a library may have installed its own there."""
+        for number in SIGNALS:
+            if (handler := signal.getsignal(number)) is not None:
+                signal.signal(number, handler)
 
     def release(self) -> None:
         """Restore the previous signal handlers."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from ..errors import InputError
+from ..signals import early
 
 PROGRAM = "python -m pfem_petsc"
 
@@ -179,6 +180,7 @@ def start_petsc(options: Sequence[str], rank: int) -> None:
         if type(error).__name__ != "Error":  # PETSc.Error cannot be imported before PETSc is started
             raise
         raise InputError(f"PETSc does not start with the options {' '.join(options)}: {error}") from error
+    early().keep_watching()  # PETSc installs its own for hang-ups
     if rank == 0:
         for line in without_effect(options):
             print(f"warning: {line}", file=sys.stderr, flush=True)

@@ -110,7 +110,7 @@ def warn_of_gain(case: Case, step: float, across: float = np.inf) -> str:
     if not any(treatment == known for known, _ in CASES):
         return ""
     step, parameters = float(f"{step:.2g}"), time.scheme.model_dump()
-    bars = int(np.clip(np.round(across), BARS[0], BARS[-1]))
+    bars = max(round(across), BARS[0]) if across < BARS[-1] else BARS[-1]
     gain, worst = -1.0, RodImpact(treatment, time.mass == "consistent", step, 0.0, bars)
     for restitution in sorted({0.0, *(wall.restitution for wall in case.wall)}):
         impact = replace(worst, restitution=restitution)

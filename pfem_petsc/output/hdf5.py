@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import resource
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -352,13 +353,17 @@ def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None =
     Raises
     ------
     SimulationFailure
-        On all ranks, if the file (or folder ``target``) is missing or fewer than ``n_bytes`` + 1 MiB are free.
+        On all ranks, if the file (or folder ``target``) is missing or fewer than ``n_bytes`` + 1 MiB are free, on the
+        disk or below the limit of the process for the size of files.
     """
 
     def look() -> None:
         try:
-            (target or path).stat()
-            free = shutil.disk_usage(path.parent).free
+            size = (target or path).stat().st_size
+            free, full = shutil.disk_usage(path.parent).free, "disk full"
+            limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+            if limit != resource.RLIM_INFINITY and limit - size < free:
+                free, full = max(limit - size, 0), f"limit of file sizes reached (ulimit -f: {limit / 1e6:.1f} MB)"
         except OSError as error:
             raise SimulationFailure(
                 f"{path}: gone or unreachable during the run ({os.strerror(error.errno)}); "
@@ -367,7 +372,7 @@ def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None =
         needed = n_bytes + (1 << 20)
         if free < needed:
             raise SimulationFailure(
-                f"{path}: disk full: {free / 1e6:.1f} MB are free, and the next write may take {needed / 1e6:.1f} MB. "
+                f"{path}: {full}: {free / 1e6:.1f} MB are free, and the next write may take {needed / 1e6:.1f} MB. "
                 "What was written before is complete; make room and continue with --restart, or write less "
                 "(fields_every, fields, precision, compression in [output])"
             )

@@ -100,12 +100,9 @@ class Impulses:
         load = self.forces(totals, walls, self.links.totals())
         u = (load if balance.a_hat is None else load - balance.a_hat) / balance.alpha
         stepper.scheme.finish(state, balance, u, stepper.part)
-        inertia = stepper.model.inertia
         for name, change in stepper.prescribed.change.items():
-            every = np.zeros((len(inertia.mass), 3))
-            stepper.model.supports.put(every, change)
             particles = getattr(state, name) if name in ("v", "a") else state.memory[name]
-            particles[SUPPORT] += inertia.mass_times(every, np.empty_like(every)).sum(axis=0)
+            particles[SUPPORT] += change
 
     def jump(self) -> None:
         """Add the velocity jumps of the treatment in this step."""

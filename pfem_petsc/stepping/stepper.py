@@ -67,8 +67,9 @@ class PrescribedMotion:
 
     Attributes
     ----------
-    change : changes of velocity, acceleration and scheme memory of prescribed components (k,) relative to those of the
-        scheme in the last step, by name; empty without moving supports
+    change : sums over this rank's nodes (3,) of the mass times the changes of velocity, acceleration and scheme memory
+        of prescribed components relative to those of the scheme in the last step, by name; empty without moving
+        supports
     """
 
     def __init__(self, stepper: Stepper) -> None:
@@ -120,7 +121,10 @@ class PrescribedMotion:
             supports.put(state.memory["half_velocity"], way / self.stepper.part)
         ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
         made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
-        self.change = {name: supports.get(given[name]) - array[:, 0] for name, array in made.items()}
+        for name, array in made.items():
+            change = np.zeros_like(state.v)
+            supports.put(change, supports.get(given[name]) - array[:, 0])
+            self.change[name] = self.stepper.model.inertia.mass_times(change, np.empty_like(change)).sum(axis=0)
 
     def _restart(self) -> None:
         """Make the memory of the scheme consistent with the new velocities and accelerations."""

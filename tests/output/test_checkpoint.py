@@ -1,6 +1,7 @@
 """Checkpoints: bitwise on any number of ranks, never incomplete, and damage is refused with the reason."""
 
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from mpi4py import MPI
 
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.output.checkpoint import Checkpoint, newest_checkpoint, write_checkpoint
+from pfem_petsc.output.hdf5 import require_room
 from pfem_petsc.parallel.natural import NaturalOrder
 
 COMM = MPI.COMM_WORLD
@@ -205,6 +207,18 @@ def test_a_kill_leaves_a_complete_checkpoint(tmp_path, chance):
         arrays, found = read(newest_checkpoint(tmp_path), MPI.COMM_SELF)
         assert found.scalars["step"] >= written - 1 > 0
         assert arrays["positions"].tobytes() == values()["positions"][owned_ids(MPI.COMM_SELF, 2)].tobytes()
+
+
+def test_limit_of_file_sizes_is_no_damage(tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    (tmp_path / "file").write_bytes(bytes(2_000_000))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, limits[1]))
+    try:
+        require_room(MPI.COMM_SELF, tmp_path / "file", 500_000)
+        with pytest.raises(SimulationFailure, match=r"ulimit -f: 4\.0 MB\): 2\.0 MB are free"):
+            require_room(MPI.COMM_SELF, tmp_path / "file", 1_000_000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_disk_full_keeps_the_checkpoint_before(small_disk):

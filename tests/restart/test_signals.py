@@ -5,6 +5,7 @@ import os
 import pty
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -127,6 +128,20 @@ def test_handlers_are_given_back(tmp_path, handlers, end):
         gc.collect()
     assert mine(handlers)
     assert not (tmp_path / "out.lock").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ignored", [False, True])
+def test_hang_up_while_petsc_starts(ignored):
+    """PETSc's own handler would end the process, also under nohup."""
+    code = (
+        "import os, signal; from pfem_petsc.signals import early, watch_early; watch_early(); "
+        "from pfem_petsc.cli.parser import start_petsc; start_petsc([], 0); "
+        "os.kill(os.getpid(), signal.SIGHUP); print('signal', early()._signal)"
+    )
+    words = [*(["nohup"] if ignored else []), sys.executable, "-c", code]
+    done = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=PATIENCE)
+    assert done.stdout.split()[-2:] == ["signal", "0" if ignored else str(int(signal.SIGHUP))], done.stderr
 
 
 def test_ignored_hang_up_stays_ignored(tmp_path, handlers):

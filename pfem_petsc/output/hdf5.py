@@ -360,10 +360,10 @@ def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None =
     def look() -> None:
         try:
             size = (target or path).stat().st_size
-            free, full = shutil.disk_usage(path.parent).free, "disk full"
+            free, limited = shutil.disk_usage(path.parent).free, ""
             limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
             if limit != resource.RLIM_INFINITY and limit - size < free:
-                free, full = max(limit - size, 0), f"limit of file sizes reached (ulimit -f: {limit / 1e6:.1f} MB)"
+                free, limited = max(limit - size, 0), f" (ulimit -f: {limit / 1e6:.1f} MB for a file)"
         except OSError as error:
             raise SimulationFailure(
                 f"{path}: gone or unreachable during the run ({os.strerror(error.errno)}); "
@@ -372,7 +372,7 @@ def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None =
         needed = n_bytes + (1 << 20)
         if free < needed:
             raise SimulationFailure(
-                f"{path}: {full}: {free / 1e6:.1f} MB are free, and the next write may take {needed / 1e6:.1f} MB. "
+                f"{path}: disk full{limited}: {free / 1e6:.1f} MB are free, and the next write may take {needed / 1e6:.1f} MB. "
                 "What was written before is complete; make room and continue with --restart, or write less "
                 "(fields_every, fields, precision, compression in [output])"
             )

@@ -215,7 +215,7 @@ def test_limit_of_file_sizes_is_no_damage(tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, limits[1]))
     try:
         require_room(MPI.COMM_SELF, tmp_path / "file", 500_000)
-        with pytest.raises(SimulationFailure, match=r"ulimit -f: 4\.0 MB\): 2\.0 MB are free"):
+        with pytest.raises(SimulationFailure, match=r"ulimit -f: 4\.0 MB for a file\): 2\.0 MB are free"):
             require_room(MPI.COMM_SELF, tmp_path / "file", 1_000_000)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -139,8 +139,9 @@ OF_SWEEP = (
         "--results",
         metavar="NAME",
         nargs="+",
-        help="columns of the history whose last values are in the table; vectors have a column for each component, "
-        "wall/floor/force.z is one of them",
+        help="columns of the history whose last values are in the table, named as for plot --curves; vectors have a "
+        "column for each component, wall/floor/force.z is one of them; or columns of the table without this option, "
+        "like peak_wall/floor/force",
     ),
     argument("--remove", action="store_true", help="remove the results of the runs, and keep the table only"),
     argument("--wall-time", metavar="TIME", type=seconds, help="stop a run after this time"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import html
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ from ..registry import nearest
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["Table", "flat_columns"]
+__all__ = ["Table", "flat_columns", "over_nodes", "selected"]
 
 _SHOWN = 10  # rows shown at the beginning and at the end of a long table
 
@@ -126,6 +127,58 @@ def flat_columns(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     for k in range(values.shape[1]):
         found |= flat_columns(f"{name}[{k}]", values[:, k])
     return found
+
+
+_DISPLACEMENT = "/displacement"
+_SELECTION = re.compile(r"(?P<whole>.+?)(\[(?P<node>\d+)\])?(\.(?P<part>x|y|z|norm))?")
+
+
+def source_of(name: str) -> str:
+    """Return the column of the history that a name of :func:`selected` is computed from."""
+    whole = _SELECTION.fullmatch(name)["whole"]
+    if not whole.endswith(_DISPLACEMENT):
+        return whole
+    return whole.removesuffix(_DISPLACEMENT) + ("/position" if whole.startswith("probe/") else "")
+
+
+def selected(history: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    """Return a column of a history, (rows,), (rows, 3) or (rows, nodes, 3), or what a name selects of it.
+
+    ``NAME[0]`` is the value of the first node, and ``.x``, ``.y``, ``.z``, ``.norm`` are components; of all nodes, that
+    of their mean, of reactions that of the sum. ``probe/NAME/displacement`` is the position relative to that of the
+    first row, and ``centre_of_mass/displacement`` that of the centre of mass.
+
+    Raises
+    ------
+    InputError
+        If the history has no such column, or the column no such component or node.
+    """
+    known = [column for column in history if not column.startswith("event/")]
+    if name in known:
+        return np.asarray(history[name])
+    whole, node, part = _SELECTION.fullmatch(name).group("whole", "node", "part")
+    source = whole if whole in known else source_of(whole)
+    if source not in known:
+        raise InputError(f"the history has no column '{whole}'{nearest(whole, known)}")
+    values = np.asarray(history[source])
+    if values.ndim == 1:
+        raise InputError(f"{name}: column '{whole}' is a number and has no components")
+    if node and (values.ndim == 2 or int(node) >= values.shape[1]):
+        raise InputError(f"{name}: the column {whole} has {', '.join(list(flat_columns(whole, values))[:6])}")
+    if source != whole:
+        values = values - values[:1]
+    if node:
+        values = values[:, int(node)]
+    if part and values.ndim == 3:
+        values = over_nodes(whole, values)
+    if part == "norm":
+        return np.linalg.norm(values, axis=1)
+    return values[:, "xyz".index(part)] if part else values
+
+
+def over_nodes(name: str, values: np.ndarray) -> np.ndarray:
+    """Return the sum (rows, 3) over the nodes of a column of reactions (rows, nodes, 3), of others the mean."""
+    return values.sum(axis=1) if name.endswith("/reaction") else values.mean(axis=1)
 
 
 def _column(values: Sequence[Any] | np.ndarray) -> np.ndarray:

@@ -10,15 +10,13 @@ import numpy as np
 
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
+from ..output.table import over_nodes, selected, source_of
 from ..output.units import TIME, unit_of
-from ..registry import nearest
 from .chart import COLOURS, REFERENCE, Chart, Curve, Panel, largest
 from .closed_forms import ClosedForm, closed_form
 from .filters import AS_COMPUTED, Filter, amplitude_spectrum
 
 History = Mapping[str, np.ndarray]
-
-_DISPLACEMENT = "/displacement"  # of probes, and of the centre of mass
 
 _PEAKS = 5  # of a spectrum, at most, that are told
 
@@ -36,47 +34,24 @@ def words(name: str) -> str:
 
 
 def column(history: History, name: str) -> dict[str, np.ndarray]:
-    """Return the curves (n,) of a name: a column, or ``.x``, ``.y``, ``.z``, ``.norm`` of one.
+    """Return the curves (n,) of a name, which :func:`~pfem_petsc.output.table.selected` takes.
 
     Columns of nodes are the mean over the nodes, of reactions the sum. A vector without component gives those that are
-    not zero up to rounding. ``probe/NAME/displacement`` is the position relative to that of the first row, and
-    ``centre_of_mass/displacement`` that of the centre of mass.
+    not zero up to rounding.
 
     Raises
     ------
     InputError
         If the history has no such column.
     """
-    whole, _, part = name.rpartition(".")
-    if name in list(history) or part not in ("x", "y", "z", "norm"):
-        whole, part = name, ""
-    if whole not in list(history) and (position := _position(whole)) in list(history):
-        values = read(history, position)
-        history = {whole: values - values[:1]}
-    if whole not in list(history) or whole.startswith("event/"):
-        known = [each for each in history if not each.startswith("event/")]
-        raise InputError(f"the history holds no column '{whole}'{nearest(whole, known)}")
-    values = read(history, whole)
+    values = selected(history, name).astype(float)
     if values.ndim == 3:
-        values = values.sum(axis=1) if whole.endswith("/reaction") else values.mean(axis=1)
+        values = over_nodes(name, values)
     if values.ndim == 1:
-        if part:
-            raise InputError(f"{name}: column '{whole}' is a number and has no components")
-        return {whole: values}
-    if part == "norm":
-        return {name: np.linalg.norm(values, axis=1)}
-    if part:
-        return {name: values[:, "xyz".index(part)]}
+        return {name: values}
     largest = float(np.nanmax(np.abs(values), initial=0.0))
     kept = [k for k in range(3) if np.nanmax(np.abs(values[:, k]), initial=0.0) > 1e-9 * largest]
-    return {f"{whole}.{'xyz'[k]}": values[:, k] for k in kept or range(3)}
-
-
-def _position(name: str) -> str:
-    """Return the name of the positions that displacements are made of; others as they are."""
-    if not name.endswith(_DISPLACEMENT):
-        return name
-    return name.removesuffix(_DISPLACEMENT) + ("/position" if name.startswith("probe/") else "")
+    return {f"{name}.{'xyz'[k]}": values[:, k] for k in kept or range(3)}
 
 
 def smoothed(result: Any, chosen: Filter, values: np.ndarray, touch: bool = False) -> np.ndarray:
@@ -96,7 +71,7 @@ def exact_curves(exact: ClosedForm | None, names: Sequence[str], place: np.ndarr
     curves: list[Curve] = []
     for name in names:
         whole = name if exact is None or name in exact.columns else name.rpartition(".")[0] or name
-        if exact is not None and _position(whole) in exact.columns:
+        if exact is not None and source_of(whole) in exact.columns:
             values = column(exact.columns, name)[name]
             curves.append(Curve("" if curves else exact.name, values, REFERENCE, f"{name} closed form", place))
     return curves
@@ -113,7 +88,7 @@ def usual_curves(results: Sequence[Any]) -> list[str]:
     chosen += [name for name in forces if any(np.any(result.history[name]) for result in results)]
     for name in common:
         if name.startswith("probe/") and name.endswith("/position"):
-            moved = name.removesuffix("/position") + _DISPLACEMENT
+            moved = name.removesuffix("position") + "displacement"
             chosen += (
                 [moved] if any(np.any(np.concatenate([*column(r.history, moved).values()])) for r in results) else []
             )
@@ -184,8 +159,7 @@ def draw_curves(
 
 def unit_of_curve(name: str) -> str:
     """Return the SI unit of a column or a component of one."""
-    whole, _, part = name.rpartition(".")
-    return unit_of(_position(whole if part in ("x", "y", "z", "norm") else name))
+    return unit_of(source_of(name))
 
 
 def _single(history: History, name: str) -> np.ndarray:

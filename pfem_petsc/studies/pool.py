@@ -43,7 +43,7 @@ class Task(NamedTuple):
 
 
 class Report(NamedTuple):
-    """How a run has ended: exit status, message, wall time [s] and number of steps."""
+    """How a run has ended: exit status, message (warnings of a run that is done), wall time [s] and number of steps."""
 
     status: int
     message: str
@@ -160,6 +160,9 @@ def perform(task: Task) -> Report:
                 status = simulation.run()
             finally:
                 steps = simulation.stepper.number
+            warnings = simulation.outputs.progress.warnings
+            if warnings:
+                message = f"{len(warnings)} warning{'s' * (len(warnings) > 1)}: {warnings[0]}"
     except PfemError as error:
         status, message = error.exit_status, str(error)
     except Exception as error:  # noqa: BLE001 - whatever it is becomes a row of the table

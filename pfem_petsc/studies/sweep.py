@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from ..case.toml import plain
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError, PfemError
 from ..output.result import Result, open_result, peak_force, touch_impulse
-from ..output.table import Table, flat_columns
+from ..output.table import Table, flat_columns, selected
 from ..registry import nearest
 from .pool import Report, Task, performed
 
@@ -52,11 +51,13 @@ def sweep(
         last key varying fastest; or a list of changes, each as for :meth:`Case.copy`, one for each run
     processes : number of runs at a time
     results : columns of results: a function of the finished :class:`Result` for each name, or a column of the history,
-        whose last value is used (vectors have a column for each component; ``wall/floor/force.z`` is one of them); or
-        one function that returns values by name. Functions are called in this process; an exception becomes the
-        message of the row, whose status is then 1. Default: the last values of time and of the energies that occur
-        [J], the largest forces of walls and supports [N], as means over the time of a wave forth and back in the
-        shortest bar there, and the impulses of walls in the rows in which nodes touch them [N s]
+        whose last value is used (vectors have a column for each component), or a part of it as for
+        :func:`~pfem_petsc.output.table.selected`, or one of the default results; or one function that returns values
+        by name. Functions are called in this process; an exception becomes the message of the row, whose status is then
+        1. Default: ``final_...``, the last values of time and of the energies that occur [J];
+        ``peak_wall/NAME/force`` and ``peak_support_force``, the largest forces of walls and supports [N], as means over
+        the time of a wave forth and back in the shortest bar there; and ``touch_wall/NAME/impulse``, the impulses of
+        walls in the rows in which nodes touch them [N s]
     output : folder of the results, which are in folders ``0000``, ``0001``, ... in it; default:
         ``results/<case name>-sweep``. An existing one is moved aside
     keep : whether the results of the runs are kept; otherwise those with status 0 are removed after their row is made
@@ -67,7 +68,7 @@ def sweep(
     -------
     Table with the columns ``run``, one for each key, ``status`` (0: done, 2: rejected, 3: failed, 4: stopped, 1 or
     negative: an unexpected error or signal), ``message``, ``wall_time`` [s], ``steps``, and the results (nan for runs
-    without).
+    without). The message of a run that is done is the number of its warnings and the first of them.
 
     Raises
     ------
@@ -88,7 +89,7 @@ def sweep(
         raise InputError(f"sweep: results: the table has a column {name!r} already")
     cases, refused = _cases(case, changes)
     if isinstance(results, Mapping):
-        _refuse_unknown({label: name for label, name in results.items() if isinstance(name, str)}, cases.values())
+        _refuse_unknown([name for name in results.values() if isinstance(name, str)], cases.values())
     folder = _prepared(Path(output) if output is not None else Path("results") / f"{case.name}-sweep")
     tasks = [Task(each, folder / f"{number:04d}", wall_time) for number, each in cases.items()]
     numbers = list(cases)
@@ -185,18 +186,18 @@ def _progress(quiet: bool) -> Progress:
 def _results_of(result: Result, results: ResultFunction | Mapping[str, ResultFunction | str] | None) -> dict[str, Any]:
     """Return the results of a run by name, as :func:`sweep` takes them."""
     if results is None:
-        return dict(_default_results(result))
+        return {name: value(result) for name, value in _usual_results(result.history).items()}
     if callable(results):
         values = results(result)
         return dict(values) if isinstance(values, Mapping) else {"result": values}
     found: dict[str, Any] = {}
     for name, what in results.items():
-        found |= {name: what(result)} if callable(what) else _last(result.history, name, what)
+        found |= {name: what(result)} if callable(what) else _column(result, name, what)
     return found
 
 
-def _refuse_unknown(asked: Mapping[str, str], cases: Iterable[Case]) -> None:
-    """Refuse columns of the history, by their names in the table, that no case has; one has all of them as a rule."""
+def _refuse_unknown(asked: Iterable[str], cases: Iterable[Case]) -> None:
+    """Refuse columns of results that no case has; one has all of them as a rule."""
     from mpi4py import MPI
 
     from ..simulation import Simulation
@@ -209,8 +210,8 @@ def _refuse_unknown(asked: Mapping[str, str], cases: Iterable[Case]) -> None:
         except PfemError:  # which becomes the message of the row
             continue
         try:
-            for label, name in asked.items():
-                _last(rows, label, name)
+            for name in asked:
+                _check(rows, name)
             return
         except InputError as error:
             refusal = refusal or error
@@ -218,29 +219,39 @@ def _refuse_unknown(asked: Mapping[str, str], cases: Iterable[Case]) -> None:
         raise refusal
 
 
-def _last(history: Mapping[str, np.ndarray], label: str, name: str) -> dict[str, Any]:
-    """Return the last value of a column as ``label``: all components of a vector, or the one at the end of the name."""
-    whole = name if name in history else re.sub(r"(\[\d+\])?\.[xyz]$", "", name)
-    if whole not in history:
-        raise InputError(f"sweep: results: history has no {whole}{nearest(whole, list(history))}")
-    values = history[whole][-1:]
-    if whole == name:
-        return {each: column[0] for each, column in flat_columns(label, values).items()}
-    columns = flat_columns(whole, values)
-    if name not in columns:
-        raise InputError(f"sweep: results: {name}: the column {whole} has {', '.join(list(columns)[:6])}")
-    return {label: columns[name][0]}
+def _check(history: Mapping[str, np.ndarray], name: str) -> None:
+    """Refuse a name that is neither one of the default results nor a selection of the history."""
+    usual = list(_usual_results(history))
+    if name in usual:
+        return
+    if name.startswith(("final_", "peak_", "touch_")):
+        raise InputError(f"sweep: results: there is no {name!r}{nearest(name, usual)}")
+    try:
+        selected(history, name)
+    except InputError as error:
+        raise InputError(f"sweep: results: {error}") from None
 
 
-def _default_results(result: Result) -> Iterator[tuple[str, Any]]:
-    """Yield name and value: last time and energies, largest mean forces [N], and impulses of first touches [N s]."""
-    history = result.history
+def _column(result: Result, label: str, name: str) -> dict[str, Any]:
+    """Return one of the default results, or the last value of a column, a number or all components, as ``label``."""
+    usual = _usual_results(result.history)
+    if name in usual:
+        return {label: usual[name](result)}
+    last = selected(result.history, name)[-1:]
+    return {each: column[0] for each, column in flat_columns(label, last).items()}
+
+
+def _usual_results(columns: Iterable[str]) -> dict[str, ResultFunction]:
+    """Return the default results that a history with these columns has: last time and energies, largest mean forces
+    [N], and impulses of first touches [N s]."""
+    names, found = list(columns), {}
     for name in ("time", *STORED, *LOST, *SUPPLIED, "energy_imbalance"):
-        if name in history:
-            yield f"final_{name}", float(history[name][-1])
-    for name in history:
+        if name in names:
+            found[f"final_{name}"] = lambda result, name=name: float(result.history[name][-1])
+    for name in names:
         if (name.startswith("wall/") and name.endswith("/force")) or name == "support_force":
-            yield f"peak_{name}", peak_force(result, name)[0]
+            found[f"peak_{name}"] = lambda result, name=name: peak_force(result, name)[0]
         if name.startswith("wall/") and name.endswith("/contacts"):
-            wall = name.removesuffix("/contacts")
-            yield f"touch_{wall}/impulse", touch_impulse(result, wall.removeprefix("wall/"))[0]
+            wall = name.removeprefix("wall/").removesuffix("/contacts")
+            found[f"touch_wall/{wall}/impulse"] = lambda result, wall=wall: touch_impulse(result, wall)[0]
+    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gc
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from pfem_petsc import Case, InputError, Simulation, Truss, open_result, sweep
 from pfem_petsc.cli import cases as verb
 from pfem_petsc.cli.main import main
 from pfem_petsc.mechanics.compiled import Compilation
+from pfem_petsc.output.result import peak_force
 from pfem_petsc.output.table import Table
 from pfem_petsc.solvers import matrix_free as outlive
 from pfem_petsc.studies import pool
@@ -193,11 +195,25 @@ def test_values_of_a_command_line(text, values):
     assert verb._values(f"key={text}") == ("key", values)
 
 
+def test_a_run_with_warnings_says_so(rod, tmp_path):
+    """Where its row is otherwise that of a run without: runs are compared by the table."""
+    changes = {"time.integrator": ["newmark", "generalized_alpha"]}
+    table = sweep(rod, changes, output=tmp_path / "out", quiet=True)
+    assert table["status"].tolist() == [0, 0]
+    assert table["message"][0] == ""
+    assert re.match(r"\d+ warnings?: contact: generalized_alpha .* gains energy in impacts", table["message"][1])
+
+
 def test_vectors_are_columns_of_their_components(rod, tmp_path):
     asked = ["wall/wall/force", "probe/tip/position[0].x", "kinetic_energy"]
+    of_plots = {"peak": "peak_wall/wall/force", "last": "probe/tip/position.x", "moved": "probe/tip/displacement.norm"}
     vary = {"initial.velocity": [(1.0, 0.0, 0.0), (0.2, 0.0, 0.0)], "time.end": [0.3]}  # the first one fails
-    table = sweep(rod, vary, results={name: name for name in asked}, output=tmp_path / "out", quiet=True)
-    assert list(table)[-5:] == [*(f"wall/wall/force.{axis}" for axis in "xyz"), *asked[1:]]
+    results = {name: name for name in asked} | of_plots
+    table = sweep(rod, vary, results=results, output=tmp_path / "out", quiet=True)
+    assert list(table)[-8:] == [*(f"wall/wall/force.{axis}" for axis in "xyz"), *asked[1:], *of_plots]
+    assert table["last"][1] == table["probe/tip/position[0].x"][1]
+    assert table["moved"][1] == pytest.approx(abs(table["last"][1] - 1.0))
+    assert table["peak"][1] == peak_force(open_result(tmp_path / "out" / "0001"), "wall/wall/force")[0] > 0.0
     history = open_result(tmp_path / "out" / "0001").history
     assert table["wall/wall/force.x"][1] == history["wall/wall/force"][-1, 0] and np.isnan(
         table["wall/wall/force.x"][0]
@@ -210,7 +226,8 @@ def test_vectors_are_columns_of_their_components(rod, tmp_path):
     assert float(rows[1]["wall/wall/force.x"]) == table["wall/wall/force.x"][1]
     for name, told in (
         ("probe/tip/position[4].x", r"probe/tip/position has probe/tip/position\[0\].x"),
-        ("kinetic_energi", "history has no kinetic_energi, did you mean 'kinetic_energy'"),
+        ("peak_wall/wal/force", "no 'peak_wall/wal/force', did you mean 'peak_wall/wall/force'"),
+        ("kinetic_energi", "history has no column 'kinetic_energi', did you mean 'kinetic_energy'"),
     ):
         with pytest.raises(InputError, match=told):
             sweep(rod, [{}], results={"w": name}, output=tmp_path / "wrong", quiet=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import html
+import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,7 +18,7 @@ from ..registry import nearest
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["Table", "flat_columns", "over_nodes", "selected"]
+__all__ = ["SWEEP", "Table", "flat_columns", "over_nodes", "selected", "source_of", "varied"]
 
 _SHOWN = 10  # rows shown at the beginning and at the end of a long table
 
@@ -127,6 +128,21 @@ def flat_columns(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     for k in range(values.shape[1]):
         found |= flat_columns(f"{name}[{k}]", values[:, k])
     return found
+
+
+SWEEP = "sweep.csv"
+"""Table of a sweep, beside the folders of its runs."""
+
+
+def varied(folder: Path) -> dict[str, str]:
+    """Return the values that a sweep gave to the run in a folder, by their keys; empty if it is no run of a sweep."""
+    try:
+        with (folder.parent / SWEEP).open(newline="", encoding="utf-8") as file:
+            row = next(row for row in csv.DictReader(file) if f"{int(row['run']):04d}" == folder.name)
+    except (OSError, KeyError, ValueError, StopIteration):
+        return {}
+    values = itertools.takewhile(lambda item: item[0] != "status", row.items())
+    return {key: value for key, value in values if key != "run" and value != "nan"}
 
 
 _DISPLACEMENT = "/displacement"

@@ -10,13 +10,15 @@ import numpy as np
 
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.table import over_nodes, selected, source_of
+from ..output.table import over_nodes, selected, source_of, varied
 from ..output.units import TIME, unit_of
 from .chart import COLOURS, REFERENCE, Chart, Curve, Panel, largest
 from .closed_forms import ClosedForm, closed_form
 from .filters import AS_COMPUTED, Filter, amplitude_spectrum
 
 History = Mapping[str, np.ndarray]
+
+_LONGEST = 50  # number of letters of a label that tells the values of a run
 
 _PEAKS = 5  # of a spectrum, at most, that are told
 
@@ -170,8 +172,12 @@ def _single(history: History, name: str) -> np.ndarray:
 
 
 def labels_of(results: Sequence[Any]) -> list[str]:
-    """Return distinct names of results: those of their folders, or as much of the paths as it takes."""
+    """Return distinct names of results: what varies in runs of a sweep, else folders, or as much of the paths as it
+    takes."""
     paths = [Path(result.path).absolute() for result in results]
+    labels = _values_of_runs([varied(path.parent) for path in paths])
+    if len(set(labels)) == len(labels) and all(0 < len(label) <= _LONGEST for label in labels):
+        return labels
     for count in range(1, max(len(path.parts) for path in paths)):
         labels = ["/".join(path.parent.parts[-count:]) for path in paths]
         if len(set(labels)) == len(labels):
@@ -179,6 +185,15 @@ def labels_of(results: Sequence[Any]) -> list[str]:
     return (
         [str(path) for path in paths] if len(set(paths)) == len(paths) else [f"{k}: {p}" for k, p in enumerate(paths)]
     )
+
+
+def _values_of_runs(runs: Sequence[Mapping[str, str]]) -> list[str]:
+    """Return for each run of a sweep the values that differ between some of them, with as much of the keys as it takes;
+    empty texts for others."""
+    keys = [key for key in runs[0] if len({run.get(key) for run in runs}) > 1]
+    short = [key.rpartition(".")[2] for key in keys]
+    names = short if len(set(short)) == len(short) else keys
+    return [", ".join(f"{name} = {run[key]}" for name, key in zip(names, keys) if key in run) for run in runs]
 
 
 def draw_spectra(

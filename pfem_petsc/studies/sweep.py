@@ -17,7 +17,7 @@ from ..case.toml import plain
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError, PfemError
 from ..output.result import Result, open_result, peak_force, touch_impulse
-from ..output.table import Table, flat_columns, selected
+from ..output.table import SWEEP, Table, flat_columns, selected
 from ..registry import nearest
 from .pool import Report, Task, performed
 
@@ -115,7 +115,7 @@ def sweep(
             failed = sum(row["status"] != 0 for row in rows.values())
             progress.update(counter, advance=1, failed=failed)
             table = _table(rows, found, asked, results is None)
-            table.to_csv(folder / "sweep.csv")
+            table.to_csv(folder / SWEEP)
     return table
 
 

@@ -21,6 +21,7 @@ from pfem_petsc.cli.main import main
 from pfem_petsc.mechanics.compiled import Compilation
 from pfem_petsc.output.result import peak_force
 from pfem_petsc.output.table import Table
+from pfem_petsc.post.curves import labels_of
 from pfem_petsc.solvers import matrix_free as outlive
 from pfem_petsc.studies import pool
 from pfem_petsc.studies.pool import Task
@@ -202,6 +203,19 @@ def test_a_run_with_warnings_says_so(rod, tmp_path):
     assert table["status"].tolist() == [0, 0]
     assert table["message"][0] == ""
     assert re.match(r"\d+ warnings?: contact: generalized_alpha .* gains energy in impacts", table["message"][1])
+
+
+def test_comparisons_name_what_varies(rod, tmp_path):
+    """In the place of the folders of the runs, where that is known and distinct."""
+    changes = [{"time.step": step, "time.end": end} for step, end in ((0.01, 0.1), (0.02, 0.1), (0.01, 0.2))]
+    sweep(rod, [*changes, {"time.end": 0.2}], output=tmp_path / "out", quiet=True)
+    runs = [open_result(tmp_path / "out" / f"{number:04d}") for number in range(4)]
+    assert labels_of(runs[:2]) == ["step = 0.01", "step = 0.02"]
+    assert labels_of(runs[:3]) == ["step = 0.01, end = 0.1", "step = 0.02, end = 0.1", "step = 0.01, end = 0.2"]
+    assert labels_of(runs[2:]) == ["0002", "0003"]
+    assert labels_of([runs[0], runs[0]])[0].startswith("0: ")
+    (tmp_path / "out" / "sweep.csv").unlink()
+    assert labels_of(runs[:2]) == ["0000", "0001"]
 
 
 def test_vectors_are_columns_of_their_components(rod, tmp_path):

@@ -38,7 +38,7 @@ _CONVERT = {
     **dict.fromkeys((".geo", ".geo_unrolled", ".step", ".stp", ".brep"), _GEOMETRY),
     **dict.fromkeys((".vtk", ".med", ".bdf", ".nas", ".fem", ".xdmf", ".mesh", ".unv"), _MESHIO),
 }
-"""How to make a file that is read out of another; meshio is installed with the program."""
+"""How to make a file that is read out of another; meshio comes with the extra ``mesh``."""
 
 
 def suffixes(*what: str) -> dict[str, ModuleType]:

@@ -54,7 +54,7 @@ def forecast(
     """Return label and text of the estimates of memory and, if the steps are known, of time and disk. Collective."""
     plans = plan.stages or (plan,)
     held = model.comm.allreduce(max(_needed(model, each) for each in plans))
-    entries = {"memory needed": f"about {engineering(held, 'B', 3)} on all ranks"}
+    entries = {"memory needed": f"about {engineering(held, 'B', 3)} by the end of the run, on all ranks"}
     known = [(stage, each) for stage, each in zip(case.stages, plans, strict=True) if each.steps is not None]
     if known:
         seconds = sum(_seconds(model, each) for _, each in known)
@@ -118,13 +118,18 @@ def memory_warning(model: Model, plan: Plan, source: str) -> list[str]:
 
 
 def _needed(model: Model, plan: Plan) -> float:
-    """Return the maximum memory of this rank [B]."""
+    """Return the maximum memory of this rank until the end of the run [B]."""
     kind = "" if plan.linear is None else plan.linear.preconditioner
     each = _PER_BAR.get(kind, max(_PER_BAR.values()))
     if kind in DIRECT or model.case.modes is not None:
         # fill-in in three dimensions: the factors of n unknowns have O(n^(4/3)) entries
         each = _PER_BAR_FACTORISED * (model.mesh.n_bars / _FACTORISED_AT) ** (1.0 / 3.0)
-    return _EMPTY + each * len(model.mesh.bars)
+    return max(_used(), _EMPTY + each * len(model.mesh.bars))
+
+
+def _used() -> float:
+    """Return the maximum memory of this rank so far [B]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0  # kibibytes on Linux
 
 
 def _seconds(model: Model, plan: Plan) -> float:
@@ -140,8 +145,6 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
     """Return label and text of sizes, distribution, time step and solver. Collective."""
     mesh, comm = model.mesh, model.comm
     owned, ghosts = np.array(comm.allgather((mesh.n_owned, mesh.n_local - mesh.n_owned))).T
-    # kibibytes on Linux
-    peak = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0)
     ranks = f"{comm.size}"
     if comm.size > 1:
         most = f"{owned.max():,} nodes"
@@ -164,7 +167,7 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         "walls": ", ".join(walls) or "none",
         **({"contact pairs": ", ".join(pair.name for pair in case.contact_pair)} if case.contact_pair else {}),
         **({"constraints": ", ".join(f"{c.name} ({c.kind})" for c in case.constraint)} if case.constraint else {}),
-        "memory": f"{engineering(peak, 'B', 3)} in use on all ranks",
+        "memory": f"{engineering(comm.allreduce(_used()), 'B', 3)} used so far, on all ranks",
     }
 
 

@@ -37,10 +37,14 @@ def numpy_is_too_new(error: BaseException) -> bool:
     )
 
 
-def raised(error: BaseException) -> str:
-    """Return what a function of a user raised, and where: ``raised ValueError: no such node (my.py, line 7)``."""
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"raised {type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
+def raised(error: BaseException, file: str | None = None) -> str:
+    """Return what a function of a user raised, and where: ``raised ValueError: no such node (my.py, line 7)``.
+
+    With a ``file``, the place is the last one in it, and left out if there is none.
+    """
+    frames = [each for each in traceback.extract_tb(error.__traceback__) if file in (None, each.filename)]
+    place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
+    return f"raised {type(error).__name__}: {error}{place}"
 
 
 class PfemError(Exception):

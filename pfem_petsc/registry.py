@@ -11,7 +11,9 @@ import contextlib
 import difflib
 import importlib
 import pkgutil
+import re
 import sys
+import traceback
 from functools import cache
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
@@ -166,6 +168,25 @@ def add_plugin(path: Path | str) -> None:
 def has_plugin(path: Path | str) -> bool:
     """Return whether the module of a file was added."""
     return Path(path).resolve() in _sources
+
+
+def added_file(package: str, name: str) -> str:
+    """Return the file of a module that a plugin or another distribution adds; empty for one of the program."""
+    return "" if name in _own(package) else str(lookup(package, name, "").__file__)
+
+
+def blame(error: BaseException) -> str:
+    """Return the place in a plugin where an error was raised, or which could not be compiled, and why; or nothing."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if Path(frame.filename) in _sources:
+            return f"{frame.filename}, line {frame.lineno}, in {frame.name}: {type(error).__name__}: {error}"
+    text = str(error)
+    for found in re.finditer(r'File "(.+)", line (\d+)', text):  # as Numba quotes a function that it cannot compile
+        path = Path(found[1]).resolve()
+        if path in _sources:
+            reason = text[: found.start()].rstrip().rpartition("\n")[2].strip()
+            return f"{path}, line {found[2]}: this cannot be compiled: {reason}"
+    return ""
 
 
 def _names(node: ast.stmt) -> list[str]:

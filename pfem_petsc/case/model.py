@@ -24,18 +24,17 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, core_schema
 
-from ..contact.walls.base import WallKeys
+from ..contact.walls.base import WALLS, WallKeys
 from ..errors import InputError
 from ..fields import cell_fields, point_fields
 from ..mechanics.materials.base import LAWS, MaterialKeys, internal_variables, law_name
-from ..registry import choices, lookup, modules, nearest
+from ..registry import added_file, choices, lookup, modules, nearest
 from . import tables as t
 from .base import ConstraintKeys, FilePath, Name, NonNegativeInt, PositiveInt, StrictModel, listed, refusal
 from .files import Columns, TableFile, file_columns, rows_of
 
 GENERATORS = "pfem_petsc.mesh.generators"
 INTEGRATORS = "pfem_petsc.integrators"
-WALLS = "pfem_petsc.contact.walls"
 CONSTRAINTS = "pfem_petsc.contact.constraints"
 TREATMENTS = "pfem_petsc.contact.treatments"
 STATIC_METHODS = "pfem_petsc.statics.methods"
@@ -335,7 +334,10 @@ class _Materials(Family):
         if hardening:
             text = f"{hardening[0]} = {table[hardening[0]]!r} needs a yield_stress [Pa]"
             raise refusal(((), text, None))
-        known = lookup(LAWS, law, "").LAW
+        known, file = lookup(LAWS, law, "").LAW, added_file(LAWS, law)
+        flaw = known.flaw(material, file) if file else ""
+        if flaw:
+            raise refusal((("law",), f"{file}: {flaw}", law))
         if material.softening is not None and known.softening is None:
             raise refusal((("softening",), f"the law {law} does not soften by a table; remove the key", None))
         variables = [variable for variable, _ in material.choose(known).internal]

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 from ..case.toml import built_in_cases
 from ..errors import NUMPY_REMEDY, EarlyStop, InputError, PfemError, SimulationFailure, numpy_is_too_new, printable
-from ..registry import add_plugin
+from ..registry import add_plugin, blame
 from ..signals import give_back_early
 from .parser import PLUGINS, PROGRAM, Parser, Verb, fill
 
@@ -294,5 +294,8 @@ def exit_message(error: BaseException) -> tuple[int, str]:
         case _ if type(error).__module__ == "petsc4py.PETSc" and getattr(error, "ierr", 0) in _PETSC_REFUSED:
             check = "check what follows -- (docs/linear_solvers.md)"
             return InputError.exit_status, f"error: PETSc rejects an option: {reason}; {check}"
+    if place := blame(error):
+        kind = InputError if type(error).__module__.startswith("numba.") else SimulationFailure
+        return kind.exit_status, f"error: the plugin {place}"
     detail = f"{type(error).__name__}: {(reason or 'no message')[:500]}"
     return SimulationFailure.exit_status, f"internal error: {detail}; run with --debug to see where"

@@ -13,9 +13,10 @@ import numpy as np
 from mpi4py import MPI
 
 from ..mechanics.compiled import kernel
-from ..registry import lookup
+from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, FREE_PART, resolvable
 from .wall_motion import WallMotion
+from .walls.base import made_wall
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -272,9 +273,8 @@ class NodeWalls:
         self.state = None
         self.names = [wall.name for wall in walls]
         self.any = bool(walls)
-        self.walls = [
-            lookup("pfem_petsc.contact.walls", wall.type, f"{case.source}: wall.type").Wall(wall) for wall in walls
-        ]
+        with agreed(mesh.comm):
+            self.walls = [made_wall(wall, mesh.points[: mesh.n_owned]) for wall in walls]
         self.motion = WallMotion(walls, case.holds("wall"))
         self.moving = self.motion.moving
         self.all_nodes = np.array([wall.node_set is None for wall in walls], dtype=bool)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..contact.wall_motion import WallMotion
-from ..contact.walls.base import Surface, slab
+from ..contact.walls.base import WALLS, Surface, slab
 from ..errors import InputError
 from ..fields import STATUS
 from ..mechanics.bars import area_fields, bar_shapes, named_groups, section_of_bars
@@ -537,8 +537,8 @@ def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str]
     """
     drawn = []
     for wall in walls:
-        known = wall.type in choices("pfem_petsc.contact.walls")
-        module = lookup("pfem_petsc.contact.walls", wall.type, "wall.type") if known else None
+        known = wall.type in choices(WALLS)
+        module = lookup(WALLS, wall.type, "wall.type") if known else None
         draw = getattr(module, "surface", plane if wall.type == "plane" else None)
         if draw is None:
             why = "defines no function surface" if known else "is unknown; name the file that defines it by --plugin"
@@ -587,4 +587,4 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
 
 def _place(wall: Any) -> np.ndarray:
     """A point that the keys of a wall give (3,) [m]."""
-    return np.asarray(lookup("pfem_petsc.contact.walls", wall.type, "wall.type").Wall(wall).centre, dtype=float)
+    return np.asarray(lookup(WALLS, wall.type, "wall.type").Wall(wall).centre, dtype=float)

@@ -9,12 +9,18 @@ import sys
 import pytest
 from helpers.launch import environment
 from helpers.pages import EXAMPLES
+from mpi4py import MPI
 
-from pfem_petsc import Case, InputError, registry
+from pfem_petsc import Case, InputError, Simulation, registry
 from pfem_petsc.cli.main import main
 
 FILES = sorted(path.rpartition("/")[2] for path in EXAMPLES if path.endswith(".py"))
 CASE = next(code for path, code in EXAMPLES.items() if path.endswith(".toml"))
+
+
+def code_of(name):
+    """Return an example of CONTRIBUTING.md by the name of its file."""
+    return next(code for path, code in EXAMPLES.items() if path.endswith(name))
 
 
 @pytest.fixture
@@ -126,9 +132,88 @@ def test_what_is_no_plugin_is_refused(tmp_path, name, text, told):
         Case.from_dict({"plugins": ["none.py"], **data}, folder=tmp_path)
 
 
+LAW = code_of("viscoplastic.py")
+RETURNED = "return stress, tangent, (plastic, back, heat), (elastic, heat, 0.5 * back * back / hardening)"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (
+            RETURNED,
+            "return stress, tangent",
+            r"response returned \(0.0, 1000000.0\); it must return \(stress, tangent, ",
+        ),
+        (RETURNED, "return stress, tangent, q, (elastic,)", r"tuples of the lengths that LAW has: 3 and 3"),
+        (RETURNED, "return stress, tangent, q, elastic", r"tuples of the lengths that LAW has: 3 and 3"),
+        ("relative = young", "relative = youn", r"response raised NameError: .*\(\S+viscoplastic.py, line \d+\)"),
+        ("return self.young_modulus, self.yield_stress, ", "return ", "response raised ValueError: not enough values"),
+        ("return self.young_modulus, ", "return self.young_modulus #", r"Parameters.pack returned 1000000.0; it must"),
+    ],
+)
+def test_wrong_laws_are_refused(plugin_files, forgotten, old, new, told):
+    forgotten()
+    assert LAW.count(old) >= 1
+    (plugin_files / "viscoplastic.py").write_text(LAW.replace(old, new, 1))
+    text = rf'material.default.law = "viscoplastic": {plugin_files}/viscoplastic.py: .*{told}'
+    with pytest.raises(InputError, match=text):
+        Case.load(plugin_files / "polygon_spin.toml", plugins=[plugin_files / name for name in FILES])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("return normals, ", "return 2.0 * normals, ", r"planes returned the normal \[.*\] and the offset .* at \["),
+        ("return normals, normals @ self.centre", "return normals, np.nan * normals[:, 0]", ".*the offset nan at"),
+        ("return normals, normals @ self.centre", "return normals, 0.0", r"planes returned \[\(12, 3\), \(\)\]"),
+        ("return normals, normals @ self.centre", "return normals", "planes returned ndarray"),
+        ("def planes(", "def plane(", "it raised TypeError: .* abstract method '?planes"),
+        ("arm = x - ", "arm = y - ", r"it raised NameError: .*\(\S+funnel.py, line \d+\)"),
+        ("self.centre = ", "self.centre, self.apex = 0.0, ", r"its centre is 0.0; it must be an array \(3,\)"),
+        (
+            "    def planes(",
+            "    flat, normal, offset = True, (0, 0, 2), 0.0\n\n    def planes(",
+            "its normal is .*unit",
+        ),
+    ],
+)
+def test_wrong_walls_are_refused(plugin_files, tmp_path, forgotten, old, new, told):
+    forgotten()
+    code = code_of("funnel.py")
+    assert code.count(old) >= 1
+    (plugin_files / "funnel.py").write_text(code.replace(old, new, 1))
+    case = Case.load(plugin_files / "polygon_spin.toml", plugins=[plugin_files / name for name in FILES])
+    with pytest.raises(InputError, match=f"wall 'funnel': {plugin_files}/funnel.py: the class Wall: {told}"):
+        Simulation(case, MPI.COMM_SELF, check_only=True)
+
+
+@pytest.mark.slow
+def test_other_failures_name_the_plugin(plugin_files, forgotten, monkeypatch, capsys):
+    monkeypatch.chdir(plugin_files)
+    words = ["polygon_spin.toml", "--quiet", "--plugin", *FILES]
+    plain = "def other(x):\n    return abs(x)\n\n\n@register_jitable\ndef response"
+    for name, changes, status, told in (
+        ("bdf2.py", {"state.a = ": "state.a = one * "}, 3, "in finish: NameError: name 'one' is not defined"),
+        (
+            "viscoplastic.py",
+            {"@register_jitable\ndef response": plain, "= abs(relative)": "= other(relative)"},
+            2,
+            "this cannot be compiled: Untyped global name 'other'",
+        ),
+    ):
+        forgotten()
+        code = code_of(name)
+        for old, new in changes.items():
+            code = code.replace(old, new, 1)
+        (plugin_files / name).write_text(code)
+        assert main(words) == status
+        error = capsys.readouterr().err
+        assert error.startswith(f"error: the plugin {plugin_files / name}, line ") and told in error
+        (plugin_files / name).write_text(code_of(name))
+
+
 def test_installed_packages_add_modules_by_entry_points(tmp_path, monkeypatch):
-    code = next(code for path, code in EXAMPLES.items() if path.endswith("viscoplastic.py"))
-    absolute = code.replace("...case", "pfem_petsc.case").replace(
+    absolute = LAW.replace("...case", "pfem_petsc.case").replace(
         "from .base", "from pfem_petsc.mechanics.materials.base"
     )
     (tmp_path / "soft_laws.py").write_text(absolute)

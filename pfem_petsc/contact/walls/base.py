@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from ...case.base import Finite, NonNegativeFloat, PositiveFloat, Vector3, WallParameters, listed
+from ...errors import InputError, raised
+from ...registry import added_file, lookup
+
+WALLS = "pfem_petsc.contact.walls"
+"""The package of the walls."""
 
 Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
 
@@ -71,7 +76,8 @@ class WallKeys(WallParameters):
 
 
 class BaseWall(ABC):
-    """The surface of a wall at rest.
+    """The surface of a wall at rest: nodes stay where n . x >= d, with the unit normals n and offsets d of its tangent
+    planes.
 
     Attributes
     ----------
@@ -90,7 +96,8 @@ class BaseWall(ABC):
     def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the tangent planes nearest to positions (m, 3) [m]: unit normals (m, 3) and offsets (m,) [m].
 
-        The allowed region is n . x >= d; n . x - d is the distance of x from the surface, negative beyond it.
+        The normals have the length 1 and point to the allowed side, n . x >= d; n . x - d is the distance of x from
+        the surface [m], negative beyond it. m may be zero.
         """
 
     def gaps(self, x: np.ndarray) -> np.ndarray:
@@ -102,6 +109,49 @@ class BaseWall(ABC):
     def stops(self, before: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
         """Return (m,) bool: nodes that the wall stops between ``before`` (m, 3) and ``x`` (m, 3); for partial walls."""
         return np.ones(len(x), dtype=bool)
+
+
+def made_wall(parameters: WallKeys, x: np.ndarray) -> BaseWall:
+    """Return the wall of its keys, after a look at what it gives for positions (m, 3) [m].
+
+    Raises
+    ------
+    InputError
+        If a class that is not of the program does not do what :class:`BaseWall` says.
+    """
+    module = lookup(WALLS, parameters.type, "wall.type")
+    file = added_file(WALLS, parameters.type)
+    if not file:
+        return module.Wall(parameters)
+    try:
+        wall = module.Wall(parameters)
+        flaw = _flaw(wall, x[:100])
+    except Exception as error:  # noqa: BLE001 - of a user
+        flaw = f"it {raised(error, file)}"
+    if flaw:
+        raise InputError(f"wall {parameters.name!r}: {file}: the class Wall: {flaw}")
+    return wall
+
+
+def _flaw(wall: BaseWall, x: np.ndarray) -> str:
+    """Return how a wall differs from what :class:`BaseWall` says, empty if it does not."""
+    if np.shape(wall.centre) != (3,):
+        return f"its centre is {wall.centre!r:.80}; it must be an array (3,)"
+    if wall.flat and not _is_plane(wall.normal, wall.offset):
+        return f"its normal is {wall.normal!r:.80} and its offset {wall.offset!r:.80}; give a unit vector and a number"
+    must = "it must return unit normals (m, 3) and offsets (m,) for positions (m, 3)"
+    planes = wall.planes(x)
+    shapes = [np.shape(each) for each in planes] if isinstance(planes, tuple) else type(planes).__name__
+    if shapes != [x.shape, x.shape[:1]]:
+        return f"planes returned {shapes} for positions {x.shape}; {must}"
+    for place, normal, offset in zip(x.tolist(), *map(np.ndarray.tolist, map(np.asarray, planes)), strict=True):
+        if not _is_plane(normal, offset):
+            return f"planes returned the normal {normal} and the offset {offset} at {place}; {must}"
+    return ""
+
+
+def _is_plane(normal: Any, offset: Any) -> bool:
+    return np.shape(normal) == (3,) and abs(np.linalg.norm(normal) - 1.0) < 1e-6 and bool(np.isfinite(offset))
 
 
 def direction(value: tuple[float, float, float], what: str) -> tuple[float, float, float]:

@@ -16,6 +16,7 @@ from pydantic import Field, field_validator
 from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, listed
 from ...case.tables import Rupture
 from ...columns import BAR_ENERGIES
+from ...errors import raised
 from ...registry import lookup
 from ..compiled import inlined
 
@@ -356,11 +357,37 @@ class Law:
         names = [name for name, _ in self.internal]
         return names.index("slack") if "slack" in names else -1
 
+    def flaw(self, material: MaterialKeys, file: str) -> str:
+        """Return how what the functions in a file give of an unstrained bar differs from what they must give; empty if
+        it does not."""
+        p, q = material.pack(), (0.0,) * len(self.internal)
+        if not _are_numbers(p):
+            return f"Parameters.pack returned {p!r:.80}; it must return a tuple of numbers"
+        try:
+            given = self.response(0.0, 0.0, 0.0, 0.0, (*p, *(1.0 for _ in self.bar_data)), q)
+        except ArithmeticError:  # compiled code has infinite numbers instead
+            return ""
+        except Exception as error:  # noqa: BLE001 - of a user
+            return "" if "math domain error" in str(error) else f"the function response {raised(error, file)}"
+        fits = isinstance(given, tuple) and len(given) == 4 and _are_numbers(given[:2])
+        if fits and _are_numbers(given[2], len(q)) and _are_numbers(given[3], len(self.energies)):
+            return ""
+        return (
+            f"the function response returned {given!r:.80}; it must return (stress, tangent, internal variables, "
+            f"energies), the last two as tuples of the lengths that LAW has: {len(q)} and {len(self.energies)}"
+        )
+
     def refuses(self, scheme: Any) -> str | None:
         """Return why a :class:`~pfem_petsc.integrators.base.Scheme` cannot use the law, None if it can."""
         if scheme.discrete_gradient and self.mean_stress is None:
             return self.no_mean_stress or "it has no mean stress over a step (mean_stress), which this scheme needs"
         return None
+
+
+def _are_numbers(values: Any, count: int | None = None) -> bool:
+    """Whether values are a tuple of numbers, as many as ``count``, if it is given."""
+    right = isinstance(values, tuple) and all(isinstance(value, int | float | np.number) for value in values)
+    return right and (count is None or len(values) == count)
 
 
 SMALL = 1e-6  # change of strain over strain, below which the quotient is rounding, and the trapezoidal rule is exact

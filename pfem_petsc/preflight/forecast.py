@@ -61,10 +61,11 @@ def forecast(
         size = result_bytes(known, model.mesh, fields.points, fields.cells, columns)
         counted = [stage for stage, _ in known]
         unknown = [f"stage {stage.name!r}" for stage in case.stages if stage not in counted]
-        entries["run time"] = (
-            f"about {duration(seconds)} of steps on idle cores, within a factor of 3; start, "
-            "compilation and output are extra"
-        )
+        if seconds:  # modes alone have no steps
+            entries["run time"] = (
+                f"about {duration(seconds)} of steps on idle cores, within a factor of 3; start, "
+                "compilation and output are extra"
+            )
         most = "at most " if case.output.compression != "none" else "about "
         entries["result file"] = f"{most}{engineering(size, 'B', 3)}"
         if unknown:
@@ -163,7 +164,6 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         "wave speed": engineering(model.wave_speed, "m/s"),
         **plan.texts,
         **describe_modes(model),
-        "linear solver": plan.linear.why if plan.linear is not None else "none: nodes are solved independently",
         "walls": ", ".join(walls) or "none",
         **({"contact pairs": ", ".join(pair.name for pair in case.contact_pair)} if case.contact_pair else {}),
         **({"constraints": ", ".join(f"{c.name} ({c.kind})" for c in case.constraint)} if case.constraint else {}),

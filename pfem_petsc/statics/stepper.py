@@ -492,7 +492,7 @@ def make_stepper(model: Model) -> StaticStepper:
     stepper.plan = Plan(
         stepper.scheme,
         LOAD_FACTOR if points is None else POINT,
-        {"static analysis": f"{case.static.method} ({words})"},
+        {"static analysis": f"{case.static.method} ({words})", "linear solver": choice.why},
         parameters.step,
         stepper.end,
         choice,

@@ -243,6 +243,7 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
         "integrator": time.integrator + (f" ({parameters})" if parameters else ""),
         "critical step": engineering(critical, "s") if np.isfinite(critical) else "none (implicit)",
         "time step": f"{engineering(step, 's', 6)}, {steps:,} steps to {engineering(step * steps, 's')}",
+        "linear solver": "none, nodes are solved independently" if linear is None else linear.why,
     }
     choice = None if linear is None else {"asked": list(asked), "choice": asdict(linear)}
     record = {"step": step, "frequency": list(frequency), "linear": choice}

@@ -372,7 +372,8 @@ def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None =
         needed = n_bytes + (1 << 20)
         if free < needed:
             raise SimulationFailure(
-                f"{path}: disk full{limited}: {free / 1e6:.1f} MB are free, and the next write may take {needed / 1e6:.1f} MB. "
+                f"{path}: disk full{limited}: {free / 1e6:.1f} MB are free, and the next write may take "
+                f"{needed / 1e6:.1f} MB. "
                 "What was written before is complete; make room and continue with --restart, or write less "
                 "(fields_every, fields, precision, compression in [output])"
             )

@@ -104,7 +104,8 @@ STATIC = {
     "newton": {"step": 0.25},
     "relaxation": {"step": 0.5, "method": "relaxation"},
     "arc_length": {"step": 0.25, "method": "arc_length", "max_points": 4},
-    "displacement": {"step": 1e-4, "method": "displacement", "max_points": 4, "node_set": "top"},
+    # steps of one length: those that adapt depend on numbers of iterations
+    "displacement": {"step": 1e-4, "max_step": 1e-4, "method": "displacement", "max_points": 4, "node_set": "top"},
 }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,42 @@ def _add_forces(first, members, forces, columns, values, out):
             out[i, 0] += x
             out[i, 1] += y
             out[i, 2] += z
+
+
+class LoadSchedule(NamedTuple):
+    """Loads and gravity that vary, at the times of some steps.
+
+    Attributes
+    ----------
+    gravity : (steps, 3) [m/s2]; (0, 3) if neither loads nor gravity vary
+    varies : whether gravity does
+    values : (steps, k) of tables, and 1 for forces without one
+    first, members, forces, columns : arguments of :func:`_add_forces`
+    """
+
+    gravity: np.ndarray
+    varies: bool
+    values: np.ndarray
+    first: np.ndarray
+    members: np.ndarray
+    forces: np.ndarray
+    columns: np.ndarray
+
+
+@kernel
+def set_forces(step, loads, mass, out):
+    """Write the forces (n, 3) [N] at a step of a :class:`LoadSchedule`; of constant gravity it has written before, only
+    those of nodes with loads are written."""
+    gravity = loads.gravity
+    if loads.varies:
+        for i in range(len(mass)):
+            for c in range(3):
+                out[i, c] = mass[i] * gravity[step, c]
+    else:
+        for i in loads.members:
+            for c in range(3):
+                out[i, c] = mass[i] * gravity[step, c]
+    _add_forces(loads.first, loads.members, loads.forces, loads.columns, loads.values[step], out)
 
 
 class NodalLoads:
@@ -69,7 +105,7 @@ class NodalLoads:
         forces = np.array([force for _, force, _ in self._entries]).reshape(-1, 3)
         # forces without a table are multiplied by the last value
         which = np.array([column if column >= 0 else self._width for _, _, column in self._entries], dtype=np.int64)
-        self._arguments = first, members, forces, which
+        self.arguments = first, members, forces, which
         self._values = np.empty(self._width + 1)
 
     def _add_file(self, key: str, load: LoadFile, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> None:
@@ -90,11 +126,15 @@ class NodalLoads:
             if len(members[member]):
                 self._entries.append((members[member], load.scale * force, column))
 
-    def add(self, time: float, constant: float, out: np.ndarray) -> None:
-        """Add the forces at a time [s] to ``out`` (owned, 3) [N]; those without a table times ``constant``."""
+    def values(self, time: float, constant: float) -> np.ndarray:
+        """Values (k,) of the tables at a time [s], and ``constant``; the array is used again."""
         self._tables.at(time, self._values)
         self._values[self._width] = constant
-        _add_forces(*self._arguments, self._values, out)
+        return self._values
+
+    def add(self, time: float, constant: float, out: np.ndarray) -> None:
+        """Add the forces at a time [s] to ``out`` (owned, 3) [N]; those without a table times ``constant``."""
+        _add_forces(*self.arguments, self.values(time, constant), out)
 
 
 def _read(key: str, load: LoadFile) -> Forces:
@@ -299,6 +339,24 @@ class ExternalForce:
     def steady(self) -> bool:
         """Whether the forces are constant from now on."""
         return self._steady and not self.state_forces and not self.reactions
+
+    @property
+    def scheduled(self) -> bool:
+        """Whether the forces depend on time alone, by tables, and are known for many steps: see :meth:`schedule`."""
+        if self.steady:
+            return True
+        kept = self._loads is None or self.held is not None
+        return not (self.state_forces or self.reactions or self.ramped or kept)
+
+    def schedule(self, times: np.ndarray) -> LoadSchedule:
+        """Forces at some times [s]; none if they are constant."""
+        none = np.empty(0, dtype=np.int64)
+        if self.steady:
+            return LoadSchedule(np.empty((0, 3)), False, np.empty((0, 1)), none, none, np.empty((0, 3)), none)
+        moments = times.tolist()
+        gravity = np.array([self.gravity_at(time) for time in moments])
+        values = np.array([self._loads.values(time, 1.0).copy() for time in moments])
+        return LoadSchedule(gravity, self.gravity_varies, values, *self._loads.arguments)
 
     def call(self, function: Callable[[float, ForceState], Any]) -> None:
         """Add the forces that a function returns."""

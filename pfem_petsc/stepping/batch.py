@@ -115,7 +115,10 @@ class Batch:
     def _node_arrays(self) -> NodeArrays:
         model, h = self.model, self.stepper.h
         supports, inertia = model.supports, model.inertia
-        external = self.stepper.state.external if model.external.active else np.empty((0, 3))
+        external = np.empty((0, 3))
+        if model.external.active:
+            external = self.stepper.state.external
+            external = external if model.external.steady else external.copy()  # steps of a batch write it
         damping = inertia.damping if inertia.damped else np.empty(0)
         order = np.argsort(supports.nodes, kind="stable")
         nodes, held = supports.nodes[order], supports.positions(0.0)[order]
@@ -202,6 +205,7 @@ class Batch:
         steps = np.flatnonzero(due)
         shares = np.zeros((len(steps) + (0 if due[-1] else 1), self._width))
         begin, impulses = state.step, ledger.impulses.state
+        loads = model.external.schedule((begin + 1 + np.arange(count)) * stepper.h)
         flags = np.zeros((count, len(log.releases)), dtype=bool)
         rows = model.links.export_rows(self._stiffness)
         for block, columns in zip(model.bars.blocks, self._columns_of, strict=True):
@@ -214,6 +218,7 @@ class Batch:
             state.memory["half_velocity"],
             self._bars,
             self._nodes,
+            loads,
             self._walls,
             rows,
             self._messages,
@@ -253,6 +258,8 @@ class Batch:
         model.contact.log.last, self.ledger.impacts.met = made.touched, made.met
         state.support = self._support if model.supports.any else stepper.zero
         state.contact = self._contact if made.pressing else stepper.zero
+        if model.external.active:
+            state.external = self._nodes.external
         stepper.energy = StrainEnergy(tuple(energies.tolist()), made.failed)
         walls = model.contact.nothing
         if len(model.contact.walls):

@@ -20,6 +20,7 @@ from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import accelerations, advance, advance_loaded, centre, kick, move
 from ..mechanics.compiled import borrowing, calls, kernel
 from ..mechanics.elements import PULLED, clear_energies, first_inverted, sum_energies
+from ..mechanics.loads import LoadSchedule, set_forces
 from ..mechanics.runs import copy, join_components, new_rows, slide_planes, split_components
 from ..mechanics.tuples import CHUNK
 from ..mesh.ordering import NODE_BLOCK
@@ -191,6 +192,7 @@ class BatchData(NamedTuple):
     half: np.ndarray
     bars: BarArrays
     nodes: NodeArrays
+    loads: LoadSchedule
     walls: WallArrays
     rows: NamedTuple
     messages: NamedTuple
@@ -936,6 +938,8 @@ def batch_loop(data, touched, met, due, flags):
         values = row[len(row) - 3 * _PROBED * probed :].reshape(probed, _PROBED, 3)
         for i in near:
             contact[i] = 0.0
+        if len(data.loads.gravity) > 0:
+            set_forces(step, data.loads, nodes.mass, nodes.external)
         clear_forces(lanes, n, Acting(supported, loaded, False, damped))
         if ending:
             clear_ends(lanes, n)

@@ -216,10 +216,10 @@ class Model:
 
     @property
     def steady(self) -> bool:
-        """Whether steps can be made in batches: supports, loads and bars are constant in time, walls flat
-        and at rest, and pairs and constraints served too, which exclude walls: a batch solves either."""
+        """Whether steps can be made in batches: supports and bars are constant in time, loads depend on time alone,
+        walls are flat and at rest, and pairs and constraints served too, which exclude walls: a batch solves either."""
         changing = self.supports.moving or self.bars_vary or bool(self.bars.families) or self.inertia.varies
-        steady = not changing and self.external.steady and self.contact.steady
+        steady = not changing and self.external.scheduled and self.contact.steady
         return steady and self.links.batched and not (bool(self.links) and self.contact.any)
 
     def initial_velocity(self) -> np.ndarray:

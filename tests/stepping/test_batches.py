@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.lattices import two_lattices
+from helpers.stopped import assert_restart_is_bitwise
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
@@ -41,6 +42,26 @@ SMALL = {
         "wall": [FLOOR | {"normal": [0.5, 0.1, 1.0], "point": [0, 0, -2e-4]}],
     },
     "heavy": {"support": [{"node_set": "foot", "fix": "xz"}], "gravity": {"acceleration": [0.0, 0.0, -1e4]}},
+    "loads over time": {
+        "support": [{"node_set": "foot", "fix": "z"}],
+        "load": [
+            {"node_set": "corner", "force": [10.0, 0.0, 0.0]},
+            {"node_set": "corner", "force": [0.0, 5.0, 0.0], "table": [[0.0, 0.0], [2e-5, 1.0], [5e-5, -2.0]]},
+            {
+                "node_set": "foot",
+                "force": [0.0, 1.0, 0.0],
+                "table": [[1e-5, 0.0], [3e-5, 1.0]],
+                "interpolation": "smooth",
+            },
+        ],
+        "gravity": {"acceleration": [0.0, 0.0, -1e4]},
+    },
+    "gravity over time": {
+        "support": [{"node_set": "foot", "fix": "xz"}],
+        "load": [{"node_set": "corner", "force": [10.0, 0.0, 0.0]}],
+        "gravity": {"acceleration": [[0.0, 0.0, 0.0, -1e4], [4e-5, 1e4, 0.0, 2e4]]},
+        "wall": [SIDE],
+    },
     "held and loaded": {
         "material": DAMPED,
         "support": [{"node_set": "foot", "fix": "z"}],
@@ -170,6 +191,12 @@ def test_batches_are_single_steps_and_move_as_the_general_stepper(name, comm, sh
     if name in SMALL and name != "removed":  # a support that is removed gives its reaction to another list of loads
         general = made(given, shared_tmp_path, "general")[0]
         compare(one, general, exact=False, same_order=name != "sections")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["sections", "loads over time", "gravity over time"])
+def test_restarts_between_batches_are_bitwise(name, comm, tmp_path):
+    assert_restart_is_bitwise(case(SMALL[name]), comm, tmp_path, 3, 50, 111)
 
 
 @pytest.mark.parallel

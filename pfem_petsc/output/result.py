@@ -196,6 +196,9 @@ class Result:
         self.n_nodes, self.n_bars = mesh_sizes(file)
         self.point_fields, self.cell_fields = sorted(vtk["PointData"]), sorted(vtk["CellData"])
         self.case_text: str = file["case/text"][()].decode()
+        # a mesh of arrays makes a long text, which is not parsed without need
+        stages = tomllib.loads(self.case_text).get("stage", ()) if "[[stage]]" in self.case_text else ()
+        self._static_stages = ["static" in stage for stage in stages]
         self.attributes: dict[str, Any] = read_attributes(file["case"])
         self._n_rows = complete_rows(file)
         self._columns = dataset_names(file["history"])
@@ -210,11 +213,6 @@ class Result:
         """What its times are: time, load factor, or points of a path; with static stages, time and load factors."""
         axis = AXES[self.attributes.get("axis", TIME.symbol)]
         return axis._replace(staged=True) if any(self._static_stages) else axis
-
-    @property
-    def _static_stages(self) -> list[bool]:
-        """Whether each stage is static; empty without stages."""
-        return ["static" in stage for stage in tomllib.loads(self.case_text).get("stage", [])]
 
     @property
     def stretches(self) -> list[slice]:

@@ -229,11 +229,13 @@ class Result:
 
     def place(self, time: float) -> str:
         """Text of one of its times: ``t = 1.000 s``, in static analyses and stages ``load factor 0.25``."""
-        static = self._static_stages
-        if any(static):
-            row = min(int(np.searchsorted(self.history["time"], time)), self._n_rows - 1)
-            if static[self.history["stage"][row]]:
-                return LOAD_FACTOR.place(float(self.history["load_factor"][row]))
+        static, history = self._static_stages, self.history
+        if any(static) and self._n_rows:
+            times, stages = history["time"], history["stage"]
+            stage = stages[min(int(np.searchsorted(times, time)), self._n_rows - 1)]
+            if static[stage]:
+                rows = stages == stage
+                return LOAD_FACTOR.place(float(np.interp(time, times[rows], history["load_factor"][rows])))
         return self.axis.place(time)
 
     @property

@@ -104,6 +104,9 @@ def _global_names(code: CodeType) -> set[str]:
 # Assuming "no NaN" would hide divergence.
 _FAST = {"nsz"}
 
+COMPILED = not numba.config.DISABLE_JIT
+"""Whether loops are compiled, so that others can call them by their addresses."""
+
 _LONGEST = 130  # characters in the names of cached files for a variant of a loop; file systems take 255 in all
 
 

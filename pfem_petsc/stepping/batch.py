@@ -11,7 +11,7 @@ from ..columns import BAR_ENERGIES, HEAD, Share, values_at_state
 from ..contact.node_walls import NOTED, WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
-from ..mechanics.compiled import packed
+from ..mechanics.compiled import COMPILED, packed
 from ..mechanics.elements import PulledBars, pull_addresses
 from ..mechanics.runs import Columns, make_columns, new_planes, no_columns
 from ..mesh.ordering import NODE_BLOCK
@@ -183,6 +183,7 @@ class Batch:
             and stepper.treatment is None
             # -log_view measures the methods of single steps
             and not PETSc.Log.isActive()
+            and COMPILED
             # all ranks would have to stop where a bar of one breaks
             and (alone or not model.bars.can_break)
             and model.mesh.messages() is not None

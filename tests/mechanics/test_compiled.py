@@ -147,7 +147,7 @@ def test_every_process_finds_the_loop_of_batches_of_another():
         "from pfem_petsc.mechanics.elements import batch_pulls\n"
         "from pfem_petsc.mechanics.materials.elastic import LAW\n"
         "from pfem_petsc.mechanics.elements import engineering\n"
-        "loop = batch_pulls(LAW, engineering, 1).padded\n"
+        "loop = batch_pulls(LAW, engineering).padded\n"
         "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
     )
     keys = set()
@@ -167,7 +167,7 @@ def test_loops_of_all_laws_have_names_of_their_own():
             for measure in MEASURES.values():
                 loops = make_loops(variant, measure)
                 names.append(_variant(loops.forces.py_func))
-                longest = batch_pulls(variant, measure, 1).padded._cache._cache_file._data_path("x")
+                longest = batch_pulls(variant, measure).padded._cache._cache_file._data_path("x")
                 assert len(Path(longest).name) < 220
     assert len(names) > 40 and len(set(names)) == len(names)
 
@@ -241,7 +241,7 @@ def test_functions_of_one_name_have_the_same_code():
         for measure in MEASURES.values():
             loops = make_loops(law, measure)
             made = [value for value in vars(loops).values() if callable(value)]
-            for loop in (*made, *vars(batch_pulls(law, measure, 1)).values()):
+            for loop in (*made, *vars(batch_pulls(law, measure)).values()):
                 closures(loop, found)
     digests = {}
     for function in found:

@@ -22,6 +22,7 @@ from .parallel.petsc_log import instrument, staged
 from .preflight.checks import inspect, later_gaps, warnings_before
 from .preflight.forecast import forecast, summarise
 from .restart.checkpoints import find_restart, finished, finished_message
+from .restart.state import RunState
 from .run.outputs import Outputs, ReportedCompilation
 from .run.recorder import Recorder
 from .run.stages import Stages
@@ -107,6 +108,8 @@ class Simulation(WithEquations):
         self._reached: float | None = None
         if self.restart is not None and self.restart.continues or self.notes:
             self._reached = on_root(self.comm, finished, case, self.folder, self.plan.end)
+        if self.restart is not None and not self.finished:
+            RunState(self.stepper).restore(self.restart.file, case.source)
         self.mesh = self.model.mesh
         if number == 0:
             check_start(self.model.contact, self.mesh.points[: self.mesh.n_owned], self.model.size)
@@ -168,7 +171,9 @@ class Simulation(WithEquations):
 
     @property
     def state(self) -> State:
-        """The state of this rank's nodes: :class:`~pfem_petsc.integrators.base.State`."""
+        """The state of this rank's nodes: :class:`~pfem_petsc.integrators.base.State`.
+
+        Before :meth:`start`, it is that of the mesh at rest, or with ``restart`` that of the checkpoint."""
         return self.stepper.state
 
     @property

@@ -104,7 +104,9 @@ def error_of(integrator: str, parameters: dict, treatment: str, wall: dict) -> f
 
 def reason_of(error: InputError) -> str:
     """Return why a combination is refused: the message without the place that it names first."""
-    return re.sub(r"^case: (contact\.treatment = \"\w+\"|wall '[^']*'): ", "", str(error))
+    return re.sub(
+        r"^case: (contact\.treatment = \"\w+\"( with time\.integrator = \"\w+\")?|wall '[^']*'): ", "", str(error)
+    )
 
 
 def lines(schemes: tuple = SCHEMES) -> list[str]:

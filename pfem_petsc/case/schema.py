@@ -41,7 +41,7 @@ else:
 
 
 class Case(_Tables):
-    """A validated case. Created by :meth:`from_file` (or :meth:`load`), from its text, or from tables.
+    """A validated case. Created by :meth:`load` from a file, from its text, or from tables.
 
     ``Case(mesh=..., material={...}, section={...}, time={...})`` takes the tables of a case file, all at once as nested
     tables (``Case({...}, mesh=truss)``), or by name; the mesh may be a :class:`~pfem_petsc.mesh.truss.Truss`. NumPy
@@ -83,6 +83,7 @@ class Case(_Tables):
     Notes
     -----
     ``Case.load`` is a constructor, ``case.load`` the list of loads: an instance's attribute hides the classmethod.
+    :meth:`from_file` is another name of it.
     """
 
     def __init__(
@@ -187,6 +188,7 @@ class Case(_Tables):
         return cls.from_dict(parse_toml(read_text(path), str(path)), folder=path.parent, plugins=plugins, **named)
 
     from_file = load
+    """Another name."""
 
     @classmethod
     def from_toml(
@@ -406,8 +408,9 @@ def _validated(
         problems.add((), "[time] and [static] exclude each other: give one of them")
     if not any(key in data for key in (*ANALYSES, "stage", "modes")):
         problems.add((), "the table [time] is missing, or one of [static], [[stage]], [modes], which give the analysis")
-    # [[stage]] is checked by stages_of
-    known = {key: value for key, value in data.items() if key in KEYS and value is not None and key != "stage"}
+    # [[stage]] is checked by stages_of, which refuses an analysis beside it
+    elsewhere = ("stage", *ANALYSES) if "stage" in data else ()
+    known = {key: value for key, value in data.items() if key in KEYS and value is not None and key not in elsewhere}
     return problems.validated(CaseModel, known, reading, place)
 
 
@@ -470,7 +473,9 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         return []
     for key in ANALYSES:
         if key in data:
-            problems.add((), f"[{key}] and [[stage]] exclude each other: give [stage.{key}]")
+            having = [f"stage[{k}].{key}" for k, row in enumerate(rows) if isinstance(row, Mapping) and key in row]
+            there = f"; this case has {', '.join(having)}" if having else ""
+            problems.add((), f"[{key}] and [[stage]] exclude each other: give [stage.{key}]{there}")
     last = len(rows) - 1
     common = {key: value for key, value in data.items() if key not in ("stage", "modes", *ANALYSES)}
     owner: dict[str, int] = {}

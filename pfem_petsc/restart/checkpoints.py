@@ -62,9 +62,13 @@ def changed_keys(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], 
     refused = [key for key in keys if not _is_free(key, last)]
     if refused:
         more = f" (and {len(refused) - 5} more)" if len(refused) > 5 else ""
+        free = ", ".join(FREE)
+        if last >= 0:
+            analysis = "time" if "time" in now["stage"][last] else "static"
+            free = free.replace("time.end, static.end", f"stage[{last}].{analysis}.end")
         raise InputError(
             f"{path}: belongs to a different case than {source}: {'; '.join(lines[key] for key in refused[:5])}{more}. "
-            f"A restart continues with the same model and time step, and may change {', '.join(FREE)} only: restore "
+            f"A restart continues with the same model and time step, and may change {free} only: restore "
             "the case, or start without --restart"
         )
     return list(lines.values())

@@ -227,7 +227,7 @@ class Outputs:
         self._callbacks.append((function, every))
 
     def open(self, restart: Restart | None, notes: list[str]) -> None:
-        """Initialise the state, or restore it from a checkpoint, and open all outputs. Collective.
+        """Initialise the state, unless it was restored from a checkpoint, and open all outputs. Collective.
 
         Raises
         ------
@@ -237,10 +237,7 @@ class Outputs:
         stages, folder, plan = self._stages, self._folder, self._stages.plan
         stepper, model = stages.stepper, stages.model
         state = RunState(stepper)
-        if restart is not None:
-            # before any change to the folder, because the checkpoint may be refused
-            state.restore(restart.file, stages.case.source)
-            self._continues = restart.continues
+        self._continues = restart is not None and restart.continues
         aside = on_root(model.comm, prepare_folder, folder, restart, plan)
         notes = [*notes, *([] if aside is None else [f"{folder}: earlier results were moved to {aside}"])]
         self.progress = self._compilation.progress = self._open_progress(notes)

@@ -372,7 +372,7 @@ def _treatment(model: Model, plan: Plan) -> type[Treatment] | None:
         raise InputError(f'{key}: needs time.mass = "lumped"')
     reason = treatment.refuses(plan.scheme)
     if reason is not None:
-        raise InputError(f"{key}: {reason}")
+        raise InputError(f'{key} with time.integrator = "{model.case.time.integrator}": {reason}')
     return treatment
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import copy
+from pathlib import Path
 
 import pytest
 from helpers.small_models import BLOCK
 
 from pfem_petsc import Case
 from pfem_petsc.errors import InputError
+from pfem_petsc.restart.checkpoints import changed_keys
 
 
 def test_tables_stay_in_force_until_a_stage_replaces_them():
@@ -108,5 +110,22 @@ def test_stages_are_a_list_of_at_least_one(stages):
 @pytest.mark.parametrize("table", ["time", "static"])
 def test_an_analysis_beside_stages_is_refused(table):
     given = {"time": {"integrator": "newmark", "step": 1e-6, "end": 1e-5}, "static": {"step": 0.5}}
-    with pytest.raises(InputError, match=rf"\[{table}\] and \[\[stage\]\] exclude each other"):
+    having = [f"stage[{k}].{table}" for k, stage in enumerate(BLOCK["stage"]) if table in stage]
+    text = f"case: [{table}] and [[stage]] exclude each other: give [stage.{table}]; this case has {', '.join(having)}"
+    with pytest.raises(InputError) as found:
         Case.from_dict({**BLOCK, table: given[table]})
+    assert str(found.value) == text
+    with pytest.raises(InputError) as found:
+        Case.from_dict(BLOCK).update({f"{table}.end": 2.0})
+    assert str(found.value) == text
+
+
+def test_a_restart_says_what_it_may_change():
+    before = Case.from_dict(BLOCK).to_dict()
+    now = copy.deepcopy(before)
+    now["stage"][0]["static"]["end"] = 0.5
+    with pytest.raises(
+        InputError, match=r"may change title, plugins, stage\[3\]\.static\.end, modes, output, solver only"
+    ):
+        changed_keys(Path("checkpoint.h5"), before, now, "case")
+    assert changed_keys(Path("checkpoint.h5"), before, {**before, "title": "other"}, "case")

@@ -52,6 +52,19 @@ def test_closed_without_a_step(comm, shared_tmp_path):
     assert not (shared_tmp_path / "out").exists()
 
 
+@pytest.mark.parallel
+def test_state_of_a_restart(comm, shared_tmp_path):
+    """It is there before the first step."""
+    keys = ["output.checkpoint_every=8"]
+    with simulate(comm, shared_tmp_path, *keys) as simulation:
+        simulation.run()
+        position, time = simulation.state.position.copy(), simulation.state.time
+    with simulate(comm, shared_tmp_path, *keys, "time.end=0.25", restart=True) as simulation:
+        assert (simulation.state.step, simulation.state.time) == (20, time)
+        np.testing.assert_array_equal(simulation.state.position, position)
+        assert next(iter(simulation)).step == 21
+
+
 def test_exception_within(tmp_path):
     """Results, signals and folder are free afterwards, and the exception is told."""
     from mpi4py import MPI

@@ -30,7 +30,7 @@ class Treatment(Base):
             return None
         schemes = {name: lookup(INTEGRATORS, name, "").Scheme for name in choices(INTEGRATORS)}
         suited = ", ".join(name for name, one in schemes.items() if one.force_acts_once)
-        return f"is compatible with the integrators {suited}"
+        return f"it is compatible with the integrators {suited} only; choose one of them, or another treatment"
 
     def before(self) -> None:
         """Record the initial positions of nodes and the forces there."""

@@ -88,7 +88,7 @@ def generate_on(
     if not found[0][1]:  # nobody has, or not the one that would send them
         raise InputError(
             f"mesh: the arrays of this case (digest {str(digest)[:12]}...) are not in its text, as they are large: "
-            "give the truss, as in Case.from_file(path, mesh=truss)"
+            "give the truss, as in Case.load(path, mesh=truss)"
         )
     with agreed(comm):
         if comm.rank == 0:

@@ -8,6 +8,7 @@ use the positions as integers at module level, which are constants of the machin
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -234,6 +235,22 @@ class Row(Mapping):
 
     def __repr__(self) -> str:
         return repr(dict(self))
+
+
+class Excerpt:
+    """Takes some columns of rows of one layout, which are numbers, at once: many times faster than one by one."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._names = tuple(dict.fromkeys(names))
+        self._layout: Layout | None = None
+
+    def __call__(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the numbers by name; of another mapping than a row, the mapping."""
+        if not isinstance(row, Row):
+            return row
+        if row.layout is not self._layout:
+            self._layout, self._take = row.layout, itemgetter(*map(row.layout.first, self._names))
+        return dict(zip(self._names, self._take(row._numbers), strict=True))
 
 
 def _layout(*columns: Column) -> Layout:

@@ -44,8 +44,9 @@ class SignalNotes:
                 self._before[number] = signal.signal(number, self._note)
 
     def keep_watching(self) -> None:
-        """Install the handlers again, below Python, after a library may have installed its own there."""
-        for number in SIGNALS:
+        """Install the handlers again, below Python, after a library may have installed its own there. Python ignores
+        broken pipes, so that writing to one raises an error."""
+        for number in (*SIGNALS, signal.SIGPIPE):
             if (handler := signal.getsignal(number)) is not None:
                 signal.signal(number, handler)
 

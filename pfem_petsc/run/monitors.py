@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..columns import STORED, SUPPLIED
+from ..columns import ENERGIES, STORED, SUPPLIED, Excerpt
 from ..contact.monitoring import CrossingBars
 from ..errors import SimulationFailure
 from ..output.units import LOAD_FACTOR, TIME
@@ -27,6 +28,7 @@ _DIVERGENCE_ROWS = (
     6  # consecutive rows; after a start from rest, or when a wall first strikes, there is no input to compare with
 )
 _BARS = ("elastic_energy", "spring_energy")
+_energies = Excerpt(["active_contacts", *(energy.name for energy in ENERGIES)])
 
 
 class BlowUp:
@@ -63,18 +65,17 @@ class BlowUp:
         SimulationFailure
             On all ranks, if the energy is not finite, or the energy created exceeds the input several times.
         """
+        whole, row = row, _energies(row)
         held = row["kinetic_energy"] + row["elastic_energy"]
-        static = not self.inertial and "load_factor" in row
-        place = LOAD_FACTOR.exact(row["load_factor"]) if static else TIME.exact(row["time"])
-        when = f"step {row['step']}, {place}"
-        if not np.isfinite(held) and row["step"] == 0:
+        if not math.isfinite(held) and whole["step"] == 0:
             raise SimulationFailure(
-                f"{when}: the energy is not finite at the start{self._where(state)}: correct loads, velocities and "
-                "material (SI units)"
+                f"{self._when(whole)}: the energy is not finite at the start{self._where(state)}: correct loads, "
+                "velocities and material (SI units)"
             )
-        if not np.isfinite(held):
+        if not math.isfinite(held):
             raise SimulationFailure(
-                f"{when}: the energy is not finite: the motion diverged{self._where(state)}; reduce time.step"
+                f"{self._when(whole)}: the energy is not finite: the motion diverged{self._where(state)}; "
+                "reduce time.step"
             )
         if not self.inertial:
             return
@@ -98,9 +99,15 @@ class BlowUp:
         kept["strange"] = kept["strange"] + 1 if created > kept["limit"] * kept["most"] else 0
         if kept["strange"] >= _DIVERGENCE_ROWS:
             raise SimulationFailure(
-                f"{when}: the integration has created {created:.3g} J, but only {kept['most']:.3g} J were supplied: "
-                f"the motion is unstable and fastest at {self._fastest(state)}; reduce time.step"
+                f"{self._when(whole)}: the integration has created {created:.3g} J, but only {kept['most']:.3g} J were "
+                f"supplied: the motion is unstable and fastest at {self._fastest(state)}; reduce time.step"
             )
+
+    def _when(self, row: Mapping[str, Any]) -> str:
+        """Return the step of a row and its time or load factor."""
+        static = not self.inertial and "load_factor" in row
+        place = LOAD_FACTOR.exact(row["load_factor"]) if static else TIME.exact(row["time"])
+        return f"step {row['step']}, {place}"
 
     def _where(self, state: State) -> str:
         """Return the first node and bar, by mesh number, with positions or velocities that are not finite."""
@@ -179,6 +186,7 @@ class ContactWatch:
         """Check a row of the history."""
         if self.told:
             return
+        whole, row = row, _energies(row)
         given = sum(row[name] for name in SUPPLIED)
         net = sum(row[name] for name in STORED) + sum(row[name] for name in CAUSES) - given
         if self.start is None:
@@ -192,7 +200,7 @@ class ContactWatch:
         if not self.rows:
             return
         made = f"{gain:.3g} J, {100.0 * gain / self.scale:.2g} % of the energy that the run had or was given"
-        at = f"step {row['step']}, t = {row['time']:.6g} s"
+        at = f"step {whole['step']}, t = {whole['time']:.6g} s"
         if self.touched:
             self.told = True
             self.tell(
@@ -200,7 +208,7 @@ class ContactWatch:
                 "energy in impacts; use another contact.treatment or time.integrator, or a smaller time.step "
                 "(docs/contact.md, phases of an impact)"
             )
-        elif self.rows >= (_AT_END if row["step"] >= self.last else _GAIN_ROWS):
+        elif self.rows >= (_AT_END if whole["step"] >= self.last else _GAIN_ROWS):
             self.told = True
             self.tell(
                 f"{at}: the total energy, including dissipated energy, has grown by {made}, without contact: the "

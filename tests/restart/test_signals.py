@@ -131,6 +131,18 @@ def test_handlers_are_given_back(tmp_path, handlers, end):
 
 
 @pytest.mark.slow
+def test_reader_of_the_output_that_exits(tmp_path):
+    """As in ``python -m pfem_petsc CASE | head -1``: the run goes on."""
+    words = command(1, "rod_impact", "-o", tmp_path / "out", "--set", "time.end=0.5")
+    process = subprocess.Popen(words, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.readline()
+    process.stdout.close()
+    said = process.stderr.read()
+    assert process.wait(timeout=PATIENCE) == 0, said
+    assert open_result(tmp_path / "out").history["time"][-1] == pytest.approx(0.5)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("ignored", [False, True])
 def test_hang_up_while_petsc_starts(ignored):
     """PETSc's own handler would end the process, also under nohup."""

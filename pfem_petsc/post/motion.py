@@ -586,5 +586,7 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
 
 
 def _place(wall: Any) -> np.ndarray:
-    """A point that the keys of a wall give (3,) [m]."""
+    """A point that the keys of a wall give (3,) [m]; zero for a type that is unknown, which is not drawn."""
+    if wall.type not in choices(WALLS):
+        return np.zeros(3)
     return np.asarray(lookup(WALLS, wall.type, "wall.type").Wall(wall).centre, dtype=float)

@@ -188,6 +188,21 @@ def test_wrong_walls_are_refused(plugin_files, tmp_path, forgotten, old, new, to
 
 
 @pytest.mark.slow
+def test_walls_of_stages_are_left_out_of_pictures(plugin_files, forgotten, monkeypatch, capsys):
+    monkeypatch.chdir(plugin_files)
+    forgotten()
+    data = Case.load("polygon_spin.toml", plugins=FILES).to_dict()
+    wall, time, _ = data.pop("wall"), data.pop("time") | {"end": 0.004}, data.pop("initial")
+    data["stage"] = [{"time": time}, {"time": time, "wall": wall}]
+    with Simulation(Case.from_dict(data), MPI.COMM_SELF, output="out", quiet=True) as simulation:
+        simulation.run()
+    forgotten()
+    with pytest.warns(UserWarning, match="a wall of type funnel"):
+        assert main(["render", "out", "--frames", "2", "--video", "none", "--size", "160x120"]) == 0
+    assert "'funnel' is left out of the picture" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_other_failures_name_the_plugin(plugin_files, forgotten, monkeypatch, capsys):
     monkeypatch.chdir(plugin_files)
     words = ["polygon_spin.toml", "--quiet", "--plugin", *FILES]

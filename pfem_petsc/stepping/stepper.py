@@ -430,7 +430,7 @@ class Stepper(ABC):
 
     def at(self, step: int, time: float) -> str:
         """A step and a time of the stage as they are counted in the results, for messages."""
-        place = AXIS.exact(self.model.origin + time) if self.plan.axis.unit else LOAD_FACTOR.exact(time)
+        place = AXIS.exact(self.model.origin + time) if self.scheme.inertial else LOAD_FACTOR.exact(time)
         return f"step {self.model.first_step + step}, {place}"
 
     @property

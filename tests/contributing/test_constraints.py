@@ -91,6 +91,8 @@ def test_tether_between_bodies(integrator, keys, examples, comm, shared_tmp_path
     turned = history["angular_momentum"] - history["angular_momentum"][0]
     assert np.abs(turned).max() < (1e-11 if integrator == "central_differences" and not keys else 2e-2)
     force, taut = history["constraint/rope/force"], 0
+    # along the line within the step, where these schemes balance forces; it turns until the end of the step
+    turn = 0.02 if integrator in ("energy_momentum", "generalized_alpha") else 1e-9
     for index in range(len(result.times)):
         x = result.positions(index)
         arm = x[4] - x[3]
@@ -100,7 +102,7 @@ def test_tether_between_bodies(integrator, keys, examples, comm, shared_tmp_path
         assert pull >= 0.0
         if pull > 0.0:
             taut += 1
-            assert np.abs(force[index] + pull * arm / distance).max() < 1e-9 * pull
+            assert np.abs(force[index] + pull * arm / distance).max() < turn * pull
     assert taut > 3
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"][0]
 

@@ -97,7 +97,7 @@ def test_tether_between_bodies(integrator, keys, examples, comm, shared_tmp_path
         x = result.positions(index)
         arm = x[4] - x[3]
         distance = np.linalg.norm(arm)
-        assert distance < 0.2 + 1e-13
+        assert distance < 0.2 + 1e-12
         pull = -force[index] @ arm / distance
         assert pull >= 0.0
         if pull > 0.0:

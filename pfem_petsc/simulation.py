@@ -108,11 +108,11 @@ class Simulation(WithEquations):
         self._reached: float | None = None
         if self.restart is not None and self.restart.continues or self.notes:
             self._reached = on_root(self.comm, finished, case, self.folder, self.plan.end)
-        if self.restart is not None and not self.finished:
-            RunState(self.stepper).restore(self.restart.file, case.source)
         self.mesh = self.model.mesh
         if number == 0:
             check_start(self.model.contact, self.mesh.points[: self.mesh.n_owned], self.model.size)
+        if self.restart is not None and not self.finished:
+            RunState(self.stepper).restore(self.restart.file, case.source)
         minutes = case.output.checkpoint_minutes
         interval = 60.0 * minutes if minutes else None
         self._synchroniser = Synchroniser(self._stages, stop, lock, interval)

@@ -58,6 +58,10 @@ class LoadSchedule(NamedTuple):
     columns: np.ndarray
 
 
+_NONE = np.empty(0, dtype=np.int64)
+_CONSTANT = LoadSchedule(np.empty((0, 3)), False, np.empty((0, 1)), _NONE, _NONE, np.empty((0, 3)), _NONE)
+
+
 @kernel
 def set_forces(step, loads, mass, out):
     """Write the forces (n, 3) [N] at a step of a :class:`LoadSchedule`; of constant gravity it has written before, only
@@ -348,14 +352,13 @@ class ExternalForce:
         kept = self._loads is None or self.held is not None
         return not (self.state_forces or self.reactions or self.ramped or kept)
 
-    def schedule(self, times: np.ndarray) -> LoadSchedule:
-        """Forces at some times [s]; none if they are constant."""
-        none = np.empty(0, dtype=np.int64)
+    def schedule(self, steps: range, h: float) -> LoadSchedule:
+        """Forces at the ends of some steps of a size [s]; none if they are constant."""
         if self.steady:
-            return LoadSchedule(np.empty((0, 3)), False, np.empty((0, 1)), none, none, np.empty((0, 3)), none)
-        moments = times.tolist()
-        gravity = np.array([self.gravity_at(time) for time in moments])
-        values = np.array([self._loads.values(time, 1.0).copy() for time in moments])
+            return _CONSTANT
+        times = [step * h for step in steps]
+        gravity = np.array([self.gravity_at(time) for time in times])
+        values = np.array([self._loads.values(time, 1.0).copy() for time in times])
         return LoadSchedule(gravity, self.gravity_varies, values, *self._loads.arguments)
 
     def call(self, function: Callable[[float, ForceState], Any]) -> None:

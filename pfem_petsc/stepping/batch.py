@@ -206,7 +206,7 @@ class Batch:
         steps = np.flatnonzero(due)
         shares = np.zeros((len(steps) + (0 if due[-1] else 1), self._width))
         begin, impulses = state.step, ledger.impulses.state
-        loads = model.external.schedule((begin + 1 + np.arange(count)) * stepper.h)
+        loads = model.external.schedule(range(begin + 1, begin + 1 + count), stepper.h)
         flags = np.zeros((count, len(log.releases)), dtype=bool)
         rows = model.links.export_rows(self._stiffness)
         for block, columns in zip(model.bars.blocks, self._columns_of, strict=True):

@@ -132,6 +132,7 @@ class Recorder:
 
     def __init__(self, stepper: Stepper, columns: Mapping[str, np.dtype] | None = None) -> None:
         self.stepper, self.model = stepper, stepper.model
+        self._at_state = values_at_state(self.model)
         self.start_energy: float | None = None
         self.energy_scale = 0.0
         self.alarmed = False
@@ -232,7 +233,7 @@ class Recorder:
         head = share.head
         head[:] = stepper.ledger.sums
         head[_BARS], head[HEAD.first("alarm")] = stepper.energy.energies, alarm
-        for first, value in values_at_state(self.model):
+        for first, value in self._at_state:
             head[first] = value(stepper)
         if contact.any:
             share.changes[:], contact.log.changes = contact.log.changes, 0

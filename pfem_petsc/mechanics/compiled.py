@@ -17,7 +17,9 @@ import numba
 import numpy as np
 from numba.core import errors, event, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.cpu import CPUTargetOptions
 from numba.core.dispatcher import Dispatcher
+from numba.core.options import TargetOptions
 from numba.core.registry import cpu_target
 from numba.extending import _Intrinsic, intrinsic, register_jitable
 
@@ -103,6 +105,8 @@ def _global_names(code: CodeType) -> set[str]:
 # the same bits on both, and a restarted run is bitwise identical to an uninterrupted one (contraction would save 5 %).
 # Assuming "no NaN" would hide divergence.
 _FAST = {"nsz"}
+
+CPUTargetOptions.noalias = TargetOptions.Mapping("noalias")  # a flag of Numba's own loops, which has no option
 
 COMPILED = not numba.config.DISABLE_JIT
 """Whether loops are compiled, so that others can call them by their addresses."""
@@ -196,6 +200,13 @@ def borrowing(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     _distinguish(function)
     return register_jitable(fastmath=_FAST, error_model="numpy", _nrt=False)(function)
+
+
+def borrowing_apart(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function as :func:`borrowing` that writes to no array that shares memory with another argument: loops
+    over many arrays are vectorised only if their addresses need not be compared."""
+    _distinguish(function)
+    return register_jitable(fastmath=_FAST, error_model="numpy", _nrt=False, noalias=True)(function)
 
 
 def borrowing_kernel(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -17,11 +17,11 @@ from numba.core import types
 from numba.extending import register_jitable
 
 from ..columns import BAR_ENERGIES
-from .compiled import address_of, borrowing, borrowing_kernel, inlined, kernel
+from ..mesh.ordering import NODE_BLOCK
+from .compiled import address_of, borrowing, borrowing_apart, borrowing_kernel, inlined, kernel
 from .materials.base import Law
-from .runs import Columns, Sweep, copy, end_differences, scatter_forces
-from .strips import add_rows, subtract_rows
-from .tuples import CHUNK, accumulate, bar_value, blend, differ, put, take, take_from
+from .runs import Columns, Sweep, add_lower_ends, clear_lower_ends, copy, end_differences, scatter_forces
+from .tuples import CHUNK, ROW, accumulate, bar_value, blend, differ, put, take, take_from
 
 COLLAPSED_STRETCH = 1e-3  # below this fraction of its rest length a bar is crushed, and no truss model applies
 SHORTENED_STRETCH = math.sqrt(0.8)  # only bars shorter than this are checked for passing through zero length
@@ -160,6 +160,15 @@ def length_of(d):
     return math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
 
 
+@inlined
+def stretch_and_inverse(squared, rest):
+    """Return the stretch of a bar with a squared length, and the inverse of its length [1/m], by one root and one
+    division, which take longest in loops over forces; the stretch of a bar at rest is exactly 1."""
+    length = math.sqrt(squared)
+    inverse = 1.0 / (length * rest)
+    return 1.0 + (length - rest) * (length * inverse), rest * inverse
+
+
 @cache
 def make_element(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
     """Make the functions that read and evaluate a bar: ``read``, ``evaluate``, ``stiffness``, ``step_stiffness``."""
@@ -187,10 +196,10 @@ def make_element(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
         return Bar(bars.rest[k], shift, warmth, area, p, strain, stress, variables_of(bars.history, column))
 
     @inlined
-    def evaluate(length, bar, step):
+    def evaluate(stretch, bar, step):
         """Return strain with its first two derivatives by the stretch, stress [Pa], modulus [Pa], internal variables at
         the end of the step and energy densities [J/m3] of a bar; the strain includes the thermal one."""
-        strain, slope, curvature = measure(length / bar.rest)
+        strain, slope, curvature = measure(stretch)
         rate = 0.0
         if by_rate and step > 0.0:
             rate = (strain - bar.shift - bar.strain) / step
@@ -206,7 +215,7 @@ def make_element(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
             if abs(bar.variables[gone]) >= 1.0:
                 return 0.0, 0.0, 0.0
         length = length_of(d)
-        _, slope, curvature, stress, modulus, _, _ = evaluate(length, bar, step)
+        _, slope, curvature, stress, modulus, _, _ = evaluate(length / bar.rest, bar, step)
         axial = bar.area * (modulus * slope * slope + stress * curvature) / bar.rest
         return axial, bar.area * stress * slope / length, 1.0 / length
 
@@ -357,7 +366,7 @@ def _state_loops(law: Law, element: SimpleNamespace, measure: Callable[..., Any]
             if can_break:
                 stress *= 1.0 - abs(bar.variables[gone])
         else:
-            strain, slope, _, stress, _, _, _ = evaluate(length, bar, 0.0)
+            strain, slope, _, stress, _, _, _ = evaluate(length / bar.rest, bar, 0.0)
         strains[k] = strain
         stresses[k] = stress
         forces[k] = bar.area * stress * slope
@@ -365,7 +374,8 @@ def _state_loops(law: Law, element: SimpleNamespace, measure: Callable[..., Any]
     @borrowing
     def densities(x, bars, k, out):
         """``out``: (b,) stored and dissipated energy per rest volume [J/m3], for laws without rate."""
-        _, _, _, _, _, _, found = evaluate(length_of(end_difference(x, bars, k)), read(bars, k), 0.0)
+        bar = read(bars, k)
+        _, _, _, _, _, _, found = evaluate(length_of(end_difference(x, bars, k)) / bar.rest, bar, 0.0)
         for density in found:
             out[k] += density
 
@@ -431,7 +441,7 @@ def sum_energies(work, places, energies):
     [J] at ``places`` (k,), see :data:`~pfem_petsc.columns.BAR_ENERGIES`."""
     for j in range(len(places)):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0  # additions that do not wait for each other
-        for i in range((4 + j) * CHUNK, (5 + j) * CHUNK, 8):
+        for i in range((4 + j) * ROW, (4 + j) * ROW + CHUNK, 8):
             s0 += work[i]
             s1 += work[i + 1]
             s2 += work[i + 2]
@@ -446,8 +456,8 @@ def sum_energies(work, places, energies):
 @inlined
 def clear_energies(work, places):
     """Set the sums of :func:`sum_energies` to zero."""
-    sums = work[4 * CHUNK :]
-    for i in range(len(places) * CHUNK):  # much faster than an assignment to a slice
+    sums = work[4 * ROW :]
+    for i in range(len(places) * ROW):  # much faster than an assignment to a slice
         sums[i] = 0.0
 
 
@@ -467,7 +477,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
         """Add the internal forces of the chunks [begun, ended) of the sweep to ``f``; results as those of
         :func:`forces`.
 
-        ``work`` (work_rows CHUNK,): end differences, force over length, sums of the energies, new history. One sum is
+        ``work`` (work_rows ROW,): end differences, force over length, sums of the energies, new history. One sum is
         kept per position in a chunk, so vector instructions need no reordering.
         """
         failed = -1
@@ -475,9 +485,9 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
         broke = 0
         starts, chunks = bars.sweep.starts, bars.sweep.chunks
         rest, history, step = bars.rest, bars.history, bars.step
-        xs, ys, zs, cs = work[:CHUNK], work[CHUNK : 2 * CHUNK], work[2 * CHUNK : 3 * CHUNK], work[3 * CHUNK : 4 * CHUNK]
-        lasts = work[(first_new + last) * CHUNK :]
-        stresses = work[(first_new + last + 1) * CHUNK :]
+        xs, ys, zs, cs = work[:ROW], work[ROW : 2 * ROW], work[2 * ROW : 3 * ROW], work[3 * ROW : 4 * ROW]
+        lasts = work[(first_new + last) * ROW :]
+        stresses = work[(first_new + last + 1) * ROW :]
         for chunk in range(begun, ended):
             first = starts[chunks[chunk]]
             n = starts[chunks[chunk + 1]] - first
@@ -487,12 +497,12 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
             changed = 0
             for i in range(n):
                 bar = read(bars, first + i)
-                length = math.sqrt(xs[i] * xs[i] + ys[i] * ys[i] + zs[i] * zs[i])
-                short += 0 if length / bar.rest >= SHORTENED_STRETCH else 1  # NaN counts
-                strain, slope, _, stress, _, new, densities = evaluate(length, bar, step)
-                add_energies(work, 4 * CHUNK + i, bar.area * bar.rest, densities)
+                stretch, inverse = stretch_and_inverse(xs[i] * xs[i] + ys[i] * ys[i] + zs[i] * zs[i], bar.rest)
+                short += 0 if stretch >= SHORTENED_STRETCH else 1  # NaN counts
+                strain, slope, _, stress, _, new, densities = evaluate(stretch, bar, step)
+                add_energies(work, 4 * ROW + i, bar.area * bar.rest, densities)
                 if n_rows > 0:
-                    put_new(work, first_new * CHUNK + i, new)
+                    put_new(work, first_new * ROW + i, new)
                     changed += 1 if by_rate or changes(new, bar.variables) else 0
                     if can_break:
                         broke += 1 if new[gone] != bar.variables[gone] else 0
@@ -503,10 +513,10 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                         left = 1.0 - abs(bar.variables[gone])
                         kept = stress / left if left > 0.0 else 0.0
                     stresses[i] = kept
-                cs[i] = bar.area * stress * slope / length
+                cs[i] = bar.area * stress * slope * inverse
             if n_rows > 0 and commit and changed > 0:
                 for j in range(n_rows):
-                    copy(work[(first_new + j) * CHUNK :], history[j][begin : begin + n])
+                    copy(work[(first_new + j) * ROW :], history[j][begin : begin + n])
             if short > 0:
                 for i in range(n):
                     stretch = math.sqrt(xs[i] ** 2 + ys[i] ** 2 + zs[i] ** 2) / rest[first + i]
@@ -531,7 +541,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
         """Add internal forces to ``f``, and sums over counted bars to ``energies``, see
         :data:`~pfem_petsc.columns.BAR_ENERGIES` [J]; return the first failed bar or -1, whether any bar is so short
         that it may be inverted, and how many bars have changed their state of rupture."""
-        work = np.empty(work_rows * CHUNK)
+        work = np.empty(work_rows * ROW)
         failed = -1
         shortened = False
         broke = 0
@@ -553,7 +563,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
         end_differences(x, bars.sweep, bars.far, chunk, work)
         along, across = stored[0, first : first + n], stored[1, first : first + n]
         for i in range(n):
-            d = (work[i], work[CHUNK + i], work[2 * CHUNK + i])
+            d = (work[i], work[ROW + i], work[2 * ROW + i])
             axial, geometric, inverse = stiffness(d, read(bars, first + i), bars.step)
             along[i] = weight * ((axial - geometric) * inverse * inverse)
             across[i] = weight * geometric
@@ -561,7 +571,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     @kernel
     def stiffnesses(x, bars, weight, stored):
         """Write (dN/dl - N/l)/l^2 and N/l of each bar [N/m3], [N/m] times ``weight`` to ``stored`` (2, b)."""
-        work = np.empty(3 * CHUNK)
+        work = np.empty(3 * ROW)
         for chunk in range(len(bars.sweep.diagonal)):
             linearise_chunk(x, bars, chunk, weight, stored, work)
 
@@ -589,7 +599,7 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
         len(law.bar_data),
     )
     variables_of, data_of = take(len(law.internal)), take_from(n_data)
-    put_force, put_new, put_last, changes = put(3), put(len(law.internal)), put(2), differ(len(law.internal))
+    add_force, put_new, put_last, changes = accumulate(3), put(len(law.internal)), put(2), differ(len(law.internal))
     n_energies = len(law.energies)
     first_new = 4 + n_energies
     add_energies, real_ones, nothing = accumulate(n_energies), blend(n_energies), (0.0,) * n_energies
@@ -601,89 +611,110 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
         return -1, False
 
     def make(counts: bool) -> Callable[..., Any]:
-        @borrowing
+        @borrowing_apart
         def add_padded(x, bars, base, begun, ended, work):
             """Add the internal forces of the groups [begun, ended) of padded runs to ``bars.pulls`` (3 stride,), and
             update the history in ``bars.columns.kept``; return the first failed bar, or -1, and whether any bar is so
             short that it may be inverted.
 
-            ``x`` (n, 3) positions, which are also in ``bars.planes`` (3 stride,) from node ``base`` on; ``work``: as
-            that of single steps, with forces of a group by components, the sums of energies if the loop ``counts``
-            them, and new history.
+            ``x`` (n, 3) positions, which are also in ``bars.planes`` (3 stride,) from node ``base`` on; ``work``: the
+            forces on the lower ends of the bars of a block of nodes by components, the sums of energies if the loop
+            ``counts`` them, and new history.
             """
             failed = -1
             shortened = False
-            data, sweep, columns, planes, sums = bars.data, bars.data.sweep, bars.columns, bars.planes, bars.pulls
+            data, columns, planes, sums = bars.data, bars.columns, bars.planes, bars.pulls
             stride = len(planes) // 3
-            heads, fars, starts, runs = columns.heads, columns.fars, columns.starts, columns.runs
-            kept, step = columns.kept, data.step
+            heads, fars, starts = columns.heads, columns.fars, columns.starts
+            rests, kept, step = columns.rest, columns.kept, data.step
+            origin = -1  # first node of the block whose forces are in the workspace
+            wide = 0
             for group in range(begun, ended):
                 first = starts[group]
                 n = starts[group + 1] - first
-                head, tail = heads[group] - base, fars[group] - base
-                x0, y0, z0 = planes[head:], planes[stride + head :], planes[2 * stride + head :]
-                x1, y1, z1 = planes[tail:], planes[stride + tail :], planes[2 * stride + tail :]
+                node = np.int64(heads[group])
+                block = node // NODE_BLOCK * NODE_BLOCK
+                if block != origin:
+                    if origin >= 0:
+                        add_lower_ends(work, wide, sums, origin - base)
+                    clear_lower_ends(work)
+                    origin = block
+                    wide = 0
+                lower = work[node - block :]
+                wide = max(wide, node - block + n)
+                x0, x1 = node - base, np.int64(fars[group]) - base
+                y0, y1, z0, z1 = x0 + stride, x1 + stride, x0 + 2 * stride, x1 + 2 * stride
                 short = 0
                 changed = 0
                 for i in range(n):
-                    rest = columns.rest[first + i]
+                    rest = rests[first + i]
                     real = rest > 0.0
                     rest = rest if real else 1.0
-                    dx, dy, dz = x1[i] - x0[i], y1[i] - y0[i], z1[i] - z0[i]
+                    # unsigned: negative indices need not be handled
+                    dx = planes[np.uint64(x1 + i)] - planes[np.uint64(x0 + i)]
+                    dy = planes[np.uint64(y1 + i)] - planes[np.uint64(y0 + i)]
+                    dz = planes[np.uint64(z1 + i)] - planes[np.uint64(z0 + i)]
                     squared = dx * dx + dy * dy + dz * dz
-                    length = math.sqrt(squared if real else 1.0)
-                    short += 0 if length / rest >= SHORTENED_STRETCH else 1  # NaN counts
+                    stretch, inverse = stretch_and_inverse(squared if real else 1.0, rest)
+                    short += 0 if stretch >= SHORTENED_STRETCH else 1  # NaN counts
                     q = variables_of(kept, first + i)
                     before = kept[last, first + i] if by_rate else 0.0
                     p = data.parameters + data_of(kept, n_rows, first + i) if n_data else data.parameters
                     area = bar_value(columns.area, first + i) if real else 0.0
                     bar = Bar(rest, 0.0, 0.0, area, p, before, 0.0, q)
-                    strain, slope, _, stress, _, new, densities = evaluate(length, bar, step)
+                    strain, slope, _, stress, _, new, densities = evaluate(stretch, bar, step)
                     if counts:
                         # what a column without a bar keeps may be anything
                         some = real_ones(real, densities, nothing) if keeps else densities
-                        add_energies(work, 4 * CHUNK + i, area * rest, some)
-                    pull = area * stress * slope / length
+                        add_energies(work, 4 * ROW + i, area * rest, some)
+                    pull = area * stress * slope * inverse
                     if keeps:
                         pull = pull if real else 0.0
-                    put_force(work, i, (pull * dx, pull * dy, pull * dz))
+                    pull = pull if stretch > COLLAPSED_STRETCH else 0.0
+                    add_force(lower, i, -pull, (dx, dy, dz))
+                    sums[np.uint64(x1 + i)] += pull * dx
+                    sums[np.uint64(y1 + i)] += pull * dy
+                    sums[np.uint64(z1 + i)] += pull * dz
                     if n_rows > 0:
-                        put_new(work, first_new * CHUNK + i, new)
+                        put_new(work, first_new * ROW + i, new)
                         changed += 1 if real and (by_rate or changes(new, q)) else 0
                     if by_rate:
-                        put_last(work, (first_new + last) * CHUNK + i, (strain, stress))
+                        put_last(work, (first_new + last) * ROW + i, (strain, stress))
                 if n_rows > 0 and changed > 0:
                     for j in range(n_rows):
-                        copy(work[(first_new + j) * CHUNK :], kept[j][first : first + n])
+                        copy(work[(first_new + j) * ROW :], kept[j][first : first + n])
                 if short > 0:
-                    for run in range(runs[group], runs[group + 1]):
-                        ahead = sweep.heads[run] - heads[group]
-                        for k in range(sweep.starts[run + 1] - sweep.starts[run]):
-                            i = ahead + k
-                            a, b = heads[group] + i, fars[group] + i
-                            dx, dy, dz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
-                            stretch = math.sqrt(dx * dx + dy * dy + dz * dz) / columns.rest[first + i]
-                            if stretch < SHORTENED_STRETCH:
-                                shortened = True
-                            if not (stretch > COLLAPSED_STRETCH):  # NaN fails this test too
-                                if failed < 0:
-                                    failed = np.int64(sweep.starts[run] + k)  # signed, like -1
-                                for c in range(3):
-                                    work[c * CHUNK + i] = 0.0
-                if columns.close[group]:
-                    for run in range(runs[group], runs[group + 1]):
-                        at, count = sweep.heads[run] - heads[group], sweep.starts[run + 1] - sweep.starts[run]
-                        subtract_rows(sums, stride, head + at, count, work, at)
-                        add_rows(sums, stride, tail + at, count, work, at)
-                else:  # nodes that are both ends of bars receive forces by the number of the bar, as in single steps
-                    add_rows(sums, stride, tail, n, work, 0)
-                    subtract_rows(sums, stride, head, n, work, 0)
+                    at, inverted = find_short(x, data.sweep, columns, group)
+                    failed = at if failed < 0 else failed
+                    shortened = shortened or inverted
+            if origin >= 0:
+                add_lower_ends(work, wide, sums, origin - base)
             return failed, shortened
 
         return add_padded
 
     plain, counting = (add_none, add_none) if law.rupture >= 0 else (make(False), make(True))
     return {"add_padded": plain, "add_padded_energies": counting}
+
+
+@borrowing
+def find_short(x, sweep, columns, group):
+    """Return the first collapsed bar of a group of padded runs at positions ``x`` (n, 3), or -1, and whether any is so
+    short that it may be inverted."""
+    failed, shortened = -1, False
+    head, far, first = np.int64(columns.heads[group]), np.int64(columns.fars[group]), np.int64(columns.starts[group])
+    for run in range(columns.runs[group], columns.runs[group + 1]):
+        ahead = np.int64(sweep.heads[run]) - head
+        for k in range(sweep.starts[run + 1] - sweep.starts[run]):
+            i = ahead + k
+            a, b = head + i, far + i
+            dx, dy, dz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+            stretch = math.sqrt(dx * dx + dy * dy + dz * dz) / columns.rest[first + i]
+            if stretch < SHORTENED_STRETCH:
+                shortened = True
+            if not (stretch > COLLAPSED_STRETCH) and failed < 0:  # NaN fails this test too
+                failed = np.int64(sweep.starts[run] + k)  # signed, like -1
+    return failed, shortened
 
 
 @cache

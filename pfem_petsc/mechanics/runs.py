@@ -10,8 +10,8 @@ import numpy as np
 
 from ..mesh.ordering import FEW, LEAST_RUN, NODE_BLOCK
 from .compiled import borrowing, inlined, kernel
-from .strips import APART, LANES, add_strips, differences
-from .tuples import CHUNK
+from .strips import LANES, add_strips, differences
+from .tuples import CHUNK, ROW
 
 _LINE = 8  # numbers in a line of the cache
 
@@ -32,8 +32,8 @@ def new_planes(nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 @inlined
 def new_rows(count):
-    """Return ``count`` rows of :data:`CHUNK` numbers in one array, aligned to lines of the cache; not initialised."""
-    room = np.empty(count * CHUNK + _LINE)
+    """Return ``count`` rows of a workspace in one array, aligned to lines of the cache; not initialised."""
+    room = np.empty(count * ROW + _LINE)
     return room[-(room.ctypes.data // 8) % _LINE :]
 
 
@@ -79,6 +79,24 @@ def slide_planes(planes, shift, count):
         one, other = planes[c * stride : c * stride + count], planes[c * stride + shift :]
         for i in range(len(one)):
             one[i] = other[i]
+
+
+@borrowing
+def clear_lower_ends(work):
+    """Set the first three rows of a workspace to zero."""
+    for i in range(3 * ROW):
+        work[i] = 0.0
+
+
+@borrowing
+def add_lower_ends(work, count, pulls, first):
+    """Add the first three rows of a workspace to components ``pulls`` (3 stride,) of ``count`` nodes from ``first``
+    on."""
+    stride = len(pulls) // 3
+    for c in range(3):
+        sums, row = pulls[c * stride + first : c * stride + first + count], work[c * ROW :]
+        for i in range(len(sums)):
+            sums[i] += row[i]
 
 
 class Sweep(NamedTuple):
@@ -193,7 +211,7 @@ def end_differences(x, sweep, far, chunk, work):
     ``far``: upper end of each bar, for fans.
     """
     heads, fars, starts = sweep.heads, sweep.fars, sweep.starts
-    xs, ys, zs = work[:CHUNK], work[CHUNK : 2 * CHUNK], work[2 * CHUNK : 3 * CHUNK]
+    xs, ys, zs = work[:ROW], work[ROW : 2 * ROW], work[2 * ROW : 3 * ROW]
     first = starts[sweep.chunks[chunk]]
     for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
         at = starts[run]
@@ -217,8 +235,8 @@ def scatter_forces(f, sweep, far, chunk, work):
     """Subtract the forces of a chunk of bars from their lower ends in ``f`` (n, 3), and add them to the upper ones:
     the first three rows of a workspace times the fourth one."""
     heads, fars, starts = sweep.heads, sweep.fars, sweep.starts
-    xs, ys, zs = work[:CHUNK], work[CHUNK : 2 * CHUNK], work[2 * CHUNK : 3 * CHUNK]
-    cs = work[3 * CHUNK : 4 * CHUNK]
+    xs, ys, zs = work[:ROW], work[ROW : 2 * ROW], work[2 * ROW : 3 * ROW]
+    cs = work[3 * ROW : 4 * ROW]
     first = starts[sweep.chunks[chunk]]
     for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
         at = starts[run]
@@ -261,7 +279,6 @@ class Columns(NamedTuple):
     heads, fars : (groups,) uint32, ends of the first column of each group
     starts : (groups + 1,) uint32, first column of each group, and the end
     runs : (groups + 1,) uint32, first run of the sweep in each group, and the end
-    close : (groups,) bool, whether vectors of both ends overlap: forces are then added run by run, as in single steps
     rest : (columns,) rest lengths [m]
     area : areas [m2], a number or (columns,)
     kept : (rows, columns) history of the bars, or rows without columns; see :func:`spread_history`
@@ -273,7 +290,6 @@ class Columns(NamedTuple):
     fars: np.ndarray
     starts: np.ndarray
     runs: np.ndarray
-    close: np.ndarray
     rest: np.ndarray
     area: float | np.ndarray
     kept: np.ndarray
@@ -291,7 +307,6 @@ def no_columns(area: float | np.ndarray, rows: int) -> Columns:
         none,
         none,
         none,
-        np.empty(0, dtype=np.bool_),
         empty,
         area,
         np.empty((rows, 0)),
@@ -318,9 +333,8 @@ def make_columns(sweep: Sweep, rest: np.ndarray, area: float | np.ndarray, rows:
     if isinstance(area, np.ndarray):
         values, area = area, aligned(columns)
         _spread(values, sweep, (runs, heads, starts), 0.0, area)
-    close = (fars - heads) < APART
     parts = np.searchsorted(runs, sweep.chunks[sweep.parts]).astype(np.int64)
-    return Columns(heads, fars, starts, runs, close, spread, area, np.zeros((rows, columns)), counted, parts)
+    return Columns(heads, fars, starts, runs, spread, area, np.zeros((rows, columns)), counted, parts)
 
 
 @kernel

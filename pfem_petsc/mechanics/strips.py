@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from .tuples import CHUNK
+from .tuples import ROW
 
 LANES = 8
 """Numbers of a vector."""
@@ -152,8 +152,8 @@ class Arguments:
         return self.numbers(k, self.builder.add(node, self.builder.mul(stride, _number(component))))
 
     def row(self, k: int, column: Any, number: int) -> Any:
-        """Return a pointer into a row of a workspace, of :data:`~pfem_petsc.mechanics.tuples.CHUNK` numbers."""
-        return self.numbers(k, self.builder.add(column, _number(number * CHUNK)))
+        """Return a pointer into a row of a workspace."""
+        return self.numbers(k, self.builder.add(column, _number(number * ROW)))
 
 
 @intrinsic
@@ -279,30 +279,3 @@ def add_stiffness_diagonals(typingctx, x, minus, plus, low, high, count, along, 
         return context.get_dummy_value()
 
     return types.void(x, minus, plus, low, high, count, along, across, first), generate
-
-
-def _change_components(sign: str) -> Any:
-    """Make the intrinsic that adds the first three rows of a workspace, from ``first`` on, to ``count`` nodes of
-    components ``f`` (3 stride,), or subtracts them."""
-
-    @intrinsic
-    def change(typingctx, f, stride, node, count, work, first):  # noqa: ANN001, ANN202
-        def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
-            given = Arguments(context, builder, signature, values)
-            combine = getattr(builder, sign)
-            ends = [given.plane(0, given.index(2), given.index(1), c) for c in range(3)]
-            rows = [given.row(4, given.index(5), c) for c in range(3)]
-
-            def body(at: Any, strip: Strip) -> None:
-                for end, row in zip(ends, rows, strict=True):
-                    strip.store(combine(strip.load(end, at), strip.load(row, at)), end, at)
-
-            for_strips(builder, given.index(3), body, ends[0])
-            return context.get_dummy_value()
-
-        return types.void(f, stride, node, count, work, first), generate
-
-    return change
-
-
-add_rows, subtract_rows = _change_components("fadd"), _change_components("fsub")

@@ -17,7 +17,11 @@ from numba.extending import overload
 from .compiled import borrowing
 
 CHUNK = 512
-"""Bars whose working arrays fit into the fastest cache: numbers in a row of a workspace."""
+"""Bars whose working arrays fit into the fastest cache."""
+
+ROW = CHUNK + 88
+"""Numbers from one row of a workspace to the next, of which :data:`CHUNK` are used. With a power of two, loads from a
+row would wait for stores to others, whose addresses end with the same bits."""
 
 
 @cache
@@ -28,7 +32,7 @@ def written_out(text: str, count: int, borrowed: bool = True) -> Callable[..., A
     """
 
     def repeat(part: re.Match) -> str:
-        return "".join(part[1].replace("{jC}", str(j * CHUNK)).replace("{j}", str(j)) for j in range(count))
+        return "".join(part[1].replace("{jC}", str(j * ROW)).replace("{j}", str(j)) for j in range(count))
 
     names: dict[str, Any] = {"__name__": __name__}
     exec(re.sub("<(.*?)>", repeat, text, flags=re.DOTALL), names)  # noqa: S102 - of texts in the program

@@ -22,7 +22,7 @@ from ..mechanics.compiled import borrowing, calls, kernel
 from ..mechanics.elements import PULLED, clear_energies, first_inverted, sum_energies
 from ..mechanics.loads import LoadSchedule, set_forces
 from ..mechanics.runs import copy, join_components, new_rows, slide_planes, split_components
-from ..mechanics.tuples import CHUNK
+from ..mechanics.tuples import ROW
 from ..mesh.ordering import NODE_BLOCK
 from .impact import Approach, Touched, join_nodes, plane_gaps, stop_nodes, unpressed
 from .impulses import IN_COLUMNS, WALLS
@@ -837,7 +837,7 @@ def pull_again(x, n_blocks, bars, f, work):
 @kernel
 def new_work(sections, rows):
     """Return workspaces of some rows for each section, aligned; not initialised."""
-    return new_rows(sections * rows)[: sections * rows * CHUNK].reshape(sections, rows * CHUNK)
+    return new_rows(sections * rows)[: sections * rows * ROW].reshape(sections, rows * ROW)
 
 
 @borrowing

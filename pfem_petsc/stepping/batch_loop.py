@@ -38,6 +38,7 @@ from .ledger_loops import (
     WIDE,
     WORKS,
     Acting,
+    EndArrays,
     add_drags,
     add_ends,
     add_loads,
@@ -47,7 +48,6 @@ from .ledger_loops import (
     clear_ends,
     clear_forces,
     clear_sums,
-    half_steps,
     new_sums,
     spread,
     start_of_step,
@@ -113,17 +113,6 @@ class WallArrays(NamedTuple):
     touched: Touched
     present: np.ndarray
     releases: np.ndarray
-
-
-class EndArrays(NamedTuple):
-    """Room for the end of a step at the nodes of a block, (3 NODE_BLOCK,): increments, velocities, accelerations and
-    the half step before; and two arrays (WIDE,), room for :func:`~pfem_petsc.stepping.ledger_loops.add_ends`."""
-
-    u: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    way: np.ndarray
-    room: tuple[np.ndarray, np.ndarray]
 
 
 class BlockArrays(NamedTuple):
@@ -610,12 +599,12 @@ def push_particles(totals, force, links, alpha, h, impulses, u):
 def end_block(block, alone, keep, nodes, shared, state, forces):
     """Add what the ledger needs of the end of a step at the nodes of a block to the sums. ``forces`` (m, 3) are those
     of the block, and ``alone`` if they determine the increments. To ``keep`` means to write increments, velocities and
-    accelerations to the state; they remain in ``shared.ends``."""
+    accelerations to the state; the former remain in ``shared.ends``."""
     h, eta, alpha, ends, lanes = shared.h, shared.eta, shared.alpha, shared.ends, shared.lanes
     first = NODE_BLOCK * block
     last = min(first + NODE_BLOCK, len(shared.half))
     wide = 3 * (last - first)
-    u, v, a, way, force = ends.u[:wide], ends.v[:wide], ends.a[:wide], ends.way[:wide], forces.reshape(-1)
+    u, left, force = ends.u[:wide], ends.left[:wide], forces.reshape(-1)
     if alone:
         spread(shared.inverses[first:last], u)
         if len(nodes.external) > 0:
@@ -629,22 +618,20 @@ def end_block(block, alone, keep, nodes, shared, state, forces):
             u[3 * (nodes.support_nodes[k] - first) + nodes.support_components[k]] = shared.held[k]
     else:
         copy(state.u[first:last].reshape(-1), u)
-    centre(u, eta, shared.half[first:last].reshape(-1), v)
-    accelerations(u, alpha, a)
-    half_steps(h, v, a, way)
-    add_ends(shared.x[first:last].reshape(-1), nodes.mass[first:last], (v, a, way), force, ends.room, lanes)
+    x, half = shared.x[first:last].reshape(-1), shared.half[first:last].reshape(-1)
+    add_ends(x, nodes.mass[first:last], half, force, (h, alpha, eta), ends, lanes)
     if len(nodes.external) > 0:
-        add_powers(nodes.external[first:last].reshape(-1), way, lanes[ENDS + EXTERNAL])
+        add_powers(nodes.external[first:last].reshape(-1), left, lanes[ENDS + EXTERNAL])
     if len(nodes.damping) > 0:
         drag = shared.drag[:wide]
         spread(nodes.damping[first:last], drag)
         for j in range(wide):
-            drag[j] *= v[j]
-        add_powers(drag, way, lanes[ENDS + DAMPING])
+            drag[j] *= half[j] - eta * u[j]
+        add_powers(drag, left, lanes[ENDS + DAMPING])
     if keep:
         copy(u, state.u[first:last].reshape(-1))
-        copy(v, state.v[first:last].reshape(-1))
-        copy(a, state.a[first:last].reshape(-1))
+        centre(u, eta, half, state.v[first:last].reshape(-1))
+        accelerations(u, alpha, state.a[first:last].reshape(-1))
 
 
 @borrowing
@@ -652,7 +639,7 @@ def end_rows(block, shared, contact):
     """Add the works of the forces of rows over the half step at the nodes of a block, after :func:`end_block`."""
     first = NODE_BLOCK * block
     forces = contact[first : min(first + NODE_BLOCK, len(shared.half))].reshape(-1)
-    add_powers(forces, shared.ends.way[: len(forces)], shared.lanes[ENDS + CONTACT])
+    add_powers(forces, shared.ends.left[: len(forces)], shared.lanes[ENDS + CONTACT])
 
 
 @borrowing
@@ -725,12 +712,13 @@ def probe_forces(probes, support, contact, pressing, values):
 def probe_block(block, probes, shared, values):
     """Write positions, velocities and accelerations of the probes in a block to ``values`` (p, 4, 3), after
     :func:`end_block`."""
-    first, ends = NODE_BLOCK * block, shared.ends
+    first, u = NODE_BLOCK * block, shared.ends.u
     for k in range(probes.starts[block], probes.starts[block + 1]):
         i, at = probes.nodes[k], probes.order[k]
         for c in range(3):
-            j = 3 * (i - first) + c
-            values[at, 0, c], values[at, 1, c], values[at, 2, c] = shared.x[i, c], ends.v[j], ends.a[j]
+            step = u[3 * (i - first) + c]
+            values[at, 0, c] = shared.x[i, c]
+            values[at, 1, c], values[at, 2, c] = shared.half[i, c] - shared.eta * step, shared.alpha * step
 
 
 _INT, _SHORT, _BYTES = ir.IntType(64), ir.IntType(32), ir.IntType(8).as_pointer()
@@ -887,13 +875,7 @@ def batch_loop(data, touched, met, due, flags):
     increments, factors = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK)
     load, held = np.empty(len(nodes.support_nodes)), np.empty(len(nodes.support_nodes))
     speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
-    ends = EndArrays(
-        np.empty(3 * NODE_BLOCK),
-        np.empty(3 * NODE_BLOCK),
-        np.empty(3 * NODE_BLOCK),
-        np.empty(3 * NODE_BLOCK),
-        (np.empty(WIDE), np.empty(WIDE)),
-    )
+    ends = EndArrays(np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK), np.empty(WIDE), np.empty(WIDE))
     totals, lanes, after = np.zeros((3, 3)), new_sums(), np.empty(len(WORKS))
     sums, energies = (np.empty(len(WORKS) + 1), np.empty((3, 3))), np.empty(len(_BARS))
     probed = len(probes.nodes)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import inlined, kernel
+from ..mechanics.compiled import borrowing, borrowing_apart, inlined, kernel
 
 WORKS = ("external", "contact", "damping", "inertial", "internal")
 """Works of the ledger [J], in this order; the first includes supports."""
@@ -23,7 +23,7 @@ _KINETIC = ENDS + len(WORKS)
 _MOMENTA = _KINETIC + 1  # the first of the lanes of :func:`add_momenta`
 _ROWS = _MOMENTA + 4
 
-LANES = 128
+LANES = 64
 """Nodes with sums of their own; blocks of nodes begin at multiples of it."""
 
 WIDE = 3 * LANES
@@ -92,15 +92,26 @@ def total(force):
 def add_momenta(place, masses, momentum, lanes):
     """Add momentum, mass times position, and two parts of the angular momentum to ``lanes`` (4, WIDE); positions,
     ``masses`` and ``momentum`` (3 n,) are those of at most :data:`LANES` consecutive nodes from a multiple of it on."""
-    moved, angular, crossed = lanes[1], lanes[2], lanes[3]
+    moved = lanes[1]
     add_forces(momentum, lanes[0])
     for j in range(len(place)):
         moved[j] += masses[j] * place[j]
+    _add_turning(place, momentum, (lanes[2], lanes[3]))
+
+
+@borrowing_apart
+def _add_turning(place, momentum, sums):
+    """Add both parts of the angular momentum to ``sums``, see :func:`add_momenta`."""
+    angular, crossed = sums
     # x p_y - y p_x and y p_z - z p_y at the places of x and y, x p_z - z p_x at that of x; others are not used
-    for j in range(len(place) - 1):
-        angular[j] += place[j] * momentum[j + 1] - place[j + 1] * momentum[j]
-    for j in range(len(place) - 2):
-        crossed[j] += place[j] * momentum[j + 2] - place[j + 2] * momentum[j]
+    n = len(place) - 1
+    one, other, moving, turning = place[:n], place[1:], momentum[:n], momentum[1:]
+    for j in range(n):
+        angular[j] += one[j] * turning[j] - other[j] * moving[j]
+    n -= 1
+    last, spinning = place[2:], momentum[2:]
+    for j in range(n):
+        crossed[j] += one[j] * spinning[j] - last[j] * moving[j]
 
 
 @kernel
@@ -159,35 +170,51 @@ def clear_ends(lanes, n):
         clear_sums(lanes[row], n)
 
 
-@kernel
-def add_ends(x, mass, motion, force, room, lanes):
+class EndArrays(NamedTuple):
+    """Room for the end of a step at the nodes of a block: increments, and displacements in the last half of the step,
+    (3 m,); masses and momenta of :data:`LANES` nodes, (WIDE,)."""
+
+    u: np.ndarray
+    left: np.ndarray
+    masses: np.ndarray
+    momentum: np.ndarray
+
+
+@borrowing
+def add_ends(x, mass, half, force, numbers, ends, lanes):
     """Add what the ledger needs of the end of a step at consecutive nodes, from a multiple of :data:`LANES` on: the
     works of inertia and of the internal ``force`` over half the step, kinetic energy and momenta.
 
-    ``motion``: velocities, accelerations, and half the step, see :func:`half_steps`; arrays (3 n,), but ``mass`` (n,).
-    ``room``: two arrays (WIDE,).
+    ``half``: velocities half a step later, (3 n,) like ``x`` and ``force``; ``mass`` (n,); ``numbers``: h, alpha and
+    eta. From the increments ``ends.u``, it writes ``ends.left``.
     """
-    masses, product = room
-    v, a, way = motion
-    add_powers(force, way, lanes[ENDS + INTERNAL])
-    for first in range(0, len(v), WIDE):
-        last = min(first + WIDE, len(v))
-        speed, pull, moving = v[first:last], a[first:last], product[: last - first]
-        spread(mass[first // 3 : last // 3], masses)
-        for j in range(len(moving)):
-            moving[j] = masses[j] * pull[j]
-        add_powers(moving, pull, lanes[ENDS + INERTIAL])
-        for j in range(len(moving)):
-            moving[j] = masses[j] * speed[j]
-        add_powers(moving, speed, lanes[_KINETIC])
-        add_momenta(x[first:last], masses, moving, lanes[_MOMENTA:])
+    sums = (lanes[ENDS + INTERNAL], lanes[ENDS + INERTIAL], lanes[_KINETIC], lanes[_MOMENTA], lanes[_MOMENTA + 1])
+    for first in range(0, len(x), WIDE):
+        last = min(first + WIDE, len(x))
+        place, momentum = x[first:last], ends.momentum[: last - first]
+        spread(mass[first // 3 : last // 3], ends.masses)
+        given = (ends.u[first:last], half[first:last], force[first:last], place, ends.masses)
+        _add_motion(given, numbers, (ends.left[first:last], momentum), sums)
+        _add_turning(place, momentum, (lanes[_MOMENTA + 2], lanes[_MOMENTA + 3]))
 
 
-@kernel
-def half_steps(h, v, a, way):
-    """Compute the last half of a step of h v - h^2 a/2; arrays (3 n,)."""
-    for j in range(len(way)):
-        way[j] = (0.5 * h) * (v[j] - (0.5 * h) * a[j])
+@borrowing_apart
+def _add_motion(given, numbers, made, sums):
+    u, half, force, place, masses = given
+    h, alpha, eta = numbers
+    left, momentum = made
+    internal, inertial, kinetic, momenta, moved = sums
+    for j in range(len(u)):
+        rate = alpha * u[j]
+        speed = half[j] - eta * u[j]
+        way = (0.5 * h) * (speed - (0.5 * h) * rate)
+        moving = masses[j] * speed
+        left[j], momentum[j] = way, moving
+        internal[j] += force[j] * way
+        inertial[j] += masses[j] * rate * rate
+        kinetic[j] += moving * speed
+        momenta[j] += moving
+        moved[j] += masses[j] * place[j]
 
 
 @kernel

@@ -483,12 +483,9 @@ class Bars:
         for family in self.families:
             family.add_step_forces(x0, x, f)
 
-    def product(self, x: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
-        """Compute ``out`` = K_t(x) u for local arrays (nodes, 3); valid for owned nodes."""
-        out[:] = 0.0
-        self._for_blocks("product", x, (u, out))
-        for family in self.families:
-            family.add_product(1.0, u, out)
+    def factors(self, x: np.ndarray, stored: np.ndarray) -> None:
+        """Fill ``stored`` (3, b) with dN/dl - N/l [N/m], N/l [N/m] and 1/l [1/m] of each bar at ``x``."""
+        self._for_blocks("factors", x, stored)
 
     def lengths(self, x: np.ndarray) -> np.ndarray:
         """Return the length (b,) of each local bar [m]."""

@@ -332,17 +332,12 @@ def _state_loops(law: Law, element: SimpleNamespace, measure: Callable[..., Any]
         add_blocks(out, bars, k, out.weight * (axial - geometric), n, n, out.weight * geometric)
 
     @borrowing
-    def product(x, bars, k, out):
-        """``out``: vectors u and K u (local nodes, 3)."""
-        u, sums = out
-        d = end_difference(x, bars, k)
-        axial, geometric, inverse = stiffness(d, read(bars, k), bars.step)
-        nx, ny, nz = d[0] * inverse, d[1] * inverse, d[2] * inverse
-        dx, dy, dz = end_difference(u, bars, k)
-        along = (axial - geometric) * (nx * dx + ny * dy + nz * dz)
-        add_to_ends(
-            sums, bars, k, along * nx + geometric * dx, along * ny + geometric * dy, along * nz + geometric * dz
-        )
+    def factors(x, bars, k, out):
+        """``out``: (3, b) dN/dl - N/l, N/l and 1/l."""
+        axial, geometric, inverse = stiffness(end_difference(x, bars, k), read(bars, k), bars.step)
+        out[0, k] = axial - geometric
+        out[1, k] = geometric
+        out[2, k] = inverse
 
     @borrowing
     def linearise(x, bars, k, out):
@@ -396,7 +391,7 @@ def _state_loops(law: Law, element: SimpleNamespace, measure: Callable[..., Any]
             rate += (begun - bar.shift - bar.strain) / bars.step + eta * (bar.strain - (strain - bar.shift))
         bars.history[known, k - bars.start] = rate
 
-    visits = (tangents, product, linearise, fields, densities, rates)
+    visits = (tangents, factors, linearise, fields, densities, rates)
     return {visit.__name__: _for_all(visit.__name__, visit) for visit in visits}
 
 

@@ -178,8 +178,11 @@ def differences(typingctx, x, low, high, count, work, first):  # noqa: ANN001, A
     return types.void(x, low, high, count, work, first), generate
 
 
-def add_to_both(builder: Any, ends: list[Any], distance: Any, count: Any, pull: Callable[[Any, Strip], Any]) -> None:
-    """Generate the subtraction of what ``pull`` returns from the nodes of a strip, and the addition to the other."""
+def add_to_both(
+    builder: Any, ends: list[Any], distance: Any, count: Any, pull: Callable[[Any, Strip], Any], first: int = 0
+) -> None:
+    """Generate the subtraction of what ``pull`` returns from the nodes of a strip, and the addition to the other;
+    ``first``: which of both ends comes first where they are close. With 1, sums are those of a loop over the bars."""
 
     def add(strip: Strip, at: Any, which: int, pulls: list[Any]) -> None:
         combine = builder.fadd if which else builder.fsub
@@ -195,7 +198,7 @@ def add_to_both(builder: Any, ends: list[Any], distance: Any, count: Any, pull: 
         with apart:
             for_strips(builder, count, both)
         with close:  # a load of what has just been stored at another place would have to wait
-            for which in range(2):
+            for which in (first, 1 - first):
                 for_strips(builder, count, lambda at, strip, which=which: add(strip, at, which, pull(at, strip)))
 
 
@@ -227,6 +230,28 @@ def _spread(builder: Any, values: Any) -> list[Any]:
     return [builder.shuffle_vector(values, nothing, chosen(*some)) for some in places]
 
 
+def _products(given: Arguments, builder: Any, factors: list[Any], first: int) -> None:
+    """Generate the products of bars between the nodes of two arrays, for both of the functions below; see there."""
+    low, high = given.index(3), given.index(4)
+    ends = [[given.numbers(k, node, 3) for node in (low, high)] for k in range(3)]
+
+    def difference(of: list[Any], at: Any, strip: Strip) -> list[Any]:
+        one, other = (strip.load_nodes(end, at) for end in of)
+        return [builder.fsub(b, a) for a, b in zip(one, other, strict=True)]
+
+    def pull(at: Any, strip: Strip) -> list[Any]:
+        d, w = difference(ends[0], at, strip), difference(ends[1], at, strip)
+        c, g, *inverse = (strip.load(factor, at) for factor in factors)
+        for values in inverse:
+            d = [builder.fmul(a, b) for a, b in zip(d, _spread(builder, values), strict=True)]
+        px, py, pz = separate(builder, [builder.fmul(a, b) for a, b in zip(d, w, strict=True)])
+        c = builder.fmul(c, builder.fadd(builder.fadd(px, py), pz))
+        parts = zip(_spread(builder, c), d, _spread(builder, g), w, strict=True)
+        return [builder.fadd(builder.fmul(a, b), builder.fmul(e, f)) for a, b, e, f in parts]
+
+    add_to_both(builder, ends[2], builder.sub(high, low), given.index(5), pull, first)
+
+
 @intrinsic
 def add_stiffness_products(typingctx, x, u, out, low, high, count, along, across, first):  # noqa: ANN001, ANN201
     """Add (c d d^T + g I) w of ``count`` bars to the nodes of ``out`` (n, 3) from ``high`` on, and subtract it from
@@ -235,26 +260,23 @@ def add_stiffness_products(typingctx, x, u, out, low, high, count, along, across
 
     def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
         given = Arguments(context, builder, signature, values)
-        low, high, first = given.index(3), given.index(4), given.index(8)
-        ends = [[given.numbers(k, node, 3) for node in (low, high)] for k in range(3)]
-        factors = [given.numbers(k, first) for k in (6, 7)]
-
-        def difference(of: list[Any], at: Any, strip: Strip) -> list[Any]:
-            one, other = (strip.load_nodes(end, at) for end in of)
-            return [builder.fsub(b, a) for a, b in zip(one, other, strict=True)]
-
-        def pull(at: Any, strip: Strip) -> list[Any]:
-            d, w = difference(ends[0], at, strip), difference(ends[1], at, strip)
-            px, py, pz = separate(builder, [builder.fmul(a, b) for a, b in zip(d, w, strict=True)])
-            c, g = (strip.load(factor, at) for factor in factors)
-            c = builder.fmul(c, builder.fadd(builder.fadd(px, py), pz))
-            parts = zip(_spread(builder, c), d, _spread(builder, g), w, strict=True)
-            return [builder.fadd(builder.fmul(a, b), builder.fmul(e, f)) for a, b, e, f in parts]
-
-        add_to_both(builder, ends[2], builder.sub(high, low), given.index(5), pull)
+        _products(given, builder, [given.numbers(k, given.index(8)) for k in (6, 7)], 0)
         return context.get_dummy_value()
 
     return types.void(x, u, out, low, high, count, along, across, first), generate
+
+
+@intrinsic
+def add_tangent_products(typingctx, x, u, out, low, high, count, along, across, inverse, first):  # noqa: ANN001, ANN201
+    """Add (c n n^T + g I) w of ``count`` bars as :func:`add_stiffness_products`, with n = d times ``inverse``; to the
+    bits of a loop over the bars in their order."""
+
+    def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
+        given = Arguments(context, builder, signature, values)
+        _products(given, builder, [given.numbers(k, given.index(9)) for k in (6, 7, 8)], 1)
+        return context.get_dummy_value()
+
+    return types.void(x, u, out, low, high, count, along, across, inverse, first), generate
 
 
 @intrinsic

@@ -16,6 +16,7 @@ from ..errors import InputError
 from ..integrators.base import Scheme
 from ..mechanics.bars import viscous_rate
 from ..mechanics.materials.base import law_name, law_of
+from ..mechanics.tangent import Tangent
 from ..output.units import TIME as AXIS
 from ..output.units import Axis, engineering
 from ..registry import choices, lookup
@@ -72,31 +73,38 @@ def highest_frequency(model: Model, x: np.ndarray, steps: int = 60, accuracy: fl
     q = (hashed >> np.uint64(11)).astype(np.float64) / 2.0**53 - 0.5
     supports.clear(q)
 
+    # what each step would allocate is allocated once: the pages of large arrays are requested anew each time
+    local, product = np.zeros((2, mesh.n_local, 3))
+    w, room = np.empty((2, owned, 3))
+
+    def dot(u: np.ndarray, v: np.ndarray) -> float:
+        return comm.allreduce(float(np.multiply(u, v, out=room).sum()))
+
     def norm(u: np.ndarray) -> float:
-        return float(np.sqrt(comm.allreduce(float((u * u).sum()))))
+        return float(np.sqrt(dot(u, u)))
 
     size = norm(q)
     if size == 0.0:
         return Frequency(0.0, 0.0)
     q /= size
     previous = np.zeros_like(q)
-    local, product = np.zeros((mesh.n_local, 3)), np.zeros((mesh.n_local, 3))
+    tangent = Tangent(model.bars, x)
     diagonal: list[float] = []
     beside: list[float] = []
     low = high = 0.0
     basis: list[np.ndarray] = []
     for _ in range(min(steps, 3 * mesh.n_nodes)):
         if model.inertia.consistent:
-            basis.append(q)
-        local[:owned] = scale * q
+            basis.append(q.copy())
+        np.multiply(scale, q, out=local[:owned])
         mesh.update_ghosts(local)
-        model.bars.product(x, local, product)
-        w = scale * product[:owned]
+        tangent.product(local, product)
+        np.multiply(scale, product[:owned], out=w)
         supports.clear(w)
-        alpha = comm.allreduce(float((w * q).sum()))
-        w -= alpha * q
+        alpha = dot(w, q)
+        w -= np.multiply(alpha, q, out=room)
         if beside:
-            w -= beside[-1] * previous
+            w -= np.multiply(beside[-1], previous, out=room)
         beta = norm(w)
         diagonal.append(alpha)
         matrix = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
@@ -108,7 +116,7 @@ def highest_frequency(model: Model, x: np.ndarray, steps: int = 60, accuracy: fl
         if residual <= accuracy * max(ritz, 0.0) or beta <= 1e-14 * max(abs(ritz), 1e-300):
             break
         beside.append(beta)
-        previous, q = q, w / beta
+        previous, q, w = q, np.divide(w, beta, out=w), previous
     if model.inertia.consistent and low > 0.0:
         shape = scale * sum(weight * vector for weight, vector in zip(vectors[:, -1], basis))
         low /= comm.allreduce(float((shape * model.inertia.mass_times(shape, np.empty_like(shape))).sum()))

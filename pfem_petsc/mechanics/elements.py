@@ -171,7 +171,8 @@ def stretch_and_inverse(squared, rest):
 
 @cache
 def make_element(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
-    """Make the functions that read and evaluate a bar: ``read``, ``evaluate``, ``stiffness``, ``step_stiffness``."""
+    """Make the functions that read and evaluate a bar: ``read``, ``evaluate``, ``whole_stress``, ``stiffness`` and
+    ``step_stiffness``."""
     response, mean_stress, by_rate, last = law.response, law.mean_stress, law.rate, len(law.internal)
     can_break, gone, ratio = law.rupture >= 0, max(law.rupture, 0), _RATIOS[measure]
     n_rows, n_data = len(law.rows), len(law.bar_data)
@@ -207,6 +208,14 @@ def make_element(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
             strain - bar.shift, rate, step, bar.warmth, bar.parameters, bar.variables
         )
         return strain, slope, curvature, stress, modulus, new, densities
+
+    @inlined
+    def whole_stress(stress, variables):
+        """Return the stress [Pa] that a law with a rate keeps: of what is left of a bar."""
+        if can_break:
+            left = 1.0 - abs(variables[gone])
+            return stress / left if left > 0.0 else 0.0
+        return stress
 
     @inlined
     def stiffness(d, bar, step):
@@ -256,7 +265,9 @@ def make_element(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
         dc = bar.area * (modulus * slope * r + mean * dr) / (rest * rest)
         return c, dc, 1.0 / length
 
-    return SimpleNamespace(read=read, evaluate=evaluate, stiffness=stiffness, step_stiffness=step_stiffness)
+    return SimpleNamespace(
+        read=read, evaluate=evaluate, whole_stress=whole_stress, stiffness=stiffness, step_stiffness=step_stiffness
+    )
 
 
 class MatrixRows(NamedTuple):
@@ -459,7 +470,7 @@ def clear_energies(work, places):
 def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     """Make the loops that evaluate chunks of runs, several bars at once: ``forces``, with its part for batches
     ``add_forces``; and ``stiffnesses``; ``places`` and ``work_rows`` of the workspace, see :func:`sum_energies`."""
-    read, evaluate, stiffness = element.read, element.evaluate, element.stiffness
+    read, evaluate, whole_stress, stiffness = element.read, element.evaluate, element.whole_stress, element.stiffness
     places = np.array([BAR_ENERGIES.index(name) for name in law.energies], dtype=np.int64)
     by_rate, last, n_rows = law.rate, len(law.internal), len(law.rows)
     first_new = 4 + len(places)
@@ -487,7 +498,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
             first = starts[chunks[chunk]]
             n = starts[chunks[chunk + 1]] - first
             begin = first - bars.start  # column of the history
-            end_differences(x, bars.sweep, bars.far, chunk, work)
+            end_differences(x, bars.sweep, bars.ends, chunk, work)
             short = 0
             changed = 0
             for i in range(n):
@@ -503,11 +514,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                         broke += 1 if new[gone] != bar.variables[gone] else 0
                 if by_rate:
                     lasts[i] = strain - bar.shift
-                    kept = stress
-                    if can_break:  # the stress of what is left of the bar
-                        left = 1.0 - abs(bar.variables[gone])
-                        kept = stress / left if left > 0.0 else 0.0
-                    stresses[i] = kept
+                    stresses[i] = whole_stress(stress, bar.variables)
                 cs[i] = bar.area * stress * slope * inverse
             if n_rows > 0 and commit and changed > 0:
                 for j in range(n_rows):
@@ -555,7 +562,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
         starts, chunks = bars.sweep.starts, bars.sweep.chunks
         first = starts[chunks[chunk]]
         n = starts[chunks[chunk + 1]] - first
-        end_differences(x, bars.sweep, bars.far, chunk, work)
+        end_differences(x, bars.sweep, bars.ends, chunk, work)
         along, across = stored[0, first : first + n], stored[1, first : first + n]
         for i in range(n):
             d = (work[i], work[ROW + i], work[2 * ROW + i])
@@ -581,36 +588,22 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
 
 def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     """Make ``add_padded`` and ``add_padded_energies``, which add internal forces of padded runs for batches of steps,
-    the latter with the sums of energies.
-
-    Laws of bars that can break have no such loops, since a step in which a bar breaks ends the batch: they are replaced
-    by a function that does nothing.
-    """
-    evaluate, by_rate, last, n_rows, n_data = (
-        element.evaluate,
-        law.rate,
-        len(law.internal),
-        len(law.rows),
-        len(law.bar_data),
-    )
+    the latter with the sums of energies."""
+    evaluate, whole_stress = element.evaluate, element.whole_stress
+    by_rate, last, n_rows, n_data = law.rate, len(law.internal), len(law.rows), len(law.bar_data)
     variables_of, data_of = take(len(law.internal)), take_from(n_data)
     add_force, put_new, put_last, changes = accumulate(3), put(len(law.internal)), put(2), differ(len(law.internal))
     n_energies = len(law.energies)
     first_new = 4 + n_energies
     add_energies, real_ones, nothing = accumulate(n_energies), blend(n_energies), (0.0,) * n_energies
     keeps = n_rows + n_data > 0
-
-    @borrowing
-    def add_none(x, bars, base, begun, ended, work):
-        """Replace the loops where they do not apply."""
-        return -1, False
+    rupture, can_break, gone = law.rupture, law.rupture >= 0, max(law.rupture, 0)
 
     def make(counts: bool) -> Callable[..., Any]:
         @borrowing_apart
         def add_padded(x, bars, base, begun, ended, work):
             """Add the internal forces of the groups [begun, ended) of padded runs to ``bars.pulls`` (3 stride,), and
-            update the history in ``bars.columns.kept``; return the first failed bar, or -1, and whether any bar is so
-            short that it may be inverted.
+            update the history in ``bars.columns.kept``; results as those of :func:`forces`.
 
             ``x`` (n, 3) positions, which are also in ``bars.planes`` (3 stride,) from node ``base`` on; ``work``: the
             forces on the lower ends of the bars of a block of nodes by components, the sums of energies if the loop
@@ -618,6 +611,7 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
             """
             failed = -1
             shortened = False
+            broke = 0
             data, columns, planes, sums = bars.data, bars.columns, bars.planes, bars.pulls
             stride = len(planes) // 3
             heads, fars, starts = columns.heads, columns.fars, columns.starts
@@ -673,35 +667,39 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                     if n_rows > 0:
                         put_new(work, first_new * ROW + i, new)
                         changed += 1 if real and (by_rate or changes(new, q)) else 0
+                        if can_break:
+                            broke += 1 if real and new[gone] != q[gone] else 0
                     if by_rate:
-                        put_last(work, (first_new + last) * ROW + i, (strain, stress))
+                        put_last(work, (first_new + last) * ROW + i, (strain, whole_stress(stress, q)))
                 if n_rows > 0 and changed > 0:
                     for j in range(n_rows):
                         copy(work[(first_new + j) * ROW :], kept[j][first : first + n])
                 if short > 0:
-                    at, inverted = find_short(x, data.sweep, columns, group)
+                    at, inverted = find_short(x, data.sweep, columns, group, rupture)
                     failed = at if failed < 0 else failed
                     shortened = shortened or inverted
             if origin >= 0:
                 add_lower_ends(work, wide, sums, origin - base)
-            return failed, shortened
+            return failed, shortened, broke
 
         return add_padded
 
-    plain, counting = (add_none, add_none) if law.rupture >= 0 else (make(False), make(True))
-    return {"add_padded": plain, "add_padded_energies": counting}
+    return {"add_padded": make(False), "add_padded_energies": make(True)}
 
 
 @borrowing
-def find_short(x, sweep, columns, group):
+def find_short(x, sweep, columns, group, rupture):
     """Return the first collapsed bar of a group of padded runs at positions ``x`` (n, 3), or -1, and whether any is so
-    short that it may be inverted."""
+    short that it may be inverted; broken bars may have any length. ``rupture``: see
+    :class:`~pfem_petsc.mechanics.materials.base.Law`."""
     failed, shortened = -1, False
     head, far, first = np.int64(columns.heads[group]), np.int64(columns.fars[group]), np.int64(columns.starts[group])
     for run in range(columns.runs[group], columns.runs[group + 1]):
         ahead = np.int64(sweep.heads[run]) - head
         for k in range(sweep.starts[run + 1] - sweep.starts[run]):
             i = ahead + k
+            if rupture >= 0 and abs(columns.kept[rupture, first + i]) >= 1.0:
+                continue
             a, b = head + i, far + i
             dx, dy, dz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
             stretch = math.sqrt(dx * dx + dy * dy + dz * dz) / columns.rest[first + i]
@@ -753,10 +751,10 @@ def batch_pulls(law: Law, measure: Callable[..., Any]) -> SimpleNamespace:
     @borrowing_kernel
     def padded(x, bars, base, begun, ended, work, counts):
         if counts:
-            failed, shortened = add_padded_energies(x, bars[0], base, begun, ended, work)
+            failed, shortened, broke = add_padded_energies(x, bars[0], base, begun, ended, work)
         else:
-            failed, shortened = add_padded(x, bars[0], base, begun, ended, work)
-        return np.int64(failed), bool(shortened), np.int64(0)
+            failed, shortened, broke = add_padded(x, bars[0], base, begun, ended, work)
+        return np.int64(failed), bool(shortened), np.int64(broke)
 
     return SimpleNamespace(chunks=chunks, padded=padded)
 

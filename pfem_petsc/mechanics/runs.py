@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..mesh.ordering import FEW, LEAST_RUN, NODE_BLOCK
-from .compiled import borrowing, inlined, kernel
+from .compiled import borrowing, borrowing_apart, inlined, kernel
 from .strips import LANES, add_strips, differences
 from .tuples import CHUNK, ROW
 
@@ -204,65 +204,64 @@ def _follows(bars, k):
     return low and max(bars[k, 0], bars[k, 1]) == max(bars[k - 1, 0], bars[k - 1, 1]) + 1
 
 
-@borrowing
-def end_differences(x, sweep, far, chunk, work):
-    """Write the end differences of a chunk of bars at positions ``x`` (n, 3) to the first three rows of a workspace.
-
-    ``far``: upper end of each bar, for fans.
-    """
+@borrowing_apart
+def end_differences(x, sweep, ends, chunk, work):
+    """Write the end differences of a chunk of bars at positions ``x`` (n, 3) to the first three rows of a workspace,
+    from the lower one of the ``ends`` (b, 2) to the upper one."""
     heads, fars, starts = sweep.heads, sweep.fars, sweep.starts
-    xs, ys, zs = work[:ROW], work[ROW : 2 * ROW], work[2 * ROW : 3 * ROW]
     first = starts[sweep.chunks[chunk]]
-    for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
-        at = starts[run]
-        if sweep.diagonal[chunk]:
+    if sweep.diagonal[chunk]:
+        for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
+            at = starts[run]
             differences(x, heads[run], fars[run], starts[run + 1] - at, work, at - first)
-            continue
-        a = heads[run]
-        ax = x[a, 0]
-        ay = x[a, 1]
-        az = x[a, 2]
-        for k in range(at, starts[run + 1]):
-            b = far[k]
-            i = k - first
-            xs[i] = x[b, 0] - ax
-            ys[i] = x[b, 1] - ay
-            zs[i] = x[b, 2] - az
+        return
+    xs, ys, zs = work[:ROW], work[ROW : 2 * ROW], work[2 * ROW : 3 * ROW]
+    places = x.reshape(-1)
+    for i in range(starts[sweep.chunks[chunk + 1]] - first):
+        one, other = np.int64(ends[first + i, 0]), np.int64(ends[first + i, 1])
+        a, b = 3 * min(one, other), 3 * max(one, other)
+        # unsigned: negative indices need not be handled
+        xs[i] = places[np.uint64(b)] - places[np.uint64(a)]
+        ys[i] = places[np.uint64(b + 1)] - places[np.uint64(a + 1)]
+        zs[i] = places[np.uint64(b + 2)] - places[np.uint64(a + 2)]
 
 
-@borrowing
+@borrowing_apart
 def scatter_forces(f, sweep, far, chunk, work):
     """Subtract the forces of a chunk of bars from their lower ends in ``f`` (n, 3), and add them to the upper ones:
     the first three rows of a workspace times the fourth one."""
     heads, fars, starts = sweep.heads, sweep.fars, sweep.starts
+    first = starts[sweep.chunks[chunk]]
+    if sweep.diagonal[chunk]:
+        for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
+            at = starts[run]
+            add_strips(f, heads[run], fars[run], starts[run + 1] - at, work, at - first)
+        return
     xs, ys, zs = work[:ROW], work[ROW : 2 * ROW], work[2 * ROW : 3 * ROW]
     cs = work[3 * ROW : 4 * ROW]
-    first = starts[sweep.chunks[chunk]]
+    for i in range(starts[sweep.chunks[chunk + 1]] - first):
+        xs[i] *= cs[i]
+        ys[i] *= cs[i]
+        zs[i] *= cs[i]
+    forces = f.reshape(-1)
     for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
-        at = starts[run]
-        if sweep.diagonal[chunk]:
-            add_strips(f, heads[run], fars[run], starts[run + 1] - at, work, at - first)
-            continue
         fx = 0.0
         fy = 0.0
         fz = 0.0
-        for k in range(at, starts[run + 1]):
-            b = far[k]
+        for k in range(starts[run], starts[run + 1]):
+            b = 3 * np.int64(far[k])
             i = k - first
-            c = cs[i]
-            gx = c * xs[i]
-            gy = c * ys[i]
-            gz = c * zs[i]
-            fx += gx
-            fy += gy
-            fz += gz
-            f[b, 0] += gx
-            f[b, 1] += gy
-            f[b, 2] += gz
-        a = heads[run]
-        f[a, 0] -= fx
-        f[a, 1] -= fy
-        f[a, 2] -= fz
+            fx += xs[i]
+            fy += ys[i]
+            fz += zs[i]
+            # unsigned: negative indices need not be handled
+            forces[np.uint64(b)] += xs[i]
+            forces[np.uint64(b + 1)] += ys[i]
+            forces[np.uint64(b + 2)] += zs[i]
+        a = 3 * np.int64(heads[run])
+        forces[np.uint64(a)] -= fx
+        forces[np.uint64(a + 1)] -= fy
+        forces[np.uint64(a + 2)] -= fz
 
 
 NO_BAR = -1.0

@@ -135,10 +135,9 @@ class Batch:
         return WallArrays(contact.flat_walls(0.0, PROJECTED * self.model.size), touched, log.present, log.releases)
 
     def _columns(self) -> list[Columns]:
-        """Return the columns of the bars of each section; empty if bars are heated, can break or are not all in
-        diagonal runs."""
+        """Return the columns of the bars of each section; empty if bars are heated or not all in diagonal runs."""
         bars = self.model.bars
-        if bars.can_break or bars.heat.size or not all(block.sweep.diagonal.all() for block in bars.blocks):
+        if bars.heat.size or not all(block.sweep.diagonal.all() for block in bars.blocks):
             return []
         return [
             make_columns(block.sweep, bars.rest[block.start : block.stop], block.area, len(block.history))

@@ -800,15 +800,16 @@ def pull(x, bars, block, f, work):
 def pull_padded(x, bars, base, block, work, counts):
     """Add the same forces by padded runs to ``bars.pulls``, and energies to ``work`` if it ``counts`` them; ``base`` is
     the first node there."""
-    failed, shortened = -1, False
+    failed, shortened, broke = -1, False, 0
     for s in range(len(bars.sections)):
         begun, ended = bars.padded_parts[s, block], bars.padded_parts[s, block + 1]
         if begun < ended:
             address, loop = bars.sections[s, 0], bars.sections[s, 2]
-            at, short, _ = _pull(loop, (x, address, np.int64(base), begun, ended, work[s], counts))
+            at, short, more = _pull(loop, (x, address, np.int64(base), begun, ended, work[s], counts))
             failed = at if failed < 0 else failed
             shortened = shortened or short
-    return failed, shortened
+            broke += more
+    return failed, shortened, broke
 
 
 @borrowing
@@ -961,10 +962,9 @@ def batch_loop(data, touched, met, due, flags):
                 lost = finish_positions(messages, x, before, True)
                 if lost != 0:
                     break
-                broke = 0
                 if padded:
                     split_block(n, len(x), x, planes, pulls, base)
-                    at, short = pull_padded(x, bars, base, n_blocks, aside, False)
+                    at, short, broke = pull_padded(x, bars, base, n_blocks, aside, False)
                 else:
                     at, short, broke = pull(x, bars, n_blocks, f, aside)
                 failed = at if at >= 0 else failed
@@ -983,15 +983,13 @@ def batch_loop(data, touched, met, due, flags):
                 moved += 1
             start = NODE_BLOCK * block if brief else 0
             if padded:
-                at, short = pull_padded(x, bars, base, block, work, ending)
-                failed = at if failed < 0 else failed
-                shortened = shortened or short
+                at, short, broke = pull_padded(x, bars, base, block, work, ending)
                 join_block(block, n, pulls, base, forces, start)
             else:
                 at, short, broke = pull(x, bars, block, f, work)
-                failed = at if failed < 0 else failed
-                shortened = shortened or short
-                changed += broke
+            failed = at if failed < 0 else failed
+            shortened = shortened or short
+            changed += broke
             first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
             if linked:
                 ready = finished

@@ -8,7 +8,6 @@ use the positions as integers at module level, which are constants of the machin
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -216,16 +215,15 @@ class Row(Mapping):
     vector : (width,) float64
     """
 
-    __slots__ = ("_numbers", "layout", "vector")
+    __slots__ = ("layout", "vector")
 
     def __init__(self, layout: Layout, vector: np.ndarray) -> None:
         self.layout = layout
         self.vector = vector
-        self._numbers = vector.tolist()
 
     def __getitem__(self, name: str) -> Any:
         first, end, shape, kind = self.layout.places[name]
-        return self.vector[first:end].reshape(shape) if shape else kind(self._numbers[first])
+        return self.vector[first:end].reshape(shape) if shape else kind(self.vector[first])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.layout.places)
@@ -235,22 +233,6 @@ class Row(Mapping):
 
     def __repr__(self) -> str:
         return repr(dict(self))
-
-
-class Excerpt:
-    """Takes some columns of rows of one layout, which are numbers, at once: many times faster than one by one."""
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self._names = tuple(dict.fromkeys(names))
-        self._layout: Layout | None = None
-
-    def __call__(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the numbers by name; of another mapping than a row, the mapping."""
-        if not isinstance(row, Row):
-            return row
-        if row.layout is not self._layout:
-            self._layout, self._take = row.layout, itemgetter(*map(row.layout.first, self._names))
-        return dict(zip(self._names, self._take(row._numbers), strict=True))
 
 
 def _layout(*columns: Column) -> Layout:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..columns import ENERGIES, STORED, SUPPLIED, Excerpt
+from ..columns import LOST, STORED, SUPPLIED
 from ..contact.monitoring import CrossingBars
 from ..errors import SimulationFailure
+from ..mechanics.compiled import kernel
 from ..output.units import LOAD_FACTOR, TIME
 
 if TYPE_CHECKING:
@@ -27,8 +27,64 @@ _IN_CONTACT = 1e3
 _DIVERGENCE_ROWS = (
     6  # consecutive rows; after a start from rest, or when a wall first strikes, there is no input to compare with
 )
+WATCHED = ("active_contacts", *STORED, *LOST, *SUPPLIED)
+"""Columns of the history that rows are checked by."""
+_AT = {name: k for k, name in enumerate(WATCHED)}
+_KINETIC, _WALLS, _LOST, _ACTIVE = map(
+    _AT.get, ("kinetic_energy", "wall_kinetic_energy", "numerical_dissipation", "active_contacts")
+)
 _BARS = ("elastic_energy", "spring_energy")
-_energies = Excerpt(["active_contacts", *(energy.name for energy in ENERGIES)])
+_ELASTIC, _SPRINGS = map(_AT.get, _BARS)
+_SUPPLIED, _STORED = (np.array([_AT[name] for name in names]) for names in (SUPPLIED, STORED))
+
+
+def watched(row: Mapping[str, Any]) -> np.ndarray:
+    """Return the columns :data:`WATCHED` of one row, (1, k)."""
+    return np.array([[float(row[name]) for name in WATCHED]])
+
+
+@kernel
+def _first_not_finite(rows: np.ndarray) -> int:
+    """Return the first of ``rows`` (m, k) of :data:`WATCHED` whose kinetic or elastic energy is not finite, or m."""
+    for k in range(len(rows)):
+        if not math.isfinite(rows[k, _KINETIC] + rows[k, _ELASTIC]):
+            return k
+    return len(rows)
+
+
+# numbers of a check between rows; after them follow the lowest works
+_STRANGE, _MOST, _MOST_LOST, _LIMIT, _STARTED, _START_ELASTIC, _START_SPRINGS = range(7)
+_LOWEST = _START_SPRINGS + 1
+
+
+@kernel
+def _first_created(rows: np.ndarray, kept: np.ndarray) -> tuple[int, float]:
+    """Return the first of ``rows`` (m, k) of :data:`WATCHED` with which too many have more energy than was supplied,
+    or m, and the energy created [J]; update the numbers ``kept`` between rows."""
+    created = 0.0
+    for k in range(len(rows)):
+        row = rows[k]
+        moving, lost = row[_KINETIC] + row[_WALLS], row[_LOST]
+        if kept[_STARTED] == 0.0:
+            kept[_STARTED], kept[_START_ELASTIC], kept[_START_SPRINGS] = 1.0, row[_ELASTIC], row[_SPRINGS]
+            # walls with mass as well: a truss at rest has no other energy than that of what hits it
+            kept[_MOST] += moving
+            kept[_MOST_LOST] = lost
+        released = kept[_START_ELASTIC] - row[_ELASTIC] + kept[_START_SPRINGS] - row[_SPRINGS]
+        kept[_MOST] = max(kept[_MOST], released)
+        for j in range(len(_SUPPLIED)):
+            # rises only: what a force has taken away, as drag does, it need not give back
+            work = row[_SUPPLIED[j]]
+            kept[_LOWEST + j] = min(kept[_LOWEST + j], work)
+            kept[_MOST] = max(kept[_MOST], work - kept[_LOWEST + j])
+        kept[_MOST_LOST] = max(kept[_MOST_LOST], lost)
+        created = min(kept[_MOST_LOST] - lost, moving - released)
+        if row[_ACTIVE] > 0:
+            kept[_LIMIT] = _IN_CONTACT
+        kept[_STRANGE] = kept[_STRANGE] + 1 if created > kept[_LIMIT] * kept[_MOST] else 0
+        if kept[_STRANGE] >= _DIVERGENCE_ROWS:
+            return k, created
+    return len(rows), created
 
 
 class BlowUp:
@@ -44,64 +100,69 @@ class BlowUp:
 
     def __init__(self, model: Model, inertial: bool = True) -> None:
         self.model, self.inertial = model, inertial
-        # number of consecutive suspicious rows, energy input, the largest numerical dissipation [J], the factor of the
-        # input up to which rows are not suspicious, energies of the first row, and lowest works
-        self._kept: dict[str, Any] = {"strange": 0, "most": model.rounding * model.length, "lost": 0.0}
-        self._kept |= {"limit": _CREATED, "start": {}, "lowest": {}}
+        self._kept = np.array(
+            [0.0, model.rounding * model.length, 0.0, _CREATED, 0.0, 0.0, 0.0] + len(SUPPLIED) * [np.inf]
+        )
+        self._created = 0.0  # by the last row [J]
 
     def kept(self) -> dict[str, Any]:
-        """Return the state for a checkpoint."""
-        return copy.deepcopy(self._kept)
+        """Return the state for a checkpoint: the number of consecutive suspicious rows, energy input, the largest
+        numerical dissipation [J], the factor of the input up to which rows are not suspicious, energies of the first
+        row, and lowest works."""
+        kept = self._kept.tolist()
+        started = kept[_STARTED] > 0.0
+        return {
+            "strange": int(kept[_STRANGE]),
+            "most": kept[_MOST],
+            "lost": kept[_MOST_LOST],
+            "limit": kept[_LIMIT],
+            "start": dict(zip(_BARS, kept[_START_ELASTIC:_LOWEST], strict=True)) if started else {},
+            "lowest": dict(zip(SUPPLIED, kept[_LOWEST:], strict=True)) if started else {},
+        }
 
     def load_state(self, kept: dict[str, Any]) -> None:
         """Restore the state from a checkpoint."""
-        self._kept = copy.deepcopy(kept)
+        start, lowest = (kept[what] for what in ("start", "lowest"))
+        numbers = [kept[what] for what in ("strange", "most", "lost", "limit")]
+        numbers += [bool(start), *(start.get(name, 0.0) for name in _BARS)]
+        self._kept[:] = numbers + [lowest.get(name, np.inf) for name in SUPPLIED]
 
-    def check(self, row: dict[str, Any], state: State) -> None:
-        """Check a row.
+    def first_wrong(self, rows: np.ndarray) -> int:
+        """Return the first of ``rows`` (m, k) of :data:`WATCHED` that :meth:`failure` tells of, or m."""
+        finite = _first_not_finite(rows)
+        if not self.inertial:
+            return finite
+        at, self._created = _first_created(rows[:finite], self._kept)
+        return at
+
+    def check(self, row: Mapping[str, Any], state: State) -> None:
+        """Check one row.
 
         Raises
         ------
         SimulationFailure
-            On all ranks, if the energy is not finite, or the energy created exceeds the input several times.
+            On all ranks, see :meth:`failure`.
         """
-        whole, row = row, _energies(row)
-        held = row["kinetic_energy"] + row["elastic_energy"]
-        if not math.isfinite(held) and whole["step"] == 0:
-            raise SimulationFailure(
-                f"{self._when(whole)}: the energy is not finite at the start{self._where(state)}: correct loads, "
+        if self.first_wrong(watched(row)) == 0:
+            raise self.failure(row, state)
+
+    def failure(self, row: Mapping[str, Any], state: State) -> SimulationFailure:
+        """Return what is wrong with a row: the energy is not finite, or the energy created exceeds the input several
+        times. Collective."""
+        if math.isfinite(row["kinetic_energy"] + row["elastic_energy"]):
+            return SimulationFailure(
+                f"{self._when(row)}: the integration has created {self._created:.3g} J, but only "
+                f"{self._kept[_MOST]:.3g} J were supplied: the motion is unstable and fastest at "
+                f"{self._fastest(state)}; reduce time.step"
+            )
+        if row["step"] == 0:
+            return SimulationFailure(
+                f"{self._when(row)}: the energy is not finite at the start{self._where(state)}: correct loads, "
                 "velocities and material (SI units)"
             )
-        if not math.isfinite(held):
-            raise SimulationFailure(
-                f"{self._when(whole)}: the energy is not finite: the motion diverged{self._where(state)}; "
-                "reduce time.step"
-            )
-        if not self.inertial:
-            return
-        kept, lost = self._kept, float(row["numerical_dissipation"])
-        start, lowest = kept["start"], kept["lowest"]
-        if not start:
-            start |= {name: float(row[name]) for name in _BARS}
-            # walls with mass as well: a truss at rest has no other energy than that of what hits it
-            kept["most"] += float(row["kinetic_energy"] + row["wall_kinetic_energy"])
-            kept["lost"] = lost
-        released = sum(start[name] - float(row[name]) for name in _BARS)
-        # rises only: what a force has taken away, as drag does, it need not give back
-        lowest |= {name: min(lowest.get(name, np.inf), float(row[name])) for name in SUPPLIED}
-        rises = [float(row[name]) - lowest[name] for name in SUPPLIED]
-        kept["most"] = max(kept["most"], released, *rises)
-        kept["lost"] = max(kept["lost"], lost)
-        held = float(row["kinetic_energy"] + row["wall_kinetic_energy"]) - released
-        created = min(kept["lost"] - lost, held)
-        if row["active_contacts"] > 0:
-            kept["limit"] = _IN_CONTACT
-        kept["strange"] = kept["strange"] + 1 if created > kept["limit"] * kept["most"] else 0
-        if kept["strange"] >= _DIVERGENCE_ROWS:
-            raise SimulationFailure(
-                f"{self._when(whole)}: the integration has created {created:.3g} J, but only {kept['most']:.3g} J were "
-                f"supplied: the motion is unstable and fastest at {self._fastest(state)}; reduce time.step"
-            )
+        return SimulationFailure(
+            f"{self._when(row)}: the energy is not finite: the motion diverged{self._where(state)}; reduce time.step"
+        )
 
     def _when(self, row: Mapping[str, Any]) -> str:
         """Return the step of a row and its time or load factor."""
@@ -146,6 +207,56 @@ CAUSES = {
     "damping_dissipation": "damping stops nodes",
 }
 """What dissipates besides friction and impact, and how messages tell it."""
+_CAUSES = np.array([_AT[name] for name in CAUSES])
+
+# numbers of a check between rows
+_BEGUN, _START, _SCALE, _TOUCHED, _ROWS = range(5)
+
+
+@kernel
+def _sum(row: np.ndarray, columns: np.ndarray) -> float:
+    total = 0.0
+    for k in range(len(columns)):
+        total += row[columns[k]]
+    return total
+
+
+@kernel
+def _first_gain(
+    rows: np.ndarray, numbers: np.ndarray, limits: tuple[bool, float, float, float], kept: np.ndarray
+) -> tuple[int, float]:
+    """Return the first of ``rows`` (m, k) of :data:`WATCHED`, with the ``numbers`` (m,) of their steps, that is to be
+    told, or m, and the energy gained [J]; update the numbers ``kept`` between rows.
+
+    ``limits``: whether the scheme is explicit, what its own energy may gain of the elastic energy, the energy [J] of
+    what is at rest, and the number of the last step.
+    """
+    explicit, swing, rounding, last = limits
+    gain = 0.0
+    for k in range(len(rows)):
+        row = rows[k]
+        net = _sum(row, _STORED) + _sum(row, _CAUSES) - _sum(row, _SUPPLIED)
+        if kept[_BEGUN] == 0.0:
+            kept[_BEGUN], kept[_START] = 1.0, net
+        scale = max(kept[_SCALE], rounding, abs(kept[_START]))
+        for j in range(len(_SUPPLIED)):
+            scale = max(scale, abs(row[_SUPPLIED[j]]))
+        kept[_SCALE] = scale
+        if row[_ACTIVE] > 0:
+            kept[_TOUCHED] = 1.0
+        touched = kept[_TOUCHED] > 0.0
+        gain = net - kept[_START]
+        if explicit and not touched:
+            # what its own energy may have gained for a while: all of it where nothing dissipates
+            dissipates = False
+            for j in range(len(_CAUSES)):
+                dissipates = dissipates or row[_CAUSES[j]] > 0.0
+            gain -= swing * (row[_ELASTIC] + row[_SPRINGS]) if dissipates else np.inf
+        kept[_ROWS] = kept[_ROWS] + 1 if gain > _SHARE * scale + rounding else 0
+        patience = 1 if touched else _AT_END if numbers[k] >= last else _GAIN_ROWS
+        if kept[_ROWS] >= patience:
+            return k, gain
+    return len(rows), gain
 
 
 class ContactWatch:
@@ -170,58 +281,56 @@ class ContactWatch:
     def __init__(self, model: Model, tell: Callable[[str], None], plan: Plan) -> None:
         self.tell = tell
         self.told = False
-        self.explicit = plan.scheme.explicit
-        self.swing = min((0.5 * plan.step * plan.frequency.upper) ** 2, 1.0)  # of the elastic energy
-        self.rounding = model.rounding * model.length  # of energies [J]: what is at rest has no other
-        self.rows = 0
+        swing = min((0.5 * plan.step * plan.frequency.upper) ** 2, 1.0)  # of the elastic energy
+        # of energies [J]: what is at rest has no other
+        self._limits = (plan.scheme.explicit, float(swing), float(model.rounding * model.length), float(plan.steps))
+        self._kept = np.zeros(5)
         contact, time = model.case.contact, model.case.time
         self.key = "time.safety" if time.step == "auto" else "time.step"
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
-        self.last, self.moves = plan.steps, model.supports.moves
-        self.start: float | None = None
-        self.scale = 0.0
-        self.touched = False
+        self.moves = model.supports.moves
 
-    def check(self, row: dict[str, Any]) -> None:
-        """Check a row of the history."""
+    @property
+    def start(self) -> float | None:
+        """Energy of the first row less what had been supplied [J]; None before it."""
+        return float(self._kept[_START]) if self._kept[_BEGUN] else None
+
+    @start.setter
+    def start(self, energy: float | None) -> None:
+        self._kept[_BEGUN], self._kept[_START] = energy is not None, energy or 0.0
+
+    def first_gain(self, rows: np.ndarray, numbers: np.ndarray) -> int:
+        """Return the first of ``rows`` (m, k) of :data:`WATCHED`, with the ``numbers`` (m,) of their steps, that
+        :meth:`tell_gain` is to tell of, or m."""
         if self.told:
-            return
-        whole, row = row, _energies(row)
-        given = sum(row[name] for name in SUPPLIED)
-        net = sum(row[name] for name in STORED) + sum(row[name] for name in CAUSES) - given
-        if self.start is None:
-            self.start = net
-        self.scale = max(self.scale, self.rounding, abs(self.start), *(abs(row[name]) for name in SUPPLIED))
-        self.touched = self.touched or row["active_contacts"] > 0
-        gain = net - self.start
-        if self.explicit and not self.touched:
-            gain -= self._swing(row)
-        self.rows = self.rows + 1 if gain > _SHARE * self.scale + self.rounding else 0
-        if not self.rows:
-            return
-        made = f"{gain:.3g} J, {100.0 * gain / self.scale:.2g} % of the energy that the run had or was given"
-        at = f"step {whole['step']}, t = {whole['time']:.6g} s"
-        if self.touched:
-            self.told = True
+            return len(rows)
+        at, self._gain = _first_gain(rows, numbers, self._limits, self._kept)
+        return at
+
+    def check(self, row: Mapping[str, Any]) -> None:
+        """Check one row."""
+        if self.first_gain(watched(row), np.array([float(row["step"])])) == 0:
+            self.tell_gain(row)
+
+    def tell_gain(self, row: Mapping[str, Any]) -> None:
+        """Tell of the energy gained in a row."""
+        self.told = True
+        scale = self._kept[_SCALE]
+        made = f"{self._gain:.3g} J, {100.0 * self._gain / scale:.2g} % of the energy that the run had or was given"
+        at = f"step {row['step']}, t = {row['time']:.6g} s"
+        if self._kept[_TOUCHED]:
             self.tell(
                 f"{at}: contact has produced {made}: {self.what} gains "
                 "energy in impacts; use another contact.treatment or time.integrator, or a smaller time.step "
                 "(docs/contact.md, phases of an impact)"
             )
-        elif self.rows >= (_AT_END if whole["step"] >= self.last else _GAIN_ROWS):
-            self.told = True
+        else:
             self.tell(
                 f"{at}: the total energy, including dissipated energy, has grown by {made}, without contact: the "
                 f"steps are too large for the motion{self._causes(row)}; reduce {self.key}"
             )
 
-    def _swing(self, row: dict[str, Any]) -> float:
-        """What an explicit scheme's own energy may have gained for a while [J]: all of it where nothing dissipates."""
-        if not any(row[name] > 0.0 for name in CAUSES):
-            return float("inf")
-        return self.swing * (row["elastic_energy"] + row["spring_energy"])
-
-    def _causes(self, row: dict[str, Any]) -> str:
+    def _causes(self, row: Mapping[str, Any]) -> str:
         """Return what large steps get wrong as part of a sentence."""
         found = [text for name, text in CAUSES.items() if row[name] > 0.0]
         found += ["supports move"] if self.moves else []

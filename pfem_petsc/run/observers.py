@@ -20,7 +20,7 @@ from ..stepping.bar_events import MOST_TOLD
 from ..stepping.ledger import Ledger
 from ..stepping.stepper import Step, Stepper
 from ..version import __version__
-from .monitors import BlowUp, ContactWatch, Doubts
+from .monitors import WATCHED, BlowUp, ContactWatch, Doubts
 from .recorder import Recorder
 from .stages import Stages
 from .synchroniser import Synchroniser
@@ -94,6 +94,7 @@ class History(Observer):
         self.blow_up = BlowUp(model, inertial)
         # works over the increments of equilibria are quadratures, whose error is no energy that something has made
         self._contact_watch = ContactWatch(model, warn, stages.stepper.plan) if inertial else None
+        self._watched = self.recorder.layout.indices(WATCHED)
         self.row: Mapping[str, Any] | None = None
         self.writer: ResultWriter | None = None
 
@@ -103,7 +104,10 @@ class History(Observer):
         ``last``: row of its end; ``kick``: work [J] and momentum (3,) [N s] of the velocities that the stage adds.
         """
         self.row, self.writer = last, earlier.writer
-        self._check(self.recorder.begin_stage(earlier.recorder, last, kick))
+        first = self.recorder.begin_stage(earlier.recorder, last, kick)
+        self.blow_up.check(first, self._stepper.state)
+        if self._contact_watch is not None:
+            self._contact_watch.check(first)
 
     def kept(self) -> dict[str, Any]:
         """Return what a restart goes on with, besides the ledger."""
@@ -156,21 +160,28 @@ class History(Observer):
 
     def record(self) -> None:
         """Record the rows of the last step or batch, unless a rank has a fault, which is raised on all ranks."""
-        for row in self.recorder.rows(alarm=self._synchroniser.alarm):
-            if self.recorder.alarmed:
-                self._synchroniser.synchronise()
-            self.take(row)
+        rows, alarms = self.recorder.rows(alarm=self._synchroniser.alarm)
+        begun = 0
+        for alarm in np.flatnonzero(alarms).tolist():
+            self._take(rows[begun:alarm])
+            self._synchroniser.synchronise()
+            begun = alarm
+        self._take(rows[begun:])
 
-    def take(self, row: Row) -> None:
-        """Check a row, store it and add it to the history."""
-        self._check(row)
-        self.row = row
-        self.writer.append_history(row if self._model.comm.rank == 0 else None)
-
-    def _check(self, row: Row) -> None:
-        self.blow_up.check(row, self._stepper.state)
+    def _take(self, rows: np.ndarray) -> None:
+        """Check rows (m, width), store the last one and add them to the history."""
+        layout = self.recorder.layout
+        values = rows[:, self._watched]
+        sound = self.blow_up.first_wrong(values)
         if self._contact_watch is not None:
-            self._contact_watch.check(row)
+            gained = self._contact_watch.first_gain(values[:sound], rows[:sound, layout.first("step")])
+            if gained < sound:
+                self._contact_watch.tell_gain(Row(layout, rows[gained]))
+        for vector in rows[:sound]:
+            self.row = Row(layout, vector)
+            self.writer.append_history(self.row if self._model.comm.rank == 0 else None)
+        if sound < len(rows):
+            raise self.blow_up.failure(Row(layout, rows[sound]), self._stepper.state)
 
     def complete(self) -> None:
         """Record the row of the last step."""

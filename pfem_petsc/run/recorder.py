@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -123,7 +123,7 @@ class Recorder:
     ----------
     columns : name to the type of a value, with its shape
     energy_scale : largest energy of any kind in the rows so far [J]
-    alarmed : whether any rank raised a fault flag with the last row
+    layout : of a row
     carried : (width of a row of this stage,) sums of the stages before, added to its columns; None without
     rest : (width of a row of all stages,) values of the columns that this stage does not have; None without stages
     probed : nodes of all probes on this rank
@@ -135,7 +135,6 @@ class Recorder:
         self._at_state = values_at_state(self.model)
         self.start_energy: float | None = None
         self.energy_scale = 0.0
-        self.alarmed = False
         self.carried: np.ndarray | None = None
         model = self.model
         probes = {probe.name: model.nodes[probe.node_set] for probe in model.case.output.probe}
@@ -143,12 +142,12 @@ class Recorder:
         self.probe_nodes, self.probed = self._probes.ids, self._probes.nodes
         self._layout = Layout(self._columns())
         self.columns = self._layout.columns if columns is None else columns
-        self._whole, self.rest = self._layout, None
+        self.layout, self.rest = self._layout, None
         if columns is not None:
-            self._whole = Layout(columns)
-            self._at = self._whole.indices(self._layout.places)
-            self.rest = np.zeros(self._whole.width)
-            self.rest[self._whole["stage"]] = model.case.number
+            self.layout = Layout(columns)
+            self._at = self.layout.indices(self._layout.places)
+            self.rest = np.zeros(self.layout.width)
+            self.rest[self.layout["stage"]] = model.case.number
         self._place()
 
     def _columns(self) -> dict[str, np.dtype]:
@@ -187,13 +186,14 @@ class Recorder:
     def row(self, alarm: bool = False) -> Row:
         """Return the history row of the present state. Collective; see :meth:`rows`."""
         self.stepper.instants = None
-        return next(self.rows(alarm))
+        vectors, _ = self.rows(alarm)
+        return Row(self.layout, vectors[0])
 
-    def rows(self, alarm: bool) -> Iterator[Row]:
-        """Generate the rows of the batch of steps that has been made, or that of the present state. Collective.
+    def rows(self, alarm: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows (m, width) of the batch of steps that has been made, or that of the present state, and which
+        of them some rank has not made or has a fault in, (m,) bool. Collective.
 
-        ``alarm``: whether this rank has a fault in the present state; :attr:`alarmed` is then true on all ranks, as it
-        is with the rows of steps of a batch that a rank has not made.
+        ``alarm``: whether this rank has a fault in the present state.
         """
         stepper, contact = self.stepper, self.model.contact
         instants, stepper.instants = stepper.instants or self._present(alarm), None
@@ -209,8 +209,7 @@ class Recorder:
         if self.rest is not None:
             own, vectors = vectors, np.repeat(self.rest[None], len(vectors), axis=0)
             vectors[:, self._at] = own
-        for self.alarmed, vector in zip(alarms.tolist(), vectors, strict=True):
-            yield Row(self._whole, vector)
+        return vectors, alarms
 
     def _total(self, shares: np.ndarray) -> np.ndarray:
         """Return the sums over all ranks from this rank's shares (m, width), and the probes of all. Collective."""
@@ -290,7 +289,7 @@ class Recorder:
     def put(self, values: Mapping[str, np.ndarray]) -> None:
         """Set values of columns that this stage may not have."""
         for name, value in values.items():
-            self.rest[self._whole[name]] = value
+            self.rest[self.layout[name]] = value
 
     def begin_stage(self, before: Recorder, last: Row, kick: tuple[float, np.ndarray]) -> Row:
         """Go on after the stage that has ended; return the row of the start. Collective.
@@ -323,8 +322,8 @@ class Recorder:
         self.carried = np.zeros(layout.width)
         for name, value in change.items():
             self.carried[layout[name]] = np.ravel(value)
-        for name in self._whole.places:
+        for name in self.layout.places:
             if declared(name).stages in (SUMMED, LASTING):
-                self.rest[self._whole[name]] = np.ravel(last[name])
+                self.rest[self.layout[name]] = np.ravel(last[name])
         self.start_energy, self.energy_scale = before.start_energy, before.energy_scale
         return self.row()

@@ -633,7 +633,7 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                 wide = max(wide, node - block + n)
                 x0, x1 = node - base, np.int64(fars[group]) - base
                 y0, y1, z0, z1 = x0 + stride, x1 + stride, x0 + 2 * stride, x1 + 2 * stride
-                short = 0
+                short = False
                 changed = 0
                 for i in range(n):
                     rest = rests[first + i]
@@ -645,7 +645,7 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                     dz = planes[np.uint64(z1 + i)] - planes[np.uint64(z0 + i)]
                     squared = dx * dx + dy * dy + dz * dz
                     stretch, inverse = stretch_and_inverse(squared if real else 1.0, rest)
-                    short += 0 if stretch >= SHORTENED_STRETCH else 1  # NaN counts
+                    short |= not stretch >= SHORTENED_STRETCH  # NaN counts
                     q = variables_of(kept, first + i)
                     before = kept[last, first + i] if by_rate else 0.0
                     p = data.parameters + data_of(kept, n_rows, first + i) if n_data else data.parameters
@@ -674,7 +674,7 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                 if n_rows > 0 and changed > 0:
                     for j in range(n_rows):
                         copy(work[(first_new + j) * ROW :], kept[j][first : first + n])
-                if short > 0:
+                if short:
                     at, inverted = find_short(x, data.sweep, columns, group, rupture)
                     failed = at if failed < 0 else failed
                     shortened = shortened or inverted

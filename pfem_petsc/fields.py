@@ -26,7 +26,8 @@ class Field(NamedTuple):
     ----------
     place : ``nodes``, values (owned, 3), or ``bars``, values (local bars,)
     unit : SI unit, empty for a pure number
-    value : returns its values from a :class:`~pfem_petsc.fields.Snapshot`; called by all ranks
+    value : returns its values from a :class:`~pfem_petsc.fields.Snapshot`, which no later step changes; called by all
+        ranks
     default : whether it is written if a case does not name fields, from a :class:`~pfem_petsc.stepping.model.Model`
     """
 
@@ -40,9 +41,9 @@ class Field(NamedTuple):
 # to add a field, add one entry here
 FIELDS = [
     Field("displacement", "nodes", "m", lambda now: now.state.position - now.start),
-    Field("velocity", "nodes", "m/s", lambda now: now.state.v),
-    Field("acceleration", "nodes", "m/s²", lambda now: now.acceleration()),
-    Field("contact_force", "nodes", "N", lambda now: now.state.contact),
+    Field("velocity", "nodes", "m/s", lambda now: now.state.v.copy()),
+    Field("acceleration", "nodes", "m/s²", lambda now: now.acceleration().copy()),
+    Field("contact_force", "nodes", "N", lambda now: now.state.contact.copy()),
     Field("strain", "bars", "", lambda now: now.bars["strain"]),
     Field("stress", "bars", "Pa", lambda now: now.bars["stress"]),
     Field("axial_force", "bars", "N", lambda now: now.bars["axial_force"]),
@@ -85,7 +86,7 @@ class Snapshot:
     def temperature(self) -> np.ndarray:
         """(local bars,) temperature above reference [K], zero if the case has none."""
         temperatures = self.model.temperatures
-        return temperatures.values if temperatures.any else 0.0 * self.bars["strain"]
+        return temperatures.values.copy() if temperatures.any else 0.0 * self.bars["strain"]
 
 
 class Fields:

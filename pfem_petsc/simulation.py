@@ -277,7 +277,8 @@ class Simulation(WithEquations):
         possible, when no output is due after them."""
         return self._iterate(batches=True)
 
-    def _iterate(self, batches: bool) -> Iterator[Step]:
+    def _iterate(self, batches: bool, shown: bool = True) -> Iterator[Step]:
+        """Run; ``shown``: to somebody who may read the snapshots of a step that is yielded."""
         self._usable()
         if self.finished:
             return
@@ -296,7 +297,10 @@ class Simulation(WithEquations):
                 outputs.stop_early()
                 while True:
                     while self.state.step < self.stepper.last_step:
-                        yield self._advance(outputs.steps_left(self.stepper.number) if batches else 1)
+                        made = self._advance(outputs.steps_left(self.stepper.number) if batches else 1)
+                        if shown:
+                            outputs.wait()
+                        yield made
                         outputs.stop_early()
                     if stages.at_last:
                         break
@@ -352,7 +356,7 @@ class Simulation(WithEquations):
         """
         if self.finished and self.comm.rank == 0 and not self.quiet:
             print(finished_message(self.folder, self._reached, self.plan))
-        for _ in self.batches():
+        for _ in self._iterate(batches=True, shown=False):
             pass
         return 0
 

@@ -41,7 +41,8 @@ def checksum(comm: MPI.Comm, slab: np.ndarray, first: int) -> int:
 def summed(comm: MPI.Comm, parts: Sequence[int]) -> np.ndarray:
     """Return the sums over ranks, modulo 2^64, of parts as :func:`word_sum` gives them (n,) uint64. Collective."""
     total = np.array([part & _WORD for part in parts], dtype=np.uint64)
-    comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+    if comm.size > 1:
+        comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
     return total
 
 

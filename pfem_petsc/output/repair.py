@@ -99,8 +99,9 @@ def _extents(file: h5py.File, counts: tuple[int, int, int]) -> dict[str, int]:
     return rows | ({f"{CHECKS}/snapshots": n_snapshots} if n_snapshots else {})
 
 
-def reopen(path: Path, sizes: tuple[int, int], contents: Contents, kept: Kept) -> None:
-    """Prepare a result file to be continued after a step, with mesh and fields unchanged. Not collective.
+def reopen(path: Path, sizes: tuple[int, int], contents: Contents, kept: Kept) -> bool:
+    """Prepare a result file to be continued after a step, with mesh and fields unchanged; return whether it is
+    compressed. Not collective.
 
     Parameters
     ----------
@@ -120,7 +121,7 @@ def reopen(path: Path, sizes: tuple[int, int], contents: Contents, kept: Kept) -
     _refuse_damaged(path)
     with _replaced(path) as target:
         with readable(path), h5py.File(path, "r", locking=False) as file:
-            counts = _counts(file, kept)
+            counts, compressed = _counts(file, kept), is_compressed(file["VTKHDF/Points"])
             _check_same(file, path, counts[0], sizes, contents)
             earlier = list(read_attributes(file["case"]).get("restarts_after_step", []))
             described = {**contents.attributes, "restarts_after_step": [*earlier, kept.step]}
@@ -132,6 +133,7 @@ def reopen(path: Path, sizes: tuple[int, int], contents: Contents, kept: Kept) -
             with h5py.File(target, "r+", locking=False) as file:
                 write_case(file, contents.case_text, described)
                 prepare_modes(file, contents.modes, sizes[0])
+    return compressed
 
 
 def _refuse_damaged(path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,19 +15,8 @@ from mpi4py import MPI
 from ..columns import Layout
 from ..errors import InputError, PfemError, SimulationFailure
 from ..parallel.agreement import on_root
-from .hdf5 import (
-    Growing,
-    create_new,
-    grow,
-    is_compressed,
-    open_shared,
-    release,
-    require_parallel_hdf5,
-    require_room,
-    write_rows,
-    writes_together,
-    writing,
-)
+from ..parallel.memory import SharedArrays
+from .hdf5 import Growing, create_new, require_parallel_hdf5, require_room, write_rows, writing
 from .integrity import RowDigests, mark_digest, numbers_digest, snapshot_digests, summed, word_sum
 from .layout import (
     CHECKS,
@@ -46,6 +35,7 @@ from .layout import (
     row_type,
 )
 from .repair import reopen
+from .shared import SharedFile
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -55,15 +45,18 @@ if TYPE_CHECKING:
 _PIECE = 2**18  # number of bars whose connectivity is written at once on one rank
 # rows buffered in memory before they are written; fewer if rows are wide
 _BUFFER_ROWS, _BUFFER_BYTES = 1024, 1 << 24
+# bytes of a snapshot from which it is written beside the steps: less takes as long as handing it to a thread
+_BESIDE = 1 << 18
 
 
-def _write_connectivity(file: h5py.File, comm: MPI.Comm, path: Path, mesh: DistributedMesh) -> None:
+def _write_connectivity(shared: SharedFile, mesh: DistributedMesh) -> None:
     """Write the ends of all bars in mesh numbering, their offsets, and the digest of the mesh. Collective.
 
     Bars that are evaluated on two ranks are written by the rank that counts them.
     """
-    vtk, order = file["VTKHDF"], mesh.bar_order
-    first, count, together = order.first, order.count, writes_together(comm)
+    comm, order = shared.comm, mesh.bar_order
+    first, count, file = order.first, order.count, shared.file
+    targets = {name: Growing(file["VTKHDF"][name]) if file else None for name in ("Connectivity", "Offsets")}
     # one rank may have all bars: pieces keep the working arrays small
     piece = count if comm.size > 1 else min(count, _PIECE)
     total = 0
@@ -74,51 +67,52 @@ def _write_connectivity(file: h5py.File, comm: MPI.Comm, path: Path, mesh: Distr
         else:
             ends = mesh.node_ids[mesh.bars[order.owned_rows(start, stop)]].astype(np.int64)
         total += word_sum(ends.ravel(), 2 * (first + start))
-        with writing(comm, path):
-            write_rows(vtk["Connectivity"], 2 * (first + start), ends.ravel(), collective=together)
+        shared.write(targets["Connectivity"], 2 * (first + start), ends.ravel())
         # there is one more offset than bars, which the last rank writes
         end = first + stop + (stop == count and comm.rank == comm.size - 1)
-        with writing(comm, path):
-            write_rows(vtk["Offsets"], first + start, 2 * np.arange(first + start, end), collective=together)
+        shared.write(targets["Offsets"], first + start, 2 * np.arange(first + start, end))
     digest = summed(comm, [total])
-    with writing(comm, path):
-        if comm.rank == 0:
-            write_rows(file[CHECKS]["mesh"], 0, digest)
-        file.flush()
+
+    def finish() -> None:
+        with shared.writing():
+            if comm.rank == 0:
+                write_rows(file[CHECKS]["mesh"], 0, digest)
+            file.flush()
+
+    shared.call(finish)
 
 
 class _Table:
     """Appends rows to ``/history``, or to ``/event``.
 
-    Rank 0 has the values and writes them; the file grows on all ranks together. The attribute ``rows`` is updated after
-    a flush of the data, so that neither a reader nor a kill ever leaves an incomplete row counted.
+    Rank 0 has the values and writes them; the file grows on its owners. The attribute ``rows`` is updated after a flush
+    of the data, so that neither a reader nor a kill ever leaves an incomplete row counted.
 
     Parameters
     ----------
-    file : h5py.File
-        Open for writing on all ranks, with the group.
-    comm : MPI.Comm
-    path : Path
-        For messages.
+    shared : SharedFile
     name : of the group
-    columns : names, in the order of a row's vector
+    columns : names, in the order of a row's vector, to their types
     """
 
-    def __init__(self, file: h5py.File, comm: MPI.Comm, path: Path, name: str, columns: Mapping[str, Any]) -> None:
-        self._comm, self._path = comm, path
-        group = file[name]
-        self._columns = {column: Growing(group[column]) for column in columns}
-        self._digests = Growing(file[CHECKS][name])
-        self._rows_attribute = h5py.h5a.open(group.id, b"rows")
-        self.n_rows = int(group.attrs["rows"])
-        self._layout = Layout({column: row_type(group[column]) for column in columns})
-        row_bytes = sum(dtype.itemsize for dtype in self._layout.columns.values())
+    def __init__(self, shared: SharedFile, name: str, columns: Mapping[str, np.dtype]) -> None:
+        self._shared, self._root, self._file = shared, shared.comm.rank == 0, shared.file
+        types = dict(columns)
+        if self._file is not None:
+            group = self._file[name]
+            types = {column: row_type(group[column]) for column in columns}
+            self._columns = {column: Growing(group[column]) for column in columns}
+            self._digests = Growing(self._file[CHECKS][name])
+            self._rows_attribute = h5py.h5a.open(group.id, b"rows")
+            self.n_rows = int(group.attrs["rows"])
+        self._layout = Layout(types)
+        row_bytes = shared.call(lambda: sum(dtype.itemsize for dtype in types.values()))
         self._capacity = max(1, min(_BUFFER_ROWS, _BUFFER_BYTES // max(1, row_bytes)))
         # Disk space of a write: the rows, and a new chunk in each column.
         self.reserve_bytes = self._capacity * row_bytes + len(columns) * CHUNK_BYTES
         self.n_buffered = 0
         self._checksums = RowDigests(self._layout)
-        self._buffer = np.empty((self._capacity if comm.rank == 0 else 0, self._layout.width))
+        self._buffer = np.empty((self._capacity if self._root else 0, self._layout.width))
 
     @property
     def full(self) -> bool:
@@ -127,29 +121,32 @@ class _Table:
 
     def append(self, row: Mapping[str, Any] | None) -> None:
         """Buffer one row: rank 0 passes a value for each column, the others None. No communication."""
-        if self._comm.rank == 0:
+        if self._root:
             self._buffer[self.n_buffered] = self._layout.vector(row if row is not None else {})
         self.n_buffered += 1
 
-    def write(self) -> None:
-        """Write the buffered rows without counting them; flush the file, then call :meth:`commit`. Collective."""
-        if self.n_buffered == 0:
+    def take(self) -> tuple[int, np.ndarray]:
+        """Return the number of buffered rows, and on rank 0 the rows (n, width); empty the buffer."""
+        n, self.n_buffered = self.n_buffered, 0
+        return n, self._buffer[:n].copy()
+
+    def write(self, n: int, rows: np.ndarray) -> None:
+        """Write rows from :meth:`take` without counting them; a flush and :meth:`commit` come next. For owners."""
+        if n == 0:
             return
-        first, self.n_rows = self.n_rows, self.n_rows + self.n_buffered
-        with writing(self._comm, self._path):
+        first, self.n_rows = self.n_rows, self.n_rows + n
+        with self._shared.writing():
             for dataset in (*self._columns.values(), self._digests):
                 dataset.grow(self.n_rows)
-        with writing(self._comm, self._path):
-            if self._comm.rank == 0:
-                rows = self._buffer[: self.n_buffered]
+        with self._shared.writing():
+            if self._root:
                 for name, (at, end, shape, _) in self._layout.places.items():
-                    self._columns[name].write(first, rows[:, at:end].reshape(len(rows), *shape))
+                    self._columns[name].write(first, rows[:, at:end].reshape(n, *shape))
                 self._digests.write(first, self._checksums.of_vectors(rows, first))
-        self.n_buffered = 0
 
     def commit(self) -> None:
-        """Count the written rows as complete; flush the file afterwards. Collective."""
-        with writing(self._comm, self._path):
+        """Count the written rows as complete; flush the file afterwards. For owners."""
+        with self._shared.writing():
             self._rows_attribute.write(np.array(self.n_rows, dtype=np.int64))
 
 
@@ -160,11 +157,7 @@ class _Snapshots:
 
     Parameters
     ----------
-    file : h5py.File
-        Open on all ranks.
-    comm : MPI.Comm
-    path : Path
-        For messages.
+    shared : SharedFile
     mesh : DistributedMesh
     contents : Contents
 
@@ -173,29 +166,34 @@ class _Snapshots:
     count : number of snapshots
     """
 
-    def __init__(self, file: h5py.File, comm: MPI.Comm, path: Path, mesh: DistributedMesh, contents: Contents) -> None:
-        # chunks that several ranks share are compressed by one of them
-        self._together = writes_together(comm) or (comm.size > 1 and is_compressed(file["VTKHDF/Points"]))
-        self._file, self._vtk, self.comm, self.path = file, file["VTKHDF"], comm, path
+    def __init__(self, shared: SharedFile, mesh: DistributedMesh, contents: Contents) -> None:
+        self._shared, self._file, self._comm = shared, shared.file, shared.comm
         self._fields, self._precision = contents.fields, np.dtype(contents.precision)
         self._nodes, self._bars = mesh.node_order, mesh.bar_order
         self._sizes = int(mesh.n_nodes), int(mesh.n_bars)
         # bars evaluated on two ranks are written by the rank that counts them
         self._counted = _as_slice(mesh.counted)
-        steps = self._vtk["Steps"]
-        self.count = int(steps.attrs["NSteps"])
+        self._ids = mesh.node_ids[: mesh.n_owned], mesh.bar_ids[self._counted]
+        self._memory: SharedArrays | None = None
+        self._data: dict[str, Growing] = {}
+        self.count = shared.call(self._open)
+
+    def _open(self) -> int:
+        """Find the datasets in the file; return the number of snapshots. For owners."""
+        steps = self._file["VTKHDF/Steps"]
         self._per_step = {name: Growing(steps[name]) for name in PER_STEP}
         # one column, because there is one type of cell
         self._wide = {name: (1, *steps[name].shape[1:]) for name in PER_STEP}
         self._times = Growing(steps["Values"])
-        self._marks = {name: Growing(file["snapshots"][name]) for name in ("step", "time")}
+        self._marks = {name: Growing(self._file["snapshots"][name]) for name in ("step", "time")}
         self._n_steps = h5py.h5a.open(steps.id, b"NSteps")
-        self._data: dict[str, Growing] = {}
-        if self.count:
-            self._open_data(file[CHECKS]["snapshots"])
+        count = int(steps.attrs["NSteps"])
+        if count:
+            self._open_data(self._file[CHECKS]["snapshots"])
+        return count
 
     def _open_data(self, digests: h5py.Dataset) -> None:
-        self._data = {name: Growing(dataset) for name, dataset in field_datasets(self._vtk).items()}
+        self._data = {name: Growing(dataset) for name, dataset in field_datasets(self._file["VTKHDF"]).items()}
         self._digests = Growing(digests)
 
     def arrays(
@@ -216,37 +214,55 @@ class _Snapshots:
             for name, array in arrays.items()
         )
 
-    def append(self, step: int, time: float, arrays: Mapping[str, np.ndarray]) -> None:
-        """Write a snapshot except its time in ``/VTKHDF``, without counting it. Collective.
+    def gather(self, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the rows of all ranks in mesh numbering, in memory that ranks share. Collective."""
+        if self._memory is None:
+            kinds = {
+                name: (self._row_type(name, a), (self._order(name).n_global, *a.shape[1:]))
+                for name, a in arrays.items()
+            }
+            with writing(self._comm, self._shared.name):
+                self._memory = SharedArrays(self._comm, {name: np.dtype(kind) for name, kind in kinds.items()})
+        for name, array in arrays.items():
+            self._memory.arrays[name][self._ids[name.startswith("CellData")]] = array
+        self._comm.Barrier()
+        return dict(self._memory.arrays)
+
+    def write(self, n: int, arrays: dict[str, np.ndarray]) -> np.ndarray:
+        """Write the values of snapshot n, which ``arrays`` then no longer hold; return their digests. For owners.
 
         One field after the other goes to mesh numbering, into its digest and into the file, while it is in the cache.
         """
-        n = self.count
         if not self._data:
-            with writing(self.comm, self.path):
+            with self._shared.writing():
                 for name, array in arrays.items():
                     if name != "Points":
                         kind, _, field = name.partition("/")
-                        create_field(self._vtk, kind, field, array.shape[1:], self._row_type(name, array))
+                        row_type = self._row_type(name, array)
+                        create_field(self._file["VTKHDF"], kind, field, array.shape[1:], row_type)
                 self._open_data(create_snapshot_checks(self._file))
-        with writing(self.comm, self.path):
+        with self._shared.writing():
             for name in arrays:
                 self._data[name].grow((n + 1) * self._order(name).n_global)
         sums = {}
-        for name, array in arrays.items():
-            order = self._order(name)
-            slab = order.to_slab(array)
-            slab = slab.astype(self._row_type(name, slab), copy=False)
+        for name in list(arrays):
+            order, slab = self._order(name), arrays.pop(name)
+            if self._memory is None:
+                slab = order.to_slab(slab)
+                slab = slab.astype(self._row_type(name, slab), copy=False)
             sums[name] = word_sum(slab, order.first)
-            with writing(self.comm, self.path):
-                self._data[name].write(n * order.n_global + order.first, slab, collective=self._together)
-        digests = snapshot_digests(self.comm, sums)
-        with writing(self.comm, self.path):
+            with self._shared.writing():
+                self._data[name].write(n * order.n_global + order.first, slab, collective=self._shared.together)
+        return snapshot_digests(self._shared.owners, sums)
+
+    def mark(self, n: int, step: int, time: float, digests: np.ndarray) -> None:
+        """Write the entries of snapshot n, except its time in ``/VTKHDF``, without counting it. For owners."""
+        with self._shared.writing():
             for dataset in (*self._per_step.values(), *self._marks.values(), self._digests):
                 dataset.grow(n + 1)
         rows = {"PointOffsets": n * self._sizes[0], "CellDataRows": n * self._sizes[1], "NumberOfParts": 1}
-        with writing(self.comm, self.path):
-            if self.comm.rank == 0:
+        with self._shared.writing():
+            if self._comm.rank == 0:
                 for name, dataset in self._per_step.items():
                     dataset.write(n, np.full(self._wide[name], rows.get(name, 0)))
                 self._marks["step"].write(n, np.array([step]))
@@ -254,18 +270,16 @@ class _Snapshots:
                 mark = np.array([mark_digest(n, step, time)], dtype=np.uint64)
                 self._digests.write(n, np.concatenate([mark, digests])[None])
 
-    def publish(self, time: float) -> None:
-        """Count the snapshot, whose data have been flushed, and then write its time [s]. Collective."""
-        n = self.count
-        with writing(self.comm, self.path):
+    def publish(self, n: int, time: float) -> None:
+        """Count snapshot n, whose data have been flushed, and then write its time [s]. For owners."""
+        with self._shared.writing():
             self._n_steps.write(np.array(n + 1, dtype=np.int64))
             self._file.flush()
-        with writing(self.comm, self.path):
+        with self._shared.writing():
             self._times.grow(n + 1)
-            if self.comm.rank == 0:
+            if self._comm.rank == 0:
                 self._times.write(n, np.array([time], dtype=np.float64))
             self._file.flush()
-        self.count = n + 1
 
     def _order(self, name: str) -> NaturalOrder:
         return self._bars if name.startswith("CellData") else self._nodes
@@ -292,7 +306,7 @@ class ResultWriter:
     needed to run the case again, ``/snapshots`` step and time of each snapshot.
 
     All methods are collective. After a :class:`SimulationFailure` they raise it again, and the writer can only be
-    closed.
+    closed. A snapshot may be written beside what the caller does next; what fails then is raised by the next method.
 
     Parameters
     ----------
@@ -318,32 +332,32 @@ class ResultWriter:
         self.path, self.comm = Path(path), comm
         self._mesh = mesh
         self._unpublished: Path | None = None  # temporary name until the file has complete data
-        self._file: h5py.File | None = None
+        self._shared: SharedFile | None = None
         # The failure after which nothing can be written, and whether the open file can still be closed.
         self._failure: SimulationFailure | None = None
         self._broken = False
         sizes = int(mesh.n_nodes), int(mesh.n_bars)
         contents = contents._replace(attributes=describe_run(comm, contents.attributes))
+        compressed = contents.compressed
         if kept is None:
             self._unpublished = create_new(self.path, comm, create_result, *sizes, contents, checked=True)
         else:
-            on_root(comm, reopen, self.path, sizes, contents, kept)
-        with writing(comm, self.path):
-            self._file = open_shared(self._unpublished or self.path, comm)
-        if contents.events and EVENT not in self._file:
+            compressed = on_root(comm, reopen, self.path, sizes, contents, kept)
+        self._shared = SharedFile(self._unpublished or self.path, comm, self.path, compressed)
+        if contents.events and not self._shared.call(lambda: EVENT in self._shared.file):
             raise InputError(f"{self.path}: has no events, which the run records: write elsewhere (-o)")
-        self._snapshots = _Snapshots(self._file, comm, self.path, mesh, contents)
-        self._history = _Table(self._file, comm, self.path, "history", contents.columns)
+        self._snapshots = _Snapshots(self._shared, mesh, contents)
+        self._history = _Table(self._shared, "history", contents.columns)
         self._tables = [self._history]
         if contents.events:
-            self._tables.append(_Table(self._file, comm, self.path, EVENT, contents.events))
+            self._tables.append(_Table(self._shared, EVENT, contents.events))
         if kept is None:
             with self._whole_or_failed():
-                _write_connectivity(self._file, comm, self.path, mesh)
+                _write_connectivity(self._shared, mesh)
 
     @property
     def n_snapshots(self) -> int:
-        """Number of snapshots in the file."""
+        """Number of snapshots, with the one that is being written."""
         return self._snapshots.count
 
     def write_snapshot(
@@ -354,7 +368,27 @@ class ResultWriter:
         point_data: Mapping[str, np.ndarray],
         cell_data: Mapping[str, np.ndarray],
     ) -> None:
-        """Append a snapshot, and write the buffered history rows. Collective.
+        """Append a snapshot, and write the buffered history rows. Collective; parameters of :meth:`begin_snapshot`.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, for example if the disk is full or the file is missing.
+        """
+        self.begin_snapshot(time, step, points, point_data, cell_data)
+        self.wait()
+
+    def begin_snapshot(
+        self,
+        time: float,
+        step: int,
+        points: np.ndarray,
+        point_data: Mapping[str, np.ndarray],
+        cell_data: Mapping[str, np.ndarray],
+    ) -> None:
+        """Begin to append a snapshot and to write the buffered history rows; :meth:`wait` ends it. Collective.
+
+        Small ones are written at once.
 
         Parameters
         ----------
@@ -363,7 +397,7 @@ class ResultWriter:
         step : int
             Number of the time step, larger than that of the previous snapshot.
         points : (n_owned, 3) float64
-            Current positions [m].
+            Current positions [m]. The values of all arrays must stay until the end of the write.
         point_data : mapping of name to (n_owned, 3) or (n_owned,)
         cell_data : mapping of name to (n local bars, ...)
             Only the counted bars are written.
@@ -373,14 +407,27 @@ class ResultWriter:
         SimulationFailure
             On all ranks, for example if the disk is full or the file is missing.
         """
-        file = self._ready()
-        arrays = self._snapshots.arrays(points, point_data, cell_data)
-        self._require_room(self._snapshots.n_bytes(arrays))
+        shared, snapshots = self._ready(), self._snapshots
+        arrays = snapshots.arrays(points, point_data, cell_data)
+        n_bytes = snapshots.n_bytes(arrays)
+        self._require_room(n_bytes)
         with self._whole_or_failed():
-            self._snapshots.append(step, time, arrays)
-            self._write_rows(file)
-            self._snapshots.publish(time)
-            self._publish()
+            if self.comm.size > 1 and not shared.together:
+                arrays = snapshots.gather(arrays)
+            n, rows = snapshots.count, [table.take() for table in self._tables]
+
+            def work() -> None:
+                snapshots.mark(n, step, time, snapshots.write(n, arrays))
+                self._write_rows(rows)
+                snapshots.publish(n, time)
+                self._publish()
+
+            snapshots.count += 1
+            shared.submit(work, beside=n_bytes >= _BESIDE and n > 0)
+
+    def wait(self) -> None:
+        """Wait until all that was begun is in the file. Collective."""
+        self._ready()
 
     def append_history(self, row: Mapping[str, Any] | None) -> None:
         """Add a row: rank 0 passes a value for each column, the other ranks None. Collective.
@@ -398,26 +445,31 @@ class ResultWriter:
             self.flush_history()
         table.append(row)
 
-    def _write_rows(self, file: h5py.File) -> None:
-        """Write the buffered rows, and count them once they are flushed. Collective."""
-        for table in self._tables:
-            table.write()
-        with writing(self.comm, self.path):
-            file.flush()
+    def _write_rows(self, rows: Sequence[tuple[int, np.ndarray]]) -> None:
+        """Write rows taken from the tables, and count them once they are flushed. For owners."""
+        for table, taken in zip(self._tables, rows, strict=True):
+            table.write(*taken)
+        with self._shared.writing():
+            self._shared.file.flush()
         for table in self._tables:
             table.commit()
 
     def flush_history(self) -> None:
         """Write the rows and events kept in memory. Collective."""
-        file = self._ready()
+        shared = self._ready()
         if not any(table.n_buffered for table in self._tables):
             return
         self._require_room(0)
         with self._whole_or_failed():
-            self._write_rows(file)
-            with writing(self.comm, self.path):
-                file.flush()
-            self._publish()
+            rows = [table.take() for table in self._tables]
+
+            def work() -> None:
+                self._write_rows(rows)
+                with shared.writing():
+                    shared.file.flush()
+                self._publish()
+
+            shared.call(work)
 
     def write_modes(self, eigenvalues: np.ndarray, values: np.ndarray, shapes: np.ndarray) -> None:
         """Write all modes, replacing existing ones. Collective.
@@ -428,54 +480,61 @@ class ResultWriter:
         shapes : (k, owned, 3)
         """
         self.flush_history()
-        file = self._ready()
+        self._ready()
         self._require_room(24 * self._mesh.n_nodes * len(values))
         with self._whole_or_failed():
-            self._write_modes(file, eigenvalues, values, shapes)
-            self._publish()
+            self._write_modes(eigenvalues, values, shapes)
+            self._shared.call(self._publish)
 
-    def _write_modes(self, file: h5py.File, eigenvalues: np.ndarray, values: np.ndarray, shapes: np.ndarray) -> None:
-        comm, path, order = self.comm, self.path, self._mesh.node_order
-        group, checks = file[MODES], file[CHECKS][MODES]
-        name = next(name for name, _ in MODE_VALUES.values() if name in group)
-        n = len(eigenvalues)
-        shape = Growing(group["shape"])
-        with writing(comm, path):
-            for dataset in (group[name], group["eigenvalue"], group["shape"]):
-                grow(dataset, n)
+    def _write_modes(self, eigenvalues: np.ndarray, values: np.ndarray, shapes: np.ndarray) -> None:
+        shared, order, n = self._shared, self._mesh.node_order, len(eigenvalues)
+        datasets: dict[str, Growing] = {}
+
+        def begin() -> None:
+            datasets.update((name, Growing(dataset)) for name, dataset in shared.file[MODES].items())
+            with shared.writing():
+                for dataset in datasets.values():
+                    dataset.grow(n)
+
+        shared.call(begin)
         digests = np.zeros(n, dtype=np.uint64)
         for k in range(n):
             slab = np.ascontiguousarray(order.to_slab(shapes[k]))
-            total = snapshot_digests(comm, {"shape": word_sum(slab, order.first)})[0]
+            total = snapshot_digests(shared.comm, {"shape": word_sum(slab, order.first)})[0]
             digests[k] = total ^ np.uint64(numbers_digest(k, eigenvalues[k], values[k]))
-            with writing(comm, path):
-                shape.write((k, order.first, 0), slab[None], collective=comm.size > 1)
-        with writing(comm, path):
-            if comm.rank == 0:
-                group[name][:] = values
-                group["eigenvalue"][:] = eigenvalues
-            file.flush()
-        with writing(comm, path):
-            grow(checks, n)
-            if comm.rank == 0:
-                checks[:] = digests
-            file.flush()
+            shared.write(datasets.get("shape"), order.first, slab, (k,))
+
+        def finish() -> None:
+            checks = Growing(shared.file[CHECKS][MODES])
+            with shared.writing():
+                if shared.comm.rank == 0:
+                    datasets[next(name for name, _ in MODE_VALUES.values() if name in datasets)].write(0, values)
+                    datasets["eigenvalue"].write(0, eigenvalues)
+                shared.file.flush()
+            with shared.writing():
+                checks.grow(n)
+                if shared.comm.rank == 0:
+                    checks.write(0, digests)
+                shared.file.flush()
+
+        shared.call(finish)
 
     def close(self) -> None:
         """Write buffered rows and close the file; a second call does nothing. Collective."""
-        if self._file is None:
+        if self._shared is None:
             return
         try:
             if self._failure is None:
                 self.flush_history()
         finally:
-            file, self._file = self._file, None
+            shared = self._shared
             if self._broken:
-                release(file, self.comm)
+                self._shared = None
+                shared.abandon()
             else:
-                with writing(self.comm, self.path):
-                    file.close()
-                self._publish()
+                shared.close()
+                shared.call(self._publish)
+                self._shared = None
 
     def __enter__(self) -> ResultWriter:
         return self
@@ -485,12 +544,15 @@ class ResultWriter:
         if kind is None or self.comm.size == 1 or isinstance(error, PfemError):
             self.close()
 
-    def _ready(self) -> h5py.File:
+    def _ready(self) -> SharedFile:
+        """The file, when nothing is being written any more. Collective."""
         if self._failure is not None:
             raise self._failure
-        if self._file is None:
+        if self._shared is None:
             raise ValueError(f"{self.path}: the writer is closed")
-        return self._file
+        with self._whole_or_failed():
+            self._shared.wait()
+        return self._shared
 
     @contextmanager
     def _whole_or_failed(self) -> Iterator[None]:
@@ -503,14 +565,14 @@ class ResultWriter:
             raise
 
     def _publish(self) -> None:
-        """Rename the file to its final name after the first flush.
+        """Rename the file to its final name after the first flush. For owners.
 
         The first flush writes links to new objects before the superblock, which contains the end of the file, so HDF5
         may be unable to open a file that was killed before.
         """
         if self._unpublished is None:
             return
-        with writing(self.comm, self.path):
+        with self._shared.writing():
             if self.comm.rank == 0:
                 os.replace(self._unpublished, self.path)
         self._unpublished = None

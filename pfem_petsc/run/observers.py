@@ -255,7 +255,8 @@ class Snapshots(Observer):
         if held is not None:
             check_positions(self._stepper.model, *held, at)
         now = Snapshot(self._stepper.model, state, self._stepper.acceleration)
-        self.writer.write_snapshot(place, number, state.position, fields.at("nodes", now), fields.at("bars", now))
+        points = state.position.copy()  # as all values that are written while the next steps change the state
+        self.writer.begin_snapshot(place, number, points, fields.at("nodes", now), fields.at("bars", now))
         self.last = number
         for text in self._piercing.look(state.x, state.time, at):
             self._warn(text)

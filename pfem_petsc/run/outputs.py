@@ -402,9 +402,15 @@ class Outputs:
         self.progress.update(step, made.time, size, made.newton, made.linear, contacts, history.drift)
         for function, every in self._callbacks:
             if step % every == 0:
+                self.wait()
                 with agreed_call(self._stages.comm, step):
                     function(made)
         return made
+
+    def wait(self) -> None:
+        """Wait until the last snapshot is in the file, for those who may read it. Collective."""
+        if self._writer is not None:
+            self._writer.wait()
 
     def steps_left(self, step: int) -> int:
         """Return the number of steps until an observer must act or the ranks synchronise."""

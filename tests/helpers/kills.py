@@ -37,6 +37,9 @@ DROP = ("mesh.cells=[5,5,5]", "time.step=5e-7", "output.fields_every=20")
 KINDS = {
     "explicit": Kind("rod_impact", (*IMPACT, "time.end=1.0", "output.fields_every=25")),
     "explicit contact, plastic": Kind("lattice_drop", (*DROP, "time.end=3e-4")),
+    "explicit, snapshots beside the steps": Kind(
+        "lattice_drop", ("mesh.cells=[10,10,10]", "time.step=5e-7", "time.end=3e-4", "output.fields_every=20")
+    ),
     "implicit contact": Kind(
         "rod_impact", ("time.integrator=newmark", "time.end=2.5", "mesh.elements=60", "output.fields_every=5")
     ),

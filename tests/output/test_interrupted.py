@@ -216,7 +216,7 @@ from helpers.synthetic import Truss, options, write
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.output import vtkhdf
 vtkhdf.require_room = lambda *given, **named: None  # as where a quota, not the disk, is full
-truss = Truss(MPI.COMM_SELF, n_nodes=2000, n_bars=4000)
+truss = Truss(MPI.COMM_SELF, n_nodes=int(sys.argv[3]), n_bars=2 * int(sys.argv[3]))
 try:
     with vtkhdf.ResultWriter(sys.argv[2], MPI.COMM_SELF, truss.mesh, **options()) as writer:
         write(writer, truss, range(1000), every=1)
@@ -226,15 +226,15 @@ except SimulationFailure as error:
 
 
 @pytest.mark.slow
-def test_disk_full_inside_hdf5_is_a_failure_and_no_crash(small_disk):
+@pytest.mark.parametrize("n_nodes", [2000, 3500], ids=["at once", "beside the steps"])
+def test_disk_full_inside_hdf5_is_a_failure_and_no_crash(small_disk, n_nodes):
     path = small_disk / "result.vtkhdf"
-    done = subprocess.run(
-        [sys.executable, "-c", FULL, str(HERE), str(path)], capture_output=True, env=environment(), text=True
-    )
+    command = [sys.executable, "-c", FULL, str(HERE), str(path), str(n_nodes)]
+    done = subprocess.run(command, capture_output=True, env=environment(), text=True)
     assert done.returncode == 1, done.stderr
     assert "failed: " in done.stderr
     assert "is the disk full" in done.stderr
-    truss = Truss(MPI.COMM_SELF, n_nodes=2000, n_bars=4000)
+    truss = Truss(MPI.COMM_SELF, n_nodes=n_nodes, n_bars=2 * n_nodes)
     result = open_result(path)
     n = len(result.times)
     assert n > 3

@@ -9,7 +9,14 @@ from helpers.kills import KINDS, VtkReader, assert_readable, differences, killed
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "ranks"),
-    [("explicit contact, plastic", 1), ("implicit contact", 1), ("multistep", 1), ("explicit contact, plastic", 2)],
+    [
+        ("explicit contact, plastic", 1),
+        ("explicit, snapshots beside the steps", 1),
+        ("implicit contact", 1),
+        ("multistep", 1),
+        ("explicit contact, plastic", 2),
+        ("explicit, snapshots beside the steps", 2),
+    ],
 )
 def test_killed_at_random_moments_the_run_ends_as_if_undisturbed(tmp_path, name, ranks):
     seed = random.SystemRandom().randrange(10**6)

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-COMPILED = {"kernel", "inlined", "borrowing", "borrowing_kernel", "intrinsic", "njit", "overload", "register_jitable"}
+COMPILED = {"kernel", "inlined", "intrinsic", "njit", "overload", "register_jitable"}
+COMPILED |= {"borrowing", "borrowing_apart", "borrowing_kernel"}
 """Decorators of functions whose types Numba infers."""
 
 

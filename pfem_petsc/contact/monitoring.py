@@ -14,7 +14,7 @@ from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..tolerances import BEYOND
 from .contact import Contact
-from .neighbours import NeighbourSearch, Segments
+from .neighbours import Points, Segments, find_pairs
 from .node_walls import held_by_supports
 
 if TYPE_CHECKING:
@@ -263,50 +263,48 @@ class CrossingBars:
 
     def __init__(self, model: Model) -> None:
         self._model = model
-        mesh, bars = model.mesh, model.bars
-        counted = np.arange(len(mesh.bars))[mesh.counted]
-        radius = bars.radii()[counted]
-        slender = radius < STOUT * bars.mesh_lengths[counted]
-        slender &= mesh.bar_ids[counted] < mesh.n_bars - mesh.n_connectors
-        self._bars, self._radius = counted[slender], radius[slender]
+        mesh = model.mesh
         self._n_bars = mesh.n_bars - mesh.n_connectors
-        self.applicable = model.comm.allreduce(len(self._bars)) > 1
-        self._meeting = self._linked_nodes()
-        self._before: np.ndarray | None = None
+        radius = model.bars.radii()[mesh.counted]
+        slender = radius < STOUT * model.bars.mesh_lengths[mesh.counted]
+        slender &= mesh.bar_ids[mesh.counted] < self._n_bars
+        self._bars = mesh.counted
+        if not (isinstance(self._bars, slice) and slender.all()):
+            self._bars = np.arange(len(mesh.bars), dtype=np.int32)[self._bars][slender]
+        self.applicable = model.comm.allreduce(int(np.count_nonzero(slender))) > 1
+        self._kind = self._linked_bars()
         self._last: _Search | None = None
 
-    def _linked_nodes(self) -> np.ndarray:
-        """Return (local,) 1.0 for nodes in contact pairs and constraints, else 0.0. Collective."""
+    def _linked_bars(self) -> np.ndarray:
+        """Return (bars,) uint8: 1 for those with an end in contact pairs or constraints, else 0; (0,) without any.
+        Collective."""
         case, mesh = self._model.case, self._model.mesh
+        tables = (*case.contact_pair, *case.constraint)
+        if not tables:
+            return np.empty(0, np.uint8)
         linked = np.zeros((mesh.n_local, 1))
-        for table in (*case.contact_pair, *case.constraint):
+        for table in tables:
             for value in table.model_dump().values():
                 for name in value if isinstance(value, list | tuple) else [value]:
                     if isinstance(name, str) and name in self._model.nodes:
                         linked[self._model.nodes[name]] = 1.0
         mesh.update_ghosts(linked)
-        return linked[:, 0]
+        return (linked[mesh.bars[self._bars], 0] > 0.0).any(axis=1).astype(np.uint8)
 
     def find(self, x: np.ndarray) -> Crossing | None:
         """Return the bars at positions (local, 3) [m] that pass through each other; None if the search would take too
         long, because too many bars are in one place."""
-        if self._last is None:
-            points = self._model.mesh.points
-            self._before, gap = self._pairs(points, 1.0 + _NEAR)
-            self._last = _Search(Crossing(0, 0, (-1, -1)), gap, points, self._intact())
-        if self._before is None:
-            return None
-        if self._moved(x) < 0.499 * self._last.gap:
-            return self._last.found
-        pairs, gap = self._pairs(x, 1.0)
-        found = None if pairs is None else self._count(pairs[~np.isin(pairs, self._before)])
-        self._last = _Search(found, gap, x.copy(), self._intact())
-        return found
+        if self._last is None:  # in the mesh, no bar does
+            self._last = _Search(Crossing(0, 0, (-1, -1)), 0.0, self._model.mesh.points, self._intact())
+        moved = self._moved(x)
+        if moved > 0.0 and moved >= 0.499 * self._last.gap:
+            self._last = _Search(*self._search(x), x.copy(), self._intact())
+        return self._last.found
 
     def _intact(self) -> np.ndarray:
-        """Return (bars,) bool: those that are not broken."""
+        """Return (bars,) bool: those that are not broken; (0,) if none can break."""
         if not self._model.bars.can_break:
-            return np.ones(len(self._bars), dtype=bool)
+            return np.empty(0, dtype=bool)
         return self._model.bars.status()[self._bars] != STATUS.index("broken")
 
     def _moved(self, x: np.ndarray) -> float:
@@ -319,52 +317,30 @@ class CrossingBars:
         broken = bool((self._intact() != last.intact).any()) or not np.isfinite(square)
         return np.sqrt(comm.allreduce(np.inf if broken else square, op=MPI.MAX))
 
-    def _count(self, new: np.ndarray) -> Crossing:
-        """Return the number of pairs and bars from the keys of pairs on this rank. Collective."""
+    def _count(self, pairs: np.ndarray) -> Crossing:
+        """Return the number of pairs and bars from the pairs (m, 2) that this rank has found. Collective."""
         comm, n = self._model.comm, self._n_bars
-        first, second = new // n, new % n
-        both = np.unique(np.concatenate([first, second]))
+        both = np.unique(pairs)
         bars = np.unique(Router(comm, slab_of(both, n, comm.size)).send(both))
-        lowest = int(new.min()) if len(new) else np.iinfo(np.int64).max
+        lowest = int((pairs[:, 0] * n + pairs[:, 1]).min(initial=np.iinfo(np.int64).max))
         lowest = comm.allreduce(lowest, op=MPI.MIN)
-        return Crossing(comm.allreduce(len(new)), comm.allreduce(len(bars)), (lowest // n, lowest % n))
+        return Crossing(comm.allreduce(len(pairs)), comm.allreduce(len(bars)), (lowest // n, lowest % n))
 
-    def _pairs(self, x: np.ndarray, factor: float) -> tuple[np.ndarray | None, float]:
-        """Return keys of pairs, first number times the number of bars plus second, on the rank of the first, and by how
-        much the distance of any two bars differs at least from the sum of their radii [m]; radii are multiplied by a
-        factor."""
-        comm, mesh = self._model.comm, self._model.mesh
-        chosen = self._bars
-        kept = self._intact()
-        ends = mesh.bars[chosen[kept]]
+    def _search(self, x: np.ndarray) -> tuple[Crossing | None, float]:
+        """Return the pairs at positions (local, 3) [m], and by how much the distance of any two bars differs at least
+        from the sum of their radii [m]."""
+        comm, mesh, bars = self._model.comm, self._model.mesh, self._model.bars
+        ids, ends, radius, kind = mesh.bar_ids[self._bars], mesh.bars[self._bars], bars.radii()[self._bars], self._kind
         # stray nodes may be anywhere, and squares of distances must be finite; a NaN has its own message elsewhere
         near = (np.abs(x) < _STRAY).all(axis=1)
-        fine = near[ends[:, 0]] & near[ends[:, 1]]
-        ends, kept = ends[fine], np.flatnonzero(kept)[fine]
-        nodes, points, radius = mesh.node_ids[ends].astype(np.int64), x[ends], factor * self._radius[kept]
-        turned = nodes[:, 0] > nodes[:, 1]
-        nodes[turned], points[turned] = nodes[turned, ::-1], points[turned, ::-1]
-        ids = mesh.bar_ids[chosen[kept]].astype(np.int64)
-        # bars with a common label are not compared: at a node, or both at links
-        links = np.where((self._meeting[ends] > 0.0).any(axis=1), -1, -2 - ids)
-        lengths = np.linalg.norm(points[:, 1] - points[:, 0], axis=1)
-        number, size = comm.allreduce(np.array([len(lengths), float((lengths + 4.0 * radius).sum())]))
-        if not number:
-            return np.empty(0, np.int64), np.inf
-        gap = skin = _SKIN * size / number
-        segments = Segments(ids, np.column_stack([nodes, links]), points, radius + 0.5 * skin)
-        search = NeighbourSearch(comm, segments)
-        if search.crowded:
-            return None, 0.0
-        keys = [np.empty(0, np.int64)]
-        for pairs in search.pairs():
-            apart = pairs.distance - (pairs.reach - skin)
-            gap = min(gap, float(np.abs(apart).min()))
-            one, two = np.sort(pairs.ids[apart < 0.0], axis=1).T
-            keys.append(one * self._n_bars + two)
-        found = np.concatenate(keys)
-        found = Router(comm, slab_of(found // self._n_bars, self._n_bars, comm.size)).send(found)
-        return found, comm.allreduce(gap, op=MPI.MIN)
+        if bars.can_break or not near.all():
+            kept = near[ends].all(axis=1)
+            if bars.can_break:
+                kept &= self._intact()
+            ids, ends, radius, kind = ids[kept], ends[kept], radius[kept], kind[kept] if len(kind) else kind
+        segments = Segments(ids, ends, radius, kind)
+        found = find_pairs(comm, Points(x, mesh.node_ids, mesh.points), segments, _SKIN, 1.0 + _NEAR)
+        return (None, 0.0) if found is None else (self._count(found.ids), found.gap)
 
 
 class _Search(NamedTuple):

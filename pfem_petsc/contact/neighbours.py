@@ -1,207 +1,445 @@
 """Pairs of line segments that are close to each other, among segments of all ranks.
 
-Space is divided into cells of about a segment. Each rank holds the segments in the cells that a hash assigns to
-it, and compares those that share a cell. A pair belongs to the first cell that both have, or, if one is longer than a
-cell, to that of a point between the two where they are closest, so that it is found once, by one rank. Points are
-segments whose ends coincide.
+Segments, or pieces of long ones, are sorted by the cells of their middles. Cells are as wide as two of them can be
+apart and still be close: then they are in the same cell or in neighbouring ones. Two planes of cells at a time are
+sorted and compared, by vectors of boxes in single precision, so that there are few temporary arrays. On several ranks,
+each has the cells that a hash assigns to it. Points are segments whose ends coincide.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
-from ..mechanics.compiled import inlined, kernel
+from ..mechanics.compiled import borrowing, borrowing_apart, borrowing_kernel, inlined, kernel
 from ..mesh.exchange import Router
 
-# Limits of the work for each segment: cells listed, and pairs compared.
-_CELLS, _PAIRS = 64.0, 2000.0
+# Limits for each segment: pieces, and comparisons.
+_PIECES, _COMPARISONS = 8.0, 2000.0
 
 # Cells of 8 x 8 x 8 belong to one rank, so that most segments are sent to one or two.
 _BLOCK = 8
 
-_CHUNK = 1 << 18  # pairs found at a time
-_LONG = 1 << 40  # number of a cell where there is none
-_SECOND = 1 << 62  # added to the numbers of the second set of segments
+_CELLS = (1 << 21) - 2  # along an axis; those beyond belong to the last one
+_ROOM = 1 << 12  # pairs for which there is room at first
+_LANES = 32  # boxes compared at once, at most
+# In single precision and cells: rounding, a half, and a product of lengths below which squares vanish.
+_SLACK, _HALF, _TINY = np.float32(1e-3), np.float32(0.5), np.float32(1e-15)
+_DIGIT = 11  # bits by which cells are sorted at once
+
+
+# The places of the bits of a byte that are 1, lowest first, and their number.
+_PLACES = np.array([([k for k in range(8) if byte >> k & 1] + 8 * [0])[:8] for byte in range(256)], np.int32)
+_NUMBERS = np.array([byte.bit_count() for byte in range(256)], np.int32)
+
+
+class Points(NamedTuple):
+    """Ends of segments: positions ``at`` (p, 3) [m]; ``names`` (p,), the same on all ranks: segments that share one are
+    no pair; positions ``before`` (p, 3) [m], if any: what was a pair there is none."""
+
+    at: np.ndarray
+    names: np.ndarray
+    before: np.ndarray = np.empty((0, 3))
 
 
 class Segments(NamedTuple):
-    """Segments of a rank.
-
-    ids (n,) int64: numbers, unique on all ranks; labels (n, k) int64: those with a common one are no pair; ends
-    (n, 2, 3) [m]; margin (n,) [m]: pairs are not farther apart than the sum of theirs
-    """
+    """Segments of a rank: numbers ``ids`` (n,), unique on all ranks; their end ``points`` (n, 2) int32, rows of
+    :class:`Points`; ``margin`` (n,) [m]: pairs are closer than the sum of theirs; ``kind`` (n,) uint8, or (0,): two of
+    one kind are no pair, unless it is 0."""
 
     ids: np.ndarray
-    labels: np.ndarray
-    ends: np.ndarray
+    points: np.ndarray
     margin: np.ndarray
+    kind: np.ndarray = np.empty(0, np.uint8)
 
 
 class Pairs(NamedTuple):
-    """Pairs: their ids (m, 2) and labels (m, 2, k), where they are closest to each other, from 0 at the first end of
-    each to 1 at the second (m, 2), their distance there (m,) [m], and the sum of their margins (m,) [m]."""
+    """Pairs that a rank has found, each on one rank.
+
+    ``ids`` (m, 2), that with the lower kind and number first; ``names`` of their ends (m, 2, 2); where they are closest
+    to each other, ``at`` (m, 2), from 0 at the first end of each to 1 at the second; and the ``gap``, the smallest
+    difference [m] between a distance and the sum of the margins on all ranks, up to the skin, also of what is no pair
+    because of positions before.
+    """
 
     ids: np.ndarray
-    labels: np.ndarray
+    names: np.ndarray
     at: np.ndarray
-    distance: np.ndarray
-    reach: np.ndarray
+    gap: float
 
 
-class NeighbourSearch:
-    """Search of close segments. Construction is collective; time and memory are proportional to the segments of a rank.
+class _Grid(NamedTuple):
+    """Cells: their lowest corner (3,) [m], inverse edges (3,) [1/m] and numbers (3,) int64 along x, y and z; the axis
+    across planes, that across rows, that along rows; how far pieces reach from their middles (3,) [m], the unit of
+    single-precision numbers [m], the longest piece of a segment [m], the skin [m]; and the number of ranks, and this
+    one."""
+
+    low: np.ndarray
+    inverse: np.ndarray
+    count: np.ndarray
+    axes: tuple[int, int, int]
+    extents: np.ndarray
+    unit: float
+    longest: float
+    skin: float
+    ranks: tuple[int, int]
+
+
+def find_pairs(comm: MPI.Comm, points: Points, own: Segments, skin: float = 0.0, factor: float = 1.0) -> Pairs | None:
+    """Find the pairs of segments that are closer than the sum of their margins, on any rank. Collective.
 
     Parameters
     ----------
     comm : MPI.Comm
-    one, two : Segments of this rank
-        Pairs are of a segment of ``one`` with one of ``two``, in this order; without ``two``, of two segments of
-        ``one``, that with the lower number first. Coordinates must be finite, and their squares too.
+    points : Points
+        Coordinates must be finite, and their squares too.
+    own : Segments of this rank
+    skin : float
+        Distance beyond the margins to which :attr:`Pairs.gap` is found, over the mean length with margins.
+    factor : float
+        Of the margins, for the positions before.
 
-    Attributes
-    ----------
-    crowded : whether the search would take too long, because too many segments are in one place
+    Returns
+    -------
+    Pairs, or None on all ranks if the search would take too long, because too many segments are in one place
+    """
+    low, high, sums = np.full(3, np.inf), np.full(3, -np.inf), np.zeros(2)
+    _measure(points.at, own, low, high, sums)
+    number = comm.allreduce(len(own.ids))
+    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+    comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
+    mean = float(sums[1]) / max(float(sums[0]), 1.0)
+    skin, longest, pieces = skin * mean, 2.0 * mean or 1.0, 0.0
+    while number:
+        extents = np.zeros(4)
+        _extend(points.at, own, longest, skin, extents)
+        before, pieces = pieces, comm.allreduce(float(extents[3]))
+        comm.Allreduce(MPI.IN_PLACE, extents, op=MPI.MAX)
+        if pieces == before or pieces > _PIECES * number:  # shorter pieces are no better, or too many
+            return None
+        grid = _make_grid(comm, low, high, extents[:3], longest, skin)
+        held = (points, own) if comm.size == 1 else _hold(comm, grid, points, own)
+        found, comparisons = _compare(grid, *held, factor, _COMPARISONS * number)
+        if comm.allreduce(comparisons) <= _COMPARISONS * number:
+            return found._replace(gap=comm.allreduce(min(found.gap, skin), op=MPI.MIN))
+        longest *= 0.5
+    return Pairs(np.empty((0, 2), np.int64), np.empty((0, 2, 2), np.int64), np.empty((0, 2)), np.inf)
+
+
+def _make_grid(
+    comm: MPI.Comm, low: np.ndarray, high: np.ndarray, extents: np.ndarray, longest: float, skin: float
+) -> _Grid:
+    """Return the cells for segments in a box whose pieces reach at most ``extents`` (3,) [m] from their middles."""
+    edges = np.maximum(2.0 * extents, 0.25 * extents.max()) * (1.0 + 1e-8)
+    count = np.minimum((high - low) / edges, float(_CELLS)).astype(np.int64) + 1
+    planes, rows, along = (int(axis) for axis in np.argsort(-count, kind="stable"))
+    axes, ranks = (planes, rows, along), (comm.size, comm.rank)
+    return _Grid(low, 1.0 / edges, count, axes, extents, float(edges.max()), longest, skin, ranks)
+
+
+def _hold(comm: MPI.Comm, grid: _Grid, points: Points, own: Segments) -> tuple[Points, Segments]:
+    """Send segments to the ranks of their cells and of the neighbouring ones; return those that this rank has then.
+    Collective."""
+    none, seen = np.empty(0, np.int64), np.full(comm.size, -1, np.int64)
+    count = _list_ranks(points.at, own, grid, seen, (none, none))
+    ranks, rows = np.empty(count, np.int64), np.empty(count, np.int64)
+    seen[:] = -1
+    _list_ranks(points.at, own, grid, seen, (ranks, rows))
+    router = Router(comm, ranks, rows)
+    ends = router.send(points.at[own.points])
+    before = router.send(points.before[own.points]) if len(points.before) else points.before
+    names = router.send(points.names[own.points])
+    kind = router.send(own.kind) if comm.allreduce(len(own.kind)) else own.kind
+    at = np.arange(2 * len(ends), dtype=np.int32).reshape(-1, 2)
+    return (
+        Points(ends.reshape(-1, 3), names.reshape(-1), before.reshape(-1, 3)),
+        Segments(router.send(own.ids), at, router.send(own.margin), kind),
+    )
+
+
+class _Planes(NamedTuple):
+    """Rows of segments, sorted by planes of cells: ``rows`` (m,) int32 from ``starts`` (planes + 1,) on; their pieces
+    ``parts`` (m,) int32, or (0,) if all are whole; ``marks`` (p,) int32 of points, equal where their names are."""
+
+    starts: np.ndarray
+    rows: np.ndarray
+    parts: np.ndarray
+    marks: np.ndarray
+
+
+class _Work(NamedTuple):
+    """Room for two planes of at most m pieces, sorted.
+
+    ``keys`` of cells (3, m) and ``rows`` (3, m), of which the last are for sorting, as are the numbers of ``digits``;
+    ``parts``, numbers of pieces (2, m); ``lines`` (2 m, 8): middle, way from end to end, margin and length; ``boxes``
+    (2, 6, m + lanes); marks of the ``ends`` (2, 2, m + lanes); which ones are ``near``, as bytes and as ``words`` of
+    the same memory; ``hits``, those of both planes, the second after m; ``bounds`` (5, 4) of ranges of cells.
     """
 
-    def __init__(self, comm: MPI.Comm, one: Segments, two: Segments | None = None) -> None:
-        self._between = two is not None
-        if two is not None:
-            two = two._replace(ids=two.ids + _SECOND)
-            one = Segments(*(np.concatenate(arrays) for arrays in zip(one, two)))
-        lengths = np.linalg.norm(one.ends[:, 1] - one.ends[:, 0], axis=1)
-        points = one.ends.reshape(-1, 3).T.copy()  # minima along rows are many times faster
-        low, high = points.min(axis=1, initial=np.inf), points.max(axis=1, initial=-np.inf)
-        comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-        comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-        sizes = lengths + 2.0 * one.margin
-        number, long, size = comm.allreduce(np.array([len(lengths), np.count_nonzero(lengths), sizes.sum()]))
-        self._low, self._cell, self.crowded = low, size / max(long, 1.0), False
-        self._held, self._start, change = one, np.zeros(1, np.int64), 1.0
-        self._keys, self._rows, self._corners = np.empty(0, np.int64), np.empty(0, np.int32), np.empty((0, 3), np.int64)
-        while number:
-            cells = ((lengths // self._cell + 1.0) * (2.0 + 2.0 * one.margin / self._cell) ** 3).sum()
-            fits = comm.allreduce(float(cells)) <= _CELLS * number and (high - low).max() < 2.0**60 * self._cell
-            if fits:
-                self._hold(comm, one)
-                counts = np.diff(self._start).astype(float)
-                if comm.allreduce(float((counts * counts).sum())) <= 2.0 * _PAIRS * number:
-                    return
-            before, change = change, 0.5 if fits else 2.0
-            if before * change == 1.0:  # smaller cells are too many, larger ones too full
-                self.crowded = True
-                return
-            self._cell *= change
-
-    def _hold(self, comm: MPI.Comm, own: Segments) -> None:
-        """Send segments to the ranks of their cells, and sort the cells that are held by this one. Collective."""
-        none, no_rows, corners = np.empty(0, np.int64), np.empty(0, np.int32), np.empty((len(own.ids), 3), np.int64)
-        if comm.size > 1:
-            cells = (own.ends, own.margin), (self._low, self._cell), corners
-            count = _list_cells(*cells, (comm.size, -1), none, (none, no_rows))
-            ranks, rows = np.empty(count, np.int64), np.empty(count, np.int32)
-            _list_cells(*cells, (comm.size, -1), none, (ranks, rows))
-            each = np.unique(rows.astype(np.int64) * comm.size + ranks)
-            router = Router(comm, each % comm.size, each // comm.size)
-            own = Segments(*(router.send(array) for array in own))
-        self._corners = np.empty((len(own.ids), 3), np.int64)
-        cells = (own.ends, own.margin), (self._low, self._cell), self._corners
-        counts = np.zeros(1 << (2 * len(own.ids)).bit_length(), np.int64)
-        count = _list_cells(*cells, (comm.size, comm.rank), counts, (none, no_rows))
-        self._start = np.append(0, np.cumsum(counts))
-        self._held, self._keys, self._rows = own, np.empty(count, np.int64), np.empty(count, np.int32)
-        _list_cells(*cells, (comm.size, comm.rank), self._start[:-1].copy(), (self._keys, self._rows))
-
-    def pairs(self) -> Iterator[Pairs]:
-        """Yield the pairs that this rank finds, a limited number at a time; each is found by one rank."""
-        room = max(_CHUNK, int(np.diff(self._start).max(initial=0)))
-        found_rows, at, distance = np.empty((room, 2), np.int64), np.empty((room, 2)), np.empty(room)
-        buckets, grid = (self._start, self._keys, self._rows, self._corners), (self._low, self._cell, self._between)
-        state = np.zeros(2, np.int64)
-        while state[0] < len(self._start) - 1:
-            found = slice(0, _compare(state, buckets, self._held, grid, (found_rows, at, distance)))
-            rows = found_rows[found]
-            ids, reach = self._held.ids[rows], self._held.margin[rows].sum(axis=1)
-            ids[ids >= _SECOND] -= _SECOND
-            if len(rows):
-                yield Pairs(ids, self._held.labels[rows], at[found].copy(), distance[found].copy(), reach)
+    keys: np.ndarray
+    rows: np.ndarray
+    parts: np.ndarray
+    lines: np.ndarray
+    boxes: np.ndarray
+    ends: np.ndarray
+    digits: np.ndarray
+    near: np.ndarray
+    words: np.ndarray
+    hits: np.ndarray
+    bounds: np.ndarray
 
 
-@inlined
-def _key(i, j, k):
-    """Return a number of a cell from its numbers along the axes, which wrap around after 2^21 cells."""
-    mask = (1 << 21) - 1
-    return ((i & mask) << 42) | ((j & mask) << 21) | (k & mask)
+class _Found(NamedTuple):
+    """Room for rows of pairs (m, 2) int32, where they are closest (m, 2), and the gap (1,) [m]."""
+
+    rows: np.ndarray
+    at: np.ndarray
+    gap: np.ndarray
 
 
-@inlined
-def _mixed(key):
-    """Return a number from 0 to 2^31 - 1 that looks random."""
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    return np.int64(mixed >> np.uint64(33))
+def _make_work(m: int) -> _Work:
+    near = np.empty(2 * (-(-m // 8) * 8 + _LANES), np.uint8)
+    return _Work(
+        np.empty((3, m), np.int64),
+        np.empty((3, m), np.int32),
+        np.empty((2, m), np.int32),
+        np.empty((2 * m, 8), np.float32),
+        np.zeros((2, 6, m + _LANES), np.float32),
+        np.zeros((2, 2, m + _LANES), np.int32),
+        np.empty((1 << _DIGIT) + 1, np.int64),
+        near,
+        near.view(np.uint64),
+        np.empty(2 * m + 8, np.int32),
+        np.empty((5, 4), np.int64),
+    )
+
+
+def _compare(grid: _Grid, points: Points, held: Segments, factor: float, most: float) -> tuple[Pairs, float]:
+    """Return the pairs among the segments that are held, and the number of comparisons, which end beyond the most."""
+    planes = _make_planes(grid, points, held)
+    work = _make_work(int(np.diff(planes.starts).max(initial=1)))
+    room, state, gap = _ROOM, np.zeros(3, np.int64), np.full(1, np.inf)
+    rows, at = [np.empty((0, 2), np.int32)], [np.empty((0, 2))]
+    while state[0] < len(planes.starts) - 1 and state[2] <= most:
+        out = _Found(np.empty((room, 2), np.int32), np.empty((room, 2)), gap)
+        count = _compare_planes(state, planes, points, held, grid, (factor, most), work, out)
+        rows.append(out.rows[:count])
+        at.append(out.at[:count])
+        room = max(room, int(state[1]))
+    found = np.concatenate(rows)
+    ids = held.ids[found].astype(np.int64)
+    names = points.names[held.points[found]].astype(np.int64)
+    return Pairs(ids, names, np.concatenate(at), float(gap[0])), float(state[2])
+
+
+def _make_planes(grid: _Grid, points: Points, held: Segments) -> _Planes:
+    """Return the segments sorted by planes."""
+    starts, none = np.zeros(int(grid.count[grid.axes[0]]) + 2, np.int64), np.empty(0, np.int32)
+    long = _sort_planes(points.at, held, grid, starts[1:], (none, none))
+    np.cumsum(starts, out=starts)
+    rows = np.empty(starts[-1], np.int32)
+    parts = np.empty(len(rows) if long else 0, np.int32)
+    _sort_planes(points.at, held, grid, starts[:-1].copy(), (rows, parts))
+    marks = points.names
+    if int(marks.max(initial=0)) > np.iinfo(np.int32).max:
+        marks = np.unique(marks, return_inverse=True)[1]
+    return _Planes(starts[:-1], rows, parts, marks.astype(np.int32))
 
 
 @kernel
-def _list_cells(segments, grid, corners, ranks, buckets, listed):
-    """List the cells around segments: the key of the cell and the row of the segment, for cells of ``ranks[1]`` of
-    ``ranks[0]``; with -1, the rank of the cell and the row. Each goes to the place that its bucket, if there are any,
-    is at, which moves on; without arrays for the list they are counted. ``corners`` (n, 3) are set to
-    the first cell of each segment, or far away for those longer than a cell. Returns the length of the list."""
-    ends, margins = segments
-    low, cell = grid
-    keys, rows = listed
-    size, rank = ranks
-    first = np.empty(3, np.int64)
-    last = np.empty(3, np.int64)
-    before = np.empty((2, 3), np.int64)
+def _measure(at, segments, low, high, sums):
+    """Write the corners of the box around segments, how many are longer than zero, and the sum of their lengths with
+    margins."""
+    low_x = low_y = low_z = np.inf
+    high_x = high_y = high_z = -np.inf
+    number = total = 0.0
+    for n in range(len(segments.ids)):
+        a, b = segments.points[n, 0], segments.points[n, 1]
+        x, y, z, p, q, r = at[a, 0], at[a, 1], at[a, 2], at[b, 0], at[b, 1], at[b, 2]
+        low_x, low_y, low_z = min(low_x, x, p), min(low_y, y, q), min(low_z, z, r)
+        high_x, high_y, high_z = max(high_x, x, p), max(high_y, y, q), max(high_z, z, r)
+        square = (p - x) ** 2 + (q - y) ** 2 + (r - z) ** 2
+        number += square > 0.0
+        total += np.sqrt(square) + 2.0 * segments.margin[n]
+    low[0], low[1], low[2], high[0], high[1], high[2] = low_x, low_y, low_z, high_x, high_y, high_z
+    sums[0], sums[1] = number, total
+
+
+@borrowing
+def _pieces(at, segments, n, longest, skin):
+    """Return the number of pieces of a segment: not longer than ``longest``, or four times as long as thick."""
+    a, b = segments.points[n, 0], segments.points[n, 1]
+    x, y, z = at[b, 0] - at[a, 0], at[b, 1] - at[a, 1], at[b, 2] - at[a, 2]
+    square, most = x * x + y * y + z * z, max(longest, 4.0 * (segments.margin[n] + 0.5 * skin))
+    return 1 if square <= most * most else int(np.sqrt(square) / most) + 1
+
+
+@kernel
+def _extend(at, segments, longest, skin, extents):
+    """Write how far pieces with their margins reach from their middles along x, y and z, and the number of pieces."""
+    x = y = z = number = 0.0
+    for n in range(len(segments.ids)):
+        pieces = _pieces(at, segments, n, longest, skin)
+        a, b = segments.points[n, 0], segments.points[n, 1]
+        part, margin = 0.5 / pieces, segments.margin[n] + 0.5 * skin
+        x = max(x, part * abs(at[b, 0] - at[a, 0]) + margin)
+        y = max(y, part * abs(at[b, 1] - at[a, 1]) + margin)
+        z = max(z, part * abs(at[b, 2] - at[a, 2]) + margin)
+        number += pieces
+    extents[0], extents[1], extents[2], extents[3] = x, y, z, number
+
+
+@borrowing
+def _cell(at, segments, n, part, pieces, grid, c):
+    """Return the number of the cell of the middle of a piece along an axis. It grows with the coordinate, by no more
+    than one over the edge of a cell."""
+    a, b = segments.points[n, 0], segments.points[n, 1]
+    middle = at[a, c] + (part + 0.5) / pieces * (at[b, c] - at[a, c])
+    return int(min(max((middle - grid.low[c]) * grid.inverse[c], 0.0), grid.count[c] - 1.0))
+
+
+@borrowing
+def _holder(i, j, k, ranks):
+    """Return the rank of a cell."""
+    key = np.uint64((((i // _BLOCK) << 42) | ((j // _BLOCK) << 21) | (k // _BLOCK)) + 1)
+    return np.int64((key * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(33)) % ranks
+
+
+@kernel
+def _list_ranks(at, segments, grid, seen, listed):
+    """List the ranks to which each segment goes, and its row; without arrays for the list they are counted. ``seen``
+    (ranks,): the last segment that went to each. Returns the length of the list."""
+    ranks, rows = listed
     count = 0
-    for n in range(len(ends)):
-        way = ends[n, 1] - ends[n, 0]
-        length = np.sqrt((way * way).sum())
-        margin = margins[n] + 1e-9 * (length + cell)
-        pieces = int(length / cell) + 1
-        for piece in range(pieces):
+    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
+    for n in range(len(segments.ids)):
+        pieces = _pieces(at, segments, n, grid.longest, grid.skin)
+        for part in range(pieces):
             for c in range(3):
-                p = ends[n, 0, c] + piece / pieces * way[c]
-                q = ends[n, 0, c] + (piece + 1) / pieces * way[c]
-                first[c] = int(np.floor((min(p, q) - margin - low[c]) / cell))
-                last[c] = int(np.floor((max(p, q) + margin - low[c]) / cell))
-            if piece == 0:
-                corners[n] = first
-            else:
-                corners[n, 0] = _LONG
+                cell = _cell(at, segments, n, part, pieces, grid, c)
+                first[c], last[c] = max(cell - 1, 0) // _BLOCK, (cell + 1) // _BLOCK
             for i in range(first[0], last[0] + 1):
                 for j in range(first[1], last[1] + 1):
                     for k in range(first[2], last[2] + 1):
-                        # pieces follow a line, so that a cell of an earlier piece is also one of the last piece
-                        if (
-                            piece
-                            and before[0, 0] <= i <= before[1, 0]
-                            and before[0, 1] <= j <= before[1, 1]
-                            and before[0, 2] <= k <= before[1, 2]
-                        ):
+                        holder = _holder(i * _BLOCK, j * _BLOCK, k * _BLOCK, grid.ranks[0])
+                        if seen[holder] == n:
                             continue
-                        holder = 0
-                        if size > 1:
-                            holder = _mixed(_key(i // _BLOCK, j // _BLOCK, k // _BLOCK)) % size
-                        if rank >= 0 and holder != rank:
-                            continue
-                        key = holder if rank < 0 else _key(i, j, k)
-                        at = count
-                        if len(buckets):
-                            bucket = _mixed(key) & (len(buckets) - 1)
-                            at = buckets[bucket]
-                            buckets[bucket] += 1
-                        if len(keys):
-                            keys[at] = key
-                            rows[at] = n
+                        seen[holder] = n
+                        if len(rows):
+                            ranks[count] = holder
+                            rows[count] = n
                         count += 1
-            before[0] = first
-            before[1] = last
     return count
+
+
+@kernel
+def _sort_planes(at, segments, grid, starts, listed):
+    """Write the rows of segments, and their pieces if some have several, to the places of their planes, ``starts``
+    (planes,), which move on; without arrays, they are counted. Returns whether some segments have several pieces."""
+    rows, parts = listed
+    long = False
+    for n in range(len(segments.ids)):
+        pieces = _pieces(at, segments, n, grid.longest, grid.skin)
+        long |= pieces > 1
+        for part in range(pieces):
+            plane = _cell(at, segments, n, part, pieces, grid, grid.axes[0])
+            if len(rows) == 0:
+                starts[plane] += 1
+                continue
+            rows[starts[plane]] = n
+            if len(parts) > 0:
+                parts[starts[plane]] = part
+            starts[plane] += 1
+    return long
+
+
+@borrowing
+def _sort(work, which, count, most):
+    """Sort ``count`` keys, from 0 to ``most``, and places of a plane, stably."""
+    keys, order, other_keys, other_order = work.keys[which], work.rows[which], work.keys[2], work.rows[2]
+    places = work.digits
+    bits = 0
+    while most >> bits:
+        bits += 1
+    passes = -(-bits // _DIGIT)
+    for turn in range(passes):
+        width = -(-bits // passes)
+        shift, mask = turn * width, (1 << width) - 1
+        for digit in range(mask + 2):
+            places[digit] = 0
+        for i in range(count):
+            places[((keys[i] >> shift) & mask) + 1] += 1
+        for digit in range(mask + 1):
+            places[digit + 1] += places[digit]
+        for i in range(count):
+            digit = (keys[i] >> shift) & mask
+            other_keys[places[digit]] = keys[i]
+            other_order[places[digit]] = order[i]
+            places[digit] += 1
+        for i in range(count):
+            keys[i] = other_keys[i]
+            order[i] = other_order[i]
+
+
+@borrowing
+def _load(plane, planes, points, held, grid, work, which):
+    """Sort the pieces of a plane by rows and cells; write their keys, rows, pieces, boxes and the marks of their ends.
+    Returns how many."""
+    at, rows, parts = points.at, planes.rows, planes.parts
+    first, count = planes.starts[plane], planes.starts[plane + 1] - planes.starts[plane]
+    keys, places, some = work.keys[which], work.rows[which], work.parts[which]
+    boxes, lines, ends = work.boxes, work.lines, work.ends
+    wide = grid.count[grid.axes[2]] + 2
+    most = np.int64(0)
+    for i in range(count):
+        n = rows[first + i]
+        part = parts[first + i] if len(parts) > 0 else 0
+        pieces = _pieces(at, held, n, grid.longest, grid.skin)
+        row = _cell(at, held, n, part, pieces, grid, grid.axes[1]) + 1
+        keys[i] = row * wide + _cell(at, held, n, part, pieces, grid, grid.axes[2]) + 1
+        most = max(most, keys[i])
+        places[i] = first + i
+    _sort(work, which, count, most)
+    for i in range(count):
+        place = places[i]
+        n = rows[place]
+        part = parts[place] if len(parts) > 0 else 0
+        pieces = _pieces(at, held, n, grid.longest, grid.skin)
+        a, b = held.points[n, 0], held.points[n, 1]
+        places[i] = n
+        some[i] = part
+        ends[which, 0, i], ends[which, 1, i] = planes.marks[a], planes.marks[b]
+        slack, at_line = 0.0, which * work.rows.shape[1] + i
+        margin = (held.margin[n] + 0.5 * grid.skin) / grid.unit
+        square = 0.0
+        for c in range(3):
+            way = (at[b, c] - at[a, c]) / pieces / grid.unit
+            p = (at[a, c] - grid.low[c]) / grid.unit + part * way
+            q = p + way
+            # in single precision, boxes are rounded outwards
+            slack = max(slack, 2e-7 * (max(abs(p), abs(q)) + 1.0))
+            boxes[which, c, i] = min(p, q) - margin - slack
+            boxes[which, 3 + c, i] = max(p, q) + margin + slack
+            lines[at_line, c], lines[at_line, 3 + c] = 0.5 * (p + q), way
+            square += way * way
+        lines[at_line, 6], lines[at_line, 7] = margin + slack, np.sqrt(square)
+    return count
+
+
+@borrowing_apart
+def _meet(boxes, ends, which, first, count, box, one, other, near):
+    """Write to ``near`` which of the boxes from ``first`` on meet a ``box`` of six numbers and share no end with it."""
+    low_x, low_y, low_z = boxes[which, 0, first:], boxes[which, 1, first:], boxes[which, 2, first:]
+    high_x, high_y, high_z = boxes[which, 3, first:], boxes[which, 4, first:], boxes[which, 5, first:]
+    a, b = ends[which, 0, first:], ends[which, 1, first:]
+    for i in range(count):
+        meets = (low_x[i] <= box[3]) & (low_y[i] <= box[4]) & (low_z[i] <= box[5])
+        meets &= (high_x[i] >= box[0]) & (high_y[i] >= box[1]) & (high_z[i] >= box[2])
+        meets &= (a[i] != one) & (a[i] != other) & (b[i] != one) & (b[i] != other)
+        near[i] = meets
 
 
 @inlined
@@ -210,7 +448,7 @@ def _clip(value):
 
 
 @inlined
-def _closest(ends, a, b):
+def _closest(at, points, a, b):
     """Return the parameters from 0 to 1 of the closest points of segments ``a`` and ``b``.
 
     Source: Ericson, Real-time collision detection (2005), 5.1.9.
@@ -221,9 +459,9 @@ def _closest(ends, a, b):
     ar = 0.0
     br = 0.0
     for c in range(3):
-        u = ends[a, 1, c] - ends[a, 0, c]
-        v = ends[b, 1, c] - ends[b, 0, c]
-        w = ends[a, 0, c] - ends[b, 0, c]
+        u = at[points[a, 1], c] - at[points[a, 0], c]
+        v = at[points[b, 1], c] - at[points[b, 0], c]
+        w = at[points[a, 0], c] - at[points[b, 0], c]
         aa += u * u
         bb += v * v
         ab += u * v
@@ -244,88 +482,221 @@ def _closest(ends, a, b):
 
 
 @inlined
-def _meet(keys, boxes, i, near):
-    """Write the segments of a bucket behind segment ``i`` whose cell is the same and whose ``boxes`` (6, n), components
-    of the lower and the upper corner, meet its own to ``near`` (n,); return how many. Without branches."""
-    low_x, low_y, low_z, high_x, high_y, high_z = boxes[:, i]
-    count = 0
-    for j in range(i + 1, len(keys)):
-        near[count] = j
-        meets = (boxes[0, j] <= high_x) & (boxes[1, j] <= high_y) & (boxes[2, j] <= high_z)
-        meets &= (boxes[3, j] >= low_x) & (boxes[4, j] >= low_y) & (boxes[5, j] >= low_z)
-        count += meets & (keys[j] == keys[i])
-    return count
+def _distance(at, points, a, b):
+    """Return the distance of segments ``a`` and ``b`` [m], and where they are closest."""
+    s, t = _closest(at, points, a, b)
+    square = 0.0
+    for c in range(3):
+        first = at[points[a, 0], c] + s * (at[points[a, 1], c] - at[points[a, 0], c])
+        way = at[points[b, 0], c] + t * (at[points[b, 1], c] - at[points[b, 0], c]) - first
+        square += way * way
+    return np.sqrt(square), s, t
 
 
-@inlined
-def _common(labels, a, b):
-    common = False
-    for m in range(labels.shape[1]):
-        for n in range(labels.shape[1]):
-            common |= labels[a, m] == labels[b, n]
-    return common
+@borrowing_apart
+def _compare_lines(lines, this, hits, count, near):
+    """Write to ``near`` whether a piece ``this`` may be close to each of ``count`` others, ``hits``; all in ``lines``.
 
-
-@kernel
-def _compare(state, buckets, held, grid, out):
-    """Write the rows of segments that are pairs, where they are closest, and their distances; return how many.
-
-    Starts at a place of a bucket, ``state`` (2,), and leaves there where it goes on after the arrays are full.
+    Otherwise they are certainly apart: along the normal of both, along one of them, or across one of them in the plane
+    of both (separating axes). In single precision and without divisions.
     """
-    start, keys, rows, corners = buckets
-    ids, labels, ends, margin = held
-    low, cell, between = grid
-    found_rows, found_at, found_distance = out
-    found = 0
-    place, first, way = np.empty(3, np.int64), np.empty(3), np.empty(3)
-    most = (start[1:] - start[:-1]).max()
-    boxes, near = np.empty((6, most)), np.empty(most, np.int64)
-    for bucket in range(state[0], len(start) - 1):
-        begin, end = start[bucket], start[bucket + 1]
-        for p in range(begin, end):
-            one = rows[p]
-            more = margin[one] + 1e-9 * cell
-            for c in range(3):
-                boxes[c, p - begin] = min(ends[one, 0, c], ends[one, 1, c]) - more
-                boxes[3 + c, p - begin] = max(ends[one, 0, c], ends[one, 1, c]) + more
-        for p in range(max(begin, state[1]), end):
-            if found + end - p > len(found_rows):
-                state[0] = bucket
-                state[1] = p
-                return found
-            key, one = keys[p], rows[p]
-            for j in range(_meet(keys[begin:end], boxes, p - begin, near)):
-                two = rows[begin + near[j]]
-                corner = max(corners[one, 0], corners[two, 0])
-                y, z = max(corners[one, 1], corners[two, 1]), max(corners[one, 2], corners[two, 2])
-                if corner < _LONG and _key(corner, y, z) != key:
-                    continue
-                # rounding must not depend on the order of the segments, which depends on the ranks
-                a, b = (one, two) if ids[one] < ids[two] else (two, one)
-                if between and (ids[a] >= _SECOND or ids[b] < _SECOND):
-                    continue
-                if _common(labels, a, b):
-                    continue
-                reach = margin[a] + margin[b]
-                s, t = _closest(ends, a, b)
-                square = 0.0
-                for c in range(3):
-                    first[c] = ends[a, 0, c] + s * (ends[a, 1, c] - ends[a, 0, c])
-                    way[c] = ends[b, 0, c] + t * (ends[b, 1, c] - ends[b, 0, c]) - first[c]
-                    square += way[c] * way[c]
-                if square > reach * reach:
-                    continue
-                if corner == _LONG:
-                    part = margin[a] / reach if reach > 0.0 else 0.5
-                    for c in range(3):
-                        place[c] = int(np.floor((first[c] + way[c] * part - low[c]) / cell))
-                    if _key(place[0], place[1], place[2]) != key:
-                        continue
-                found_rows[found, 0] = a
-                found_rows[found, 1] = b
-                found_at[found, 0] = s
-                found_at[found, 1] = t
-                found_distance[found] = np.sqrt(square)
-                found += 1
-    state[0] = len(start) - 1
+    x, y, z = lines[this, 0], lines[this, 1], lines[this, 2]
+    ux, uy, uz = lines[this, 3], lines[this, 4], lines[this, 5]
+    margin, u = lines[this, 6] + _SLACK, lines[this, 7]
+    for k in range(count):
+        hit = hits[k]
+        wx, wy, wz = lines[hit, 0] - x, lines[hit, 1] - y, lines[hit, 2] - z
+        vx, vy, vz = lines[hit, 3], lines[hit, 4], lines[hit, 5]
+        reach, v = margin + lines[hit, 6], lines[hit, 7]
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        square = nx * nx + ny * ny + nz * nz
+        n = np.sqrt(square)
+        uv, uw, vw = ux * vx + uy * vy + uz * vz, ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
+        rounding = _SLACK * u * v
+        close = abs(nx * wx + ny * wy + nz * wz) <= reach * n + rounding
+        close &= abs(uw) <= _HALF * (u * u + abs(uv)) + reach * u
+        close &= abs(vw) <= _HALF * (v * v + abs(uv)) + reach * v
+        close &= abs(u * u * vw - uv * uw) <= _HALF * square + (reach * n + rounding) * u
+        close &= abs(v * v * uw - uv * vw) <= _HALF * square + (reach * n + rounding) * v
+        near[k] = close | (u * v < _TINY)
+
+
+@borrowing
+def _examine(points, held, grid, factor, one, two, found, out):
+    """Return 1 if two pieces, (row, piece) each, are those of a pair, which is written if there is room for it."""
+    # rounding must not depend on the order of the segments, which depends on the ranks
+    forth = held.ids[one[0]] < held.ids[two[0]]
+    if len(held.kind) > 0:
+        kind, other = held.kind[one[0]], held.kind[two[0]]
+        if kind == other and kind > 0:
+            return 0
+        forth = forth if kind == other else kind < other
+    (i, part_i), (j, part_j) = (one, two) if forth else (two, one)
+    if i == j:
+        return 0
+    reach = held.margin[i] + held.margin[j]
+    distance, s, t = _distance(points.at, held.points, i, j)
+    beyond = distance - reach
+    if beyond > grid.skin:
+        return 0
+    out.gap[0] = min(out.gap[0], abs(beyond))
+    if not beyond < 0.0:
+        return 0
+    pieces = _pieces(points.at, held, i, grid.longest, grid.skin)
+    others = _pieces(points.at, held, j, grid.longest, grid.skin)
+    if min(int(s * pieces), pieces - 1) != part_i or min(int(t * others), others - 1) != part_j:
+        return 0  # of other pieces
+    if len(points.before) > 0:
+        distance, _, _ = _distance(points.before, held.points, i, j)
+        if distance < factor * reach:
+            return 0
+    if found < len(out.rows):
+        out.rows[found, 0], out.rows[found, 1] = i, j
+        out.at[found, 0], out.at[found, 1] = s, t
+    return 1
+
+
+@borrowing
+def _find_ranges(work, key, wide, this, here, other, there):
+    """Move the ranges of the cells around a cell: behind it in its row, in the next row, and in three rows of the next
+    plane; in each row the cell before, beside, and after it, as four bounds."""
+    for j in range(5):
+        which, most = (this, here) if j < 2 else (other, there)
+        middle = key + (j if j < 2 else j - 3) * wide
+        for bound in range(4):
+            at = work.bounds[j, bound]
+            while at < most and work.keys[which, at] < middle - 1 + bound:
+                at += 1
+            work.bounds[j, bound] = at
+
+
+@borrowing_apart
+def _pick(words, count, place, hits, found, places, numbers):
+    """Append the places of the bytes that are 1, of ``count`` in ``words``, to those ``found``; return how many."""
+    for word in range((count + 7) // 8):
+        bits = np.int64((words[word] * np.uint64(0x0102040810204080)) >> np.uint64(56))
+        if 8 * word + 8 > count:
+            bits &= (1 << (count - 8 * word)) - 1
+        for k in range(8):
+            hits[found + k] = place + places[bits, k]
+        found += numbers[bits]
+        place += 8
     return found
+
+
+@borrowing
+def _collect(work, i, this, sides):
+    """Write the places of pieces that are not certainly apart from a piece ``i`` of ``this`` plane to ``work.hits``;
+    return how many. ``sides``: whether it reaches the next plane, the row before and after, the cell before and after.
+    Without branches that depend on single boxes, which cost more than the comparisons."""
+    boxes, hits, near, width = work.boxes, work.hits, work.near, work.rows.shape[1]
+    box = (
+        boxes[this, 0, i],
+        boxes[this, 1, i],
+        boxes[this, 2, i],
+        boxes[this, 3, i],
+        boxes[this, 4, i],
+        boxes[this, 5, i],
+    )
+    one, other = work.ends[this, 0, i], work.ends[this, 1, i]
+    ahead, before, after, low, high = sides
+    found = 0
+    for j in range(5):
+        if (j > 1 and not ahead) or (j == 2 and not before) or ((j == 1 or j == 4) and not after):
+            continue
+        which = this if j < 2 else 1 - this
+        start = work.bounds[j, 0 if low else 1] if j > 0 else i + 1
+        count = work.bounds[j, 3 if high else 2] - start
+        if count <= 0:
+            continue
+        _meet(boxes, work.ends, which, start, (count + _LANES - 1) // _LANES * _LANES, box, one, other, near)
+        found = _pick(work.words, count, which * width + start, hits, found, _PLACES, _NUMBERS)
+    _compare_lines(work.lines, this * width + i, hits, found, near)
+    count, found = found, 0
+    for k in range(count):
+        hits[found] = hits[k]
+        found += near[k]
+    return found
+
+
+@borrowing_kernel
+def _compare_planes(state, planes, points, held, grid, options, work, out):
+    """Write the rows of segments that are pairs, and where they are closest; return how many.
+
+    ``options``: the factor of margins before, and the most comparisons.
+    ``state`` (3,): the plane to start at, and where to go on after the arrays are full; the pairs for which there must
+    be room then; the number of comparisons.
+    """
+    starts, bounds, boxes = planes.starts, work.bounds, work.boxes
+    across, rows, along = grid.axes
+    wide, width = grid.count[along] + 2, work.rows.shape[1]
+    loaded = -1
+    found = 0
+    here = there = 0
+    for plane in range(state[0], len(starts) - 1):
+        if starts[plane + 1] == starts[plane]:
+            continue
+        begun, before = found, state[2]
+        this, other = plane % 2, (plane + 1) % 2
+        here = there if loaded == plane else _load(plane, planes, points, held, grid, work, this)
+        there = 0
+        if plane + 2 < len(starts):
+            there = _load(plane + 1, planes, points, held, grid, work, other)
+        loaded = plane + 1
+        bounds[:] = 0
+        first = 0
+        while first < here:
+            key = work.keys[this, first]
+            begin = first
+            while first < here and work.keys[this, first] == key:
+                first += 1
+            row, cell = key // wide - 1, key % wide - 1
+            _find_ranges(work, key, wide, this, here, other, there)
+            if grid.ranks[0] > 1 and not _is_here(plane, row, cell, grid):
+                continue
+            state[2] += (first - begin) * (first - begin - 1) // 2 + (first - begin) * (bounds[0, 3] - first)
+            for j in range(1, 5):
+                state[2] += (first - begin) * (bounds[j, 3] - bounds[j, 0])
+            if state[2] > options[1]:
+                return found
+            for i in range(begin, first):
+                sides = (
+                    _reaches(boxes[this, 3 + across, i], plane, 1, grid, across),
+                    _reaches(boxes[this, rows, i], row, 0, grid, rows),
+                    _reaches(boxes[this, 3 + rows, i], row, 1, grid, rows),
+                    _reaches(boxes[this, along, i], cell, 0, grid, along),
+                    _reaches(boxes[this, 3 + along, i], cell, 1, grid, along),
+                )
+                for hit in range(_collect(work, i, this, sides)):
+                    which = work.hits[hit] // width
+                    place = work.hits[hit] - which * width
+                    one = work.rows[this, i], work.parts[this, i]
+                    two = work.rows[which, place], work.parts[which, place]
+                    found += _examine(points, held, grid, options[0], one, two, found, out)
+        if found > len(out.rows):
+            state[0], state[1], state[2] = plane, 2 * (found - begun), before
+            return begun
+    state[0] = len(starts) - 1
+    return found
+
+
+@borrowing
+def _reaches(side, cell, upper, grid, axis):
+    """Return whether a box with a ``side`` may meet pieces of the cell before or, if ``upper``, after its own."""
+    border = (cell + upper) / (grid.inverse[axis] * grid.unit)
+    reach = grid.extents[axis] / grid.unit * (1.0 + 1e-6) + 1e-3 + 1e-6 * border
+    return side + reach >= border if upper else side - reach <= border
+
+
+@borrowing
+def _is_here(plane, row, along, grid):
+    """Return whether a cell belongs to this rank."""
+    i = j = k = np.int64(0)
+    for axis, number in ((grid.axes[0], plane), (grid.axes[1], row), (grid.axes[2], along)):
+        if axis == 0:
+            i = number
+        elif axis == 1:
+            j = number
+        else:
+            k = number
+    return _holder(i, j, k, grid.ranks[0]) == grid.ranks[1]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.neighbours import NeighbourSearch, Segments
+from ..contact.neighbours import Points, Segments, find_pairs
 from ..mechanics.compiled import kernel
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
@@ -85,25 +85,24 @@ class Geometry:
         mesh, comm = self._mesh, self._comm
         bars = np.arange(len(mesh.bars))[mesh.counted]
         bars = bars[mesh.bar_ids[bars] < mesh.n_bars - mesh.n_connectors]
-        ends, ids = mesh.points[mesh.bars[bars]], mesh.node_ids[: mesh.n_owned].astype(np.int64)
-        margin = _NEAR * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-        labels = mesh.node_ids[mesh.bars[bars]].astype(np.int64)
-        own = Segments(mesh.bar_ids[bars].astype(np.int64), labels, ends, margin)
-        at = np.repeat(mesh.points[: mesh.n_owned, None], 2, axis=1)
-        nodes = Segments(ids, np.stack([ids, ids], axis=1), at, np.zeros(len(ids)))
-        search = NeighbourSearch(comm, own, nodes)
-        if search.crowded:
+        own = np.arange(mesh.n_owned, dtype=np.int32)
+        segments = Segments(
+            np.concatenate([mesh.bar_ids[bars], mesh.node_ids[own]]),
+            np.concatenate([mesh.bars[bars], np.stack([own, own], axis=1)]),
+            np.concatenate([_NEAR * self._model.bars.mesh_lengths[bars], np.zeros(len(own))]),
+            np.repeat(np.array([1, 2], np.uint8), [len(bars), len(own)]),
+        )
+        pairs = find_pairs(comm, Points(mesh.points, mesh.node_ids), segments)
+        if pairs is None:
             return None
-        between, on_bars, twins = 0, [], np.empty((0, 2), np.int64)
-        for pairs in search.pairs():
-            part = pairs.at[:, 0]
-            inner = (part > _NEAR) & (part < 1.0 - _NEAR)
-            between += int(inner.sum())
-            rows = np.concatenate([pairs.ids, pairs.labels[:, 0]], axis=1)[inner]
-            on_bars = sorted(on_bars + rows.tolist())[:_SHOWN]
-            end = pairs.labels[np.arange(len(part)), 0, (part > 0.5).astype(np.int64)]
-            met = np.sort(np.stack([end, pairs.ids[:, 1]], axis=1)[~inner], axis=1)
-            twins = np.unique(np.concatenate([twins, met]), axis=0)  # one for each bar of its nodes
+        part = pairs.at[:, 0]
+        inner = (part > _NEAR) & (part < 1.0 - _NEAR)
+        between = int(inner.sum())
+        rows = np.concatenate([pairs.ids, pairs.names[:, 0]], axis=1)[inner]
+        on_bars = sorted(rows.tolist())[:_SHOWN]
+        end = pairs.names[np.arange(len(part)), 0, (part > 0.5).astype(np.int64)]
+        # one for each bar of its nodes
+        twins = np.unique(np.sort(np.stack([end, pairs.ids[:, 1]], axis=1)[~inner], axis=1), axis=0)
         alike = np.unique(twins)
         alike = np.unique(Router(comm, slab_of(alike, mesh.n_nodes, comm.size)).send(alike))
         every = sorted(row for some in comm.allgather(on_bars) for row in some)[:_SHOWN]

@@ -66,6 +66,18 @@ def test_pairs_are_those_of_every_pair_compared(seed, longest, comm):
     assert CrossingBars(model).find(model.mesh.points + 1e3).pairs == 0
 
 
+def test_pairs_that_cross_in_the_mesh_do_not_count_wherever_they_are(comm):
+    """A bracing whose bars cross in the mesh, and a third bar that moves into both of them."""
+    points = np.array([[0.0, 0, 0], [1, 1, 0], [1, 0, 0.03], [0, 1, 0.03], [0.5, 0.5, 5.0], [0.5, 0.6, 6.0]])
+    model = Model(rods(points, np.array([[0, 1], [2, 3], [4, 5]]), 0.02), comm)
+    search = CrossingBars(model)
+    assert search.find(model.mesh.points).pairs == 0
+    moved = points + [0.0, 0.0, 1.0]
+    moved[0], moved[4], moved[5] = [0.0, 0.0, 1.01], [0.5, 0.5, 0.5], [0.5, 0.5, 1.5]
+    assert search.find(moved[model.mesh.node_ids]) == (2, 3, (0, 2))
+    assert search.find(model.mesh.points).pairs == 0
+
+
 def falling_onto(others):
     """A bar that falls through one at rest at 1 m/s, between 0.38 s and 0.62 s, and others far away; a snapshot every
     0.1 s."""

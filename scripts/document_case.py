@@ -97,7 +97,7 @@ def rows(model: type[StrictModel], without: Any = ()) -> tuple[list[list[str]], 
     for key, field in model.model_fields.items():
         if key in without or key == getattr(model, "slot", None):
             continue
-        unit, text = _unit(_plain(field.description or ""))
+        unit, text = _unit(_plain(model.description(key)))
         lines.append([f"`{key}`", type_text(field.annotation, field.metadata), unit, _default(field), text])
         inner += [(key, nested) for nested in _models(field.annotation)]
     return lines, inner

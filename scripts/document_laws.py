@@ -34,14 +34,14 @@ def text_of(name: str) -> str:
 
 def undocumented(name: str) -> list[str]:
     """Return the keys of a law that have no text."""
-    fields = lookup(LAWS, name, "").Parameters.model_fields
-    return [key for key, field in fields.items() if not (field.description or "").strip()]
+    model = lookup(LAWS, name, "").Parameters
+    return [key for key in model.model_fields if not model.description(key)]
 
 
 def _table(head: str, model: type[MaterialKeys], without: Any) -> str:
     rows = []
     for key, field in model.model_fields.items():
-        text = " ".join((field.description or "").split()).replace("``", "`").replace("|", "\\|")
+        text = " ".join(model.description(key).split()).replace("``", "`").replace("|", "\\|")
         rows.append([f"`{key}`", _default(field.default), text])
     rows = [row for row in rows if row[0].strip("`") not in without]
     return markdown([head, "default", ""], rows) + "\n\n"

@@ -6,8 +6,13 @@ with the name of the key before any work is done.
 
 from __future__ import annotations
 
+import ast
+import inspect
 import sys
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Protocol, TypeVar
 
@@ -48,6 +53,20 @@ def refusal(*problems: tuple[tuple[str | int, ...], str, Any]) -> ValidationErro
     return ValidationError.from_exception_data("case", details)
 
 
+@cache
+def _texts(model: type) -> dict[str, str]:
+    """Return the texts below the keys of a model, from its source, which is read only when they are needed."""
+    try:
+        body = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0].body
+    except (OSError, TypeError):
+        return {}
+    return {
+        one.target.id: inspect.cleandoc(text.value.value)
+        for one, text in pairwise(body)
+        if isinstance(one, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
+    }
+
+
 class StrictModel(BaseModel):
     """A table of a case file: no unknown keys, values of the stated type only, finite numbers only.
 
@@ -58,14 +77,18 @@ class StrictModel(BaseModel):
 
     __slots__ = ("_place",)
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False, defer_build=True)
 
     exactly_one: ClassVar[tuple[tuple[str, ...], ...]] = ()
     """Groups of keys, of each of which the table has exactly one."""
     at_most_one: ClassVar[tuple[tuple[str, ...], ...]] = ()
     """Groups of keys, of each of which the table has at most one."""
+
+    @classmethod
+    def description(cls, key: str) -> str:
+        """Return the text below a key in the class that declares it, or ""."""
+        owner = next((base for base in cls.__mro__ if key in base.__dict__.get("__annotations__", {})), cls)
+        return _texts(owner).get(key, "")
 
     @model_validator(mode="after")
     def _as_many_as_allowed(self) -> StrictModel:

@@ -77,9 +77,7 @@ class Problems:
     def _describe(self, owner: Owner, item: Any, place: Callable[[KeyPath], KeyPath]) -> None:
         where, field = place(owner.path), owner.field
         kind, value, context = item["type"], item["input"], item.get("ctx", {})
-        about = (
-            f" ({' '.join(field.description.split()).rstrip('.')})" if field is not None and field.description else ""
-        )
+        about = f" ({' '.join(owner.about.split()).rstrip('.')})" if owner.about else ""
         if kind == "extra_forbidden":
             text = owner.unknown(str(where[-1]))
             if owner.taker and where not in self.overridden and any(p[:-1] == where[:-1] for p in self.overridden):
@@ -113,6 +111,7 @@ class Owner(NamedTuple):
     path : of the key in the case
     taker : what has these keys, if they are those of a module found by name
     family : to which the module belongs
+    about : text of the field
     """
 
     model: type[StrictModel]
@@ -120,6 +119,7 @@ class Owner(NamedTuple):
     path: KeyPath
     taker: str = ""
     family: Family | None = None
+    about: str = ""
 
     def unknown(self, key: str) -> str:
         """Return the message for a key that the table does not have."""
@@ -146,7 +146,7 @@ def _owner(model: type[StrictModel], loc: KeyPath, data: Any) -> Owner:
             continue
         many, models, chosen = shape_of(field)
         data = data if inner else _item(data, part)
-        owner = owner._replace(field=field)
+        owner = owner._replace(field=field, about=owner.model.description(str(part)))
         if many is not None and models and rest:
             data = _item(data, rest[0])
             owner = owner._replace(path=(*owner.path, rest.pop(0)))

@@ -15,12 +15,14 @@ from typing import Any
 
 import numba
 import numpy as np
+from llvmlite.binding import parse_assembly, parse_bitcode
 from numba.core import errors, event, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.cpu import CPUTargetOptions
 from numba.core.dispatcher import Dispatcher
 from numba.core.options import TargetOptions
 from numba.core.registry import cpu_target
+from numba.core.runtime import rtsys
 from numba.extending import _Intrinsic, intrinsic, register_jitable
 
 
@@ -110,6 +112,8 @@ CPUTargetOptions.noalias = TargetOptions.Mapping("noalias")  # a flag of Numba's
 
 COMPILED = not numba.config.DISABLE_JIT
 """Whether loops are compiled, so that others can call them by their addresses."""
+
+_FORMAT = 2  # of cached files
 
 _LONGEST = 130  # characters in the names of cached files for a variant of a loop; file systems take 255 in all
 
@@ -286,6 +290,45 @@ class _Cache(FunctionCache):
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
         return signature, codegen.magic_tuple()
 
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load machine code as Numba does, but without what only compilation needs: implementations of all functions,
+        whose modules take longer to import than everything else, and what others would inline."""
+        rtsys.initialize(target_context)
+        codegen = target_context.codegen()
+        found = self._cache_file.load(self._index_key(sig, codegen))
+        if found is None:
+            return None
+        *reduced, inlined_code, symbols = found
+        codegen._engine._defined_symbols |= symbols
+        compiled = self._impl.rebuild(target_context, reduced)
+        _parse_later(compiled.library, inlined_code)
+        return compiled
+
+    def _save_overload(self, sig: Any, data: Any) -> None:
+        """Save machine code as Numba does, but apart from the code that others inline, and without empty environments,
+        whose modules each start would import."""
+        if not self._impl.check_cachable(data):
+            return
+        self._impl.locator.ensure_cache_path()
+        (name, kind, (machine_code, inlined_code)), *parts, environments = self._impl.reduce(data)
+        library = name, kind, (machine_code, parse_assembly("").as_bitcode())
+        kept = tuple(one for one in environments if one.consts)
+        module = data.library._get_module_for_linking()
+        named = (one for kind in (module.functions, module.global_variables) for one in kind)
+        symbols = {one.name for one in named if not one.is_declaration}
+        self._cache_file.save(self._index_key(sig, data.codegen), (library, *parts, kept, inlined_code, symbols))
+
+
+def _parse_later(library: Any, code: bytes) -> None:
+    """Give a library of machine code the code that others inline, which is parsed when one does."""
+
+    def module() -> Any:
+        del library._get_module_for_linking
+        library._shared_module = parse_bitcode(code)
+        return library._get_module_for_linking()
+
+    library._get_module_for_linking = module
+
 
 class _CacheFile(IndexDataCacheFile):
     """Index of the machine code of one loop on disk, valid for the byte code it was compiled from, in whatever file.
@@ -319,7 +362,7 @@ class _CacheFile(IndexDataCacheFile):
         # computed late: when the loop is defined, functions below it in its file do not exist yet
         if self._digest is None:
             # the name distinguishes machine code from that of versions whose closures had names in common
-            self._digest = f"{self._function.__qualname__} {code_digest(self._function)}"
+            self._digest = f"{_FORMAT} {self._function.__qualname__} {code_digest(self._function)}"
         return self._digest
 
     @_source_stamp.setter

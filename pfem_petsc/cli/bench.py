@@ -60,7 +60,9 @@ ARGUMENTS = (
     argument("--history-every", metavar="N", type=_size, default=1, help="steps between rows of the history"),
     argument("--seconds", metavar="T", type=float, default=2.0, help="approximate time for each job"),
     argument(
-        "--compile", action="store_true", help="only compile the loops of the jobs for later runs; measure nothing"
+        "--compile",
+        action="store_true",
+        help="only compile the loops of the jobs and of all material laws for later runs; measure nothing",
     ),
     argument("-o", "--output", metavar="FILE", type=Path, help="write all figures as JSON"),
 )
@@ -70,6 +72,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     """Measure and print. Collective."""
     start_petsc(arguments.petsc_options, comm.rank)
     from ..bench import report
+    from ..bench.compilation import compile_loops
     from ..bench.measure import time_job
     from ..parallel.agreement import on_root
 
@@ -85,13 +88,13 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     chosen = jobs(
         arguments.jobs, explicit, arguments.implicit, arguments.mass, arguments.plastic, arguments.history_every
     )
-    begin = time.perf_counter()
-    for job in chosen:  # compile or load kernels and start libraries before the measurements
-        time_job(job, kind, 2, comm, None, 0.0)
     if arguments.compile:
-        time_job(tiny_jobs(explicit)[0], "cubic", 2, comm, None, 0.0, 3000)
+        begin = time.perf_counter()
+        compile_loops(chosen, kind, explicit, comm)
         say(f"loops for this machine are compiled: {time.perf_counter() - begin:.1f} s")
         return 0
+    for job in chosen:  # compile or load kernels and start libraries before the measurements
+        time_job(job, kind, 2, comm, None, 0.0)
     title = f"{report.processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {kind} lattices"
     say(title)
     bandwidth = report.measure_bandwidth(comm)

@@ -13,6 +13,7 @@ from helpers.pages import run
 from helpers.stopped import assert_restart_is_bitwise
 
 from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.case import base
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 
@@ -166,8 +167,8 @@ def test_keys_of_a_law_are_documented_by_their_texts(examples, monkeypatch):
         assert re.search(rf"^\| `{key}` \| \S+ \| .*{re.escape(unit)}\.? \|$", text, flags=re.MULTILINE), key
     assert "`dissipated_density` [J/m³]" in text
     assert undocumented("viscoplastic") == []
-    module = importlib.import_module("pfem_petsc.mechanics.materials.viscoplastic")
-    monkeypatch.setattr(module.Parameters.model_fields["viscosity"], "description", None)
+    texts = base._texts
+    monkeypatch.setattr(base, "_texts", lambda model: {**texts(model), "viscosity": ""})
     assert undocumented("viscoplastic") == ["viscosity"]
 
 

@@ -1,0 +1,59 @@
+"""Compiles the loops that first runs need: those of the jobs of the benchmark, and of all material laws."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from mpi4py import MPI
+
+from ..case.schema import Case
+from ..mechanics.materials.base import LAWS, MaterialKeys
+from ..registry import choices, lookup
+from ..simulation import Simulation
+from .measure import DENSITY, YOUNG_MODULUS, Job, time_job, tiny_jobs
+
+
+def compile_loops(jobs: list[Job], kind: str, explicit: str, comm: MPI.Comm) -> None:
+    """Make a few steps of each job on a lattice of a ``kind``, and ``explicit`` steps of each law; the ranks share
+    them. Collective."""
+    own: list[Callable[[], Any]] = [
+        *(partial(time_job, job, kind, 2, MPI.COMM_SELF, None, 0.0) for job in jobs),
+        partial(time_job, tiny_jobs(explicit)[0], "cubic", 2, MPI.COMM_SELF, None, 0.0, 3000),
+    ]
+    laws = [partial(_run, name, explicit) for name in choices(LAWS)]
+    shares = [own + laws] if comm.size == 1 else [own, *(laws[k :: comm.size - 1] for k in range(comm.size - 1))]
+    for make in shares[comm.rank]:
+        make()
+    comm.Barrier()
+    if comm.size > 1:
+        time_job(jobs[0], kind, 2, comm, None, 0.0)
+
+
+def law_case(name: str, explicit: str) -> Case:
+    """Return a case with a law, on a floor; keys that the law needs are 1 in SI units, which all laws accept."""
+    model = lookup(LAWS, name, "").Parameters
+    own = {key: field for key, field in model.model_fields.items() if key not in MaterialKeys.model_fields}
+    material: dict[str, Any] = {"law": name, "young_modulus": YOUNG_MODULUS, "density": DENSITY}
+    for key, field in own.items():
+        if field.is_required() and key not in material:
+            material[key] = 1.0 if field.annotation is float else [[1.0 / YOUNG_MODULUS, 1.0]]
+    table = {
+        "mesh": {"generator": "lattice", "kind": "cubic", "cells": [2, 2, 2], "pitch": 1.0},
+        "material": {"it": material},
+        "section": {"all": {"area": 1e-4, "shape": "round", "material": "it"}},
+        "initial": {"velocity": [0.0, 0.0, -1.0]},
+        "wall": [{"name": "floor", "type": "plane", "point": [0.0, 0.0, -1.0], "normal": [0.0, 0.0, 1.0]}],
+        "time": {"integrator": explicit, "step": 1e-6, "end": 2e-6},
+    }
+    return Case.from_dict(table, source=name)
+
+
+def _run(law: str, explicit: str) -> None:
+    told = io.StringIO()  # warnings about values that nobody means
+    with tempfile.TemporaryDirectory(prefix="pfem_compile_") as folder, contextlib.redirect_stderr(told):
+        Simulation(law_case(law, explicit), MPI.COMM_SELF, output=folder, quiet=True).run()

@@ -517,14 +517,24 @@ class Bars:
 
     def radii(self) -> np.ndarray:
         """Return the outer radius (b,) [m] of each local bar: of its shape, else of the circle of its area."""
-        return self.of_blocks(lambda block: self._shapes(block).radius)
+
+        def radius(block: BarBlock) -> np.ndarray | float:
+            if not isinstance(block.area, float):
+                return self._shapes(block).radius
+            one = bar_shapes(self.case.section[block.section], np.ones(1), np.array([block.area]))
+            return float(one.radius[0])  # that of each of them
+
+        return self.of_blocks(radius)
 
     def euler_loads(self) -> np.ndarray:
         """Return pi^2 E I/(K L)^2 (b,) [N] of each local bar, with its length L in the mesh and I, K of its section;
         infinite if the section has neither a shape nor a second moment."""
 
-        def load(block: BarBlock) -> np.ndarray:
-            shapes, section = self._shapes(block), self.case.section[block.section]
+        def load(block: BarBlock) -> np.ndarray | float:
+            section = self.case.section[block.section]
+            if section.shape is None and section.second_moment is None:
+                return np.inf
+            shapes = self._shapes(block)
             young = self.case.material[section.material].young_modulus
             with np.errstate(divide="ignore"):
                 force = np.pi**2 * young * shapes.second_moment / shapes.effective_length**2

@@ -117,12 +117,15 @@ class Geometry:
         Only directions within the line or plane of the whole truss count: a plane truss is never braced out of its
         plane.
         """
-        span = self.span
-        inside = np.einsum("ri,nij,sj->nrs", span, self._held + self._model.supports.spans(), span)
+        span, inside = self.span, self._held
+        if self._model.supports.any:
+            inside = inside + self._model.supports.spans()
+        if len(span) < 3:  # else it would only be turned
+            inside = np.einsum("ri,nij,sj->nrs", span, inside, span)
         # det / trace^(r-1) is a lower bound of the smallest eigenvalue: well above zero, no more work is needed
-        trace = np.trace(inside, axis1=1, axis2=2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            doubtful = ~(np.linalg.det(inside) / trace ** (len(span) - 1) > _RANK)
+        bounds = np.empty(len(inside))
+        _bound_eigenvalues(inside, bounds)
+        doubtful = ~(bounds > _RANK)
         if doubtful.any():
             doubtful[doubtful] = np.linalg.eigvalsh(inside[doubtful])[:, 0] < _RANK
         return self._lowest(doubtful)
@@ -185,13 +188,39 @@ def _rigid_motions(arms: np.ndarray, held: np.ndarray, span: np.ndarray) -> int:
 @kernel
 def _add_directions(points, bars, total):
     for k in range(len(bars)):
-        d = points[bars[k, 1]] - points[bars[k, 0]]
-        d = d / np.sqrt((d * d).sum())
-        for end in bars[k]:
+        a, b = bars[k, 0], bars[k, 1]
+        x, y, z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        x, y, z = x / length, y / length, z / length
+        for end in (a, b):
             if end < len(total):
-                for i in range(3):
-                    for j in range(3):
-                        total[end, i, j] += d[i] * d[j]
+                sums = total[end]
+                sums[0, 0] += x * x
+                sums[1, 1] += y * y
+                sums[2, 2] += z * z
+                sums[0, 1] += x * y
+                sums[0, 2] += x * z
+                sums[1, 2] += y * z
+    for end in range(len(total)):
+        for i in range(3):
+            for j in range(i):
+                total[end, i, j] = total[end, j, i]
+
+
+@kernel
+def _bound_eigenvalues(matrices, bounds):
+    """Write det/trace^(r - 1) of symmetric matrices (n, r, r), r up to 3; NaN for zeros."""
+    for k in range(len(matrices)):
+        m = matrices[k]
+        if len(m) == 1:
+            bounds[k] = m[0, 0]
+        elif len(m) == 2:
+            bounds[k] = (m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]) / (m[0, 0] + m[1, 1])
+        else:
+            determinant = m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
+            determinant -= m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
+            determinant += m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
+            bounds[k] = determinant / (m[0, 0] + m[1, 1] + m[2, 2]) ** 2
 
 
 @kernel

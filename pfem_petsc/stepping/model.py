@@ -239,5 +239,7 @@ class Model:
                     mass = self.inertia.mass[members]
                     sums = comm.allreduce(np.append(mass @ points[members], mass.sum()))
                     centre = sums[:3] / sums[3]
-                v[members] += np.cross(spin, points[members] - centre)
+                x, y, z = (points[members] - centre).T
+                p, q, r = spin
+                v[members] += np.stack([q * z - r * y, r * x - p * z, p * y - q * x], axis=1)
         return v

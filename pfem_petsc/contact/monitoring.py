@@ -12,6 +12,7 @@ from ..errors import SimulationFailure
 from ..fields import STATUS
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
+from ..parallel.heap import returning_freed_memory
 from ..tolerances import BEYOND
 from .contact import Contact
 from .neighbours import Points, Segments, find_pairs
@@ -298,7 +299,9 @@ class CrossingBars:
             self._last = _Search(Crossing(0, 0, (-1, -1)), 0.0, self._model.mesh.points, self._intact())
         moved = self._moved(x)
         if moved > 0.0 and moved >= 0.499 * self._last.gap:
-            self._last = _Search(*self._search(x), x.copy(), self._intact())
+            with returning_freed_memory():
+                found, gap = self._search(x)
+            self._last = _Search(found, gap, x.copy(), self._intact())
         return self._last.found
 
     def _intact(self) -> np.ndarray:

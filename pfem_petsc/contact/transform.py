@@ -372,6 +372,8 @@ class Transform:
 
     def forward(self, w: np.ndarray) -> None:
         """Transform w (owned, 3) to u, in place. Collective."""
+        if self.identity:
+            return
         for link in reversed(self.links):
             link.forward(w)
         at = self.frames.nodes
@@ -379,6 +381,8 @@ class Transform:
 
     def inverse(self, u: np.ndarray) -> None:
         """Transform u (owned, 3) to w, in place. Collective."""
+        if self.identity:
+            return
         at = self.frames.nodes
         u[at] = np.einsum("nij,nj->ni", self.frames.basis, u[at])
         for link in self.links:
@@ -386,6 +390,8 @@ class Transform:
 
     def residual(self, predictor: np.ndarray, u: np.ndarray, g: np.ndarray) -> None:
         """Transform the residual force (owned, 3) at predictor + u to the residual of w, in place. Collective."""
+        if self.identity:
+            return
         at, slipping = self.frames.nodes, self.sliding.nodes
         g[at] = np.einsum("nji,nj->ni", self.frames.inverse, g[at])
         g[slipping] = self.sliding.couple(predictor[slipping] + u[slipping], g[slipping])
@@ -404,6 +410,8 @@ class Transform:
 
         ``left`` : value of :meth:`left` where H was evaluated.
         """
+        if self.identity:
+            return
         at, slipping = self.frames.nodes, self.sliding.nodes
         out[slipping] += np.einsum("nij,nj->ni", self.sliding.stiffness, u[slipping])
         out[at] = np.einsum("nij,nj->ni", left, out[at])

@@ -45,6 +45,13 @@ def copy(values, out):
 
 
 @borrowing
+def fill(out, value):
+    """Write a value to all of ``out``."""
+    for i in range(len(out)):
+        out[i] = value
+
+
+@borrowing
 def split_components(x, first, count, planes, stride, base):
     """Write the vectors of ``count`` nodes of ``x`` (n, 3), from ``first`` on, to ``planes`` (3 stride,), which begin
     at node ``base``."""
@@ -270,14 +277,42 @@ NO_BAR = -1.0
 _MOST = 1.25  # columns for each bar; beyond, they cost more than the begin and end of each run
 
 
-class Columns(NamedTuple):
-    """Columns of all bars of a sweep, in groups of one offset and one block of nodes.
+class Groups(NamedTuple):
+    """Groups of the runs of a sweep, of one offset and one block of nodes each.
 
     Attributes
     ----------
     heads, fars : (groups,) uint32, ends of the first column of each group
     starts : (groups + 1,) uint32, first column of each group, and the end
     runs : (groups + 1,) uint32, first run of the sweep in each group, and the end
+    """
+
+    heads: np.ndarray
+    fars: np.ndarray
+    starts: np.ndarray
+    runs: np.ndarray
+
+
+def make_groups(sweep: Sweep) -> Groups:
+    """Make the groups of a sweep of diagonal chunks."""
+    n = len(sweep.heads)
+    firsts = np.append(sweep.chunks[sweep.parts].astype(np.int64), n)  # runs that begin a part, or are not counted
+    fresh = np.zeros(n + 1, dtype=np.bool_)
+    fresh[firsts] = True
+    group_of = np.empty(n, dtype=np.int64)
+    count = _group_runs(sweep.heads, sweep.fars, sweep.starts, fresh, group_of)
+    runs = np.searchsorted(group_of, np.arange(count + 1)).astype(np.uint32)
+    heads, fars, starts = (np.empty(count + k, dtype=np.uint32) for k in (0, 0, 1))
+    _place_groups(sweep.heads, sweep.fars, sweep.starts, runs, heads, fars, starts)
+    return Groups(heads, fars, starts, runs)
+
+
+class Columns(NamedTuple):
+    """Columns of all bars of a sweep, in :class:`Groups`.
+
+    Attributes
+    ----------
+    heads, fars, starts, runs : of the groups
     rest : (columns,) rest lengths [m]
     area : areas [m2], a number or (columns,)
     kept : (rows, columns) history of the bars, or rows without columns; see :func:`spread_history`
@@ -317,23 +352,16 @@ def no_columns(area: float | np.ndarray, rows: int) -> Columns:
 def make_columns(sweep: Sweep, rest: np.ndarray, area: float | np.ndarray, rows: int) -> Columns:
     """Make the columns of a sweep of diagonal chunks over b bars, with room for ``rows`` of a history; ``rest`` (b,)
     [m], ``area`` [m2] a number or (b,)."""
-    n = len(sweep.heads)
-    firsts = np.append(sweep.chunks[sweep.parts].astype(np.int64), n)  # runs that begin a part, or are not counted
-    fresh = np.zeros(n + 1, dtype=np.bool_)
-    fresh[firsts] = True
-    group_of = np.empty(n, dtype=np.int64)
-    groups = _group_runs(sweep.heads, sweep.fars, sweep.starts, fresh, group_of)
-    runs = np.searchsorted(group_of, np.arange(groups + 1)).astype(np.uint32)
-    counted = int(np.searchsorted(runs, sweep.chunks[sweep.counted]))
-    heads, fars, starts = (np.empty(groups + k, dtype=np.uint32) for k in (0, 0, 1))
-    columns = _place_groups(sweep.heads, sweep.fars, sweep.starts, runs, heads, fars, starts)
+    groups = make_groups(sweep)
+    counted = int(np.searchsorted(groups.runs, sweep.chunks[sweep.counted]))
+    columns = int(groups.starts[-1])
     spread = aligned(columns)
-    _spread(rest, sweep, (runs, heads, starts), NO_BAR, spread)
+    spread_values(rest, sweep, groups, NO_BAR, spread)
     if isinstance(area, np.ndarray):
         values, area = area, aligned(columns)
-        _spread(values, sweep, (runs, heads, starts), 0.0, area)
-    parts = np.searchsorted(runs, sweep.chunks[sweep.parts]).astype(np.int64)
-    return Columns(heads, fars, starts, runs, spread, area, np.zeros((rows, columns)), counted, parts)
+        spread_values(values, sweep, groups, 0.0, area)
+    parts = np.searchsorted(groups.runs, sweep.chunks[sweep.parts]).astype(np.int64)
+    return Columns(*groups, spread, area, np.zeros((rows, columns)), counted, parts)
 
 
 @kernel
@@ -359,7 +387,7 @@ def _group_runs(heads, fars, starts, fresh, group_of):
 
 @kernel
 def _place_groups(run_heads, run_fars, run_starts, runs, heads, fars, starts):
-    """Return the number of columns; write the first column of each group, and its ends."""
+    """Write the first column of each group, and its ends."""
     count = np.int64(0)
     for g in range(len(heads)):
         first, last = runs[g], runs[g + 1] - 1
@@ -371,21 +399,21 @@ def _place_groups(run_heads, run_fars, run_starts, runs, heads, fars, starts):
         starts[g] = count
         count += -(-wide // LANES) * LANES
     starts[len(heads)] = count
-    return count
 
 
 @kernel
-def _spread(values, sweep, groups, none, spread):
-    """Write the values of bars to their columns, and ``none`` to the others; ``groups``: runs, heads and starts."""
-    runs, heads, starts = groups
-    for k in range(len(spread)):
-        spread[k] = none
+def spread_values(values, sweep, groups, none, spread):
+    """Write the values of the bars of a sweep to their columns, and ``none`` to the others."""
+    runs, heads, starts = groups.runs, groups.heads, groups.starts
     for g in range(len(heads)):
+        end = starts[g]
         for run in range(runs[g], runs[g + 1]):
             at = starts[g] + sweep.heads[run] - heads[g]
-            begin = sweep.starts[run] - sweep.starts[0]
-            for k in range(sweep.starts[run + 1] - sweep.starts[run]):
-                spread[at + k] = values[begin + k]
+            begin, count = sweep.starts[run] - sweep.starts[0], sweep.starts[run + 1] - sweep.starts[run]
+            fill(spread[end:at], none)
+            end = at + count
+            copy(values[begin : begin + count], spread[at:end])
+        fill(spread[end : starts[g + 1]], none)
 
 
 @kernel

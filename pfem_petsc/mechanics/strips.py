@@ -230,74 +230,32 @@ def _spread(builder: Any, values: Any) -> list[Any]:
     return [builder.shuffle_vector(values, nothing, chosen(*some)) for some in places]
 
 
-def _products(given: Arguments, builder: Any, factors: list[Any], first: int) -> None:
-    """Generate the products of bars between the nodes of two arrays, for both of the functions below; see there."""
-    low, high = given.index(3), given.index(4)
-    ends = [[given.numbers(k, node, 3) for node in (low, high)] for k in range(3)]
-
-    def difference(of: list[Any], at: Any, strip: Strip) -> list[Any]:
-        one, other = (strip.load_nodes(end, at) for end in of)
-        return [builder.fsub(b, a) for a, b in zip(one, other, strict=True)]
-
-    def pull(at: Any, strip: Strip) -> list[Any]:
-        d, w = difference(ends[0], at, strip), difference(ends[1], at, strip)
-        c, g, *inverse = (strip.load(factor, at) for factor in factors)
-        for values in inverse:
-            d = [builder.fmul(a, b) for a, b in zip(d, _spread(builder, values), strict=True)]
-        px, py, pz = separate(builder, [builder.fmul(a, b) for a, b in zip(d, w, strict=True)])
-        c = builder.fmul(c, builder.fadd(builder.fadd(px, py), pz))
-        parts = zip(_spread(builder, c), d, _spread(builder, g), w, strict=True)
-        return [builder.fadd(builder.fmul(a, b), builder.fmul(e, f)) for a, b, e, f in parts]
-
-    add_to_both(builder, ends[2], builder.sub(high, low), given.index(5), pull, first)
-
-
-@intrinsic
-def add_stiffness_products(typingctx, x, u, out, low, high, count, along, across, first):  # noqa: ANN001, ANN201
-    """Add (c d d^T + g I) w of ``count`` bars to the nodes of ``out`` (n, 3) from ``high`` on, and subtract it from
-    those from ``low`` on; d and w: end differences of ``x`` and ``u`` (n, 3), c and g: ``along`` and ``across`` from
-    ``first`` on."""
-
-    def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
-        given = Arguments(context, builder, signature, values)
-        _products(given, builder, [given.numbers(k, given.index(8)) for k in (6, 7)], 0)
-        return context.get_dummy_value()
-
-    return types.void(x, u, out, low, high, count, along, across, first), generate
-
-
 @intrinsic
 def add_tangent_products(typingctx, x, u, out, low, high, count, along, across, inverse, first):  # noqa: ANN001, ANN201
-    """Add (c n n^T + g I) w of ``count`` bars as :func:`add_stiffness_products`, with n = d times ``inverse``; to the
-    bits of a loop over the bars in their order."""
+    """Add (c n n^T + g I) w of ``count`` bars to the nodes of ``out`` (n, 3) from ``high`` on, and subtract it from
+    those from ``low`` on; n and w: end differences of ``x``, times ``inverse``, and of ``u`` (n, 3); c and g: ``along``
+    and ``across``, from ``first`` on as ``inverse``. To the bits of a loop over the bars in their order."""
 
     def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
         given = Arguments(context, builder, signature, values)
-        _products(given, builder, [given.numbers(k, given.index(9)) for k in (6, 7, 8)], 1)
+        low, high, first = given.index(3), given.index(4), given.index(9)
+        ends = [[given.numbers(k, node, 3) for node in (low, high)] for k in range(3)]
+        factors = [given.numbers(k, first) for k in (6, 7, 8)]
+
+        def difference(of: list[Any], at: Any, strip: Strip) -> list[Any]:
+            one, other = (strip.load_nodes(end, at) for end in of)
+            return [builder.fsub(b, a) for a, b in zip(one, other, strict=True)]
+
+        def pull(at: Any, strip: Strip) -> list[Any]:
+            d, w = difference(ends[0], at, strip), difference(ends[1], at, strip)
+            c, g, inverse = (strip.load(factor, at) for factor in factors)
+            d = [builder.fmul(a, b) for a, b in zip(d, _spread(builder, inverse), strict=True)]
+            px, py, pz = separate(builder, [builder.fmul(a, b) for a, b in zip(d, w, strict=True)])
+            c = builder.fmul(c, builder.fadd(builder.fadd(px, py), pz))
+            parts = zip(_spread(builder, c), d, _spread(builder, g), w, strict=True)
+            return [builder.fadd(builder.fmul(a, b), builder.fmul(e, f)) for a, b, e, f in parts]
+
+        add_to_both(builder, ends[2], builder.sub(high, low), given.index(5), pull, 1)
         return context.get_dummy_value()
 
     return types.void(x, u, out, low, high, count, along, across, inverse, first), generate
-
-
-@intrinsic
-def add_stiffness_diagonals(typingctx, x, minus, plus, low, high, count, along, across, first):  # noqa: ANN001, ANN201
-    """Add the diagonals of c d d^T + g I of ``count`` bars to the nodes of ``plus`` (n, 3) from ``high`` on, and
-    subtract them from those of ``minus`` (n, 3) from ``low`` on; see :func:`add_stiffness_products`."""
-
-    def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
-        given = Arguments(context, builder, signature, values)
-        low, high, first = given.index(3), given.index(4), given.index(8)
-        strips = [given.numbers(0, node, 3) for node in (low, high)]
-        ends = [given.numbers(1, low, 3), given.numbers(2, high, 3)]
-        factors = [given.numbers(k, first) for k in (6, 7)]
-
-        def pull(at: Any, strip: Strip) -> list[Any]:
-            one, other = (strip.load_nodes(end, at) for end in strips)
-            d = [builder.fsub(b, a) for a, b in zip(one, other, strict=True)]
-            c, g = (_spread(builder, strip.load(factor, at)) for factor in factors)
-            return [builder.fadd(builder.fmul(b, builder.fmul(a, a)), e) for a, b, e in zip(d, c, g, strict=True)]
-
-        add_to_both(builder, ends, builder.sub(high, low), given.index(5), pull)
-        return context.get_dummy_value()
-
-    return types.void(x, minus, plus, low, high, count, along, across, first), generate

@@ -23,7 +23,7 @@ EVENTS: dict[str, tuple[str, ...]] = {
     "pfemForces": ("model.bars.forces", "model.bars.step_forces"),
     "pfemGhosts": ("mesh.update_ghosts",),
     "pfemSolve": ("stepper.solve",),
-    "pfemProduct": ("stepper.hessian.times",),
+    "pfemProduct": ("stepper.hessian.apply",),
     "pfemResidual": ("stepper.newton._residual",),
     "pfemHessian": ("stepper.newton._hessian",),
     "pfemPreconditioner": ("stepper.lagged.renew",),
@@ -50,7 +50,7 @@ def _of_balance(simulation: Any) -> float:
 
 FLOPS: dict[str, Callable[[Any], float]] = {
     "model.bars.forces": _of_bars(OF_FORCE),
-    "stepper.hessian.times": lambda simulation: _of_bars(OF_PRODUCT)(simulation) + 3 * simulation.mesh.n_owned,
+    "stepper.hessian.apply": lambda simulation: _of_bars(OF_PRODUCT)(simulation) + 3 * simulation.mesh.n_owned,
     "stepper.solve": _of_balance,
 }
 """Method to the operations of a call of it on this rank."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from petsc4py import PETSc
 
-from .linear import reproducible_products, set_preconditioner
+from .linear import USUAL_REDUCTION, reproducible_products, set_preconditioner
 from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian
 from .multigrid import GridMultigrid
@@ -153,8 +153,9 @@ class LaggedPreconditioner:
         if the next problem needs a set-up
     history : (b, names) data of the material laws there, see ``Bars.history``; (b, 0) if they keep none
     count : other data that decide on a set-up: the coefficients of the Hessian, iterations of the first solve with it,
-        excess iterations of later solves, and iterations of the last solve
+        excess iterations of later solves, and iterations of the last solve, all for the usual reduction
     carried : whether it was set up for an earlier problem
+    share : of the usual reduction of the residual, in digits, that the present solve makes
     """
 
     def __init__(self, model: Model, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
@@ -172,11 +173,16 @@ class LaggedPreconditioner:
         self.history = np.zeros((len(mesh.bars), 0))
         self.count = [0.0] * 6
         self.carried = False
+        self.share = 1.0
         self._supports = model.supports
         self._problem = None
         self._kept: np.ndarray | None = None
         self._right = PETSc.Vec().createMPI((3 * mesh.n_owned, 3 * mesh.n_nodes), bsize=3, comm=mesh.comm)
         self._left = self._right.duplicate()
+
+    def expect(self, reduction: float) -> None:
+        """Take account of the factor by which the next solve reduces the residual."""
+        self.share = max(np.log(reduction) / np.log(USUAL_REDUCTION), 1.0 / 3.0)
 
     @property
     def is_set_up(self) -> bool:
@@ -243,7 +249,7 @@ class LaggedPreconditioner:
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Compute y = P x for the unknowns kept, see :meth:`renew`. Collective."""
-        self.count[-1] += 1.0
+        self.count[-1] += 1.0 / self.share
         kept = self._kept
         if kept is None:
             self.inner.apply(x, y)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
-from ..mechanics.compiled import inlined, kernel
-from ..mechanics.mass import consistent_product, scale_rows
-from ..mechanics.strips import add_stiffness_diagonals, add_stiffness_products
+from ..mechanics.compiled import kernel
+from ..mechanics.mass import consistent_product
+from ..mechanics.products import BarProducts
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -60,6 +60,8 @@ def outlive(reference: weakref.ref) -> None:
         matrices = solver.getOperators()
         if solver.getPC().getType() == "python":
             solver.getPC().setType("none")
+        if solver.getType() == "python":
+            solver.setType("cg")
     for matrix in matrices:
         if matrix and matrix.getType() == "python":
             matrix.incRef()
@@ -108,6 +110,8 @@ class Restriction:
 class Context:
     """Python context of an operator that owns its PETSc matrix; does not keep the operator alive."""
 
+    kept = None  # all unknowns
+
     def __init__(self, operator: Extension | MatrixFreeHessian) -> None:
         self.operator = weakref.ref(operator)
 
@@ -155,68 +159,6 @@ class Extension:
 
 
 @kernel
-def add_products(sweep, far, x, stored, u, out):
-    """Add K u to ``out``, chunk by chunk of a :class:`~pfem_petsc.mechanics.runs.Sweep`."""
-    heads, fars, starts, chunks = sweep.heads, sweep.fars, sweep.starts, sweep.chunks
-    for chunk in range(len(sweep.diagonal)):
-        if not sweep.diagonal[chunk]:  # a function apart: within this loop it makes that of diagonal runs slower
-            _add_stars(sweep, chunk, far, x, stored, u, out)
-            continue
-        for run in range(chunks[chunk], chunks[chunk + 1]):
-            at = starts[run]
-            add_stiffness_products(x, u, out, heads[run], fars[run], starts[run + 1] - at, stored[0], stored[1], at)
-
-
-@inlined
-def _add_stars(sweep, chunk, far, x, stored, u, out):
-    """Add the products of a chunk whose runs are stars."""
-    heads, starts, chunks = sweep.heads, sweep.starts, sweep.chunks
-    for run in range(chunks[chunk], chunks[chunk + 1]):
-        a = heads[run]
-        ax, ay, az = x[a, 0], x[a, 1], x[a, 2]
-        px, py, pz = u[a, 0], u[a, 1], u[a, 2]
-        sx = sy = sz = 0.0
-        for k in range(starts[run], starts[run + 1]):
-            b = far[k]
-            dx, dy, dz = x[b, 0] - ax, x[b, 1] - ay, x[b, 2] - az
-            ux, uy, uz = u[b, 0] - px, u[b, 1] - py, u[b, 2] - pz
-            c = stored[0, k] * (dx * ux + dy * uy + dz * uz)
-            g = stored[1, k]
-            fx, fy, fz = c * dx + g * ux, c * dy + g * uy, c * dz + g * uz
-            sx += fx
-            sy += fy
-            sz += fz
-            out[b, 0] += fx
-            out[b, 1] += fy
-            out[b, 2] += fz
-        out[a, 0] -= sx
-        out[a, 1] -= sy
-        out[a, 2] -= sz
-
-
-@kernel
-def add_diagonals(sweep, far, x, stored, minus, plus):
-    """Add the diagonal of K at the upper ends of bars to ``plus``, and subtract that at the lower ends from ``minus``,
-    both (local nodes, 3)."""
-    heads, fars, starts, chunks = sweep.heads, sweep.fars, sweep.starts, sweep.chunks
-    for chunk in range(len(sweep.diagonal)):
-        for run in range(chunks[chunk], chunks[chunk + 1]):
-            at = starts[run]
-            if sweep.diagonal[chunk]:
-                count = starts[run + 1] - at
-                add_stiffness_diagonals(x, minus, plus, heads[run], fars[run], count, stored[0], stored[1], at)
-                continue
-            a = heads[run]
-            for k in range(at, starts[run + 1]):
-                b = far[k]
-                for i in range(3):
-                    d = x[b, i] - x[a, i]
-                    part = stored[0, k] * (d * d) + stored[1, k]
-                    plus[b, i] += part
-                    minus[a, i] -= part
-
-
-@kernel
 def add_blocks(bars, x, stored, blocks):
     """Add the diagonal blocks (local nodes, 6): xx, xy, xz, yy, yz, zz."""
     for k in range(len(bars)):
@@ -258,8 +200,8 @@ class MatrixFreeHessian:
     mat : PETSc matrix of type python
     bounded : the matrix of steps with bounds, equal to ``mat``
     problem : of the last :meth:`linearise`
-    x : (local, 3) positions there [m]
-    stored : (2, b) data of each bar for the product, see :meth:`~pfem_petsc.mechanics.bars.Bars.stiffnesses`
+    bars : :class:`~pfem_petsc.mechanics.products.BarProducts`
+    x, stored : positions there [m], and data of each bar, of these
     """
 
     def __init__(self, model: Model) -> None:
@@ -270,10 +212,11 @@ class MatrixFreeHessian:
         self.mat.setUp()
         at_exit(outlive, self.mat)
         self.bounded = self.mat
-        self.stored = np.zeros((2, len(mesh.bars)))
-        self.x = np.zeros((mesh.n_local, 3))
+        self.bars = BarProducts(model.bars)
+        self.x, self.stored = self.bars.x, self.bars.stored
         self._u = np.zeros((mesh.n_local, 3))
         self._out = np.zeros((mesh.n_local, 3))
+        self._none = np.zeros(mesh.n_owned)
         self.problem = None
 
     def update(self, problem: StepProblem, w: np.ndarray) -> None:
@@ -288,20 +231,29 @@ class MatrixFreeHessian:
         self._left = problem.transform.left()
         self.x[:] = problem.x
         self.model.bars.stiffnesses(self.x, problem.balance.weight, self.stored)
+        self.bars.take()
 
     def put(self, problem: StepProblem, bars: np.ndarray) -> None:
         """Linearise at the predictor of a problem, with the stiffness (5, b) of ``Bars.linearise``. Collective."""
         self.update(problem, np.zeros_like(problem.u))
         self.stored[0], self.stored[1] = bars[3] / self.model.bars.lengths(self.x) ** 2, bars[4]
+        self.bars.take()
 
     def make_definite(self) -> None:
         """Drop negative eigenvalues of the bars' stiffness, due to compression or softening laws."""
         drop_negative(self.mesh.bars, self.x, self.stored)
+        self.bars.take()
 
     @cached_property
     def extension(self) -> Extension:
         """The operator with rows and columns of the identity for active unknowns."""
         return Extension(self)
+
+    @property
+    def vectors(self) -> tuple[np.ndarray, np.ndarray]:
+        """The vector (3 owned,) that :meth:`apply` reads and may change, and the one that it writes."""
+        owned = self.mesh.n_owned
+        return self._u[:owned].reshape(-1), self._out[:owned].reshape(-1)
 
     def times(self, given: np.ndarray, out: np.ndarray) -> None:
         """Compute ``out`` = H ``given``, both (owned, 3) and contiguous. Collective."""
@@ -309,36 +261,43 @@ class MatrixFreeHessian:
         self.apply()
         out[:] = self._out[: len(given)]
 
-    def apply(self) -> None:
-        """Apply H to the owned rows of :attr:`_u`, and write those of :attr:`_out`. Collective."""
+    def apply(self, free: bool = False) -> None:
+        """Apply H to the owned rows of :attr:`_u`, and write those of :attr:`_out`. Collective.
+
+        Parameters
+        ----------
+        free : prescribed components of the vector are zero, and those of the product are not needed
+        """
         problem, owned = self.problem, self.mesh.n_owned
         u, out = self._u, self._out
         supports = self.model.supports
-        if supports.any:
+        held = None
+        if supports.any and not free:
             held = problem.scale * supports.get(u)
             supports.clear(u[:owned])
         problem.transform.forward(u)
         self.mesh.update_ghosts(u)
         inertia, bars = self.model.inertia, self.model.bars
+        alpha, eta = problem.balance.alpha, problem.balance.eta
+        self.bars.times(self._none if inertia.consistent else problem.nodal, u, out)
         if inertia.consistent:
-            out[:] = 0.0
-            coefficients = inertia.coefficients(problem.balance.alpha, problem.balance.eta)
+            coefficients = inertia.coefficients(alpha, eta)
             for block, coefficient in zip(bars.blocks, coefficients, strict=True):
                 consistent_product(bars.ends, bars.mesh_lengths, block.start, block.stop, 6.0 * coefficient, u, out)
             if inertia.points.any:
-                out[:owned] += inertia.points.nodal(problem.balance.alpha, problem.balance.eta)[:, None] * u[:owned]
-        else:
-            scale_rows(problem.nodal, u, out)
-            out[owned:] = 0.0
-            if inertia.redistribution is not None:
-                inertia.redistribution.add_times(problem.balance.alpha, u, out)
-        for block in bars.blocks:
-            add_products(block.sweep, bars.far, self.x, self.stored, u, out)
+                out[:owned] += inertia.points.nodal(alpha, eta)[:, None] * u[:owned]
+        elif inertia.redistribution is not None:
+            inertia.redistribution.add_times(alpha, u, out)
         for family in bars.families:
             family.add_product(problem.balance.weight, u, out)
         problem.transform.linear(self._left, u, out)
-        if supports.any:
+        if held is not None:
             supports.put(out, held)
+
+    @property
+    def masks(self) -> bool:
+        """Whether prescribed components are unknowns of their own, so that :meth:`apply` may leave them out."""
+        return self.problem.transform.identity and self.model.supports.inclined is None
 
     def diagonal(self) -> np.ndarray:
         """Return the diagonal of H (owned, 3)."""
@@ -358,12 +317,7 @@ class MatrixFreeHessian:
 
     def _plain_diagonal(self) -> np.ndarray:
         """Return the diagonal (owned, 3), without supports and transform."""
-        owned, bars = self.mesh.n_owned, self.model.bars
-        minus, plus = np.zeros((2, self.mesh.n_local, 3))
-        for block in bars.blocks:
-            add_diagonals(block.sweep, bars.far, self.x, self.stored, minus, plus)
-        diagonal = plus[:owned]
-        diagonal -= minus[:owned]
+        diagonal = self.bars.diagonal()[: self.mesh.n_owned]
         for nodes, extra in self._additions():
             diagonal[nodes] += np.einsum("kii->ki", extra)
         diagonal += self._nodal()[:, None]

@@ -13,8 +13,9 @@ from petsc4py import PETSc
 
 from ..errors import InputError
 from ..tolerances import ROUNDING
+from .conjugate_gradients import pass_less_often
 from .lagged import LaggedPreconditioner, Preconditioning
-from .linear import LinearChoice, configure, is_failed_factorisation, linear_reason, newton_reason
+from .linear import USUAL_REDUCTION, LinearChoice, configure, is_failed_factorisation, linear_reason, newton_reason
 from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian, at_exit, outlive
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
     from .problem import StepProblem
 
-__all__ = ["STAGNATION", "NewtonReport", "NewtonSolver", "Tolerance", "zero_tolerance"]
+__all__ = ["STAGNATION", "Forcing", "NewtonReport", "NewtonSolver", "Tolerance", "zero_tolerance"]
 
 STAGNATION = 100.0
 """A residual within this many rounding errors that no longer falls has converged."""
@@ -88,6 +89,53 @@ class NewtonReport:
         )
 
 
+_WELL = 0.1  # of the required residual: what the last linear solve of a step leaves of it
+_FEW = 0.5  # of the residual that linearisation leaves: what linear solves before the last leave beside it
+_LEAST, _MOST = 1e-7, 1e-2  # reductions by a linear solve before the last
+
+
+class Forcing:
+    """How accurately linear systems are solved and when they are made again (inexact Newton methods).
+
+    After an iteration the residual consists of that of its linear system, which is known, and of that of linearisation.
+    The latter grows with the square of the residual before. More accurate solutions than it allows are wasted, and less
+    accurate ones make another iteration necessary. In the first iteration it is expected from the last solve.
+
+    Attributes
+    ----------
+    curvature : residual of linearisation over the square of the residual before, in the first iteration of the last
+        solve [1/N]; negative if there was none
+    renews : whether the Hessian changes noticeably
+    """
+
+    def __init__(self) -> None:
+        self.curvature = -1.0
+        self.renews = True
+        self._rest = 0.0  # residual of linearisation in the next iteration [N], as expected
+
+    def begin(self, norm: float) -> None:
+        """Begin a solve with a residual of a 2-norm [N]."""
+        self._rest = self.curvature * norm**2
+        self.renews = True
+
+    def note(self, before: float, linear: float, norm: float, required: float, first: bool) -> None:
+        """Take account of an iteration: 2-norms [N] of the residuals before it, of its linear system, and after it, and
+        that of the solution."""
+        rest, share = float(np.sqrt(max(norm**2 - linear**2, 0.0))), norm / max(before, 1e-300)
+        if first and before > 0.0:
+            self.curvature = rest / before**2
+        self._rest = rest * share**2
+        self.renews = not 2.0 * rest * share < _WELL * required
+
+    def reduction(self, norm: float, required: float) -> float:
+        """Return by how much the next linear solve reduces a residual of a 2-norm, if ``required`` is the residual of
+        the solution [N]."""
+        if self._rest < 0.0 or norm == 0.0:
+            return USUAL_REDUCTION
+        left = max(_WELL * required, min(_FEW * self._rest, _MOST * norm))
+        return min(max(left / norm, _LEAST), 0.5)
+
+
 class NewtonSolver:
     """Solves for the position increment of a step; created once per run.
 
@@ -104,6 +152,7 @@ class NewtonSolver:
     Attributes
     ----------
     problem : the current problem
+    forcing : of its linear solves
     lagged : preconditioner of all solvers, None if PETSc builds one from the operator
     """
 
@@ -130,8 +179,9 @@ class NewtonSolver:
         self._solvers: dict[tuple[bool, bool], PETSc.SNES] = {}
         self.problem: StepProblem | None = None
         self._ours: dict[tuple[bool, bool], Preconditioning] = {}
+        self.forcing = Forcing()
         self._previous = self._longest = np.inf
-        self._full = False
+        self._full = self._forces = False
         self._place = np.zeros((mesh.n_owned, 3))  # the last iterate of full steps
 
     def solve(
@@ -161,6 +211,9 @@ class NewtonSolver:
             self._upper.array[:] = np.minimum(upper, PETSc.INFINITY).ravel()
         start, options = u.copy(), PETSc.Options(_PREFIXES[contact])
         self._full = not (options.hasName("snes_linesearch_type") or options.hasName("snes_type"))
+        self._forces = (self.bounded if contact else self.choice).krylov != "preonly" and not options.hasName(
+            "ksp_rtol"
+        )
         report = self._search(start, contact)
         if not report.converged and self._suffices:
             # the iteration that was to improve a sufficient guess failed, as where the stiffness is singular
@@ -266,7 +319,12 @@ class NewtonSolver:
         configure(ksp, LinearChoice("gmres", choice.preconditioner, "indefinite"), True, ours)
         report = self._attempt(start, contact, careful)
         configure(ksp, choice, contact, ours)
+        self._pass_less_often(ksp)
         return report
+
+    def _pass_less_often(self, ksp: PETSc.KSP) -> None:
+        if isinstance(self.hessian, MatrixFreeHessian):
+            pass_less_often(ksp, self.hessian)
 
     def _solver(self, contact: bool, careful: bool = False) -> PETSc.SNES:
         key = contact, careful
@@ -302,6 +360,7 @@ class NewtonSolver:
         finally:
             for name in defaults:
                 options.delValue(name)
+        self._pass_less_often(snes.getKSP())
         self._solvers[key] = snes
         at_exit(outlive, snes)
         return snes
@@ -312,6 +371,13 @@ class NewtonSolver:
             self.problem.residual(u.getArray(readonly=True).reshape(shape), out.reshape(shape))
 
     def _hessian(self, snes: PETSc.SNES, u: PETSc.Vec, matrix: PETSc.Mat, preconditioner: PETSc.Mat) -> None:
+        if self._forces:
+            reduction = self.forcing.reduction(self._previous, self._tolerance.residual)
+            snes.getKSP().setTolerances(rtol=reduction)
+            if self.lagged is not None:
+                self.lagged.expect(reduction)
+            if not self.forcing.renews and self.lagged is None:
+                return
         array = u.getArray(readonly=True).reshape(self.mesh.n_owned, 3)
         self.hessian.update(self.problem, array)
 
@@ -323,6 +389,10 @@ class NewtonSolver:
         tolerance = self._tolerance
         if iteration == 0:
             self._first, self._suffices = norm, norm <= tolerance.residual
+            self.forcing.begin(norm)
+        elif self._forces:
+            linear = snes.getKSP().getResidualNorm()
+            self.forcing.note(previous, linear, norm, tolerance.residual, iteration == 1)
         if norm <= (tolerance.residual if iteration else tolerance.guess):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if iteration and (self._rounded(norm, 1.0) or (norm > 0.5 * previous and self._rounded(norm, STAGNATION))):

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .node_loops import balance as add_up
+
 if TYPE_CHECKING:
     from ..contact.transform import Transform
     from ..integrators.base import Balance, State
@@ -46,6 +48,7 @@ class StepProblem:
         self.f = np.zeros((mesh.n_local, 3))
         self.u = np.zeros((mesh.n_owned, 3))
         self._work = np.zeros((mesh.n_owned, 3))
+        self._evaluated = np.full_like(self.x, np.nan)  # positions of the forces f
         self.nodal = balance.alpha * inertia.mass + balance.eta * inertia.damping
         self.scale = float((self.nodal if balance.alpha else model.nodal_stiffness).max(initial=0.0))
         # the part independent of u: M a_hat + C v_hat + (1 - w) f_n - f_ext
@@ -74,26 +77,38 @@ class StepProblem:
         self.transform.inverse(w)
         return w
 
-    def imbalance(self, u: np.ndarray, g: np.ndarray) -> None:
-        """Write g = M a + C v + f_int - f_ext at u, in x, without supports and walls [N]. Collective."""
-        mesh, inertia, balance = self.model.mesh, self.model.inertia, self.balance
-        owned = mesh.n_owned
-        if inertia.consistent:
-            g[:] = inertia.mass_times(balance.alpha * u, self._work)
-            if inertia.damped and balance.eta:
-                g += inertia.damping_times(balance.eta * u, self._work)
-        else:
-            np.multiply(self.nodal[:, None], u, out=g)
+    def imbalance(self, u: np.ndarray, g: np.ndarray, evaluated: bool = False) -> None:
+        """Write g = M a + C v + f_int - f_ext at u, in x, without supports and walls [N]. Collective.
+
+        If bars were ``evaluated`` since temperatures, rest lengths or their history have changed, forces are not
+        evaluated again at the same positions.
+        """
+        inertia, balance, weight = self.model.inertia, self.balance, self.balance.weight
+        internal = self.state.f[: len(u)]
+        if weight:
+            self.place(u)
+            if not (evaluated and np.array_equal(self.x, self._evaluated)):
+                self._evaluate()
+            internal = self.f[: len(u)]
+        if not inertia.consistent:
+            add_up(self.nodal, u, self.known, weight, internal, g)
             if inertia.redistribution is not None:
                 inertia.redistribution.add_times(balance.alpha, u, g)
+            return
+        g[:] = inertia.mass_times(balance.alpha * u, self._work)
+        if inertia.damped and balance.eta:
+            g += inertia.damping_times(balance.eta * u, self._work)
         g += self.known
-        if balance.weight:
-            self.place(u)
-            if balance.discrete_gradient:
-                self.model.bars.step_forces(self.state.x, self.x, self.f)
-            else:
-                self.model.bars.forces(self.x, self.f, commit=False)
-            g += balance.weight * self.f[:owned]
+        if weight:
+            g += weight * internal
+
+    def _evaluate(self) -> None:
+        """Evaluate the internal forces at the positions."""
+        if self.balance.discrete_gradient:
+            self.model.bars.step_forces(self.state.x, self.x, self.f)
+        else:
+            self.model.bars.forces(self.x, self.f, commit=False)
+        self._evaluated[:] = self.x
 
     def residual(self, w: np.ndarray, g: np.ndarray) -> None:
         """Write g(w) (owned, 3) [N]. Collective."""

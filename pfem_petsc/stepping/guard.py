@@ -44,6 +44,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..mechanics.compiled import kernel
+from ..solvers.node_loops import largest_distance
 
 if TYPE_CHECKING:
     from .model import Model
@@ -163,7 +164,10 @@ class StepGuard:
         mesh, rest = self.model.mesh, self.model.bars.rest
         if len(mesh.bars) == 0:
             return 0.0, -1, (-1, -1), 0.0, 0.0
-        value, k = _largest_miss(mesh.bars, self.model.bars.watched, before, after, self._predicted)
+        watched = self.model.bars.watched
+        if 2.0 * largest_distance(after, self._predicted) <= NOTICEABLE * watched.min():  # the ends of any bar
+            return 0.0, -1, (-1, -1), 0.0, 0.0
+        value, k = _largest_miss(mesh.bars, watched, before, after, self._predicted)
         a, b = mesh.bars[k]
         start, end = before[b] - before[a], after[b] - after[a]
         lengths = np.linalg.norm(start) * np.linalg.norm(end)

@@ -22,7 +22,8 @@ from ..solvers.lagged import LaggedPreconditioner
 from ..solvers.linear import LinearChoice, MassSolver, unsymmetric
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
-from ..solvers.newton import NewtonSolver, Tolerance, zero_tolerance
+from ..solvers.newton import Forcing, NewtonSolver, Tolerance, zero_tolerance
+from ..solvers.node_loops import motion_energy, net_force, squares, translate
 from ..solvers.problem import StepProblem
 from ..tolerances import ON_BOUND
 from .guard import StepGuard
@@ -91,10 +92,11 @@ class ImplicitStepper(Stepper):
     failures : number of failed solves of each kind in this run
     """
 
-    kept_numbers = (*Stepper.kept_numbers, "level", "lagged_count", "resolved")
+    kept_numbers = (*Stepper.kept_numbers, "level", "lagged_count", "resolved", "curvature")
     kept_arrays = (*Stepper.kept_arrays, "held", "lagged_place")
     kept_bars = ("lagged_history",)
     resolved = AttributeOf("resolution.numbers")
+    curvature = AttributeOf("forcing.curvature")
     lagged_count = AttributeOf("lagged.count", [])
     lagged_place, lagged_history = (AttributeOf(f"lagged.{name}", np.empty((0, 0))) for name in ("place", "history"))
 
@@ -105,6 +107,7 @@ class ImplicitStepper(Stepper):
         self.failures: Counter[str] = Counter()
         _free_left_over(model.comm)
         self._choice = choice
+        self.forcing = Forcing()
         self._make_solvers()
         self.guard = StepGuard(model) if model.case.solver.guard else None
         self._after = np.zeros_like(self.state.x)
@@ -182,6 +185,7 @@ class ImplicitStepper(Stepper):
         bounded = choice if model.contact.symmetric else unsymmetric(choice)
         most = model.case.solver.max_newton
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.size, self.lagged)
+        self.newton.forcing = self.forcing  # which outlasts these solvers
         self._couple_rows()
         self.newton.prepare(model.can_touch)
         self._mass: MassSolver | None = None
@@ -248,12 +252,11 @@ class ImplicitStepper(Stepper):
     def _suspicion(self, balance: Balance, solution: Solution) -> str | None:
         """Return why the guard rejects a solution, None if it accepts it. Collective."""
         state, model = self.state, self.model
-        owned, h = model.mesh.n_owned, balance.time - state.time
+        h = balance.time - state.time
         after = self.with_ghosts(balance.predictor + solution.u)
-        move = after[:owned] - state.position
         momentum = model.inertia.mass_times(state.v, np.empty_like(state.v))
-        work = state.external + state.contact + state.support
-        energy = 0.5 * float((momentum * state.v).sum()) + 0.5 * float(np.abs(work * move).sum())
+        forces = state.external, state.contact, state.support
+        energy = motion_energy(momentum, state.v, forces, state.position, after)
         return self.guard.check(state.x, after, state.position + self.scheme.expected_move(state, h), energy)
 
     def _with_walls(self, balance: Balance) -> Solution:
@@ -314,7 +317,7 @@ class ImplicitStepper(Stepper):
             bounds.project(w, 2.0 * zero_tolerance(model.size))
             u = problem.increment(w).copy()
             g = np.empty_like(u)
-            problem.imbalance(u, g)
+            problem.imbalance(u, g, evaluated=True)
             try:
                 outcome = active_set.check(trial, bounds, w, u, g, report.norm, tolerance)
             except NotConverged as failure:
@@ -335,9 +338,8 @@ class ImplicitStepper(Stepper):
     def _force_scale(self) -> float:
         """Return the largest 2-norm [N] of momentum per part of a step, loads and internal forces. Collective."""
         state, model = self.state, self.model
-        momentum = ((model.inertia.mass[:, None] * state.v) ** 2).sum() if state.v.any() else 0.0
-        internal = state.f[: model.mesh.n_owned]
-        sums = np.array([momentum / self.part**2, (state.external**2).sum(), (internal**2).sum()])
+        sums = squares(model.inertia.mass, state.v, state.external, state.f[: model.mesh.n_owned])
+        sums[0] /= self.part**2
         model.comm.Allreduce(MPI.IN_PLACE, sums)
         return float(np.sqrt(sums.max()))
 
@@ -371,10 +373,9 @@ class ImplicitStepper(Stepper):
 
         An iterative solution leaves a residual within the tolerance, whose sum would be a drift of linear momentum.
         """
-        net = self.model.comm.allreduce(np.append(g.sum(axis=0), problem.nodal.sum()))
-        shift = net[:3] / net[3]
-        u -= shift
-        g -= problem.nodal[:, None] * shift
+        net = net_force(g, problem.nodal)
+        self.model.comm.Allreduce(MPI.IN_PLACE, net)
+        translate(net[:3] / net[3], problem.nodal, u, g)
 
     def _free_guess(self, balance: Balance) -> np.ndarray:
         """Return increments for an unchanged acceleration."""

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..mesh.ordering import NODE_BLOCK
-from .compiled import borrowing_apart, inlined, kernel
+from .compiled import borrowing, borrowing_apart, inlined, kernel
 from .mass import scale_rows
 from .runs import (
     Groups,
+    Sweep,
     add_lower_ends,
     aligned,
     clear_lower_ends,
@@ -31,12 +32,23 @@ _add_force = accumulate(3)
 
 
 class PaddedBars(NamedTuple):
-    """Bars of a section by columns of padded runs: ``groups``, and c [N/m3] and g [N/m] (columns,), zero where there is
-    no bar."""
+    """Bars of a section by columns of padded runs: ``groups``, c [N/m3] and g [N/m] (columns,), zero where there is no
+    bar, and whether the groups are in the order of their blocks of nodes."""
 
     groups: Groups
     along: np.ndarray
     across: np.ndarray
+    ascending: bool
+
+
+def pad(sweep: Sweep) -> PaddedBars | None:
+    """Return the columns of the bars of a sweep; None if they are not all in diagonal runs."""
+    if not sweep.diagonal.all():
+        return None
+    groups = make_groups(sweep)
+    count = int(groups.starts[-1])
+    ascending = bool((np.diff(groups.heads.astype(np.int64) // NODE_BLOCK) >= 0).all())
+    return PaddedBars(groups, aligned(count), aligned(count), ascending)
 
 
 class BarProducts:
@@ -56,11 +68,7 @@ class BarProducts:
         nodes = bars.mesh.n_local
         self.x = np.zeros((nodes, 3))
         self.stored = np.zeros((2, len(bars.ends)))
-        self._padded: list[PaddedBars | None] = []
-        for block in bars.blocks:
-            groups = make_groups(block.sweep) if block.sweep.diagonal.all() else None
-            count = 0 if groups is None else int(groups.starts[-1])
-            self._padded.append(None if groups is None else PaddedBars(groups, aligned(count), aligned(count)))
+        self._padded = [pad(block.sweep) for block in bars.blocks]
         some = any(padded is not None for padded in self._padded)
         count = nodes if some else 0
         self._planes = (*new_planes(count), new_planes(count)[0])
@@ -71,17 +79,17 @@ class BarProducts:
             split(self.x, self._planes[0])
         for block, padded in zip(self.bars.blocks, self._padded, strict=True):
             if padded is not None:
-                for values, spread in zip(self.stored[:, block.start : block.stop], padded[1:], strict=True):
+                for values, spread in zip(self.stored[:, block.start : block.stop], padded[1:3], strict=True):
                     spread_values(values, block.sweep, padded.groups, 0.0, spread)
 
     def times(self, nodal: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
         """Write nodal u + K u to ``out``, both (local, 3); ``nodal`` (owned,) [N/m]."""
         padded = [bars for bars in self._padded if bars is not None]
         for k, bars in enumerate(padded):
-            add_padded_products(bars, self._planes, (k == 0, k == len(padded) - 1), nodal, u, out)
+            add_padded_products(bars, self._planes, Task(u, out, nodal, k == 0, k == len(padded) - 1))
         if not padded:
             scale_rows(nodal, u, out)
-            out[len(nodal) :] = 0.0
+        out[len(nodal) :] = 0.0  # those of ghosts are not complete
         for block, bars in zip(self.bars.blocks, self._padded, strict=True):
             if bars is None:
                 add_products(block.sweep, self.bars.far, self.x, self.stored, u, out)
@@ -115,22 +123,65 @@ def _add_components(planes, f):
         nodes[3 * i + 2] += zs[i]
 
 
+class Task(NamedTuple):
+    """A product of all bars: ``u`` and ``out`` (local, 3), ``nodal`` (owned,); and whether those of a section are its
+    ``first``, before which u is split, and its ``last``, after which nodal u and the sums are written to out."""
+
+    u: np.ndarray
+    out: np.ndarray
+    nodal: np.ndarray
+    first: bool
+    last: bool
+
+
+@borrowing
+def _begin(task, first, end, vectors, sums):
+    """Write the vectors of the nodes [first, end) to planes, and clear their sums."""
+    stride = len(sums) // 3
+    split_components(task.u, first, end - first, vectors, stride, 0)
+    for c in range(3):
+        fill(sums[c * stride + first : c * stride + end], 0.0)
+
+
+@borrowing
+def _end(task, first, end, sums):
+    """Write the products of the nodes [first, end)."""
+    nodal = task.nodal[first:end]
+    end = first + len(nodal)
+    _join(nodal, task.u[first:end].reshape(-1), sums[first:], len(sums) // 3, task.out[first:end].reshape(-1))
+
+
+@borrowing_apart
+def _join(nodal, u, sums, stride, out):
+    """Write nodal u and sums in planes to vectors (3 n,)."""
+    xs, ys, zs = sums, sums[stride:], sums[2 * stride :]
+    for i in range(len(nodal)):
+        out[3 * i] = nodal[i] * u[3 * i] + xs[i]
+        out[3 * i + 1] = nodal[i] * u[3 * i + 1] + ys[i]
+        out[3 * i + 2] = nodal[i] * u[3 * i + 2] + zs[i]
+
+
 def _group_loop(diagonal: bool) -> Callable[..., Any]:
     """Make the loop over groups of padded runs that adds products, or the diagonal of the stiffness."""
     sign = 1.0 if diagonal else -1.0
 
     @borrowing_apart
-    def add_groups(bars, places, vectors, sums, work):
-        """Add to ``sums`` (3 stride,); ``work``: what is due to the lower ends of the bars of a block of nodes."""
+    def add_groups(bars, places, vectors, sums, task, work):
+        """Add to ``sums`` (3 stride,); ``work``: what is due to the lower ends of the bars of a block of nodes.
+
+        Vectors are split shortly before they are needed, and products written as soon as they are complete.
+        """
         heads, fars, starts = bars.groups.heads, bars.groups.fars, bars.groups.starts
         stride = len(places) // 3
         along, across = bars.along, bars.across
         origin = -1  # first node of the block whose sums are in the workspace
         wide = 0
+        nodes = len(task.u)
+        ready, done = (0 if task.first else nodes), 0
         for group in range(len(heads)):
             first = starts[group]
             n = starts[group + 1] - first
-            node = np.int64(heads[group])
+            node, far = np.int64(heads[group]), np.int64(fars[group])
             block = node // NODE_BLOCK * NODE_BLOCK
             if block != origin:
                 if origin >= 0:
@@ -138,9 +189,15 @@ def _group_loop(diagonal: bool) -> Callable[..., Any]:
                 clear_lower_ends(work)
                 origin = block
                 wide = 0
+                if not diagonal and task.last and bars.ascending:
+                    _end(task, done, block, sums)
+                    done = block
+            if not diagonal and ready < min(far + n, nodes):
+                _begin(task, ready, min(far + n, nodes), vectors, sums)
+                ready = min(far + n, nodes)
             lower = work[node - block :]
             wide = max(wide, node - block + n)
-            x0, x1 = node, np.int64(fars[group])
+            x0, x1 = node, far
             y0, y1, z0, z1 = x0 + stride, x1 + stride, x0 + 2 * stride, x1 + 2 * stride
             for i in range(n):
                 # unsigned: negative indices need not be handled
@@ -162,6 +219,11 @@ def _group_loop(diagonal: bool) -> Callable[..., Any]:
                 sums[np.uint64(z1 + i)] += fz
         if origin >= 0:
             add_lower_ends(work, wide, sums, origin)
+        if not diagonal:
+            if ready < nodes:
+                _begin(task, ready, nodes, vectors, sums)
+            if task.last:
+                _end(task, done, nodes, sums)
 
     return add_groups
 
@@ -170,38 +232,19 @@ _add_group_products, _add_group_diagonals = _group_loop(False), _group_loop(True
 
 
 @kernel
-def add_padded_products(bars, planes, ends, nodal, u, out):
-    """Add the products of :class:`PaddedBars` with ``u`` (n, 3) to the third of ``planes`` (3 stride,), of positions,
-    vectors and sums; ``ends``: whether they are the first bars, before which planes are set, and the last ones, after
-    which nodal u and the sums are written to ``out`` (n, 3)."""
+def add_padded_products(bars, planes, task):
+    """Add the products of :class:`PaddedBars` for a :class:`Task`; ``planes`` (3 stride,) of positions, vectors and
+    sums."""
     places, vectors, sums = planes
-    if ends[0]:
-        split_components(u, 0, len(u), vectors, len(vectors) // 3, 0)
-        fill(sums, 0.0)
-    _add_group_products(bars, places, vectors, sums, new_rows(3))
-    if ends[1]:
-        owned = len(nodal)
-        _join(nodal, u[:owned].reshape(-1), sums, out[:owned].reshape(-1))
-        out[owned:] = 0.0  # those of ghosts are not complete
-
-
-@borrowing_apart
-def _join(nodal, u, sums, out):
-    """Write nodal u and sums in planes to vectors (3 n,)."""
-    stride = len(sums) // 3
-    xs, ys, zs = sums, sums[stride:], sums[2 * stride :]
-    for i in range(len(nodal)):
-        out[3 * i] = nodal[i] * u[3 * i] + xs[i]
-        out[3 * i + 1] = nodal[i] * u[3 * i + 1] + ys[i]
-        out[3 * i + 2] = nodal[i] * u[3 * i + 2] + zs[i]
+    _add_group_products(bars, places, vectors, sums, task, new_rows(3))
 
 
 @kernel
 def add_padded_diagonals(bars, planes, diagonal):
-    """Add the diagonal of :class:`PaddedBars` to ``diagonal`` (n, 3); ``planes`` (3 stride,) as for products."""
+    """Add the diagonal of :class:`PaddedBars` to ``diagonal`` (n, 3); ``planes`` as for products."""
     places, vectors, sums = planes
     fill(sums, 0.0)
-    _add_group_diagonals(bars, places, vectors, sums, new_rows(3))
+    _add_group_diagonals(bars, places, vectors, sums, Task(diagonal, diagonal, sums, False, False), new_rows(3))
     _add_components(sums, diagonal)
 
 

@@ -133,6 +133,9 @@ class AssembledPreconditioner:
 _SET_UP = {"gamg": 90, "lu": 40, "mumps": 55, "multigrid": 15}
 
 
+_NONE = (0.0,) * 6 + (1.0,)  # before the first set-up
+
+
 class LaggedPreconditioner:
     """The preconditioner and the decision when to set it up again.
 
@@ -152,10 +155,10 @@ class LaggedPreconditioner:
     place : (owned, 6) positions at which the Hessian was evaluated [m], and whether a component was active; (owned, 0)
         if the next problem needs a set-up
     history : (b, names) data of the material laws there, see ``Bars.history``; (b, 0) if they keep none
-    count : other data that decide on a set-up: the coefficients of the Hessian, iterations of the first solve with it,
-        excess iterations of later solves, and iterations of the last solve, all for the usual reduction
+    count : other data that decide on a set-up: the coefficients of the Hessian, iterations of the first solve with it
+        for the usual reduction, excess iterations of later solves, iterations of the last solve, and its share
     carried : whether it was set up for an earlier problem
-    share : of the usual reduction of the residual, in digits, that the present solve makes
+    share : digits by which the next solve reduces the residual, over those of the usual reduction
     """
 
     def __init__(self, model: Model, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
@@ -171,7 +174,7 @@ class LaggedPreconditioner:
         self.outlasts = not model.bars_vary and not model.inertia.varies
         self.place = np.zeros((mesh.n_owned, 0))
         self.history = np.zeros((len(mesh.bars), 0))
-        self.count = [0.0] * 6
+        self.count = list(_NONE)
         self.carried = False
         self.share = 1.0
         self._supports = model.supports
@@ -202,11 +205,11 @@ class LaggedPreconditioner:
         problem : StepProblem, at the positions at which the Hessian is required
         kept : this rank's unknowns in the system, local and ascending; None for all
         """
-        *coefficients, first, beyond, last = self.count or [0.0] * 6
+        *coefficients, first, beyond, last, share = [*(self.count or _NONE), 1.0][: len(_NONE)]
         if last and not first:
-            first = last
+            first = last / share
         else:
-            beyond += max(last - first, 0.0)
+            beyond += max(last - first * share, 0.0)
         balance = problem.balance
         wanted = [balance.alpha, balance.eta, balance.weight]
         due = beyond > _SET_UP.get(self.kind, 0)
@@ -231,7 +234,7 @@ class LaggedPreconditioner:
                 self.history = self.bars.history()
         self.carried &= not due
         self._problem = problem
-        self.count = [*wanted, first, beyond, 0.0]
+        self.count = [*wanted, first, beyond, 0.0, self.share]
 
     def _make_again(self, problem: StepProblem) -> None:
         """Recreate the preconditioner after a restart, from the Hessian at its last set-up."""
@@ -249,7 +252,7 @@ class LaggedPreconditioner:
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Compute y = P x for the unknowns kept, see :meth:`renew`. Collective."""
-        self.count[-1] += 1.0 / self.share
+        self.count[-2] += 1.0
         kept = self._kept
         if kept is None:
             self.inner.apply(x, y)

@@ -127,12 +127,12 @@ class Forcing:
         self._rest = rest * share**2
         self.renews = not 2.0 * rest * share < _WELL * required
 
-    def reduction(self, norm: float, required: float) -> float:
-        """Return by how much the next linear solve reduces a residual of a 2-norm, if ``required`` is the residual of
-        the solution [N]."""
+    def reduction(self, norm: float, tolerance: Tolerance) -> float:
+        """Return the factor by which the next linear solve reduces a residual of a 2-norm [N]."""
         if self._rest < 0.0 or norm == 0.0:
             return USUAL_REDUCTION
-        left = max(_WELL * required, min(_FEW * self._rest, _MOST * norm))
+        left = max(_WELL * tolerance.residual, min(_FEW * self._rest, _MOST * norm))
+        left = max(left, min(_WELL * tolerance.rounding, USUAL_REDUCTION * norm))
         return min(max(left / norm, _LEAST), 0.5)
 
 
@@ -372,7 +372,7 @@ class NewtonSolver:
 
     def _hessian(self, snes: PETSc.SNES, u: PETSc.Vec, matrix: PETSc.Mat, preconditioner: PETSc.Mat) -> None:
         if self._forces:
-            reduction = self.forcing.reduction(self._previous, self._tolerance.residual)
+            reduction = self.forcing.reduction(self._previous, self._tolerance)
             snes.getKSP().setTolerances(rtol=reduction)
             if self.lagged is not None:
                 self.lagged.expect(reduction)

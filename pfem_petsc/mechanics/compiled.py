@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib
 import os
 import pickle
 import threading
@@ -299,6 +300,9 @@ class _Cache(FunctionCache):
         if found is None:
             return None
         *reduced, inlined_code, symbols = found
+        _, _, (machine_code, _) = reduced[0]
+        if b"_numba_hashsecret" in machine_code:  # of this process, which this module makes known to machine code
+            importlib.import_module("numba.cpython.hashing")
         codegen._engine._defined_symbols |= symbols
         compiled = self._impl.rebuild(target_context, reduced)
         _parse_later(compiled.library, inlined_code)

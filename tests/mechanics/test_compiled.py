@@ -61,6 +61,41 @@ def test_compiling_is_noticed_once_and_loading_is_not(module):
     assert len(took) == 2
 
 
+def test_machine_code_from_disk_finds_what_it_refers_to(tmp_path):
+    """Hashes of texts need a number of the process, a system of equations LAPACK, a random number its generator."""
+    (tmp_path / "loops_of_others.py").write_text(
+        "import numpy as np\n"
+        "from pfem_petsc.mechanics.compiled import kernel\n"
+        "@kernel\n"
+        "def of_text(text):\n"
+        "    return hash(text)\n"
+        "@kernel\n"
+        "def solved(a, b):\n"
+        "    np.random.seed(1)\n"
+        "    return np.linalg.solve(a, b) + 0.0 * np.sort(np.random.rand(2))\n"
+        "@kernel\n"
+        "def refused(x):\n"
+        "    if x > 1.0:\n"
+        "        raise ValueError('too large')\n"
+        "    print('value', x)\n"
+    )
+    program = (
+        "import numpy as np\n"
+        "from loops_of_others import of_text, solved, refused\n"
+        "assert of_text('a long text') == hash('a long text')\n"
+        "print(solved(2.0 * np.eye(2), np.ones(2)))\n"
+        "refused(0.5)\n"
+        "try:\n"
+        "    refused(2.0)\n"
+        "except ValueError as error:\n"
+        "    print(error)\n"
+    )
+    for _ in range(2):  # compiled, then loaded
+        command = [sys.executable, "-c", program]
+        said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+        assert said == "[0.5 0.5]\nvalue 0.5\ntoo large\n"
+
+
 def test_short_compilations_are_not_reported():
     """They count together; a report comes while the loop that makes them long is compiled."""
     told, took = [], []

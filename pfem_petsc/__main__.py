@@ -3,10 +3,15 @@
 if __name__ == "__main__":
     from .signals import watch_early
 
-    watch_early()  # before the imports, which take a second
+    watch_early()  # before the imports, which take half a second
 
     import sys
 
+    from .leaving import leave_at_exit
+
+    leaving = leave_at_exit()  # before the imports, so that what they do at exit is done before
+
     from .cli.main import main
 
-    sys.exit(main())
+    leaving.status = main()
+    sys.exit(leaving.status)

@@ -16,7 +16,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "pfem_petsc"
 
 FLOORS = (
-    ("columns", "errors", "fields", "files", "signals", "tolerances", "version"),
+    ("columns", "errors", "fields", "files", "leaving", "signals", "tolerances", "version"),
     ("registry",),
     ("parallel",),
     ("cases",),

@@ -105,28 +105,34 @@ def find_pairs(comm: MPI.Comm, points: Points, own: Segments, skin: float = 0.0,
     -------
     Pairs, or None on all ranks if the search would take too long, because too many segments are in one place
     """
-    low, high, sums = np.full(3, np.inf), np.full(3, -np.inf), np.zeros(2)
-    _measure(points.at, own, low, high, sums)
     number = comm.allreduce(len(own.ids))
-    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-    comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
+    box, extents, sums = _measure(comm, points.at, own, np.inf, 0.0)
     mean = float(sums[1]) / max(float(sums[0]), 1.0)
     skin, longest, pieces = skin * mean, 2.0 * mean or 1.0, 0.0
     while number:
-        extents = np.zeros(4)
-        _extend(points.at, own, longest, skin, extents)
-        before, pieces = pieces, comm.allreduce(float(extents[3]))
-        comm.Allreduce(MPI.IN_PLACE, extents, op=MPI.MAX)
+        box, extents, sums = _measure(comm, points.at, own, longest, skin)
+        before, pieces = pieces, float(sums[2])
         if pieces == before or pieces > _PIECES * number:  # shorter pieces are no better, or too many
             return None
-        grid = _make_grid(comm, low, high, extents[:3], longest, skin)
+        grid = _make_grid(comm, *box, extents, longest, skin)
         held = (points, own) if comm.size == 1 else _hold(comm, grid, points, own)
         found, comparisons = _compare(grid, *held, factor, _COMPARISONS * number)
         if comm.allreduce(comparisons) <= _COMPARISONS * number:
             return found._replace(gap=comm.allreduce(min(found.gap, skin), op=MPI.MIN))
         longest *= 0.5
     return Pairs(np.empty((0, 2), np.int64), np.empty((0, 2, 2), np.int64), np.empty((0, 2)), np.inf)
+
+
+def _measure(
+    comm: MPI.Comm, at: np.ndarray, own: Segments, longest: float, skin: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the lowest and highest corner of the box around all segments (2, 3), how far their pieces reach from their
+    middles (3,) [m], and sums (3,), see :func:`_measure_segments`. Collective."""
+    most, sums = np.empty(9), np.empty(3)
+    _measure_segments(at, own, longest, skin, most, sums)
+    comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
+    comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
+    return np.stack([-most[:3], most[3:6]]), most[6:], sums
 
 
 def _make_grid(
@@ -249,25 +255,6 @@ def _make_planes(grid: _Grid, points: Points, held: Segments) -> _Planes:
     return _Planes(starts[:-1], rows, parts, marks.astype(np.int32))
 
 
-@kernel
-def _measure(at, segments, low, high, sums):
-    """Write the corners of the box around segments, how many are longer than zero, and the sum of their lengths with
-    margins."""
-    low_x = low_y = low_z = np.inf
-    high_x = high_y = high_z = -np.inf
-    number = total = 0.0
-    for n in range(len(segments.ids)):
-        a, b = segments.points[n, 0], segments.points[n, 1]
-        x, y, z, p, q, r = at[a, 0], at[a, 1], at[a, 2], at[b, 0], at[b, 1], at[b, 2]
-        low_x, low_y, low_z = min(low_x, x, p), min(low_y, y, q), min(low_z, z, r)
-        high_x, high_y, high_z = max(high_x, x, p), max(high_y, y, q), max(high_z, z, r)
-        square = (p - x) ** 2 + (q - y) ** 2 + (r - z) ** 2
-        number += square > 0.0
-        total += np.sqrt(square) + 2.0 * segments.margin[n]
-    low[0], low[1], low[2], high[0], high[1], high[2] = low_x, low_y, low_z, high_x, high_y, high_z
-    sums[0], sums[1] = number, total
-
-
 @borrowing
 def _pieces(at, segments, n, longest, skin):
     """Return the number of pieces of a segment: not longer than ``longest``, or four times as long as thick."""
@@ -278,18 +265,30 @@ def _pieces(at, segments, n, longest, skin):
 
 
 @kernel
-def _extend(at, segments, longest, skin, extents):
-    """Write how far pieces with their margins reach from their middles along x, y and z, and the number of pieces."""
-    x = y = z = number = 0.0
+def _measure_segments(at, segments, longest, skin, most, sums):
+    """Write the largest coordinates, with both signs, and how far pieces with their margins reach from their middles
+    along x, y and z (9,); and the numbers of segments longer than zero, the sum of their lengths with margins, and the
+    number of pieces (3,)."""
+    x0 = y0 = z0 = x1 = y1 = z1 = -np.inf
+    x = y = z = number = total = every = 0.0
     for n in range(len(segments.ids)):
-        pieces = _pieces(at, segments, n, longest, skin)
         a, b = segments.points[n, 0], segments.points[n, 1]
+        ax, ay, az, bx, by, bz = at[a, 0], at[a, 1], at[a, 2], at[b, 0], at[b, 1], at[b, 2]
+        x0, y0, z0 = max(x0, -ax, -bx), max(y0, -ay, -by), max(z0, -az, -bz)
+        x1, y1, z1 = max(x1, ax, bx), max(y1, ay, by), max(z1, az, bz)
+        square = (bx - ax) ** 2 + (by - ay) ** 2 + (bz - az) ** 2
+        number += square > 0.0
+        total += np.sqrt(square) + 2.0 * segments.margin[n]
+        pieces = _pieces(at, segments, n, longest, skin)
         part, margin = 0.5 / pieces, segments.margin[n] + 0.5 * skin
-        x = max(x, part * abs(at[b, 0] - at[a, 0]) + margin)
-        y = max(y, part * abs(at[b, 1] - at[a, 1]) + margin)
-        z = max(z, part * abs(at[b, 2] - at[a, 2]) + margin)
-        number += pieces
-    extents[0], extents[1], extents[2], extents[3] = x, y, z, number
+        x, y, z = (
+            max(x, part * abs(bx - ax) + margin),
+            max(y, part * abs(by - ay) + margin),
+            max(z, part * abs(bz - az) + margin),
+        )
+        every += pieces
+    most[0], most[1], most[2], most[3], most[4], most[5], most[6], most[7], most[8] = x0, y0, z0, x1, y1, z1, x, y, z
+    sums[0], sums[1], sums[2] = number, total, every
 
 
 @borrowing

@@ -123,9 +123,9 @@ class Geometry:
         if len(span) < 3:  # else it would only be turned
             inside = np.einsum("ri,nij,sj->nrs", span, inside, span)
         # det / trace^(r-1) is a lower bound of the smallest eigenvalue: well above zero, no more work is needed
-        bounds = np.empty(len(inside))
-        _bound_eigenvalues(inside, bounds)
-        doubtful = ~(bounds > _RANK)
+        trace = np.trace(inside, axis1=1, axis2=2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            doubtful = ~(np.linalg.det(inside) / trace ** (len(span) - 1) > _RANK)
         if doubtful.any():
             doubtful[doubtful] = np.linalg.eigvalsh(inside[doubtful])[:, 0] < _RANK
         return self._lowest(doubtful)
@@ -205,22 +205,6 @@ def _add_directions(points, bars, total):
         for i in range(3):
             for j in range(i):
                 total[end, i, j] = total[end, j, i]
-
-
-@kernel
-def _bound_eigenvalues(matrices, bounds):
-    """Write det/trace^(r - 1) of symmetric matrices (n, r, r), r up to 3; NaN for zeros."""
-    for k in range(len(matrices)):
-        m = matrices[k]
-        if len(m) == 1:
-            bounds[k] = m[0, 0]
-        elif len(m) == 2:
-            bounds[k] = (m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]) / (m[0, 0] + m[1, 1])
-        else:
-            determinant = m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
-            determinant -= m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
-            determinant += m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
-            bounds[k] = determinant / (m[0, 0] + m[1, 1] + m[2, 2]) ** 2
 
 
 @kernel

@@ -79,3 +79,37 @@ def motion_energy(momentum, v, forces, before, after):
             else:
                 z += part
     return 0.5 * (x + y + z)
+
+
+@kernel
+def extend(before, after, differences, orders):
+    """Replace first and second backward differences (n, 6) of vectors by those at ``after`` (n, 3), and the orders (n,)
+    by those that would have predicted it best."""
+    for i in range(len(after)):
+        first = second = third = 0.0
+        for c in range(3):
+            one = after[i, c] - before[i, c]
+            two = one - differences[i, c]
+            three = two - differences[i, 3 + c]
+            differences[i, c] = one
+            differences[i, 3 + c] = two
+            first += one * one
+            second += two * two
+            third += three * three
+        order = 1 if second < first else 0
+        if third < min(first, second):
+            order = 2
+        orders[i] = order
+
+
+@kernel
+def extrapolate(vectors, differences, orders, factor, out):
+    """Write vectors (n, 3) expected next, by polynomials of the ``orders`` (n,), times a factor."""
+    for i in range(len(out)):
+        for c in range(3):
+            value = vectors[i, c]
+            if orders[i] > 0:
+                value += differences[i, c]
+            if orders[i] > 1:
+                value += differences[i, 3 + c]
+            out[i, c] = factor * value

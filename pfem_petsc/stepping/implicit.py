@@ -23,7 +23,7 @@ from ..solvers.linear import LinearChoice, MassSolver, unsymmetric
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
 from ..solvers.newton import Forcing, NewtonSolver, Tolerance, zero_tolerance
-from ..solvers.node_loops import motion_energy, net_force, squares, translate
+from ..solvers.node_loops import extend, extrapolate, motion_energy, net_force, squares, translate
 from ..solvers.problem import StepProblem
 from ..tolerances import ON_BOUND
 from .guard import StepGuard
@@ -88,12 +88,14 @@ class ImplicitStepper(Stepper):
     Attributes
     ----------
     level : the next step is made in 2**level parts
+    differences, orders : (owned, 6) first and second backward differences of accelerations [m/s2], and (owned,) orders
+        of the polynomials in time that predict them; for guesses
     message : receives what users are told during a step
     failures : number of failed solves of each kind in this run
     """
 
     kept_numbers = (*Stepper.kept_numbers, "level", "lagged_count", "resolved", "curvature")
-    kept_arrays = (*Stepper.kept_arrays, "held", "lagged_place")
+    kept_arrays = (*Stepper.kept_arrays, "held", "lagged_place", "differences", "orders")
     kept_bars = ("lagged_history",)
     resolved = AttributeOf("resolution.numbers")
     curvature = AttributeOf("forcing.curvature")
@@ -112,6 +114,8 @@ class ImplicitStepper(Stepper):
         self.guard = StepGuard(model) if model.case.solver.guard else None
         self._after = np.zeros_like(self.state.x)
         self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes in contact with walls in the last step
+        self.differences = np.zeros((model.mesh.n_owned, 6 if scheme.inertial else 0))
+        self.orders = np.zeros(model.mesh.n_owned, dtype=np.uint8)
         self.accuracy = 1.0  # of a solve, as a factor on the tolerance of steps; zero: to rounding
         self.resolution = Resolution()
 
@@ -167,6 +171,8 @@ class ImplicitStepper(Stepper):
             self.model.contact.motion.bodies.step_changed(self.scheme)
             self.step_changed = True
             self.part = part
+            self.differences[:] = 0.0
+            self.orders[:] = 0
         self.smallest = min(self.smallest, part)
 
     def _make_solvers(self) -> None:
@@ -378,8 +384,16 @@ class ImplicitStepper(Stepper):
         translate(net[:3] / net[3], problem.nodal, u, g)
 
     def _free_guess(self, balance: Balance) -> np.ndarray:
-        """Return increments for an unchanged acceleration."""
-        return self.state.a / balance.alpha
+        """Return increments for the accelerations that those of the last steps let expect."""
+        guess = np.empty_like(self.state.a)
+        extrapolate(self.state.a, self.differences, self.orders, 1.0 / balance.alpha, guess)
+        return guess
+
+    def _finish(self, end: float) -> None:
+        before = self.state.a
+        super()._finish(end)
+        if self.scheme.inertial:
+            extend(before, self.state.a, self.differences, self.orders)
 
     def _guess(self, balance: Balance) -> np.ndarray:
         """Return the increments with which solves begin, prescribed components at their exact positions."""

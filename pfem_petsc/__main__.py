@@ -13,5 +13,4 @@ if __name__ == "__main__":
 
     from .cli.main import main
 
-    leaving.status = main()
-    sys.exit(leaving.status)
+    sys.exit(leaving.ends_with(main()))

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+import gc
 import os
 import sys
+from typing import TextIO
 
 
 class Leaving:
@@ -21,24 +23,22 @@ class Leaving:
 
     status: int | None = None
 
+    def ends_with(self, status: int) -> int:
+        """Take the exit status of the program, which has nothing more to do, and return it."""
+        self.status = status
+        if status == 0:
+            gc.freeze()  # nothing that is collected at exit would be freed for long
+        return status
+
     def leave(self) -> None:
         """End the process if the program has succeeded."""
-        if self.status != 0 or _files_are_open():
+        if self.status != 0:
             return
-        for stream in (sys.stdout, sys.stderr):
-            try:
-                stream.flush()
-            except (OSError, ValueError):
-                return  # reported, with the exit status, by Python
-        # the order in which they end with the interpreter: PETSc prints its logs, then MPI tells the launcher
-        if "petsc4py.PETSc" in sys.modules:
-            sys.modules["petsc4py.PETSc"]._finalize()
-        if "mpi4py.MPI" in sys.modules:
-            mpi = sys.modules["mpi4py.MPI"]
-            if mpi.Is_initialized() and not mpi.Is_finalized():
-                mpi.Finalize()
-        ctypes.CDLL(None).fflush(None)  # what libraries have printed
-        os._exit(0)
+        if not _files_are_open() and _are_flushed(sys.stdout, sys.stderr):
+            _finalise()
+            os._exit(0)
+        gc.unfreeze()
+        gc.collect()  # objects that libraries could no longer free after Python
 
 
 def leave_at_exit() -> Leaving:
@@ -46,6 +46,28 @@ def leave_at_exit() -> Leaving:
     leaving = Leaving()
     atexit.register(leaving.leave)
     return leaving
+
+
+def _finalise() -> None:
+    """Finalise libraries in the order in which they end with the interpreter: PETSc prints its logs, then MPI tells the
+    launcher."""
+    if "petsc4py.PETSc" in sys.modules:
+        sys.modules["petsc4py.PETSc"]._finalize()
+    if "mpi4py.MPI" in sys.modules:
+        mpi = sys.modules["mpi4py.MPI"]
+        if mpi.Is_initialized() and not mpi.Is_finalized():
+            mpi.Finalize()
+    ctypes.CDLL(None).fflush(None)  # what libraries have printed
+
+
+def _are_flushed(*streams: TextIO) -> bool:
+    """Return whether all is written; what is not, Python reports with the exit status of that."""
+    try:
+        for stream in streams:
+            stream.flush()
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _files_are_open() -> bool:

@@ -64,7 +64,12 @@ class SharedFile:
 
     def call(self, function: Callable[[], T]) -> T:
         """Call a function that uses the file on its owners; return its result on all ranks. Collective."""
-        return function() if self.together else on_root(self.comm, function)
+        return function() if self.together else on_root(self.comm, self._guarded, function)
+
+    def _guarded(self, function: Callable[[], T]) -> T:
+        """Call a function of the only owner, whose errors of HDF5 other ranks must know."""
+        with self.writing():
+            return function()
 
     def write(self, dataset: Growing | None, first: int, rows: np.ndarray, index: tuple[int, ...] = ()) -> None:
         """Write each rank's rows (n, ...) from row ``first`` of a dataset, at an index of the dimensions before.
@@ -115,7 +120,7 @@ class SharedFile:
             return
         self._begun = True
         if self.file is not None:
-            self._work = self._thread.submit(work)
+            self._work = self._thread.submit(self._guarded, work)
 
     def wait(self) -> None:
         """Wait for the work beside the steps. Collective.

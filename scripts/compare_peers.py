@@ -72,11 +72,14 @@ MODES = {
         "explicit, elastic, foot held, a row every 500 steps, wall time on two ranks",
         (OURS_2, LAMMPS_2),
     ),
+    "whole": ("300 explicit steps from the shell to the prompt, default output", (OURS, LAMMPS)),
+    "whole_long": ("20,000 explicit steps from the shell to the prompt, default output", (OURS, LAMMPS)),
     "explicit_contact": ("explicit, elastoplastic, wall", (OURS, BARE, OPENSEES)),
     "implicit": ("implicit at 2 l/c, elastic, foot held", (OURS, FREE, ASSEMBLED, AMGCL, MUMPS, UMFPACK)),
     "static": ("static increments between plates, elastic", (OURS, GAMG, DIRECT, AMGCL)),
     "implicit_contact": ("implicit at 2 l/c, elastoplastic, wall", (OURS, MUMPS, UMFPACK)),
 }
+DEFAULT = [mode for mode in MODES if mode != "whole_long"]  # which writes 2,000 snapshots
 TIME_LIMIT = 1200.0  # [s] for one run
 
 
@@ -84,7 +87,7 @@ def main() -> int:
     """Install, run, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", type=int, nargs="+", default=[10_230, 101_706], help="bars; the nearest lattices")
-    parser.add_argument("--modes", nargs="+", choices=list(MODES), default=list(MODES), help="what to compare")
+    parser.add_argument("--modes", nargs="+", choices=list(MODES), default=DEFAULT, help="what to compare")
     parser.add_argument("--only", nargs="+", choices=["bare", *PACKAGES], help="the peers to run; default: all")
     parser.add_argument("--repeats", type=int, default=3, help="rounds (default %(default)s)")
     parser.add_argument("--venv", type=Path, default=ROOT / "results" / "peers-venv", help="environment of the peers")
@@ -132,6 +135,8 @@ def install(name: str, folder: Path) -> str | None:
 
 def steps_of(mode: str, bars: int) -> int:
     """Return the number of timed steps: enough for the clock, few enough for the slowest code."""
+    if mode.startswith("whole"):
+        return 20_000 if mode == "whole_long" else 300
     if mode == "static":
         return 5 if bars < 50_000 else 3 if bars < 500_000 else 1
     if "_long" in mode or "_rows" in mode:

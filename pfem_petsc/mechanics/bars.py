@@ -483,10 +483,6 @@ class Bars:
         for family in self.families:
             family.add_step_forces(x0, x, f)
 
-    def factors(self, x: np.ndarray, stored: np.ndarray) -> None:
-        """Fill ``stored`` (3, b) with dN/dl - N/l [N/m], N/l [N/m] and 1/l [1/m] of each bar at ``x``."""
-        self._for_blocks("factors", x, stored)
-
     def lengths(self, x: np.ndarray) -> np.ndarray:
         """Return the length (b,) of each local bar [m]."""
         lengths = np.empty_like(self.rest)

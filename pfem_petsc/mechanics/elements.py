@@ -343,14 +343,6 @@ def _state_loops(law: Law, element: SimpleNamespace, measure: Callable[..., Any]
         add_blocks(out, bars, k, out.weight * (axial - geometric), n, n, out.weight * geometric)
 
     @borrowing
-    def factors(x, bars, k, out):
-        """``out``: (3, b) dN/dl - N/l, N/l and 1/l."""
-        axial, geometric, inverse = stiffness(end_difference(x, bars, k), read(bars, k), bars.step)
-        out[0, k] = axial - geometric
-        out[1, k] = geometric
-        out[2, k] = inverse
-
-    @borrowing
     def linearise(x, bars, k, out):
         """``out``: weight and (5, b) n, dN/dl - N/l and N/l."""
         weight, stored = out
@@ -402,7 +394,7 @@ def _state_loops(law: Law, element: SimpleNamespace, measure: Callable[..., Any]
             rate += (begun - bar.shift - bar.strain) / bars.step + eta * (bar.strain - (strain - bar.shift))
         bars.history[known, k - bars.start] = rate
 
-    visits = (tangents, factors, linearise, fields, densities, rates)
+    visits = (tangents, linearise, fields, densities, rates)
     return {visit.__name__: _for_all(visit.__name__, visit) for visit in visits}
 
 
@@ -474,7 +466,8 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     places = np.array([BAR_ENERGIES.index(name) for name in law.energies], dtype=np.int64)
     by_rate, last, n_rows = law.rate, len(law.internal), len(law.rows)
     first_new = 4 + len(places)
-    work_rows = first_new + n_rows
+    first_pull = first_new + n_rows
+    work_rows = first_pull + 3
     add_energies, put_new, changes = accumulate(len(law.energies)), put(len(law.internal)), differ(len(law.internal))
     can_break, gone = law.rupture >= 0, max(law.rupture, 0)
 
@@ -483,8 +476,8 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
         """Add the internal forces of the chunks [begun, ended) of the sweep to ``f``; results as those of
         :func:`forces`.
 
-        ``work`` (work_rows ROW,): end differences, force over length, sums of the energies, new history. One sum is
-        kept per position in a chunk, so vector instructions need no reordering.
+        ``work`` (work_rows ROW,): end differences, force over length, sums of the energies, new history, and
+        forces as vectors. One sum is kept per position in a chunk, so vector instructions need no reordering.
         """
         failed = -1
         shortened = False
@@ -494,6 +487,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
         xs, ys, zs, cs = work[:ROW], work[ROW : 2 * ROW], work[2 * ROW : 3 * ROW], work[3 * ROW : 4 * ROW]
         lasts = work[(first_new + last) * ROW :]
         stresses = work[(first_new + last + 1) * ROW :]
+        pulls = work[first_pull * ROW :]
         for chunk in range(begun, ended):
             first = starts[chunks[chunk]]
             n = starts[chunks[chunk + 1]] - first
@@ -535,7 +529,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                             failed = np.int64(first + i)  # signed, like -1
                         # the norms of the solver must detect an inadmissible trial position
                         cs[i] = 0.0 if commit else math.nan
-            scatter_forces(f, bars.sweep, bars.far, chunk, work)
+            scatter_forces(f, bars.sweep, bars.far, chunk, work, pulls)
         return failed, shortened, broke
 
     @kernel

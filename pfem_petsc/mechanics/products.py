@@ -73,6 +73,15 @@ class BarProducts:
         count = nodes if some else 0
         self._planes = (*new_planes(count), new_planes(count)[0])
 
+    @classmethod
+    def tangent(cls, bars: Bars, x: np.ndarray) -> BarProducts:
+        """Return products with the tangent stiffness at positions ``x`` (local, 3), without springs."""
+        made = cls(bars)
+        made.x[:] = x
+        bars.stiffnesses(x, 1.0, made.stored)
+        made.take()
+        return made
+
     def take(self) -> None:
         """Take account of changes of :attr:`x` and :attr:`stored`."""
         if len(self._planes[0]):

@@ -10,10 +10,9 @@ import numpy as np
 
 from ..mesh.ordering import FEW, LEAST_RUN, NODE_BLOCK
 from .compiled import borrowing, borrowing_apart, inlined, kernel
-from .strips import LANES, add_strips, differences
 from .tuples import CHUNK, ROW
 
-_LINE = 8  # numbers in a line of the cache
+_LINE = LANES = 8  # numbers in a line of the cache, and of a vector
 
 
 def aligned(count: int) -> np.ndarray:
@@ -216,15 +215,20 @@ def end_differences(x, sweep, ends, chunk, work):
     """Write the end differences of a chunk of bars at positions ``x`` (n, 3) to the first three rows of a workspace,
     from the lower one of the ``ends`` (b, 2) to the upper one."""
     heads, fars, starts = sweep.heads, sweep.fars, sweep.starts
-    first = starts[sweep.chunks[chunk]]
+    first = np.int64(starts[sweep.chunks[chunk]])
+    places = x.reshape(-1)
     if sweep.diagonal[chunk]:
         for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
-            at = starts[run]
-            differences(x, heads[run], fars[run], starts[run + 1] - at, work, at - first)
+            at = np.int64(starts[run])
+            xs, ys, zs = work[at - first :], work[ROW + at - first :], work[2 * ROW + at - first :]
+            low, high = places[3 * np.int64(heads[run]) :], places[3 * np.int64(fars[run]) :]
+            for i in range(np.int64(starts[run + 1]) - at):
+                xs[i] = high[3 * i] - low[3 * i]
+                ys[i] = high[3 * i + 1] - low[3 * i + 1]
+                zs[i] = high[3 * i + 2] - low[3 * i + 2]
         return
     xs, ys, zs = work[:ROW], work[ROW : 2 * ROW], work[2 * ROW : 3 * ROW]
-    places = x.reshape(-1)
-    for i in range(starts[sweep.chunks[chunk + 1]] - first):
+    for i in range(np.int64(starts[sweep.chunks[chunk + 1]]) - first):
         one, other = np.int64(ends[first + i, 0]), np.int64(ends[first + i, 1])
         a, b = 3 * min(one, other), 3 * max(one, other)
         # unsigned: negative indices need not be handled
@@ -234,37 +238,42 @@ def end_differences(x, sweep, ends, chunk, work):
 
 
 @borrowing_apart
-def scatter_forces(f, sweep, far, chunk, work):
+def scatter_forces(f, sweep, far, chunk, work, pulls):
     """Subtract the forces of a chunk of bars from their lower ends in ``f`` (n, 3), and add them to the upper ones:
-    the first three rows of a workspace times the fourth one."""
+    the first three rows of a workspace times the fourth one. ``pulls``: room for vectors (3 CHUNK,)."""
     heads, fars, starts = sweep.heads, sweep.fars, sweep.starts
-    first = starts[sweep.chunks[chunk]]
-    if sweep.diagonal[chunk]:
-        for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
-            at = starts[run]
-            add_strips(f, heads[run], fars[run], starts[run + 1] - at, work, at - first)
-        return
+    first = np.int64(starts[sweep.chunks[chunk]])
     xs, ys, zs = work[:ROW], work[ROW : 2 * ROW], work[2 * ROW : 3 * ROW]
     cs = work[3 * ROW : 4 * ROW]
-    for i in range(starts[sweep.chunks[chunk + 1]] - first):
-        xs[i] *= cs[i]
-        ys[i] *= cs[i]
-        zs[i] *= cs[i]
+    for i in range(np.int64(starts[sweep.chunks[chunk + 1]]) - first):
+        pulls[3 * i] = cs[i] * xs[i]
+        pulls[3 * i + 1] = cs[i] * ys[i]
+        pulls[3 * i + 2] = cs[i] * zs[i]
     forces = f.reshape(-1)
+    if sweep.diagonal[chunk]:
+        for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
+            of_run = pulls[3 * (np.int64(starts[run]) - first) : 3 * (np.int64(starts[run + 1]) - first)]
+            low, high = forces[3 * np.int64(heads[run]) :], forces[3 * np.int64(fars[run]) :]
+            for i in range(len(of_run)):
+                low[i] -= of_run[i]
+            for i in range(len(of_run)):
+                high[i] += of_run[i]
+        return
     for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
         fx = 0.0
         fy = 0.0
         fz = 0.0
         for k in range(starts[run], starts[run + 1]):
             b = 3 * np.int64(far[k])
-            i = k - first
-            fx += xs[i]
-            fy += ys[i]
-            fz += zs[i]
+            at = 3 * (k - first)
+            gx, gy, gz = pulls[at], pulls[at + 1], pulls[at + 2]
+            fx += gx
+            fy += gy
+            fz += gz
             # unsigned: negative indices need not be handled
-            forces[np.uint64(b)] += xs[i]
-            forces[np.uint64(b + 1)] += ys[i]
-            forces[np.uint64(b + 2)] += zs[i]
+            forces[np.uint64(b)] += gx
+            forces[np.uint64(b + 1)] += gy
+            forces[np.uint64(b + 2)] += gz
         a = 3 * np.int64(heads[run])
         forces[np.uint64(a)] -= fx
         forces[np.uint64(a + 1)] -= fy

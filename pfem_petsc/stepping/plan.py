@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..integrators.base import Scheme
 from ..mechanics.bars import viscous_rate
 from ..mechanics.materials.base import law_name, law_of
-from ..mechanics.tangent import Tangent
+from ..mechanics.products import BarProducts
 from ..output.units import TIME as AXIS
 from ..output.units import Axis, engineering
 from ..registry import choices, lookup
@@ -88,7 +88,7 @@ def highest_frequency(model: Model, x: np.ndarray, steps: int = 60, accuracy: fl
         return Frequency(0.0, 0.0)
     q /= size
     previous = np.zeros_like(q)
-    tangent = Tangent(model.bars, x)
+    products, no_inertia = BarProducts.tangent(model.bars, x), np.zeros(owned)
     diagonal: list[float] = []
     beside: list[float] = []
     low = high = 0.0
@@ -98,7 +98,9 @@ def highest_frequency(model: Model, x: np.ndarray, steps: int = 60, accuracy: fl
             basis.append(q.copy())
         np.multiply(scale, q, out=local[:owned])
         mesh.update_ghosts(local)
-        tangent.product(local, product)
+        products.times(no_inertia, local, product)
+        for family in model.bars.families:
+            family.add_product(1.0, local, product)
         np.multiply(scale, product[:owned], out=w)
         supports.clear(w)
         alpha = dot(w, q)

@@ -1,11 +1,15 @@
-"""``python -m pfem_petsc``."""
+"""``python -m pfem_petsc``, and the command ``pfem-petsc``."""
 
-if __name__ == "__main__":
+from __future__ import annotations
+
+import sys
+
+
+def run() -> int:
+    """Run the program and return its exit status."""
     from .signals import watch_early
 
     watch_early()  # before the imports, which take half a second
-
-    import sys
 
     from .leaving import leave_at_exit
 
@@ -13,4 +17,8 @@ if __name__ == "__main__":
 
     from .cli.main import main
 
-    sys.exit(leaving.ends_with(main()))
+    return leaving.ends_with(main())
+
+
+if __name__ == "__main__":
+    sys.exit(run())

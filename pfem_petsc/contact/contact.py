@@ -40,8 +40,8 @@ class Contact(ExplicitContact):
 
     @property
     def steady(self) -> bool:
-        """Return whether there are no walls, or only flat walls at rest without further features."""
-        return not self.any or (self.plain and not self.moving.any())
+        """Whether batches of steps serve the walls: flat ones, at rest or with prescribed motion, but not tied."""
+        return not self.any or (self.plain and not self.motion.bodies.any)
 
     def record(self, walls: WallForces, time: float, h: float) -> FreshTies:
         """Record a step of ``h`` [s] whose positions at ``time`` have these forces; return the nodes that were tied.

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class FlatWalls(NamedTuple):
-    """Planes n . x >= d without further features, and the nodes (n,) of a rank.
+    """Planes n . x >= d and the nodes (n,) of a rank, in a step.
 
     Attributes
     ----------
@@ -35,6 +35,12 @@ class FlatWalls(NamedTuple):
     all_nodes : (w,) bool, whether a plane applies to all nodes; members : (n, w) bool, to which nodes otherwise
     tolerance : a plane violated by at most this counts as satisfied [m]
     room : (n,) int64, workspace
+    way : (w, 3) displacements of the planes in the step [m]
+    friction : (2, w) coefficients of dynamic and static friction; (2, 0) if all are zero
+    restitution : (w,) coefficients, (0,) if all are zero
+    rebound, arrival : (n, w) memory of the last step of nodes that hit planes, updated, see :func:`impact_square`;
+        (0, w) without restitution
+    touching : (n, w) bool, contacts of the last step
     """
 
     fixed: np.ndarray
@@ -44,6 +50,21 @@ class FlatWalls(NamedTuple):
     members: np.ndarray
     tolerance: float
     room: np.ndarray
+    way: np.ndarray
+    friction: np.ndarray
+    restitution: np.ndarray
+    rebound: np.ndarray
+    arrival: np.ndarray
+    touching: np.ndarray
+
+
+class Arrivals(NamedTuple):
+    """Nodes (m,) at walls: their positions at the start of the step, and how far they would move without forces (m, 3)
+    [m]; the force for a displacement of each (m,) [N/m]."""
+
+    start: np.ndarray
+    drift: np.ndarray
+    stiffness: np.ndarray
 
 
 class WallSums(NamedTuple):
@@ -55,9 +76,9 @@ class WallSums(NamedTuple):
 
 
 @borrowing
-def find_beyond(first, free, walls, found):
+def find_beyond(first, free, walls, found, returning):
     """Write the nodes, from node ``first`` on, whose positions ``free`` (3 m,) lie beyond planes of :class:`FlatWalls`
-    to ``found``; return their number."""
+    to ``found``; return their number. With ``returning`` nodes, those that rebound are among them."""
     normals, offsets, all_nodes, members = walls.normals, walls.offsets, walls.all_nodes, walls.members
     n = len(free) // 3
     beyond = 0
@@ -66,7 +87,7 @@ def find_beyond(first, free, walls, found):
         for i in range(n):
             gap = -offset + nx * free[3 * i] + ny * free[3 * i + 1] + nz * free[3 * i + 2]
             beyond += 1 if gap < 0.0 else 0
-    if beyond == 0:
+    if beyond == 0 and not returning:
         return 0
     m = 0
     for i in range(n):
@@ -74,7 +95,9 @@ def find_beyond(first, free, walls, found):
             gap = -offsets[k]
             for c in range(3):
                 gap += normals[k, c] * free[3 * i + c]
-            if gap < 0.0 and (all_nodes[k] or members[first + i, k]):
+            if (gap < 0.0 and (all_nodes[k] or members[first + i, k])) or (
+                returning and walls.rebound[first + i, k] > 0.0
+            ):
                 found[m] = first + i
                 m += 1
                 break
@@ -82,21 +105,26 @@ def find_beyond(first, free, walls, found):
 
 
 @kernel
-def press_nodes(nodes, places, walls, stiffness, sums):
-    """Project ``nodes`` (m,) at ``places`` (m, 3) [m], in place, onto planes of :class:`FlatWalls`, and add the forces
-    of the planes to ``sums``, see :class:`WallSums`.
+def press_nodes(nodes, places, given, walls, sums):
+    """Project ``nodes`` (m,) at ``places`` (m, 3) [m], in place, onto planes of :class:`FlatWalls`, with friction and
+    restitution, and add the forces of the planes to ``sums``, see :class:`WallSums`; ``given``: :class:`Arrivals`.
 
-    ``stiffness`` (m,) force for a displacement of each of them [N/m]. Returns the index of the first infeasible node
-    among them, or -1; their offsets (m, w), -inf where a plane does not apply; the total force (m, 3) [N]; and planes
-    that they touch (m, w).
+    Returns the index of the first infeasible node among them, and of the first whose friction was not found, or -1;
+    their offsets (m, w), -inf where a plane does not apply; the total force (m, 3) [N]; planes that they touch (m, w);
+    and the energy that friction dissipates [J].
     """
-    fixed, normals, offsets = walls.fixed, walls.normals, walls.offsets
+    fixed, normals, offsets, way = walls.fixed, walls.normals, walls.offsets, walls.way
     all_nodes, members, tolerance = walls.all_nodes, walls.members, walls.tolerance
+    rebound, arrival, restitution = walls.rebound, walls.arrival, walls.restitution
     force, contacts, moment = sums.force, sums.contacts, sums.moment
+    start, drift, stiffness = given.start, given.drift, given.stiffness
     w, m = len(offsets), len(nodes)
+    rough, bounces = walls.friction.shape[1] > 0, len(restitution) > 0
+    free = places.copy()
     held = np.empty((m, 3), dtype=np.bool_)
     all_normals = np.empty((m, w, 3))
     all_offsets = np.empty((m, w))
+    pull = np.zeros((m if bounces else 0, w))  # by forces, towards the walls
     for j in range(m):
         i = nodes[j]
         for c in range(3):
@@ -105,17 +133,49 @@ def press_nodes(nodes, places, walls, stiffness, sums):
             for c in range(3):
                 all_normals[j, k, c] = normals[k, c]
             all_offsets[j, k] = offsets[k] if all_nodes[k] or members[i, k] else -math.inf
-    multipliers = np.zeros((m, w))
-    infeasible = project(places, held, all_normals, all_offsets, tolerance, multipliers)
+            if bounces:
+                for c in range(3):
+                    pull[j, k] -= normals[k, c] * (free[j, c] - start[j, c] - drift[j, c])
+                if rebound[i, k] > 0.0:
+                    q = pull[j, k]
+                    whole = max(rebound[i, k] + q * arrival[i, k] + 0.25 * q * q, 0.0)
+                    all_offsets[j, k] += max(restitution[k] * math.sqrt(whole) - 0.5 * q, 0.0)
+    strengths = np.zeros((m, w))
+    infeasible = project(places, held, all_normals, all_offsets, tolerance, strengths)
+    for j in range(m):
+        for k in range(w):
+            if bounces:
+                i = nodes[j]
+                fresh = strengths[j, k] > 0.0 and not walls.touching[i, k] and restitution[k] > 0.0
+                approach = arrived = 0.0
+                for c in range(3):
+                    approach -= normals[k, c] * (free[j, c] - start[j, c] - way[k, c])
+                    arrived -= normals[k, c] * (places[j, c] - start[j, c] - way[k, c])
+                square = max(approach * approach - pull[j, k] * (approach - arrived), 0.0)
+                rebound[i, k] = square if fresh and approach > 0.0 else 0.0
+                arrival[i, k] = arrived if fresh else 0.0
+            strengths[j, k] *= stiffness[j]
+    drag = np.zeros((m, w, 3))
+    unsettled = -1
+    if rough:
+        rubbing = Rubbing(start, way, held, all_normals, all_offsets, walls.friction[0], walls.friction[1], stiffness)
+        unsettled = add_friction(rubbing, places, strengths, drag)
     total = np.zeros((m, 3))
     touching = np.zeros((m, w), dtype=np.bool_)
+    dissipated = 0.0
     for j in range(m):
         x, y, z = places[j, 0], places[j, 1], places[j, 2]
         for k in range(w):
-            strength = multipliers[j, k] * stiffness[j]
+            strength = strengths[j, k]
             if strength == 0.0:
                 continue
             fx, fy, fz = strength * normals[k, 0], strength * normals[k, 1], strength * normals[k, 2]
+            if rough:
+                fx += drag[j, k, 0]
+                fy += drag[j, k, 1]
+                fz += drag[j, k, 2]
+                for c in range(3):
+                    dissipated -= drag[j, k, c] * (places[j, c] - start[j, c] - way[k, c])
             total[j, 0] += fx
             total[j, 1] += fy
             total[j, 2] += fz
@@ -127,25 +187,13 @@ def press_nodes(nodes, places, walls, stiffness, sums):
             moment[k, 2] += x * fy - y * fx
             touching[j, k] = True
             contacts[k] += 1
-    return infeasible, all_offsets, total, touching
+    return infeasible, unsettled, all_offsets, total, touching, dissipated
 
 
 @kernel
-def press_planes(predictor, u, walls, stiffness, sums):
-    """Project nodes that lie beyond planes onto them, and add the forces of the planes to ``sums``, a WallSums.
-
-    Parameters
-    ----------
-    predictor, u : (n, 3); the free positions are predictor + u [m]; ``u`` is corrected in place
-    walls : FlatWalls
-    stiffness : (n,) force for a displacement of the node [N/m]
-
-    Returns
-    -------
-    tuple
-        Nodes (m,); index of the first infeasible node among them, or -1; their offsets (m, w), -inf where a plane does
-        not apply; total force (m, 3) [N]; planes that they touch (m, w); and positions (m, 3) [m].
-    """
+def find_pressed(predictor, u, walls, returning):
+    """Return the nodes (m,) to press: those whose positions predictor + u, (n, 3) both, lie beyond planes of
+    :class:`FlatWalls`, or that rebound if any are ``returning``."""
     n, room = len(u), walls.room
     free = np.empty(3 * NODE_BLOCK)
     m = 0
@@ -154,19 +202,8 @@ def press_planes(predictor, u, walls, stiffness, sums):
         where, more = predictor[first:last].reshape(-1), u[first:last].reshape(-1)
         for j in range(len(where)):
             free[j] = where[j] + more[j]
-        m += find_beyond(first, free[: len(where)], walls, room[m:])
-    nodes = room[:m].copy()
-    places, own = np.empty((m, 3)), np.empty(m)
-    for j in range(m):
-        own[j] = stiffness[nodes[j]]
-        for c in range(3):
-            places[j, c] = predictor[nodes[j], c] + u[nodes[j], c]
-    start = places.copy()
-    infeasible, all_offsets, total, touching = press_nodes(nodes, places, walls, own, sums)
-    for j in range(m):
-        for c in range(3):
-            u[nodes[j], c] += places[j, c] - start[j, c]
-    return nodes, infeasible, all_offsets, total, touching, places
+        m += find_beyond(first, free[: len(where)], walls, room[m:], returning)
+    return room[:m].copy()
 
 
 def impact_square(approach: np.ndarray, arrival: np.ndarray, pull: np.ndarray) -> np.ndarray:
@@ -206,7 +243,7 @@ class ExplicitContact(NodeWalls):
     Attributes
     ----------
     ties : Ties
-    plain : infinite flat walls without friction, restitution or ties: one compiled pass handles them
+    plain : infinite flat walls without ties, and if they have mass without restitution: compiled passes handle them
     """
 
     def __init__(
@@ -219,10 +256,11 @@ class ExplicitContact(NodeWalls):
     ) -> None:
         super().__init__(case, nodes, mesh, fixed, parameters)
         self.ties = Ties(self, case.wall if parameters is None else parameters)
-        plain = self.flat.all() and not (self.has_friction or self.partial or self.ties.any)
-        self.plain = bool(plain and not self.restitution.any())
+        heavy = any(wall.mass is not None for wall in (case.wall if parameters is None else parameters))
+        bounces = bool(self.restitution.any())
+        self.plain = bool(self.flat.all() and not (self.partial or self.ties.any or (heavy and bounces)))
         self._part = 1.0  # see :meth:`acting`
-        self._room = np.empty(len(self.members) if plain else 0, dtype=np.int64)
+        self._room = np.empty(len(self.members) if self.plain else 0, dtype=np.int64)
 
     def explicit(
         self,
@@ -258,20 +296,59 @@ class ExplicitContact(NodeWalls):
     def _press_planes(
         self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
     ) -> tuple:
-        w = len(self.walls)
-        walls, sums = self.flat_walls(time, tolerance), WallSums(np.zeros((w, 3)), np.zeros(w, int), np.zeros((w, 3)))
-        nodes, infeasible, offsets, force, touching, places = press_planes(predictor, u, walls, stiffness, sums)
+        w, state = len(self.walls), self.state
+        walls = self.flat_walls(tolerance)
+        walls.offsets[:] = self.plane_offsets(time)
+        walls.way[:] = self.motion.displacements(time)
+        sums = WallSums(np.zeros((w, 3)), np.zeros(w, int), np.zeros((w, 3)))
+        nodes = find_pressed(predictor, u, walls, len(walls.restitution) > 0)
+        start = places = predictor[nodes] + u[nodes]
+        drift = np.zeros_like(places)
+        if state is not None:
+            start = state.position[nodes]
+            walls.way[:] -= self.motion.displacements(state.time)
+            if len(walls.restitution):
+                drift = (time - state.time) * state.memory["half_velocity"][nodes]
+        given, free = Arrivals(start, drift, stiffness[nodes]), places.copy()
+        infeasible, unsettled, offsets, force, touching, friction = press_nodes(nodes, places, given, walls, sums)
+        u[nodes] += places - free
         if infeasible >= 0:
             raise SimulationFailure(self.infeasible_message(nodes[infeasible], offsets[infeasible]))
+        if unsettled >= 0:
+            raise SimulationFailure(self.unsettled_friction(nodes[unsettled], self.normals))
         if len(nodes) == 0:
             return nodes, force, self.nothing
-        return nodes, force, WallForces(*sums, nodes, touching, places)
+        return nodes, force, WallForces(*sums, nodes, touching, places, friction)
 
-    def flat_walls(self, time: float, tolerance: float) -> FlatWalls:
-        """Return plain walls at a time [s] for compiled passes; planes violated by at most the tolerance [m] count as
-        satisfied."""
-        planes = self.normals, self.plane_offsets(time), self.all_nodes, self.members
-        return FlatWalls(self.fixed, *planes, tolerance, self._room)
+    def unsettled_friction(self, node: int, normals: np.ndarray) -> str:
+        """Return the message about an owned node without a solution of its friction at walls with ``normals`` (w,
+        3)."""
+        return jam(self, node, normals) or (
+            f"the friction of node {self.mesh.node_ids[node]} on several walls did not converge; reduce time.step"
+        )
+
+    def flat_walls(self, tolerance: float) -> FlatWalls:
+        """Return plain walls for compiled passes, which set where these are; planes violated by at most the tolerance
+        [m] count as satisfied."""
+        w, members = self._offsets.size, self.members
+        friction = np.array([self.friction, self.static_friction]) if self.has_friction else np.empty((2, 0))
+        memory = 2 * [np.empty((0, w))]
+        if self.rebounds:
+            memory = [self.state.memory.setdefault(name, np.zeros(members.shape)) for name in ("rebound", "arrival")]
+        return FlatWalls(
+            self.fixed,
+            self.normals,
+            self._offsets.copy(),
+            self.all_nodes,
+            members,
+            tolerance,
+            self._room,
+            np.zeros((w, 3)),
+            friction,
+            self.restitution if self.rebounds else np.empty(0),
+            *memory,
+            self.log.touching,
+        )
 
     def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
         """Find the final positions of walls with mass in an explicit step. Collective."""
@@ -496,11 +573,7 @@ class ExplicitContact(NodeWalls):
             rubbing = Rubbing(before, way, fixed, normals, offsets, *rough, stiffness)
             unsettled = add_friction(rubbing, at, normal_forces, drag)
             if unsettled >= 0:
-                raise SimulationFailure(
-                    jam(self, nodes[unsettled], normals[unsettled])
-                    or f"the friction of node {self.mesh.node_ids[nodes[unsettled]]} on several walls did not "
-                    "converge; reduce time.step"
-                )
+                raise SimulationFailure(self.unsettled_friction(nodes[unsettled], normals[unsettled]))
             if self.flat.all():
                 break
             there, distances = self.planes(applicable, at, displacements, acting)

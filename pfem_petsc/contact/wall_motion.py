@@ -230,6 +230,16 @@ class WallMotion:
         displacements[self.bodies.at] = self.bodies.displacements(time)
         return displacements
 
+    def schedule(self, times: np.ndarray) -> np.ndarray:
+        """Return displacements [m] and velocities [m/s] (t, 2, w, 3) of walls with prescribed motion at times (t,) [s];
+        at the kinks of a linear table the right limit."""
+        values = np.zeros((len(times), 2, len(self._motions), 3))
+        values[:, 0] = self.held
+        for k, motion in enumerate(self._motions):
+            if motion is not None:
+                values[:, :, k] += motion.at(times)[:, :2]
+        return values
+
     def rates(self, time: float, ahead: bool = False) -> np.ndarray:
         """Return velocities (w, 3) [m/s] at a time [s]; at the kinks of a linear table the left limit, or the right one
         if ``ahead``."""

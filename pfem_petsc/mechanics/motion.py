@@ -38,8 +38,8 @@ class Motion:
         self.coefficients = coefficients
         self.jumps = jumps
 
-    def at(self, time: float, span: float = 0.0, ahead: bool = True) -> np.ndarray:
-        """Return displacement [m], velocity [m/s] and acceleration [m/s2] at a time [s], (3, 3).
+    def at(self, time: float | np.ndarray, span: float = 0.0, ahead: bool = True) -> np.ndarray:
+        """Return displacement [m], velocity [m/s] and acceleration [m/s2] at times of any shape [s], (..., 3, 3).
 
         Parameters
         ----------
@@ -47,17 +47,17 @@ class Motion:
         span : size of the step [s]; a velocity jump within it, after t = 0, counts as acceleration over the step
         ahead : at the time of a row, whether to return the right limit; else the left limit
         """
-        slack = _ROUNDING * abs(time)
-        row = int(np.searchsorted(self.times, time + slack if ahead else time - slack, "right" if ahead else "left"))
-        if row == 0:
-            return np.stack([self.coefficients[0, 0], np.zeros(3), np.zeros(3)])
-        s = time - self.times[row - 1]
-        c0, c1, c2, c3 = self.coefficients[row - 1]
-        moved = np.stack(
-            [c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2.0 * c2 + 3.0 * s * c3), 2.0 * c2 + 6.0 * s * c3]
-        )
+        time = np.asarray(time, dtype=np.float64)
+        slack = _ROUNDING * np.abs(time)
+        row = np.searchsorted(self.times, time + slack if ahead else time - slack, "right" if ahead else "left")
+        begun = row[..., None] > 0
+        s = np.where(begun, (time - self.times[row - 1])[..., None], 0.0)
+        c0, c1, c2, c3 = np.moveaxis(self.coefficients[np.maximum(row - 1, 0)], -2, 0)
+        v, a = c1 + s * (2.0 * c2 + 3.0 * s * c3), 2.0 * c2 + 6.0 * s * c3
+        moved = np.stack([c0 + s * (c1 + s * (c2 + s * c3)), np.where(begun, v, 0.0), np.where(begun, a, 0.0)], axis=-2)
         if self.jumps and span > 0.0:
-            moved[2] = (moved[1] - self.at(max(time - span, 0.0))[1]) / span if time > 0.0 else 0.0
+            jump = (moved[..., 1, :] - self.at(np.maximum(time - span, 0.0))[..., 1, :]) / span
+            moved[..., 2, :] = np.where((time > 0.0)[..., None], jump, 0.0)
         return moved
 
 

@@ -182,6 +182,7 @@ class Supports:
         along no axis
     at : (nodes, components), an index into arrays (owned, 3)
     nodes, components : (a,) indices of the prescribed components along axes, sorted by node
+    origins : (a,) positions from which their displacements count [m]
     inclined : Directions of the nodes with others; None if the whole model has none
     """
 
@@ -269,7 +270,7 @@ class Supports:
         self.fixed[:] = (first >= 0) | self._detached[:, None]  # in place: contact holds the array
         self.nodes, self.components = np.nonzero(self.fixed)
         self.at = (self.nodes, self.components)
-        self._start = self._origin[self.at]
+        self.origins = self._origin[self.at]
         by = first[self.at]
         self._moved = [  # each motion, and for each axis the places of its components among those prescribed
             (each.motion, [np.flatnonzero((by == k) & (self.components == axis)) for axis in range(3)])
@@ -300,8 +301,8 @@ class Supports:
     def positions(self, time: float) -> np.ndarray:
         """Return prescribed :meth:`coordinates` (k,) [m] at a time [s]."""
         if not self._moved and self.inclined is None:
-            return self._start
-        return self._joined(self._start, 0.0) + self._at(time, 0.0)[0]
+            return self.origins
+        return self._joined(self.origins, 0.0) + self._at(time, 0.0)[0]
 
     def _joined(self, along_axes: np.ndarray, others: np.ndarray | float) -> np.ndarray:
         if self.inclined is None:
@@ -314,6 +315,17 @@ class Supports:
         At velocity jumps (linear interpolation) the acceleration is the mean over the preceding ``span`` [s].
         """
         return tuple(self._at(time, span)[1:])
+
+    def schedule(self, times: np.ndarray, span: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the displacements [m], velocities [m/s] and accelerations [m/s2] of all m motions along axes at times
+        (t,) [s], (t, 3, 3 m); and the column of each prescribed component (a,) there, -1 for those at rest. ``span``:
+        see :meth:`rates`."""
+        columns = np.full(len(self.nodes), -1)
+        for k, (_, places) in enumerate(self._moved):
+            for axis, of_axis in enumerate(places):
+                columns[of_axis] = 3 * k + axis
+        moved = [motion.at(times, span) for motion, _ in self._moved]
+        return np.concatenate([np.zeros((len(times), 3, 0)), *moved], axis=2), columns
 
     def _at(self, time: float, span: float) -> np.ndarray:
         along_axes = np.zeros((3, len(self.nodes)))  # displacements, velocities, accelerations

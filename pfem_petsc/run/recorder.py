@@ -206,6 +206,9 @@ class Recorder:
         times = contact.log.meet(self.model.comm, contacts)[instants.noted]
         with np.errstate(invalid="ignore", over="ignore"):  # sums that are not finite are told by the checks of rows
             vectors = self._unpack(total, (instants.place, instants.number, stepper.smallest), times)
+        for vector, time in zip(vectors, instants.time.tolist() if len(self._motion) else [], strict=False):
+            motion = np.hstack([contact.positions(time), contact.motion.rates(time)])
+            vector[self._motion] = motion[contact.moving].ravel()
         if self.rest is not None:
             own, vectors = vectors, np.repeat(self.rest[None], len(vectors), axis=0)
             vectors[:, self._at] = own
@@ -249,15 +252,16 @@ class Recorder:
             self._probes.fill(share.probes, state, acceleration, support)
             if reacts:
                 head[HEAD["support_force"]] = stepper.support_force(support)
-        number, place, noted = (np.array([of]) for of in (stepper.number, stepper.place, contact.log.noted))
-        return Instants(number, place, share.numbers[None], noted)
+        of_state = stepper.number, stepper.place, state.time
+        number, place, time, noted = (np.array([of]) for of in (*of_state, contact.log.noted))
+        return Instants(number, place, time, share.numbers[None], noted)
 
     def _unpack(self, sums: np.ndarray, of_run: tuple[Any, ...], contact_times: np.ndarray) -> np.ndarray:
         """Return the values of m rows of this stage from the sums over ranks; begin those of the next row.
 
         ``of_run``: values of the columns :data:`~pfem_petsc.columns.OF_RUN`; ``contact_times`` (m, walls) [s].
         """
-        stepper, contact, layout = self.stepper, self.model.contact, self._layout
+        stepper, layout = self.stepper, self._layout
         vectors, at = np.empty((len(sums), layout.width)), layout.first
         vectors[:, self._to] = sums[:, self._from]
         vectors[:, layout.width - self._probes.width :] = sums[:, self._probed :]
@@ -280,10 +284,6 @@ class Recorder:
         vectors[:, at("energy_imbalance")] = held - self.start_energy
         stepper.iterations = [0, 0]
         vectors[:, self._contact_times] = contact_times
-        if len(self._motion):
-            time = stepper.state.time
-            motion = np.hstack([contact.positions(time), contact.motion.rates(time)])
-            vectors[:, self._motion] = motion[np.flatnonzero(contact.moving)].ravel()
         return vectors if self.carried is None else vectors + self.carried
 
     def put(self, values: Mapping[str, np.ndarray]) -> None:

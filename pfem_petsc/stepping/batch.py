@@ -28,6 +28,7 @@ from .batch_loop import (
     WallArrays,
     batch_loop,
 )
+from .batch_supports import MovingSupports, SpringArrays
 from .impact import Touched
 from .stepper import Instants, Solution
 
@@ -61,6 +62,7 @@ class Batch:
         probed = stepper.probed[order]
         self._probes = ProbeArrays(probed, _starts(probed, len(self._nodes.mass)), order)
         state = stepper.state
+        self._springs = self._spring_arrays()
         self._support, self._contact = np.zeros_like(state.v), np.zeros_like(state.v)
         if state.contact is not stepper.zero:
             self._contact[:] = state.contact
@@ -96,6 +98,7 @@ class Batch:
             np.array([len(of.places) for of in loops], dtype=np.int64),
             max((of.work_rows for of in loops), default=0),
             any(len(block.history) for block in blocks),
+            BAR_ENERGIES.index("spring_energy"),
             reach,
             self._meeting(),
             bars.ends,
@@ -120,19 +123,42 @@ class Batch:
             external = self.stepper.state.external
             external = external if model.external.steady else external.copy()  # steps of a batch write it
         damping = inertia.damping if inertia.damped else np.empty(0)
-        order = np.argsort(supports.nodes, kind="stable")
-        nodes, held = supports.nodes[order], supports.positions(0.0)[order]
+        nodes = supports.nodes
         starts = _starts(nodes, len(inertia.mass))
         stiffness = 1.0 / (h * h) * inertia.mass + (0.5 / h * inertia.damping if inertia.damped else 0.0)
-        fixed = nodes, supports.components[order], held, starts
+        fixed = nodes, supports.components, supports.origins.copy(), starts
         return NodeArrays(inertia.mass, damping, stiffness, 1.0 / stiffness, external, *fixed)
+
+    def _spring_arrays(self) -> SpringArrays:
+        springs, owned = self.model.bars.springs, len(self.model.inertia.mass)
+        if springs is None:
+            nobody = np.empty(0, dtype=np.int64)
+            return SpringArrays(nobody, _starts(nobody, owned), np.empty((0, 3, 3)), np.empty((0, 3)))
+        return SpringArrays(springs.nodes, _starts(springs.nodes, owned), springs.stiffness, springs.anchors)
+
+    def _moving_supports(self, begin: int, count: int) -> MovingSupports:
+        """Return the supports that move in ``count`` steps from one of a number on."""
+        supports = self.model.supports
+        motions, columns = supports.schedule(self._times(begin, count if supports.moves else -2), self.stepper.h)
+        at = np.flatnonzero(columns >= 0)
+        moved, probes = np.nonzero(self._nodes.support_nodes[at][:, None] == self.stepper.probed)
+        return MovingSupports(at, columns[at], supports.origins[at], motions, np.column_stack([moved, probes]))
 
     def _wall_arrays(self) -> WallArrays:
         contact, log = self.model.contact, self.model.contact.log
         touched = Touched(
             log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.ledger.impacts.slack
         )
-        return WallArrays(contact.flat_walls(0.0, PROJECTED * self.model.size), touched, log.present, log.releases)
+        walls = contact.flat_walls(PROJECTED * self.model.size)
+        return WallArrays(walls, walls.offsets.copy(), self._wall_motions(0, 0), touched, log.present, log.releases)
+
+    def _times(self, begin: int, count: int) -> np.ndarray:
+        """Return the times of the start of ``count`` steps from one of a number on, of their ends, and of one more."""
+        return np.arange(begin, begin + count + 2) * self.stepper.h
+
+    def _wall_motions(self, begin: int, count: int) -> np.ndarray:
+        contact = self.model.contact
+        return contact.motion.schedule(self._times(begin, count if contact.moving.any() else -2))
 
     def _columns(self) -> list[Columns]:
         """Return the columns of the bars of each section; empty if bars are heated or not all in diagonal runs."""
@@ -217,9 +243,11 @@ class Batch:
             stepper.before,
             state.memory["half_velocity"],
             self._bars,
+            self._springs,
             self._nodes,
+            self._moving_supports(begin, count),
             loads,
-            self._walls,
+            self._walls._replace(motions=self._wall_motions(begin, count)),
             rows,
             self._messages,
             StateArrays(state.f, state.a, state.v, self._support, self._contact, self._u),
@@ -228,6 +256,8 @@ class Batch:
             ImpulseArrays(impulses.memory["half_velocity"], impulses.a, impulses.v),
             self._probes,
             log.changes,
+            ledger.friction_ahead,
+            stepper.solution.walls.force.copy(),
             shares,
         )
         made = batch_loop(data, log.last, ledger.impacts.met, due, flags)
@@ -238,7 +268,7 @@ class Batch:
         sound = self._take(made, row[_BARS], end)
         for at, value in self._at_state:
             row[at] = value(stepper)
-        ledger.follow_batch(row[: HEAD.width])
+        ledger.follow_batch(row[: HEAD.width], made.friction)
         log.changes, noted = made.changes, np.zeros(end, dtype=np.int64)
         if len(log.releases):
             noted += log.note(flags[:end], stepper.h, comm) + 1 + np.arange(end)
@@ -248,8 +278,8 @@ class Batch:
             shares[unsound] = 0.0
             shares[unsound, HEAD.first("alarm")] = 1.0
             number = begin + steps + 1
-            place = model.origin + number * stepper.h
-            stepper.instants = Instants(model.first_step + number, place, shares, noted[steps])
+            time = number * stepper.h
+            stepper.instants = Instants(model.first_step + number, model.origin + time, time, shares, noted[steps])
 
     def _take(self, made: Made, energies: np.ndarray, end: int) -> int:
         """Take the state after the last of ``end`` steps, with ``energies`` of the bars [J]; return how many of these
@@ -263,7 +293,8 @@ class Batch:
         stepper.energy = StrainEnergy(tuple(energies.tolist()), made.failed)
         walls = model.contact.nothing
         if len(model.contact.walls):
-            walls = WallForces(made.force, made.contacts, made.moment, made.near, made.touching, made.places)
+            nodes = made.near, made.touching, made.places
+            walls = WallForces(made.force, made.contacts, made.moment, *nodes, made.friction)
         stepper.solution = Solution(self._u, state.f, walls, contacts=made.pressing)
         begin = state.step
         state.step, state.time = begin + made.done - 1, (begin + made.done) * stepper.h
@@ -293,6 +324,9 @@ class Batch:
         if made.failed >= 0 or made.turned >= 0:
             return SimulationFailure(stepper.collapse(max(made.failed, made.turned)))
         if made.infeasible >= 0:
-            text = self.model.contact.infeasible_message(made.near[made.infeasible], made.offsets)
+            contact, node = self.model.contact, made.near[made.infeasible]
+            text = contact.infeasible_message(node, made.offsets)
+            if made.jammed:
+                text = contact.unsettled_friction(node, contact.normals)
             return SimulationFailure(f"{stepper.when(stepper.scheme.balance(stepper.state, stepper.h))}: {text}")
         return None

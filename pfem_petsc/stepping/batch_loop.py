@@ -14,7 +14,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from ..columns import BAR_ENERGIES, HEAD, PAIR, PROBED, WALL
-from ..contact.explicit import FlatWalls, find_beyond, press_nodes
+from ..contact.explicit import Arrivals, FlatWalls, find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows, solve_rows
 from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import accelerations, advance, advance_loaded, centre, kick, move
@@ -24,8 +24,17 @@ from ..mechanics.loads import LoadSchedule, set_forces
 from ..mechanics.runs import copy, join_components, new_rows, slide_planes, split_components
 from ..mechanics.tuples import ROW
 from ..mesh.ordering import NODE_BLOCK
+from .batch_supports import (
+    MovingSupports,
+    SpringArrays,
+    add_ends_of_supports,
+    add_inertia,
+    add_springs,
+    place_supports,
+    put_rates,
+)
 from .impact import Approach, Touched, join_nodes, plane_gaps, stop_nodes, unpressed
-from .impulses import IN_COLUMNS, WALLS
+from .impulses import IN_COLUMNS, SUPPORT, WALLS
 from .ledger_loops import (
     CONTACT,
     DAMPING,
@@ -69,6 +78,7 @@ class BarArrays(NamedTuple):
     places, n_energies : (s, k) and (s,) int64, see :func:`~pfem_petsc.mechanics.elements.sum_energies`
     work_rows : number of rows of the largest workspace
     keeps : whether laws have a history
+    spring_place : index of the energy of springs among those of bars
     reach : how many blocks of nodes beyond its own the bars of a block reach
     meeting : the first block that waits for messages
     ends, watched : see ``Bars``
@@ -82,6 +92,7 @@ class BarArrays(NamedTuple):
     n_energies: np.ndarray
     work_rows: int
     keeps: bool
+    spring_place: int
     reach: int
     meeting: int
     ends: np.ndarray
@@ -107,9 +118,14 @@ class NodeArrays(NamedTuple):
 
 
 class WallArrays(NamedTuple):
-    """Flat walls and their log; see :mod:`~pfem_petsc.contact.explicit` and :mod:`~pfem_petsc.contact.node_walls`."""
+    """Flat walls and their log, see :mod:`~pfem_petsc.contact.explicit` and :mod:`~pfem_petsc.contact.node_walls`;
+    their ``origins`` (w,), offsets without displacement [m]; and for walls that move ``motions`` (t, 2, w, 3),
+    displacements and velocities at the start of the first step, at the end of each, and of one more, else (0, 2, w,
+    3)."""
 
     flat: FlatWalls
+    origins: np.ndarray
+    motions: np.ndarray
     touched: Touched
     present: np.ndarray
     releases: np.ndarray
@@ -172,7 +188,8 @@ class BatchData(NamedTuple):
     """All that a batch reads and writes: the step [s]; positions (local, 3), those of the previous step, which are
     computed for the last step alone, and velocities at half steps (n, 3); records of arrays; the sums of the ledger, of
     which the dissipation by impact is added to; works (5,) of all balances; particles of impulses; contacts that have
-    changed since the last row; and this rank's shares (m, width) of the rows of the steps that are due, and at last of
+    changed since the last row; the energy that friction dissipates in the next step [J]; forces of walls (w, 3) at the
+    start [N]; and this rank's shares (m, width) of the rows of the steps that are due, and at last of
     the last step if it is not, see :class:`~pfem_petsc.columns.Share`."""
 
     h: float
@@ -180,7 +197,9 @@ class BatchData(NamedTuple):
     before: np.ndarray
     half: np.ndarray
     bars: BarArrays
+    springs: SpringArrays
     nodes: NodeArrays
+    moving: MovingSupports
     loads: LoadSchedule
     walls: WallArrays
     rows: NamedTuple
@@ -191,6 +210,8 @@ class BatchData(NamedTuple):
     impulses: ImpulseArrays
     probes: ProbeArrays
     changes: int
+    friction: float
+    push: np.ndarray
     shares: np.ndarray
 
 
@@ -200,10 +221,11 @@ class Made(NamedTuple):
     ``done``: number of steps made; ``recorded``: number of shares of rows; ``lost``: error code of MPI. In the last
     step: ``changed``: number of bars that changed their state of rupture; ``failed``, ``turned``: the first bar that
     collapsed, and that went through zero length, or -1; ``infeasible``: index in ``near`` of a node that no position
-    satisfies, or -1, with the ``offsets`` of its planes; ``force``, ``contacts``, ``moment``: sums of the walls;
-    ``near``: nodes with wall forces, the walls that they are ``touching``, and their ``places``; ``touched``, ``met``:
-    nodes that touch walls, and that have touched them and not left; ``pressing``: number of nodes with contact forces;
-    and ``changes``: contacts that closed or opened since the last row.
+    satisfies, or -1, with the ``offsets`` of its planes, or if it is ``jammed`` one whose friction was not found;
+    ``force``, ``contacts``, ``moment``: sums of the walls; ``near``: nodes with wall forces, the walls that they are
+    ``touching``, and their ``places``; ``touched``, ``met``: nodes that touch walls, and that have touched them and not
+    left; ``pressing``: number of nodes with contact forces; ``changes``: contacts that closed or opened since the last
+    row; and ``friction``: the energy that it dissipates in the next step [J].
     """
 
     done: int
@@ -213,6 +235,7 @@ class Made(NamedTuple):
     failed: int
     turned: int
     infeasible: int
+    jammed: bool
     offsets: np.ndarray
     force: np.ndarray
     contacts: np.ndarray
@@ -224,15 +247,18 @@ class Made(NamedTuple):
     met: np.ndarray
     pressing: int
     changes: int
+    friction: float
 
 
 # constants of the machine code
-_KINETIC, _EXTERNAL, _DAMPING, _IMPACT, _NUMERICAL, _MOMENTA, _SUPPORT, _IMPULSES, _PRESSING = map(
+_KINETIC, _EXTERNAL, _PUSHED, _DAMPING, _RUBBED, _IMPACT, _NUMERICAL, _MOMENTA, _SUPPORT, _IMPULSES, _PRESSING = map(
     HEAD.first,
     (
         "kinetic_energy",
         "external_work",
+        "contact_work",
         "damping_dissipation",
+        "friction_dissipation",
         "impact_dissipation",
         "numerical_dissipation",
         "momentum",  # followed by angular momentum and centre of mass
@@ -447,10 +473,10 @@ def sum_rows(rows, pressing):
 
 
 @kernel
-def finish_rows(rows, changed, slack, nodes, shared, state, u):
+def finish_rows(rows, changed, slack, nodes, moved, shared, state, u):
     """Return the dissipation [J] of rows that close; ``changed`` rows have a force that begins or ends.
 
-    Velocities and accelerations of the state are written at their nodes.
+    Velocities and accelerations of the state are written at their nodes; ``moved``: MovingSupports and the step.
     """
     x, half, alpha, eta = shared.x, shared.half, shared.alpha, shared.eta
     v, a, contact = state.v, state.a, state.contact
@@ -467,6 +493,7 @@ def finish_rows(rows, changed, slack, nodes, shared, state, u):
             centre(u[i], eta, half[i], v[i])
             accelerations(u[i], alpha, a[i])
         free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
+        put_rates(*moved, nodes, v, a)
         for m in range(count):
             i = around[m]
             ends[end, m, 9] = nodes.mass[i]
@@ -511,16 +538,44 @@ def mark_blocks(marks, nodes, value):
 
 
 @borrowing
-def find_pressed(block, walls, free):
-    """Write the nodes of a block that lie beyond a plane at ``free`` (3 m,) to the walls' room; return their number."""
+def find_pressed(block, walls, free, returning):
+    """Write the nodes of a block that lie beyond a plane at ``free`` (3 m,), or rebound if any are ``returning``, to
+    the walls' room; return their number."""
     first = NODE_BLOCK * block
-    return find_beyond(first, free, walls.flat, walls.flat.room)
+    return find_beyond(first, free, walls.flat, walls.flat.room, returning)
+
+
+@kernel
+def place_walls(step, walls, level):
+    """Set the planes that walls reach one step after a step of the batch, and ``level`` (w,), their offsets at its
+    end."""
+    flat, motions, normals = walls.flat, walls.motions, walls.flat.normals
+    for k in range(len(level)):
+        level[k] = flat.offsets[k] = walls.origins[k]
+        for c in range(3):
+            before, after = motions[step + 1, 0, k, c], motions[step + 2, 0, k, c]
+            level[k] += normals[k, c] * before
+            flat.offsets[k] += normals[k, c] * after
+            flat.way[k, c] = after - before
+
+
+@kernel
+def work_of_walls(step, walls, push, force):
+    """Return the work of walls over the way that a step of the batch went, with forces (w, 3) at its start and end."""
+    work = 0.0
+    for k in range(len(force)):
+        for c in range(3):
+            way = walls.motions[step + 1, 0, k, c] - walls.motions[step, 0, k, c]
+            work += 0.5 * (push[k, c] + force[k, c]) * way
+            push[k, c] = force[k, c]
+    return work
 
 
 @kernel
 def press_block(block, counts, nodes, walls, shared, places_of, out):
     """Press the nodes of a block that :func:`find_pressed` has found, and append them to those of before; ``counts``:
-    their numbers. Return the first infeasible node among all of them, or -1.
+    their numbers. Return the first node among all of them that is infeasible or, if there is none, jammed, or -1;
+    whether it is jammed; and the energy that friction dissipates [J].
 
     ``places_of``: positions and increments of the nodes of the block, flat, of which the latter are corrected; ``out``:
     contact forces (n, 3) [N], and Pressed, to which they are written.
@@ -530,13 +585,14 @@ def press_block(block, counts, nodes, walls, shared, places_of, out):
     contact, pressed = out
     first = NODE_BLOCK * block
     found = walls.flat.room[:m].copy()
-    places, stiffness = np.empty((m, 3)), np.empty(m)
+    places, given = np.empty((m, 3)), Arrivals(np.empty((m, 3)), np.empty((m, 3)), np.empty(m))
     for j in range(m):
         i = found[j]
-        stiffness[j] = nodes.stiffness[i]
+        given.stiffness[j] = nodes.stiffness[i]
         for c in range(3):
             places[j, c] = free[3 * (i - first) + c]
-    infeasible, offsets, total, touching = press_nodes(found, places, walls.flat, stiffness, pressed)
+            given.start[j, c], given.drift[j, c] = shared.x[i, c], shared.h * shared.half[i, c]
+    infeasible, jammed, offsets, total, touching, rubbed = press_nodes(found, places, given, walls.flat, pressed)
     for j in range(m):
         i = found[j]
         for c in range(3):
@@ -549,15 +605,16 @@ def press_block(block, counts, nodes, walls, shared, places_of, out):
             pressed.touching[count + j, k] = touching[j, k]
     if infeasible >= 0:
         pressed.offsets[:] = offsets[infeasible]
-        infeasible += count
-    return infeasible
+        return count + infeasible, False, rubbed
+    return count + jammed if jammed >= 0 else -1, jammed >= 0, rubbed
 
 
 @kernel
-def stop_at_walls(nodes, walls, shared, state, u, touched, met):
+def stop_at_walls(nodes, walls, level, moved, shared, state, u, touched, met):
     """Return the dissipation of contacts that close [J], and the nodes that are on walls afterwards.
 
-    Velocities and accelerations of the state are written at the nodes that touch walls or have touched them.
+    Velocities and accelerations of the state are written at the nodes that touch walls or have touched them; ``level``
+    (w,): offsets of the planes; ``moved``: MovingSupports and the step.
     """
     x, half, alpha, eta = shared.x, shared.half, shared.alpha, shared.eta
     v, a, contact = state.v, state.a, state.contact
@@ -565,15 +622,17 @@ def stop_at_walls(nodes, walls, shared, state, u, touched, met):
     for i in around:
         centre(u[i], eta, half[i], v[i])
         accelerations(u[i], alpha, a[i])
-    all_normals, gaps = plane_gaps(around, x, walls.flat.normals, walls.flat.offsets)
+    all_normals, gaps = plane_gaps(around, x, walls.flat.normals, level)
     free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
+    put_rates(*moved, nodes, v, a)
     for j in range(len(around)):
         i = around[j]
         for c in range(3):
             if walls.touched.fixed[i, c]:  # wall forces do not change prescribed components
                 free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
     still = np.zeros(walls.flat.normals.shape)
-    approach = Approach(all_normals, gaps, free_v, free_a, still, still)
+    rates = walls.motions[moved[1] + 1, 1] if len(walls.motions) > 0 else still
+    approach = Approach(all_normals, gaps, free_v, free_a, rates, still)
     counted = np.ones(len(walls.flat.offsets), dtype=np.bool_)
     return stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))
 
@@ -643,13 +702,14 @@ def end_rows(block, shared, contact):
 
 
 @borrowing
-def end_at_walls(near, shared, contact, u, v):
+def end_at_walls(near, shared, contact, u):
     """Add the works of the forces of walls over the half step at the nodes that are ``near``."""
-    h, alpha, works = shared.h, shared.alpha, shared.lanes[ENDS + CONTACT]
+    h, alpha, eta, half, works = shared.h, shared.alpha, shared.eta, shared.half, shared.lanes[ENDS + CONTACT]
     for i in near:
         at = 3 * (i % LANES)
         for c in range(3):
-            works[at + c] += contact[i, c] * ((0.5 * h) * (v[i, c] - (0.5 * h) * (alpha * u[i, c])))
+            speed = half[i, c] - eta * u[i, c]
+            works[at + c] += contact[i, c] * ((0.5 * h) * (speed - (0.5 * h) * (alpha * u[i, c])))
 
 
 @kernel
@@ -669,7 +729,8 @@ def record_sums(row, ledger, powers, ends, totals, particles, energies):
     row[_EXTERNAL] = powers[EXTERNAL] + works[EXTERNAL]
     row[_DAMPING] = powers[DAMPING] + works[DAMPING]
     inertial = ((powers[INTERNAL] + works[INTERNAL]) - stored) + powers[INERTIAL] - works[INERTIAL]
-    row[_NUMERICAL] = inertial - (powers[CONTACT] + works[CONTACT]) - ledger[_IMPACT]
+    pushed = powers[CONTACT] + works[CONTACT] - ledger[_PUSHED] + ledger[_RUBBED]
+    row[_NUMERICAL] = inertial - pushed - ledger[_IMPACT]
     for c in range(3):
         for k in range(3):
             row[_MOMENTA + 3 * k + c] = momenta[k, c]
@@ -813,14 +874,15 @@ def pull_padded(x, bars, base, block, work, counts):
 
 
 @borrowing
-def pull_again(x, n_blocks, bars, f, work):
-    """Compute all forces in the order of a step."""
+def pull_again(x, n_blocks, bars, springs, f, work, sums):
+    """Compute all forces in the order of a step; ``sums`` (4,) of springs are overwritten."""
     flat = f.reshape(-1)
     for j in range(len(flat)):
         flat[j] = 0.0
     pull(x, bars, n_blocks, f, work)
     for block in range(n_blocks):
         pull(x, bars, block, f, work)
+    add_springs(0, len(springs.nodes), springs, x, f, 0, sums)
 
 
 @kernel
@@ -863,6 +925,9 @@ def batch_loop(data, touched, met, due, flags):
         data.messages,
         data.state,
     )
+    springs, moving = data.springs, data.moving
+    sprung, carried = len(springs.nodes) > 0, len(moving.at) > 0
+    grounds, jumps = np.zeros(4), np.zeros((2, 3))
     ledger, powers, impulses, probes, shares = data.ledger, data.powers, data.impulses, data.probes, data.shares
     n = len(half)
     n_walls = len(walls.flat.offsets)
@@ -890,8 +955,11 @@ def batch_loop(data, touched, met, due, flags):
     n_blocks = (n + NODE_BLOCK - 1) // NODE_BLOCK
     # blocks whose forces alone determine their increments; blocks with nodes that touch walls or have touched them
     alone, on_walls = np.ones(n_blocks, dtype=np.bool_), np.zeros(n_blocks, dtype=np.bool_)
+    along = np.zeros(n_blocks, dtype=np.bool_)  # blocks with supports that move
+    for p in range(len(moving.at)):
+        along[nodes.support_nodes[moving.at[p]] // NODE_BLOCK] = True
     for block in range(n_blocks if linked else 0):
-        alone[block] = not (damped or rows.near[block])
+        alone[block] = not (damped or rows.near[block] or along[block])
     # fields that loops over blocks would count references to
     planes, pulls = bars.planes, bars.pulls
     room_for, reach = len(planes) // 3, bars.reach
@@ -902,7 +970,9 @@ def batch_loop(data, touched, met, due, flags):
     touching = 0
     done = 0
     recorded = 0
-    changes = data.changes
+    changes, friction = data.changes, data.friction
+    travels, bounces, jammed = len(walls.motions) > 0, len(walls.flat.restitution) > 0, False
+    level = walls.flat.offsets.copy()  # of planes at the end of the step
     several = len(x) > n or messages.count > 0
     lost = 0  # error code of MPI
     aside = new_work(len(bars.sections), bars.work_rows)  # energies that are not counted
@@ -921,6 +991,12 @@ def batch_loop(data, touched, met, due, flags):
         values = row[len(row) - 3 * _PROBED * probed :].reshape(probed, _PROBED, 3)
         for i in near:
             contact[i] = 0.0
+        place_supports(moving, step, nodes)
+        if travels:
+            place_walls(step, walls, level)
+        ledger[_RUBBED] += friction  # on the way that the balance before has determined
+        friction = 0.0
+        grounds[:] = 0.0
         if len(data.loads.gravity) > 0:
             set_forces(step, data.loads, nodes.mass, nodes.external)
         clear_forces(lanes, n, Acting(supported, loaded, False, damped))
@@ -991,6 +1067,8 @@ def batch_loop(data, touched, met, due, flags):
             shortened = shortened or short
             changed += broke
             first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
+            if sprung:
+                add_springs(springs.starts[block], springs.starts[block + 1], springs, x, forces, start, grounds)
             if linked:
                 ready = finished
                 finished, pressing, more = pass_block(
@@ -1004,16 +1082,20 @@ def batch_loop(data, touched, met, due, flags):
                     if pressing > 0:
                         end_rows(over, shared, contact)
                 continue
-            if plain:
+            if plain and not along[block]:
                 advance_block(block, nodes, shared, forces, start)
             else:
                 free, here = speeds[: 3 * (last - first)], increments[: 3 * (last - first)]
                 solve_block(block, nodes, shared, forces, start, free, here)
-                found = find_pressed(block, walls, free) if n_walls > 0 else 0
+                found = 0
+                if n_walls > 0:
+                    found = find_pressed(block, walls, free, bounces and on_walls[block])
                 if found > 0:
                     counts, out = (found, count_near), (contact, pressed)
-                    at = press_block(block, counts, nodes, walls, shared, (free, here), out)
-                    infeasible = at if infeasible < 0 else infeasible
+                    at, jam, rubbed = press_block(block, counts, nodes, walls, shared, (free, here), out)
+                    if at >= 0 and (infeasible < 0 or (jammed and not jam)):
+                        infeasible, jammed = at, jam
+                    friction += rubbed
                     count_near += found
                 finish_block(block, nodes, shared, forces, start, contact, here)
                 alone[block] = not (damped or on_walls[block] or found > 0)
@@ -1040,15 +1122,21 @@ def batch_loop(data, touched, met, due, flags):
             clear_sums(lanes[CONTACT], n)
             add_sparse_powers(near, contact, v, lanes[CONTACT])
         if len(touched) > 0 or len(met) > 0:
-            impact, met = stop_at_walls(nodes, walls, shared, state, u, touched, met)
+            impact, met = stop_at_walls(nodes, walls, level, (moving, step), shared, state, u, touched, met)
         if altered > 0:
-            impact += finish_rows(rows, altered, walls.touched.slack, nodes, shared, state, u)
+            impact += finish_rows(rows, altered, walls.touched.slack, nodes, (moving, step), shared, state, u)
         sum_rows(rows, pressing)
         touching = len(near) + 2 * pressing
         after[:] = powers
         sum_balance(lanes, n, h, Acting(supported, loaded, touching > 0, damped), totals, after)
+        for c in range(3 if sprung else 0):
+            totals[0, c] -= grounds[c]
+        if carried:
+            add_inertia(moving, step, nodes, shared, (totals, after, jumps))
         push_particles(totals, pressed.force, rows.totals, alpha, h, impulses, push_u)
         ledger[_IMPACT] += impact
+        if travels:
+            ledger[_PUSHED] += work_of_walls(step, walls, data.push, pressed.force)
         for k in range(n_walls):
             flags[step, k] = pressed.contacts[k] > 0
         done += 1
@@ -1056,7 +1144,7 @@ def batch_loop(data, touched, met, due, flags):
         if shortened or wrong or last_one:
             turned = -1
             if brief:
-                pull_again(x, n_blocks, bars, f, aside)
+                pull_again(x, n_blocks, bars, springs, f, aside, np.empty(4))
             if not last_one:  # the state does not have the end of this step yet
                 clear_ends(lanes, n)
                 for block in range(n_blocks):
@@ -1069,14 +1157,21 @@ def batch_loop(data, touched, met, due, flags):
             if failed < 0 and shortened:
                 turned = first_inverted(x, before, bars.ends, bars.watched)
             wrong = wrong or turned >= 0
+            put_rates(moving, step, nodes, v, a)
         if ending or wrong:
             if padded and not ending:
                 clear_all_energies(bars, work)  # a failure, whose energies nothing reads
-            end_at_walls(near, shared, contact, u, v)
+            end_at_walls(near, shared, contact, u)
             sum_ends(lanes, n, h, *sums)
             sum_all_energies(bars, work, energies)
+            if sprung:
+                energies[bars.spring_place] = grounds[3]
             centre(push_u.reshape(-1), eta, impulses.half.reshape(-1), impulses.v.reshape(-1))
             accelerations(push_u.reshape(-1), alpha, impulses.a.reshape(-1))
+            if carried:
+                add_ends_of_supports(moving, step, nodes, shared, sums, values)
+                for c in range(3):
+                    impulses.v[SUPPORT, c] += jumps[1, c]
             record_sums(row, ledger, powers, sums, totals, impulses.v, energies)
             row[_PRESSING] = touching
             record_contact(row, pressed, walls, rows, impulses.v)
@@ -1086,6 +1181,8 @@ def batch_loop(data, touched, met, due, flags):
             if due[step]:
                 changes = 0
             recorded += 1
+        for c in range(3 if carried else 0):
+            impulses.half[SUPPORT, c] += jumps[0, c]
         powers[:] = after
         if wrong and not several:
             break
@@ -1097,6 +1194,7 @@ def batch_loop(data, touched, met, due, flags):
         failed,
         turned,
         infeasible,
+        jammed,
         pressed.offsets,
         pressed.force,
         pressed.contacts,
@@ -1108,4 +1206,5 @@ def batch_loop(data, touched, met, due, flags):
         met,
         touching,
         changes,
+        friction,
     )

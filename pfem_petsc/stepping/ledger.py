@@ -315,34 +315,41 @@ class Ledger:
 
     def begin_batches(self) -> None:
         """Continue the works balance by balance, after a step."""
-        present, h, sums = self._before, self.stepper.h, self.sums
-        ends = self._half_works(present)
-        self.powers = -ends
-        self.powers[EXTERNAL] += sums[_AT["external_work"]]
-        self.powers[DAMPING] += sums[_AT["damping_dissipation"]]
+        stepper, present, h, sums = self.stepper, self._before, self.stepper.h, self.sums
+        v, a = present.velocity, present.acceleration
+        way, half_square = (0.5 * h) * (v - (0.5 * h) * a), 0.125 * h * h * power(present.inertial, a)
+        forces = [(EXTERNAL, present.external), (CONTACT, present.contact), (DAMPING, present.damping)]
+        forces.append((INTERNAL, present.internal))
+        supports = self.model.supports
+        carried = 0.0
+        if supports.moves:  # works are over the ways between positions, and inertia is that of the motion
+            way, v, mass = way.copy(), v.copy(), self.model.inertia.mass[supports.every_node]
+            half_way = supports.get(0.5 * (stepper.state.position - stepper.before[: len(v)]))
+            centre = half_way / h + 0.5 * supports.get(stepper.state.memory["half_velocity"])
+            speed, rate = supports.get(v), supports.get(a)
+            half_square += float((mass * (0.5 * speed * speed - rate * half_way - 0.125 * h * h * rate * rate)).sum())
+            carried = h * float((mass * rate * centre).sum())
+            supports.put(way, half_way)
+            supports.put(v, centre)
+            forces.append((EXTERNAL, present.support))
+        self.powers = np.zeros(len(WORKS))
+        self.powers[EXTERNAL] = sums[_AT["external_work"]]
+        self.powers[DAMPING] = sums[_AT["damping_dissipation"]]
         impact, numerical = sums[_AT["impact_dissipation"]], sums[_AT["numerical_dissipation"]]
-        self.powers[INERTIAL] = numerical + ends[INERTIAL] + present.energy.total + impact
-        for k in (EXTERNAL, CONTACT, DAMPING, INTERNAL):
-            force = getattr(present, WORKS[k])
-            if force is not self.stepper.zero:
-                self.powers[k] += h * power(force, present.velocity)
+        rubbed = sums[_AT["friction_dissipation"]] - sums[_AT["contact_work"]]
+        self.powers[INERTIAL] = numerical + half_square + present.energy.total + impact + carried + rubbed
+        for k, force in forces:
+            if force is not stepper.zero:
+                self.powers[k] += h * power(force, v) - power(force, way)
 
-    def _half_works(self, present: Moment) -> np.ndarray:
-        """Return half the works (5,) [J] over the last step of a leapfrog scheme of the forces at its end.
+    @property
+    def friction_ahead(self) -> float:
+        """Energy that friction dissipates in the next step, which the last balance has determined [J]."""
+        return self._pending[1]
 
-        The step was h v - h^2 a/2. At the place of inertia is h^2/8 times the sum of m a . a.
-        """
-        h, works = self.stepper.h, np.zeros(len(WORKS))
-        way = (0.5 * h) * (present.velocity - (0.5 * h) * present.acceleration)
-        for k in (EXTERNAL, CONTACT, DAMPING, INTERNAL):
-            force = getattr(present, WORKS[k])
-            if force is not self.stepper.zero:
-                works[k] = power(force, way)
-        works[INERTIAL] = 0.125 * h * h * power(present.inertial, present.acceleration)
-        return works
-
-    def follow_batch(self, sums: np.ndarray) -> None:
-        """Take the sums (width of HEAD,) at the end of a batch of steps."""
+    def follow_batch(self, sums: np.ndarray, friction: float) -> None:
+        """Take the sums (width of HEAD,) at the end of a batch of steps, and :attr:`friction_ahead`."""
+        self._pending = [0.0, friction]
         self.sums[:] = sums
         self.sums[_AT_STATE] = 0.0
         self._before.energy = self.stepper.energy
@@ -351,6 +358,7 @@ class Ledger:
         """Keep the present state, from which a step without batches goes on."""
         self._before = moment_of(self.stepper)
         self._before.kinetic = self.sums[_AT["kinetic_energy"]]
+        self._walls_before()
         self.powers = None
 
     def _damped(self) -> float:

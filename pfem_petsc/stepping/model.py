@@ -216,9 +216,11 @@ class Model:
 
     @property
     def steady(self) -> bool:
-        """Whether steps can be made in batches: supports and bars are constant in time, loads depend on time alone,
-        walls are flat and at rest, and pairs and constraints served too, which exclude walls: a batch solves either."""
-        changing = self.supports.moving or self.bars_vary or bool(self.bars.families) or self.inertia.varies
+        """Whether steps can be made in batches: supports are along axes, bars and damping constant in time, loads
+        depend on time alone, walls are flat, without mass and not tied, and pairs and constraints served too, which
+        exclude walls: a batch solves either."""
+        others = any(family is not self.bars.springs for family in self.bars.families)
+        changing = self.supports.inclined is not None or self.bars_vary or others or self.inertia.varies
         steady = not changing and self.external.scheduled and self.contact.steady
         return steady and self.links.batched and not (bool(self.links) and self.contact.any)
 

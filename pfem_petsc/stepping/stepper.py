@@ -34,12 +34,14 @@ class Instants(NamedTuple):
     Attributes
     ----------
     number, place : (m,) numbers of the steps, and times in the results, over all stages [s]
+    time : (m,) from the start of the stage [s]
     shares : (m, width) of this rank, see :class:`~pfem_petsc.columns.Share`
     noted : (m,) number of steps after each of which the contact log had noted the walls that were touched
     """
 
     number: np.ndarray
     place: np.ndarray
+    time: np.ndarray
     shares: np.ndarray
     noted: np.ndarray
 

@@ -68,6 +68,44 @@ SMALL = {
         "load": [{"node_set": "corner", "force": [10.0, 0.0, 0.0]}],
         "wall": [SIDE],
     },
+    "on springs": {"spring": [{"node_set": "foot", "stiffness": [1e5, 2e5, 3e5]}]},
+    "carried by supports": {
+        "material": DAMPED,
+        "support": [
+            {"node_set": "foot", "fix": "xz", "motion": [[0, 0, 0, 0], [3e-5, 1e-4, 0, -2e-4], [6e-5, 0, 0, 1e-4]]},
+            {"node_set": "corner", "fix": "z"},
+        ],
+        "load": [{"node_set": "foot", "force": [0.0, 3.0, 2.0], "table": [[0.0, 0.0], [8e-5, 1.0]]}],
+    },
+    "carried along a wall": {
+        "support": [
+            {
+                "node_set": "foot",
+                "fix": "x",
+                "motion": [[0, 0, 0, 0], [3.01e-5, 1e-4, 0, 0], [6e-5, 0, 0, 0]],
+                "interpolation": "linear",
+            }
+        ],
+        "spring": [{"node_set": "corner", "stiffness": [1e5, 2e5, 3e5]}],
+        "wall": [FLOOR | {"normal": [0.5, 0.1, 1.0], "point": [0, 0, -2e-4]}],
+    },
+    "rough walls": {"wall": [FLOOR | {"friction": 0.3, "static_friction": 0.5}, SIDE | {"friction": 0.1}]},
+    "rebounding": {"wall": [FLOOR | {"restitution": 0.6}, SIDE]},
+    "rebounding, damped and rough": {
+        "material": DAMPED,
+        "wall": [FLOOR | {"restitution": 0.9}, SIDE | {"friction": 0.1}],
+    },
+    "pushed": {"wall": [FLOOR | {"velocity": [0.0, 0.0, 5.0], "restitution": 0.3}]},
+    "pushed by rough walls": {
+        "material": DAMPED,
+        "support": [{"node_set": "corner", "fix": "z", "velocity": [0.0, 0.0, -20.0]}],
+        "wall": [
+            SIDE | {"velocity": [-2.0, 0.0, 0.0]},
+            FLOOR
+            | {"friction": 0.4, "motion": [[0, 0, 0, 0], [3.003e-5, 1e-4, 0, 2e-4], [6e-5, 0, 0, -1e-4]]}
+            | {"interpolation": "linear"},
+        ],
+    },
     "removed": {
         "support": [{"name": "feet", "node_set": "foot", "fix": "z"}],
         "remove": [{"supports": "feet", "time": 3e-5}],
@@ -94,6 +132,11 @@ LARGE = {  # bars by padded runs
     },
     "missing bars": {"mesh": block(16, 17, 16) | {"missing": 0.02, "seed": 4}},
     "moving window": {"mesh": block(45, 12, 12)},
+    "carried block": {
+        "mesh": block(11, 9, 10),
+        "support": [{"node_set": "foot", "fix": "xyz", "velocity": [3.0, 1.0, -20.0]}],
+        "spring": [{"node_set": "corner", "stiffness": [1e5, 2e5, 3e5]}],
+    },
     "held on a wall": {
         "mesh": block(11, 9, 10),
         "material": DAMPED,
@@ -190,7 +233,8 @@ def test_batches_are_single_steps_and_move_as_the_general_stepper(name, comm, sh
         np.testing.assert_array_equal(first.history, second.history)
     if name in SMALL and name != "removed":  # a support that is removed gives its reaction to another list of loads
         general = made(given, shared_tmp_path, "general")[0]
-        compare(one, general, exact=False, same_order=name != "sections")
+        moves = any(word in name for word in ("carried", "pushed", "rebounding"))  # rounding of times
+        compare(one, general, exact=False, same_order=name != "sections" and not moves)
 
 
 @pytest.mark.slow

@@ -94,6 +94,8 @@ class ExplicitStepper(Stepper):
 
     def supports_changed(self) -> None:
         super().supports_changed()
+        if self.model.supports.moves and self.ledger is not None and self.ledger.powers is not None:
+            self.ledger.end_batches()  # works of components that no longer move are over the ways between positions
         self.load_ended()
 
     def load_ended(self) -> None:

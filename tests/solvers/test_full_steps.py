@@ -54,15 +54,16 @@ def test_a_stiff_pendulum_takes_few_iterations(comm, shared_tmp_path, capsys):
     np.testing.assert_allclose(np.hypot(x, z), 1.0, atol=1e-6)
 
 
-def test_the_line_search_of_the_user_is_the_only_one(comm, shared_tmp_path, capsys):
+def test_the_line_search_of_the_user_is_the_only_one(comm, shared_tmp_path):
+    """It takes tens of iterations where full steps take at most six."""
     options = PETSc.Options()
     options["pfem_snes_linesearch_type"] = "bt"
     try:
         data = PENDULUM | {"time": PENDULUM["time"] | {"end": 8 * STEP}}
-        run(Case.from_dict(data), comm, shared_tmp_path)
+        history = run(Case.from_dict(data), comm, shared_tmp_path)
     finally:
         options.delValue("pfem_snes_linesearch_type")
-    assert "no convergence after 50 Newton iterations" in capsys.readouterr().err
+    assert history["newton_iterations"].max() > 10
 
 
 def stiff_and_soft(seed, ratio, turn=1e-4, nodes=20):

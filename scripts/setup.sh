@@ -293,6 +293,8 @@ compile_loops() {
     "$python" -m compileall -q pfem_petsc
     on_ranks 2 400 "$python" -m pfem_petsc bench --compile &&
         "$python" -m pfem_petsc rod_impact --quiet -o "$folder/rod" --set time.end=0.7 &&
+        "$python" -m pfem_petsc lattice_drop --quiet -o "$folder/drop" &&
+        "$python" -m pfem_petsc hanging_net --quiet -o "$folder/net" &&
         "$python" -m pfem_petsc render "$folder/rod" --frames 2 --video none > /dev/null
     local status=$?
     rm -rf "$folder"

@@ -12,7 +12,7 @@ from typing import Any
 from mpi4py import MPI
 
 from ..case.schema import Case
-from ..mechanics.materials.base import LAWS, MaterialKeys
+from ..mechanics.materials.base import LAWS
 from ..registry import choices, lookup
 from ..simulation import Simulation
 from .measure import DENSITY, YOUNG_MODULUS, Job, time_job, tiny_jobs
@@ -36,10 +36,8 @@ def compile_loops(jobs: list[Job], kind: str, explicit: str, comm: MPI.Comm) -> 
 
 def law_case(name: str, explicit: str) -> Case:
     """Return a case with a law, on a floor; keys that the law needs are 1 in SI units, which all laws accept."""
-    model = lookup(LAWS, name, "").Parameters
-    own = {key: field for key, field in model.model_fields.items() if key not in MaterialKeys.model_fields}
     material: dict[str, Any] = {"law": name, "young_modulus": YOUNG_MODULUS, "density": DENSITY}
-    for key, field in own.items():
+    for key, field in lookup(LAWS, name, "").Parameters.model_fields.items():
         if field.is_required() and key not in material:
             material[key] = 1.0 if field.annotation is float else [[1.0 / YOUNG_MODULUS, 1.0]]
     table = {

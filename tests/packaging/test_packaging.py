@@ -100,9 +100,11 @@ def test_data_files_are_in_the_wheel():
 
 def test_set_up_compiles_what_the_first_commands_need():
     """Loops of runs and of drawing; the commands of setup.sh are accepted."""
-    text = (ROOT / "scripts" / "setup.sh").read_text().replace('"$folder/rod"', "rod").replace("\\\n", " ")
+    text = (ROOT / "scripts" / "setup.sh").read_text().replace("\\\n", " ")
+    text = re.sub(r'"\$folder/(\w+)"', r"\1", text)
     commands = re.findall(r'"\$python" -m pfem_petsc ([^\n&|>]*)', text)
-    assert {command.split()[0] for command in commands} == {"bench", "rod_impact", "render"}
+    cases = {"rod_impact", "lattice_drop", "hanging_net"}
+    assert {command.split()[0] for command in commands} == {"bench", "render", *cases}
     for command in commands:
         _parse(shlex.split(command))
 

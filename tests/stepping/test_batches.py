@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import EarlyStop, SimulationFailure
+from pfem_petsc.mesh import ordering
 from pfem_petsc.mesh.ordering import NODE_BLOCK
 
 IT = {"young_modulus": 110e9, "density": 4500.0}
@@ -259,7 +260,8 @@ def test_restarts_between_batches_are_bitwise(name, comm, tmp_path):
 
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", PAIRS)
-def test_batches_with_pairs(name, comm, shared_tmp_path):
+def test_batches_with_pairs(name, comm, shared_tmp_path, monkeypatch):
+    monkeypatch.setattr(ordering, "_by_graph", lambda slab, comm: None)  # PT-Scotch divides a mesh anew in each run
     tables = two_lattices(shared_tmp_path / "mesh.vtu", "central_differences", **PAIRS[name])
     tables["output"] = {"fields_every": 0, "history_every": 3, "probe": [{"name": "held", "node_set": "held"}]}
     given = Case.from_dict(tables)
@@ -269,19 +271,13 @@ def test_batches_with_pairs(name, comm, shared_tmp_path):
     assert fewer == count if between else fewer < 0.4 * count
     assert name != "many blocks" or comm.size > 1 or len(one.state.v) > 2 * NODE_BLOCK
     other = made(given, shared_tmp_path, "general", comm)[0]
-    # on three ranks, PT-Scotch may divide the mesh in another way in the next run
-    alike = [np.array_equal(one.mesh.node_ids, run.mesh.node_ids) for run in (many, other)]
-    alike = comm.allreduce(np.array(alike, dtype=int)) == comm.size
-    assert comm.size == 3 or alike.all()
     history = open_result(many.folder).history
-    if alike[0]:
-        compare(one, many)
-        np.testing.assert_array_equal(one.model.links.force, many.model.links.force)
+    compare(one, many)
+    np.testing.assert_array_equal(one.model.links.force, many.model.links.force)
     assert history["active_contacts"].max() > 8 and np.ptp(history["active_contacts"]) > 8
     assert np.abs(history["pair/faces/impulse"][-1]).max() > 0.01 and history["impact_dissipation"][-1] > 0.0
     assert np.abs(history["energy_imbalance"]).max() < 1e-11 * history["kinetic_energy"].max()
-    if alike[1]:
-        compare(one, other, exact=False)
+    compare(one, other, exact=False)
 
 
 def test_batches_with_pairs_of_several_tables(tmp_path):

@@ -45,7 +45,7 @@ stage() {
 color=$([[ -t 1 ]] && echo yes || echo no)
 selected=$([[ $# -gt 0 ]] && echo yes || echo no)
 jobs=${TEST_JOBS:-2}
-stage "1 rank" timeout --kill-after=15 "$limit" "$python" -m pytest -n "$jobs" --dist loadfile --color="$color" \
+stage "1 rank" timeout --kill-after=15 "$limit" "$python" -m pytest -n "$jobs" --dist worksteal --color="$color" \
     --durations=5 "$@"
 stage "2 ranks" on_ranks 2 "$limit" "$python" -m pytest --color="$color" "$@"
 stage "3 ranks" on_ranks 3 "$limit" "$python" -m pytest --color="$color" "$@"

@@ -112,7 +112,7 @@ def _parse(words: Sequence[str], petsc_options: Sequence[str] = ()) -> tuple[arg
         if near and not Path(words[0]).exists() and words[0] not in built_in_cases():
             raise InputError(f"{words[0]}: there is no such verb or case; did you mean '{near[0]}'?")
         words = ["run", *words]
-    parser, verbs = make_parser()
+    parser, verbs = make_parser(words[0])
     # One rank prints help.
     with contextlib.redirect_stdout(io.StringIO()) if launched_rank() else contextlib.nullcontext():
         arguments, unknown = parser.parse_known_args(words)
@@ -127,8 +127,8 @@ def _parse(words: Sequence[str], petsc_options: Sequence[str] = ()) -> tuple[arg
     return arguments, verb
 
 
-def make_parser() -> tuple[Parser, dict[str, Verb]]:
-    """Return the parser of all verbs, and their modules by name."""
+def make_parser(only: str = "") -> tuple[Parser, dict[str, Verb]]:
+    """Return the parser of a verb, or of all, and the verbs by name; the modules of others are not imported."""
     from .. import __version__
 
     parser = Parser(
@@ -139,7 +139,7 @@ def make_parser() -> tuple[Parser, dict[str, Verb]]:
     parser.add_argument("--version", action="version", version=f"pfem_petsc {__version__}")
     subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     verbs = {}
-    for name, home in HOMES.items():
+    for name, home in ((only, HOMES[only]),) if only in HOMES else HOMES.items():
         module = importlib.import_module(f"{__package__}.{home}")
         verbs[name] = verb = next(each for each in module.VERBS if each.name == name)
         sub = subparsers.add_parser(

@@ -5,25 +5,33 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib
+import operator
 import os
 import pickle
+import sys
 import threading
 import time
+import uuid
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numba
 import numpy as np
-from llvmlite.binding import parse_assembly, parse_bitcode
+from llvmlite.binding import ObjectFileRef, add_symbol, parse_bitcode
 from numba.core import errors, event, types
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.caching import CompileResultCacheImpl
+from numba.core.codegen import CodeLibrary, JITCodeLibrary
+from numba.core.compiler import compile_result
 from numba.core.cpu import CPUTargetOptions
 from numba.core.dispatcher import Dispatcher
 from numba.core.options import TargetOptions
 from numba.core.registry import cpu_target
-from numba.core.runtime import rtsys
+from numba.core.runtime import _nrt_python
+from numba.core.serialize import dumps
+from numba.core.sigutils import normalize_signature
 from numba.extending import _Intrinsic, intrinsic, register_jitable
 
 
@@ -32,30 +40,67 @@ def code_digest(function: Callable[..., Any]) -> str:
 
     Machine code depends on nothing else in the program. Calls of compiled functions are followed too.
     """
-    digest = _Digest()
-    digest.add(function)
+    numbers: dict[FunctionType, int] = {}
+    digest = hashlib.sha256()
+    following = [getattr(function, "py_func", function)]
+    while following:
+        one = following.pop()
+        if one not in numbers:
+            numbers[one] = len(numbers)
+            own, others = _part(one)
+            digest.update(own)
+            following += reversed(others)
+        digest.update(b"%d" % numbers[one])
     return digest.hexdigest()
 
 
+_parts: dict[FunctionType, tuple[list[Any], bytes, list[FunctionType]]] = {}
+
+
+def _part(function: FunctionType) -> tuple[bytes, list[FunctionType]]:
+    """Return a digest of a function without those that it refers to, and these.
+
+    It is kept with the values of all names, some of which are defined or replaced later.
+    """
+    names = _global_names(function.__code__)
+    values = [function.__globals__.get(name) for name in names]
+    values += [cell.cell_contents for cell in function.__closure__ or ()]
+    kept = _parts.get(function)
+    if kept is None or not all(map(operator.is_, kept[0], values)):
+        digest = _Digest()
+        digest.add(function.__code__)
+        for cell in function.__closure__ or ():
+            digest.add(cell.cell_contents)
+        for name in names:
+            if name in function.__globals__:
+                digest.update(name.encode())
+                digest.add(function.__globals__[name])
+        kept = _parts[function] = values, digest.digest(), digest.functions
+    return kept[1:]
+
+
 class _Digest:
-    """Digest of objects that machine code can depend on, and of all objects that they refer to."""
+    """Digest of objects that machine code can depend on; ``functions`` are those found among them."""
 
     def __init__(self) -> None:
-        self._digest = hashlib.sha256()
-        self._seen: set[int] = set()
-        self.hexdigest = self._digest.hexdigest
+        digest = hashlib.sha256()
+        self.update, self.digest = digest.update, digest.digest
+        self.functions: list[FunctionType] = []
 
     def add(self, thing: Any) -> None:
-        """Add a function, or an object that functions refer to."""
-        update = self._digest.update
+        """Add an object that functions refer to."""
+        update = self.update
         if isinstance(thing, CodeType):
-            self._add_code(thing)
+            update(thing.co_code)
+            update(repr((thing.co_names, thing.co_varnames, thing.co_freevars)).encode())
+            self.add(thing.co_consts)
         elif isinstance(thing, Dispatcher):
             self.add(thing.py_func)
         elif isinstance(thing, _Intrinsic):
             self.add(thing._defn)
         elif isinstance(thing, FunctionType):
-            self._add_function(thing)
+            update(b"function")
+            self.functions.append(thing)
         elif isinstance(thing, np.ndarray):
             update(repr((thing.shape, thing.dtype)).encode() + thing.tobytes())
         elif isinstance(thing, ModuleType):
@@ -65,7 +110,7 @@ class _Digest:
             if thing.__module__.partition(".")[0] == __name__.partition(".")[0]:  # it may generate code
                 for part in vars(thing).values():
                     if isinstance(part, FunctionType):
-                        self._add_function(part)
+                        self.add(part)
         elif isinstance(thing, (tuple, list, frozenset)):
             for part in sorted(thing, key=repr) if isinstance(thing, frozenset) else thing:
                 self.add(part)
@@ -74,33 +119,16 @@ class _Digest:
         else:
             update(type(thing).__qualname__.encode())
 
-    def _add_code(self, code: CodeType) -> None:
-        self._digest.update(code.co_code)
-        self._digest.update(repr((code.co_names, code.co_varnames, code.co_freevars)).encode())
-        for constant in code.co_consts:
-            self.add(constant)
 
-    def _add_function(self, function: FunctionType) -> None:
-        if id(function) in self._seen:
-            return
-        self._seen.add(id(function))
-        self._add_code(function.__code__)
-        for cell in function.__closure__ or ():
-            self.add(cell.cell_contents)
-        # sorted, because the order of a set of names differs between processes
-        for name in sorted(_global_names(function.__code__)):
-            if name in function.__globals__:
-                self._digest.update(name.encode())
-                self.add(function.__globals__[name])
-
-
-def _global_names(code: CodeType) -> set[str]:
-    """Return the names that a function and its nested functions may look up globally."""
+@functools.cache
+def _global_names(code: CodeType) -> tuple[str, ...]:
+    """Return the names that a function and its nested functions may look up globally, sorted: the order of a set of
+    names differs between processes."""
     names = set(code.co_names)
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            names |= _global_names(constant)
-    return names
+            names |= set(_global_names(constant))
+    return tuple(sorted(names))
 
 
 # Neither contraction to fused multiply-add nor reassociation: the result of a loop must not depend on how it was
@@ -114,7 +142,9 @@ CPUTargetOptions.noalias = TargetOptions.Mapping("noalias")  # a flag of Numba's
 COMPILED = not numba.config.DISABLE_JIT
 """Whether loops are compiled, so that others can call them by their addresses."""
 
-_FORMAT = 2  # of cached files
+_FORMAT = 3  # of cached files
+
+_DAMAGED = (pickle.UnpicklingError, EOFError, ValueError, TypeError, AttributeError, IndexError, ImportError, KeyError)
 
 _LONGEST = 130  # characters in the names of cached files for a variant of a loop; file systems take 255 in all
 
@@ -122,23 +152,9 @@ _LONGEST = 130  # characters in the names of cached files for a variant of a loo
 def kernel(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:
     """Compile a loop; the machine code is cached on disk if a folder for it is writable. ``more`` options of Numba."""
     options: dict[str, Any] = {"fastmath": _FAST, "error_model": "numpy", "nogil": True, **more}
-    try:
-        compiled = numba.njit(cache=True, **options)(function)
-    except RuntimeError as error:
-        if "no locator" not in str(error):
-            raise
-        _warn_once(
-            "compiled code cannot be cached (neither the package folder nor the home folder is writable), so every "
-            "start compiles again; set NUMBA_CACHE_DIR to a writable folder"
-        )
-        return numba.njit(**options)(function)
-    cache = getattr(compiled, "_cache", None)
-    file = getattr(cache, "_cache_file", None)
-    if isinstance(cache, FunctionCache) and isinstance(file, IndexDataCacheFile):
-        cache.__class__ = _Cache
-        file.__class__ = _CacheFile
-        file._function = function
-        file._variant = _variant(function)
+    compiled = numba.njit(**options)(function)
+    if isinstance(compiled, Dispatcher):
+        compiled._cache = _Cache(function)
     _distinguish(function)
     return compiled
 
@@ -281,115 +297,147 @@ def packed(value: tuple[Any, ...]) -> tuple[np.ndarray, types.Type]:
     return room, types.CPointer(kind)
 
 
-class _Cache(FunctionCache):
-    """Cache of one loop whose keys do not depend on the process.
+class _Cache:
+    """Cache of one loop on disk, in place of Numba's.
 
-    Numba's own key includes the pickled closure, which for functions of a closure within a closure differs between
-    processes. The digest that stamps the index covers closures.
+    A file holds the machine code for one signature and processor, which its name has a digest of. It begins with a
+    stamp of all else that the machine code depends on: Numba's own, the time and size of the loop's file, would keep
+    machine code whose inlined functions have changed in other files, and discard it if only a comment has changed.
+    Where files may be is looked up late, for most loops of a program are not called.
     """
 
-    def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
-        return signature, codegen.magic_tuple()
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self._name = f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}"
+
+    @functools.cached_property
+    def _impl(self) -> CompileResultCacheImpl | None:
+        try:
+            return CompileResultCacheImpl(self._function)
+        except RuntimeError as error:
+            if "no locator" not in str(error):
+                raise
+            _warn_once(
+                "compiled code cannot be cached (neither the package folder nor the home folder is writable), so every "
+                "start compiles again; set NUMBA_CACHE_DIR to a writable folder"
+            )
+            return None
+
+    @functools.cached_property
+    def stamp(self) -> bytes:
+        """Digest of the loop, of what it calls and of Numba."""
+        # computed late: when the loop is defined, functions below it in its file do not exist yet
+        # the name distinguishes machine code from that of versions whose closures had names in common
+        text = f"{_FORMAT} {numba.__version__} {self._function.__qualname__} {code_digest(self._function)}"
+        return hashlib.sha256(text.encode()).digest()
+
+    @functools.cached_property
+    def base(self) -> str:
+        """Path of the files of this loop without the digest of a signature."""
+        # loops made by one function, for each law and strain measure, would otherwise overwrite each other
+        variant = _variant(self._function)
+        first, _, rest = self._impl.get_filename_base(self._name, sys.abiflags).partition(".")
+        name = f"{first}.{variant}.{rest}" if variant else f"{first}.{rest}"
+        return os.path.join(self._impl.locator.get_cache_path(), name)
+
+    def path(self, sig: Any, codegen: Any) -> str:
+        """Return the path of the file of a signature."""
+        key = hashlib.sha256(repr((sig, _processor(codegen))).encode()).hexdigest()
+        return f"{self.base}.{key[:16]}.nbc"
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load machine code as Numba does, but without what only compilation needs: implementations of all functions,
         whose modules take longer to import than everything else, and what others would inline."""
-        rtsys.initialize(target_context)
-        codegen = target_context.codegen()
-        found = self._cache_file.load(self._index_key(sig, codegen))
-        if found is None:
+        if self._impl is None:
             return None
-        *reduced, inlined_code, symbols = found
-        _, _, (machine_code, _) = reduced[0]
-        if b"_numba_hashsecret" in machine_code:  # of this process, which this module makes known to machine code
-            importlib.import_module("numba.cpython.hashing")
-        codegen._engine._defined_symbols |= symbols
-        compiled = self._impl.rebuild(target_context, reduced)
-        _parse_later(compiled.library, inlined_code)
-        return compiled
+        codegen = target_context.codegen()
+        try:
+            content = Path(self.path(sig, codegen)).read_bytes()
+            if content[: len(self.stamp)] != self.stamp:
+                return None
+            found = pickle.loads(memoryview(content)[len(self.stamp) :])
+        except (OSError, *_DAMAGED):
+            return None  # missing, truncated or damaged: compile again and overwrite
+        signature, fndesc, environments, reload_init, *code = found
+        if signature.args != normalize_signature(sig)[0]:
+            return None
+        for function in reload_init:
+            function()
+        library = _Loaded(codegen, *code)
+        own, *others = environments
+        entry = target_context.get_executable(library, fndesc, own)
+        for one in others:
+            codegen.set_env(one.env_name, one)
+        return compile_result(
+            target_context=target_context,
+            typing_context=target_context.typing_context,
+            library=library,
+            environment=own,
+            entry_point=entry,
+            fndesc=fndesc,
+            signature=signature,
+            objectmode=False,
+            lifted=(),
+            reload_init=reload_init,
+            referenced_envs=others,
+        )
 
-    def _save_overload(self, sig: Any, data: Any) -> None:
-        """Save machine code as Numba does, but apart from the code that others inline, and without empty environments,
-        whose modules each start would import."""
-        if not self._impl.check_cachable(data):
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Save machine code, what others inline, and the environments that are not empty, whose modules each start
+        would import."""
+        if self._impl is None or not self._impl.check_cachable(data):
             return
-        self._impl.locator.ensure_cache_path()
-        (name, kind, (machine_code, inlined_code)), *parts, environments = self._impl.reduce(data)
-        library = name, kind, (machine_code, parse_assembly("").as_bitcode())
-        kept = tuple(one for one in environments if one.consts)
+        (name, _, code), fndesc, own, signature, *_, reload_init, environments = self._impl.reduce(data)
+        kept = [own, *(one for one in environments if one.consts)]
         module = data.library._get_module_for_linking()
         named = (one for kind in (module.functions, module.global_variables) for one in kind)
         symbols = {one.name for one in named if not one.is_declaration}
-        self._cache_file.save(self._index_key(sig, data.codegen), (library, *parts, kept, inlined_code, symbols))
-
-
-def _parse_later(library: Any, code: bytes) -> None:
-    """Give a library of machine code the code that others inline, which is parsed when one does."""
-
-    def module() -> Any:
-        del library._get_module_for_linking
-        library._shared_module = parse_bitcode(code)
-        return library._get_module_for_linking()
-
-    library._get_module_for_linking = module
-
-
-class _CacheFile(IndexDataCacheFile):
-    """Index of the machine code of one loop on disk, valid for the byte code it was compiled from, in whatever file.
-
-    Numba's own stamp is the time and size of the loop's file. It would keep machine code whose inlined functions have
-    changed in other files, and discard it if only a comment has changed.
-    """
-
-    _function: Callable[..., Any]
-    _variant: str = ""
-    _digest: str | None = None
-
-    @property
-    def _index_path(self) -> str:
-        # loops made by one function, for each law and strain measure, would otherwise overwrite each other
-        return os.path.join(self._cache_path, self._named(self._index_name))
-
-    @_index_path.setter
-    def _index_path(self, path: str) -> None:
-        """Accept Numba's path, which has no variant."""
-
-    def _data_path(self, name: str) -> str:
-        return os.path.join(self._cache_path, self._named(name))
-
-    def _named(self, name: str) -> str:
-        first, _, rest = name.partition(".")
-        return f"{first}.{self._variant}.{rest}" if self._variant else name
-
-    @property
-    def _source_stamp(self) -> str:
-        # computed late: when the loop is defined, functions below it in its file do not exist yet
-        if self._digest is None:
-            # the name distinguishes machine code from that of versions whose closures had names in common
-            self._digest = f"{_FORMAT} {self._function.__qualname__} {code_digest(self._function)}"
-        return self._digest
-
-    @_source_stamp.setter
-    def _source_stamp(self, stamp: Any) -> None:
-        """Ignore Numba's own stamp."""
-
-    def _load_index(self) -> dict[Any, str]:
+        content = self.stamp + dumps((signature, fndesc, kept, reload_init, name, *code, symbols))
+        path = self.path(sig, data.codegen)
         try:
-            return super()._load_index()
-        except (pickle.UnpicklingError, EOFError, ValueError, TypeError, AttributeError, IndexError, ImportError):
-            return {}  # truncated or damaged: compile again and overwrite
-
-    def load(self, key: Any) -> Any:
-        try:
-            return super().load(key)
-        except (pickle.UnpicklingError, EOFError, ValueError, TypeError, AttributeError, IndexError, ImportError):
-            return None
-
-    def save(self, key: Any, data: Any) -> None:
-        try:
-            super().save(key, data)
+            self._impl.locator.ensure_cache_path()
+            temporary = Path(f"{path}.tmp.{uuid.uuid4().hex[:16]}")
+            try:
+                temporary.write_bytes(content)
+                temporary.replace(path)
+            finally:
+                temporary.unlink(missing_ok=True)
         except OSError as error:
             _warn_once(f"compiled code cannot be kept for the next start: {error.strerror}")
+
+
+@functools.cache
+def _processor(codegen: Any) -> tuple[Any, ...]:
+    return codegen.magic_tuple()
+
+
+class _Loaded(JITCodeLibrary):
+    """Machine code of a file, which goes to LLVM as it is; what others inline is parsed when one does."""
+
+    _finalized = _disable_inspection = True
+
+    def __init__(self, codegen: Any, name: str, machine_code: bytes, inlined_code: bytes, symbols: set[str]) -> None:
+        CodeLibrary.__init__(self, codegen, name)
+        _make_runtime_known()
+        if b"_numba_hashsecret" in machine_code:  # of this process, which this module makes known to machine code
+            importlib.import_module("numba.cpython.hashing")
+        codegen._engine._ee.add_object_file(ObjectFileRef.from_data(machine_code))
+        codegen._engine._defined_symbols |= symbols
+        self._inlined_code = inlined_code
+
+    def _get_module_for_linking(self) -> Any:
+        return self._module
+
+    @functools.cached_property
+    def _module(self) -> Any:
+        return parse_bitcode(self._inlined_code)
+
+
+@functools.cache
+def _make_runtime_known() -> None:
+    """Make the functions for Numba's arrays known to machine code; those that compilation needs are not compiled."""
+    for name, address in _nrt_python.c_helpers.items():
+        add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
 
 class Compilation(event.Listener):

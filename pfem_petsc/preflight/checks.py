@@ -14,7 +14,6 @@ from mpi4py import MPI
 
 from ..contact.monitoring import small_walls
 from ..output.units import engineering
-from ..statics.stability import names_motions
 from ..tolerances import ON_BOUND
 from .forecast import memory_warning
 from .geometry import Geometry
@@ -101,8 +100,11 @@ def _loose_nodes(case: Case, model: Model, geometry: Geometry) -> list[str]:
     Static analyses that need a stiffness name such nodes and their directions themselves, if it is singular.
     """
     static = case.static is not None and case.static.method != "relaxation"
-    if static and names_motions(model):
-        return []
+    if static:
+        from ..statics.stability import names_motions
+
+        if names_motions(model):
+            return []
     loose, first = geometry.unbraced()
     divided = (
         ". Was the mesh subdivided? Each member of a truss is one bar: in Gmsh `Transfinite Curve {:} = 2;` (an "

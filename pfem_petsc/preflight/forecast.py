@@ -10,9 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..files import memory_of_machine
-from ..modes.find import describe_modes
 from ..output.units import duration, engineering
-from ..solvers.linear import DIRECT
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -122,7 +120,7 @@ def _needed(model: Model, plan: Plan) -> float:
     """Return the maximum memory of this rank until the end of the run [B]."""
     kind = "" if plan.linear is None else plan.linear.preconditioner
     each = _PER_BAR.get(kind, max(_PER_BAR.values()))
-    if kind in DIRECT or model.case.modes is not None:
+    if plan.linear is not None and plan.linear.factorises or model.case.modes is not None:
         # fill-in in three dimensions: the factors of n unknowns have O(n^(4/3)) entries
         each = _PER_BAR_FACTORISED * (model.mesh.n_bars / _FACTORISED_AT) ** (1.0 / 3.0)
     return max(_used(), _EMPTY + each * len(model.mesh.bars))
@@ -138,7 +136,7 @@ def _seconds(model: Model, plan: Plan) -> float:
     bars = model.comm.allreduce(len(model.mesh.bars), op=MPI.MAX)
     if plan.linear is None:
         return plan.steps * (_SECONDS_PER_STEP + _SECONDS_EXPLICIT * bars)
-    iterations = 50.0 if plan.linear.preconditioner not in DIRECT else 100.0
+    iterations = 100.0 if plan.linear.factorises else 50.0
     return plan.steps * (10.0 * _SECONDS_PER_STEP + _SECONDS_PER_ITERATION * iterations * bars)
 
 
@@ -154,6 +152,11 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
     walls = [
         wall.name if wall.mass is None else f"{wall.name} ({engineering(wall.mass, 'kg')})" for wall in case.every_wall
     ]
+    modes = {}
+    if model.case.modes is not None:
+        from ..modes.find import describe_modes
+
+        modes = describe_modes(model)
     return {
         "nodes": f"{mesh.n_nodes:,}",
         "bars": f"{mesh.n_bars:,}",
@@ -163,7 +166,7 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         "mass": engineering(model.total_mass, "kg") + f" ({case.mass})",
         "wave speed": engineering(model.wave_speed, "m/s"),
         **plan.texts,
-        **describe_modes(model),
+        **modes,
         "walls": ", ".join(walls) or "none",
         **({"contact pairs": ", ".join(pair.name for pair in case.contact_pair)} if case.contact_pair else {}),
         **({"constraints": ", ".join(f"{c.name} ({c.kind})" for c in case.constraint)} if case.constraint else {}),

@@ -14,7 +14,6 @@ from ..columns import declared
 from ..errors import EarlyStop, SimulationFailure, printable
 from ..fields import Fields
 from ..mechanics.compiled import Compilation
-from ..modes.find import Found, find_modes, weakest_member
 from ..output.checkpoint import NAME as CHECKPOINT
 from ..output.layout import MODE_VALUES, Contents, Kept
 from ..output.progress import Progress, Span
@@ -34,7 +33,7 @@ from .stages import Stages
 from .synchroniser import Synchroniser
 
 if TYPE_CHECKING:
-    from ..stepping.stepper import Stepper
+    from ..modes.find import Found
 
 
 _PATIENCE = 2.0
@@ -81,6 +80,8 @@ def record_modes(stepper: Stepper, writer: ResultWriter, folder: Path, progress:
     PfemError
         On all ranks.
     """
+    from ..modes.find import find_modes
+
     model, settings = stepper.model, stepper.model.case.modes
     consistent = (settings.mass or model.case.mass) == "consistent"
     found = find_modes(model, stepper.state, settings, consistent)
@@ -100,6 +101,8 @@ def record_modes(stepper: Stepper, writer: ResultWriter, folder: Path, progress:
 
 def _tell_members(stepper: Stepper, found: Found, progress: Progress) -> None:
     """Report the first bar that buckles as a column, which the factors of the truss do not contain. Collective."""
+    from ..modes.find import weakest_member
+
     weakest = weakest_member(stepper.model, stepper.state.x)
     if weakest is None:
         return

@@ -18,9 +18,7 @@ from ..columns import declared
 from ..contact.contact import check_start
 from ..errors import InputError, SimulationFailure
 from ..fields import Fields
-from ..modes.find import InitialState, describe_modes
 from ..preflight.checks import warnings_before
-from ..statics.stepper import make_stepper as static_stepper
 from ..stepping.model import Model, StageStart
 from ..stepping.plan import Plan, make_plan
 from ..stepping.plan import make_stepper as time_stepper
@@ -36,10 +34,17 @@ def _make_stepper(model: Model, recorded: Mapping[str, Any] | None) -> Stepper:
 
     ``recorded``: record of the plan of the continued run, None for a new run
     """
-    describe_modes(model)  # refuses at the start modes that cannot be computed at the end
+    if model.case.modes is not None:
+        from ..modes.find import describe_modes
+
+        describe_modes(model)  # refuses at the start modes that cannot be computed at the end
     if model.case.static is not None:
+        from ..statics.stepper import make_stepper as static_stepper
+
         return static_stepper(model)
     if model.case.time is None:
+        from ..modes.find import InitialState
+
         return InitialState(model)
     return time_stepper(model, make_plan(model, recorded))
 

@@ -47,9 +47,14 @@ class LinearChoice:
     matrix_free: bool = False
 
     @property
+    def factorises(self) -> bool:
+        """Whether the preconditioner is a factorisation of the whole matrix."""
+        return self.preconditioner in DIRECT
+
+    @property
     def lagged(self) -> bool:
         """Whether the preconditioner has its own matrix from an earlier iteration."""
-        return self.preconditioner in ("gamg", "multigrid") or (self.matrix_free and self.preconditioner in DIRECT)
+        return self.preconditioner in ("gamg", "multigrid") or (self.matrix_free and self.factorises)
 
 
 @dataclass(frozen=True)

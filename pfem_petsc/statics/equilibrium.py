@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from petsc4py import PETSc
 
-from ..contact.transform import Transform
 from ..errors import InputError
 from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..parallel.agreement import agreed
-from ..solvers.matrix import HessianMatrix
-from ..solvers.problem import StepProblem
 
 if TYPE_CHECKING:
+    from ..solvers.matrix import HessianMatrix
+    from ..solvers.problem import StepProblem
     from ..stepping.model import Model
     from ..stepping.stepper import Stepper
 
@@ -101,6 +100,9 @@ class PathEquilibrium(Equilibrium):
 
 def problem_at_rest(model: Model, state: State, external: np.ndarray) -> StepProblem:
     """Return the problem of equilibrium of a state under external forces (owned, 3) [N], without walls. Collective."""
+    from ..contact.transform import Transform
+    from ..solvers.problem import StepProblem
+
     return StepProblem(model, state, Equilibrium().balance(state, 0.0), external, Transform(model.mesh))
 
 
@@ -163,6 +165,8 @@ class WithEquations:
         Each call fills and returns the same matrix, which belongs to the simulation; copy what you keep. Rows and
         columns of prescribed components are those of s times the identity.
         """
+        from ..solvers.matrix import HessianMatrix
+
         stepper = self.stepper
         with self._problem(x, at) as (_, positions, problem):
             if self._stiffness is None or self._stiffness[:2] != (stepper, stepper.support_changes):

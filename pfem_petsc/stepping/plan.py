@@ -20,14 +20,12 @@ from ..mechanics.products import BarProducts
 from ..output.units import TIME as AXIS
 from ..output.units import Axis, engineering
 from ..registry import choices, lookup
-from ..solvers.background_grid import fills_block
-from ..solvers.linear import Demand, LinearChoice, choose_linear
 from ..tolerances import TIME
 from .explicit import ExplicitStepper, RedistributedStepper
-from .implicit import ImplicitStepper
 
 if TYPE_CHECKING:
     from ..case.schema import Case
+    from ..solvers.linear import LinearChoice
     from .model import Model
     from .stepper import Stepper
 
@@ -245,6 +243,8 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     if not scheme.explicit or model.inertia.consistent:
         kept = None if recorded is None else recorded.get("linear")
         if kept is not None and tuple(kept["asked"]) == asked:
+            from ..solvers.linear import LinearChoice
+
             linear = LinearChoice(**kept["choice"])
         else:
             linear = _linear(model, scheme, 0.0 if scheme.explicit else step * frequency.upper / 2.0, steps)
@@ -312,6 +312,9 @@ def _check_laws(case: Case, scheme: Scheme) -> None:
 
 def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoice:
     """Choose the linear solver for steps of ``over`` times the limit of central differences."""
+    from ..solvers.background_grid import fills_block
+    from ..solvers.linear import Demand, choose_linear
+
     case = model.case
     impact = model.can_touch or not all(law_of(material).smooth for material in case.material.values())
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
@@ -357,6 +360,8 @@ def make_stepper(model: Model, plan: Plan) -> Stepper:
     if treatment is not None:
         treatment.prepare(model)
     if plan.linear is not None:
+        from .implicit import ImplicitStepper
+
         stepper: Stepper = ImplicitStepper(model, plan.scheme, plan.step, plan.linear)
     else:
         explicit = ExplicitStepper if model.inertia.redistribution is None else RedistributedStepper

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 
@@ -10,6 +11,8 @@ def run() -> int:
     from .signals import watch_early
 
     watch_early()  # before the imports, which take half a second
+
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for them in all installed packages
 
     from .leaving import leave_at_exit
 

@@ -62,6 +62,8 @@ def run_case(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
         from ..simulation import Simulation
     finally:
         if collects:
+            gc.freeze()
+            gc.unfreeze()  # into the oldest generation, so that the first collections do not look there either
             gc.enable()
     output = arguments.output or Path("results", case.name)
     command = _command(arguments, case, comm.size)

@@ -90,17 +90,16 @@ class _Digest:
     def add(self, thing: Any) -> None:
         """Add an object that functions refer to."""
         update = self.update
-        if isinstance(thing, CodeType):
-            update(thing.co_code)
-            update(repr((thing.co_names, thing.co_varnames, thing.co_freevars)).encode())
-            self.add(thing.co_consts)
-        elif isinstance(thing, Dispatcher):
-            self.add(thing.py_func)
-        elif isinstance(thing, _Intrinsic):
-            self.add(thing._defn)
+        # the most frequent ones first
+        if isinstance(thing, (bool, int, float, complex, str, bytes, type(None), type(...), np.generic)):
+            update(repr(thing).encode())
         elif isinstance(thing, FunctionType):
             update(b"function")
             self.functions.append(thing)
+        elif isinstance(thing, CodeType):
+            update(thing.co_code)
+            update(repr((thing.co_names, thing.co_varnames, thing.co_freevars)).encode())
+            self.add(thing.co_consts)
         elif isinstance(thing, np.ndarray):
             update(repr((thing.shape, thing.dtype)).encode() + thing.tobytes())
         elif isinstance(thing, ModuleType):
@@ -114,8 +113,10 @@ class _Digest:
         elif isinstance(thing, (tuple, list, frozenset)):
             for part in sorted(thing, key=repr) if isinstance(thing, frozenset) else thing:
                 self.add(part)
-        elif isinstance(thing, (bool, int, float, complex, str, bytes, type(None), type(...), np.generic)):
-            update(repr(thing).encode())
+        elif isinstance(thing, Dispatcher):
+            self.add(thing.py_func)
+        elif isinstance(thing, _Intrinsic):
+            self.add(thing._defn)
         else:
             update(type(thing).__qualname__.encode())
 

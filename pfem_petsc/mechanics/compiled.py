@@ -231,6 +231,13 @@ def borrowing_apart(function: Callable[..., Any]) -> Callable[..., Any]:
     return register_jitable(fastmath=_FAST, error_model="numpy", _nrt=False, noalias=True)(function)
 
 
+@register_jitable(fastmath=_FAST | {"reassoc"}, error_model="numpy")
+def add_freely(total: float, value: float) -> float:
+    """Return a sum whose additions a loop may reorder, and keep in vectors of partial sums: for sums of the history
+    that one loop alone makes, and that nothing else depends on."""
+    return total + value
+
+
 def borrowing_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a loop that others call by its address, see :func:`calls`, without counting references."""
     return kernel(function, _nrt=False)

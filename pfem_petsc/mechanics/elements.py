@@ -21,7 +21,7 @@ from ..mesh.ordering import NODE_BLOCK
 from .compiled import address_of, borrowing, borrowing_apart, borrowing_kernel, inlined, kernel
 from .materials.base import Law
 from .runs import Columns, Sweep, add_lower_ends, clear_lower_ends, copy, end_differences, scatter_forces
-from .tuples import CHUNK, ROW, accumulate, bar_value, blend, differ, put, take, take_from
+from .tuples import CHUNK, ROW, accumulate, bar_value, differ, put, sum_up, take, take_from
 
 COLLAPSED_STRETCH = 1e-3  # below this fraction of its rest length a bar is crushed, and no truss model applies
 SHORTENED_STRETCH = math.sqrt(0.8)  # only bars shorter than this are checked for passing through zero length
@@ -589,7 +589,8 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     add_force, put_new, put_last, changes = accumulate(3), put(len(law.internal)), put(2), differ(len(law.internal))
     n_energies = len(law.energies)
     first_new = 4 + n_energies
-    add_energies, real_ones, nothing = accumulate(n_energies), blend(n_energies), (0.0,) * n_energies
+    sum_densities, nothing = sum_up(n_energies), (0.0,) * n_energies
+    put_energies = accumulate(n_energies)
     keeps = n_rows + n_data > 0
     rupture, can_break, gone = law.rupture, law.rupture >= 0, max(law.rupture, 0)
 
@@ -612,6 +613,7 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
             rests, kept, step = columns.rest, columns.kept, data.step
             origin = -1  # first node of the block whose forces are in the workspace
             wide = 0
+            stored = nothing
             for group in range(begun, ended):
                 first = starts[group]
                 n = starts[group + 1] - first
@@ -647,9 +649,7 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                     bar = Bar(rest, 0.0, 0.0, area, p, before, 0.0, q)
                     strain, slope, _, stress, _, new, densities = evaluate(stretch, bar, step)
                     if counts:
-                        # what a column without a bar keeps may be anything
-                        some = real_ones(real, densities, nothing) if keeps else densities
-                        add_energies(work, 4 * ROW + i, area * rest, some)
+                        stored = sum_densities(stored, real, area * rest, densities)
                     pull = area * stress * slope * inverse
                     if keeps:
                         pull = pull if real else 0.0
@@ -674,6 +674,8 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                     shortened = shortened or inverted
             if origin >= 0:
                 add_lower_ends(work, wide, sums, origin - base)
+            if counts:
+                put_energies(work, 4 * ROW, 1.0, stored)
             return failed, shortened, broke
 
         return add_padded

@@ -14,7 +14,7 @@ import numpy as np
 from numba.core import types
 from numba.extending import overload
 
-from .compiled import borrowing
+from .compiled import add_freely, borrowing
 
 CHUNK = 512
 """Bars whose working arrays fit into the fastest cache."""
@@ -34,7 +34,7 @@ def written_out(text: str, count: int, borrowed: bool = True) -> Callable[..., A
     def repeat(part: re.Match) -> str:
         return "".join(part[1].replace("{jC}", str(j * ROW)).replace("{j}", str(j)) for j in range(count))
 
-    names: dict[str, Any] = {"__name__": __name__}
+    names: dict[str, Any] = {"__name__": __name__, "add": add_freely}
     exec(re.sub("<(.*?)>", repeat, text, flags=re.DOTALL), names)  # noqa: S102 - of texts in the program
     function = names["function"]
     function.__qualname__ = f"written_out.<locals>.{function.__qualname__}"  # several of one name: see `_distinguish`
@@ -71,6 +71,13 @@ def blend(count: int) -> Callable[..., Any]:
     """Make a function that returns the tuple ``one`` if ``condition``, else ``other``."""
     text = "def function(condition, one, other): return (<one[{j}] if condition else other[{j}], >)"
     return written_out(text, count)
+
+
+def sum_up(count: int) -> Callable[..., Any]:
+    """Make a function that returns the tuple of ``sums``, to which it adds ``factor`` times another tuple if it is
+    ``real``; see :func:`~.compiled.add_freely`."""
+    part = "add(sums[{j}], factor * values[{j}] if real else 0.0), "
+    return written_out(f"def function(sums, real, factor, values): return (<{part}>)", count)
 
 
 def sum_with(count: int) -> Callable[..., Any]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import borrowing, borrowing_apart, inlined, kernel
+from ..mechanics.compiled import add_freely, borrowing, borrowing_apart, inlined, kernel
 
 WORKS = ("external", "contact", "damping", "inertial", "internal")
 """Works of the ledger [J], in this order; the first includes supports."""
@@ -18,10 +18,9 @@ WORKS = ("external", "contact", "damping", "inertial", "internal")
 EXTERNAL, CONTACT, DAMPING, INERTIAL, INTERNAL = range(len(WORKS))
 REACTIONS, _PUSHES, _DRAGS = (len(WORKS) + k for k in range(3))  # further lanes of a balance: sums of forces
 ENDS = _DRAGS + 1
-"""The first of the lanes of the works over the last half step, in the order of :data:`WORKS`."""
-_KINETIC = ENDS + len(WORKS)
-_MOMENTA = _KINETIC + 1  # the first of the lanes of :func:`add_momenta`
-_ROWS = _MOMENTA + 4
+"""The first of the lanes of the works of loads, contact and damping over the last half step, in the order of
+:data:`WORKS`."""
+_SUMS = ENDS + DAMPING + 1  # not lanes, but the sums of :func:`add_ends`
 
 LANES = 64
 """Nodes with sums of their own; blocks of nodes begin at multiples of it."""
@@ -88,58 +87,31 @@ def total(force):
     return sums
 
 
-@kernel
-def add_momenta(place, masses, momentum, lanes):
-    """Add momentum, mass times position, and two parts of the angular momentum to ``lanes`` (4, WIDE); positions,
-    ``masses`` and ``momentum`` (3 n,) are those of at most :data:`LANES` consecutive nodes from a multiple of it on."""
-    moved = lanes[1]
-    add_forces(momentum, lanes[0])
-    for j in range(len(place)):
-        moved[j] += masses[j] * place[j]
-    _add_turning(place, momentum, (lanes[2], lanes[3]))
-
-
-@borrowing_apart
-def _add_turning(place, momentum, sums):
-    """Add both parts of the angular momentum to ``sums``, see :func:`add_momenta`."""
-    angular, crossed = sums
-    # x p_y - y p_x and y p_z - z p_y at the places of x and y, x p_z - z p_x at that of x; others are not used
-    n = len(place) - 1
-    one, other, moving, turning = place[:n], place[1:], momentum[:n], momentum[1:]
-    for j in range(n):
-        angular[j] += one[j] * turning[j] - other[j] * moving[j]
-    n -= 1
-    last, spinning = place[2:], momentum[2:]
-    for j in range(n):
-        crossed[j] += one[j] * spinning[j] - last[j] * moving[j]
-
-
-@kernel
-def finish_momenta(lanes, wide, sums):
-    """Write momentum, angular momentum and mass times position (3, 3) from the lanes of :func:`add_momenta`."""
-    around_z, around_x, _ = sum_lane(lanes[2], wide)
-    sums[0, 0], sums[0, 1], sums[0, 2] = sum_lane(lanes[0], wide)
-    sums[1, 0], sums[1, 1], sums[1, 2] = around_x, -sum_lane(lanes[3], wide)[0], around_z
-    sums[2, 0], sums[2, 1], sums[2, 2] = sum_lane(lanes[1], wide)
+@inlined
+def turn(place, momentum):
+    """Return the cross product of the place of a node and its momentum."""
+    (x, y, z), (px, py, pz) = place, momentum
+    return y * pz - z * py, z * px - x * pz, x * py - y * px
 
 
 @kernel
 def sum_momenta(x, mass, momentum):
     """Return momentum, angular momentum and mass times position (3, 3) of nodes at ``x`` (n, 3) with ``momentum`` (n,
     3) and lumped ``mass`` (n,)."""
-    lanes, masses, sums = np.zeros((4, WIDE)), np.empty(WIDE), np.empty((3, 3))
-    for first in range(0, len(x), LANES):
-        last = min(first + LANES, len(x))
-        spread(mass[first:last], masses)
-        add_momenta(x[first:last].reshape(-1), masses, momentum[first:last].reshape(-1), lanes)
-    finish_momenta(lanes, min(3 * len(x), WIDE), sums)
+    sums = np.zeros((3, 3))
+    for i in range(len(x)):
+        angular = turn((x[i, 0], x[i, 1], x[i, 2]), (momentum[i, 0], momentum[i, 1], momentum[i, 2]))
+        for c in range(3):
+            sums[0, c] += momentum[i, c]
+            sums[1, c] += angular[c]
+            sums[2, c] += mass[i] * x[i, c]
     return sums
 
 
 @kernel
 def new_sums():
     """Return the lanes of all sums, zero."""
-    return np.zeros((_ROWS, WIDE))
+    return np.zeros((_SUMS + 1, WIDE))
 
 
 @kernel
@@ -165,8 +137,10 @@ def clear_forces(lanes, n, acting):
 
 @kernel
 def clear_ends(lanes, n):
-    """Set the sums of :func:`add_ends` to zero."""
-    for row in range(ENDS, len(lanes)):
+    """Set the sums of :func:`add_ends`, and the lanes of the other works over the last half step, to zero."""
+    for k in range(12):
+        lanes[_SUMS, k] = 0.0
+    for row in range(ENDS, _SUMS):
         clear_sums(lanes[row], n)
 
 
@@ -182,52 +156,62 @@ class EndArrays(NamedTuple):
 
 @borrowing
 def add_ends(x, mass, half, force, numbers, ends, lanes):
-    """Add what the ledger needs of the end of a step at consecutive nodes, from a multiple of :data:`LANES` on: the
-    works of inertia and of the internal ``force`` over half the step, kinetic energy and momenta.
+    """Add what the ledger needs of the end of a step at consecutive nodes: the works of inertia and of the internal
+    ``force`` over half the step, kinetic energy and momenta.
 
     ``half``: velocities half a step later, (3 n,) like ``x`` and ``force``; ``mass`` (n,); ``numbers``: h, alpha and
     eta. From the increments ``ends.u``, it writes ``ends.left``.
     """
-    sums = (lanes[ENDS + INTERNAL], lanes[ENDS + INERTIAL], lanes[_KINETIC], lanes[_MOMENTA], lanes[_MOMENTA + 1])
-    for first in range(0, len(x), WIDE):
-        last = min(first + WIDE, len(x))
-        place, momentum = x[first:last], ends.momentum[: last - first]
-        spread(mass[first // 3 : last // 3], ends.masses)
-        given = (ends.u[first:last], half[first:last], force[first:last], place, ends.masses)
-        _add_motion(given, numbers, (ends.left[first:last], momentum), sums)
-        _add_turning(place, momentum, (lanes[_MOMENTA + 2], lanes[_MOMENTA + 3]))
+    _add_motion((ends.u, half, force, x, mass), numbers, lanes[_SUMS])
+    h, alpha, eta = numbers
+    u, left = ends.u, ends.left
+    for j in range(len(x)):
+        left[j] = (0.5 * h) * ((half[j] - eta * u[j]) - (0.5 * h) * (alpha * u[j]))
 
 
 @borrowing_apart
-def _add_motion(given, numbers, made, sums):
-    u, half, force, place, masses = given
+def _add_motion(given, numbers, sums):
+    """Add internal work and that of inertia without factors, see :func:`sum_ends`, twice the kinetic energy, momentum,
+    angular momentum and mass times position to ``sums``."""
+    u, half, force, x, mass = given
     h, alpha, eta = numbers
-    left, momentum = made
-    internal, inertial, kinetic, momenta, moved = sums
-    for j in range(len(u)):
-        rate = alpha * u[j]
-        speed = half[j] - eta * u[j]
-        way = (0.5 * h) * (speed - (0.5 * h) * rate)
-        moving = masses[j] * speed
-        left[j], momentum[j] = way, moving
-        internal[j] += force[j] * way
-        inertial[j] += masses[j] * rate * rate
-        kinetic[j] += moving * speed
-        momenta[j] += moving
-        moved[j] += masses[j] * place[j]
+    back = 0.5 * h * alpha
+    internal = inertial = kinetic = 0.0
+    p0 = p1 = p2 = q0 = q1 = q2 = m0 = m1 = m2 = 0.0
+    for i in range(len(mass)):
+        # unsigned: negative indices need not be handled
+        a, b, c = np.uint64(3 * i), np.uint64(3 * i + 1), np.uint64(3 * i + 2)
+        m, place = mass[i], (x[a], x[b], x[c])
+        u0, u1, u2 = u[a], u[b], u[c]
+        v0, v1, v2 = half[a] - eta * u0, half[b] - eta * u1, half[c] - eta * u2
+        work = force[a] * (v0 - back * u0) + force[b] * (v1 - back * u1) + force[c] * (v2 - back * u2)
+        momentum = m * v0, m * v1, m * v2
+        angular = turn(place, momentum)
+        internal = add_freely(internal, work)
+        inertial = add_freely(inertial, m * (u0 * u0 + u1 * u1 + u2 * u2))
+        kinetic = add_freely(kinetic, momentum[0] * v0 + momentum[1] * v1 + momentum[2] * v2)
+        p0, p1, p2 = add_freely(p0, momentum[0]), add_freely(p1, momentum[1]), add_freely(p2, momentum[2])
+        q0, q1, q2 = add_freely(q0, angular[0]), add_freely(q1, angular[1]), add_freely(q2, angular[2])
+        m0, m1, m2 = add_freely(m0, m * place[0]), add_freely(m1, m * place[1]), add_freely(m2, m * place[2])
+    inertial *= alpha * alpha
+    found = internal, inertial, kinetic, p0, p1, p2, q0, q1, q2, m0, m1, m2
+    for k in range(12):
+        sums[k] += found[k]
 
 
 @kernel
 def sum_ends(lanes, n, h, ends, momenta):
     """Write the works of :data:`WORKS` over the last half step, and at last the kinetic energy, to ``ends`` (6,) [J],
-    and the sums of :func:`add_momenta` (3, 3)."""
-    wide = min(3 * n, WIDE)
-    for k in range(len(ends)):
+    and momentum, angular momentum and mass times position (3, 3)."""
+    wide, sums = min(3 * n, WIDE), lanes[_SUMS]
+    for k in (EXTERNAL, CONTACT, DAMPING):
         x, y, z = sum_lane(lanes[ENDS + k], wide)
         ends[k] = x + y + z
-    ends[INERTIAL] *= 0.125 * h * h
-    ends[len(WORKS)] *= 0.5
-    finish_momenta(lanes[_MOMENTA:], wide, momenta)
+    ends[INTERNAL] = (0.5 * h) * sums[0]
+    ends[INERTIAL] = 0.125 * h * h * sums[1]
+    ends[len(WORKS)] = 0.5 * sums[2]
+    for k in range(9):
+        momenta[k // 3, k % 3] = sums[3 + k]
 
 
 @kernel

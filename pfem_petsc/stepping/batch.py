@@ -17,17 +17,10 @@ from ..mechanics.runs import Columns, make_columns, new_planes, no_columns
 from ..mesh.ordering import NODE_BLOCK
 from ..parallel.heap import return_freed_memory
 from ..tolerances import PROJECTED
-from .batch_loop import (
-    BarArrays,
-    BatchData,
-    ImpulseArrays,
-    Made,
-    NodeArrays,
-    ProbeArrays,
-    StateArrays,
-    WallArrays,
-    batch_loop,
-)
+from .batch_blocks import BarArrays, NodeArrays, StateArrays
+from .batch_contact import WallArrays
+from .batch_history import ImpulseArrays, ProbeArrays
+from .batch_loop import BatchData, Made, batch_loop
 from .batch_supports import MovingSupports, SpringArrays
 from .impact import Touched
 from .stepper import Instants, Solution

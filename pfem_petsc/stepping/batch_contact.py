@@ -1,0 +1,255 @@
+"""What walls, and rows over two nodes, do to the nodes of a block in a step of a batch, and to those that close."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..contact.explicit import Arrivals, FlatWalls, find_beyond, press_nodes
+from ..contact.fixed_rows import close_rows, solve_rows
+from ..integrators._leapfrog import accelerations, centre
+from ..mechanics.compiled import borrowing, kernel
+from ..mesh.ordering import NODE_BLOCK
+from .batch_blocks import advance_block, finish_block, solve_block
+from .batch_supports import put_rates
+from .impact import Approach, Touched, join_nodes, plane_gaps, stop_nodes, unpressed
+from .ledger_loops import CONTACT, LANES
+
+
+class WallArrays(NamedTuple):
+    """Flat walls and their log, see :mod:`~pfem_petsc.contact.explicit` and :mod:`~pfem_petsc.contact.node_walls`;
+    their ``origins`` (w,), offsets without displacement [m]; and for walls that move ``motions`` (t, 2, w, 3),
+    displacements and velocities at the start of the first step, at the end of each, and of one more, else (0, 2, w,
+    3)."""
+
+    flat: FlatWalls
+    origins: np.ndarray
+    motions: np.ndarray
+    touched: Touched
+    present: np.ndarray
+    releases: np.ndarray
+
+
+class Pressed(NamedTuple):
+    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` for all blocks of a step: room for ``nodes`` (n,),
+    the planes that they are ``touching`` (n, w), their ``places`` (n, 3); ``offsets`` (w,) of the infeasible node; and
+    the sums of each wall, ``force`` (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
+
+    nodes: np.ndarray
+    touching: np.ndarray
+    places: np.ndarray
+    offsets: np.ndarray
+    force: np.ndarray
+    contacts: np.ndarray
+    moment: np.ndarray
+
+
+@kernel
+def new_pressed(n, w):
+    """Return room for ``n`` nodes and ``w`` walls. Pages of memory that no node needs are not touched."""
+    nodes = np.empty(n if w > 0 else 0, dtype=np.int64)
+    touching, places = np.empty((len(nodes), w), dtype=np.bool_), np.empty((len(nodes), 3))
+    force, contacts, moment = np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3))
+    return Pressed(nodes, touching, places, np.empty(w), force, contacts, moment)
+
+
+@kernel
+def mark_blocks(marks, nodes, value):
+    """Set ``marks`` of the blocks of ``nodes`` to ``value``."""
+    for i in nodes:
+        marks[i // NODE_BLOCK] = value
+
+
+@borrowing
+def find_pressed(block, walls, free, returning):
+    """Write the nodes of a block that lie beyond a plane at ``free`` (3 m,), or rebound if any are ``returning``, to
+    the walls' room; return their number."""
+    first = NODE_BLOCK * block
+    return find_beyond(first, free, walls.flat, walls.flat.room, returning)
+
+
+@kernel
+def place_walls(step, walls, level):
+    """Set the planes that walls reach one step after a step of the batch, and ``level`` (w,), their offsets at its
+    end."""
+    flat, motions, normals = walls.flat, walls.motions, walls.flat.normals
+    for k in range(len(level)):
+        level[k] = flat.offsets[k] = walls.origins[k]
+        for c in range(3):
+            before, after = motions[step + 1, 0, k, c], motions[step + 2, 0, k, c]
+            level[k] += normals[k, c] * before
+            flat.offsets[k] += normals[k, c] * after
+            flat.way[k, c] = after - before
+
+
+@kernel
+def work_of_walls(step, walls, push, force):
+    """Return the work of walls over the way that a step of the batch went, with forces (w, 3) at its start and end."""
+    work = 0.0
+    for k in range(len(force)):
+        for c in range(3):
+            way = walls.motions[step + 1, 0, k, c] - walls.motions[step, 0, k, c]
+            work += 0.5 * (push[k, c] + force[k, c]) * way
+            push[k, c] = force[k, c]
+    return work
+
+
+@kernel
+def press_block(block, counts, nodes, walls, shared, places_of, out):
+    """Press the nodes of a block that :func:`find_pressed` has found, and append them to those of before; ``counts``:
+    their numbers. Return the first node among all of them that is infeasible or, if there is none, jammed, or -1;
+    whether it is jammed; and the energy that friction dissipates [J].
+
+    ``places_of``: positions and increments of the nodes of the block, flat, of which the latter are corrected; ``out``:
+    contact forces (n, 3) [N], and Pressed, to which they are written.
+    """
+    m, count = counts
+    free, u = places_of
+    contact, pressed = out
+    first = NODE_BLOCK * block
+    found = walls.flat.room[:m].copy()
+    places, given = np.empty((m, 3)), Arrivals(np.empty((m, 3)), np.empty((m, 3)), np.empty(m))
+    for j in range(m):
+        i = found[j]
+        given.stiffness[j] = nodes.stiffness[i]
+        for c in range(3):
+            places[j, c] = free[3 * (i - first) + c]
+            given.start[j, c], given.drift[j, c] = shared.x[i, c], shared.h * shared.half[i, c]
+    infeasible, jammed, offsets, total, touching, rubbed = press_nodes(found, places, given, walls.flat, pressed)
+    for j in range(m):
+        i = found[j]
+        for c in range(3):
+            at = 3 * (i - first) + c
+            u[at] += places[j, c] - free[at]
+            contact[i, c] = total[j, c]
+            pressed.places[count + j, c] = places[j, c]
+        pressed.nodes[count + j] = i
+        for k in range(touching.shape[1]):
+            pressed.touching[count + j, k] = touching[j, k]
+    if infeasible >= 0:
+        pressed.offsets[:] = offsets[infeasible]
+        return count + infeasible, False, rubbed
+    return count + jammed if jammed >= 0 else -1, jammed >= 0, rubbed
+
+
+@kernel
+def stop_at_walls(nodes, walls, level, moved, shared, state, u, touched, met):
+    """Return the dissipation of contacts that close [J], and the nodes that are on walls afterwards.
+
+    Velocities and accelerations of the state are written at the nodes that touch walls or have touched them; ``level``
+    (w,): offsets of the planes; ``moved``: MovingSupports and the step.
+    """
+    x, half, alpha, eta = shared.x, shared.half, shared.alpha, shared.eta
+    v, a, contact = state.v, state.a, state.contact
+    around = join_nodes(met, touched, walls.present)
+    for i in around:
+        centre(u[i], eta, half[i], v[i])
+        accelerations(u[i], alpha, a[i])
+    all_normals, gaps = plane_gaps(around, x, walls.flat.normals, level)
+    free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
+    put_rates(*moved, nodes, v, a)
+    for j in range(len(around)):
+        i = around[j]
+        for c in range(3):
+            if walls.touched.fixed[i, c]:  # wall forces do not change prescribed components
+                free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
+    still = np.zeros(walls.flat.normals.shape)
+    rates = walls.motions[moved[1] + 1, 1] if len(walls.motions) > 0 else still
+    approach = Approach(all_normals, gaps, free_v, free_a, rates, still)
+    counted = np.ones(len(walls.flat.offsets), dtype=np.bool_)
+    return stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))
+
+
+@borrowing
+def pass_block(block, counts, rows, alone, nodes, shared, arrays):
+    """Solve a block and the rows of its nodes whose other node is in it or in a block before; finish all blocks that
+    wait for no other rows.
+
+    ``alone`` (blocks,) bool: whether forces alone determine the increments of a block; ``counts``: numbers of blocks
+    that are finished, and of rows that have a force; ``arrays``: internal forces, increments, contact forces (n, 3).
+    Returns both numbers, and that of rows whose force begins or ends.
+    """
+    finished, pressing = counts
+    f, u, contact = arrays
+    n = len(shared.half)
+    if not alone[block]:
+        first = NODE_BLOCK * block
+        last = min(first + NODE_BLOCK, n)
+        solve_block(block, nodes, shared, f, 0, shared.speeds[: 3 * (last - first)], u[first:last].reshape(-1))
+    count, changed = solve_rows(block, rows, nodes, shared, u, contact)
+    pressing += count
+    while finished < len(rows.ready) and rows.ready[finished] <= block:
+        if alone[finished]:
+            advance_block(finished, nodes, shared, f, 0)
+        else:
+            first = NODE_BLOCK * finished
+            last = min(first + NODE_BLOCK, n)
+            finish_block(finished, nodes, shared, f, 0, contact, u[first:last].reshape(-1))
+            if pressing > 0:
+                _add_pushes(finished, rows, contact, shared.speeds, shared.lanes[CONTACT])
+        finished += 1
+    return finished, pressing, changed
+
+
+@borrowing
+def _add_pushes(block, rows, contact, speeds, sums):
+    """Add the powers of the rows' forces on the nodes of a block with velocities ``speeds`` (3 m,) to ``sums``."""
+    first = NODE_BLOCK * block
+    for k in range(rows.node_starts[block], rows.node_starts[block + 1]):
+        if rows.force[rows.of[k]] > 0.0:
+            i = rows.nodes[k]
+            at, place = 3 * (i % LANES), 3 * (i - first)
+            for c in range(3):
+                sums[at + c] += contact[i, c] * speeds[place + c]
+
+
+@kernel
+def sum_rows(rows, pressing):
+    """Write the forces on the second nodes of each table to ``rows.totals``, as
+    :func:`~pfem_petsc.contact.rows.last_forces` does; ``pressing`` rows have a force."""
+    force, normals, place = rows.force, rows.normals, rows.place
+    for k in range(len(rows.totals)):
+        x = y = z = 0.0
+        if pressing > 0:
+            for j in range(rows.table_starts[k], rows.table_starts[k + 1]):
+                p = place[j]
+                x += force[p] * normals[p, 0]
+                y += force[p] * normals[p, 1]
+                z += force[p] * normals[p, 2]
+        rows.totals[k, 0], rows.totals[k, 1], rows.totals[k, 2] = x, y, z
+
+
+@kernel
+def finish_rows(rows, changed, slack, nodes, moved, shared, state, u):
+    """Return the dissipation [J] of rows that close; ``changed`` rows have a force that begins or ends.
+
+    Velocities and accelerations of the state are written at their nodes; ``moved``: MovingSupports and the step.
+    """
+    x, half, alpha, eta = shared.x, shared.half, shared.alpha, shared.eta
+    v, a, contact = state.v, state.a, state.contact
+    where, force, closed = rows.where, rows.force, rows.closed
+    at, count = np.empty(changed, dtype=np.int64), 0
+    ends = np.empty((2, changed, 10))
+    for p in rows.place:
+        if (force[p] > 0.0) != closed[p]:
+            at[count] = p
+            count += 1
+    for end in range(2):
+        around = where[end][at]
+        for i in around:
+            centre(u[i], eta, half[i], v[i])
+            accelerations(u[i], alpha, a[i])
+        free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
+        put_rates(*moved, nodes, v, a)
+        for m in range(count):
+            i = around[m]
+            ends[end, m, 9] = nodes.mass[i]
+            for c in range(3):
+                # rows do not change prescribed components
+                fixed = rows.free[end, at[m], c] == 0.0
+                ends[end, m, c] = x[i, c]
+                ends[end, m, 3 + c] = v[i, c] if fixed else free_v[m, c]
+                ends[end, m, 6 + c] = a[i, c] if fixed else free_a[m, c]
+    counted = np.ones(len(force), dtype=np.bool_)
+    return close_rows(rows, at, ends, counted, slack)

@@ -96,7 +96,8 @@ class Messages(NamedTuple):
     ----------
     rows : (r,) owned rows that are sent; leaving : (r, 3), arriving : (g, 3) buffers
     count : number of requests; requests, statuses : their handles, and room for as many statuses, as bytes
-    start_all, wait_all : addresses of ``MPI_Startall`` and ``MPI_Waitall``
+    start_all, wait_all, reduce_all : addresses of ``MPI_Startall``, ``MPI_Waitall`` and ``MPI_Allreduce``
+    handles : (3,) of the type int, the maximum, and the communicator
     """
 
     rows: np.ndarray
@@ -107,10 +108,12 @@ class Messages(NamedTuple):
     statuses: np.ndarray
     start_all: int
     wait_all: int
+    reduce_all: int
+    handles: np.ndarray
 
 
-def _addresses() -> tuple[int, int] | None:
-    """Return the addresses of ``MPI_Startall`` and ``MPI_Waitall``; None if they cannot be found."""
+def _addresses() -> tuple[int, ...] | None:
+    """Return the addresses of the functions of :class:`Messages`; None if they cannot be found."""
     try:
         library = ctypes.CDLL(MPI.__file__)
         text, length = ctypes.create_string_buffer(MPI.MAX_LIBRARY_VERSION_STRING), ctypes.c_int()
@@ -118,10 +121,10 @@ def _addresses() -> tuple[int, int] | None:
         # a library of another MPI than mpi4py's would not know its requests
         if text.value.decode().strip() != MPI.Get_library_version().strip("\0 \n"):
             return None
-        found = [ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in ("MPI_Startall", "MPI_Waitall")]
+        names = "MPI_Startall", "MPI_Waitall", "MPI_Allreduce"
+        return tuple(ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in names)
     except (OSError, AttributeError):
         return None
-    return found[0], found[1]
 
 
 class GhostExchange:
@@ -194,7 +197,7 @@ class GhostExchange:
 
         None if the functions of MPI cannot be called by loops. One rank has none, and needs no functions.
         """
-        addresses = (0, 0) if self._comm.size == 1 else _addresses()
+        addresses = (0, 0, 0) if self._comm.size == 1 else _addresses()
         if addresses is None:
             return None
         buffers = self._of(3)
@@ -203,7 +206,9 @@ class GhostExchange:
         requests = np.frombuffer(b"".join(handles), dtype=np.uint8).copy()
         statuses = np.zeros(max(len(handles), 1) * status, dtype=np.uint8)
         rows = self.rows.astype(np.int64)
-        return Messages(rows, buffers.leaving, buffers.arriving, len(handles), requests, statuses, *addresses)
+        used = np.array([MPI._handleof(each) for each in (MPI.INT, MPI.MAX, self._comm)], dtype=np.uint64)
+        arrays = buffers.leaving, buffers.arriving, len(handles), requests, statuses
+        return Messages(rows, *arrays, *addresses, used.view(np.int64))
 
     def update(self, array: np.ndarray) -> None:
         """Send the owned rows of ``array`` (n_local, k) float64 to their ghosts on other ranks."""

@@ -91,6 +91,7 @@ class Batch:
             np.array([len(of.places) for of in loops], dtype=np.int64),
             max((of.work_rows for of in loops), default=0),
             any(len(block.history) for block in blocks),
+            bars.can_break,
             BAR_ENERGIES.index("spring_energy"),
             reach,
             self._meeting(),
@@ -195,15 +196,12 @@ class Batch:
         from petsc4py import PETSc
 
         model = stepper.model
-        alone = model.comm.size == 1
         serves = (
             stepper.scheme.leapfrog
             and stepper.treatment is None
             # -log_view measures the methods of single steps
             and not PETSc.Log.isActive()
             and COMPILED
-            # all ranks would have to stop where a bar of one breaks
-            and (alone or not model.bars.can_break)
             and model.mesh.messages() is not None
             and model.steady
         )
@@ -214,8 +212,8 @@ class Batch:
         ``left``; the last one remains to be counted. What rows of the history need of those that are due is collected,
         see :attr:`~pfem_petsc.stepping.stepper.Stepper.instants`, except for a step with a removal, which changes it.
 
-        On one rank fewer steps are made if a bar breaks or something fails. With several ranks all make all steps, but
-        this rank's state remains that of a failure. The stepper then has a fault.
+        Fewer steps are made if a bar of any rank breaks, and on one rank if something fails: several ranks then make
+        all steps, but this rank's state remains that of the failure. The stepper then has a fault.
         """
         stepper, ledger, state, model = self.stepper, self.ledger, self.stepper.state, self.model
         log, comm, due = model.contact.log, model.comm, self._due(min(most, left))
@@ -257,7 +255,7 @@ class Batch:
         if made.lost:
             raise MPI.Exception(made.lost)
         model.links.import_rows(rows)
-        end, row = made.done if comm.size == 1 else count, shares[made.recorded - 1]
+        end, row = made.passed, shares[made.recorded - 1]
         sound = self._take(made, row[_BARS], end)
         for at, value in self._at_state:
             row[at] = value(stepper)

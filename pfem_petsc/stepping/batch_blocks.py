@@ -31,7 +31,7 @@ class BarArrays(NamedTuple):
     padded_parts : the same of groups of padded runs; (s, 0) if not all sections have such
     places, n_energies : (s, k) and (s,) int64, see :func:`~pfem_petsc.mechanics.elements.sum_energies`
     work_rows : number of rows of the largest workspace
-    keeps : whether laws have a history
+    keeps, can_break : whether laws have a history; whether bars of the case can break, the same on all ranks
     spring_place : index of the energy of springs among those of bars
     reach : how many blocks of nodes beyond its own the bars of a block reach
     meeting : the first block that waits for messages
@@ -46,6 +46,7 @@ class BarArrays(NamedTuple):
     n_energies: np.ndarray
     work_rows: int
     keeps: bool
+    can_break: bool
     spring_place: int
     reach: int
     meeting: int

@@ -124,7 +124,8 @@ class BatchData(NamedTuple):
 class Made(NamedTuple):
     """Outcome of a batch.
 
-    ``done``: number of steps made; ``recorded``: number of shares of rows; ``lost``: error code of MPI. In the last
+    ``done``: number of steps made; ``passed``: those that other ranks make too, of which this one only sends messages
+    after a failure; ``recorded``: number of shares of rows; ``lost``: error code of MPI. In the last
     step: ``changed``: number of bars that changed their state of rupture; ``failed``, ``turned``: the first bar that
     collapsed, and that went through zero length, or -1; ``infeasible``: index in ``near`` of a node that no position
     satisfies, or -1, with the ``offsets`` of its planes, or if it is ``jammed`` one whose friction was not found;
@@ -135,6 +136,7 @@ class Made(NamedTuple):
     """
 
     done: int
+    passed: int
     recorded: int
     lost: int
     changed: int
@@ -188,6 +190,32 @@ def _wait_all(typingctx, address, count, requests, statuses):  # noqa: ANN001, A
     return types.int32(types.int64, types.int64, requests, statuses), _call
 
 
+def _call_reduction(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    """Generate a call of ``MPI_Allreduce`` of one number. Handles are pointers or integers, which go the same way."""
+    address, *arrays, kind, operation, comm = values
+    pointers = [
+        builder.bitcast(context.make_array(each)(context, builder, array).data, _BYTES)
+        for each, array in zip(signature.args[1:3], arrays, strict=True)
+    ]
+    function = builder.inttoptr(address, ir.FunctionType(_SHORT, [_BYTES] * 2 + [_SHORT] + [_INT] * 3).as_pointer())
+    return builder.call(function, [*pointers, _SHORT(1), kind, operation, comm])
+
+
+@intrinsic
+def _reduce_all(typingctx, address, mine, every, kind, operation, comm):  # noqa: ANN001, ANN201
+    """Call ``MPI_Allreduce`` at an address for one number; return its error code."""
+    return types.int32(types.int64, mine, every, types.int64, types.int64, types.int64), _call_reduction
+
+
+@kernel
+def any_rank(messages, here):
+    """Return whether a condition holds on any rank, and MPI's error code. Collective."""
+    mine, every, handles = np.zeros(1, dtype=np.int32), np.zeros(1, dtype=np.int32), messages.handles
+    mine[0] = 1 if here else 0
+    lost = _reduce_all(messages.reduce_all, mine, every, handles[0], handles[1], handles[2])
+    return every[0] > 0, lost
+
+
 @kernel
 def start_positions(messages, x, h, half):
     """Send the positions that owned nodes reach in a step, x + h ``half`` (owned, 3); return MPI's error code.
@@ -223,8 +251,8 @@ def batch_loop(data, touched, met, due, flags):
     Its arguments are BatchData; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them;
     ``due`` (count,) bool, the steps with a row; and ``flags`` (count, walls) bool, which receives the walls that are
     touched in each step. Velocities, accelerations and increments are written to the state in the last step alone. It
-    returns Made: fewer steps on one rank where something fails or bars change their state of rupture; several ranks
-    make all steps, as others wait for their messages.
+    returns Made: fewer steps where bars of any rank change their state of rupture, and on one rank where something
+    fails; several ranks make all steps then, as others wait for their messages.
     """
     count, h, x, before, half = len(flags), data.h, data.x, data.before, data.half
     bars, nodes, walls, rows, messages, state = (
@@ -279,11 +307,12 @@ def batch_loop(data, touched, met, due, flags):
     changed = 0
     touching = 0
     done = 0
+    passed = 0
     recorded = 0
     changes, friction = data.changes, data.friction
     travels, bounces, jammed = len(walls.motions) > 0, len(walls.flat.restitution) > 0, False
     level = walls.flat.offsets.copy()  # of planes at the end of the step
-    several = len(x) > n or messages.count > 0
+    several, stops = messages.reduce_all != 0, False
     lost = 0  # error code of MPI
     aside = new_work(len(bars.sections), bars.work_rows)  # energies that are not counted
     padded = bars.padded_parts.shape[1] > 0
@@ -293,7 +322,10 @@ def batch_loop(data, touched, met, due, flags):
             # the other ranks still need messages, until all know of the failure
             lost = start_positions(messages, x, h, half)
             lost = finish_positions(messages, x, before, False) if lost == 0 else lost
-            if lost != 0:
+            passed += 1
+            if bars.can_break and lost == 0:
+                stops, lost = any_rank(messages, False)
+            if lost != 0 or stops:
                 break
             continue
         last_one, row = step == count - 1, shares[recorded]
@@ -448,7 +480,13 @@ def batch_loop(data, touched, met, due, flags):
         for k in range(n_walls):
             flags[step, k] = pressed.contacts[k] > 0
         done += 1
-        wrong = failed >= 0 or infeasible >= 0 or changed > 0 or not np.isfinite(after[INTERNAL])
+        passed += 1
+        stops = changed > 0
+        if several and bars.can_break:
+            stops, lost = any_rank(messages, stops)
+            if lost != 0:
+                break
+        wrong = failed >= 0 or infeasible >= 0 or stops or not np.isfinite(after[INTERNAL])
         if shortened or wrong or last_one:
             turned = -1
             if brief:
@@ -487,10 +525,11 @@ def batch_loop(data, touched, met, due, flags):
         for c in range(3 if carried else 0):
             impulses.half[SUPPORT, c] += jumps[0, c]
         powers[:] = after
-        if wrong and not several:
+        if stops or (wrong and not several):
             break
     return Made(
         done,
+        passed,
         recorded,
         lost,
         changed,

@@ -107,6 +107,10 @@ SMALL = {
             | {"interpolation": "linear"},
         ],
     },
+    "breaking": {
+        "material": {"it": DAMPED["it"] | {"rupture": {"strain": 3e-3, "steps": 3}}},
+        "wall": [FLOOR | {"friction": 0.3}],
+    },
     "removed": {
         "support": [{"name": "feet", "node_set": "foot", "fix": "z"}],
         "remove": [{"supports": "feet", "time": 3e-5}],

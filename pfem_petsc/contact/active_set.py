@@ -38,9 +38,14 @@ class Bounds:
 
     arrays: tuple[np.ndarray, np.ndarray] | None = None
 
-    def clip(self, w: np.ndarray) -> np.ndarray:
-        """Return a guess (owned, 3) clipped exactly to the bounds."""
-        return w if self.arrays is None else np.clip(w, *self.arrays)
+    def clip(self, w: np.ndarray, within: float) -> np.ndarray:
+        """Return a guess (owned, 3) within the bounds, on them where it is not farther than ``within`` [m] from them,
+        as :meth:`project` requires of the solution."""
+        if self.arrays is None:
+            return w
+        w = np.clip(w, *self.arrays)
+        self.project(w, within)
+        return w
 
     def project(self, w: np.ndarray, within: float) -> None:
         """Set unknowns (owned, 3) within ``within`` [m] of a bound to the bound, in place."""

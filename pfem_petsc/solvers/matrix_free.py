@@ -217,6 +217,7 @@ class MatrixFreeHessian:
         self._u = np.zeros((mesh.n_local, 3))
         self._out = np.zeros((mesh.n_local, 3))
         self._none = np.zeros(mesh.n_owned)
+        self._diagonal: np.ndarray | None = None
         self.problem = None
 
     def update(self, problem: StepProblem, w: np.ndarray) -> None:
@@ -231,18 +232,23 @@ class MatrixFreeHessian:
         self._left = problem.transform.left()
         self.x[:] = problem.x
         self.model.bars.stiffnesses(self.x, problem.balance.weight, self.stored)
+        self._take()
+
+    def _take(self) -> None:
+        """Take account of changes of positions and stiffness."""
         self.bars.take()
+        self._diagonal = None
 
     def put(self, problem: StepProblem, bars: np.ndarray) -> None:
         """Linearise at the predictor of a problem, with the stiffness (5, b) of ``Bars.linearise``. Collective."""
         self.update(problem, np.zeros_like(problem.u))
         self.stored[0], self.stored[1] = bars[3] / self.model.bars.lengths(self.x) ** 2, bars[4]
-        self.bars.take()
+        self._take()
 
     def make_definite(self) -> None:
         """Drop negative eigenvalues of the bars' stiffness, due to compression or softening laws."""
         drop_negative(self.mesh.bars, self.x, self.stored)
-        self.bars.take()
+        self._take()
 
     @cached_property
     def extension(self) -> Extension:
@@ -300,7 +306,9 @@ class MatrixFreeHessian:
         return self.problem.transform.identity and self.model.supports.inclined is None
 
     def diagonal(self) -> np.ndarray:
-        """Return the diagonal of H (owned, 3)."""
+        """Return the diagonal of H (owned, 3), which stays the same until the next linearisation; read-only."""
+        if self._diagonal is not None:
+            return self._diagonal
         problem, supports = self.problem, self.model.supports
         if problem.transform.identity and supports.inclined is None:
             diagonal = self._plain_diagonal()
@@ -313,6 +321,7 @@ class MatrixFreeHessian:
             at, free = supports.inclined.nodes, supports.inclined.free
             full = free @ full_blocks(blocks[at]) @ free + problem.scale * (np.eye(3) - free)
             diagonal[at] = np.einsum("mii->mi", full)
+        self._diagonal = diagonal
         return diagonal
 
     def _plain_diagonal(self) -> np.ndarray:

@@ -410,6 +410,8 @@ class NewtonSolver:
 
     def _rounded(self, norm: float, factor: float) -> bool:
         """Return whether the last residual, of the given 2-norm [N], is due to rounding up to a factor. Collective."""
+        if not norm <= factor * self._tolerance.rounding:
+            return False
         g = self._g.array.reshape(self.mesh.n_owned, 3)
         if self._bounds is not None:  # forces on active bounds are not part of the residual
             w, near = self._u.array.reshape(g.shape), zero_tolerance(self.length)

@@ -296,6 +296,7 @@ class ImplicitStepper(Stepper):
         active_set = ActiveSet(model, self.state, balance, self.held, self.links, self.remedy)
         candidates, links = self._candidates(active_set, balance), active_set.links
         newton = linear = 0
+        near_bound = 2.0 * zero_tolerance(model.size)
         while True:
             try:
                 trial = active_set.place(candidates, links, balance.predictor + guess)
@@ -305,11 +306,12 @@ class ImplicitStepper(Stepper):
             near = active_set.feasible(trial, guess)
             w = problem.coordinates(near)
             bounds = active_set.bounds(trial, near, w)
-            w = bounds.clip(w)
+            w = bounds.clip(w, near_bound)
             report = self.newton.solve(problem, w, ends, bounds.arrays)
             relaxed = not report.converged and active_set.relax(trial)
             if not report.converged and not relaxed and not trial.transform.identity:
-                w = bounds.clip(problem.coordinates(active_set.approach(trial, problem, guess)))
+                w = problem.coordinates(active_set.approach(trial, problem, guess))
+                w = bounds.clip(w, near_bound)
                 report = report.then(self.newton.solve(problem, w, ends, bounds.arrays))
             newton += report.newton
             linear += report.linear
@@ -320,7 +322,7 @@ class ImplicitStepper(Stepper):
                 remedy = self.remedy if exact else f'{self.remedy}, or set solver.linear = "mumps"'
                 text = self.newton.failure_message(w, report, remedy)
                 raise NotConverged(f"{self.when(balance)}: {text}")
-            bounds.project(w, 2.0 * zero_tolerance(model.size))
+            bounds.project(w, near_bound)
             u = problem.increment(w).copy()
             g = np.empty_like(u)
             problem.imbalance(u, g, evaluated=True)

@@ -7,6 +7,7 @@ from helpers.lattices import box, lattice_case, planes, rotation, simulation
 from pfem_petsc.integrators.base import Balance
 from pfem_petsc.solvers.linear import LinearChoice
 from pfem_petsc.stepping.implicit import ImplicitStepper
+from pfem_petsc.tolerances import ON_BOUND
 
 
 def wedge(angle, seed):
@@ -79,6 +80,7 @@ def test_steps_are_the_same(name, supported, comm, shared_tmp_path):
     implicit = ImplicitStepper(run.model, explicit.scheme, explicit.h, LinearChoice("preonly", "lu", "test"))
     implicit.state = run.model.contact.state = explicit.state
     solve, worst, contacts = explicit.solve, [], []
+    within, stiffness = 2.0 * ON_BOUND * run.model.size, run.model.inertia.mass.max() / explicit.h**2
 
     def both(balance: Balance):
         state = explicit.state
@@ -91,7 +93,8 @@ def test_steps_are_the_same(name, supported, comm, shared_tmp_path):
         contacts.append(comm.allreduce(solution.contacts))
         scale = max(comm.allgather(float(np.abs(state.contact).max(initial=0.0))))
         apart = np.abs(state.contact - force).max(initial=0.0)
-        worst.append((difference, apart / scale if scale else apart))
+        # each is within ON_BOUND of the walls, along curved ones too
+        worst.append((difference / within, apart / (1e-9 * scale + within * stiffness)))
         return solution
 
     explicit.solve = both
@@ -99,5 +102,5 @@ def test_steps_are_the_same(name, supported, comm, shared_tmp_path):
     assert run.run() == 0
     implicit.destroy()
     assert max(contacts) >= 1 and sum(c > 0 for c in contacts) >= 2
-    assert max(w[0] for w in worst) < 1e-12 * 0.2
-    assert max(w[1] for w in worst) < 1e-8  # curved walls are followed to 1e-13 of the length
+    assert max(w[0] for w in worst) < 1.0
+    assert max(w[1] for w in worst) < 1.0

@@ -7,6 +7,7 @@ import io
 import tempfile
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
@@ -19,19 +20,32 @@ from .measure import DENSITY, YOUNG_MODULUS, Job, time_job, tiny_jobs
 
 
 def compile_loops(jobs: list[Job], kind: str, explicit: str, comm: MPI.Comm) -> None:
-    """Make a few steps of each job on a lattice of a ``kind``, and ``explicit`` steps of each law; the ranks share
-    them. Collective."""
-    own: list[Callable[[], Any]] = [
+    """Make a few steps of each job on a lattice of a ``kind``, and ``explicit`` steps of each law. The ranks of a
+    machine share them: each takes the next one when it is ready. Collective."""
+    work: list[Callable[[], Any]] = [
         *(partial(time_job, job, kind, 2, MPI.COMM_SELF, None, 0.0) for job in jobs),
         partial(time_job, tiny_jobs(explicit)[0], "cubic", 2, MPI.COMM_SELF, None, 0.0, 3000),
+        *(partial(_run, name, explicit) for name in choices(LAWS)),
     ]
-    laws = [partial(_run, name, explicit) for name in choices(LAWS)]
-    shares = [own + laws] if comm.size == 1 else [own, *(laws[k :: comm.size - 1] for k in range(comm.size - 1))]
-    for make in shares[comm.rank]:
-        make()
-    comm.Barrier()
+    machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
+    with tempfile.TemporaryDirectory(prefix="pfem_compile_") as own:
+        taken = Path(machine.bcast(own))
+        for k, make in enumerate(work):
+            if _is_first(taken / str(k)):
+                make()
+        comm.Barrier()
+    machine.Free()
     if comm.size > 1:
         time_job(jobs[0], kind, 2, comm, None, 0.0)
+
+
+def _is_first(place: Path) -> bool:
+    """Return whether no other rank has made a file, which is made then."""
+    try:
+        place.open("x").close()
+    except FileExistsError:
+        return False
+    return True
 
 
 def law_case(name: str, explicit: str) -> Case:

@@ -143,7 +143,7 @@ def steps_of(mode: str, bars: int) -> int:
         return 4000 if bars < 500_000 else 1600
     if mode.startswith("implicit"):
         return 5 if bars < 50_000 else 3
-    return 200 if bars < 50_000 else 40 if bars < 500_000 else 8
+    return 400 if bars < 500_000 else 200  # some batches of ours, which have up to 100
 
 
 def compare(mode: str, cells: int, codes: list[Code], pythons: dict[str, str], repeats: int) -> list[dict]:

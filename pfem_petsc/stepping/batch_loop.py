@@ -75,7 +75,6 @@ from .impulses import SUPPORT
 from .ledger_loops import (
     CONTACT,
     INTERNAL,
-    WIDE,
     WORKS,
     Acting,
     EndArrays,
@@ -279,7 +278,7 @@ def batch_loop(data, touched, met, due, flags):
     increments, factors = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK)
     load, held = np.empty(len(nodes.support_nodes)), np.empty(len(nodes.support_nodes))
     speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
-    ends = EndArrays(np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK), np.empty(WIDE), np.empty(WIDE))
+    ends = EndArrays(np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK))
     totals, lanes, after = np.zeros((3, 3)), new_sums(), np.empty(len(WORKS))
     sums, energies = (np.empty(len(WORKS) + 1), np.empty((3, 3))), np.empty(_ENERGIES)
     probed = len(probes.nodes)

@@ -146,12 +146,10 @@ def clear_ends(lanes, n):
 
 class EndArrays(NamedTuple):
     """Room for the end of a step at the nodes of a block: increments, and displacements in the last half of the step,
-    (3 m,); masses and momenta of :data:`LANES` nodes, (WIDE,)."""
+    (3 m,)."""
 
     u: np.ndarray
     left: np.ndarray
-    masses: np.ndarray
-    momentum: np.ndarray
 
 
 @borrowing

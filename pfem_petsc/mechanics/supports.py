@@ -268,7 +268,8 @@ class Supports:
             for axis in axes if name not in self._gone else []:
                 first[members[first[members, axis] < 0], axis] = k
         self.fixed[:] = (first >= 0) | self._detached[:, None]  # in place: contact holds the array
-        self.nodes, self.components = np.nonzero(self.fixed)
+        # contiguous, as empty ones are: loops would be compiled anew for the columns of one array
+        self.nodes, self.components = map(np.ascontiguousarray, np.nonzero(self.fixed))
         self.at = (self.nodes, self.components)
         self.origins = self._origin[self.at]
         by = first[self.at]

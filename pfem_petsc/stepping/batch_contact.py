@@ -134,14 +134,15 @@ def press_block(block, counts, nodes, walls, shared, places_of, out):
 
 
 @kernel
-def stop_at_walls(nodes, walls, level, moved, shared, state, u, touched, met):
+def stop_at_walls(nodes, walls, level, moved, shared, state, on_walls):
     """Return the dissipation of contacts that close [J], and the nodes that are on walls afterwards.
 
     Velocities and accelerations of the state are written at the nodes that touch walls or have touched them; ``level``
-    (w,): offsets of the planes; ``moved``: MovingSupports and the step.
+    (w,): offsets of the planes; ``moved``: MovingSupports and the step; ``on_walls``: both kinds of nodes.
     """
     x, half, alpha, eta = shared.x, shared.half, shared.alpha, shared.eta
-    v, a, contact = state.v, state.a, state.contact
+    u, v, a, contact = state.u, state.v, state.a, state.contact
+    touched, met = on_walls
     around = join_nodes(met, touched, walls.present)
     for i in around:
         centre(u[i], eta, half[i], v[i])
@@ -221,13 +222,13 @@ def sum_rows(rows, pressing):
 
 
 @kernel
-def finish_rows(rows, changed, slack, nodes, moved, shared, state, u):
+def finish_rows(rows, changed, slack, nodes, moved, shared, state):
     """Return the dissipation [J] of rows that close; ``changed`` rows have a force that begins or ends.
 
     Velocities and accelerations of the state are written at their nodes; ``moved``: MovingSupports and the step.
     """
     x, half, alpha, eta = shared.x, shared.half, shared.alpha, shared.eta
-    v, a, contact = state.v, state.a, state.contact
+    u, v, a, contact = state.u, state.v, state.a, state.contact
     where, force, closed = rows.where, rows.force, rows.closed
     at, count = np.empty(changed, dtype=np.int64), 0
     ends = np.empty((2, changed, 10))

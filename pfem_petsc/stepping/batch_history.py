@@ -112,7 +112,10 @@ def end_block(block, how, nodes, shared, state, forces, probed):
     else:
         copy(state.u[first:last].reshape(-1), u)
     x, half = shared.x[first:last].reshape(-1), shared.half[first:last].reshape(-1)
-    add_ends(x, nodes.mass[first:last], half, force, (h, alpha, eta), ends, lanes)
+    add_ends((u, half, force, x, nodes.mass[first:last]), (h, alpha, eta), lanes)
+    if len(nodes.external) > 0 or len(nodes.damping) > 0 or pressing:
+        for j in range(wide):
+            left[j] = (0.5 * h) * ((half[j] - eta * u[j]) - (0.5 * h) * (alpha * u[j]))
     if len(nodes.external) > 0:
         add_powers(nodes.external[first:last].reshape(-1), left, lanes[ENDS + EXTERNAL])
     if len(nodes.damping) > 0:

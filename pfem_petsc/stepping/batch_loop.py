@@ -161,49 +161,39 @@ _PUSHED, _RUBBED, _IMPACT = map(HEAD.first, ("contact_work", "friction_dissipati
 _ENERGIES, _PROBED = len(BAR_ENERGIES), len(PROBED)
 
 
-_INT, _SHORT, _BYTES = ir.IntType(64), ir.IntType(32), ir.IntType(8).as_pointer()
+_CODE, _BYTES = ir.IntType(32), ir.IntType(8).as_pointer()
 
 
 def _call(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    """Generate a call of the function at an address with the number of requests and pointers to arrays."""
-    address, count, *arrays = values
-    pointers = [
-        context.make_array(kind)(context, builder, array).data
-        for kind, array in zip(signature.args[2:], arrays, strict=True)
+    """Generate a call of a function of MPI at an address with numbers, handles, which are pointers or integers of the
+    same size, and pointers to arrays."""
+    address, *given = values
+    arguments = [
+        builder.bitcast(context.make_array(kind)(context, builder, value).data, _BYTES)
+        if isinstance(kind, types.Array)
+        else value
+        for kind, value in zip(signature.args[1:], given, strict=True)
     ]
-    kind = ir.FunctionType(_SHORT, [_SHORT] + [_BYTES] * len(pointers))
-    function = builder.inttoptr(address, kind.as_pointer())
-    arguments = [builder.trunc(count, _SHORT), *(builder.bitcast(pointer, _BYTES) for pointer in pointers)]
-    return builder.call(function, arguments)
+    kind = ir.FunctionType(_CODE, [argument.type for argument in arguments])
+    return builder.call(builder.inttoptr(address, kind.as_pointer()), arguments)
 
 
 @intrinsic
 def _start_all(typingctx, address, count, requests):  # noqa: ANN001, ANN201
     """Call ``MPI_Startall`` at an address; return its error code."""
-    return types.int32(types.int64, types.int64, requests), _call
+    return types.int32(types.int64, types.int32, requests), _call
 
 
 @intrinsic
 def _wait_all(typingctx, address, count, requests, statuses):  # noqa: ANN001, ANN201
     """Call ``MPI_Waitall`` at an address; return its error code."""
-    return types.int32(types.int64, types.int64, requests, statuses), _call
-
-
-def _call_reduction(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    """Generate a call of ``MPI_Allreduce`` of one number. Handles are pointers or integers, which go the same way."""
-    address, *arrays, kind, operation, comm = values
-    pointers = [
-        builder.bitcast(context.make_array(each)(context, builder, array).data, _BYTES)
-        for each, array in zip(signature.args[1:3], arrays, strict=True)
-    ]
-    function = builder.inttoptr(address, ir.FunctionType(_SHORT, [_BYTES] * 2 + [_SHORT] + [_INT] * 3).as_pointer())
-    return builder.call(function, [*pointers, _SHORT(1), kind, operation, comm])
+    return types.int32(types.int64, types.int32, requests, statuses), _call
 
 
 @intrinsic
-def _reduce_all(typingctx, address, mine, every, kind, operation, comm):  # noqa: ANN001, ANN201
-    """Call ``MPI_Allreduce`` at an address for one number; return its error code."""
-    return types.int32(types.int64, mine, every, types.int64, types.int64, types.int64), _call_reduction
+def _reduce_all(typingctx, address, mine, every, count, kind, operation, comm):  # noqa: ANN001, ANN201
+    """Call ``MPI_Allreduce`` at an address; return its error code."""
+    return types.int32(types.int64, mine, every, types.int32, types.int64, types.int64, types.int64), _call
 
 
 @kernel
@@ -211,7 +201,7 @@ def any_rank(messages, here):
     """Return whether a condition holds on any rank, and MPI's error code. Collective."""
     mine, every, handles = np.zeros(1, dtype=np.int32), np.zeros(1, dtype=np.int32), messages.handles
     mine[0] = 1 if here else 0
-    lost = _reduce_all(messages.reduce_all, mine, every, handles[0], handles[1], handles[2])
+    lost = _reduce_all(messages.reduce_all, mine, every, np.int32(1), handles[0], handles[1], handles[2])
     return every[0] > 0, lost
 
 
@@ -461,9 +451,9 @@ def batch_loop(data, touched, met, due, flags):
             clear_sums(lanes[CONTACT], n)
             add_sparse_powers(near, contact, v, lanes[CONTACT])
         if len(touched) > 0 or len(met) > 0:
-            impact, met = stop_at_walls(nodes, walls, level, (moving, step), shared, state, u, touched, met)
+            impact, met = stop_at_walls(nodes, walls, level, (moving, step), shared, state, (touched, met))
         if altered > 0:
-            impact += finish_rows(rows, altered, walls.touched.slack, nodes, (moving, step), shared, state, u)
+            impact += finish_rows(rows, altered, walls.touched.slack, nodes, (moving, step), shared, state)
         sum_rows(rows, pressing)
         touching = len(near) + 2 * pressing
         after[:] = powers

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import add_freely, borrowing, borrowing_apart, inlined, kernel
+from ..mechanics.compiled import add_freely, borrowing_apart, inlined, kernel
 
 WORKS = ("external", "contact", "damping", "inertial", "internal")
 """Works of the ledger [J], in this order; the first includes supports."""
@@ -20,7 +20,8 @@ REACTIONS, _PUSHES, _DRAGS = (len(WORKS) + k for k in range(3))  # further lanes
 ENDS = _DRAGS + 1
 """The first of the lanes of the works of loads, contact and damping over the last half step, in the order of
 :data:`WORKS`."""
-_SUMS = ENDS + DAMPING + 1  # not lanes, but the sums of :func:`add_ends`
+_SUMS = ENDS + DAMPING + 1  # not lanes, but the sums of :func:`add_ends`: two works, kinetic energy, three vectors
+_N_SUMS = 12
 
 LANES = 64
 """Nodes with sums of their own; blocks of nodes begin at multiples of it."""
@@ -138,7 +139,7 @@ def clear_forces(lanes, n, acting):
 @kernel
 def clear_ends(lanes, n):
     """Set the sums of :func:`add_ends`, and the lanes of the other works over the last half step, to zero."""
-    for k in range(12):
+    for k in range(_N_SUMS):
         lanes[_SUMS, k] = 0.0
     for row in range(ENDS, _SUMS):
         clear_sums(lanes[row], n)
@@ -152,27 +153,17 @@ class EndArrays(NamedTuple):
     left: np.ndarray
 
 
-@borrowing
-def add_ends(x, mass, half, force, numbers, ends, lanes):
-    """Add what the ledger needs of the end of a step at consecutive nodes: the works of inertia and of the internal
-    ``force`` over half the step, kinetic energy and momenta.
-
-    ``half``: velocities half a step later, (3 n,) like ``x`` and ``force``; ``mass`` (n,); ``numbers``: h, alpha and
-    eta. From the increments ``ends.u``, it writes ``ends.left``.
-    """
-    _add_motion((ends.u, half, force, x, mass), numbers, lanes[_SUMS])
-    h, alpha, eta = numbers
-    u, left = ends.u, ends.left
-    for j in range(len(x)):
-        left[j] = (0.5 * h) * ((half[j] - eta * u[j]) - (0.5 * h) * (alpha * u[j]))
-
-
 @borrowing_apart
-def _add_motion(given, numbers, sums):
-    """Add internal work and that of inertia without factors, see :func:`sum_ends`, twice the kinetic energy, momentum,
-    angular momentum and mass times position to ``sums``."""
+def add_ends(given, numbers, lanes):
+    """Add what the ledger needs of the end of a step at consecutive nodes: the works of inertia and of internal forces
+    over half the step, kinetic energy and momenta.
+
+    ``given``: increments (3 n,), velocities half a step later, internal forces and positions, (3 n,) too, and masses
+    (n,); ``numbers``: h, alpha and eta. The sums are without factors, see :func:`sum_ends`.
+    """
     u, half, force, x, mass = given
     h, alpha, eta = numbers
+    sums = lanes[_SUMS]
     back = 0.5 * h * alpha
     internal = inertial = kinetic = 0.0
     p0 = p1 = p2 = q0 = q1 = q2 = m0 = m1 = m2 = 0.0
@@ -193,7 +184,7 @@ def _add_motion(given, numbers, sums):
         m0, m1, m2 = add_freely(m0, m * place[0]), add_freely(m1, m * place[1]), add_freely(m2, m * place[2])
     inertial *= alpha * alpha
     found = internal, inertial, kinetic, p0, p1, p2, q0, q1, q2, m0, m1, m2
-    for k in range(12):
+    for k in range(_N_SUMS):
         sums[k] += found[k]
 
 

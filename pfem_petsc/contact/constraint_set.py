@@ -100,6 +100,7 @@ class ConstraintSet:
         on all ranks that have a row
     two : TwoNodeRows
     alone : whether all rows of the model are over two nodes that no other row and no wall stops, with fixed directions
+    separate : whether moreover no ranks share rows, so that a pass over rows solves them, see :meth:`export_rows`
     walled : whether walls can stop any node of the model's rows
     """
 
@@ -125,6 +126,8 @@ class ConstraintSet:
         self._turning = self.mesh.comm.allreduce(not rows.fixed.all(), op=MPI.LOR)
         self.walled = self._walls.everywhere
         self.alone = not self.walled and self.mesh.comm.allreduce(self.two.every, op=MPI.LAND)
+        own = rows.partners.alone and not self.dynamic
+        self.separate = self.alone and self.mesh.comm.allreduce(own, op=MPI.LAND)
         self._x = np.empty((len(rows.numbers), 3))
         self._blocks: FixedRows | None = None  # for nodes of the stiffness
         self._blocks_of = np.empty(0)
@@ -185,13 +188,14 @@ class ConstraintSet:
         self.two.record.closed[:] = closed[self.two.at] > 0
 
     def explicit(
-        self, balance: Balance, state: State, u: np.ndarray, stiffness: np.ndarray, none: np.ndarray, tolerance: float
-    ) -> np.ndarray:
-        """Correct the increments ``u`` (owned, 3) of a step in which each node is solved on its own. Collective.
+        self, balance: Balance, state: State, u: np.ndarray, stiffness: np.ndarray, tolerance: float
+    ) -> np.ndarray | None:
+        """Return the forces (n, 3) [N] on the nodes of rows in a step in which each node is solved on its own, with
+        increments ``u`` (owned, 3) without rows, for :meth:`push`; None if no row acts on a node of this rank.
+        Collective.
 
         ``stiffness`` (owned,) is the force for a displacement of a node [N/m]. ``tolerance`` [m] is the depth up to
-        which one of several rows that share nodes counts as satisfied. Returns the forces on nodes (owned, 3) [N],
-        ``none`` if no row acts on a node of this rank.
+        which one of several rows that share nodes counts as satisfied.
 
         Raises
         ------
@@ -199,7 +203,7 @@ class ConstraintSet:
             If no positions satisfy all rows. Raised at least on this rank, after all collective operations.
         """
         if not self:
-            return none
+            return None
         if self.dynamic:
             self.find(balance.predictor + u, np.zeros(len(u)), balance.time)
         rows, x, walls = self.rows, self._x, self._walls
@@ -220,51 +224,46 @@ class ConstraintSet:
         planes = walls.planes(x, far[:, flags], balance.time) if walls.any else None
         self.force, self.jacobian = rows.project(x, rows.spread(stiffness, far[:, 3]), tolerance, start, planes)
         if not self.force.any():
-            return none
-        load, contact = rows.forces(self.jacobian, self.force), np.zeros(u.shape)
-        push_nodes(rows.where, load, rows.free, stiffness, u, contact)
-        return contact if contact.any() else none
+            return None
+        load = rows.forces(self.jacobian, self.force)
+        return load if load[rows.mine].any() else None
 
-    @property
-    def batched(self) -> bool:
-        """Whether batches of steps can solve the rows of this rank; see :meth:`export_rows`."""
-        return self.alone and self.rows.partners.alone and not self.dynamic
+    def push(self, load: np.ndarray, stiffness: np.ndarray, u: np.ndarray, contact: np.ndarray) -> None:
+        """Correct increments by the forces of :meth:`explicit`, and add these to ``contact``, (owned, 3) both."""
+        push_nodes(self.rows.where, load, self.rows.free, stiffness, u, contact)
 
     def export_rows(self, stiffness: np.ndarray) -> FixedRows:
-        """Return the rows with their present forces for a batch of steps.
+        """Return :attr:`separate` rows with their present forces for a batch of steps; none if they are not.
 
         ``stiffness`` (owned,) is the force for a displacement of a node [N/m], the same array as long as its values
         stay the same.
         """
         if self._blocks is None or stiffness is not self._blocks_of:
-            self._blocks, self._blocks_of = self.two.of_blocks(stiffness), stiffness
+            self._blocks, self._blocks_of = self.two.of_blocks(stiffness, self.separate), stiffness
         rows = self._blocks
-        rows.force[rows.place], rows.closed[rows.place] = self.force, self.two.record.closed
+        if self.separate:
+            rows.force[rows.place], rows.closed[rows.place] = self.force, self.two.record.closed
         return rows
 
     def import_rows(self, rows: FixedRows) -> None:
         """Take the forces after the last of the steps from rows that were exported."""
-        self.force = rows.force[rows.place]
-        self.two.record.closed[:] = rows.closed[rows.place]
+        if self.separate:
+            self.force = rows.force[rows.place]
+            self.two.record.closed[:] = rows.closed[rows.place]
+
+    def pressed(self) -> np.ndarray:
+        """Return the owned nodes (m,), ascending, on which rows press."""
+        nodes = self.rows.ends[self.force > 0.0]
+        at = self.rows.where[nodes[nodes >= 0]]
+        return np.unique(at[at >= 0])
 
     def any_pressed(self) -> bool:
         """Return whether any row of the model has a force. Collective."""
         return bool(self) and bool(self.mesh.comm.allreduce(bool(self.force.any()), op=MPI.LOR))
 
-    def mark(self, held: np.ndarray) -> None:
-        """Mark owned nodes (owned,) on which rows press."""
-        nodes = self.rows.ends[self.force > 0.0]
-        at = self.rows.where[nodes[nodes >= 0]]
-        held[at[at >= 0]] = True
-
-    def count_held(self, nodes: np.ndarray, owned: int) -> int:
-        """How many of the owned nodes are among those (k,) that walls hold, or held by rows."""
-        if not self:
-            return len(nodes)
-        held = np.zeros(owned, dtype=bool)
-        held[nodes] = True
-        self.mark(held)
-        return int(np.count_nonzero(held))
+    def count_held(self, nodes: np.ndarray) -> int:
+        """Return how many owned nodes are held by walls, which hold ``nodes`` (k,), or by rows."""
+        return len(np.union1d(nodes, self.pressed())) if self else len(nodes)
 
     def totals(self) -> np.ndarray:
         """This rank's share of the forces (tables, 3) of the rows on their last nodes [N]."""

@@ -96,23 +96,24 @@ class TwoNodeRows:
         p = len(self.at)
         self.record = ClosingRows(self.normals, self.least, self.along, np.zeros(p), np.zeros(p, dtype=bool))
 
-    def of_blocks(self, stiffness: np.ndarray) -> FixedRows:
-        """Return the rows for batches of steps, sorted by blocks of nodes, without forces.
+    def of_blocks(self, stiffness: np.ndarray, some: bool) -> FixedRows:
+        """Return the rows, or none unless ``some``, for batches of steps, sorted by blocks of nodes, without forces.
 
         ``stiffness`` (owned,) is the force for a displacement of a node [N/m]; both nodes of all rows must be on this
         rank.
         """
-        p, n_blocks = len(self.at), -(-len(stiffness) // NODE_BLOCK)
-        blocks = self.nodes // NODE_BLOCK
+        own = self.nodes if some else self.nodes[:, :0]
+        p, n_blocks = own.shape[1], -(-len(stiffness) // NODE_BLOCK)
+        blocks = own // NODE_BLOCK
         later = blocks.max(axis=0)
-        order = np.lexsort((self.nodes[0], later))
+        order = np.lexsort((own[0], later))
         place = np.empty(p, dtype=np.int64)
         place[order] = np.arange(p)
         numbers = np.arange(n_blocks + 1)
         ready = np.arange(n_blocks)
         for end in blocks:
             np.maximum.at(ready, end, later)
-        where = np.ascontiguousarray(self.nodes[:, order])
+        where = np.ascontiguousarray(own[:, order])
         at = np.argsort(where.ravel(), kind="stable")
         nodes = where.ravel()[at]
         near = np.zeros(n_blocks, dtype=bool)
@@ -123,7 +124,7 @@ class TwoNodeRows:
         return FixedRows(
             starts=np.searchsorted(later[order], numbers),
             place=place,
-            table_starts=np.searchsorted(self.rows.source, np.arange(tables + 1)),
+            table_starts=np.searchsorted(self.rows.source[self.at][:p], np.arange(tables + 1)),
             ready=np.maximum.accumulate(ready) if p else np.empty(0, dtype=np.int64),
             near=near,
             nodes=nodes,
@@ -182,8 +183,8 @@ def solve_rows(block, rows, nodes, shared, u, contact):
 
     ``nodes`` has ``mass`` and ``damping`` (n,), ``shared`` the step ``h``, the numbers ``alpha`` and ``eta``, and
     positions and velocities at half steps ``x``, ``half`` (n, 3), to which increments ``u`` (n, 3) are added;
-    ``contact`` (n, 3) [N] is written, and zero at nodes of rows without a force. Returns the number of rows with a
-    force, and of rows whose force begins or ends with respect to ``rows.closed``.
+    forces are written to ``contact`` (n, 3) [N], which is zero. Returns the number of rows with a force, and of rows
+    whose force begins or ends with respect to ``rows.closed``.
     """
     x, half, h = shared.x, shared.half, shared.h
     mass, damping, alpha, eta = nodes.mass, nodes.damping, shared.alpha, shared.eta
@@ -205,12 +206,8 @@ def solve_rows(block, rows, nodes, shared, u, contact):
             else:
                 d2 = d
         short = rows.least[p] - ((d0 + d2) + d1)
-        before = force[p]
         if short <= 0.0 or not rows.soft[p] > 0.0:
-            if before != 0.0:
-                force[p] = 0.0
-                for c in range(3):
-                    contact[i, c] = contact[j, c] = 0.0
+            force[p] = 0.0
             if rows.closed[p]:
                 changed += 1
             continue
@@ -231,6 +228,17 @@ def solve_rows(block, rows, nodes, shared, u, contact):
                     part *= rows.free[end, p, c]
                 u[node, c] += part / hard
     return count, changed
+
+
+@kernel
+def pressed_nodes(rows, pressing):
+    """Return the nodes (m,), ascending, of ``pressing`` rows, which are all that have a force."""
+    nodes, count = np.empty(2 * pressing, dtype=np.int64), 0
+    for k in range(len(rows.of) if pressing > 0 else 0):
+        if rows.force[rows.of[k]] > 0.0:
+            nodes[count] = rows.nodes[k]
+            count += 1
+    return nodes
 
 
 @kernel

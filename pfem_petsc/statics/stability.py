@@ -253,7 +253,7 @@ def held_nodes(model: Model, walls: WallForces) -> np.ndarray:
     held[walls.nodes[walls.touching[:, special].any(axis=1)]] = True
     if contact.ties.any:
         held[contact.ties.nodes()[0]] = True
-    model.links.mark(held)
+    held[model.links.pressed()] = True
     return held
 
 

@@ -21,6 +21,7 @@ from .batch_blocks import BarArrays, NodeArrays, StateArrays
 from .batch_contact import WallArrays
 from .batch_history import ImpulseArrays, ProbeArrays
 from .batch_loop import BatchData, Made, batch_loop
+from .batch_rows import RowCaller
 from .batch_supports import MovingSupports, SpringArrays
 from .impact import Touched
 from .stepper import Instants, Solution
@@ -60,6 +61,7 @@ class Batch:
         if state.contact is not stepper.zero:
             self._contact[:] = state.contact
         self._u = np.zeros_like(state.v)
+        self._caller = RowCaller(stepper, self._stiffness, self._u, self._contact)
         share = Share(len(self.model.contact.names), len(self.model.links.columns), len(probed))
         self._width, self._at_state = len(share.numbers), values_at_state(self.model)
         return_freed_memory()
@@ -212,8 +214,9 @@ class Batch:
         ``left``; the last one remains to be counted. What rows of the history need of those that are due is collected,
         see :attr:`~pfem_petsc.stepping.stepper.Stepper.instants`, except for a step with a removal, which changes it.
 
-        Fewer steps are made if a bar of any rank breaks, and on one rank if something fails: several ranks then make
-        all steps, but this rank's state remains that of the failure. The stepper then has a fault.
+        Fewer steps are made if a bar of any rank breaks, and if something fails; but several ranks whose bars cannot
+        break, and whose rows need no calls, make all steps, though the state remains that of the failure. The stepper
+        then has a fault.
         """
         stepper, ledger, state, model = self.stepper, self.ledger, self.stepper.state, self.model
         log, comm, due = model.contact.log, model.comm, self._due(min(most, left))
@@ -240,6 +243,7 @@ class Batch:
             loads,
             self._walls._replace(motions=self._wall_motions(begin, count)),
             rows,
+            self._caller.begin(begin, rows.totals),
             self._messages,
             StateArrays(state.f, state.a, state.v, self._support, self._contact, self._u),
             ledger.sums,
@@ -252,6 +256,7 @@ class Batch:
             shares,
         )
         made = batch_loop(data, log.last, ledger.impacts.met, due, flags)
+        self._caller.end()
         if made.lost:
             raise MPI.Exception(made.lost)
         model.links.import_rows(rows)
@@ -319,5 +324,10 @@ class Batch:
             text = contact.infeasible_message(node, made.offsets)
             if made.jammed:
                 text = contact.unsettled_friction(node, contact.normals)
-            return SimulationFailure(f"{stepper.when(stepper.scheme.balance(stepper.state, stepper.h))}: {text}")
-        return None
+            return self._at_balance(text)
+        return self._at_balance(self._caller.failure) if made.unsolved else None
+
+    def _at_balance(self, text: object) -> SimulationFailure:
+        """Return a failure of the balance for the next positions."""
+        stepper = self.stepper
+        return SimulationFailure(f"{stepper.when(stepper.scheme.balance(stepper.state, stepper.h))}: {text}")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..integrators._leapfrog import advance, advance_loaded, centre, kick, move
+from ..integrators._leapfrog import advance, advance_loaded, centre, drift, kick, move
 from ..mechanics.compiled import borrowing, calls, kernel
 from ..mechanics.elements import PULLED, clear_energies, sum_energies
 from ..mechanics.runs import join_components, new_rows, split_components
@@ -217,6 +217,25 @@ def solve_block(block, nodes, shared, f, start, free, u):
         j = 3 * (i - first) + nodes.support_components[k]
         shared.load[k] = nodes.stiffness[i] * u[j]
         u[j] = shared.held[k] = nodes.support_positions[k] - free[j]
+    for j in range(len(u)):
+        free[j] += u[j]
+
+
+@borrowing
+def predict(block, shared, predictor):
+    """Write the positions to which the nodes of a block move without forces to ``predictor`` (n, 3)."""
+    first = NODE_BLOCK * block
+    last = min(first + NODE_BLOCK, len(shared.half))
+    where, speed = shared.x[first:last].reshape(-1), shared.half[first:last].reshape(-1)
+    drift(where, shared.h, speed, predictor[first:last].reshape(-1))
+
+
+@borrowing
+def place_block(block, shared, u, free):
+    """Write the positions that the nodes of a block reach with increments ``u`` to ``free``, (3 m,) both."""
+    first = NODE_BLOCK * block
+    last = min(first + NODE_BLOCK, len(shared.half))
+    drift(shared.x[first:last].reshape(-1), shared.h, shared.half[first:last].reshape(-1), free)
     for j in range(len(u)):
         free[j] += u[j]
 

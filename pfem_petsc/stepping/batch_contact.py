@@ -7,14 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ..contact.explicit import Arrivals, FlatWalls, find_beyond, press_nodes
-from ..contact.fixed_rows import close_rows, solve_rows
+from ..contact.fixed_rows import close_rows
 from ..integrators._leapfrog import accelerations, centre
 from ..mechanics.compiled import borrowing, kernel
 from ..mesh.ordering import NODE_BLOCK
-from .batch_blocks import advance_block, finish_block, solve_block
 from .batch_supports import put_rates
 from .impact import Approach, Touched, join_nodes, plane_gaps, stop_nodes, unpressed
-from .ledger_loops import CONTACT, LANES
 
 
 class WallArrays(NamedTuple):
@@ -122,7 +120,7 @@ def press_block(block, counts, nodes, walls, shared, places_of, out):
         for c in range(3):
             at = 3 * (i - first) + c
             u[at] += places[j, c] - free[at]
-            contact[i, c] = total[j, c]
+            contact[i, c] += total[j, c]  # rows may press there too
             pressed.places[count + j, c] = places[j, c]
         pressed.nodes[count + j] = i
         for k in range(touching.shape[1]):
@@ -160,49 +158,6 @@ def stop_at_walls(nodes, walls, level, moved, shared, state, on_walls):
     approach = Approach(all_normals, gaps, free_v, free_a, rates, still)
     counted = np.ones(len(walls.flat.offsets), dtype=np.bool_)
     return stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))
-
-
-@borrowing
-def pass_block(block, counts, rows, alone, nodes, shared, arrays):
-    """Solve a block and the rows of its nodes whose other node is in it or in a block before; finish all blocks that
-    wait for no other rows.
-
-    ``alone`` (blocks,) bool: whether forces alone determine the increments of a block; ``counts``: numbers of blocks
-    that are finished, and of rows that have a force; ``arrays``: internal forces, increments, contact forces (n, 3).
-    Returns both numbers, and that of rows whose force begins or ends.
-    """
-    finished, pressing = counts
-    f, u, contact = arrays
-    n = len(shared.half)
-    if not alone[block]:
-        first = NODE_BLOCK * block
-        last = min(first + NODE_BLOCK, n)
-        solve_block(block, nodes, shared, f, 0, shared.speeds[: 3 * (last - first)], u[first:last].reshape(-1))
-    count, changed = solve_rows(block, rows, nodes, shared, u, contact)
-    pressing += count
-    while finished < len(rows.ready) and rows.ready[finished] <= block:
-        if alone[finished]:
-            advance_block(finished, nodes, shared, f, 0)
-        else:
-            first = NODE_BLOCK * finished
-            last = min(first + NODE_BLOCK, n)
-            finish_block(finished, nodes, shared, f, 0, contact, u[first:last].reshape(-1))
-            if pressing > 0:
-                _add_pushes(finished, rows, contact, shared.speeds, shared.lanes[CONTACT])
-        finished += 1
-    return finished, pressing, changed
-
-
-@borrowing
-def _add_pushes(block, rows, contact, speeds, sums):
-    """Add the powers of the rows' forces on the nodes of a block with velocities ``speeds`` (3 m,) to ``sums``."""
-    first = NODE_BLOCK * block
-    for k in range(rows.node_starts[block], rows.node_starts[block + 1]):
-        if rows.force[rows.of[k]] > 0.0:
-            i = rows.nodes[k]
-            at, place = 3 * (i % LANES), 3 * (i - first)
-            for c in range(3):
-                sums[at + c] += contact[i, c] * speeds[place + c]
 
 
 @kernel

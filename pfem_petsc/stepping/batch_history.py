@@ -90,9 +90,9 @@ def end_block(block, how, nodes, shared, state, forces, probed):
     probes; ``probed``: ProbeArrays, and their values (p, 4, 3).
 
     ``how``: whether forces (m, 3) of the block alone determine its increments; whether these, velocities and
-    accelerations are kept in the state; and whether rows over two nodes press.
+    accelerations are kept in the state.
     """
-    alone, keep, pressing = how
+    alone, keep = how
     h, eta, alpha, ends, lanes = shared.h, shared.eta, shared.alpha, shared.ends, shared.lanes
     first = NODE_BLOCK * block
     last = min(first + NODE_BLOCK, len(shared.half))
@@ -113,7 +113,7 @@ def end_block(block, how, nodes, shared, state, forces, probed):
         copy(state.u[first:last].reshape(-1), u)
     x, half = shared.x[first:last].reshape(-1), shared.half[first:last].reshape(-1)
     add_ends((u, half, force, x, nodes.mass[first:last]), (h, alpha, eta), lanes)
-    if len(nodes.external) > 0 or len(nodes.damping) > 0 or pressing:
+    if len(nodes.external) > 0 or len(nodes.damping) > 0:
         for j in range(wide):
             left[j] = (0.5 * h) * ((half[j] - eta * u[j]) - (0.5 * h) * (alpha * u[j]))
     if len(nodes.external) > 0:
@@ -128,16 +128,14 @@ def end_block(block, how, nodes, shared, state, forces, probed):
         copy(u, state.u[first:last].reshape(-1))
         centre(u, eta, half, state.v[first:last].reshape(-1))
         accelerations(u, alpha, state.a[first:last].reshape(-1))
-    if pressing:
-        add_powers(state.contact[first:last].reshape(-1), left, lanes[ENDS + CONTACT])
     _probe(block, u, shared, *probed)
 
 
 @borrowing
-def end_at_walls(near, shared, contact, u):
-    """Add the works of the forces of walls over the half step at the nodes that are ``near``."""
+def end_at_contacts(held, shared, contact, u):
+    """Add the works of the forces of walls and rows over the half step at the nodes that are ``held``."""
     h, alpha, eta, half, works = shared.h, shared.alpha, shared.eta, shared.half, shared.lanes[ENDS + CONTACT]
-    for i in near:
+    for i in held:
         at = 3 * (i % LANES)
         for c in range(3):
             speed = half[i, c] - eta * u[i, c]

@@ -14,6 +14,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from ..columns import BAR_ENERGIES, HEAD, PROBED
+from ..contact.fixed_rows import pressed_nodes, solve_rows
 from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import accelerations, centre
 from ..mechanics.compiled import kernel
@@ -32,6 +33,8 @@ from .batch_blocks import (
     join_block,
     move_block,
     new_work,
+    place_block,
+    predict,
     pull,
     pull_again,
     pull_padded,
@@ -45,7 +48,6 @@ from .batch_contact import (
     finish_rows,
     mark_blocks,
     new_pressed,
-    pass_block,
     place_walls,
     press_block,
     stop_at_walls,
@@ -55,13 +57,14 @@ from .batch_contact import (
 from .batch_history import (
     ImpulseArrays,
     ProbeArrays,
-    end_at_walls,
+    end_at_contacts,
     end_block,
     probe_forces,
     push_particles,
     record_contact,
     record_sums,
 )
+from .batch_rows import CLOSE, FAILED, SOLVE, CalledRows, call_rows
 from .batch_supports import (
     MovingSupports,
     SpringArrays,
@@ -71,6 +74,7 @@ from .batch_supports import (
     place_supports,
     put_rates,
 )
+from .impact import join_nodes
 from .impulses import SUPPORT
 from .ledger_loops import (
     CONTACT,
@@ -108,6 +112,7 @@ class BatchData(NamedTuple):
     loads: LoadSchedule
     walls: WallArrays
     rows: NamedTuple
+    called: CalledRows
     messages: NamedTuple
     state: StateArrays
     ledger: np.ndarray
@@ -128,8 +133,8 @@ class Made(NamedTuple):
     step: ``changed``: number of bars that changed their state of rupture; ``failed``, ``turned``: the first bar that
     collapsed, and that went through zero length, or -1; ``infeasible``: index in ``near`` of a node that no position
     satisfies, or -1, with the ``offsets`` of its planes, or if it is ``jammed`` one whose friction was not found;
-    ``force``, ``contacts``, ``moment``: sums of the walls; ``near``: nodes with wall forces, the walls that they are
-    ``touching``, and their ``places``; ``touched``, ``met``: nodes that touch walls, and that have touched them and not
+    ``unsolved``: whether a call for rows failed; ``force``, ``contacts``, ``moment``: sums of the walls; ``near``:
+    nodes with wall forces, the walls that they are ``touching``, and their ``places``; ``touched``, ``met``: nodes that touch walls, and that have touched them and not
     left; ``pressing``: number of nodes with contact forces; ``changes``: contacts that closed or opened since the last
     row; and ``friction``: the energy that it dissipates in the next step [J].
     """
@@ -143,6 +148,7 @@ class Made(NamedTuple):
     turned: int
     infeasible: int
     jammed: bool
+    unsolved: bool
     offsets: np.ndarray
     force: np.ndarray
     contacts: np.ndarray
@@ -240,8 +246,8 @@ def batch_loop(data, touched, met, due, flags):
     Its arguments are BatchData; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them;
     ``due`` (count,) bool, the steps with a row; and ``flags`` (count, walls) bool, which receives the walls that are
     touched in each step. Velocities, accelerations and increments are written to the state in the last step alone. It
-    returns Made: fewer steps where bars of any rank change their state of rupture, and on one rank where something
-    fails; several ranks make all steps then, as others wait for their messages.
+    returns Made: fewer steps where bars of any rank change their state of rupture, and where something fails, except
+    on several ranks that need not agree: these make all steps then, as others wait for their messages.
     """
     count, h, x, before, half = len(flags), data.h, data.x, data.before, data.half
     bars, nodes, walls, rows, messages, state = (
@@ -252,7 +258,7 @@ def batch_loop(data, touched, met, due, flags):
         data.messages,
         data.state,
     )
-    springs, moving = data.springs, data.moving
+    springs, moving, called = data.springs, data.moving, data.called
     sprung, carried = len(springs.nodes) > 0, len(moving.at) > 0
     grounds, jumps = np.zeros(4), np.zeros((2, 3))
     ledger, powers, impulses, probes, shares = data.ledger, data.powers, data.impulses, data.probes, data.shares
@@ -263,8 +269,8 @@ def batch_loop(data, touched, met, due, flags):
     eta = 0.5 / h
     supported, loaded = len(nodes.support_nodes) > 0, len(nodes.external) > 0
     damped = len(nodes.damping) > 0
-    linked = len(rows.ready) > 0
-    plain = n_walls == 0 and not damped and not linked  # forces alone determine increments
+    linked, calling = len(rows.ready) > 0, called.address != 0
+    waits = linked or calling  # blocks for rows
     increments, factors = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK)
     load, held = np.empty(len(nodes.support_nodes)), np.empty(len(nodes.support_nodes))
     speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
@@ -277,16 +283,21 @@ def batch_loop(data, touched, met, due, flags):
     work = new_work(len(bars.sections), bars.work_rows)
     pulled = np.empty((NODE_BLOCK, 3))  # forces of a block
     push_u = np.empty(impulses.v.shape)
-    near = touched  # nodes with entries in the array of wall forces
+    # nodes with entries in the array of contact forces, of walls and of all contacts
+    near, others = touched, called.held[: called.counts[0]]
+    if linked:
+        others = pressed_nodes(rows, np.count_nonzero(rows.force > 0.0))
+    held = join_nodes(near, others, walls.present)
     pressed = new_pressed(n, n_walls)
     n_blocks = (n + NODE_BLOCK - 1) // NODE_BLOCK
-    # blocks whose forces alone determine their increments; blocks with nodes that touch walls or have touched them
-    alone, on_walls = np.ones(n_blocks, dtype=np.bool_), np.zeros(n_blocks, dtype=np.bool_)
-    along = np.zeros(n_blocks, dtype=np.bool_)  # blocks with supports that move
+    # blocks whose forces alone determine their increments, in all steps and in this one; blocks with nodes that touch
+    # walls or have touched them
+    easy, alone = np.full(n_blocks, n_walls == 0 and not damped and not calling), np.ones(n_blocks, dtype=np.bool_)
+    on_walls = np.zeros(n_blocks, dtype=np.bool_)
     for p in range(len(moving.at)):
-        along[nodes.support_nodes[moving.at[p]] // NODE_BLOCK] = True
+        easy[nodes.support_nodes[moving.at[p]] // NODE_BLOCK] = False
     for block in range(n_blocks if linked else 0):
-        alone[block] = not (damped or rows.near[block] or along[block])
+        easy[block] = easy[block] and not rows.near[block]
     # fields that loops over blocks would count references to
     planes, pulls = bars.planes, bars.pulls
     room_for, reach = len(planes) // 3, bars.reach
@@ -302,6 +313,7 @@ def batch_loop(data, touched, met, due, flags):
     travels, bounces, jammed = len(walls.motions) > 0, len(walls.flat.restitution) > 0, False
     level = walls.flat.offsets.copy()  # of planes at the end of the step
     several, stops = messages.reduce_all != 0, False
+    agree = several and (bars.can_break or calling)  # ranks that make the same steps
     lost = 0  # error code of MPI
     aside = new_work(len(bars.sections), bars.work_rows)  # energies that are not counted
     padded = bars.padded_parts.shape[1] > 0
@@ -312,15 +324,13 @@ def batch_loop(data, touched, met, due, flags):
             lost = start_positions(messages, x, h, half)
             lost = finish_positions(messages, x, before, False) if lost == 0 else lost
             passed += 1
-            if bars.can_break and lost == 0:
-                stops, lost = any_rank(messages, False)
-            if lost != 0 or stops:
+            if lost != 0:
                 break
             continue
         last_one, row = step == count - 1, shares[recorded]
         ending = due[step] or last_one
         values = row[len(row) - 3 * _PROBED * probed :].reshape(probed, _PROBED, 3)
-        for i in near:
+        for i in held:
             contact[i] = 0.0
         place_supports(moving, step, nodes)
         if travels:
@@ -338,7 +348,7 @@ def batch_loop(data, touched, met, due, flags):
         base = 0  # first node of the planes
         # Forces that nothing reads stay in the cache. The check of shortened bars reads them, as the next one is
         # likely to; those of laws with history could not be computed again. Blocks that wait for rows need them.
-        brief = padded and not last_one and not shortened and not bars.keeps and not linked
+        brief = padded and not last_one and not shortened and not bars.keeps and not waits
         forces = pulled if brief else f
         shortened = False
         if several:
@@ -350,8 +360,7 @@ def batch_loop(data, touched, met, due, flags):
             clear_all_energies(bars, work)
         count_near = 0
         finished, pressing, altered = 0, 0, 0  # blocks; rows with a force, and rows whose force begins or ends
-        if linked:
-            clear_sums(lanes[CONTACT], n)
+        unsolved = np.int64(0)  # result of a call
         if n_walls > 0:
             pressed.force[:], pressed.contacts[:], pressed.moment[:] = 0.0, 0, 0.0
             mark_blocks(on_walls, touched, True)
@@ -378,61 +387,72 @@ def batch_loop(data, touched, met, due, flags):
                 shortened = shortened or short
                 changed += broke
                 waiting = False
-            if block == n_blocks:
-                break
-            while moved < min(block + 1 + reach, n_blocks):
-                if padded and not several and room_for < NODE_BLOCK * (moved + 1) - base:
-                    live = NODE_BLOCK * block
-                    slide_planes(planes, live - base, NODE_BLOCK * moved - live)
-                    slide_planes(pulls, live - base, NODE_BLOCK * moved - live)
-                    base = live
-                move_block(moved, shared, f, padded, bars, base)
-                moved += 1
-            start = NODE_BLOCK * block if brief else 0
-            if padded:
-                at, short, broke = pull_padded(x, bars, base, block, work, ending)
-                join_block(block, n, pulls, base, forces, start)
-            else:
-                at, short, broke = pull(x, bars, block, f, work)
-            failed = at if failed < 0 else failed
-            shortened = shortened or short
-            changed += broke
-            first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
-            if sprung:
-                add_springs(springs.starts[block], springs.starts[block + 1], springs, x, forces, start, grounds)
-            if linked:
-                ready = finished
-                finished, pressing, more = pass_block(
-                    block, (finished, pressing), rows, alone, nodes, shared, (f, u, contact)
-                )
-                altered += more
-                for over in range(ready, finished if ending else ready):
-                    end = min(NODE_BLOCK * (over + 1), n)
-                    how = alone[over], last_one, pressing > 0
-                    end_block(over, how, nodes, shared, state, f[NODE_BLOCK * over : end], (probes, values))
-                continue
-            if plain and not along[block]:
-                advance_block(block, nodes, shared, forces, start)
-            else:
-                free, here = speeds[: 3 * (last - first)], increments[: 3 * (last - first)]
-                solve_block(block, nodes, shared, forces, start, free, here)
-                found = 0
-                if n_walls > 0:
-                    found = find_pressed(block, walls, free, bounces and on_walls[block])
-                if found > 0:
-                    counts, out = (found, count_near), (contact, pressed)
-                    at, jam, rubbed = press_block(block, counts, nodes, walls, shared, (free, here), out)
-                    if at >= 0 and (infeasible < 0 or (jammed and not jam)):
-                        infeasible, jammed = at, jam
-                    friction += rubbed
-                    count_near += found
-                finish_block(block, nodes, shared, forces, start, contact, here)
-                alone[block] = not (damped or on_walls[block] or found > 0)
-                if not alone[block]:
-                    copy(here, u[first:last].reshape(-1))
-            if ending:
-                how = alone[block], last_one, False
-                end_block(block, how, nodes, shared, state, forces[first - start : last - start], (probes, values))
+            ready = block + 1  # blocks that can be finished
+            if block < n_blocks:
+                while moved < min(block + 1 + reach, n_blocks):
+                    if padded and not several and room_for < NODE_BLOCK * (moved + 1) - base:
+                        live = NODE_BLOCK * block
+                        slide_planes(planes, live - base, NODE_BLOCK * moved - live)
+                        slide_planes(pulls, live - base, NODE_BLOCK * moved - live)
+                        base = live
+                    move_block(moved, shared, f, padded, bars, base)
+                    moved += 1
+                start = NODE_BLOCK * block if brief else 0
+                if padded:
+                    at, short, broke = pull_padded(x, bars, base, block, work, ending)
+                    join_block(block, n, pulls, base, forces, start)
+                else:
+                    at, short, broke = pull(x, bars, block, f, work)
+                failed = at if failed < 0 else failed
+                shortened = shortened or short
+                changed += broke
+                first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
+                if sprung:
+                    add_springs(springs.starts[block], springs.starts[block + 1], springs, x, forces, start, grounds)
+                if not easy[block]:
+                    here = u[first:last].reshape(-1) if waits else increments[: 3 * (last - first)]
+                    solve_block(block, nodes, shared, forces, start, speeds[: len(here)], here)
+                if linked:
+                    some, more = solve_rows(block, rows, nodes, shared, u, contact)
+                    pressing += some
+                    altered += more
+                    ready = finished
+                    while ready < n_blocks and rows.ready[ready] <= block:
+                        ready += 1
+                elif calling:
+                    predict(block, shared, called.predictor)
+                    ready = 0
+            elif calling:
+                unsolved = call_rows(called.address, step, SOLVE)
+                ready = n_blocks
+            for over in range(finished, min(ready, n_blocks)):
+                first, last = NODE_BLOCK * over, min(NODE_BLOCK * (over + 1), n)
+                start = first if brief else 0
+                if easy[over]:
+                    advance_block(over, nodes, shared, forces, start)
+                else:
+                    free, here = speeds[: 3 * (last - first)], increments[: 3 * (last - first)]
+                    if waits:
+                        here = u[first:last].reshape(-1)
+                        place_block(over, shared, here, free)
+                    found = 0
+                    if n_walls > 0:
+                        found = find_pressed(over, walls, free, bounces and on_walls[over])
+                    if found > 0:
+                        counts, out = (found, count_near), (contact, pressed)
+                        at, jam, rubbed = press_block(over, counts, nodes, walls, shared, (free, here), out)
+                        if at >= 0 and (infeasible < 0 or (jammed and not jam)):
+                            infeasible, jammed = at, jam
+                        friction += rubbed
+                        count_near += found
+                    finish_block(over, nodes, shared, forces, start, contact, here)
+                    alone[over] = not (waits or damped or on_walls[over] or found > 0)
+                    if not (waits or alone[over]):
+                        copy(here, u[first:last].reshape(-1))
+                if ending:
+                    how = alone[over], last_one
+                    end_block(over, how, nodes, shared, state, forces[first - start : last - start], (probes, values))
+            finished = min(ready, n_blocks)
         if n_walls > 0:
             mark_blocks(on_walls, touched, False)
             mark_blocks(on_walls, met, False)
@@ -442,20 +462,34 @@ def batch_loop(data, touched, met, due, flags):
                     walls.touched.touching, touched, near, pressed.touching, walls.present, walls.releases
                 )
                 changes += more
-        if lost != 0:
+        if lost != 0 or unsolved < FAILED:
             break
         impact = 0.0
-        if len(near) > 0:
-            for i in near:
+        held = near
+        if waits:
+            others = pressed_nodes(rows, pressing) if linked else called.held[: called.counts[0]]
+            held = join_nodes(near, others, walls.present)
+        if len(held) > 0:
+            for i in held:
                 centre(u[i], eta, half[i], v[i])
             clear_sums(lanes[CONTACT], n)
-            add_sparse_powers(near, contact, v, lanes[CONTACT])
+            add_sparse_powers(held, contact, v, lanes[CONTACT])
         if len(touched) > 0 or len(met) > 0:
             impact, met = stop_at_walls(nodes, walls, level, (moving, step), shared, state, (touched, met))
         if altered > 0:
             impact += finish_rows(rows, altered, walls.touched.slack, nodes, (moving, step), shared, state)
-        sum_rows(rows, pressing)
-        touching = len(near) + 2 * pressing
+        if calling and called.counts[1] > 0:
+            for i in called.changing[: called.counts[1]]:
+                centre(u[i], eta, half[i], v[i])
+                accelerations(u[i], alpha, a[i])
+            put_rates(moving, step, nodes, v, a)
+            if call_rows(called.address, step, CLOSE) != 0:
+                unsolved = np.int64(FAILED - 1)
+                break
+            impact += called.loss[0]
+        if linked:
+            sum_rows(rows, pressing)
+        touching = len(held)
         after[:] = powers
         sum_balance(lanes, n, h, Acting(supported, loaded, touching > 0, damped), totals, after)
         for c in range(3 if sprung else 0):
@@ -471,12 +505,14 @@ def batch_loop(data, touched, met, due, flags):
         done += 1
         passed += 1
         stops = changed > 0
-        if several and bars.can_break:
-            stops, lost = any_rank(messages, stops)
+        wrong = failed >= 0 or infeasible >= 0 or unsolved != 0 or not np.isfinite(after[INTERNAL])
+        wrong = wrong or stops
+        looks = wrong or shortened
+        if agree:
+            looks, lost = any_rank(messages, looks)
             if lost != 0:
                 break
-        wrong = failed >= 0 or infeasible >= 0 or stops or not np.isfinite(after[INTERNAL])
-        if shortened or wrong or last_one:
+        if looks or last_one:
             turned = -1
             if brief:
                 pull_again(x, n_blocks, bars, springs, f, aside, np.empty(4))
@@ -484,17 +520,22 @@ def batch_loop(data, touched, met, due, flags):
                 clear_ends(lanes, n)
                 for block in range(n_blocks):
                     first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
-                    how = alone[block], True, pressing > 0
+                    how = alone[block], True
                     end_block(block, how, nodes, shared, state, f[first:last], (probes, values))
             start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
             if failed < 0 and shortened:
                 turned = first_inverted(x, before, bars.ends, bars.watched)
             wrong = wrong or turned >= 0
             put_rates(moving, step, nodes, v, a)
+        if agree and looks:
+            stops, lost = any_rank(messages, wrong)
+            if lost != 0:
+                break
+            wrong = wrong or stops
         if ending or wrong:
             if padded and not ending:
                 clear_all_energies(bars, work)  # a failure, whose energies nothing reads
-            end_at_walls(near, shared, contact, u)
+            end_at_contacts(held, shared, contact, u)
             sum_ends(lanes, n, h, *sums)
             sum_all_energies(bars, work, energies)
             if sprung:
@@ -526,6 +567,7 @@ def batch_loop(data, touched, met, due, flags):
         turned,
         infeasible,
         jammed,
+        unsolved != 0,
         pressed.offsets,
         pressed.force,
         pressed.contacts,

@@ -137,7 +137,10 @@ class ExplicitStepper(Stepper):
             hold(held_at, balance.predictor, stiffness, u, load)
         walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.size
         with self._faults(balance):
-            state.contact = model.links.explicit(balance, state, u, stiffness, self.zero, tolerance)
+            pushes = model.links.explicit(balance, state, u, stiffness, tolerance)
+            if pushes is not None:
+                state.contact = np.zeros_like(u)
+                model.links.push(pushes, stiffness, u, state.contact)
         if model.contact.any:
             # also after a failure of links: with walls with mass this call is collective
             with self._faults(balance):
@@ -153,7 +156,7 @@ class ExplicitStepper(Stepper):
             react(held_at, load, state.contact, stiffness, u, state.support)
             if supports.inclined is not None:
                 state.support[supports.inclined.nodes] = others - supports.inclined.part(state.contact)
-        return Solution(u, state.f, walls, contacts=model.links.count_held(held, len(u)))
+        return Solution(u, state.f, walls, contacts=model.links.count_held(held))
 
     def _hold(self, balance: Balance, stiffness: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Set components of ``u`` (owned, 3) along directions to their values; return the forces (m, 3) that do so."""

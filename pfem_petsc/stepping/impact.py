@@ -231,7 +231,7 @@ class Impacts:
             return 0.0
         loss = self._on_walls(x, motion, load, time, displacements) if self.model.contact.any else 0.0
         if len(self.model.links.two.at):
-            loss += self._of_rows(x, motion, load)
+            loss += self.of_rows(x, motion, load)
         return 0.0 if self.elastic else loss
 
     def _free(self, nodes: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> tuple:
@@ -329,7 +329,7 @@ class Impacts:
         given = 0.5 * (sums[:, 2:] ** 2).sum(axis=1) / (free.mass + sums[:, 1])
         return float((keeps * (sums[:, 0] - given)).sum())
 
-    def _of_rows(self, x: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> float:
+    def of_rows(self, x: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> float:
         """Return the loss of closing rows over two nodes whose second nodes this rank owns, with the reduced mass."""
         links, mass = self.model.links, self.model.inertia.mass
         two, rows = links.two, links.two.record

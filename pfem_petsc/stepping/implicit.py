@@ -336,7 +336,7 @@ class ImplicitStepper(Stepper):
         if not trial.candidates.anywhere and not model.supports.any and model.bars.springs is None:
             self._keep_momentum(problem, u, g)
         state.contact, walls, self.held = active_set.forces(outcome, u)
-        held = model.links.count_held(np.flatnonzero(self.held), len(u))
+        held = model.links.count_held(np.flatnonzero(self.held))
         state.support = model.supports.part(g - state.contact)
         internal = problem.f if balance.weight else state.f
         if self.accuracy:

@@ -217,12 +217,10 @@ class Model:
     @property
     def steady(self) -> bool:
         """Whether steps can be made in batches: supports are along axes, bars and damping constant in time, loads
-        depend on time alone, walls are flat, without mass and not tied, and pairs and constraints served too, which
-        exclude walls: a batch solves either."""
+        depend on time alone, and walls are flat, without mass and not tied."""
         others = any(family is not self.bars.springs for family in self.bars.families)
         changing = self.supports.inclined is not None or self.bars_vary or others or self.inertia.varies
-        steady = not changing and self.external.scheduled and self.contact.steady
-        return steady and self.links.batched and not (bool(self.links) and self.contact.any)
+        return not changing and self.external.scheduled and self.contact.steady
 
     def initial_velocity(self) -> np.ndarray:
         """Return initial velocities (owned, 3) [m/s]; later ``[initial]`` tables override earlier ones. Collective."""

@@ -321,7 +321,7 @@ class Stepper(ABC):
             still = ON_BOUND * model.wave_speed
             walls = start_at_rest(model.links, model.inertia, state, self._acceleration_for, load, still)
             if walls is not None:
-                held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)], len(state.v))
+                held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)])
                 self.solution.walls, self.solution.contacts = walls, held
         if self.massless is not None:
             state.contact, self.solution.walls = self.massless.press(state.position, load, 0.0)

@@ -128,15 +128,16 @@ class BatchData(NamedTuple):
 class Made(NamedTuple):
     """Outcome of a batch.
 
-    ``done``: number of steps made; ``passed``: those that other ranks make too, of which this one only sends messages
-    after a failure; ``recorded``: number of shares of rows; ``lost``: error code of MPI. In the last
-    step: ``changed``: number of bars that changed their state of rupture; ``failed``, ``turned``: the first bar that
-    collapsed, and that went through zero length, or -1; ``infeasible``: index in ``near`` of a node that no position
-    satisfies, or -1, with the ``offsets`` of its planes, or if it is ``jammed`` one whose friction was not found;
-    ``unsolved``: whether a call for rows failed; ``force``, ``contacts``, ``moment``: sums of the walls; ``near``:
-    nodes with wall forces, the walls that they are ``touching``, and their ``places``; ``touched``, ``met``: nodes that touch walls, and that have touched them and not
-    left; ``pressing``: number of nodes with contact forces; ``changes``: contacts that closed or opened since the last
-    row; and ``friction``: the energy that it dissipates in the next step [J].
+    ``done``: number of steps made; ``passed``: those that other ranks make too, of which this one only sends
+    messages after a failure; ``recorded``: number of shares of rows; ``lost``: error code of MPI. In the last step:
+    ``changed``: number of bars that changed their state of rupture; ``failed``, ``turned``: the first bar that
+    collapsed, and that went through zero length, or -1; ``infeasible``: index in ``near`` of a node that no
+    position satisfies, or -1, with the ``offsets`` of its planes, or if it is ``jammed`` one whose friction was not
+    found; ``unsolved``: whether a call for rows failed; ``force``, ``contacts``, ``moment``: sums of the walls;
+    ``near``: nodes with wall forces, the walls that they are ``touching``, and their ``places``; ``touched``,
+    ``met``: nodes that touch walls, and that have touched them and not left; ``pressing``: number of nodes with
+    contact forces; ``changes``: contacts that closed or opened since the last row; and ``friction``: the energy
+    that it dissipates in the next step [J].
     """
 
     done: int

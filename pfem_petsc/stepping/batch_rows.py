@@ -83,6 +83,8 @@ class RowCaller:
         counts, loss = np.zeros(2, dtype=np.int64), np.zeros(1)
         self.record = CalledRows(address, np.empty((n, 3)), *nodes, counts, loss)
         self._keep(0, self.links.pressed())
+        if self.record.address:
+            stepper.balance = stepper.scheme.balance(stepper.state, stepper.h)
 
     def _keep(self, which: int, nodes: np.ndarray) -> None:
         if self.record.address:

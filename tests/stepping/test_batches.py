@@ -416,6 +416,40 @@ def test_a_failure_is_that_of_single_steps(name, shared_tmp_path):
     np.testing.assert_array_equal(steps[0], steps[1])
 
 
+JAMMED = {  # a wall pushes the end of a rod against a node that is held
+    "mesh": {"generator": "two_rods", "length": 1.0, "elements": 5, "gap": 0.001},
+    "material": {"it": {"young_modulus": 1e6, "density": 1000.0}},
+    "section": {"it": {"area": 1e-4, "material": "it"}},
+    "node_set": {name: {"group": name} for name in ("first_end", "second_start")},
+    "support": [{"node_set": "second_start", "fix": "xyz"}],
+    "contact_pair": [{"name": "faces", "first": "first_end", "second": "second_start", "direction": [1.0, 0.0, 0.0]}],
+    "wall": [
+        {
+            "type": "plane",
+            "node_set": "first_end",
+            "point": [0.9999, 0, 0],
+            "normal": [1, 0, 0],
+            "velocity": [0.1, 0, 0],
+        }
+    ],
+    "time": {"integrator": "central_differences", "step": 1e-4, "end": 0.03},
+    "output": {"fields_every": 0, "history_every": 7},
+}
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("every", [1, 7])
+def test_rows_without_solution_fail_as_in_single_steps(every, comm, shared_tmp_path):
+    given, texts = Case.from_dict(JAMMED | {"output": {"fields_every": 0, "history_every": every}}), []
+    for how in ("single", "batches", "general"):
+        with pytest.raises(
+            SimulationFailure, match="no positions of nodes 5, 6 satisfy their contact pairs"
+        ) as failure:
+            made(given, shared_tmp_path, how, comm)
+        texts.append(str(failure.value))
+    assert texts[0] == texts[1] == texts[2]
+
+
 @pytest.mark.parallel
 @pytest.mark.parametrize("every", [1, 1000])
 def test_the_first_failure_is_reported(every, shared_tmp_path):

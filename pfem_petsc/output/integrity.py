@@ -65,9 +65,9 @@ def _factors(start: int, count: int) -> np.ndarray:
 @kernel
 def sum_of_words(words: np.ndarray, start: int) -> np.uint64:
     """Return the sum, modulo 2^64, of unsigned words (n,) times the factors of their indices from ``start``."""
-    total = np.uint64(0)
+    total, factor = np.uint64(0), np.uint64(start) * _ODD
     for i in range(len(words)):
-        factor = np.uint64(start + i + 1) * _ODD
+        factor += _ODD  # an addition: multiplications of vectors of 64-bit words are what limits the loop
         total += np.uint64(words[i]) * ((factor ^ (factor >> _SHIFT)) | _ONE)
     return total
 

@@ -12,6 +12,7 @@ from helpers.synthetic import Truss, options, write
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
+from pfem_petsc.output import integrity
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.verify import damages, examine
 from pfem_petsc.output.vtkhdf import ResultWriter
@@ -98,3 +99,13 @@ def test_no_random_damage_is_continued_in_silence_or_ends_the_reader(tmp_path):
 def continued(path, truss):
     with ResultWriter(path, MPI.COMM_SELF, truss.mesh, **options(append_after_step=7)) as writer:
         write(writer, truss, range(8, STEPS), every=1)
+
+
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+def test_checksum_of_long_arrays_is_that_of_their_pieces(kind):
+    """Pieces of fewer words are summed without the compiled loop."""
+    values = np.random.default_rng(3).normal(size=(5000, 3)).astype(kind)
+    pieces = range(0, 5000, 1000)
+    assert 3 * 1000 < integrity.COMPILED < values.size
+    total = sum(integrity.word_sum(values[first : first + 1000], 77 + first) for first in pieces)
+    assert integrity.word_sum(values, 77) == total % 2**64

@@ -43,31 +43,40 @@ class Growing:
     """
 
     def __init__(self, dataset: h5py.Dataset) -> None:
-        self._id, self._tail, self.dtype = dataset.id, dataset.shape[1:], dataset.dtype
+        self._id, self._shape, self.dtype = dataset.id, dataset.shape, dataset.dtype
         self._type = h5py.h5t.py_create(self.dtype)
-        self._zeros = (0,) * len(self._tail)
+        self._zeros = (0,) * (len(self._shape) - 1)
 
     def grow(self, n_rows: int) -> None:
         """Set the number of rows. Collective for a shared file."""
-        self._id.set_extent((n_rows, *self._tail))
+        self._shape = (n_rows, *self._shape[1:])
+        self._id.set_extent(self._shape)
 
     def write(self, first: int | tuple[int, ...], rows: np.ndarray | None = None, collective: bool = False) -> None:
         """Write rows (n, ...) starting at row ``first``, or an array at a place; None or nothing: join a collective
         transfer without data."""
         if rows is None and not collective:
             return
-        target = self._id.get_space()
         if rows is None or rows.size == 0:
-            rows = np.empty((1,) * (1 + len(self._tail)), dtype=self.dtype)
-            source = h5py.h5s.create_simple(rows.shape)
+            rows = np.empty((1,) * len(self._shape), dtype=self.dtype)
+            source, target = h5py.h5s.create_simple(rows.shape), self._id.get_space()
             source.select_none()
             target.select_none()
         else:
             rows = np.ascontiguousarray(rows, dtype=self.dtype)
-            source = h5py.h5s.create_simple(rows.shape)
             start = first if isinstance(first, tuple) else (first, *self._zeros)
-            target.select_hyperslab(start, rows.shape)
+            source, target = _selection(self._shape, start, rows.shape)
         self._id.write(source, target, rows, self._type, _collective() if collective else None)
+
+
+@functools.lru_cache(16)
+def _selection(
+    shape: tuple[int, ...], start: tuple[int, ...], count: tuple[int, ...]
+) -> tuple[h5py.h5s.SpaceID, h5py.h5s.SpaceID]:
+    """Return the spaces in memory and in the file of a part of a dataset, one pair for all columns of a table."""
+    target = h5py.h5s.create_simple(shape)
+    target.select_hyperslab(start, count)
+    return h5py.h5s.create_simple(count), target
 
 
 @functools.cache

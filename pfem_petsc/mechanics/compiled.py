@@ -156,8 +156,14 @@ def kernel(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:
     compiled = numba.njit(**options)(function)
     if isinstance(compiled, Dispatcher):
         compiled._cache = _Cache(function)
+        # types of other packages, which the arguments are not of; a compilation looks for them itself
+        compiled._compilation_chain_init_hook = _without_extensions
     _distinguish(function)
     return compiled
+
+
+def _without_extensions() -> None:
+    """Look for no extensions of Numba in all installed packages."""
 
 
 def _distinguish(function: Callable[..., Any]) -> None:

@@ -61,6 +61,7 @@ class Batch:
         if state.contact is not stepper.zero:
             self._contact[:] = state.contact
         self._u = np.zeros_like(state.v)
+        stepper.balance = None  # its predictor is not needed any more
         self._caller = RowCaller(stepper, self._stiffness, self._u, self._contact)
         share = Share(len(self.model.contact.names), len(self.model.links.columns), len(probed))
         self._width, self._at_state = len(share.numbers), values_at_state(self.model)

@@ -341,6 +341,11 @@ class Ledger:
         for k, force in forces:
             if force is not stepper.zero:
                 self.powers[k] += h * power(force, v) - power(force, way)
+        self._release()
+
+    def _release(self) -> None:
+        """Keep of the moment before only what batches of steps need, which have their own arrays."""
+        self._before = Moment(*9 * (self.stepper.zero,), self._before.kinetic, self._before.energy)
 
     @property
     def friction_ahead(self) -> float:
@@ -486,5 +491,6 @@ class Ledger:
         self.impulses.load_state(kept["impulses"])
         if "powers" in kept:
             self.powers = np.array(kept["powers"])
+            self._release()
         if self.model.contact.moving.any():
             self._walls_before()

@@ -1,6 +1,7 @@
-"""Times this program and its peers on the same lattice, and prints processor time per step and ratios.
+"""Times this program and its peers on the same truss, and prints processor time per step and ratios.
 
-usage: python scripts/compare_peers.py [--sizes 10230 101706] [--modes explicit_long] [--only lammps] [--repeats 3]
+usage: python scripts/compare_peers.py [--sizes 10230 101706] [--modes explicit_long] [--meshes cubic octet]
+       [--only lammps] [--repeats 3]
 
 OpenSeesPy, Kratos and LAMMPS are installed into a separate environment (results/peers-venv, or --venv); codes that
 cannot be installed are omitted. All use one thread, or two ranks in the mode named so, whose wall time is shown. Every
@@ -11,6 +12,7 @@ shared machine affects all codes. See docs/performance.md.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import subprocess
@@ -20,6 +22,8 @@ import venv
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+
+import numpy as np
 
 from pfem_petsc.bench.measure import KINDS, cells_for
 
@@ -46,6 +50,16 @@ class Code:
     solver: str = ""
     largest: int = 2_000_000
     ranks: int = 1
+
+
+@dataclass(frozen=True)
+class Truss:
+    """A truss on which codes are compared: a cubic lattice of so many cells along each edge, or one of a file."""
+
+    kind: str
+    bars: int
+    cells: int = 0
+    file: str = ""
 
 
 OURS = Code("pfem_petsc", "ours", "run_ours.py")
@@ -80,6 +94,7 @@ MODES = {
     "implicit_contact": ("implicit at 2 l/c, elastoplastic, wall", (OURS, MUMPS, UMFPACK)),
 }
 DEFAULT = [mode for mode in MODES if mode != "whole_long"]  # which writes 2,000 snapshots
+MESHES = ("cubic", "octet", "graded", "disordered", "irregular")
 TIME_LIMIT = 1200.0  # [s] for one run
 
 
@@ -88,11 +103,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", type=int, nargs="+", default=[10_230, 101_706], help="bars; the nearest lattices")
     parser.add_argument("--modes", nargs="+", choices=list(MODES), default=DEFAULT, help="what to compare")
+    parser.add_argument(
+        "--meshes", nargs="+", choices=MESHES, default=["cubic"], help="trusses (default cubic lattices)"
+    )
     parser.add_argument("--only", nargs="+", choices=["bare", *PACKAGES], help="the peers to run; default: all")
     parser.add_argument("--repeats", type=int, default=3, help="rounds (default %(default)s)")
     parser.add_argument("--venv", type=Path, default=ROOT / "results" / "peers-venv", help="environment of the peers")
     parser.add_argument("-o", "--output", type=Path, help="write all runs as JSON")
     arguments = parser.parse_args()
+    if "irregular" in arguments.meshes and not all(mode.startswith(("explicit", "whole")) for mode in arguments.modes):
+        parser.error("irregular: its nodes with few bars have no stiffness in some direction: explicit modes only")
     wanted = arguments.only if arguments.only is not None else ["bare", *PACKAGES]
     pythons = {"ours": sys.executable, "bare": sys.executable}
     for name in wanted:
@@ -101,12 +121,13 @@ def main() -> int:
             if python is not None:
                 pythons[name] = python
     runs: list[dict] = []
-    for size in sorted(arguments.sizes):
-        cells = cells_for("cubic", size)
-        for mode in arguments.modes:
-            codes = [c for c in MODES[mode][1] if c.package in pythons and size <= c.largest]
-            codes = [c for c in codes if c.package == "ours" or c.package in wanted]
-            runs += compare(mode, cells, codes, pythons, arguments.repeats)
+    for size, kind in itertools.product(sorted(arguments.sizes), arguments.meshes):
+        with tempfile.TemporaryDirectory() as folder:
+            truss = make_truss(kind, size, Path(folder))
+            for mode in arguments.modes:
+                codes = [c for c in MODES[mode][1] if c.package in pythons and size <= c.largest]
+                codes = [c for c in codes if c.package == "ours" or c.package in wanted]
+                runs += compare(mode, truss, codes, pythons, arguments.repeats)
     if arguments.output is not None:
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
         arguments.output.write_text(json.dumps(runs, indent=1) + "\n", encoding="utf-8")
@@ -133,6 +154,17 @@ def install(name: str, folder: Path) -> str | None:
     return None
 
 
+def make_truss(kind: str, size: int, folder: Path) -> Truss:
+    """Choose the cubic lattice with about ``size`` bars, or write another truss to ``folder``."""
+    if kind == "cubic":
+        cells = cells_for("cubic", size)
+        return Truss(kind, KINDS["cubic"](cells), cells)
+    subprocess.run([sys.executable, str(DRIVERS / "make_mesh.py"), kind, str(size), str(folder)], check=True)
+    file = folder / "mesh.npz"
+    with np.load(file) as arrays:
+        return Truss(kind, len(arrays["bars"]), file=str(file))
+
+
 def steps_of(mode: str, bars: int) -> int:
     """Return the number of timed steps: enough for the clock, few enough for the slowest code."""
     if mode.startswith("whole"):
@@ -146,21 +178,20 @@ def steps_of(mode: str, bars: int) -> int:
     return 400 if bars < 500_000 else 200  # some batches of ours, which have up to 100
 
 
-def compare(mode: str, cells: int, codes: list[Code], pythons: dict[str, str], repeats: int) -> list[dict]:
+def compare(mode: str, truss: Truss, codes: list[Code], pythons: dict[str, str], repeats: int) -> list[dict]:
     """Run all codes ``repeats`` times in turn, print a table, and return the runs."""
-    bars = KINDS["cubic"](cells)
     rounds: dict[str, list[dict]] = {code.label: [] for code in codes}
     left_out: dict[str, str] = {}
     for _ in range(repeats):
         for code in codes:
             if code.label in left_out:
                 continue
-            result = run(code, pythons[code.package], cells, mode, steps_of(mode, bars))
+            result = run(code, pythons[code.package], truss, mode, steps_of(mode, truss.bars))
             if isinstance(result, str):
                 left_out[code.label] = result
             else:
                 rounds[code.label].append(result)
-    print(f"\n### {bars:,} bars, {MODES[mode][0]}\n")
+    print(f"\n### {truss.bars:,} bars, {truss.kind}, {MODES[mode][0]}\n")
     clock = "wall" if codes[0].ranks > 1 else "cpu"
     print(
         f"| code | {'wall' if clock == 'wall' else 'CPU'} ms/step | x ours | range | Newton/step | memory MB | top mm |"
@@ -179,16 +210,24 @@ def compare(mode: str, cells: int, codes: list[Code], pythons: dict[str, str], r
         top = 1e3 * results[0]["top"]
         print(f"| {code.label} | {cpu:.4g} | {spread} | {newton} | {memory:.0f} | {top:.6f} |", flush=True)
     return [
-        {"code": label, "mode": mode, "round": n, **result}
+        {"code": label, "mode": mode, "mesh": truss.kind, "round": n, **result}
         for label, rs in rounds.items()
         for n, result in enumerate(rs)
     ]
 
 
-def run(code: Code, python: str, cells: int, mode: str, steps: int) -> dict | str:
+def run(code: Code, python: str, truss: Truss, mode: str, steps: int) -> dict | str:
     """Return the result of one run, or why there is none."""
-    command = [python, str(DRIVERS / code.driver), str(cells), mode.removesuffix("_ranks"), str(steps), code.solver]
+    command = [
+        python,
+        str(DRIVERS / code.driver),
+        str(truss.cells),
+        mode.removesuffix("_ranks"),
+        str(steps),
+        code.solver,
+    ]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    environment["PEER_MESH"] = truss.file
     place = Path(python).parent
     if code.package == "lammps":
         environment["LD_LIBRARY_PATH"] = str(place.parent / "lib")  # of MPI

@@ -1,11 +1,13 @@
-"""The lattice on which all codes are timed; needs NumPy only, so that every environment can import it.
+"""The truss on which all codes are timed; needs NumPy only, so that every environment can import it.
 
-Cubic cells of edge PITCH with both diagonals on every face, thrown at the plane z = 0 where its foot starts. SI units.
+Cubic cells of edge PITCH with both diagonals on every face, or the mesh of the file $PEER_MESH that make_mesh.py has
+made; thrown at the plane z = 0 where its foot starts. SI units.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -19,8 +21,17 @@ SPEED = -20.0  # [m/s] along z
 PRESSED = 0.005  # share of its height by which a lattice is pressed in static increments
 YIELD_STRESS, HARDENING_RATIO = 900e6, 0.01  # [Pa]; tangent over Young's modulus beyond yield
 WAVE_SPEED = (YOUNG_MODULUS / DENSITY) ** 0.5
-EXPLICIT_STEP = 0.1 * PITCH / WAVE_SPEED  # [s]
+MESH = os.environ.get("PEER_MESH", "")
+EXPLICIT_STEP = (0.01 if MESH else 0.1) * PITCH / WAVE_SPEED  # [s]; other meshes have bars shorter than PITCH
 IMPLICIT_STEP = 2.0 * PITCH / WAVE_SPEED  # [s]
+
+
+def truss(cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (nodes, 3) [m] and ends of bars (bars, 2) of the mesh of the file, or of a block of so many cells."""
+    if not MESH:
+        return lattice(cells)
+    with np.load(MESH) as arrays:
+        return arrays["points"], arrays["bars"]
 
 
 def lattice(cells: int) -> tuple[np.ndarray, np.ndarray]:
@@ -43,9 +54,9 @@ def lattice(cells: int) -> tuple[np.ndarray, np.ndarray]:
     return points, np.concatenate(bars)
 
 
-def middle(cells: int) -> int:
+def middle(points: np.ndarray) -> int:
     """Number of the node in the middle of the edge x = y = 0, whose displacement along x static runs report."""
-    return cells // 2
+    return int(np.argmin(np.linalg.norm(points - [0.0, 0.0, 0.499 * points[:, 2].max()], axis=1)))
 
 
 def lumped_mass(points: np.ndarray, bars: np.ndarray) -> np.ndarray:

@@ -55,7 +55,7 @@ def main() -> None:
     """Run and report."""
     cells, mode, steps, _ = m.arguments()
     contact = mode.endswith("contact")
-    points, bars = m.lattice(cells)
+    points, bars = m.truss(cells)
     order = np.lexsort((bars.max(axis=1), bars.min(axis=1)))
     bars = bars[order].astype(np.int32)
     rest = np.linalg.norm(points[bars[:, 1]] - points[bars[:, 0]], axis=1)

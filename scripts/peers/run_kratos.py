@@ -53,7 +53,7 @@ def main() -> None:
     explicit, static = mode == "explicit", mode == "static"
     h = {"explicit": m.EXPLICIT_STEP, "implicit": m.IMPLICIT_STEP, "static": 1.0 / (steps + 1)}[mode]
     Kratos.Logger.GetDefaultOutput().SetSeverity(Kratos.Logger.Severity.WARNING)
-    points, bars = m.lattice(cells)
+    points, bars = m.truss(cells)
     solver = solvers.CreateSolverByParameters(Kratos.Model(), settings(mode, h), "OpenMP")
     solver.AddVariables()
     part = solver.main_model_part
@@ -73,7 +73,7 @@ def main() -> None:
     solver.ImportModelPart()
     solver.PrepareModelPart()
     solver.AddDofs()
-    height = points[-1, 2]
+    height = points[:, 2].max()
     pressed = [node for node in part.Nodes if static and node.Z0 in (height,)]
     for node in part.Nodes:
         if static:
@@ -105,7 +105,7 @@ def main() -> None:
 
     times = m.time_steps(step, steps)
     # in static increments the top is prescribed: the node in the middle of the block's edge sags instead
-    watched = m.middle(cells) + 1 if static else len(points)
+    watched = m.middle(points) + 1 if static else len(points)
     top = part.Nodes[watched].GetSolutionStepValue(Kratos.DISPLACEMENT_X if static else Kratos.DISPLACEMENT_Z)
     m.report(times, len(bars), top, threads=float(Kratos.ParallelUtilities.GetNumThreads()))
 

@@ -45,7 +45,7 @@ def build(points: np.ndarray, bars: np.ndarray, contact: bool) -> None:
 def main() -> None:
     """Run and report."""
     cells, mode, steps, system = m.arguments()
-    points, bars = m.lattice(cells)
+    points, bars = m.truss(cells)
     contact, explicit = mode.endswith("contact"), mode.startswith("explicit")
     build(points, bars, contact)
     ops.constraints("Plain")

@@ -15,9 +15,25 @@ import time
 from pathlib import Path
 
 import model as m
+import numpy as np
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
+
+
+def block(cells: int) -> tuple[dict, dict, np.ndarray]:
+    """The table of the mesh, node sets (foot, head, last node, middle of an edge), place of the last node [m]."""
+    if not m.MESH:
+        corner = [cells * m.PITCH] * 3
+        sets = {"foot": {"group": "bottom"}, "head": {"group": "top"}, "last": {"nearest": corner}}
+        sets["middle"] = {"indices": [cells // 2]}
+        return {"generator": "lattice", "kind": "cubic", "cells": [cells] * 3, "pitch": m.PITCH}, sets, np.array(corner)
+    points, _ = m.truss(cells)
+    far, high = 1e3, float(points[:, 2].max())
+    sides = {"foot": (-far, 1e-6), "head": (high - 1e-6, far)}
+    sets = {name: {"box": [[-far, -far, low], [far, far, up]]} for name, (low, up) in sides.items()}
+    sets |= {"last": {"indices": [len(points) - 1]}, "middle": {"indices": [m.middle(points)]}}
+    return {"file": str(Path(m.MESH).with_suffix(".h5"))}, sets, points[-1]
 
 
 def table(cells: int, mode: str, steps: int, operator: str) -> dict:
@@ -29,16 +45,17 @@ def table(cells: int, mode: str, steps: int, operator: str) -> dict:
         hardening = m.YOUNG_MODULUS * m.HARDENING_RATIO / (1.0 - m.HARDENING_RATIO)
         material |= {"yield_stress": m.YIELD_STRESS, "kinematic_hardening": hardening}
     h = m.EXPLICIT_STEP if explicit else m.IMPLICIT_STEP
+    mesh, sets, last = block(cells)
     if mode == "static":
-        return pressed(cells, material, steps, operator)
+        return pressed(mesh, sets, float(last[2]), material, steps, operator)
     if explicit:
         scheme = {"integrator": "central_differences"}
     else:
         scheme = {"integrator": "newmark", "beta": 0.25, "gamma": 0.5}
     case = {
         "title": "peers",
-        "mesh": {"generator": "lattice", "kind": "cubic", "cells": [cells] * 3, "pitch": m.PITCH},
-        "node_set": {"foot": {"group": "bottom"}, "top": {"nearest": [cells * m.PITCH] * 3}},
+        "mesh": mesh,
+        "node_set": sets,
         "material": {"strut": material},
         "section": {"strut": {"area": m.AREA, "material": "strut"}},
         "initial": {"velocity": [0.0, 0.0, m.SPEED]},
@@ -47,7 +64,7 @@ def table(cells: int, mode: str, steps: int, operator: str) -> dict:
             "fields_every": 0,
             "fields": [],
             "history_every": 500 if mode.endswith("long") else 1,
-            "probe": [{"name": "top", "node_set": "top"}],
+            "probe": [{"name": "top", "node_set": "last"}],
         },
         "solver": {"operator": operator or "auto"},
     }
@@ -61,14 +78,13 @@ def table(cells: int, mode: str, steps: int, operator: str) -> dict:
     return case
 
 
-def pressed(cells: int, material: dict, steps: int, linear: str) -> dict:
+def pressed(mesh: dict, sets: dict, height: float, material: dict, steps: int, linear: str) -> dict:
     """The case of static increments; ``linear`` is the solver."""
-    height = cells * m.PITCH
     motion = [[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -m.PRESSED * height]]
     return {
         "title": "peers",
-        "mesh": {"generator": "lattice", "kind": "cubic", "cells": [cells] * 3, "pitch": m.PITCH},
-        "node_set": {"foot": {"group": "bottom"}, "head": {"group": "top"}, "top": {"indices": [m.middle(cells)]}},
+        "mesh": mesh,
+        "node_set": sets,
         "material": {"strut": material},
         "section": {"strut": {"area": m.AREA, "material": "strut"}},
         "support": [
@@ -76,7 +92,7 @@ def pressed(cells: int, material: dict, steps: int, linear: str) -> dict:
             {"node_set": "head", "fix": "xyz", "motion": motion, "interpolation": "linear"},
         ],
         "static": {"step": 1.0 / (steps + 1)},
-        "output": {"fields_every": 0, "fields": [], "probe": [{"name": "top", "node_set": "top"}]},
+        "output": {"fields_every": 0, "fields": [], "probe": [{"name": "top", "node_set": "middle"}]},
         "solver": {"linear": linear or "auto"},
     }
 
@@ -112,8 +128,8 @@ def main() -> None:
         command = [sys.executable, "-m", "pfem_petsc", str(case), "-o", str(folder / "out")]
         times = m.whole(command, steps)
         with open_result(folder / "out") as result:
-            top = result.positions(-1)[-1, 2] - cells * m.PITCH
-        m.report(times, len(m.lattice(cells)[1]), float(top))
+            top = result.positions(-1)[-1, 2] - block(cells)[2][2]
+        m.report(times, len(m.truss(cells)[1]), float(top))
         return
     with tempfile.TemporaryDirectory() as own:
         folder = MPI.COMM_WORLD.bcast(own)
@@ -121,11 +137,11 @@ def main() -> None:
             run(1, mode, 1000, operator, folder + "/first")  # all loops are compiled and loaded
         simulation, times, linear = run(cells, mode, steps, operator, folder + "/timed")
         top = simulation.row["probe/top/position"][0]
-        top = top[0] if mode == "static" else top[2] - cells * m.PITCH
+        top = top[0] if mode == "static" else top[2] - block(cells)[2][2]
         MPI.COMM_WORLD.Barrier()
         if MPI.COMM_WORLD.rank:
             return
-        m.report(times, simulation.mesh.n_bars, float(top), linear=linear / (steps + 1))
+        m.report(times, int(simulation.mesh.n_bars), float(top), linear=linear / (steps + 1))
 
 
 main()

@@ -1,6 +1,7 @@
-"""The scaling study's resumption, and the lattice and the bare loop of the comparison with peers."""
+"""The scaling study's resumption, and the meshes and the bare loop of the comparison with peers."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,11 +14,17 @@ from scaling import Point, noise_of, rows_of, run_point
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
 
-def driver(name, *options):
-    """What a driver of the comparison reports."""
+def script(name, *options, mesh=""):
+    """What a script of the comparison prints."""
     command = [sys.executable, str(SCRIPTS / "peers" / name), *map(str, options)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, env={**os.environ, "PEER_MESH": mesh})
     assert done.returncode == 0, done.stderr
+    return done
+
+
+def driver(name, *options, mesh=""):
+    """What a driver of the comparison reports."""
+    done = script(name, *options, mesh=mesh)
     line = next(text for text in done.stdout.splitlines() if text.startswith("RESULT "))
     return json.loads(line.removeprefix("RESULT "))
 
@@ -40,9 +47,20 @@ def test_peers_lattice_is_the_generators():
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["explicit", "explicit_contact"])
 def test_bare_loop_moves_as_the_program_does(mode):
-    ours, bare = (driver(name, 4, mode, 60) for name in ("run_ours.py", "run_bare_loop.py"))
+    ours, bare = (driver(name, 4, mode, 300) for name in ("run_ours.py", "run_bare_loop.py"))
     assert ours["top"] == pytest.approx(bare["top"], rel=1e-10)
     assert ours["bars"] == bare["bars"]
+
+
+@pytest.mark.thorough
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["disordered", "irregular"])
+def test_bare_loop_moves_other_meshes_as_the_program_does(tmp_path, kind):
+    script("make_mesh.py", kind, 2000, tmp_path)
+    mesh = str(tmp_path / "mesh.npz")
+    ours, bare = (driver(name, 0, "explicit", 600, mesh=mesh) for name in ("run_ours.py", "run_bare_loop.py"))
+    assert ours["top"] == pytest.approx(bare["top"], rel=1e-8)
+    assert 1500 < ours["bars"] == bare["bars"] < 2500
 
 
 @pytest.mark.thorough

@@ -154,7 +154,7 @@ def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, keep: bo
 
 def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, keep: bool) -> None:
     """Reorder nodes and bars on one rank, with few temporary arrays of the size of the mesh."""
-    order = np.argsort(sweep_keys(slab.points), kind="stable")
+    order = np.argsort(sweep_keys(slab.points if slab.undisturbed is None else slab.undisturbed), kind="stable")
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     mesh.n_owned = mesh.n_local = slab.n_nodes
@@ -163,7 +163,7 @@ def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, keep: boo
     mesh.ghost_numbers = np.empty(0, np.int64)
     mesh.points = slab.points[order]
     if not keep:
-        slab.points = slab.points[:0].copy()
+        slab.points, slab.undisturbed = slab.points[:0].copy(), None
     mesh._exchange = GhostExchange(mesh.comm, np.array([0, slab.n_nodes]), mesh.ghost_numbers)
     mesh.node_groups = {name: np.sort(place[members]) for name, members in slab.node_groups.items()}
     groups = {name: _membership(members, len(slab.bars)) for name, members in slab.bar_groups.items()}
@@ -180,9 +180,11 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
     to_owner = Router(comm, owners)
     ids = to_owner.send(np.arange(slab.first_node, slab.first_node + len(owners)))
     points = to_owner.send(slab.points)
+    places = points if slab.undisturbed is None else to_owner.send(slab.undisturbed)
     if not keep:
-        slab.points = slab.points[:0].copy()
-    order = np.lexsort((ids, sweep_keys(points, sweep_axes(*bounding_box(points, comm)))))
+        slab.points, slab.undisturbed = slab.points[:0].copy(), None
+    order = np.lexsort((ids, sweep_keys(places, sweep_axes(*bounding_box(places, comm)))))
+    del places
     n_owned = len(ids)
     starts = np.concatenate([[0], np.cumsum(comm.allgather(n_owned))]).astype(np.int64)
     numbers = np.empty(n_owned, np.int64)

@@ -49,6 +49,9 @@ class MeshSlab:
     source: str = "mesh"
     """The file or the generator, for messages."""
     structured: bool = False
+    undisturbed: np.ndarray | None = None
+    """(nodes here, 3) [m]: where the nodes of a disturbed lattice would be without, in whose order they are kept; None
+    on all ranks: the points."""
     warnings: list[str] = field(default_factory=list)
     """Warnings of the reader and the checks, for the log."""
     volume: float | None = None

@@ -1,11 +1,13 @@
 """Writes a mesh for all codes, in the order of nodes and bars in which this program has it on one rank.
 
 usage: make_mesh.py KIND BARS FOLDER; octet lattices, those with cells that grow along z or with moved nodes, and the
-edges of Delaunay's tetrahedra of random points, without the longest ones. FOLDER/mesh.npz is for the peers.
+edges of Delaunay's tetrahedra of random points, without the longest ones. FOLDER/mesh.npz is for the peers, mesh.json
+is the table of the mesh for this program.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -38,7 +40,7 @@ def main() -> None:
     """Make it by this program, and write it."""
     kind, bars, folder = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
     if kind == "irregular":
-        mesh = irregular(bars)
+        mesh = {"file": str(irregular(bars).write(folder / "mesh.h5"))}
     else:
         cells = [cells_for("octet", bars)] * 3
         mesh = {"generator": "lattice", "kind": "octet", "cells": cells, "pitch": m.PITCH, **LATTICES[kind]}
@@ -49,7 +51,7 @@ def main() -> None:
     with Simulation(case, output=folder / "none", quiet=True, check_only=True) as simulation:
         points, ends = simulation.mesh.points, simulation.mesh.bars
     np.savez(folder / "mesh.npz", points=points, bars=ends)
-    Truss(points, ends).write(folder / "mesh.h5")
+    (folder / "mesh.json").write_text(json.dumps(mesh), encoding="utf-8")
 
 
 main()

@@ -8,6 +8,7 @@ increments bars are elastic, the foot is held, and the top is pressed down.
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import tempfile
@@ -32,8 +33,8 @@ def block(cells: int) -> tuple[dict, dict, np.ndarray]:
     far, high = 1e3, float(points[:, 2].max())
     sides = {"foot": (-far, 1e-6), "head": (high - 1e-6, far)}
     sets = {name: {"box": [[-far, -far, low], [far, far, up]]} for name, (low, up) in sides.items()}
-    sets |= {"last": {"indices": [len(points) - 1]}, "middle": {"indices": [m.middle(points)]}}
-    return {"file": str(Path(m.MESH).with_suffix(".h5"))}, sets, points[-1]
+    sets |= {name: {"nearest": points[k].tolist()} for name, k in (("last", -1), ("middle", m.middle(points)))}
+    return json.loads(Path(m.MESH).with_suffix(".json").read_text(encoding="utf-8")), sets, points[-1]
 
 
 def table(cells: int, mode: str, steps: int, operator: str) -> dict:
@@ -128,7 +129,9 @@ def main() -> None:
         command = [sys.executable, "-m", "pfem_petsc", str(case), "-o", str(folder / "out")]
         times = m.whole(command, steps)
         with open_result(folder / "out") as result:
-            top = result.positions(-1)[-1, 2] - block(cells)[2][2]
+            first, last = result.positions(0), result.positions(-1)
+        node = np.argmin(np.linalg.norm(first - block(cells)[2], axis=1))
+        top = last[node, 2] - first[node, 2]
         m.report(times, len(m.truss(cells)[1]), float(top))
         return
     with tempfile.TemporaryDirectory() as own:

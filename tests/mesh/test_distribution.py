@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from helpers.meshes import slab_from, whole
+from mpi4py import MPI
 
 from pfem_petsc.mesh.distribution import distribute
 from pfem_petsc.mesh.generators import lattice
@@ -94,6 +95,19 @@ def test_bars_of_lattices_repeat_from_cell_to_cell(kind, comm):
     order = np.lexsort((low, offset))
     runs = 1 + np.count_nonzero((np.diff(low[order]) != 1) | (np.diff(offset[order]) != 0))
     assert len(mesh.bars) > n * runs
+
+
+@pytest.mark.parametrize("more", [{}, {"missing": 0.1}])
+def test_nodes_of_a_disturbed_lattice_are_in_the_order_of_the_lattice(more):
+    """So its bars are in as long runs of constant offset."""
+    alone, keys = MPI.COMM_SELF, {"kind": "octet", "cells": (5, 4, 3), "pitch": 0.1, **more}
+    slabs = [
+        lattice.generate_on(lattice.Parameters(**keys, perturbation=share), alone, {}, None) for share in (None, 0.2)
+    ]
+    plain, disturbed = (distribute(slab, np.zeros(slab.n_bars, np.int32), alone) for slab in slabs)
+    np.testing.assert_array_equal(disturbed.node_ids, plain.node_ids)
+    np.testing.assert_array_equal(disturbed.bars, plain.bars)
+    assert 0.015 < np.abs(disturbed.points - plain.points).max() < 0.02 + 1e-12
 
 
 def test_bars_lie_close_to_each_other_in_memory(comm):

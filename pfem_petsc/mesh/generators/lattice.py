@@ -115,6 +115,8 @@ def _uncut(block: Block, rank: int, size: int, wanted: _Wanted) -> MeshSlab:
     slab.bar_groups = {name: bars[0] + np.flatnonzero(mark) for name, mark in zip(wanted.groups, marks)}
     slab.bar_fields = dict(zip(wanted.fields, marks[len(wanted.groups) :]))
     slab.volume = block.volume if block.keys.map is None else None
+    if block.disturbed:
+        (slab.undisturbed,) = block.nodes.arrays(nodes, lambda *at: [block.positions(*at, disturbed=False)])
     return _named(slab, block)
 
 
@@ -276,6 +278,9 @@ class _Left:
         new = new_before + np.arange(len(self.points))
         first_node, moved = _moved(comm, np.concatenate([number[used], total + new]), total + n_new)
         points = moved(np.concatenate([block.positions(old, places), self.points]))
+        undisturbed = None
+        if block.disturbed:
+            undisturbed = moved(np.concatenate([block.positions(old, places, disturbed=False), self.points]))
         groups = {
             name: first_node + np.flatnonzero(moved(np.concatenate([mask, np.full(len(new), name == "surface")])))
             for name, mask in masks.items()
@@ -291,6 +296,7 @@ class _Left:
         first_bar, moved = _moved(comm, bars_before + np.arange(len(self.bars)), n_bars)
         ends, *marks = (moved(rows) for rows in (ends.astype(index_type(total + n_new)), *marks))
         slab = MeshSlab(total + n_new, n_bars, first_node, points, first_bar, ends, groups)
+        slab.undisturbed = undisturbed
         slab.bar_groups = {name: first_bar + np.flatnonzero(mark) for name, mark in zip(wanted.groups, marks)}
         slab.bar_fields = dict(zip(wanted.fields, marks[len(wanted.groups) :]))
         if keys.keep is None and keys.map is None:  # else it is not known what the lattice fills

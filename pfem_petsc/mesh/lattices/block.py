@@ -456,6 +456,7 @@ class Block(Joints):
                 self._levels.append(float(edge * factor))
         super().__init__(cell, cells, closed, plain)
         self._amplitude = (keys.perturbation or 0.0) * keys.pitch
+        self.disturbed = self._amplitude > 0.0
         edges = [level if isinstance(level, float) else np.diff(level[:-1]).min() for level in self._levels]
         shortest = float(np.linalg.norm(cell.spans * np.array(edges), axis=1).min())
         if self._amplitude and 2.0 * math.sqrt(3.0) * self._amplitude >= shortest:
@@ -501,8 +502,8 @@ class Block(Joints):
         solid_angle = 4.0 * np.arcsin(np.sin(half[0]) * np.sin(half[1]))
         return float(solid_angle * (outer**3 - inner**3) / 3.0)
 
-    def positions(self, numbers: np.ndarray, places: Places) -> np.ndarray:
-        """Return the positions (n, 3) [m] of nodes with given numbers and places."""
+    def positions(self, numbers: np.ndarray, places: Places, disturbed: bool = True) -> np.ndarray:
+        """Return the positions (n, 3) [m] of nodes with given numbers and places, with the perturbation or without."""
         keys, points = self.keys, np.empty((len(numbers), 3))
         for axis, (level, index) in enumerate(zip(self._levels, places[1:])):
             at = self.cell.points[places.item, axis]
@@ -510,7 +511,7 @@ class Block(Joints):
                 points[:, axis] = (index + at) * level
             else:
                 points[:, axis] = level[index] + at * (level[index + 1] - level[index])
-        if self._amplitude:
+        if self.disturbed and disturbed:
             for axis in range(3):  # nodes of outer faces remain in them
                 held = [self.on_face(places, name) for name in self.faces if FACES[name][0] == axis]
                 drawn = random_numbers(keys.seed or 0, axis, numbers)

@@ -170,7 +170,7 @@ def steps_of(mode: str, bars: int) -> int:
     if mode.startswith("whole"):
         return 20_000 if mode == "whole_long" else 300
     if mode == "static":
-        return 5 if bars < 50_000 else 3 if bars < 500_000 else 1
+        return 5 if bars < 50_000 else 3
     if "_long" in mode or "_rows" in mode:
         return 4000 if bars < 500_000 else 1600
     if mode.startswith("implicit"):

@@ -80,7 +80,7 @@ def whole(command: list[str], steps: int) -> dict[str, float]:
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - wall
     cpu = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
-    return {"cpu": cpu / steps, "wall": wall / steps, "iterations": 0.0}
+    return {"cpu": cpu / steps, "wall": wall / steps, "iterations": 0.0, "memory": 1024 * after.ru_maxrss}
 
 
 def time_steps(step: Callable[[], float], steps: int) -> dict[str, float]:
@@ -96,9 +96,8 @@ def report(times: dict[str, float], bars: int, top: float, **further: float) -> 
 
     In static increments it is that of :func:`middle` along x.
     """
-    who = resource.RUSAGE_CHILDREN if resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime else resource.RUSAGE_SELF
-    peak = resource.getrusage(who).ru_maxrss * 1024
-    print("RESULT " + json.dumps({**times, "bars": bars, "top": top, "memory": peak, **further}), flush=True)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    print("RESULT " + json.dumps({"memory": peak, **times, "bars": bars, "top": top, **further}), flush=True)
 
 
 def arguments() -> tuple[int, str, int, str]:

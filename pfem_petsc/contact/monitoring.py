@@ -235,8 +235,8 @@ STOUT = 0.25
 # Bars this much closer to each other in the mesh, relative to their radii, touch there: it may be rounding.
 _NEAR = 0.01
 
-# Distance between bars up to which the search knows it, over their mean length. Until nodes have moved by half of the
-# smallest distance, no search is needed.
+# Distance between bars up to which the search knows it, over their mean length. No search is needed before it has
+# changed.
 _SKIN = 0.1
 
 # Coordinate beyond which a node is not searched [m].
@@ -273,6 +273,7 @@ class CrossingBars:
         if not (isinstance(self._bars, slice) and slender.all()):
             self._bars = np.arange(len(mesh.bars), dtype=np.int32)[self._bars][slender]
         self.applicable = model.comm.allreduce(int(np.count_nonzero(slender))) > 1
+        self._thick = 2.0 * model.comm.allreduce(float(radius[slender].max(initial=0.0)), op=MPI.MAX)
         self._kind = self._linked_bars()
         self._last: _Search | None = None
 
@@ -297,8 +298,8 @@ class CrossingBars:
         long, because too many bars are in one place."""
         if self._last is None:  # in the mesh, no bar does
             self._last = _Search(Crossing(0, 0, (-1, -1)), 0.0, self._model.mesh.points, self._intact())
-        moved = self._moved(x)
-        if moved > 0.0 and moved >= 0.499 * self._last.gap:
+        change = self._largest_change(x)
+        if change > 0.0 and change >= 0.998 * self._last.gap:
             with returning_freed_memory():
                 found, gap = self._search(x)
             self._last = _Search(found, gap, x.copy(), self._intact())
@@ -310,15 +311,30 @@ class CrossingBars:
             return np.empty(0, dtype=bool)
         return self._model.bars.status()[self._bars] != STATUS.index("broken")
 
-    def _moved(self, x: np.ndarray) -> float:
-        """Return how far a node has moved relative to the others since the last search [m]; infinite if bars broke."""
-        comm, last, owned = self._model.comm, self._last, self._model.mesh.n_owned
-        moved = x - last.x
-        mean = comm.allreduce(moved[:owned].sum(axis=0)) / self._model.mesh.n_nodes
-        moved -= mean
+    def _largest_change(self, x: np.ndarray) -> float:
+        """Return by how much the distance of any two bars may have changed since the last search, relative to the sum
+        of their radii [m]; infinite if bars broke. Collective.
+
+        An affine map, the fit of all displacements, takes nodes to within r of where they are. With its singular values
+        s, a distance d has become one between s_min d - 2 r and s_max d + 2 r: a body that spins has not changed.
+        """
+        comm, last, mesh = self._model.comm, self._last, self._model.mesh
+        own, start, moved = slice(mesh.n_owned), last.x, x - last.x
+        means = comm.allreduce(np.stack([start[own].sum(axis=0), moved[own].sum(axis=0)])) / mesh.n_nodes
+        start, moved = start - means[0], moved - means[1]
+        moments = comm.allreduce(np.stack([start[own].T @ start[own], start[own].T @ moved[own]]))
+        if not np.isfinite(moments).all():
+            return np.inf
+        gradient = np.linalg.pinv(moments[0], rcond=1e-9, hermitian=True) @ moments[1]
+        moved -= start @ gradient
+        ends = np.stack([moved.max(axis=0, initial=-np.inf), -moved.min(axis=0, initial=np.inf)])
+        comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+        moved -= 0.5 * (ends[0] - ends[1])
+        stretches = np.abs(np.linalg.svd(np.eye(3) + gradient, compute_uv=False) - 1.0)
         square = float(np.einsum("ij,ij->i", moved, moved).max(initial=0.0))
         broken = bool((self._intact() != last.intact).any()) or not np.isfinite(square)
-        return np.sqrt(comm.allreduce(np.inf if broken else square, op=MPI.MAX))
+        rest = 2.0 * np.sqrt(comm.allreduce(np.inf if broken else square, op=MPI.MAX))
+        return rest + float(stretches.max()) * (self._thick + last.gap)
 
     def _count(self, pairs: np.ndarray) -> Crossing:
         """Return the number of pairs and bars from the pairs (m, 2) that this rank has found. Collective."""

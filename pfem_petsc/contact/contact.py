@@ -40,7 +40,8 @@ class Contact(ExplicitContact):
 
     @property
     def steady(self) -> bool:
-        """Whether batches of steps serve the walls: flat ones, at rest or with prescribed motion, but not tied."""
+        """Whether batches of steps serve the walls: infinite flat ones, spheres and cylinders, at rest or with
+        prescribed motion, but not tied."""
         return not self.any or (self.plain and not self.motion.bodies.any)
 
     def record(self, walls: WallForces, time: float, h: float) -> FreshTies:

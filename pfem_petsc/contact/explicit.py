@@ -15,8 +15,9 @@ from ..mechanics.compiled import borrowing, kernel
 from ..mesh.ordering import NODE_BLOCK
 from ..tolerances import FIXED_POINT, PROJECTED, RANK
 from .friction import Rubbing, add_friction, jam
-from .node_walls import NodeWalls, WallForces
+from .node_walls import TURN, NodeWalls, WallForces
 from .projection import project
+from .surfaces import OTHER, Surfaces, is_round, tangent
 from .tied import Ties
 
 if TYPE_CHECKING:
@@ -25,46 +26,70 @@ if TYPE_CHECKING:
     from .walls.base import WallKeys
 
 
-class FlatWalls(NamedTuple):
-    """Planes n . x >= d and the nodes (n,) of a rank, in a step.
+INFEASIBLE, ADRIFT, JAMMED = range(1, 4)
+"""Why the place of a node is not found: no position satisfies its walls, the planes of round walls do not settle, or
+its friction has no solution."""
+
+_CURVED_ROUNDS = 100  # projections of a step until tangent planes and positions agree
+_ROOT = 1e-14  # relative error of squares, more than those of sums of three and of a root
+
+
+class PressedWalls(NamedTuple):
+    """Walls (w,) and the nodes (n,) of a rank that they can stop, in a step.
 
     Attributes
     ----------
-    fixed : (n, 3) bool, components that supports prescribe
-    normals, offsets : (w, 3), (w,) [m]
-    all_nodes : (w,) bool, whether a plane applies to all nodes; members : (n, w) bool, to which nodes otherwise
-    tolerance : a plane violated by at most this counts as satisfied [m]
+    surfaces : Surfaces at its end
+    part : see :meth:`~pfem_petsc.contact.node_walls.NodeWalls.acting`
+    all_nodes : (w,) bool, whether a wall applies to all nodes; members : (n, w) bool, to which nodes otherwise
+    tolerance : a wall violated by at most this counts as satisfied [m]
     room : (n,) int64, workspace
-    way : (w, 3) displacements of the planes in the step [m]
+    way : (w, 3) displacements of the walls in the step [m]; unpushed : those without the forces of nodes
     friction : (2, w) coefficients of dynamic and static friction; (2, 0) if all are zero
     restitution : (w,) coefficients, (0,) if all are zero
-    rebound, arrival : (n, w) memory of the last step of nodes that hit planes, updated, see :func:`impact_square`;
-        (0, w) without restitution
-    touching : (n, w) bool, contacts of the last step
+    rebound, arrival : (n, w) memory of the last step of nodes that hit walls; (0, w) without restitution
     """
 
-    fixed: np.ndarray
-    normals: np.ndarray
-    offsets: np.ndarray
+    surfaces: Surfaces
+    part: float
     all_nodes: np.ndarray
     members: np.ndarray
     tolerance: float
     room: np.ndarray
     way: np.ndarray
+    unpushed: np.ndarray
     friction: np.ndarray
     restitution: np.ndarray
     rebound: np.ndarray
     arrival: np.ndarray
-    touching: np.ndarray
 
 
 class Arrivals(NamedTuple):
-    """Nodes (m,) at walls: their positions at the start of the step, and how far they would move without forces (m, 3)
-    [m]; the force for a displacement of each (m,) [N/m]."""
+    """Nodes (m,) at walls (w,) in a step.
+
+    Attributes
+    ----------
+    start : (m, 3) positions at its start [m]
+    drift : (m, 3) how far they would move without forces [m]
+    stiffness : (m,) force for a displacement of each [N/m]
+    fixed : (m, 3) bool, components that supports prescribe
+    applies : (m, w) bool, walls that can stop each
+    touching : (m, w) bool, contacts of the last step
+    rebound, arrival : (m, w) memory of the last step of nodes that hit walls, in which :func:`press_nodes` leaves that
+        of this one, see :func:`impact_square`; (m, 0) without restitution
+    normals, offsets : (m, w, 3), (m, w) tangent planes of walls of other shapes; (0, w, 3), (0, w) without such walls
+    """
 
     start: np.ndarray
     drift: np.ndarray
     stiffness: np.ndarray
+    fixed: np.ndarray
+    applies: np.ndarray
+    touching: np.ndarray
+    rebound: np.ndarray
+    arrival: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
 
 
 class WallSums(NamedTuple):
@@ -77,24 +102,41 @@ class WallSums(NamedTuple):
 
 @borrowing
 def find_beyond(first, free, walls, found, returning):
-    """Write the nodes, from node ``first`` on, whose positions ``free`` (3 m,) lie beyond planes of :class:`FlatWalls`
-    to ``found``; return their number. With ``returning`` nodes, those that rebound are among them."""
-    normals, offsets, all_nodes, members = walls.normals, walls.offsets, walls.all_nodes, walls.members
+    """Write the nodes, from node ``first`` on, whose positions ``free`` (3 m,) lie beyond :class:`PressedWalls` to
+    ``found``; return their number. With ``returning`` nodes, those that rebound are among them."""
+    surfaces, all_nodes, members = walls.surfaces, walls.all_nodes, walls.members
+    normals, offsets, radii = surfaces.normals, surfaces.offsets, surfaces.radii
+    centres, axes = surfaces.centres, surfaces.axes
     n = len(free) // 3
     beyond = 0
-    for k in range(len(offsets)):  # without branches
-        nx, ny, nz, offset = normals[k, 0], normals[k, 1], normals[k, 2], offsets[k]
+    for k in range(len(radii)):  # without branches
+        if radii[k] == 0.0:
+            nx, ny, nz, offset = normals[k, 0], normals[k, 1], normals[k, 2], offsets[k]
+            for i in range(n):
+                gap = -offset + nx * free[3 * i] + ny * free[3 * i + 1] + nz * free[3 * i + 2]
+                beyond += 1 if gap < 0.0 else 0
+            continue
+        if not is_round(radii[k]):
+            continue
+        # without roots
+        cx, cy, cz, ax, ay, az = centres[k, 0], centres[k, 1], centres[k, 2], axes[k, 0], axes[k, 1], axes[k, 2]
+        side = 1.0 if radii[k] > 0.0 else -1.0
+        limit = radii[k] * radii[k] * (1.0 + side * _ROOT)
         for i in range(n):
-            gap = -offset + nx * free[3 * i] + ny * free[3 * i + 1] + nz * free[3 * i + 2]
-            beyond += 1 if gap < 0.0 else 0
+            x, y, z = free[3 * i] - cx, free[3 * i + 1] - cy, free[3 * i + 2] - cz
+            along = x * ax + y * ay + z * az
+            x -= along * ax
+            y -= along * ay
+            z -= along * az
+            beyond += 1 if side * (x * x + y * y + z * z - limit) < 0.0 else 0
     if beyond == 0 and not returning:
         return 0
     m = 0
     for i in range(n):
-        for k in range(len(offsets)):
-            gap = -offsets[k]
-            for c in range(3):
-                gap += normals[k, c] * free[3 * i + c]
+        for k in range(len(radii)):
+            gap = 0.0
+            if radii[k] != OTHER:
+                _, _, _, gap = tangent(k, surfaces, free[3 * i], free[3 * i + 1], free[3 * i + 2])
             if (gap < 0.0 and (all_nodes[k] or members[first + i, k])) or (
                 returning and walls.rebound[first + i, k] > 0.0
             ):
@@ -105,61 +147,181 @@ def find_beyond(first, free, walls, found, returning):
 
 
 @kernel
-def press_nodes(nodes, places, given, walls, sums):
-    """Project ``nodes`` (m,) at ``places`` (m, 3) [m], in place, onto planes of :class:`FlatWalls`, with friction and
-    restitution, and add the forces of the planes to ``sums``, see :class:`WallSums`; ``given``: :class:`Arrivals`.
+def _directions(free, walls, given):
+    """Return the directions (m, w, 3) of :meth:`~pfem_petsc.contact.node_walls.NodeWalls.acting` of nodes at (m, 3)."""
+    surfaces, way, part, start = walls.surfaces, walls.way, walls.part, given.start
+    m, w = len(free), len(surfaces.radii)
+    directions = np.zeros((m, w, 3))
+    for j in range(m):
+        x, y, z = free[j, 0], free[j, 1], free[j, 2]
+        for k in range(w):
+            if not is_round(surfaces.radii[k]):
+                continue
+            bx, by, bz = start[j, 0] + way[k, 0], start[j, 1] + way[k, 1], start[j, 2] + way[k, 2]
+            there = bx + part * (x - bx), by + part * (y - by), bz + part * (z - bz)
+            nx, ny, nz, _ = tangent(k, surfaces, there[0], there[1], there[2])
+            ex, ey, ez, _ = tangent(k, surfaces, x, y, z)
+            if nx * ex + ny * ey + nz * ez > TURN:
+                directions[j, k, 0], directions[j, k, 1], directions[j, k, 2] = nx, ny, nz
+    return directions
 
-    Returns the index of the first infeasible node among them, and of the first whose friction was not found, or -1;
-    their offsets (m, w), -inf where a plane does not apply; the total force (m, 3) [N]; planes that they touch (m, w);
-    and the energy that friction dissipates [J].
-    """
-    fixed, normals, offsets, way = walls.fixed, walls.normals, walls.offsets, walls.way
-    all_nodes, members, tolerance = walls.all_nodes, walls.members, walls.tolerance
-    rebound, arrival, restitution = walls.rebound, walls.arrival, walls.restitution
-    force, contacts, moment = sums.force, sums.contacts, sums.moment
-    start, drift, stiffness = given.start, given.drift, given.stiffness
-    w, m = len(offsets), len(nodes)
-    rough, bounces = walls.friction.shape[1] > 0, len(restitution) > 0
-    free = places.copy()
-    held = np.empty((m, 3), dtype=np.bool_)
-    all_normals = np.empty((m, w, 3))
-    all_offsets = np.empty((m, w))
-    pull = np.zeros((m if bounces else 0, w))  # by forces, towards the walls
-    for j in range(m):
-        i = nodes[j]
-        for c in range(3):
-            held[j, c] = fixed[i, c]
-        for k in range(w):
+
+class _Planes(NamedTuple):
+    """Tangent planes at nodes (m,): see :class:`~pfem_petsc.contact.friction.Rubbing`; ``directions`` (m, w, 3) in
+    which round walls push, zero for normals, (0, w, 3) for none; ``pull`` (m, w) by forces, towards the walls [m]."""
+
+    normals: np.ndarray
+    offsets: np.ndarray
+    directions: np.ndarray
+    pull: np.ndarray
+
+
+@borrowing
+def _set_planes(j, at, free, walls, given, planes):
+    """Set the planes of the j-th node at positions ``at`` (m, 3); it is ``free`` (m, 3) to move there."""
+    surfaces, restitution, rebound, arrival = walls.surfaces, walls.restitution, given.rebound, given.arrival
+    normals, offsets, directions, pull = planes
+    start, drift, every = given.start, given.drift, surfaces.normals
+    x, y, z = at[j, 0], at[j, 1], at[j, 2]
+    for k in range(offsets.shape[1]):
+        radius = surfaces.radii[k]
+        if radius == 0.0:
+            nx, ny, nz, offset = every[k, 0], every[k, 1], every[k, 2], surfaces.offsets[k]
+        elif radius == OTHER:
+            nx, ny, nz = given.normals[j, k, 0], given.normals[j, k, 1], given.normals[j, k, 2]
+            offset = given.offsets[j, k]
+        else:
+            nx, ny, nz, gap = tangent(k, surfaces, x, y, z)
+            if len(directions) > 0:
+                dx, dy, dz = directions[j, k, 0], directions[j, k, 1], directions[j, k, 2]
+                if dx != 0.0 or dy != 0.0 or dz != 0.0:
+                    nx, ny, nz = dx, dy, dz
+            offset = nx * x + ny * y + nz * z - gap
+        normals[j, k, 0], normals[j, k, 1], normals[j, k, 2] = nx, ny, nz
+        offsets[j, k] = offset if given.applies[j, k] else -math.inf
+        if len(restitution) > 0:
+            q = 0.0
             for c in range(3):
-                all_normals[j, k, c] = normals[k, c]
-            all_offsets[j, k] = offsets[k] if all_nodes[k] or members[i, k] else -math.inf
-            if bounces:
-                for c in range(3):
-                    pull[j, k] -= normals[k, c] * (free[j, c] - start[j, c] - drift[j, c])
-                if rebound[i, k] > 0.0:
-                    q = pull[j, k]
-                    whole = max(rebound[i, k] + q * arrival[i, k] + 0.25 * q * q, 0.0)
-                    all_offsets[j, k] += max(restitution[k] * math.sqrt(whole) - 0.5 * q, 0.0)
+                q -= normals[j, k, c] * (free[j, c] - start[j, c] - drift[j, c])
+            pull[j, k] = q
+            if rebound[j, k] > 0.0:
+                whole = max(rebound[j, k] + q * arrival[j, k] + 0.25 * q * q, 0.0)
+                offsets[j, k] += max(restitution[k] * math.sqrt(whole) - 0.5 * q, 0.0)
+
+
+@borrowing
+def _meets_round(j, x, strengths, walls, given):
+    """Return whether a round wall pushes the j-th node to its position (m, 3), or would stop it there."""
+    surfaces, bounces = walls.surfaces, len(walls.restitution) > 0
+    for k in range(strengths.shape[1]):
+        if is_round(surfaces.radii[k]) and given.applies[j, k]:
+            _, _, _, gap = tangent(k, surfaces, x[j, 0], x[j, 1], x[j, 2])
+            if strengths[j, k] > 0.0 or gap < 0.0 or (bounces and given.rebound[j, k] > 0.0):
+                return True
+    return False
+
+
+@kernel
+def _settle_on_round(j, x, free, strengths, walls, given, planes):
+    """Move the j-th node, projected to x (m, 3), until tangent planes and positions agree; return ``INFEASIBLE``,
+    ``ADRIFT``, or 0."""
+    at, own = free[j].copy(), slice(j, j + 1)
+    fixed, normals, offsets = given.fixed[own], planes.normals[own], planes.offsets[own]
+    for _ in range(_CURVED_ROUNDS):
+        change = 0.0
+        for c in range(3):
+            change = max(change, abs(x[j, c] - at[c]))
+            at[c] = x[j, c]
+        if change <= walls.tolerance or not _meets_round(j, x, strengths, walls, given):
+            return 0
+        _set_planes(j, x, free, walls, given, planes)
+        x[j] = free[j]
+        if project(x[own], fixed, normals, offsets, walls.tolerance, strengths[own]) >= 0:
+            return INFEASIBLE
+    return ADRIFT
+
+
+@kernel
+def _rub_on_round(j, x, free, drag, strengths, walls, given, planes):
+    """Repeat the friction of the j-th node, at x (m, 3), with the planes at its position until both agree; return
+    whether it was found."""
+    own = slice(j, j + 1)
+    normals, offsets, stiffness = planes.normals[own], planes.offsets[own], given.stiffness[own]
+    rough = walls.friction[0], walls.friction[1]
+    rubbing = Rubbing(given.start[own], walls.way, given.fixed[own], normals, offsets, *rough, stiffness)
+    for _ in range(_CURVED_ROUNDS):
+        if not _meets_round(j, x, strengths, walls, given):
+            break
+        earlier, distances = normals[0].copy(), offsets[0].copy()
+        _set_planes(j, x, free, walls, given, planes)
+        turn, apart = np.abs(normals[0] - earlier).max(), 0.0
+        for k in range(len(distances)):
+            if distances[k] > -math.inf:
+                apart = max(apart, abs(offsets[0, k] - distances[k]))
+        if turn <= 1e-14 and apart <= walls.tolerance:
+            break
+        x[j] = free[j]
+        project(x[own], rubbing.fixed, normals, offsets, walls.tolerance, strengths[own])
+        for k in range(len(distances)):
+            strengths[j, k] *= stiffness[0]
+        if add_friction(rubbing, x[own], strengths[own], drag[own]) >= 0:
+            return False
+    return True
+
+
+@kernel
+def press_nodes(places, given, walls, sums):
+    """Project nodes at ``places`` (m, 3) [m], in place, onto :class:`PressedWalls`, with friction and restitution, and
+    add the forces of the walls to ``sums``, see :class:`WallSums`; ``given``: :class:`Arrivals`.
+
+    Each node is solved for by itself: its bits do not depend on the others. Returns the index of the first node
+    without a place, or -1, and why; the planes at the nodes, with offset -inf where a wall does not apply; the
+    total force (m, 3) [N]; walls that they touch (m, w); and the energy that friction dissipates [J].
+    """
+    way, unpushed, tolerance, restitution = walls.way, walls.unpushed, walls.tolerance, walls.restitution
+    force, contacts, moment = sums.force, sums.contacts, sums.moment
+    start, stiffness, fixed = given.start, given.stiffness, given.fixed
+    m, w = given.applies.shape
+    rough, bounces, curved = walls.friction.shape[1] > 0, len(restitution) > 0, False
+    for radius in walls.surfaces.radii:
+        curved = curved or is_round(radius)
+    free = places.copy()
+    directions = _directions(free, walls, given) if curved and walls.part < 1.0 else np.empty((0, w, 3))
+    planes = _Planes(np.empty((m, w, 3)), np.empty((m, w)), directions, np.empty((m if bounces else 0, w)))
+    normals, pull = planes.normals, planes.pull
+    for j in range(m):
+        _set_planes(j, free, free, walls, given, planes)
     strengths = np.zeros((m, w))
-    infeasible = project(places, held, all_normals, all_offsets, tolerance, strengths)
+    failed, why = project(places, fixed, normals, planes.offsets, tolerance, strengths), 0
+    if failed >= 0:
+        why = INFEASIBLE
+    for j in range(m if curved else 0):
+        wrong = _settle_on_round(j, places, free, strengths, walls, given, planes)
+        if wrong > 0 and (failed < 0 or wrong < why or (wrong == why and j < failed)):
+            failed, why = j, wrong
+    smooth, pushed = (places.copy(), strengths > 0.0) if bounces else (places, np.empty((0, w), dtype=np.bool_))
     for j in range(m):
         for k in range(w):
-            if bounces:
-                i = nodes[j]
-                fresh = strengths[j, k] > 0.0 and not walls.touching[i, k] and restitution[k] > 0.0
-                approach = arrived = 0.0
-                for c in range(3):
-                    approach -= normals[k, c] * (free[j, c] - start[j, c] - way[k, c])
-                    arrived -= normals[k, c] * (places[j, c] - start[j, c] - way[k, c])
-                square = max(approach * approach - pull[j, k] * (approach - arrived), 0.0)
-                rebound[i, k] = square if fresh and approach > 0.0 else 0.0
-                arrival[i, k] = arrived if fresh else 0.0
             strengths[j, k] *= stiffness[j]
     drag = np.zeros((m, w, 3))
-    unsettled = -1
     if rough:
-        rubbing = Rubbing(start, way, held, all_normals, all_offsets, walls.friction[0], walls.friction[1], stiffness)
+        rubbing = Rubbing(start, way, fixed, normals, planes.offsets, walls.friction[0], walls.friction[1], stiffness)
         unsettled = add_friction(rubbing, places, strengths, drag)
+        for j in range(m if curved and failed < 0 else 0):
+            if not _rub_on_round(j, places, free, drag, strengths, walls, given, planes):
+                unsettled = min(unsettled, j) if unsettled >= 0 else j
+        if unsettled >= 0 and failed < 0:
+            failed, why = unsettled, JAMMED
+    for j in range(m if bounces else 0):
+        for k in range(w):
+            fresh = pushed[j, k] and not given.touching[j, k] and restitution[k] > 0.0
+            approach = arrived = 0.0
+            for c in range(3):
+                approach -= normals[j, k, c] * (free[j, c] - start[j, c] - unpushed[k, c])
+                arrived -= normals[j, k, c] * (smooth[j, c] - start[j, c] - way[k, c])
+            square = max(approach * approach - pull[j, k] * (approach - arrived), 0.0)
+            given.rebound[j, k] = square if fresh and approach > 0.0 else 0.0
+            given.arrival[j, k] = arrived if fresh else 0.0
     total = np.zeros((m, 3))
     touching = np.zeros((m, w), dtype=np.bool_)
     dissipated = 0.0
@@ -169,7 +331,7 @@ def press_nodes(nodes, places, given, walls, sums):
             strength = strengths[j, k]
             if strength == 0.0:
                 continue
-            fx, fy, fz = strength * normals[k, 0], strength * normals[k, 1], strength * normals[k, 2]
+            fx, fy, fz = strength * normals[j, k, 0], strength * normals[j, k, 1], strength * normals[j, k, 2]
             if rough:
                 fx += drag[j, k, 0]
                 fy += drag[j, k, 1]
@@ -187,22 +349,18 @@ def press_nodes(nodes, places, given, walls, sums):
             moment[k, 2] += x * fy - y * fx
             touching[j, k] = True
             contacts[k] += 1
-    return infeasible, unsettled, all_offsets, total, touching, dissipated
+    return failed, why, planes, total, touching, dissipated
 
 
 @kernel
-def find_pressed(predictor, u, walls, returning):
-    """Return the nodes (m,) to press: those whose positions predictor + u, (n, 3) both, lie beyond planes of
-    :class:`FlatWalls`, or that rebound if any are ``returning``."""
-    n, room = len(u), walls.room
-    free = np.empty(3 * NODE_BLOCK)
+def find_pressed(x, walls, returning):
+    """Return the nodes (m,) to press: those whose positions (n, 3) lie beyond :class:`PressedWalls`, or that rebound if
+    any are ``returning``."""
+    n, room = len(x), walls.room
     m = 0
     for first in range(0, n, NODE_BLOCK):
-        last = min(first + NODE_BLOCK, n)
-        where, more = predictor[first:last].reshape(-1), u[first:last].reshape(-1)
-        for j in range(len(where)):
-            free[j] = where[j] + more[j]
-        m += find_beyond(first, free[: len(where)], walls, room[m:], returning)
+        free = x[first : min(first + NODE_BLOCK, n)].reshape(-1)
+        m += find_beyond(first, free, walls, room[m:], returning)
     return room[:m].copy()
 
 
@@ -234,16 +392,13 @@ def rebound_way(
     return np.where(square > 0.0, restitution * np.sqrt(whole), 0.0)
 
 
-_CURVED_ROUNDS = 100  # projections of a step until tangent planes and positions agree
-
-
 class ExplicitContact(NodeWalls):
     """Walls that project free positions onto the region that they allow.
 
     Attributes
     ----------
     ties : Ties
-    plain : infinite flat walls without ties, and if they have mass without restitution: compiled passes handle them
+    plain : infinite flat walls, spheres and cylinders without ties: compiled passes handle them alone
     """
 
     def __init__(
@@ -256,11 +411,9 @@ class ExplicitContact(NodeWalls):
     ) -> None:
         super().__init__(case, nodes, mesh, fixed, parameters)
         self.ties = Ties(self, case.wall if parameters is None else parameters)
-        heavy = any(wall.mass is not None for wall in (case.wall if parameters is None else parameters))
-        bounces = bool(self.restitution.any())
-        self.plain = bool(self.flat.all() and not (self.partial or self.ties.any or (heavy and bounces)))
+        self.plain = bool((self.surfaces.radii != OTHER).all()) and not (self.partial or self.ties.any)
         self._part = 1.0  # see :meth:`acting`
-        self._room = np.empty(len(self.members) if self.plain else 0, dtype=np.int64)
+        self._room = np.empty(len(self.members) if self.any else 0, dtype=np.int64)
 
     def explicit(
         self,
@@ -284,41 +437,29 @@ class ExplicitContact(NodeWalls):
         -------
         (nodes (m,), force (m, 3) [N] by the walls, WallForces)
         """
-        self._part = part
+        self._part, x = part, predictor + u
         if self.motion.bodies.any:
-            self.push_walls(predictor + u, stiffness, time, tolerance)
-        if self.plain:
-            return self._press_planes(predictor, u, stiffness, time, tolerance)
-        nodes, correction, force, walls = self.project(predictor + u, stiffness, time, tolerance)
+            self.push_walls(x, stiffness, time, tolerance)
+        try:
+            nodes, correction, force, walls = self.project(x, stiffness, time, tolerance)
+        except SimulationFailure:  # until other ranks know of it, the other nodes stay at walls
+            u[:] = x - predictor
+            raise
         u[nodes] += correction
         return nodes, force, walls
 
-    def _press_planes(
-        self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
-    ) -> tuple:
-        w, state = len(self.walls), self.state
-        walls = self.flat_walls(tolerance)
-        walls.offsets[:] = self.plane_offsets(time)
-        walls.way[:] = self.motion.displacements(time)
-        sums = WallSums(np.zeros((w, 3)), np.zeros(w, int), np.zeros((w, 3)))
-        nodes = find_pressed(predictor, u, walls, len(walls.restitution) > 0)
-        start = places = predictor[nodes] + u[nodes]
-        drift = np.zeros_like(places)
-        if state is not None:
-            start = state.position[nodes]
-            walls.way[:] -= self.motion.displacements(state.time)
-            if len(walls.restitution):
-                drift = (time - state.time) * state.memory["half_velocity"][nodes]
-        given, free = Arrivals(start, drift, stiffness[nodes]), places.copy()
-        infeasible, unsettled, offsets, force, touching, friction = press_nodes(nodes, places, given, walls, sums)
-        u[nodes] += places - free
-        if infeasible >= 0:
-            raise SimulationFailure(self.infeasible_message(nodes[infeasible], offsets[infeasible]))
-        if unsettled >= 0:
-            raise SimulationFailure(self.unsettled_friction(nodes[unsettled], self.normals))
-        if len(nodes) == 0:
-            return nodes, force, self.nothing
-        return nodes, force, WallForces(*sums, nodes, touching, places, friction)
+    def placeless(self, node: int, why: int, normals: np.ndarray, offsets: np.ndarray) -> str:
+        """Return the message about an owned node whose place :func:`press_nodes` did not find; its planes (w, 3),
+        (w,)."""
+        if why == INFEASIBLE:
+            return self.infeasible_message(node, offsets)
+        if why == JAMMED:
+            return self.unsettled_friction(node, normals)
+        return (
+            f"the position of node {self.mesh.node_ids[node]} on curved walls did not converge in {_CURVED_ROUNDS} "
+            "iterations: walls and supports may be infeasible together; move the walls apart, free the node, or "
+            "reduce time.step"
+        )
 
     def unsettled_friction(self, node: int, normals: np.ndarray) -> str:
         """Return the message about an owned node without a solution of its friction at walls with ``normals`` (w,
@@ -327,28 +468,20 @@ class ExplicitContact(NodeWalls):
             f"the friction of node {self.mesh.node_ids[node]} on several walls did not converge; reduce time.step"
         )
 
-    def flat_walls(self, tolerance: float) -> FlatWalls:
-        """Return plain walls for compiled passes, which set where these are; planes violated by at most the tolerance
-        [m] count as satisfied."""
-        w, members = self._offsets.size, self.members
+    def pressed_walls(self, surfaces: Surfaces, part: float, tolerance: float, way: np.ndarray) -> PressedWalls:
+        """Return walls for compiled passes, see :class:`PressedWalls`."""
+        members = self.members
         friction = np.array([self.friction, self.static_friction]) if self.has_friction else np.empty((2, 0))
-        memory = 2 * [np.empty((0, w))]
+        memory = 2 * [np.empty((0, len(self.walls)))]
         if self.rebounds:
             memory = [self.state.memory.setdefault(name, np.zeros(members.shape)) for name in ("rebound", "arrival")]
-        return FlatWalls(
-            self.fixed,
-            self.normals,
-            self._offsets.copy(),
-            self.all_nodes,
-            members,
-            tolerance,
-            self._room,
-            np.zeros((w, 3)),
-            friction,
-            self.restitution if self.rebounds else np.empty(0),
-            *memory,
-            self.log.touching,
-        )
+        restitution, unpushed = self.restitution if self.rebounds else np.empty(0), way
+        bodies = self.motion.bodies
+        if bodies.any:
+            unpushed = way.copy()
+            unpushed[bodies.at] = bodies.unpushed() - bodies.state.x
+        sets = self.all_nodes, members
+        return PressedWalls(surfaces, part, *sets, tolerance, self._room, way, unpushed, friction, restitution, *memory)
 
     def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
         """Find the final positions of walls with mass in an explicit step. Collective."""
@@ -358,7 +491,7 @@ class ExplicitContact(NodeWalls):
         def forces() -> tuple[np.ndarray, np.ndarray]:
             nonlocal failure
             try:
-                nodes, correction, _, walls = self.project(x.copy(), stiffness, time, tolerance, booked=False)
+                nodes, correction, _, walls = self.project(x, stiffness, time, tolerance, booked=False)
             except SimulationFailure as met:  # raised once all ranks have left the iteration
                 failure = failure or met
                 return np.zeros((len(free.at), 3)), np.zeros((len(free.at), 3, 3))
@@ -430,159 +563,71 @@ class ExplicitContact(NodeWalls):
 
     def project(
         self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool = True
-    ) -> tuple:
-        """Project free positions (owned, 3), in place, onto the region that the walls allow.
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, WallForces]:
+        """Project free positions (owned, 3) onto the region that the walls allow; a failure leaves those found there.
 
         ``booked`` : whether the step is final and not a trial. Returns the nodes (m,), their corrections (m, 3) [m],
         the forces on them (m, 3) [N], and the sums per wall.
         """
-        ties = self.ties
-        nodes, moved, force, touching, friction = self._press(x, stiffness, time, tolerance, booked)
-        if ties.any:
-            tied, walls, places, pull = ties.hold(x, stiffness, time)
+        nodes, moved, force, sums = self._press(x, stiffness, time, tolerance, booked)
+        if self.ties.any:
+            tied, walls, places, pull = self.ties.hold(x, stiffness, time)
             every = np.zeros((len(tied), len(self.walls), 3))
             every[np.arange(len(tied)), walls] = pull
             own = np.zeros(every.shape[:2], dtype=bool)
             own[np.arange(len(tied)), walls] = True
-            nodes, moved = np.append(nodes, tied), np.vstack([moved, places])
-            force, touching = np.vstack([force, every]), np.vstack([touching, own])
-        if len(nodes) == 0:
-            return nodes, moved, np.empty((0, 3)), self.nothing
-        correction = moved - x[nodes]
-        x[nodes] = moved
-        return nodes, correction, force.sum(axis=1), self.sums(nodes, force, moved, touching, friction)
+            nodes, moved, force = np.append(nodes, tied), np.vstack([moved, places]), np.vstack([force, pull])
+            touching = np.vstack([sums.touching, own])
+            held = self.sums(tied, every, places, own)
+            sums = WallForces(
+                *(getattr(sums, name) + getattr(held, name) for name in WallForces.sums),
+                nodes,
+                touching,
+                moved,
+                sums.friction,
+            )
+        return nodes, moved - x[nodes], force, sums
 
     def _press(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool) -> tuple:
-        """Return nodes (m,) near walls that are not tied to them, positions (m, 3), forces (m, w, 3), touching (m, w),
-        and the energy that friction dissipates [J]."""
-        displacements = self.motion.displacements(time)
-        near = self.near(x, displacements)
-        if self.rebounds:
-            near |= self._returning()
+        """Return nodes (m,) near walls that are not tied to them, positions (m, 3), forces (m, 3), and the sums per
+        wall."""
+        w, state, displacements = len(self.walls), self.state, self.motion.displacements(time)
+        way = displacements if state is None else displacements - self.motion.displacements(state.time)
+        walls = self.pressed_walls(self.surfaces.at(displacements), self._part, tolerance, way)
+        bounces = len(walls.restitution) > 0
+        others = (walls.surfaces.radii == OTHER).any()
+        nodes = find_pressed(x, walls, bounces)
+        if others:
+            nodes = np.union1d(nodes, np.flatnonzero(self.near(x, displacements)))
         if self.ties.any:
-            near &= ~self.ties.held
-        nodes = np.flatnonzero(near)
+            nodes = nodes[~self.ties.held[nodes]]
         if len(nodes) == 0:
-            walls = len(self.walls)
-            return nodes, np.empty((0, 3)), np.empty((0, walls, 3)), np.empty((0, walls), dtype=bool), 0.0
-        free = x[nodes]
-        applicable = self.applicable(nodes, free, displacements)
-        at = free
-        rebounds = self._returning()[nodes] if self.rebounds else np.zeros(len(nodes), dtype=bool)
-        pull = self._pull(nodes, free, time) if self.rebounds else free
-        acting = self.acting(nodes, free, displacements, self._part)
+            return nodes, np.empty((0, 3)), np.empty((0, 3)), self.nothing
+        free = at = x[nodes]
+        start, drift = free if state is None else state.position[nodes], np.zeros_like(free)
+        if bounces:
+            drift = (time - state.time) * state.memory["half_velocity"][nodes]
+        applies = self.applicable(nodes, free, displacements)
+        acting = self.acting(nodes, free, displacements, self._part) if others else None
+        planes = np.empty((0, w, 3)), np.empty((0, w))
+        of_nodes = stiffness[nodes], self.fixed[nodes], applies, self.log.touching[nodes]
         for _ in range(_CURVED_ROUNDS):
-            normals, offsets = self.planes(applicable, at, displacements, acting)
-            if rebounds.any():
-                offsets[rebounds] += self._rebound(nodes[rebounds], normals[rebounds], pull[rebounds])
-            moved, multipliers = free.copy(), np.zeros(offsets.shape)
-            infeasible = project(moved, self.fixed[nodes], normals, offsets, tolerance, multipliers)
-            if infeasible >= 0:
-                raise SimulationFailure(self.infeasible_message(nodes[infeasible], offsets[infeasible]))
-            if self.flat.all() or np.abs(moved - at).max() <= tolerance:
+            if others:
+                planes = self.planes(applies, at, displacements, acting)
+            memory = [
+                array[nodes] if bounces else np.empty((len(nodes), 0)) for array in (walls.rebound, walls.arrival)
+            ]
+            sums, places = WallSums(np.zeros((w, 3)), np.zeros(w, int), np.zeros((w, 3))), free.copy()
+            given = Arrivals(start, drift, *of_nodes, *memory, *planes)
+            failed, why, found, force, touching, friction = press_nodes(places, given, walls, sums)
+            if failed >= 0 or not others or np.abs(places - at).max() <= tolerance:
                 break
-            at = moved
+            at = places
         else:
-            node = self.mesh.node_ids[nodes[np.argmax(np.abs(moved - at).max(axis=1))]]
-            raise SimulationFailure(
-                f"the position of node {node} on curved walls did not converge in {_CURVED_ROUNDS} "
-                "iterations: walls and supports may be infeasible together; move the walls apart, free the node, or "
-                "reduce time.step"
-            )
-        strength = multipliers * stiffness[nodes][:, None]
-        force = strength[:, :, None] * normals
-        friction = 0.0
-        if self.has_friction:
-            moved, force, friction = self._apply_friction(
-                nodes, free, displacements, (normals, offsets, acting), stiffness[nodes], moved, strength
-            )
-        if booked and self.rebounds:
-            self._remember_impacts(nodes, free, moved, pull, displacements, normals, strength)
-        return nodes, moved, force, np.einsum("mwi,mwi->mw", force, normals) > 0.0, friction
-
-    def _returning(self) -> np.ndarray:
-        """Return (owned,) bool: nodes that hit a wall with restitution in the last step."""
-        squares = self.state.memory.get("rebound")
-        return (squares > 0.0).any(axis=1) if squares is not None else np.zeros(len(self.members), dtype=bool)
-
-    def _pull(self, nodes: np.ndarray, free: np.ndarray, time: float) -> np.ndarray:
-        """Return the part (m, 3) of the nodes' displacements without walls that is due to forces [m]."""
-        state = self.state
-        as_before = state.memory["half_velocity"][nodes] * (time - state.time)
-        return free - state.position[nodes] - as_before
-
-    def _rebound(self, nodes: np.ndarray, normals: np.ndarray, pull: np.ndarray) -> np.ndarray:
-        """Return the distances (m, walls) [m] that nodes reach in this step from walls they hit in the last one."""
-        memory = self.state.memory
-        squares, arrivals = memory["rebound"][nodes], memory["arrival"][nodes]
-        towards = -np.einsum("mwi,mi->mw", normals, pull)
-        way = rebound_way(self.restitution, squares, arrivals, towards) - 0.5 * towards
-        return np.where(squares > 0.0, np.maximum(way, 0.0), 0.0)
-
-    def _remember_impacts(
-        self,
-        nodes: np.ndarray,
-        free: np.ndarray,
-        moved: np.ndarray,
-        pull: np.ndarray,
-        displacements: np.ndarray,
-        normals: np.ndarray,
-        strength: np.ndarray,
-    ) -> None:
-        """Record which nodes hit a wall with restitution in this step; see :mod:`~pfem_petsc.contact.explicit`."""
-        state = self.state
-        shape = len(self.members), len(self.walls)
-        squares, arrivals = (state.memory.setdefault(name, np.zeros(shape)) for name in ("rebound", "arrival"))
-        way = displacements - self.motion.displacements(state.time)
-        unpushed = way.copy()
-        bodies = self.motion.bodies
-        if bodies.any:  # use the motion without the recoil of the wall
-            unpushed[bodies.at] = bodies.unpushed() - bodies.state.x
-        start = state.position[nodes]
-        approach = -np.einsum("mwi,mwi->mw", normals, (free - start)[:, None, :] - unpushed)
-        arrival = -np.einsum("mwi,mwi->mw", normals, (moved - start)[:, None, :] - way)
-        towards = -np.einsum("mwi,mi->mw", normals, pull)
-        fresh = (strength > 0.0) & ~self.log.touching[nodes] & (self.restitution > 0.0)
-        squares[:], arrivals[:] = 0.0, 0.0
-        squares[nodes] = np.where(fresh, impact_square(approach, arrival, towards), 0.0)
-        arrivals[nodes] = np.where(fresh, arrival, 0.0)
-
-    def _apply_friction(
-        self,
-        nodes: np.ndarray,
-        free: np.ndarray,
-        displacements: np.ndarray,
-        planes: tuple[np.ndarray, np.ndarray, np.ndarray | None],
-        stiffness: np.ndarray,
-        moved: np.ndarray,
-        strength: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return positions (m, 3) and forces (m, w, 3) with friction, and the energy that it dissipates [J].
-
-        Curved walls are represented by planes at the result, along the directions of ``acting``.
-        """
-        state = self.state
-        way = displacements - self.motion.displacements(state.time)
-        before, fixed = state.position[nodes], self.fixed[nodes]
-        normals, offsets, acting = planes
-        applicable = offsets > -np.inf
-        tolerance = PROJECTED * self.size
-        for _ in range(_CURVED_ROUNDS):
-            at, normal_forces, drag = moved.copy(), strength.copy(), np.zeros(normals.shape)
-            rough = self.friction, self.static_friction
-            rubbing = Rubbing(before, way, fixed, normals, offsets, *rough, stiffness)
-            unsettled = add_friction(rubbing, at, normal_forces, drag)
-            if unsettled >= 0:
-                raise SimulationFailure(self.unsettled_friction(nodes[unsettled], normals[unsettled]))
-            if self.flat.all():
-                break
-            there, distances = self.planes(applicable, at, displacements, acting)
-            apart = np.abs(distances[applicable] - offsets[applicable]).max(initial=0.0)
-            if np.abs(there - normals).max() <= 1e-14 and apart <= tolerance:
-                break
-            normals, offsets = there, distances
-            moved, multipliers = free.copy(), np.zeros(offsets.shape)
-            project(moved, fixed, normals, offsets, tolerance, multipliers)
-            strength = multipliers * stiffness[:, None]
-        friction = -float((drag * (at[:, None, :] - before[:, None, :] - way)).sum())
-        return at, normal_forces[:, :, None] * normals + drag, friction
+            failed, why = int(np.argmax(np.abs(places - at).max(axis=1))), ADRIFT
+        if failed >= 0:
+            x[nodes] = places
+            raise SimulationFailure(self.placeless(nodes[failed], why, found.normals[failed], found.offsets[failed]))
+        if bounces and booked:
+            walls.rebound[nodes], walls.arrival[nodes] = memory
+        return nodes, places, force, WallForces(*sums, nodes, touching, places, friction)

@@ -15,6 +15,7 @@ from mpi4py import MPI
 from ..mechanics.compiled import kernel
 from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, FREE_PART, resolvable
+from .surfaces import Surfaces
 from .wall_motion import WallMotion
 from .walls.base import made_wall
 
@@ -239,7 +240,8 @@ def near_planes(x, normals, offsets, all_nodes, members, reach, near):
 
 
 _ZERO = np.zeros(1)
-_TURN = 0.8  # cosine between normals in a step, below which forces act along that at the new position
+TURN = 0.8
+"""Cosine between normals in a step, below which forces act along that at the new position."""
 
 
 class NodeWalls:
@@ -251,6 +253,7 @@ class NodeWalls:
     any : whether the case has walls
     moving : (walls,) bool
     normals : (walls, 3) of flat walls, zero for the others
+    surfaces : Surfaces of the walls at rest
     log : ContactLog
     restitution, friction, static_friction : (walls,); has_friction : whether any wall has friction
     size : length that tolerances are relative to [m], see :mod:`~pfem_petsc.tolerances`
@@ -291,6 +294,7 @@ class NodeWalls:
         self.rebounds = False
         self.has_friction = bool(self.static_friction.any())
         self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
+        self.surfaces = Surfaces.of(self.walls)
         self.partial = any(wall.partial for wall in self.walls)
         self.normals = np.zeros((len(walls), 3))
         self._offsets = np.zeros(len(walls))
@@ -431,7 +435,7 @@ class NodeWalls:
             end, before = x - displacements[k], start - earlier[k]
             there, _ = self.walls[k].planes(before + part * (end - before))
             turn = np.einsum("mi,mi->m", there, self.walls[k].planes(end)[0])
-            acting[:, k] = np.where((turn > _TURN)[:, None], there, 0.0)
+            acting[:, k] = np.where((turn > TURN)[:, None], there, 0.0)
         return acting
 
     def sums(

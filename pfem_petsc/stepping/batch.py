@@ -146,8 +146,13 @@ class Batch:
         touched = Touched(
             log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.ledger.impacts.slack
         )
-        walls = contact.flat_walls(PROJECTED * self.model.size)
-        return WallArrays(walls, walls.offsets.copy(), self._wall_motions(0, 0), touched, log.present, log.releases)
+        surfaces = contact.surfaces
+        at_end, level = surfaces.copy(), surfaces.copy()
+        acting = self.stepper.scheme.balance(self.stepper.state, self.stepper.h).acting
+        way = np.zeros(level.centres.shape)
+        walls = contact.pressed_walls(at_end, acting, PROJECTED * self.model.size, way)
+        motions = self._wall_motions(0, 0)
+        return WallArrays(walls, surfaces, level, motions, touched, log.present, log.releases)
 
     def _times(self, begin: int, count: int) -> np.ndarray:
         """Return the times of the start of ``count`` steps from one of a number on, of their ends, and of one more."""
@@ -320,12 +325,9 @@ class Batch:
         stepper = self.stepper
         if made.failed >= 0 or made.turned >= 0:
             return SimulationFailure(stepper.collapse(max(made.failed, made.turned)))
-        if made.infeasible >= 0:
-            contact, node = self.model.contact, made.near[made.infeasible]
-            text = contact.infeasible_message(node, made.offsets)
-            if made.jammed:
-                text = contact.unsettled_friction(node, contact.normals)
-            return self._at_balance(text)
+        if made.placeless >= 0:
+            node = made.near[made.placeless]
+            return self._at_balance(self.model.contact.placeless(node, made.why, made.normals, made.offsets))
         return self._at_balance(self._caller.failure) if made.unsolved else None
 
     def _at_balance(self, text: object) -> SimulationFailure:

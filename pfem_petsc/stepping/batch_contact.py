@@ -6,23 +6,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..contact.explicit import Arrivals, FlatWalls, find_beyond, press_nodes
+from ..contact.explicit import Arrivals, PressedWalls, find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows
+from ..contact.surfaces import Surfaces, wall_gaps
 from ..integrators._leapfrog import accelerations, centre
 from ..mechanics.compiled import borrowing, kernel
 from ..mesh.ordering import NODE_BLOCK
 from .batch_supports import put_rates
-from .impact import Approach, Touched, join_nodes, plane_gaps, stop_nodes, unpressed
+from .impact import Approach, Touched, join_nodes, stop_nodes, unpressed
 
 
 class WallArrays(NamedTuple):
-    """Flat walls and their log, see :mod:`~pfem_petsc.contact.explicit` and :mod:`~pfem_petsc.contact.node_walls`;
-    their ``origins`` (w,), offsets without displacement [m]; and for walls that move ``motions`` (t, 2, w, 3),
-    displacements and velocities at the start of the first step, at the end of each, and of one more, else (0, 2, w,
-    3)."""
+    """Walls ``pressed`` and their log, see :mod:`~pfem_petsc.contact.explicit` and
+    :mod:`~pfem_petsc.contact.node_walls`; their surfaces ``at_rest``, without displacement, and at the end of the step,
+    ``level``; and for walls that move ``motions`` (t, 2, w, 3), displacements and velocities at the start of the first
+    step, at the end of each, and of one more, else (0, 2, w, 3)."""
 
-    flat: FlatWalls
-    origins: np.ndarray
+    pressed: PressedWalls
+    at_rest: Surfaces
+    level: Surfaces
     motions: np.ndarray
     touched: Touched
     present: np.ndarray
@@ -31,12 +33,14 @@ class WallArrays(NamedTuple):
 
 class Pressed(NamedTuple):
     """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` for all blocks of a step: room for ``nodes`` (n,),
-    the planes that they are ``touching`` (n, w), their ``places`` (n, 3); ``offsets`` (w,) of the infeasible node; and
-    the sums of each wall, ``force`` (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
+    the walls that they are ``touching`` (n, w), their ``places`` (n, 3); planes, ``normals`` (w, 3) and ``offsets``
+    (w,), of a node without a place; and the sums of each wall, ``force`` (w, 3), ``contacts`` (w,) and ``moment`` (w,
+    3)."""
 
     nodes: np.ndarray
     touching: np.ndarray
     places: np.ndarray
+    normals: np.ndarray
     offsets: np.ndarray
     force: np.ndarray
     contacts: np.ndarray
@@ -49,7 +53,7 @@ def new_pressed(n, w):
     nodes = np.empty(n if w > 0 else 0, dtype=np.int64)
     touching, places = np.empty((len(nodes), w), dtype=np.bool_), np.empty((len(nodes), 3))
     force, contacts, moment = np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3))
-    return Pressed(nodes, touching, places, np.empty(w), force, contacts, moment)
+    return Pressed(nodes, touching, places, np.empty((w, 3)), np.empty(w), force, contacts, moment)
 
 
 @kernel
@@ -61,24 +65,25 @@ def mark_blocks(marks, nodes, value):
 
 @borrowing
 def find_pressed(block, walls, free, returning):
-    """Write the nodes of a block that lie beyond a plane at ``free`` (3 m,), or rebound if any are ``returning``, to
+    """Write the nodes of a block that lie beyond a wall at ``free`` (3 m,), or rebound if any are ``returning``, to
     the walls' room; return their number."""
     first = NODE_BLOCK * block
-    return find_beyond(first, free, walls.flat, walls.flat.room, returning)
+    return find_beyond(first, free, walls.pressed, walls.pressed.room, returning)
 
 
 @kernel
-def place_walls(step, walls, level):
-    """Set the planes that walls reach one step after a step of the batch, and ``level`` (w,), their offsets at its
-    end."""
-    flat, motions, normals = walls.flat, walls.motions, walls.flat.normals
-    for k in range(len(level)):
-        level[k] = flat.offsets[k] = walls.origins[k]
+def place_walls(step, walls):
+    """Set the surfaces that walls reach one step after a step of the batch, and those at its end."""
+    pressed, motions, normals = walls.pressed, walls.motions, walls.at_rest.normals
+    for surfaces, end in ((walls.level, step + 1), (pressed.surfaces, step + 2)):
+        surfaces.offsets[:], surfaces.centres[:] = walls.at_rest.offsets, walls.at_rest.centres
+        for k in range(len(normals)):
+            for c in range(3):
+                surfaces.offsets[k] += normals[k, c] * motions[end, 0, k, c]
+                surfaces.centres[k, c] += motions[end, 0, k, c]
+    for k in range(len(normals)):
         for c in range(3):
-            before, after = motions[step + 1, 0, k, c], motions[step + 2, 0, k, c]
-            level[k] += normals[k, c] * before
-            flat.offsets[k] += normals[k, c] * after
-            flat.way[k, c] = after - before
+            pressed.way[k, c] = motions[step + 2, 0, k, c] - motions[step + 1, 0, k, c]
 
 
 @kernel
@@ -94,10 +99,35 @@ def work_of_walls(step, walls, push, force):
 
 
 @kernel
-def press_block(block, counts, nodes, walls, shared, places_of, out):
+def new_arrivals(m, walls):
+    """Return room for m nodes."""
+    w = len(walls.pressed.way)
+    bounces = w if len(walls.pressed.restitution) > 0 else 0
+    motion = np.empty((m, 3)), np.empty((m, 3)), np.empty(m), np.empty((m, 3), dtype=np.bool_)
+    applies, touching = np.empty((m, w), dtype=np.bool_), np.empty((m, w), dtype=np.bool_)
+    memory = np.empty((m, bounces)), np.empty((m, bounces))
+    return Arrivals(*motion, applies, touching, *memory, np.empty((0, w, 3)), np.empty((0, w)))
+
+
+@borrowing
+def take_contacts(j, i, walls, given):
+    """Set which walls can stop a node i, the j-th one, and what it did in the last step."""
+    pressed, touched = walls.pressed, walls.touched
+    for c in range(3):
+        given.fixed[j, c] = touched.fixed[i, c]
+    for k in range(given.applies.shape[1]):
+        given.applies[j, k] = pressed.all_nodes[k] or pressed.members[i, k]
+        given.touching[j, k] = touched.touching[i, k]
+    for k in range(given.rebound.shape[1]):
+        given.rebound[j, k], given.arrival[j, k] = pressed.rebound[i, k], pressed.arrival[i, k]
+
+
+@kernel
+def press_block(block, counts, nodes, walls, shared, places_of, out, earlier):
     """Press the nodes of a block that :func:`find_pressed` has found, and append them to those of before; ``counts``:
-    their numbers. Return the first node among all of them that is infeasible or, if there is none, jammed, or -1;
-    whether it is jammed; and the energy that friction dissipates [J].
+    their numbers. Return the first node among all of them without a place, or -1, and why, as
+    :func:`~pfem_petsc.contact.explicit.press_nodes` does, with those of ``earlier`` blocks; and the energy that
+    friction dissipates [J].
 
     ``places_of``: positions and increments of the nodes of the block, flat, of which the latter are corrected; ``out``:
     contact forces (n, 3) [N], and Pressed, to which they are written.
@@ -106,15 +136,16 @@ def press_block(block, counts, nodes, walls, shared, places_of, out):
     free, u = places_of
     contact, pressed = out
     first = NODE_BLOCK * block
-    found = walls.flat.room[:m].copy()
-    places, given = np.empty((m, 3)), Arrivals(np.empty((m, 3)), np.empty((m, 3)), np.empty(m))
+    found = walls.pressed.room[:m].copy()
+    places, given = np.empty((m, 3)), new_arrivals(m, walls)
     for j in range(m):
         i = found[j]
         given.stiffness[j] = nodes.stiffness[i]
+        take_contacts(j, i, walls, given)
         for c in range(3):
             places[j, c] = free[3 * (i - first) + c]
             given.start[j, c], given.drift[j, c] = shared.x[i, c], shared.h * shared.half[i, c]
-    infeasible, jammed, offsets, total, touching, rubbed = press_nodes(found, places, given, walls.flat, pressed)
+    failed, why, planes, total, touching, rubbed = press_nodes(places, given, walls.pressed, pressed)
     for j in range(m):
         i = found[j]
         for c in range(3):
@@ -123,20 +154,23 @@ def press_block(block, counts, nodes, walls, shared, places_of, out):
             contact[i, c] += total[j, c]  # rows may press there too
             pressed.places[count + j, c] = places[j, c]
         pressed.nodes[count + j] = i
+        for k in range(given.rebound.shape[1]):
+            walls.pressed.rebound[i, k], walls.pressed.arrival[i, k] = given.rebound[j, k], given.arrival[j, k]
         for k in range(touching.shape[1]):
             pressed.touching[count + j, k] = touching[j, k]
-    if infeasible >= 0:
-        pressed.offsets[:] = offsets[infeasible]
-        return count + infeasible, False, rubbed
-    return count + jammed if jammed >= 0 else -1, jammed >= 0, rubbed
+    at, reason = earlier
+    if failed >= 0 and (at < 0 or why < reason):
+        at, reason = count + failed, why
+        pressed.normals[:], pressed.offsets[:] = planes.normals[failed], planes.offsets[failed]
+    return at, reason, rubbed
 
 
 @kernel
-def stop_at_walls(nodes, walls, level, moved, shared, state, on_walls):
+def stop_at_walls(nodes, walls, moved, shared, state, on_walls):
     """Return the dissipation of contacts that close [J], and the nodes that are on walls afterwards.
 
-    Velocities and accelerations of the state are written at the nodes that touch walls or have touched them; ``level``
-    (w,): offsets of the planes; ``moved``: MovingSupports and the step; ``on_walls``: both kinds of nodes.
+    Velocities and accelerations of the state are written at the nodes that touch walls or have touched them; ``moved``:
+    MovingSupports and the step; ``on_walls``: both kinds of nodes.
     """
     x, half, alpha, eta = shared.x, shared.half, shared.alpha, shared.eta
     u, v, a, contact = state.u, state.v, state.a, state.contact
@@ -145,7 +179,7 @@ def stop_at_walls(nodes, walls, level, moved, shared, state, on_walls):
     for i in around:
         centre(u[i], eta, half[i], v[i])
         accelerations(u[i], alpha, a[i])
-    all_normals, gaps = plane_gaps(around, x, walls.flat.normals, level)
+    normals, gaps = wall_gaps(around, x, walls.level)
     free_v, free_a = unpressed(around, v, a, contact, nodes, alpha, eta)
     put_rates(*moved, nodes, v, a)
     for j in range(len(around)):
@@ -153,10 +187,10 @@ def stop_at_walls(nodes, walls, level, moved, shared, state, on_walls):
         for c in range(3):
             if walls.touched.fixed[i, c]:  # wall forces do not change prescribed components
                 free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
-    still = np.zeros(walls.flat.normals.shape)
+    still = np.zeros(walls.pressed.way.shape)
     rates = walls.motions[moved[1] + 1, 1] if len(walls.motions) > 0 else still
-    approach = Approach(all_normals, gaps, free_v, free_a, rates, still)
-    counted = np.ones(len(walls.flat.offsets), dtype=np.bool_)
+    approach = Approach(normals, gaps, free_v, free_a, rates, still)
+    counted = np.ones(len(still), dtype=np.bool_)
     return stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))
 
 

@@ -131,13 +131,13 @@ class Made(NamedTuple):
     ``done``: number of steps made; ``passed``: those that other ranks make too, of which this one only sends
     messages after a failure; ``recorded``: number of shares of rows; ``lost``: error code of MPI. In the last step:
     ``changed``: number of bars that changed their state of rupture; ``failed``, ``turned``: the first bar that
-    collapsed, and that went through zero length, or -1; ``infeasible``: index in ``near`` of a node that no
-    position satisfies, or -1, with the ``offsets`` of its planes, or if it is ``jammed`` one whose friction was not
-    found; ``unsolved``: whether a call for rows failed; ``force``, ``contacts``, ``moment``: sums of the walls;
-    ``near``: nodes with wall forces, the walls that they are ``touching``, and their ``places``; ``touched``,
-    ``met``: nodes that touch walls, and that have touched them and not left; ``pressing``: number of nodes with
-    contact forces; ``changes``: contacts that closed or opened since the last row; and ``friction``: the energy
-    that it dissipates in the next step [J].
+    collapsed, and that went through zero length, or -1; ``placeless``: index in ``near`` of a node whose place at
+    walls was not found, or -1, and ``why``, see :func:`~pfem_petsc.contact.explicit.press_nodes`, with ``normals`` and
+    ``offsets`` of its planes; ``unsolved``: whether a call for rows failed; ``force``, ``contacts``,
+    ``moment``: sums of the walls; ``near``: nodes with wall forces, the walls that they are ``touching``, and their
+    ``places``; ``touched``, ``met``: nodes that touch walls, and that have touched them and not left; ``pressing``:
+    number of nodes with contact forces; ``changes``: contacts that closed or opened since the last row; and
+    ``friction``: the energy that it dissipates in the next step [J].
     """
 
     done: int
@@ -147,9 +147,10 @@ class Made(NamedTuple):
     changed: int
     failed: int
     turned: int
-    infeasible: int
-    jammed: bool
+    placeless: int
+    why: int
     unsolved: bool
+    normals: np.ndarray
     offsets: np.ndarray
     force: np.ndarray
     contacts: np.ndarray
@@ -264,7 +265,7 @@ def batch_loop(data, touched, met, due, flags):
     grounds, jumps = np.zeros(4), np.zeros((2, 3))
     ledger, powers, impulses, probes, shares = data.ledger, data.powers, data.impulses, data.probes, data.shares
     n = len(half)
-    n_walls = len(walls.flat.offsets)
+    n_walls = len(walls.pressed.way)
     f, a, v, support, contact, u = state.f, state.a, state.v, state.support, state.contact, state.u
     alpha = 1.0 / (h * h)
     eta = 0.5 / h
@@ -304,15 +305,14 @@ def batch_loop(data, touched, met, due, flags):
     room_for, reach = len(planes) // 3, bars.reach
     failed = -1
     turned = -1
-    infeasible = -1
+    placeless, why = -1, 0
     changed = 0
     touching = 0
     done = 0
     passed = 0
     recorded = 0
     changes, friction = data.changes, data.friction
-    travels, bounces, jammed = len(walls.motions) > 0, len(walls.flat.restitution) > 0, False
-    level = walls.flat.offsets.copy()  # of planes at the end of the step
+    travels, bounces = len(walls.motions) > 0, len(walls.pressed.restitution) > 0
     several, stops = messages.reduce_all != 0, False
     agree = several and (bars.can_break or calling)  # ranks that make the same steps
     lost = 0  # error code of MPI
@@ -320,7 +320,7 @@ def batch_loop(data, touched, met, due, flags):
     padded = bars.padded_parts.shape[1] > 0
     shortened = False
     for step in range(count):
-        if failed >= 0 or turned >= 0 or infeasible >= 0:
+        if failed >= 0 or turned >= 0 or placeless >= 0:
             # the other ranks still need messages, until all know of the failure
             lost = start_positions(messages, x, h, half)
             lost = finish_positions(messages, x, before, False) if lost == 0 else lost
@@ -335,7 +335,7 @@ def batch_loop(data, touched, met, due, flags):
             contact[i] = 0.0
         place_supports(moving, step, nodes)
         if travels:
-            place_walls(step, walls, level)
+            place_walls(step, walls)
         ledger[_RUBBED] += friction  # on the way that the balance before has determined
         friction = 0.0
         grounds[:] = 0.0
@@ -441,9 +441,10 @@ def batch_loop(data, touched, met, due, flags):
                         found = find_pressed(over, walls, free, bounces and on_walls[over])
                     if found > 0:
                         counts, out = (found, count_near), (contact, pressed)
-                        at, jam, rubbed = press_block(over, counts, nodes, walls, shared, (free, here), out)
-                        if at >= 0 and (infeasible < 0 or (jammed and not jam)):
-                            infeasible, jammed = at, jam
+                        earlier = placeless, why
+                        placeless, why, rubbed = press_block(
+                            over, counts, nodes, walls, shared, (free, here), out, earlier
+                        )
                         friction += rubbed
                         count_near += found
                     finish_block(over, nodes, shared, forces, start, contact, here)
@@ -476,7 +477,7 @@ def batch_loop(data, touched, met, due, flags):
             clear_sums(lanes[CONTACT], n)
             add_sparse_powers(held, contact, v, lanes[CONTACT])
         if len(touched) > 0 or len(met) > 0:
-            impact, met = stop_at_walls(nodes, walls, level, (moving, step), shared, state, (touched, met))
+            impact, met = stop_at_walls(nodes, walls, (moving, step), shared, state, (touched, met))
         if altered > 0:
             impact += finish_rows(rows, altered, walls.touched.slack, nodes, (moving, step), shared, state)
         if calling and called.counts[1] > 0:
@@ -506,7 +507,7 @@ def batch_loop(data, touched, met, due, flags):
         done += 1
         passed += 1
         stops = changed > 0
-        wrong = failed >= 0 or infeasible >= 0 or unsolved != 0 or not np.isfinite(after[INTERNAL])
+        wrong = failed >= 0 or placeless >= 0 or unsolved != 0 or not np.isfinite(after[INTERNAL])
         wrong = wrong or stops
         looks = wrong or shortened
         if agree:
@@ -566,9 +567,10 @@ def batch_loop(data, touched, met, due, flags):
         changed,
         failed,
         turned,
-        infeasible,
-        jammed,
+        placeless,
+        why,
         unsolved != 0,
+        pressed.normals,
         pressed.offsets,
         pressed.force,
         pressed.contacts,

@@ -8,6 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..contact.fixed_rows import close_rows
+from ..contact.surfaces import wall_gaps
 from ..mechanics.compiled import kernel
 from ..tolerances import ON_BOUND
 
@@ -31,23 +32,6 @@ def join_nodes(met, touched, present):
     for i in met:
         present[i] = False
     return nodes[:count].copy()
-
-
-@kernel
-def plane_gaps(nodes, x, normals, offsets):
-    """Return normals (m, w, 3) and distances (m, w) [m] of nodes (m,) at x (owned, 3) from planes (w, 3), (w,)."""
-    w = len(offsets)
-    every = np.empty((len(nodes), w, 3))
-    gaps = np.empty((len(nodes), w))
-    for j in range(len(nodes)):
-        i = nodes[j]
-        for k in range(w):
-            gap = -offsets[k]
-            for c in range(3):
-                gap += normals[k, c] * x[i, c]
-                every[j, k, c] = normals[k, c]
-            gaps[j, k] = gap
-    return every, gaps
 
 
 class Masses(NamedTuple):
@@ -274,7 +258,7 @@ class Impacts:
             return 0.0
         nodes = join_nodes(self.met, log.last, log.present)
         if contact.plain and not free.any:
-            normals, gaps = plane_gaps(nodes, x, contact.normals, contact.plane_offsets(time))
+            normals, gaps = wall_gaps(nodes, x, contact.surfaces.at(displacements))
         else:
             every = np.ones((len(nodes), len(contact.names)), dtype=bool)
             normals, gaps = contact.distances(every, x[nodes], displacements)

@@ -183,3 +183,15 @@ def test_guided_node_on_an_oblique_wall(integrator, parameters, treatment, resti
     assert last["impact_dissipation"] == pytest.approx(0.5 * mass * (1.0 - leaves**2), abs=1e-12)
     assert abs(last["numerical_dissipation"]) < 2e-6 * mass
     assert abs(last["energy_imbalance"]) < 1e-15
+
+
+def test_rough_cylinders_return_nodes_too(comm, tmp_path):
+    """A bar that falls along a cylinder does not slide, so friction changes nothing."""
+    case = bar("central_differences", {}, {}, velocity=-1.0, gravity=0.0, end=0.3)
+    case["initial"]["velocity"] = [0.0, 0.0, -1.0]
+    roller = {"point": [0.0, 0.0, -0.6005], "axis": [1.0, 0.0, 0.0], "radius": 0.5, "restitution": 0.8, "friction": 0.3}
+    case["wall"] = [{"type": "cylinder", "name": "roller", **roller}]
+    run = simulation(case, comm, tmp_path)
+    for _ in run:
+        pass
+    np.testing.assert_allclose(run.state.v, np.broadcast_to([0.0, 0.0, 0.8], run.state.v.shape), atol=1e-9)

@@ -27,6 +27,15 @@ PLASTIC = {"yield_stress": 100e6, "isotropic_hardening": 1e9, "kinematic_hardeni
 DAMPED = {"it": IT | {"damping": 2e4}}
 FLOOR = {"name": "floor", "type": "plane", "point": [0, 0, -1e-5], "normal": [0.0, 0.1, 1.0]}
 SIDE = {"name": "side", "type": "plane", "point": [0.0201, 0, 0], "normal": [-1.0, 0.0, 0.0], "node_set": "foot"}
+BALL = {"name": "ball", "type": "sphere", "point": [0.008, 0.011, -0.02001], "radius": 0.02}
+ROLLER = {
+    "name": "roller",
+    "type": "cylinder",
+    "point": [0.011, 0.0, -0.03001],
+    "axis": [0.1, 1.0, 0.0],
+    "radius": 0.03,
+}
+SHELL = {"name": "shell", "type": "sphere", "point": [0.01, 0.01, 0.012], "radius": 0.0194, "side": "inside"}
 SECTIONS = {
     "material": {"it": DAMPED["it"] | PLASTIC, "soft": {"young_modulus": 70e9, "density": 2700.0}},
     "section": {"it": {"area": 1e-6, "material": "it"}, "edges": {"area": 2e-6, "material": "soft", "bars": "edges"}},
@@ -105,6 +114,19 @@ SMALL = {
             FLOOR
             | {"friction": 0.4, "motion": [[0, 0, 0, 0], [3.003e-5, 1e-4, 0, 2e-4], [6e-5, 0, 0, -1e-4]]}
             | {"interpolation": "linear"},
+        ],
+    },
+    "on a ball beside a wall": {"wall": [BALL, SIDE | {"node_set": "foot"}]},
+    "on a rough roller": {
+        "material": DAMPED,
+        "wall": [ROLLER | {"friction": 0.3, "static_friction": 0.4, "node_set": "foot"}, FLOOR],
+    },
+    "rebounding in a shell": {"wall": [SHELL | {"restitution": 0.7}]},
+    "pushed by rough curved walls": {
+        "support": [{"node_set": "corner", "fix": "z", "velocity": [0.0, 0.0, -20.0]}],
+        "wall": [
+            BALL | {"friction": 0.2, "velocity": [5.0, 0.0, 9.0], "restitution": 0.5},
+            SHELL | {"friction": 0.1, "motion": [[0, 0, 0, 0], [3.003e-5, 1e-4, 0, 8e-4], [6e-5, 0, 0, 6e-4]]},
         ],
     },
     "breaking": {
@@ -413,6 +435,33 @@ def test_a_failure_is_that_of_single_steps(name, shared_tmp_path):
         texts.append(str(failure.value))
         steps.append(open_result(shared_tmp_path / how).history["step"])
     assert "bar" in texts[0] and texts[0] == texts[1] == texts[2]
+    np.testing.assert_array_equal(steps[0], steps[1])
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", ["turning", "squeezed", "jammed"])
+def test_a_failure_at_curved_walls_is_that_of_single_steps(name, shared_tmp_path):
+    """A ball presses nodes against a floor, and against supports."""
+    ball = BALL | {"node_set": "foot", "point": [0.01, 0.01, 0.0202], "velocity": [0.0, 0.0, -10.0]}
+    floor = FLOOR | {"normal": [0.0, 0.0, 1.0]}
+    changes, text = {
+        "turning": ({"wall": [ball, floor]}, "on curved walls did not converge"),
+        "squeezed": ({"wall": [ball, floor], "support": [{"node_set": "foot", "fix": "xy"}]}, "no position of node"),
+        "jammed": (
+            {
+                "wall": [ball | {"friction": 0.5, "point": [0.01, 0.014, 0.0202]}],
+                "support": [{"node_set": "foot", "fix": "xz"}],
+            },
+            "friction jams node",
+        ),
+    }[name]
+    given, texts, steps = case(changes | {"output": {"fields_every": 0, "history_every": 7}}), [], []
+    for how in ("single", "batches", "general"):
+        with pytest.raises(SimulationFailure) as failure:
+            made(given, shared_tmp_path, how)
+        texts.append(str(failure.value))
+        steps.append(open_result(shared_tmp_path / how).history["step"])
+    assert text in texts[0] and texts[0] == texts[1] == texts[2]
     np.testing.assert_array_equal(steps[0], steps[1])
 
 

@@ -111,6 +111,41 @@ class BaseWall(ABC):
         return np.ones(len(x), dtype=bool)
 
 
+class RoundWall(BaseWall):
+    """The sphere |x - c| = R, or with an axis a the cylinder |(I - a a^T) (x - c)| = R; compiled loops know both, see
+    :func:`~pfem_petsc.contact.surfaces.tangent`.
+
+    Attributes
+    ----------
+    axis : (3,) unit vector, zero for a sphere
+    radius : R [m]; sign : 1.0 if nodes stay outside, -1.0 inside
+    across : (3,) unit vector, the normal at the centre or axis itself
+    """
+
+    def __init__(self, parameters: Any, axis: np.ndarray, across: np.ndarray) -> None:
+        self.centre = np.array(parameters.point, dtype=np.float64)
+        self.axis, self.across = axis, across
+        self.radius = parameters.radius
+        self.sign = 1.0 if parameters.side == "outside" else -1.0
+        self.width = 2.0 * self.radius if self.sign > 0.0 else np.inf
+
+    def _arms(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the vectors from the centre or axis to positions, and their lengths."""
+        arm = x - self.centre
+        arm -= np.multiply.outer(arm @ self.axis, self.axis)
+        return arm, np.linalg.norm(arm, axis=1)
+
+    def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        arm, length = self._arms(x)
+        far = length[:, None] > 1e-12 * self.radius
+        normals = np.where(far, arm / np.maximum(length, 1e-300)[:, None], self.across)
+        offsets = self.sign * (np.einsum("ij,ij->i", normals, x - arm) + self.radius)
+        return self.sign * normals, offsets
+
+    def gaps(self, x: np.ndarray) -> np.ndarray:
+        return self.sign * (self._arms(x)[1] - self.radius)
+
+
 def made_wall(parameters: WallKeys, x: np.ndarray) -> BaseWall:
     """Return the wall of its keys, after a look at what it gives for positions (m, 3) [m].
 

@@ -8,8 +8,7 @@ import numpy as np
 from pydantic import field_validator
 
 from ...case.base import PositiveFloat, Vector3
-from .base import BaseWall, Surface, WallKeys, direction, perpendicular, revolved
-from .sphere import radial_planes
+from .base import RoundWall, Surface, WallKeys, direction, perpendicular, revolved
 
 
 class Parameters(WallKeys):
@@ -30,26 +29,13 @@ class Parameters(WallKeys):
         return direction(value, "the direction of the axis")
 
 
-class Wall(BaseWall):
+class Wall(RoundWall):
     """The cylinder of points at a distance R from its axis."""
 
     def __init__(self, parameters: Parameters) -> None:
-        self.centre = np.array(parameters.point, dtype=np.float64)
         axis = np.array(parameters.axis)
-        self.axis = axis / np.linalg.norm(axis)
-        self.radius = parameters.radius
-        self.sign = 1.0 if parameters.side == "outside" else -1.0
-        self.width = 2.0 * self.radius if self.sign > 0.0 else np.inf
-        self.across = perpendicular(self.axis)
-
-    def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        arm = x - self.centre
-        along = np.multiply.outer(arm @ self.axis, self.axis)
-        return radial_planes(arm - along, self.centre + along, self.radius, self.sign, self.across)
-
-    def gaps(self, x: np.ndarray) -> np.ndarray:
-        arm = x - self.centre
-        return self.sign * (np.linalg.norm(arm - np.multiply.outer(arm @ self.axis, self.axis), axis=1) - self.radius)
+        axis = axis / np.linalg.norm(axis)
+        super().__init__(parameters, axis, perpendicular(axis))
 
 
 def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:

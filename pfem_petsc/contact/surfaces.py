@@ -1,0 +1,103 @@
+"""Planes, spheres and cylinders in compiled loops: normals and distances of nodes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from ..mechanics.compiled import borrowing, inlined, kernel
+from .walls.base import BaseWall, RoundWall
+
+OTHER = np.inf
+"""Radius of walls that are neither flat nor round, which compiled loops do not know."""
+
+
+class Surfaces(NamedTuple):
+    """Walls (w,) where they are at a time.
+
+    Attributes
+    ----------
+    normals : (w, 3) of planes; of round walls at the centre itself
+    offsets : (w,) of planes n . x = d [m]
+    centres, axes : (w, 3) of round walls [m]; the axis is zero for a sphere
+    radii : (w,) positive where nodes stay outside, negative where inside, zero for planes [m]; ``OTHER``
+    """
+
+    normals: np.ndarray
+    offsets: np.ndarray
+    centres: np.ndarray
+    axes: np.ndarray
+    radii: np.ndarray
+
+    @classmethod
+    def of(cls, walls: Sequence[BaseWall]) -> Self:
+        """Return the surfaces of walls at rest."""
+        normals, centres, axes = np.zeros((3, len(walls), 3))
+        made = cls(normals, np.zeros(len(walls)), centres, axes, np.zeros(len(walls)))
+        for k, wall in enumerate(walls):
+            kind = type(wall)
+            if wall.flat:
+                made.normals[k], made.offsets[k] = wall.normal, wall.offset
+            # a class that derives from such a wall may be another surface
+            elif (kind.planes, kind.gaps) == (RoundWall.planes, RoundWall.gaps):
+                made.normals[k], made.axes[k] = wall.sign * wall.across, wall.axis
+                made.centres[k], made.radii[k] = wall.centre, wall.sign * wall.radius
+            else:
+                made.radii[k] = OTHER
+        return made
+
+    def copy(self) -> Self:
+        """Return these surfaces to be moved, see :func:`~pfem_petsc.stepping.batch_contact.place_walls`."""
+        return self._replace(offsets=self.offsets.copy(), centres=self.centres.copy())
+
+    def at(self, displacements: np.ndarray) -> Self:
+        """Return the surfaces of walls with displacements (w, 3) [m]."""
+        offsets = self.offsets + np.einsum("ij,ij->i", self.normals, displacements)
+        return self._replace(offsets=offsets, centres=self.centres + displacements)
+
+
+@inlined
+def is_round(radius):
+    """Return whether a wall with one of the ``radii`` of :class:`Surfaces` is a sphere or a cylinder."""
+    return radius != 0.0 and radius != OTHER
+
+
+@borrowing
+def tangent(k, surfaces, x, y, z):
+    """Return the normal of surface k nearest to a position, and the distance from it [m], negative beyond it."""
+    normals, radius = surfaces.normals, surfaces.radii[k]
+    nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
+    if radius == 0.0:
+        return nx, ny, nz, -surfaces.offsets[k] + nx * x + ny * y + nz * z
+    centres, axes = surfaces.centres, surfaces.axes
+    x -= centres[k, 0]
+    y -= centres[k, 1]
+    z -= centres[k, 2]
+    along = x * axes[k, 0] + y * axes[k, 1] + z * axes[k, 2]
+    x -= along * axes[k, 0]
+    y -= along * axes[k, 1]
+    z -= along * axes[k, 2]
+    length = math.sqrt(x * x + y * y + z * z)
+    side = 1.0 if radius > 0.0 else -1.0
+    if length > 1e-12 * abs(radius):
+        unit = side / length
+        nx, ny, nz = unit * x, unit * y, unit * z
+    return nx, ny, nz, side * length - radius
+
+
+@kernel
+def wall_gaps(nodes, x, surfaces):
+    """Return normals (m, w, 3) and distances (m, w) [m] of nodes (m,) at x (owned, 3) from :class:`Surfaces`."""
+    w = len(surfaces.radii)
+    normals = np.empty((len(nodes), w, 3))
+    gaps = np.empty((len(nodes), w))
+    for j in range(len(nodes)):
+        i = nodes[j]
+        for k in range(w):
+            normals[j, k, 0], normals[j, k, 1], normals[j, k, 2], gaps[j, k] = tangent(
+                k, surfaces, x[i, 0], x[i, 1], x[i, 2]
+            )
+    return normals, gaps

@@ -21,7 +21,7 @@ from ..mesh.ordering import NODE_BLOCK
 from .compiled import address_of, borrowing, borrowing_apart, borrowing_kernel, inlined, kernel
 from .materials.base import Law
 from .runs import Columns, Sweep, add_lower_ends, clear_lower_ends, copy, end_differences, scatter_forces
-from .tuples import CHUNK, ROW, accumulate, bar_value, differ, put, sum_up, take, take_from
+from .tuples import CHUNK, ROW, accumulate, bar_value, differ, put, put_into, sum_up, take, take_from
 
 COLLAPSED_STRETCH = 1e-3  # below this fraction of its rest length a bar is crushed, and no truss model applies
 SHORTENED_STRETCH = math.sqrt(0.8)  # only bars shorter than this are checked for passing through zero length
@@ -586,9 +586,8 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     evaluate, whole_stress = element.evaluate, element.whole_stress
     by_rate, last, n_rows, n_data = law.rate, len(law.internal), len(law.rows), len(law.bar_data)
     variables_of, data_of = take(len(law.internal)), take_from(n_data)
-    add_force, put_new, put_last, changes = accumulate(3), put(len(law.internal)), put(2), differ(len(law.internal))
+    add_force, put_new, put_last = accumulate(3), put_into(len(law.internal)), put_into(2)
     n_energies = len(law.energies)
-    first_new = 4 + n_energies
     sum_densities, nothing = sum_up(n_energies), (0.0,) * n_energies
     put_energies = accumulate(n_energies)
     keeps = n_rows + n_data > 0
@@ -601,8 +600,8 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
             update the history in ``bars.columns.kept``; results as those of :func:`forces`.
 
             ``x`` (n, 3) positions, which are also in ``bars.planes`` (3 stride,) from node ``base`` on; ``work``: the
-            forces on the lower ends of the bars of a block of nodes by components, the sums of energies if the loop
-            ``counts`` them, and new history.
+            forces on the lower ends of the bars of a block of nodes by components, and the sums of energies if the loop
+            ``counts`` them.
             """
             failed = -1
             shortened = False
@@ -630,7 +629,6 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                 x0, x1 = node - base, np.int64(fars[group]) - base
                 y0, y1, z0, z1 = x0 + stride, x1 + stride, x0 + 2 * stride, x1 + 2 * stride
                 short = False
-                changed = 0
                 for i in range(n):
                     rest = rests[first + i]
                     real = rest > 0.0
@@ -659,15 +657,11 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                     sums[np.uint64(y1 + i)] += pull * dy
                     sums[np.uint64(z1 + i)] += pull * dz
                     if n_rows > 0:
-                        put_new(work, first_new * ROW + i, new)
-                        changed += 1 if real and (by_rate or changes(new, q)) else 0
+                        put_new(kept, 0, first + i, new)
                         if can_break:
                             broke += 1 if real and new[gone] != q[gone] else 0
                     if by_rate:
-                        put_last(work, (first_new + last) * ROW + i, (strain, whole_stress(stress, q)))
-                if n_rows > 0 and changed > 0:
-                    for j in range(n_rows):
-                        copy(work[(first_new + j) * ROW :], kept[j][first : first + n])
+                        put_last(kept, last, first + i, (strain, whole_stress(stress, q)))
                 if short:
                     at, inverted = find_short(x, data.sweep, columns, group, rupture)
                     failed = at if failed < 0 else failed

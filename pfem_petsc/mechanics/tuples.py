@@ -56,6 +56,13 @@ def put(count: int) -> Callable[..., Any]:
     return written_out("def function(rows, at, values):\n    pass<\n    rows[at + {jC}] = values[{j}]>", count)
 
 
+def put_into(count: int) -> Callable[..., Any]:
+    """Make a function that writes a tuple to ``rows[first, k]``, ``rows[first + 1, k]``, ..."""
+    return written_out(
+        "def function(rows, first, k, values):\n    pass<\n    rows[first + {j}, k] = values[{j}]>", count
+    )
+
+
 def accumulate(count: int) -> Callable[..., Any]:
     """Make a function that adds ``factor`` times a tuple to what :func:`put` would overwrite."""
     text = "def function(rows, at, factor, values):\n    pass<\n    rows[at + {jC}] += factor * values[{j}]>"

@@ -16,6 +16,8 @@ plastic dissipation, which is nonnegative. The work of (s0 + s1)/2 would be less
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba.extending import register_jitable
 
@@ -62,13 +64,13 @@ def response(strain, rate, step, temperature, p, q):
     relative = stress - kinematic * plastic
     excess = abs(relative) - (yield_stress + isotropic * accumulated)
     if excess > 0.0:
-        flow = excess * inverse
-        accumulated += flow
-        if relative < 0.0:
-            flow = -flow
-        plastic += flow
-        stress -= young * flow
         tangent = young * (isotropic + kinematic) * inverse
+    # in loops over several bars at once a maximum and a sign take less time than conditions
+    flow = max(excess, 0.0) * inverse
+    accumulated += flow
+    flow = math.copysign(flow, relative)
+    plastic += flow
+    stress -= young * flow
     hardening = 0.5 * (isotropic * accumulated * accumulated + kinematic * plastic * plastic)
     elastic = 0.5 * stress * (strain - plastic)
     return stress, tangent, (plastic, accumulated), (elastic, yield_stress * accumulated, hardening)

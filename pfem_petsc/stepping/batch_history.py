@@ -22,6 +22,7 @@ from .ledger_loops import (
     LANES,
     WORKS,
     add_ends,
+    add_free_ends,
     add_powers,
     spread,
 )
@@ -98,6 +99,13 @@ def end_block(block, how, nodes, shared, state, forces, probed):
     last = min(first + NODE_BLOCK, len(shared.half))
     wide = 3 * (last - first)
     u, left, force = ends.u[:wide], ends.left[:wide], forces.reshape(-1)
+    x, half = shared.x[first:last].reshape(-1), shared.half[first:last].reshape(-1)
+    held = nodes.support_starts[block] < nodes.support_starts[block + 1]
+    probes = probed[0].starts[block] < probed[0].starts[block + 1]
+    if alone and not (keep or held or probes or len(nodes.external) > 0):
+        given = shared.inverses[first:last], half, force, x, nodes.mass[first:last]
+        add_free_ends(given, (h, alpha, eta), lanes)
+        return
     if alone:
         spread(shared.inverses[first:last], u)
         if len(nodes.external) > 0:
@@ -111,7 +119,6 @@ def end_block(block, how, nodes, shared, state, forces, probed):
             u[3 * (nodes.support_nodes[k] - first) + nodes.support_components[k]] = shared.held[k]
     else:
         copy(state.u[first:last].reshape(-1), u)
-    x, half = shared.x[first:last].reshape(-1), shared.half[first:last].reshape(-1)
     add_ends((u, half, force, x, nodes.mass[first:last]), (h, alpha, eta), lanes)
     if len(nodes.external) > 0 or len(nodes.damping) > 0:
         for j in range(wide):

@@ -6,7 +6,8 @@ vectorised and a sum over blocks of nodes has the bits of a sum over all nodes.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -153,39 +154,49 @@ class EndArrays(NamedTuple):
     left: np.ndarray
 
 
-@borrowing_apart
-def add_ends(given, numbers, lanes):
-    """Add what the ledger needs of the end of a step at consecutive nodes: the works of inertia and of internal forces
-    over half the step, kinetic energy and momenta.
+def _ends_loop(free: bool) -> Callable[..., Any]:
+    """Make the loop over nodes that adds up the end of a step; at ``free`` nodes internal forces alone determine the
+    increments."""
 
-    ``given``: increments (3 n,), velocities half a step later, internal forces and positions, (3 n,) too, and masses
-    (n,); ``numbers``: h, alpha and eta. The sums are without factors, see :func:`sum_ends`.
-    """
-    u, half, force, x, mass = given
-    h, alpha, eta = numbers
-    sums = lanes[_SUMS]
-    back = 0.5 * h * alpha
-    internal = inertial = kinetic = 0.0
-    p0 = p1 = p2 = q0 = q1 = q2 = m0 = m1 = m2 = 0.0
-    for i in range(len(mass)):
-        # unsigned: negative indices need not be handled
-        a, b, c = np.uint64(3 * i), np.uint64(3 * i + 1), np.uint64(3 * i + 2)
-        m, place = mass[i], (x[a], x[b], x[c])
-        u0, u1, u2 = u[a], u[b], u[c]
-        v0, v1, v2 = half[a] - eta * u0, half[b] - eta * u1, half[c] - eta * u2
-        work = force[a] * (v0 - back * u0) + force[b] * (v1 - back * u1) + force[c] * (v2 - back * u2)
-        momentum = m * v0, m * v1, m * v2
-        angular = turn(place, momentum)
-        internal = add_freely(internal, work)
-        inertial = add_freely(inertial, m * (u0 * u0 + u1 * u1 + u2 * u2))
-        kinetic = add_freely(kinetic, momentum[0] * v0 + momentum[1] * v1 + momentum[2] * v2)
-        p0, p1, p2 = add_freely(p0, momentum[0]), add_freely(p1, momentum[1]), add_freely(p2, momentum[2])
-        q0, q1, q2 = add_freely(q0, angular[0]), add_freely(q1, angular[1]), add_freely(q2, angular[2])
-        m0, m1, m2 = add_freely(m0, m * place[0]), add_freely(m1, m * place[1]), add_freely(m2, m * place[2])
-    inertial *= alpha * alpha
-    found = internal, inertial, kinetic, p0, p1, p2, q0, q1, q2, m0, m1, m2
-    for k in range(_N_SUMS):
-        sums[k] += found[k]
+    @borrowing_apart
+    def add_ends(given, numbers, lanes):
+        """Add what the ledger needs of the end of a step at consecutive nodes: the works of inertia and of internal
+        forces over half the step, kinetic energy and momenta.
+
+        ``given``: increments (3 n,), of free nodes the inverse stiffness of the balance (n,) instead; velocities half a
+        step later, internal forces and positions, (3 n,) too, and masses (n,); ``numbers``: h, alpha and eta. The sums
+        are without factors, see :func:`sum_ends`.
+        """
+        u, half, force, x, mass = given
+        h, alpha, eta = numbers
+        sums = lanes[_SUMS]
+        back = 0.5 * h * alpha
+        internal = inertial = kinetic = 0.0
+        p0 = p1 = p2 = q0 = q1 = q2 = m0 = m1 = m2 = 0.0
+        for i in range(len(mass)):
+            # unsigned: negative indices need not be handled
+            a, b, c = np.uint64(3 * i), np.uint64(3 * i + 1), np.uint64(3 * i + 2)
+            m, place, (f0, f1, f2) = mass[i], (x[a], x[b], x[c]), (force[a], force[b], force[c])
+            u0, u1, u2 = (-f0 * u[i], -f1 * u[i], -f2 * u[i]) if free else (u[a], u[b], u[c])
+            v0, v1, v2 = half[a] - eta * u0, half[b] - eta * u1, half[c] - eta * u2
+            work = f0 * (v0 - back * u0) + f1 * (v1 - back * u1) + f2 * (v2 - back * u2)
+            momentum = m * v0, m * v1, m * v2
+            angular = turn(place, momentum)
+            internal = add_freely(internal, work)
+            inertial = add_freely(inertial, m * (u0 * u0 + u1 * u1 + u2 * u2))
+            kinetic = add_freely(kinetic, momentum[0] * v0 + momentum[1] * v1 + momentum[2] * v2)
+            p0, p1, p2 = add_freely(p0, momentum[0]), add_freely(p1, momentum[1]), add_freely(p2, momentum[2])
+            q0, q1, q2 = add_freely(q0, angular[0]), add_freely(q1, angular[1]), add_freely(q2, angular[2])
+            m0, m1, m2 = add_freely(m0, m * place[0]), add_freely(m1, m * place[1]), add_freely(m2, m * place[2])
+        inertial *= alpha * alpha
+        found = internal, inertial, kinetic, p0, p1, p2, q0, q1, q2, m0, m1, m2
+        for k in range(_N_SUMS):
+            sums[k] += found[k]
+
+    return add_ends
+
+
+add_ends, add_free_ends = _ends_loop(False), _ends_loop(True)
 
 
 @kernel

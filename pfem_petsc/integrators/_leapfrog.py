@@ -6,9 +6,20 @@ The loops run over arrays (3 n,), so that they are vectorised.
 
 from __future__ import annotations
 
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import borrowing_apart, kernel
 
-__all__ = ["accelerations", "advance", "advance_loaded", "centre", "drift", "finish", "kick", "move"]
+__all__ = [
+    "accelerations",
+    "advance",
+    "advance_loaded",
+    "advance_solved",
+    "centre",
+    "drift",
+    "finish",
+    "kick",
+    "move",
+    "solve",
+]
 
 
 @kernel
@@ -91,4 +102,28 @@ def advance_loaded(f, external, inverse, numbers, half, v, sums):
             u = (load[j] - force[j]) * factor[j]
             ahead[j] += h * (alpha * u)
             speed[j] = ahead[j] - eta * u
+            sums[j] += force[j] * speed[j]
+
+
+@borrowing_apart
+def solve(inverse, x, h, half, u, free):
+    """Multiply forces ``u`` by ``inverse``, and compute the positions that the balance reaches, ``free`` = x + h half +
+    u."""
+    for j in range(len(u)):
+        step = u[j] * inverse[j]
+        u[j] = step
+        free[j] = x[j] + h * half[j] + step
+
+
+@borrowing_apart
+def advance_solved(u, f, numbers, half, v, sums):
+    """As :func:`advance` with the increments ``u`` of a balance; writes ``v``."""
+    alpha, eta, h = numbers
+    wide = len(sums)
+    for first in range(0, len(u), wide):
+        last = min(first + wide, len(u))
+        step, force, ahead, speed = u[first:last], f[first:last], half[first:last], v[first:last]
+        for j in range(len(step)):
+            ahead[j] += h * (alpha * step[j])
+            speed[j] = ahead[j] - eta * step[j]
             sums[j] += force[j] * speed[j]

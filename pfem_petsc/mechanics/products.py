@@ -71,7 +71,8 @@ class BarProducts:
         self._padded = [pad(block.sweep) for block in bars.blocks]
         some = any(padded is not None for padded in self._padded)
         count = nodes if some else 0
-        self._planes = (*new_planes(count), new_planes(count)[0])
+        places, sums = new_planes(count)
+        self._planes = places, new_planes(count)[0], sums
 
     @classmethod
     def tangent(cls, bars: Bars, x: np.ndarray) -> BarProducts:

@@ -15,25 +15,34 @@ from .tuples import CHUNK, ROW
 _LINE = LANES = 8  # numbers in a line of the cache, and of a vector
 
 
-def aligned(count: int) -> np.ndarray:
-    """Return ``count`` zeros, aligned to lines of the cache."""
-    room = np.zeros(count + _LINE)
-    first = -(room.ctypes.data // room.itemsize) % _LINE
+PAGE = 512
+"""Numbers in a page of memory. Loads wait for earlier stores to other arrays whose addresses end with the bits of a
+place in a page. What a loop over padded runs reads and writes at the same time therefore begins at different thirds:
+positions and other vectors, a workspace, and sums of forces."""
+
+_VECTORS, _WORKSPACE, _SUMS = 0, 168, 336
+
+
+def aligned(count: int, place: int | None = None) -> np.ndarray:
+    """Return ``count`` zeros, aligned to lines of the cache, or that begin at a ``place`` in a page."""
+    wide = _LINE if place is None else PAGE
+    room = np.zeros(count + wide)
+    first = ((place or 0) - room.ctypes.data // room.itemsize) % wide
     return room[first : first + count]
 
 
 def new_planes(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return planes (3 stride,) for positions and forces of ``nodes`` nodes, and for columns without a bar beyond them;
-    aligned to lines of the cache."""
+    """Return planes (3 stride,) for positions and forces of ``nodes`` nodes, and for columns without a bar beyond
+    them."""
     stride = -(-nodes // _LINE) * _LINE + 2 * _LINE if nodes else 0
-    return aligned(3 * stride), aligned(3 * stride)
+    return aligned(3 * stride, _VECTORS), aligned(3 * stride, _SUMS)
 
 
 @inlined
 def new_rows(count):
-    """Return ``count`` rows of a workspace in one array, aligned to lines of the cache; not initialised."""
-    room = np.empty(count * ROW + _LINE)
-    return room[-(room.ctypes.data // 8) % _LINE :]
+    """Return ``count`` rows of a workspace in one array, which begins at its place in a page; not initialised."""
+    room = np.empty(count * ROW + PAGE)
+    return room[(_WORKSPACE - room.ctypes.data // 8) % PAGE :]
 
 
 @borrowing

@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..integrators._leapfrog import advance, advance_loaded, centre, drift, kick, move
+from ..integrators._leapfrog import advance, advance_loaded, advance_solved, drift, move, solve
 from ..mechanics.compiled import borrowing, calls, kernel
 from ..mechanics.elements import PULLED, clear_energies, sum_energies
-from ..mechanics.runs import join_components, new_rows, split_components
+from ..mechanics.runs import PAGE, join_components, new_rows, split_components
 from ..mechanics.tuples import ROW
 from ..mesh.ordering import NODE_BLOCK
 from .batch_supports import add_springs
-from .ledger_loops import INTERNAL, REACTIONS, EndArrays, add_drags, add_loads, add_powers, add_sparse_forces, spread
+from .ledger_loops import INTERNAL, REACTIONS, EndArrays, add_drags, add_loads, add_sparse_forces, spread
 
 
 class BarArrays(NamedTuple):
@@ -196,7 +196,6 @@ def solve_block(block, nodes, shared, f, start, free, u):
     where, speed = shared.x[first:last].reshape(-1), shared.half[first:last].reshape(-1)
     force = f[first - start : last - start].reshape(-1)
     factor = shared.factors[: len(u)]
-    damped = len(nodes.damping) > 0
     if len(nodes.external) > 0:
         given = nodes.external[first:last].reshape(-1)
         for j in range(len(u)):
@@ -204,21 +203,19 @@ def solve_block(block, nodes, shared, f, start, free, u):
     else:
         for j in range(len(u)):
             u[j] = -force[j]
-    if damped:
+    if len(nodes.damping) > 0:
         spread(nodes.damping[first:last], factor)
         for j in range(len(u)):
             u[j] -= factor[j] * speed[j]
     spread(shared.inverses[first:last], factor)
-    for j in range(len(u)):
-        u[j] *= factor[j]
-        free[j] = where[j] + h * speed[j]
+    solve(factor, where, h, speed, u, free)
     for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
         i = nodes.support_nodes[k]
         j = 3 * (i - first) + nodes.support_components[k]
         shared.load[k] = nodes.stiffness[i] * u[j]
-        u[j] = shared.held[k] = nodes.support_positions[k] - free[j]
-    for j in range(len(u)):
-        free[j] += u[j]
+        drifted = where[j] + h * speed[j]
+        u[j] = shared.held[k] = nodes.support_positions[k] - drifted
+        free[j] = drifted + u[j]
 
 
 @borrowing
@@ -256,9 +253,8 @@ def finish_block(block, nodes, shared, f, start, contact, u):
         stiffness = nodes.stiffness[i]
         support[i, c] = stiffness * u[3 * (i - first) + c] - shared.load[k] - contact[i, c]
     ahead, here = shared.half[first:last].reshape(-1), shared.speeds[: len(u)]
-    kick(u, alpha, shared.h, ahead)
-    centre(u, eta, ahead, here)
-    add_powers(f[first - start : last - start].reshape(-1), here, lanes[INTERNAL])
+    force = f[first - start : last - start].reshape(-1)
+    advance_solved(u, force, (alpha, eta, shared.h), ahead, here, lanes[INTERNAL])
     add_sparse_forces(begin, end, nodes.support_nodes, nodes.support_components, support, lanes[REACTIONS])
     if len(nodes.external) > 0:
         add_loads(nodes.external[first:last].reshape(-1), here, lanes)
@@ -315,8 +311,9 @@ def pull_again(x, n_blocks, bars, springs, f, work, sums):
 
 @kernel
 def new_work(sections, rows):
-    """Return workspaces of some rows for each section, aligned; not initialised."""
-    return new_rows(sections * rows)[: sections * rows * ROW].reshape(sections, rows * ROW)
+    """Return workspaces of some rows for each section, each at its place in a page; not initialised."""
+    pages = -(-rows * ROW // PAGE)
+    return new_rows(sections * pages)[: sections * pages * PAGE].reshape(sections, pages * PAGE)
 
 
 @borrowing

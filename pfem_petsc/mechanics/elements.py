@@ -643,11 +643,11 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                     q = variables_of(kept, first + i)
                     before = kept[last, first + i] if by_rate else 0.0
                     p = data.parameters + data_of(kept, n_rows, first + i) if n_data else data.parameters
-                    area = bar_value(columns.area, first + i) if real else 0.0
+                    area = bar_value(columns.area, first + i)
                     bar = Bar(rest, 0.0, 0.0, area, p, before, 0.0, q)
                     strain, slope, _, stress, _, new, densities = evaluate(stretch, bar, step)
                     if counts:
-                        stored = sum_densities(stored, real, area * rest, densities)
+                        stored = sum_densities(stored, real if keeps else True, area * rest, densities)
                     pull = area * stress * slope * inverse
                     if keeps:
                         pull = pull if real else 0.0

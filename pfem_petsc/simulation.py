@@ -128,7 +128,7 @@ class Simulation(WithEquations):
             self.close()
         else:
             self._closed = True
-            self._leave("failed")
+            self._leave("failed", error)
 
     def close(self) -> None:
         """Close the results, free PETSc objects, restore signal handlers and unlock the folder. Collective.
@@ -264,8 +264,8 @@ class Simulation(WithEquations):
                 self.outputs.open(self.restart, self.notes)
                 instrument(self)
                 self.outputs.record_start()
-        except PfemError:
-            self._finish("failed")
+        except PfemError as error:
+            self._finish("failed", error)
             raise
 
     def __iter__(self) -> Iterator[Step]:
@@ -313,13 +313,13 @@ class Simulation(WithEquations):
             except (GeneratorExit, EarlyStop):
                 self._finish("stopped")
                 raise
-            except PfemError:
-                self._finish("failed")
+            except PfemError as error:
+                self._finish("failed", error)
                 raise
-            except BaseException:
+            except BaseException as error:
                 # only one rank may be here, so collective operations are not safe
                 end = self._finish if self.comm.size == 1 else self._leave
-                end("failed")
+                end("failed", error)
                 raise
 
     def _advance(self, most: int = 1) -> Step:
@@ -329,17 +329,17 @@ class Simulation(WithEquations):
         self._synchroniser.stop.stepped = True
         return self.outputs.after(made)
 
-    def _finish(self, outcome: str) -> None:
+    def _finish(self, outcome: str, error: BaseException | None = None) -> None:
         """Close the results and unlock the folder. Collective."""
         try:
             self.outputs.close(outcome)
         finally:
-            self._leave(outcome)
+            self._leave(outcome, error)
             self._synchroniser.lock.release()
 
-    def _leave(self, outcome: str) -> None:
+    def _leave(self, outcome: str, error: BaseException | None = None) -> None:
         """Clean up without communication; the folder stays locked until the process ends, as others may be writing."""
-        self.outputs.leave(outcome)
+        self.outputs.leave(outcome, error)
         if self.restart is not None:
             self.restart.file.close()
         self._synchroniser.stop.release()

@@ -333,7 +333,7 @@ class ConstraintSet:
                 raise InputError(
                     f"{self.source}: contact_pair {self.names[table]!r}: nodes {' and '.join(numbers)} start "
                     f"{-depth:.6g} m beyond each other; reverse the direction, which points from the first to the "
-                    "second, or move the mesh"
+                    "second, reduce 'gap', or move the mesh"
                 )
             raise InputError(
                 f"{self.source}: constraint {self.names[table]!r}: nodes {', '.join(numbers)} start {-depth:.6g} m "

@@ -245,8 +245,9 @@ def check_start(contact: Contact, x: np.ndarray, length: float, adjusts: bool = 
     if found is not None:
         depth, node, wall, count = found
         remedy = "let 'adjust = true' move the nodes" if adjusts else "let an earlier stage move the nodes"
+        side = "turn the normal to the allowed side" if contact.flat[wall] else "choose the other 'side'"
         raise InputError(
             f"{contact.source}: wall {contact.names[wall]!r}: node {node} starts {depth:.6g} "
             f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "
-            f"turn the normal to the allowed side, name the nodes that it applies to with 'node_set', or {remedy}"
+            f"{side}, name the nodes that it applies to with 'node_set', or {remedy}"
         )

@@ -203,12 +203,20 @@ class Progress:
         with contextlib.suppress(OSError):  # it is in the log
             self._show(f"warning: {text}", sys.stderr, style="yellow")
 
-    def close(self, outcome: str = "done") -> None:
-        """Print the state at the end, the wall time and the speed; a second call does nothing."""
+    def close(
+        self, outcome: str = "done", reached: tuple[int, float] | None = None, error: BaseException | None = None
+    ) -> None:
+        """Print the state at the end, the wall time and the speed; a second call does nothing.
+
+        ``reached``: number and time of the last step, the one that failed included, if it was not reported; ``error``:
+        what ended the run, for the log.
+        """
         if not self._root or self._closed:
             return
         self._closed = True
         now = self._clock()
+        if reached is not None:
+            self._last = (*reached, *self._last[2:])
         step, time, *_ = self._last
         self._draw()
         if self._bar is not None:
@@ -218,7 +226,7 @@ class Progress:
         if step > self._marked[1]:
             self._write(self._line(now))
         wall, steps = now - self._begin, step - self._span.first_step
-        text = f"{outcome}: {steps:,} steps in {duration(wall)}"
+        text = f"{outcome}: {steps:,} step{'' if steps == 1 else 's'} in {duration(wall)}"
         if self._compiling >= 0.1:
             text += f", including {duration(self._compiling)} for compiling"
         if steps and wall > self._compiling:
@@ -227,6 +235,8 @@ class Progress:
         if self._newton:
             text += f", {self._newton:,} Newton and {self._linear:,} linear iterations"
         self._write(text)
+        if error is not None:
+            self._log_line(f"error: {error}", "ERROR")
         if self._log is not None:
             self._log.close()
 

@@ -493,7 +493,8 @@ class Outputs:
             if outcome == "done":
                 raise
 
-    def leave(self, outcome: str) -> None:
-        """Close the progress report. Not collective."""
+    def leave(self, outcome: str, error: BaseException | None = None) -> None:
+        """Close the progress report, with the ``error`` that ended the run. Not collective."""
         if self.progress is not None:
-            self.progress.close(outcome)
+            reached = (self._stepper.number, self._stepper.place) if outcome == "failed" else None
+            self.progress.close(outcome, reached, error)

@@ -590,7 +590,7 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     n_energies = len(law.energies)
     sum_densities, nothing = sum_up(n_energies), (0.0,) * n_energies
     put_energies = accumulate(n_energies)
-    keeps = n_rows + n_data > 0
+    masks = n_rows + n_data > 0 or not law.relaxed  # whether columns without a bar would give forces
     rupture, can_break, gone = law.rupture, law.rupture >= 0, max(law.rupture, 0)
 
     def make(counts: bool) -> Callable[..., Any]:
@@ -647,9 +647,9 @@ def _padded_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
                     bar = Bar(rest, 0.0, 0.0, area, p, before, 0.0, q)
                     strain, slope, _, stress, _, new, densities = evaluate(stretch, bar, step)
                     if counts:
-                        stored = sum_densities(stored, real if keeps else True, area * rest, densities)
+                        stored = sum_densities(stored, real if masks else True, area * rest, densities)
                     pull = area * stress * slope * inverse
-                    if keeps:
+                    if masks:
                         pull = pull if real else 0.0
                     pull = pull if stretch > COLLAPSED_STRETCH else 0.0
                     add_force(lower, i, -pull, (dx, dy, dz))

@@ -25,7 +25,18 @@ def plugin_files(comm, shared_tmp_path):
 
 
 @pytest.fixture
-def examples(monkeypatch, comm, plugin_files):
+def own_registry(monkeypatch):
+    """A registry of plugins of the test's own."""
+    monkeypatch.setattr(registry, "_plugins", {package: {} for package in registry.KINDS})
+    monkeypatch.setattr(registry, "_sources", {})
+    yield
+    for package, modules in registry._plugins.items():
+        for name in modules:
+            sys.modules.pop(f"{package}.{name}", None)
+
+
+@pytest.fixture
+def examples(monkeypatch, comm, plugin_files, own_registry):
     """The examples' modules and their case, found by name."""
     cases = plugin_files / "cases"
     if comm.rank == 0:
@@ -33,11 +44,5 @@ def examples(monkeypatch, comm, plugin_files):
         shutil.copy(plugin_files / "polygon_spin.toml", cases)
     comm.Barrier()
     monkeypatch.setattr(toml, "FOLDER", cases)
-    monkeypatch.setattr(registry, "_plugins", {package: {} for package in registry.KINDS})
-    monkeypatch.setattr(registry, "_sources", {})
     for path in sorted(plugin_files.glob("*.py")):
         registry.add_plugin(path)
-    yield
-    for package, modules in registry._plugins.items():
-        for name in modules:
-            sys.modules.pop(f"{package}.{name}", None)

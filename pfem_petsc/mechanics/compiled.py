@@ -20,6 +20,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from llvmlite import ir
 from llvmlite.binding import ObjectFileRef, add_symbol, parse_bitcode
 from numba.core import errors, event, types
 from numba.core.caching import CompileResultCacheImpl
@@ -271,6 +272,21 @@ def calls(result: types.Tuple) -> Callable[..., Any]:
         return result(types.int64, arguments), generate
 
     return call
+
+
+def generate_call(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    """Generate a call of a C function at an address with numbers, handles, which are pointers or integers of the same
+    size, and pointers to arrays; for an intrinsic, whose first argument is the address."""
+    address, *given = values
+    arguments = [
+        builder.bitcast(context.make_array(kind)(context, builder, value).data, ir.IntType(8).as_pointer())
+        if isinstance(kind, types.Array)
+        else value
+        for kind, value in zip(signature.args[1:], given, strict=True)
+    ]
+    result = context.get_value_type(signature.return_type)
+    kind = ir.FunctionType(result, [argument.type for argument in arguments])
+    return builder.call(builder.inttoptr(address, kind.as_pointer()), arguments)
 
 
 def address_of(function: Callable[..., Any], kinds: tuple[types.Type, ...], result: types.Tuple) -> int:

@@ -32,14 +32,15 @@ class WallArrays(NamedTuple):
 
 
 class Pressed(NamedTuple):
-    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` for all blocks of a step: room for ``nodes`` (n,),
-    the walls that they are ``touching`` (n, w), their ``places`` (n, 3); planes, ``normals`` (w, 3) and ``offsets``
-    (w,), of a node without a place; and the sums of each wall, ``force`` (w, 3), ``contacts`` (w,) and ``moment`` (w,
-    3)."""
+    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` for all blocks of a step: room for ``nodes``
+    (n,), the walls that they are ``touching`` (n, w), their ``places`` (n, 3); ``failure`` (2,): the first of them
+    without a place, or -1, and why, and its planes, ``normals`` (w, 3) and ``offsets`` (w,); and the sums of each
+    wall, ``force`` (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
 
     nodes: np.ndarray
     touching: np.ndarray
     places: np.ndarray
+    failure: np.ndarray
     normals: np.ndarray
     offsets: np.ndarray
     force: np.ndarray
@@ -53,7 +54,8 @@ def new_pressed(n, w):
     nodes = np.empty(n if w > 0 else 0, dtype=np.int64)
     touching, places = np.empty((len(nodes), w), dtype=np.bool_), np.empty((len(nodes), 3))
     force, contacts, moment = np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3))
-    return Pressed(nodes, touching, places, np.empty((w, 3)), np.empty(w), force, contacts, moment)
+    failure = np.full(2, -1, dtype=np.int64)
+    return Pressed(nodes, touching, places, failure, np.empty((w, 3)), np.empty(w), force, contacts, moment)
 
 
 @kernel
@@ -123,11 +125,9 @@ def take_contacts(j, i, walls, given):
 
 
 @kernel
-def press_block(block, counts, nodes, walls, shared, places_of, out, earlier):
+def press_block(block, counts, nodes, walls, shared, places_of, out):
     """Press the nodes of a block that :func:`find_pressed` has found, and append them to those of before; ``counts``:
-    their numbers. Return the first node among all of them without a place, or -1, and why, as
-    :func:`~pfem_petsc.contact.explicit.press_nodes` does, with those of ``earlier`` blocks; and the energy that
-    friction dissipates [J].
+    their numbers. Return the energy that friction dissipates [J].
 
     ``places_of``: positions and increments of the nodes of the block, flat, of which the latter are corrected; ``out``:
     contact forces (n, 3) [N], and Pressed, to which they are written.
@@ -158,11 +158,10 @@ def press_block(block, counts, nodes, walls, shared, places_of, out, earlier):
             walls.pressed.rebound[i, k], walls.pressed.arrival[i, k] = given.rebound[j, k], given.arrival[j, k]
         for k in range(touching.shape[1]):
             pressed.touching[count + j, k] = touching[j, k]
-    at, reason = earlier
-    if failed >= 0 and (at < 0 or why < reason):
-        at, reason = count + failed, why
+    if failed >= 0 and (pressed.failure[0] < 0 or why < pressed.failure[1]):
+        pressed.failure[0], pressed.failure[1] = count + failed, why
         pressed.normals[:], pressed.offsets[:] = planes.normals[failed], planes.offsets[failed]
-    return at, reason, rubbed
+    return rubbed
 
 
 @kernel

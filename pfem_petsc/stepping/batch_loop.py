@@ -6,10 +6,9 @@ over a block are in ``batch_blocks.py``, ``batch_contact.py`` and ``batch_histor
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
@@ -17,7 +16,7 @@ from ..columns import BAR_ENERGIES, HEAD, PROBED
 from ..contact.fixed_rows import pressed_nodes, solve_rows
 from ..contact.node_walls import compare_contacts
 from ..integrators._leapfrog import accelerations, centre
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import generate_call, kernel
 from ..mechanics.elements import first_inverted
 from ..mechanics.loads import LoadSchedule, set_forces
 from ..mechanics.runs import copy, slide_planes
@@ -169,39 +168,22 @@ _PUSHED, _RUBBED, _IMPACT = map(HEAD.first, ("contact_work", "friction_dissipati
 _ENERGIES, _PROBED = len(BAR_ENERGIES), len(PROBED)
 
 
-_CODE, _BYTES = ir.IntType(32), ir.IntType(8).as_pointer()
-
-
-def _call(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    """Generate a call of a function of MPI at an address with numbers, handles, which are pointers or integers of the
-    same size, and pointers to arrays."""
-    address, *given = values
-    arguments = [
-        builder.bitcast(context.make_array(kind)(context, builder, value).data, _BYTES)
-        if isinstance(kind, types.Array)
-        else value
-        for kind, value in zip(signature.args[1:], given, strict=True)
-    ]
-    kind = ir.FunctionType(_CODE, [argument.type for argument in arguments])
-    return builder.call(builder.inttoptr(address, kind.as_pointer()), arguments)
-
-
 @intrinsic
 def _start_all(typingctx, address, count, requests):  # noqa: ANN001, ANN201
     """Call ``MPI_Startall`` at an address; return its error code."""
-    return types.int32(types.int64, types.int32, requests), _call
+    return types.int32(types.int64, types.int32, requests), generate_call
 
 
 @intrinsic
 def _wait_all(typingctx, address, count, requests, statuses):  # noqa: ANN001, ANN201
     """Call ``MPI_Waitall`` at an address; return its error code."""
-    return types.int32(types.int64, types.int32, requests, statuses), _call
+    return types.int32(types.int64, types.int32, requests, statuses), generate_call
 
 
 @intrinsic
 def _reduce_all(typingctx, address, mine, every, count, kind, operation, comm):  # noqa: ANN001, ANN201
     """Call ``MPI_Allreduce`` at an address; return its error code."""
-    return types.int32(types.int64, mine, every, types.int32, types.int64, types.int64, types.int64), _call
+    return types.int32(types.int64, mine, every, types.int32, types.int64, types.int64, types.int64), generate_call
 
 
 @kernel
@@ -305,7 +287,6 @@ def batch_loop(data, touched, met, due, flags):
     room_for, reach = len(planes) // 3, bars.reach
     failed = -1
     turned = -1
-    placeless, why = -1, 0
     changed = 0
     touching = 0
     done = 0
@@ -320,7 +301,7 @@ def batch_loop(data, touched, met, due, flags):
     padded = bars.padded_parts.shape[1] > 0
     shortened = False
     for step in range(count):
-        if failed >= 0 or turned >= 0 or placeless >= 0:
+        if failed >= 0 or turned >= 0 or pressed.failure[0] >= 0:
             # the other ranks still need messages, until all know of the failure
             lost = start_positions(messages, x, h, half)
             lost = finish_positions(messages, x, before, False) if lost == 0 else lost
@@ -441,11 +422,7 @@ def batch_loop(data, touched, met, due, flags):
                         found = find_pressed(over, walls, free, bounces and on_walls[over])
                     if found > 0:
                         counts, out = (found, count_near), (contact, pressed)
-                        earlier = placeless, why
-                        placeless, why, rubbed = press_block(
-                            over, counts, nodes, walls, shared, (free, here), out, earlier
-                        )
-                        friction += rubbed
+                        friction += press_block(over, counts, nodes, walls, shared, (free, here), out)
                         count_near += found
                     finish_block(over, nodes, shared, forces, start, contact, here)
                     alone[over] = not (waits or damped or on_walls[over] or found > 0)
@@ -507,7 +484,7 @@ def batch_loop(data, touched, met, due, flags):
         done += 1
         passed += 1
         stops = changed > 0
-        wrong = failed >= 0 or placeless >= 0 or unsolved != 0 or not np.isfinite(after[INTERNAL])
+        wrong = failed >= 0 or pressed.failure[0] >= 0 or unsolved != 0 or not np.isfinite(after[INTERNAL])
         wrong = wrong or stops
         looks = wrong or shortened
         if agree:
@@ -567,8 +544,8 @@ def batch_loop(data, touched, met, due, flags):
         changed,
         failed,
         turned,
-        placeless,
-        why,
+        pressed.failure[0],
+        pressed.failure[1],
         unsolved != 0,
         pressed.normals,
         pressed.offsets,

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
 from ..errors import SimulationFailure
+from ..mechanics.compiled import generate_call
 from ..tolerances import PROJECTED
 
 if TYPE_CHECKING:
@@ -49,16 +49,10 @@ class CalledRows(NamedTuple):
     loss: np.ndarray
 
 
-def _generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-    word = ir.IntType(64)
-    function = builder.inttoptr(values[0], ir.FunctionType(word, [word, word]).as_pointer())
-    return builder.call(function, values[1:])
-
-
 @intrinsic
 def call_rows(typingctx, address, step, what):  # noqa: ANN001, ANN201
     """Call back from a step of a batch; return whether that has failed: 0, or a negative number."""
-    return types.int64(types.int64, types.int64, types.int64), _generate
+    return types.int64(types.int64, types.int64, types.int64), generate_call
 
 
 class RowCaller:

@@ -1,14 +1,17 @@
-"""Hashes everything that runs compute, and compares the hashes of two states of the program.
+"""Keeps everything that runs compute, and compares what two states of the program have computed.
 
     .venv/bin/python scripts/oracle.py hash before --jobs 2        # all built-in cases, 200 random ones, 1 to 3 ranks
     .venv/bin/python scripts/oracle.py hash after --like before    # the same cases, after a change
-    .venv/bin/python scripts/oracle.py compare before after
+    .venv/bin/python scripts/oracle.py compare before after --within 1e-10
 
 Each case runs twice on each number of ranks: as a whole, and stopped in the middle and continued. Hashed are all
 datasets of both result files (mesh, snapshots, history, checksums), all arrays and numbers of the checkpoints of the
-middle and of the end, the exit status and its message. Cases that end with status 2 or 3 count like others. For arrays
-that differ, `compare` gives the largest difference of some sampled values, relative to the largest value. Status 0 if
-all hashes are equal. PYTHONPATH selects another checkout of the package.
+middle and of the end, the exit status and its message. Cases that end with status 2 or 3 count like others.
+
+With `--within`, `compare` accepts values that differ by less than a fraction of the scale of their quantity: the
+largest value of all datasets of the same file with the same unit. Checkpoints, checksums and numbers of iterations are
+then left out, and integers must be equal. Of long datasets, values at even spaces are kept. Status 0 if nothing
+differs. PYTHONPATH selects another checkout of the package.
 """
 
 from __future__ import annotations
@@ -30,12 +33,14 @@ import numpy as np
 TESTS = Path(__file__).resolve().parent.parent / "tests"
 sys.path[:0] = [str(TESTS), str(TESTS / "random_cases")]
 
-SAMPLES = 12
-"""Values kept of each array, evenly spaced, from which the size of a difference is estimated."""
+SAMPLES = 4000
+"""Values kept of each array, at even spaces."""
 CHUNK = 20
 """Cases per process."""
 NOT_RESULTS = {"case/text"}
 """Datasets that describe the run: file names and versions."""
+NOT_COMPARED = ("checkpoint", "iterations", "checksum")
+"""Parts of names of datasets that `--within` leaves out."""
 
 
 def main() -> int:
@@ -50,13 +55,14 @@ def main() -> int:
     make.add_argument("--jobs", type=int, default=1, help="processes at a time (default: 1)")
     check = verbs.add_parser("compare")
     check.add_argument("folders", type=Path, nargs=2)
+    check.add_argument("--within", type=float, default=0.0, metavar="FRACTION", help="of scales (default: bits)")
     check.add_argument("--all", action="store_true", help="list all arrays, not the first ones of each case")
     worker = verbs.add_parser("worker")
     worker.add_argument("folder", type=Path)
     worker.add_argument("names", nargs="+")
     arguments = parser.parse_args()
     if arguments.verb == "compare":
-        return compare(*arguments.folders, arguments.all)
+        return compare(*arguments.folders, arguments.within, arguments.all)
     if arguments.verb == "worker":
         work(arguments.folder, arguments.names)
         return 0
@@ -139,10 +145,12 @@ def work(folder: Path, names: list[str]) -> None:
         if comm.rank == 0:
             # a message may hold the folder of its file
             message = outcome.message.replace(str(folder), "")
-            whole, parts = hashed(place / "whole"), hashed(place / "parts")
+            whole, samples = hashed(place / "whole")
+            parts, _ = hashed(place / "parts")
             apart = [key for key in whole if key in parts and not _checkpoint(key) and whole[key] != parts[key]]
             entry = {"status": outcome.status, "message": message, "continued_apart": apart, "whole": whole}
             entry["parts"] = {key: value for key, value in parts.items() if _checkpoint(key)}
+            np.savez_compressed(folder / f"{name} on {comm.size}.npz", **samples)
             print(json.dumps({f"{name} on {comm.size}": entry}), flush=True)
         clear(comm, place)
 
@@ -151,36 +159,39 @@ def _checkpoint(key: str) -> bool:
     return key.startswith("checkpoint")
 
 
-def hashed(folder: Path) -> dict[str, list]:
-    """Return the hash, the largest value and samples of all datasets in the files of a folder."""
+def hashed(folder: Path) -> tuple[dict[str, list], dict[str, np.ndarray]]:
+    """Return the hash, largest value, unit and shape of all datasets in the files of a folder, and samples of them."""
     import h5py
 
     found: dict[str, list] = {}
+    samples: dict[str, np.ndarray] = {}
     for path in sorted((*folder.glob("*.vtkhdf"), *folder.glob("*.h5"))):
         with h5py.File(path, "r", locking=False) as file:
             names: list[str] = []
             file.visititems(lambda name, item, names=names: names.append(name) if hasattr(item, "dtype") else None)
             for name in sorted(set(names) - NOT_RESULTS):
-                found[f"{path.name}:{name}"] = _entry(file[name][()])
-    return found
+                key, array = f"{path.name}:{name}", np.asarray(file[name][()])
+                array = array.astype(array.dtype.str)  # without the metadata of enumerations
+                unit = file[name].attrs.get("unit", b"")
+                found[key] = [_digest(array), 0.0, unit.decode() if isinstance(unit, bytes) else str(unit), array.shape]
+                if array.dtype.kind in "fiub" and array.size:
+                    flat = array.reshape(-1)
+                    found[key][1] = float(np.abs(flat.astype(np.float64)).max())
+                    samples[key] = flat[np.unique(np.linspace(0, len(flat) - 1, SAMPLES).astype(int))]
+    return found, samples
 
 
-def _entry(values: Any) -> list:
-    array = np.asarray(values)
+def _digest(array: np.ndarray) -> str:
     digest = hashlib.sha256(f"{array.dtype} {array.shape}".encode())
-    if array.dtype.kind not in "fiub":
+    if array.dtype.kind in "fiub":
+        digest.update(np.ascontiguousarray(array).tobytes())
+    else:
         digest.update(repr(array.tolist()).encode())
-        return [digest.hexdigest()[:16], 0.0, []]
-    digest.update(np.ascontiguousarray(array).tobytes())
-    flat = array.reshape(-1).astype(np.float64)
-    if not len(flat):
-        return [digest.hexdigest()[:16], 0.0, []]
-    sample = flat[np.unique(np.linspace(0, len(flat) - 1, SAMPLES).astype(int))]
-    return [digest.hexdigest()[:16], float(np.abs(flat).max()), sample.tolist()]
+    return digest.hexdigest()[:16]
 
 
-def compare(one: Path, other: Path, every: bool) -> int:
-    """List cases and arrays whose hashes differ, and by how much."""
+def compare(one: Path, other: Path, within: float, every: bool) -> int:
+    """List cases and arrays that differ, and by how much."""
     a, b = (json.loads((folder / "hashes.json").read_text()) for folder in (one, other))
     differing = 0
     for name in sorted(a.keys() | b.keys()):
@@ -191,13 +202,17 @@ def compare(one: Path, other: Path, every: bool) -> int:
         lines = []
         if (a[name]["status"], a[name]["message"]) != (b[name]["status"], b[name]["message"]):
             lines += [f"  status {entry['status']}: {entry['message'][:200]}" for entry in (a[name], b[name])]
+        samples = [np.load(folder / f"{name}.npz") for folder in (one, other)]
         for part in ("whole", "parts"):
             mine, its = a[name][part], b[name][part]
             for key in sorted(mine.keys() | its.keys()):
+                if within and any(text in key for text in NOT_COMPARED):
+                    continue
                 if key not in mine or key not in its:
                     lines.append(f"  {part} {key}: only {'before' if key in mine else 'after'}")
                 elif mine[key][0] != its[key][0]:
-                    lines.append(f"  {part} {key}: {_apart(mine[key], its[key])}")
+                    found = _apart(key, (mine, its), samples, within)
+                    lines += [f"  {part} {key}: {found}"] if found else []
         if lines:
             differing += 1
             print(f"{name}: {len(lines)} differences")
@@ -206,11 +221,24 @@ def compare(one: Path, other: Path, every: bool) -> int:
     return 1 if differing else 0
 
 
-def _apart(mine: list, its: list) -> str:
-    largest = max(mine[1], its[1])
-    if len(mine[2]) != len(its[2]) or not largest > 0.0:
-        return "another length or type"
-    return f"about {np.abs(np.subtract(mine[2], its[2])).max() / largest:.1e} of {largest:.3g}"
+def _apart(key: str, entries: tuple[dict, dict], samples: list[Any], within: float) -> str:
+    """How two datasets of different hashes differ; empty if it is by less than the fraction of their scale."""
+    mine, its = (of[key] for of in entries)
+    if mine[3] != its[3]:
+        return f"shape {mine[3]} before, {its[3]} after"
+    if key not in samples[0] or key not in samples[1]:
+        return "" if _checkpoint(key) and within else "differs"
+    one, two = (of[key].astype(np.float64) for of in samples)
+    unit = mine[2]
+    alike = [key] if unit in ("", "1") else [name for name in entries[0] if entries[0][name][2] == unit]
+    scale = max(of[name][1] for of in entries for name in alike if name in of)
+    with np.errstate(invalid="ignore"):
+        difference = np.abs(one - two)
+    if not scale > 0.0 or not np.array_equal(np.isnan(one), np.isnan(two)):
+        return "differs"
+    fraction = np.nanmax(difference, initial=0.0) / scale
+    exact = samples[0][key].dtype.kind in "iub"
+    return "" if fraction <= within and not exact else f"{fraction:.1e} of {scale:.3g} {unit}".rstrip()
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -583,11 +583,13 @@ class Bars:
         rest, axial = self.watched, self.of_blocks(lambda block: block.area * block.modulus)
         return np.divide(axial, rest, out=np.zeros_like(axial), where=rest > 0.0)
 
-    def put_history(self, history: np.ndarray) -> None:
-        """Restore the result of :meth:`history`."""
+    def put_history(self, history: np.ndarray, names: Sequence[str] | None = None) -> None:
+        """Take the data that :meth:`history` returned, with the ``names`` of its columns if they are those of other
+        bars."""
+        names = self.kept_names if names is None else names
         for block in self.blocks:
             for name, _, values in block.variables():
-                values[:] = history[block.start : block.stop, self.kept_names.index(name)]
+                values[:] = history[block.start : block.stop, names.index(name)]
 
 
 def state_before_rupture(bars: Bars, x: np.ndarray, bar: int) -> tuple[BarBlock, np.ndarray, float, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -125,13 +124,13 @@ def with_connectors(case: Case) -> Case:
     if not tables:
         return case
     scale = connector_modulus(case)
-    made = copy.copy(case)
+    made = type(case).__new__(type(case))  # not a copy, which is of the stage alone
     materials, sections = dict(case.material), dict(case.section)
     for table in tables:
         kind = _Viscous if table.viscous else MaterialKeys
         materials[table.key] = kind.model_construct(young_modulus=scale, density=0.0)
         sections[table.key] = Section.model_construct(area_field=_AREA, material=table.key)
-    made.__dict__.update(material=materials, section=sections)
+    made.__dict__.update({**case.__dict__, "material": materials, "section": sections})
     return made
 
 

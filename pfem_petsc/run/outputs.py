@@ -367,6 +367,7 @@ class Outputs:
         self.history.begin_stage(history, row, kick)
         self._write_to(self._writer)
         self.snapshots.load_state(snapshots.kept())
+        stepper.leave()  # with the ledger, as equilibria after bars have gone take work
 
     def _complete_stage(self) -> None:
         """The row and the snapshot of the last step of a stage."""

@@ -212,7 +212,6 @@ class Stages:
         self.stepper = stepper
         kick = _kick(stepper)
         stepper.start()
-        stepper.leave()
         return kick
 
 
@@ -249,7 +248,7 @@ def _hand_over(old: Stepper, new: Stepper) -> None:
     state.v = before.v.copy()
     if not new.scheme.inertial:  # others find the forces of their start
         state.support, state.contact = old.recorded()[1].copy(), before.contact.copy()
-    new.model.bars.put_history(old.model.bars.history())
+    new.model.bars.put_history(old.model.bars.history(), old.model.bars.kept_names)
     new.model.bars.forget_rates()
     new.follow_removals(old.removals)
     new.ruptures.begin()

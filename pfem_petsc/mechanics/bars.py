@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from ..columns import BAR_ENERGIES
+from ..columns import BAR_ENERGIES, STORED
 from ..errors import InputError
 from ..fields import STATUS
 from ..mesh.node_sets import group_hint
@@ -229,6 +229,9 @@ _LOADING = 1e-8  # relative change of all lengths that distinguishes the tangent
 _KINK = 1e-6  # relative difference of these tangents above which the bar is at a kink of its law
 
 
+_LOST = np.array([name not in STORED for name in BAR_ENERGIES])
+
+
 class StrainEnergy(NamedTuple):
     """Sums over the bars counted on this rank, and its springs, in the order of
     :data:`~pfem_petsc.columns.BAR_ENERGIES` [J], the first collapsed bar (local index, -1: none), whether any bar is
@@ -397,6 +400,20 @@ class Bars:
                 block.parameters = (*block.parameters[:-1], eta * self.step)
 
     @contextmanager
+    def at_step(self, step: float, eta: float) -> Iterator[None]:
+        """Evaluate bars with another ``step``, viscous ones with ``eta`` as in :meth:`set_rates`."""
+        kept = self.step, [block.parameters for block in self.viscous_blocks]
+        self.step = step
+        for block in self.viscous_blocks if 0.0 < step < np.inf else ():
+            block.parameters = (*block.parameters[:-1], eta * step)
+        try:
+            yield
+        finally:
+            self.step = kept[0]
+            for block, parameters in zip(self.viscous_blocks, kept[1], strict=True):
+                block.parameters = parameters
+
+    @contextmanager
     def without_rates(self) -> Iterator[None]:
         """Evaluate bars at rest: laws with a rate have the step zero, and there is no viscous stress."""
         step, kept = self.step, [block.history[block.law.known_rate].copy() for block in self.viscous_blocks]
@@ -551,10 +568,19 @@ class Bars:
         return out
 
     def densities(self, x: np.ndarray) -> np.ndarray:
-        """Return stored and dissipated energy per rest volume (b,) [J/m3] at the end of the last step."""
-        out = np.zeros(len(self.ends))
+        """Return the energies per rest volume (number of BAR_ENERGIES, b) [J/m3] at the end of the last step."""
+        out = np.zeros((len(BAR_ENERGIES), len(self.ends)))
         self._for_blocks("densities", x, out)
         return out
+
+    def scaled_dissipation(self, densities: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Return by how much the energies (number of BAR_ENERGIES,) [J] that the counted bars have dissipated would
+        change, with their ``densities``, if their rest lengths change by ``change`` (b,) [m]."""
+        total = np.zeros(len(BAR_ENERGIES))
+        for block in self.blocks:
+            part = slice(block.start, block.counted)
+            total += (densities[:, part] * (block.counted_area * change[part])).sum(axis=1)
+        return np.where(_LOST, total, 0.0)
 
     def history(self) -> np.ndarray:
         """Return the data that laws keep of all local bars (b, names), one column for each of :attr:`kept_names`; zero

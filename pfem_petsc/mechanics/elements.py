@@ -329,11 +329,17 @@ def _for_all(name: str, visit: Callable[..., Any]) -> Callable[..., Any]:
     return kernel(loop)
 
 
+def _energies_of(law: Law) -> np.ndarray:
+    """Return the places of the energies of a law in :data:`~pfem_petsc.columns.BAR_ENERGIES`."""
+    return np.array([BAR_ENERGIES.index(name) for name in law.energies], dtype=np.int64)
+
+
 def _state_loops(law: Law, element: SimpleNamespace, measure: Callable[..., Any]) -> dict[str, Any]:
     """Make the loops that evaluate each bar by itself at positions x, for what :class:`~pfem_petsc.mechanics.bars.Bars`
     documents under the same names."""
     read, evaluate, stiffness = element.read, element.evaluate, element.stiffness
     by_rate, can_break, gone, known = law.rate, law.rupture >= 0, max(law.rupture, 0), max(law.known_rate, 0)
+    places = _energies_of(law)
 
     @borrowing
     def tangents(x, bars, k, out):
@@ -371,11 +377,11 @@ def _state_loops(law: Law, element: SimpleNamespace, measure: Callable[..., Any]
 
     @borrowing
     def densities(x, bars, k, out):
-        """``out``: (b,) stored and dissipated energy per rest volume [J/m3], for laws without rate."""
+        """``out``: (number of BAR_ENERGIES, b) energies per rest volume [J/m3], without flow over time."""
         bar = read(bars, k)
         _, _, _, _, _, _, found = evaluate(length_of(end_difference(x, bars, k)) / bar.rest, bar, 0.0)
-        for density in found:
-            out[k] += density
+        for j in range(len(found)):
+            out[places[j], k] = found[j]
 
     @borrowing
     def rates(x, bars, k, out):
@@ -463,7 +469,7 @@ def _run_loops(law: Law, element: SimpleNamespace) -> dict[str, Any]:
     """Make the loops that evaluate chunks of runs, several bars at once: ``forces``, with its part for batches
     ``add_forces``; and ``stiffnesses``; ``places`` and ``work_rows`` of the workspace, see :func:`sum_energies`."""
     read, evaluate, whole_stress, stiffness = element.read, element.evaluate, element.whole_stress, element.stiffness
-    places = np.array([BAR_ENERGIES.index(name) for name in law.energies], dtype=np.int64)
+    places = _energies_of(law)
     by_rate, last, n_rows = law.rate, len(law.internal), len(law.rows)
     first_new = 4 + len(places)
     first_pull = first_new + n_rows

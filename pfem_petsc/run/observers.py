@@ -21,7 +21,7 @@ from ..stepping.ledger import Ledger
 from ..stepping.stepper import Step, Stepper
 from ..version import __version__
 from .monitors import WATCHED, BlowUp, ContactWatch, Doubts
-from .recorder import Recorder
+from .recorder import Handover, Recorder
 from .stages import Stages
 from .synchroniser import Synchroniser
 
@@ -98,13 +98,10 @@ class History(Observer):
         self.row: Mapping[str, Any] | None = None
         self.writer: ResultWriter | None = None
 
-    def begin_stage(self, earlier: History, last: Row, kick: tuple[float, np.ndarray]) -> None:
-        """Go on with the rows of the stage that has ended. Collective.
-
-        ``last``: row of its end; ``kick``: work [J] and momentum (3,) [N s] of the velocities that the stage adds.
-        """
+    def begin_stage(self, earlier: History, last: Row, handed: Handover) -> None:
+        """Go on with the rows of the stage that has ended, with ``last``, the row of its end. Collective."""
         self.row, self.writer = last, earlier.writer
-        first = self.recorder.begin_stage(earlier.recorder, last, kick)
+        first = self.recorder.begin_stage(earlier.recorder, last, handed)
         self.blow_up.check(first, self._stepper.state)
         if self._contact_watch is not None:
             self._contact_watch.check(first)

@@ -355,7 +355,7 @@ class Outputs:
         self.tell_remarks()
         row = history.recorder.row()
         ended = f"step {self._stepper.number}, {self._stepper.axis.place(self._stepper.place)}"
-        kick = stages.advance()
+        handed = stages.advance()
         stepper = stages.stepper
         self.progress.message(
             f"stage {stages.model.case.name!r} ({stages.number + 1} of {len(stages.case.stage)}) begins after {ended}"
@@ -364,7 +364,7 @@ class Outputs:
         self.fields = Fields(stages.model, stages.fields)
         self._observe(RunState(stepper))
         self.checkpointing.last_step = last_step
-        self.history.begin_stage(history, row, kick)
+        self.history.begin_stage(history, row, handed)
         self._write_to(self._writer)
         self.snapshots.load_state(snapshots.kept())
         stepper.leave()  # with the ledger, as equilibria after bars have gone take work

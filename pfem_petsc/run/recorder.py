@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -104,6 +104,21 @@ class Probes:
             at = end
 
 
+class Handover(NamedTuple):
+    """What a stage changes in the state that it is handed, the same on all ranks.
+
+    Attributes
+    ----------
+    work, momentum : of the velocities that it adds [J], (3,) [N s]
+    bars : (number of BAR_ENERGIES,) what the rows of the stage before had of its own, and those of this stage have
+        besides, to the energies of bars in their rest volumes [J]: dissipated energies stay where rest lengths change
+    """
+
+    work: float
+    momentum: np.ndarray
+    bars: np.ndarray
+
+
 _ADDED = [one for one in ENERGIES if one.source != "derived"]
 _SIDES = {one.name: one.side for one in ENERGIES} | {part: one.side for one in ENERGIES for part in one.parts}
 _SIGNS = np.array([{"supplied": -1.0, "part": 0.0}.get(_SIDES[one.name], 1.0) for one in _ADDED])
@@ -179,8 +194,9 @@ class Recorder:
         moving = [wall + one.name for wall, moves in zip(walls, contact.moving, strict=True) if moves for one in MOTION]
         self._motion = layout.indices(moving)
         self._energies = layout.indices(one.name for one in _ADDED)
+        self._bars = layout.indices(BAR_ENERGIES)
         self._parts = [
-            (layout.first(one.name), [HEAD.first(part) for part in one.parts]) for one in ENERGIES if one.parts
+            (layout.first(one.name), [layout.first(part) for part in one.parts]) for one in ENERGIES if one.parts
         ]
 
     def row(self, alarm: bool = False) -> Row:
@@ -234,7 +250,8 @@ class Recorder:
         share = Share(len(contact.names), len(self.model.links.columns), len(self._probes.nodes))
         head = share.head
         head[:] = stepper.ledger.sums
-        head[_BARS], head[HEAD.first("alarm")] = stepper.energy.energies, alarm
+        head[_BARS] += stepper.energy.energies
+        head[HEAD.first("alarm")] = alarm
         for first, value in self._at_state:
             head[first] = value(stepper)
         if contact.any:
@@ -271,7 +288,7 @@ class Recorder:
             vectors[:, at(name)] = getattr(stepper, name)
         vectors[:, at("newton_iterations")], vectors[:, at("linear_iterations")] = stepper.iterations
         for first, parts in self._parts:
-            vectors[:, first] = np.cumsum(sums[:, parts], axis=1)[:, -1]
+            vectors[:, first] = np.cumsum(vectors[:, parts], axis=1)[:, -1]
         vectors[:, layout["centre_of_mass"]] /= self.model.total_mass
         energies = sums[:, _ENERGIES]
         if self.carried is not None:
@@ -291,7 +308,7 @@ class Recorder:
         for name, value in values.items():
             self.rest[self.layout[name]] = value
 
-    def begin_stage(self, before: Recorder, last: Row, kick: tuple[float, np.ndarray]) -> Row:
+    def begin_stage(self, before: Recorder, last: Row, handed: Handover) -> Row:
         """Go on after the stage that has ended; return the row of the start. Collective.
 
         Energies stay balanced, and momentum that of its impulses. Work and momentum of velocities that the stage adds
@@ -304,24 +321,29 @@ class Recorder:
         ----------
         before : of the stage that has ended
         last : row of its end
-        kick : work [J] and momentum (3,) [N s] of the velocities that the stage adds
+        handed : with what the stage changes
         """
         first, layout, case = self.row(), self._layout, self.model.case
         summed = [name for name in layout.places if declared(name).stages == SUMMED]
         change: dict[str, Any] = {name: np.array(last[name], dtype=float) for name in summed}
-        work, momentum = kick
+        work, momentum, bars = handed
+        if before.carried is not None:
+            bars = bars + before.carried[before._bars]
         gained = first["kinetic_energy"] - last["kinetic_energy"] - work
         change["external_work"] += work + max(gained, 0.0) + first["wall_kinetic_energy"] - last["wall_kinetic_energy"]
         change["numerical_dissipation"] += max(-gained, 0.0)
         if "temperature" in case.given or case.stressed:
             # dissipation too: bars may be damaged or break by it at once
             work_of = "thermal_work" if "temperature" in case.given else "prestress_work"
-            change[work_of] += sum(first[name] - last[name] for name in BAR_ENERGIES)
+            change[work_of] += sum(first[name] - last[name] for name in BAR_ENERGIES) + bars.sum()
         change["external_impulse"] += momentum
         change["support_impulse"] += first["momentum"] - last["momentum"] - momentum
         self.carried = np.zeros(layout.width)
         for name, value in change.items():
             self.carried[layout[name]] = np.ravel(value)
+        self.carried[self._bars] = bars
+        for derived, parts in self._parts:
+            self.carried[derived] = self.carried[parts].sum()
         for name in self.layout.places:
             if declared(name).stages in (SUMMED, LASTING):
                 self.rest[self.layout[name]] = np.ravel(last[name])

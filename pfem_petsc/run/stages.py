@@ -22,7 +22,7 @@ from ..preflight.checks import warnings_before
 from ..stepping.model import Model, StageStart
 from ..stepping.plan import Plan, make_plan
 from ..stepping.plan import make_stepper as time_stepper
-from .recorder import Recorder
+from .recorder import Handover, Recorder
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -182,12 +182,9 @@ class Stages:
         if self.model.case.time is not None:
             self.model.external.call(function)
 
-    def advance(self) -> tuple[float, np.ndarray]:
-        """Begin the next stage where the present one has ended. Collective.
-
-        Returns
-        -------
-        Work [J] and momentum (3,) [N s] of the velocities that the stage adds, on all ranks.
+    def advance(self) -> Handover:
+        """Begin the next stage where the present one has ended; bars and supports that go at once are still there.
+        Collective.
 
         Raises
         ------
@@ -208,21 +205,24 @@ class Stages:
         except InputError as error:
             raise SimulationFailure(f"{where}: {error}") from error
         _hand_over(old, stepper)
+        handed = _changes(old, stepper)
         old.destroy()
         self.stepper = stepper
-        kick = _kick(stepper)
         stepper.start()
-        return kick
+        return handed
 
 
-def _kick(stepper: Stepper) -> tuple[float, np.ndarray]:
-    """Work [J] and momentum (3,) [N s] of the velocities that a stage adds to those it is handed. Collective."""
-    model = stepper.model
+def _changes(old: Stepper, new: Stepper) -> Handover:
+    """What a stage changes in the state that it is handed, before its start. Collective."""
+    model, before = new.model, old.model.bars
     added = model.initial_velocity()
     momentum = model.inertia.mass_times(added, np.empty_like(added))
-    mean = stepper.state.v + 0.5 * added
-    sums = model.comm.allreduce(np.append(momentum.sum(axis=0), (momentum * mean).sum()))
-    return float(sums[3]), sums[:3]
+    work = (momentum * (new.state.v + 0.5 * added)).sum()
+    change = model.bars.rest - before.rest
+    scaled = before.scaled_dissipation(before.densities(old.state.x), change) if change.any() else 0.0
+    sums = np.concatenate([[work], momentum.sum(axis=0), old.ledger.bar_energies - scaled])
+    sums = model.comm.allreduce(sums)
+    return Handover(float(sums[0]), sums[1:4], sums[4:])
 
 
 def _end_of_stage(stepper: Stepper) -> StageStart:

@@ -133,7 +133,7 @@ class AssembledPreconditioner:
 _SET_UP = {"gamg": 90, "lu": 40, "mumps": 55, "multigrid": 15}
 
 
-_NONE = (0.0,) * 6 + (1.0,)  # before the first set-up
+_NONE = (0.0,) * 7 + (1.0,)  # before the first set-up
 
 
 class LaggedPreconditioner:
@@ -155,8 +155,9 @@ class LaggedPreconditioner:
     place : (owned, 6) positions at which the Hessian was evaluated [m], and whether a component was active; (owned, 0)
         if the next problem needs a set-up
     history : (b, names) data of the material laws there, see ``Bars.history``; (b, 0) if they keep none
-    count : other data that decide on a set-up: the coefficients of the Hessian, iterations of the first solve with it
-        for the usual reduction, excess iterations of later solves, iterations of the last solve, and its share
+    count : other data that decide on a set-up: the coefficients of the Hessian and the step of the bars there [s],
+        iterations of the first solve with it for the usual reduction, excess iterations of later solves, iterations of
+        the last solve, and its share
     carried : whether it was set up for an earlier problem
     share : digits by which the next solve reduces the residual, over those of the usual reduction
     """
@@ -205,7 +206,7 @@ class LaggedPreconditioner:
         problem : StepProblem, at the positions at which the Hessian is required
         kept : this rank's unknowns in the system, local and ascending; None for all
         """
-        *coefficients, first, beyond, last, share = [*(self.count or _NONE), 1.0][: len(_NONE)]
+        *coefficients, step, first, beyond, last, share = [*(self.count or _NONE), 1.0][: len(_NONE)]
         if last and not first:
             first = last / share
         else:
@@ -220,24 +221,25 @@ class LaggedPreconditioner:
             self.carried = True
             due |= not usable or wanted != coefficients or not self.place.shape[1]
             if not due and self._problem is None:
-                self._make_again(problem)
+                self._make_again(problem, step)
         if due:
             held = np.zeros((self.mesh.n_local, 3))
             if kept is not None:
                 held[: self.mesh.n_owned] = 1.0
                 held[: self.mesh.n_owned].reshape(-1)[kept] = 0.0
             self.inner.make(problem, held)
-            first = beyond = 0.0
+            first, beyond, step = 0.0, 0.0, self.bars.step
             owned = self.mesh.n_owned
             self.place = np.hstack([problem.x[:owned], held[:owned]]) if usable else np.zeros((owned, 0))
             if self.remembers and usable:
                 self.history = self.bars.history()
         self.carried &= not due
         self._problem = problem
-        self.count = [*wanted, first, beyond, 0.0, self.share]
+        self.count = [*wanted, step, first, beyond, 0.0, self.share]
 
-    def _make_again(self, problem: StepProblem) -> None:
-        """Recreate the preconditioner after a restart, from the Hessian at its last set-up."""
+    def _make_again(self, problem: StepProblem, step: float) -> None:
+        """Recreate the preconditioner after a restart, from the Hessian at its last set-up with a ``step`` of the bars,
+        which differs from step to step by rounding."""
         here, owned = problem.x.copy(), self.mesh.n_owned
         held = np.zeros((self.mesh.n_local, 3))
         problem.x[:owned], held[:owned] = self.place[:, :3], self.place[:, 3:]
@@ -245,7 +247,9 @@ class LaggedPreconditioner:
         if self.remembers:
             history = self.bars.history()
             self.bars.put_history(self.history)
-        self.inner.make(problem, held)
+        balance = problem.balance
+        with self.bars.at_step(step, balance.eta / balance.weight if balance.weight else 0.0):
+            self.inner.make(problem, held)
         problem.x[:] = here
         if self.remembers:
             self.bars.put_history(history)

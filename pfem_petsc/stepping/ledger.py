@@ -117,15 +117,17 @@ class BarChanges:
         if self.model.rest_lengths.varying or any(block.law.mean_of_work for block in bars.blocks):
             self._rest, self._lengths, self._densities = bars.rest.copy(), bars.lengths(x), bars.densities(x)
 
-    def works(self) -> tuple[float, float]:
-        """Return the works of changing temperatures and of changing rest lengths on the counted bars in the last step
-        [J]."""
-        model = self.model
+    def works(self) -> tuple[float, float, np.ndarray | float]:
+        """Return the works of changing temperatures and of changing rest lengths on the counted bars in the last step,
+        and by how much these have scaled what the bars had dissipated, (number of BAR_ENERGIES,) [J]."""
+        model, scaled = self.model, 0.0
         if not model.bars_vary:
-            return 0.0, 0.0
+            return 0.0, 0.0, scaled
         before = dict(vars(self))
         self.keep()
         heating = stressing = 0.0
+        if model.rest_lengths.varying:
+            scaled = model.bars.scaled_dissipation(before["_densities"], self._rest - before["_rest"])
         for k, block in enumerate(model.bars.blocks):
             part = slice(block.start, block.counted)
             mean = self._mean_stress(before, k, block)
@@ -138,7 +140,7 @@ class BarChanges:
                 heating -= float((block.counted_area * rest * mean * change).sum())
                 if block.law.modulus is not None:
                     heating += float((block.counted_area * rest * self._softening(before, block)).sum())
-        return heating, stressing
+        return heating, stressing, scaled
 
     def _mean_stress(self, before: dict, k: int, block: BarBlock) -> np.ndarray:
         """Return the mean stress of the counted bars of a block in the step [Pa]."""
@@ -160,7 +162,7 @@ class BarChanges:
             strain(of["_lengths"][part] / of["_rest"][part]) - (of["_thermal"][part] if len(of["_thermal"]) else 0.0)
             for of in (before, vars(self))
         )
-        change, work = last - first, self._densities[part] - before["_densities"][part]
+        change, work = last - first, (self._densities[:, part] - before["_densities"][:, part]).sum(axis=0)
         large = np.abs(change) > SMALL * (np.abs(first) + np.abs(last))
         return np.divide(work, change, out=mean, where=large)
 
@@ -197,12 +199,13 @@ class BarChanges:
         rest0, rest1 = before["_rest"][part], self._rest[part]
         whole = strain(last / rest1) - strain(first / rest0)
         moved = strain(last / rest) - strain(first / rest)
-        density = 0.5 * (before["_densities"][part] + self._densities[part])
+        density = 0.5 * (before["_densities"][:, part] + self._densities[:, part]).sum(axis=0)
         return float((block.counted_area * (rest * mean * (whole - moved) + density * (rest1 - rest0))).sum())
 
 
 _AT = {energy.name: HEAD.first(energy.name) for energy in ENERGIES if energy.source != "derived"}
-_AT_STATE = HEAD.indices((*BAR_ENERGIES, *(one.name for one in COUNTS), "alarm"))  # of which the ledger has no sums
+_BARS = HEAD.indices(BAR_ENERGIES)
+_AT_STATE = HEAD.indices((*BAR_ENERGIES, *(one.name for one in COUNTS), "alarm"))
 _TOTALS = slice(HEAD.first("momentum"), HEAD["support_force"].stop)
 
 
@@ -213,7 +216,8 @@ class Ledger:
     Attributes
     ----------
     sums : of a row, in the layout of :data:`~pfem_petsc.columns.HEAD`: works and dissipations since the start [J],
-        and totals of this rank's nodes at the present state
+        totals of this rank's nodes at the present state, and of the energies of bars what is added to those of their
+        rest volumes, so that rest lengths that change do not scale what was dissipated before
     impulses : Impulses
     impacts : Impacts
     powers : (5,) works of all balances of a leapfrog scheme up to the present one, in the order of ``WORKS`` [J]; at
@@ -263,7 +267,7 @@ class Ledger:
         if jump is not None:
             friction += jump.friction
         stored = present.kinetic - jumped - before.kinetic + present.energy.total - before.energy.total
-        heating, stressing = self._changes.works()
+        heating, stressing, scaled = self._changes.works()
         work, given, weight, lost = self._work_of_walls(before)
         # velocities at the ends of explicit steps are those of the steps beside
         follows = stepper.scheme.explicit and stepper.scheme.balance_at_endpoints
@@ -282,9 +286,10 @@ class Ledger:
             ("friction_dissipation", friction),
             ("impact_dissipation", impact),
             ("numerical_dissipation", numerical),
-            ("prestress_work", stressing),
+            ("prestress_work", stressing - np.sum(scaled)),
         ):
             self.sums[_AT[name]] += value
+        self.sums[_BARS] -= scaled
         self.sums[_AT["numerical_dissipation"]] += stressing
 
     def _works(self, way: np.ndarray, first: Moment, second: Moment) -> np.ndarray:
@@ -346,6 +351,11 @@ class Ledger:
     def _release(self) -> None:
         """Keep of the moment before only what batches of steps need, which have their own arrays."""
         self._before = Moment(*9 * (self.stepper.zero,), self._before.kinetic, self._before.energy)
+
+    @property
+    def bar_energies(self) -> np.ndarray:
+        """What :attr:`sums` adds to the energies of this rank's bars (number of BAR_ENERGIES,) [J]."""
+        return self.sums[_BARS]
 
     @property
     def friction_ahead(self) -> float:

@@ -26,8 +26,9 @@ class Column(NamedTuple):
     source : of an energy, see :func:`energy`
     side : of an energy, of the balance: stored + lost - supplied is constant; ``part`` of another column
     parts : columns that a derived energy sums
-    value : its value at the state of a :class:`~pfem_petsc.stepping.stepper.Stepper`, this rank's share if it is summed
-        over ranks; None if the ledger, the contact log or the recorder has it
+    value : its value, a number or (size,), at the state of a :class:`~pfem_petsc.stepping.stepper.Stepper`, this rank's
+        share if it is summed over ranks; None if the ledger, the contact log or the recorder has it
+    looped : whether the loop of a batch of steps has it too; a row with another value ends a batch
     stages : what a stage does with the value of the stage before: it goes on with a ``summed`` one, keeps a ``lasting``
         one that it does not have itself, and forgets others
     exists : whether the column is recorded, from a :class:`~pfem_petsc.stepping.model.Model`
@@ -40,7 +41,8 @@ class Column(NamedTuple):
     source: str = ""
     side: str = ""
     parts: tuple[str, ...] = ()
-    value: Callable[[Any], float] | None = None
+    value: Callable[[Any], Any] | None = None
+    looped: bool = False
     stages: str = ""
     exists: Callable[[Any], bool] = lambda model: True
 
@@ -51,7 +53,7 @@ class Column(NamedTuple):
 
 
 def energy(
-    name: str, side: str, source: str, parts: tuple[str, ...] = (), value: Callable[[Any], float] | None = None
+    name: str, side: str, source: str, parts: tuple[str, ...] = (), value: Callable[[Any], Any] | None = None
 ) -> Column:
     """Return the column of an energy [J].
 
@@ -105,14 +107,15 @@ OF_ANALYSES = (Column("load_factor", stages=LASTING), Column("pseudo_steps"), Co
 """Those that steppers name in their ``columns``."""
 ITERATIONS = (Column("newton_iterations", kind=np.int64), Column("linear_iterations", kind=np.int64))
 COUNTS = (
-    Column("active_contacts", kind=np.int64, value=lambda now: now.solution.contacts),
+    Column("active_contacts", kind=np.int64, value=lambda now: now.solution.contacts, looped=True),
     Column(
         "slack_bars",
         kind=np.int64,
         value=lambda now: now.model.bars.slack_count(),
         exists=lambda model: model.bars.slackens,
     ),
-    Column("broken_bars", kind=np.int64, value=lambda now: now.ruptures.count),
+    # others can break in the last step of a batch alone
+    Column("broken_bars", kind=np.int64, value=lambda now: now.ruptures.count, looped=True),
 )
 IMBALANCE = Column("energy_imbalance", "J")
 VECTORS = (
@@ -245,10 +248,15 @@ WALL = _layout(*OF_WALLS)
 PAIR = _layout(*OF_PAIRS)
 
 
-def values_at_state(model: Any) -> list[tuple[int, Callable[[Any], float]]]:
-    """Return where numbers of the state of a stepper are in a share, and their values from the stepper."""
-    columns = (*ENERGIES, *VECTORS, *COUNTS)
-    return [(HEAD.first(one.name), one.value) for one in columns if one.value is not None and one.exists(model)]
+def at_state(model: Any) -> list[Column]:
+    """Return the columns of a model with a value at the state of a stepper, which :data:`HEAD` has."""
+    return [one for one in (*ENERGIES, *VECTORS, *COUNTS) if one.value is not None and one.exists(model)]
+
+
+def fill_at_state(columns: Iterable[Column], stepper: Any, head: np.ndarray) -> None:
+    """Write the values of :func:`at_state` to the sums of a row."""
+    for one in columns:
+        head[HEAD[one.name]] = one.value(stepper)
 
 
 class Share:

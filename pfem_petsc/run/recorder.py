@@ -29,8 +29,9 @@ from ..columns import (
     Layout,
     Row,
     Share,
+    at_state,
     declared,
-    values_at_state,
+    fill_at_state,
 )
 from ..stepping.stepper import Instants
 
@@ -147,7 +148,7 @@ class Recorder:
 
     def __init__(self, stepper: Stepper, columns: Mapping[str, np.dtype] | None = None) -> None:
         self.stepper, self.model = stepper, stepper.model
-        self._at_state = values_at_state(self.model)
+        self._at_state = at_state(self.model)
         self.start_energy: float | None = None
         self.energy_scale = 0.0
         self.carried: np.ndarray | None = None
@@ -252,8 +253,7 @@ class Recorder:
         head[:] = stepper.ledger.sums
         head[_BARS] += stepper.energy.energies
         head[HEAD.first("alarm")] = alarm
-        for first, value in self._at_state:
-            head[first] = value(stepper)
+        fill_at_state(self._at_state, stepper, head)
         if contact.any:
             share.changes[:], contact.log.changes = contact.log.changes, 0
             for name, values in (("force", walls.force), ("moment", walls.moment)):

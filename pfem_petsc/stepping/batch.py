@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from ..columns import BAR_ENERGIES, HEAD, Share, values_at_state
+from ..columns import BAR_ENERGIES, HEAD, Share, at_state, fill_at_state
 from ..contact.node_walls import NOTED, WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
@@ -64,7 +64,8 @@ class Batch:
         stepper.balance = None  # its predictor is not needed any more
         self._caller = RowCaller(stepper, self._stiffness, self._u, self._contact)
         share = Share(len(self.model.contact.names), len(self.model.links.columns), len(probed))
-        self._width, self._at_state = len(share.numbers), values_at_state(self.model)
+        self._width, self._at_state = len(share.numbers), at_state(self.model)
+        self._ends_at_rows = not all(column.looped for column in self._at_state)
         return_freed_memory()
 
     def _bar_arrays(self) -> BarArrays:
@@ -236,7 +237,7 @@ class Batch:
         rows = model.links.export_rows(self._stiffness)
         for block, columns in zip(model.bars.blocks, self._columns_of, strict=True):
             block.lend(columns)
-        ledger.sums[_BROKEN] = stepper.ruptures.count  # others can break in the last step alone
+        ledger.sums[_BROKEN] = stepper.ruptures.count
         data = BatchData(
             stepper.h,
             state.x,
@@ -268,8 +269,7 @@ class Batch:
         model.links.import_rows(rows)
         end, row = made.passed, shares[made.recorded - 1]
         sound = self._take(made, row[_BARS], end)
-        for at, value in self._at_state:
-            row[at] = value(stepper)
+        fill_at_state(self._at_state, stepper, row)
         ledger.follow_batch(row[: HEAD.width], made.friction)
         log.changes, noted = made.changes, np.zeros(end, dtype=np.int64)
         if len(log.releases):
@@ -311,12 +311,12 @@ class Batch:
         return sound
 
     def _due(self, count: int) -> np.ndarray:
-        """Return which of up to ``count`` steps to come have a row of the history; a row of bars that slacken ends a
-        batch, since the number of slack bars is that of the state."""
+        """Return which of up to ``count`` steps to come have a row of the history; a row with values that the loop does
+        not have, such as the number of slack bars, ends a batch, as they are those of the state."""
         every = self.stepper.row_every
         numbers = self.stepper.number + 1 + np.arange(min(count, NOTED))
         due = numbers % every == 0 if every else np.zeros(len(numbers), dtype=bool)
-        if self.model.bars.slackens and due.any():
+        if self._ends_at_rows and due.any():
             due = due[: int(np.argmax(due)) + 1]
         return due
 

@@ -91,7 +91,8 @@ def test_field_is_one_entry(comm, shared_tmp_path):
 
 @pytest.mark.slow
 def test_energy_term_is_one_line(tmp_path):
-    """In a copy of the package: the columns of a row are laid out when it is imported."""
+    """In a copy of the package: the columns of a row are laid out when it is imported. What such a column is in batches
+    of steps, ``tests/stepping/test_batches.py`` tests."""
     line = re.search(r"^```python\n(energy\(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1]
     package = Path(fields.__file__).parent
     shutil.copytree(package, tmp_path / package.name)
@@ -106,7 +107,9 @@ def test_energy_term_is_one_line(tmp_path):
     assert done.returncode == 0, done.stderr
     history = open_result(tmp_path / "out").history
     sideways = np.asarray(history["sideways_energy"])
-    assert sideways[0] == pytest.approx(np.asarray(history["kinetic_energy"])[0], rel=1e-14) and sideways[0] > 0.0
+    tip = 0.5 * (1000.0 * 1e-4)  # half of the bar's mass [kg]
+    assert sideways == pytest.approx(0.5 * tip * history["probe/tip/velocity"][:, 0, 1] ** 2, rel=1e-12)
+    assert len(sideways) == 21 and sideways.min() > 0.09
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * sideways[0]
 
 

@@ -8,7 +8,7 @@ from helpers.lattices import planes, two_lattices
 from helpers.stopped import assert_restart_is_bitwise
 from mpi4py import MPI
 
-from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc import Case, Simulation, columns, open_result
 from pfem_petsc.errors import EarlyStop, SimulationFailure
 from pfem_petsc.mesh import ordering
 from pfem_petsc.mesh.ordering import NODE_BLOCK
@@ -260,6 +260,12 @@ def compare(one, other, exact=True, same_order=True):
         rounding = 0.0 if same_order else 1e-9 * np.abs(ours).max(initial=0.0)
         np.testing.assert_allclose(ours, others, rtol=0.0, atol=rounding, err_msg=what)
     first, second = (open_result(simulation.folder).history for simulation in (one, other))
+    compare_histories(first, second, exact, same_order)
+    return first
+
+
+def compare_histories(first, second, exact=True, same_order=True):
+    """As :func:`compare`."""
     assert sorted(first) == sorted(second)
     scale = max(np.abs(first[column]).max() for column in first if column.endswith(("energy", "work")))
     for column in first:
@@ -270,7 +276,6 @@ def compare(one, other, exact=True, same_order=True):
         else:
             rounding = 1e-12 if same_order else 1e-9 * np.abs(first[column]).max(initial=0.0)
             np.testing.assert_allclose(first[column], second[column], rtol=1e-9, atol=rounding, err_msg=column)
-    return first
 
 
 @pytest.mark.parallel
@@ -363,6 +368,58 @@ def test_batches_with_pairs_of_several_tables(tmp_path):
     history = compare(*(made(given, tmp_path, how, MPI.COMM_SELF)[0] for how in ("single", "batches")))
     for name in ("low", "high"):
         assert np.abs(history[f"pair/{name}/impulse"][-1]).max() > 0.01
+
+
+MOVED = {"restitution": 0.3, "friction": 0.2, "motion": [[0, 0, 0, 0], [8e-6, 0, 0, 1e-4], [3e-5, 1e-4, 0, -1e-4]]}
+CROWDED = SECTIONS | {  # something of each kind
+    "node_set": LATTICE["node_set"] | {"edge": {"group": "right"}, "side": {"nearest": [0.0, 0.0, 0.02]}},
+    "material": SECTIONS["material"]
+    | {"soft": {"young_modulus": 70e9, "density": 2700.0, "rupture": {"strain": 2e-3}}},
+    "support": [{"node_set": "corner", "fix": "yz", "velocity": [0.0, 9.0, -7.0]}],
+    "load": [{"node_set": "foot", "force": [0.0, 3.0, 2.0], "table": [[0.0, 0.0], [2e-5, 5.0]]}],
+    "gravity": {"acceleration": [0.0, 0.0, -1e4]},
+    "spring": [{"node_set": "edge", "stiffness": [1e5, 2e5, 3e5]}],
+    "dashpot": [{"node_set": "side", "coefficient": 3.0}],
+    "wall": [FLOOR | MOVED, SIDE | {"point": [0.02002, 0, 0]}],
+    "output": {"fields_every": 0, "history_every": 1, "probe": [{"name": "all", "node_set": "every"}]},
+}
+CROWDED["node_set"]["every"] = {"all": True}
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("declared", [False, True], ids=["own", "declared"])
+def test_all_columns_of_all_steps_are_those_of_single_steps(declared, comm, shared_tmp_path, monkeypatch):
+    """By any driver on any number of ranks, also an energy and a vector with a ``value`` that no loop has: in the room
+    of columns that the case leaves empty, for which the loops need not be compiled again."""
+    if declared:
+        sideways = columns.energy("wall_kinetic_energy", "part", "state", value=sideways_energy)
+        monkeypatch.setattr(columns, "ENERGIES", (*columns.ENERGIES, sideways))
+        drift = columns.Column("damping_impulse", "kg m/s", 3, value=lambda now: now.model.inertia.mass @ now.state.v)
+        monkeypatch.setattr(columns, "VECTORS", (*columns.VECTORS, drift))
+    given = case(CROWDED, end=1.6e-5)
+    one, count = made(given, shared_tmp_path, "single", comm)
+    many, fewer = made(given, shared_tmp_path, "batches", comm)
+    assert count == 80 and (fewer == count if declared else fewer < count / 3)
+    history = compare(one, many)
+    others = [] if declared else [made(given, shared_tmp_path, "general", comm)[0]]
+    if comm.size > 1:
+        others.append(made(given, shared_tmp_path / f"alone{comm.rank}", "batches", MPI.COMM_SELF)[0])
+    for other in others:
+        compare_histories(history, open_result(other.folder).history, exact=False, same_order=False)
+    empty = {"step_size", "newton_iterations", "linear_iterations", "damage_dissipation", "viscous_dissipation"}
+    empty |= {"thermal_work", "prestress_work", "wall/floor/jump_impulse", "wall/side/jump_impulse"}
+    constant = {name for name in history if np.ptp(history[name]) == 0.0}
+    assert constant <= empty | ({"wall_kinetic_energy"} if not declared else set())
+    if declared:
+        probed, mass = history["probe/all/velocity"], one.gather(one.model.inertia.mass)
+        mass = comm.bcast(mass)
+        np.testing.assert_allclose(history["damping_impulse"], np.einsum("n,tnc->tc", mass, probed), rtol=1e-12)
+        exact = 0.5 * probed[:, :, 1] ** 2 @ mass
+        np.testing.assert_allclose(history["wall_kinetic_energy"], exact, rtol=1e-12)
+
+
+def sideways_energy(now):
+    return 0.5 * now.model.inertia.mass @ now.state.v[:, 1] ** 2
 
 
 SQUEEZED = LATTICE | {

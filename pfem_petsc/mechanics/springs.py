@@ -61,7 +61,32 @@ class Springs:
     def _times(self, u: np.ndarray) -> np.ndarray:
         # written out: the order of the sum does not depend on the number of nodes
         k = self.stiffness
-        return k[:, :, 0] * u[:, :1] + k[:, :, 1] * u[:, 1:2] + k[:, :, 2] * u[:, 2:]
+        return k[:, :, 0] * u[..., :1] + k[:, :, 1] * u[..., 1:2] + k[:, :, 2] * u[..., 2:]
+
+
+class Ground:
+    """Forces of springs and dashpots to the ground on some owned nodes.
+
+    Parameters
+    ----------
+    springs : Springs, or None
+    dashpots : (owned,) force over velocity of each node [N s/m]
+    nodes : (m,)
+    """
+
+    def __init__(self, springs: Springs | None, dashpots: np.ndarray, nodes: np.ndarray) -> None:
+        self._dashpots = dashpots[nodes][:, None]
+        self._at, self._springs = np.empty(0, dtype=np.int64), springs
+        if springs is not None:
+            self._at = np.flatnonzero(np.isin(nodes, springs.nodes))
+            of = np.searchsorted(springs.nodes, nodes[self._at])
+            self._springs = Springs(self._at, springs.stiffness[of], springs.anchors[of])
+
+    def add_forces(self, x: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
+        """Add the forces [N] at positions and velocities to ``out``; (..., m, 3), any number of instants."""
+        out -= self._dashpots * v
+        if len(self._at):
+            out[..., self._at, :] -= self._springs._times(x[..., self._at, :] - self._springs.anchors)
 
 
 def make_springs(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> Springs | None:

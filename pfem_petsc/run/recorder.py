@@ -33,6 +33,7 @@ from ..columns import (
     declared,
     fill_at_state,
 )
+from ..mechanics.springs import Ground
 from ..stepping.stepper import Instants
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ class Probes:
 
     def fill(self, values: np.ndarray, state: State, acceleration: np.ndarray, support: np.ndarray) -> None:
         """Write this rank's share (m, number of PROBED, 3), with acceleration and forces of supports (owned, 3) to
-        record."""
+        record, but not those of the ground, which :class:`Recorder` adds to rows of all steppers."""
         nodes = self.nodes
         values[:, 0], values[:, 1], values[:, 2] = state.x[nodes], state.v[nodes], acceleration[nodes]
         values[:, 3] = support[nodes] + state.contact[nodes]
@@ -156,6 +157,8 @@ class Recorder:
         probes = {probe.name: model.nodes[probe.node_set] for probe in model.case.output.probe}
         self._probes = Probes(model.comm, probes, model.mesh.node_ids)
         self.probe_nodes, self.probed = self._probes.ids, self._probes.nodes
+        # static analyses have no velocities
+        self._ground = Ground(model.bars.springs, model.inertia.points.damping, self.probed)
         self._layout = Layout(self._columns())
         self.columns = self._layout.columns if columns is None else columns
         self.layout, self.rest = self._layout, None
@@ -214,6 +217,10 @@ class Recorder:
         """
         stepper, contact = self.stepper, self.model.contact
         instants, stepper.instants = stepper.instants or self._present(alarm), None
+        position, velocity, _, reaction = np.moveaxis(
+            instants.shares[:, self._probed :].reshape(len(instants.shares), -1, len(PROBED), 3), 2, 0
+        )
+        self._ground.add_forces(position, velocity, reaction)
         total = self._total(instants.shares)
         alarms = total[:, HEAD.first("alarm")] > 0.0
         contacts = None

@@ -191,6 +191,79 @@ def test_frame(scheme, operator, tmp_path):
 
 
 @pytest.mark.parallel
+@pytest.mark.parametrize("scheme", [*EXPLICIT, *IMPLICIT])
+def test_reactions_of_the_ground(scheme, comm, shared_tmp_path):
+    """A bar that moves as a whole on inclined springs and dashpots, one end held along x: node by node -K u - c v."""
+    v, c, tensor = np.array([0.0, 0.1, -0.2]), 0.3, 0.5 * np.diag(K)
+    frame = [[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]]
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.5**0.5, 0.5**0.5], [0.0, -(0.5**0.5), 0.5**0.5]])
+    tensor = turn.T @ tensor @ turn
+    it = case(
+        spring=[{"node_set": "all", "stiffness": (0.25 * K).tolist(), "frame": frame} for _ in range(2)],
+        dashpot=[{"node_set": "all", "coefficient": c}],
+        support=[{"node_set": "start", "fix": "x"}],
+        time=time_of(scheme, 1e-3, 0.3),
+        initial={"velocity": v.tolist()},
+        output={"fields_every": 0, "probe": [{"name": "all", "node_set": "all"}]},
+    )
+    history = run(it, shared_tmp_path / "out", comm)
+    reactions, velocities = history["probe/all/reaction"], history["probe/all/velocity"]
+    moved = history["probe/all/position"] - [[0.0, 0.0, 0.0], [LENGTH, 0.0, 0.0]]
+    expected, held = -np.einsum("ij,tnj->tni", tensor, moved) - c * velocities, reactions[:, 0, 0].copy()
+    reactions[:, 0, 0] = expected[:, 0, 0] = 0.0
+    np.testing.assert_allclose(reactions, expected, atol=1e-12 * np.abs(expected).max())
+    dashpots = -c * velocities.sum(axis=1)
+    reactions[:, 0, 0] = held
+    scale = np.abs(reactions).max()
+    np.testing.assert_allclose(reactions.sum(axis=1), history["support_force"] + dashpots, atol=1e-10 * scale)
+    # closed form along the axes of the springs, each an oscillator of the whole bar
+    stiff, t = K[1:], history["time"][:, None]
+    decay = c / BAR
+    omega = np.sqrt(stiff / BAR - decay**2)
+    u = (turn @ v)[1:] / omega * np.exp(-decay * t) * np.sin(omega * t)
+    rate = (turn @ v)[1:] * np.exp(-decay * t) * np.cos(omega * t) - decay * u
+    exact = -0.5 * stiff * u - c * rate
+    error = np.abs(reactions[:, 1] @ turn.T[:, 1:] - exact).max() / np.abs(exact).max()
+    assert error < (0.03 if scheme == "souza_moura" else 2e-3)
+
+
+@pytest.mark.parallel
+def test_reactions_of_springs_in_statics(comm, shared_tmp_path):
+    """A tripod whose feet stand on springs: 45 and 55 % of the load up, by moments; a bar that goes changes nothing."""
+    points = [[0, 0, 0], [1, 0, 1], [2, 0, 0], [1, 0, 0.5]]
+    bars = [[0, 1], [1, 2], [0, 2], [0, 3], [3, 2], [3, 1]]
+    groups = {"a": [0], "b": [1], "c": [2], "all": [0, 1, 2, 3]}
+    data = {
+        "mesh": {"generator": "arrays", "points": points, "bars": bars, "node_groups": groups}
+        | {"bar_groups": {"mast": [5]}},
+        "node_set": {name: {"group": name} for name in groups},
+        "material": {"m": {"young_modulus": 2e11, "density": 1.0}},
+        "section": {"s": {"area": 1e-3, "material": "m"}},
+        "support": [{"node_set": "all", "fix": "y"}, {"node_set": "a", "fix": "x"}],
+        "spring": [
+            {"node_set": "a", "stiffness": [0.0, 0.0, 1e8]},
+            {"node_set": "c", "stiffness": [0.0, 0.0, 2e8]},
+        ],
+        "dashpot": [{"node_set": "all", "coefficient": 1e3}],
+        "output": {"probe": [{"name": name, "node_set": name} for name in groups]},
+        "solver": {"rtol": 1e-12},
+        "stage": [
+            {"name": "loading", "static": {"step": 0.5}, "load": [{"node_set": "b", "force": [100.0, 0.0, -1000.0]}]},
+            {"name": "without", "static": {"step": 1.0}, "remove": [{"bars": "mast", "time": 0.0, "duration": 1.0}]},
+        ],
+    }
+    history = run(Case.from_dict(data), shared_tmp_path / "out", comm)
+    for row in (2, -1):
+        feet = history["probe/a/reaction"][row, 0], history["probe/c/reaction"][row, 0]
+        np.testing.assert_allclose(feet, [[-100.0, 0.0, 450.0], [0.0, 0.0, 550.0]], atol=0.05)
+    sums = history["probe/all/reaction"].sum(axis=1)
+    np.testing.assert_allclose(sums, history["support_force"], atol=1e-6)
+    sunk = history["probe/c/position"][:, 0, 2]
+    np.testing.assert_allclose(history["probe/c/reaction"][:, 0, 2], -2e8 * sunk, rtol=1e-12, atol=1e-12)
+    assert np.abs(history["probe/b/reaction"]).max() < 1e-8
+
+
+@pytest.mark.parallel
 @pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
 def test_frame_in_statics_modes_and_critical_steps(operator, comm, shared_tmp_path):
     """A weight that moves its bar aside; modes and the explicit limit of stiffness along the bar and across."""

@@ -410,6 +410,13 @@ def test_all_columns_of_all_steps_are_those_of_single_steps(declared, comm, shar
     empty |= {"thermal_work", "prestress_work", "wall/floor/jump_impulse", "wall/side/jump_impulse"}
     constant = {name for name in history if np.ptp(history[name]) == 0.0}
     assert constant <= empty | ({"wall_kinetic_energy"} if not declared else set())
+    # node by node what supports, walls, springs and dashpots do
+    reactions, places = history["probe/all/reaction"], history["probe/all/position"][0]
+    side = np.argmin(np.abs(places - [0.0, 0.0, 0.02]).sum(axis=1))
+    drag = 3.0 * history["probe/all/velocity"][:, side]
+    total = history["support_force"] + history["wall/floor/force"] + history["wall/side/force"] - drag
+    np.testing.assert_allclose(reactions.sum(axis=1), total, atol=1e-12 * np.abs(reactions).sum(axis=1).max())
+    assert np.abs(drag).max() > 1.0
     if declared:
         probed, mass = history["probe/all/velocity"], one.gather(one.model.inertia.mass)
         mass = comm.bcast(mass)

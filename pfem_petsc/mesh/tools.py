@@ -25,8 +25,17 @@ _POWERS = {
     "kinematic_hardening": -2,
     "density": -4,
     "damping": -4,
+    "curve": -2,
+    "area": 2,
+    "thickness": 1,
+    "prestress": -2,
+    "motion": 1,
+    "velocity": 1,
+    "acceleration": 1,
+    "stiffness": -1,
+    "coefficient": -1,
 }
-"""Powers of a unit of length in those of material keys, with newtons and seconds: MPa are N/mm2, t/mm3 are N s2/mm4."""
+"""Powers of a unit of length in those of keys, with newtons and seconds: MPa are N/mm2, t/mm3 are N s2/mm4."""
 
 
 def lengths(mesh: WholeMesh) -> np.ndarray:
@@ -210,19 +219,27 @@ def scaled(mesh: WholeMesh, scale: float) -> WholeMesh:
         return mesh
     fields = {name: values * scale**2 if name == "area" else values for name, values in mesh.bar_fields.items()}
     tables = {
-        table: {name: _scaled_keys(keys, scale) for name, keys in rows.items()} for table, rows in mesh.tables.items()
+        table: {
+            name: {key: _scaled_value(value, scale ** _power(table, key)) for key, value in keys.items()}
+            for name, keys in rows.items()
+        }
+        for table, rows in mesh.tables.items()
     }
     return replace(mesh, points=mesh.points * scale, bar_fields=fields, tables=tables)
 
 
-def _scaled_keys(keys: dict[str, Any], scale: float) -> dict[str, Any]:
-    powers = {**_POWERS, "area": 2, "thickness": 1}
-    found = {key: _converted(value * scale ** powers[key]) if key in powers else value for key, value in keys.items()}
-    if "curve" in found:
-        found["curve"] = [[strain, _converted(stress * scale**-2)] for strain, stress in found["curve"]]
-    if "acceleration" in found:
-        found["acceleration"] = [_converted(component * scale) for component in found["acceleration"]]
-    return found
+def _power(table: str, key: str) -> int:
+    return -1 if table == "mass" else _POWERS.get(key, 0)
+
+
+def _scaled_value(value: Any, factor: float) -> Any:
+    """Return a number, a list of numbers, or the values of rows, whose first column is another quantity, times a
+    factor."""
+    if factor == 1.0 or isinstance(value, str):
+        return value
+    if not isinstance(value, list):
+        return _converted(value * factor)
+    return [[v[0], *_scaled_value(v[1:], factor)] if isinstance(v, list) else _converted(v * factor) for v in value]
 
 
 def _converted(value: float) -> float:

@@ -31,22 +31,29 @@ class WholeMesh:
     bar_fields: dict[str, np.ndarray] = field(default_factory=dict)
     """(n_bars,) float64; the field ``area`` has the areas of cross-sections [m2]."""
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """What a file has besides the mesh: ``material``, ``section``, ``support`` and ``load`` (by node group),
-    ``gravity``, each with the keys of a case by name, and ``analysis``: ``static``, ``time`` and ``modes``."""
+    """What a file has besides the mesh: ``material``, ``section``, ``support``, ``load``, ``mass``, ``spring``,
+    ``dashpot``, ``temperature``, ``initial`` and ``gravity``, each with the keys of a case by name, and ``analysis``:
+    ``static``, ``time`` and ``modes``."""
     warnings: list[str] = field(default_factory=list)
     source: str = "mesh"
     """The file, for messages."""
 
 
+_CONDITIONS = ("support", "load", "gravity", "temperature", "initial", "mass", "spring", "dashpot")
+PLANE = "plane elements"
+"""Name of a support that only holds a plane truss in its plane."""
+
+
 def case_tables(tables: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return tables of a mesh in the form that a case takes: lists of supports and loads, and their node sets."""
+    """Return tables of a mesh in the form that a case takes: lists, and the node sets that they name."""
     found: dict[str, Any] = {name: table for name, table in tables.items() if name in ("material", "section")}
-    for name in ("support", "load"):
-        if tables.get(name):
-            found[name] = list(tables[name].values())
-            found.setdefault("node_set", {}).update({own: {"group": own} for own in tables[name]})
-    for table in tables.get("gravity", {}).values():
-        found["gravity"] = table
+    for name in _CONDITIONS:
+        rows = list(tables.get(name, {}).values())
+        if rows:
+            found[name] = {"gravity": rows[0], "initial": {"on": rows}}.get(name, rows)
+        for row in rows:
+            for own in row.get("between", [row[key] for key in ("node_set",) if key in row]):
+                found.setdefault("node_set", {})[own] = {"group": own}
     return found
 
 
@@ -134,7 +141,6 @@ _STEEL = {"young_modulus": 210e9, "density": 7850.0}
 _AREA = 1e-4
 _PROBED = 100
 """Number of nodes up to which a node set with a load has a probe."""
-_CONDITIONS = ("support", "load", "gravity")
 
 
 def tables_of(mesh: WholeMesh) -> tuple[dict[str, Any], list[str]]:
@@ -176,16 +182,17 @@ def tables_of(mesh: WholeMesh) -> tuple[dict[str, Any], list[str]]:
 
 
 def _probes(mesh: WholeMesh) -> list[dict[str, str]]:
-    """Return probes for the node sets with loads, but for large ones: each node has columns of the history."""
-    loaded = [name for name in mesh.tables.get("load", {}) if len(mesh.node_groups[name]) <= _PROBED]
-    return [{"name": name, "node_set": name} for name in loaded]
+    """Return probes for node sets with loads or motions, but for large ones: each node has columns of the history."""
+    moved = [keys for keys in mesh.tables.get("support", {}).values() if len(keys) > 2]
+    names = dict.fromkeys(keys["node_set"] for keys in (*mesh.tables.get("load", {}).values(), *moved))
+    return [{"name": name, "node_set": name} for name in names if len(mesh.node_groups[name]) <= _PROBED]
 
 
 def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
     """Return the text of a case file at ``case`` for a mesh file, which can be checked and run."""
     tables, made = tables_of(mesh)
     relative = os.path.relpath(file.absolute(), case.absolute().parent)
-    known = [name for name in _CONDITIONS if name in tables]
+    known = [name for name in _CONDITIONS if mesh.tables.get(name, {}).keys() - {PLANE}]
     analysis = mesh.tables.get("analysis", {})
     if not known:
         made.append("supports and loads" if analysis else "supports, loads, and the analysis")

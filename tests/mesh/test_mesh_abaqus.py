@@ -161,7 +161,8 @@ def test_other_elements(tmp_path):
         ("10, 1.D+0, 0., 0.", "-10, 1, 0., 0.", r"line 4: \*NODE: -10 is not the label of a node"),
         ("10, 1.D+0, 0., 0.", "1, 1, 0., 0.", r"\*NODE: node 1 is listed more than once, at different positions"),
         ("10, 1.D+0, 0., 0.", "10, 1, 2, 3, 4, 5, 6, 7, 8", r"line 6: \*NODE: .* has 9 values; expected 1 to 7"),
-        ("2, 10, 7", "2, 10", r"line 14: \*ELEMENT: '2, 10' has 2 values; expected 3 to 5 with commas"),
+        ("2, 10, 7", "2, 10", r"line 14: \*ELEMENT: '2, 10' has 2 values; expected 3 with commas"),
+        ("2, 10, 7", "2, 10, 7, 1", r"line 14: \*ELEMENT: '2, 10, 7, 1' has 4 values; expected 3 with commas"),
         ("2, 10, 7", "2, 10, 8", r"line 11: \*ELEMENT: node 8 of element 2 is not defined"),
         ("2, 10, 7", "1, 10, 7", r"\*ELEMENT: element 1 is listed more than once"),
         ("TYPE=t3d2,\n   ELSET=Base", "ELSET=Base", r"line 11: \*ELEMENT: the parameter TYPE= is missing"),
@@ -173,6 +174,16 @@ def test_other_elements(tmp_path):
         ("ELSET=legs", "ELSET=lex", r"line 42: \*SOLID SECTION: there is no element set lex"),
         ("*Node, nset=ALL", "*Node, SYSTEM=C", r"SYSTEM=C is not read: write the nodes in Cartesian"),
         ("*NSET, NSET=Feet, GENERATE", "*NGEN", r"line 23: \*NGEN is not read: write the nodes and elements one by"),
+        (
+            "*NSET, NSET=Top",
+            "*SYSTEM\n0, 0, 1\n*NSET, NSET=Top",
+            r"line 21: \*SYSTEM is not read: write .* global coord",
+        ),
+        (
+            "*HEADING",
+            "*PARAMETER\nE = 1.",
+            r"line 1: \*PARAMETER is not read: write the values in the place of the names",
+        ),
         ("*NSET, NSET=Top", "*INSTANCE, NAME=I, PART=P\n*END INSTANCE\n*NSET, NSET=Top", r"there is no part P"),
         ("*NSET, NSET=Top", "*NSET, NSET=Top, INSTANCE=J", r"line 21: \*NSET: there is no instance J"),
         ("*HEADING\n A", "A", r"line 1: 'A tripod, written by hand' precedes the first \*KEYWORD"),
@@ -190,3 +201,109 @@ def test_one_thing_wrong(tmp_path, old, new, text):
 def test_members_that_are_not_there_are_told(tmp_path):
     mesh = read_whole(written(tmp_path, FLAT.replace("*NSET, NSET=Top\n21,", "*NSET, NSET=Top\n21, 22, 23")))
     assert mesh.warnings[0].endswith("2 members of node sets are not there, and are left out")
+
+
+MIXED = """*NODE
+1, 0., 0., 0.
+2, 1., 0., 0.
+3, 1., 1., 0.
+4, 0., 1., 0.
+5, 0.5, 1.5, 1.
+*ELEMENT, TYPE=S4, ELSET=PLATE
+1, 1, 2, 3, 4
+*ELEMENT, TYPE=T3D2, ELSET=RODS
+2, 3, 5
+3, 4, 5
+*ELSET, ELSET=BOTH
+PLATE, RODS
+*ELSET, ELSET=FIRST
+1
+*NSET, NSET=CORNERS, ELSET=PLATE
+*NSET, NSET=FOOT
+1
+*SOLID SECTION, ELSET=PLATE, MATERIAL=M
+*SOLID SECTION, ELSET=BOTH, MATERIAL=M
+0.01
+"""
+
+
+def test_sets_and_sections_without_bars_are_left_out(tmp_path):
+    """A set of which one element is a bar is the group of these; one that does not exist is an error."""
+    mesh = read_whole(written(tmp_path, MIXED))
+    assert members(mesh.bar_groups) == {"RODS": [0, 1], "BOTH": [0, 1]} and mesh.node_groups == {}
+    assert list(mesh.tables["section"]) == ["BOTH"] and mesh.bar_fields["area"].tolist() == [0.01, 0.01]
+    assert [text.partition("a.inp: ")[2] for text in mesh.warnings] == [
+        "left out elements of the types S4",
+        "line 16: *NSET: nodes of elements that are left out are not read",
+        "left out the node sets CORNERS, FOOT: no bar ends at their nodes",
+        "left out the element sets PLATE, FIRST: none of their elements is a bar",
+        "left out the sections of PLATE: none of their elements is a bar",
+        "left out 2 nodes where no bar ends (labels 1, 2)",
+    ]
+    with pytest.raises(InputError, match=r"line 19: \*SOLID SECTION: there is no element set PLATES"):
+        read_whole(written(tmp_path, MIXED.replace("SECTION, ELSET=PLATE,", "SECTION, ELSET=PLATES,")))
+
+
+def test_names_in_quotes(tmp_path):
+    """They may have blanks, commas and, after a dot, those of instances; blanks in keywords do not matter."""
+    text = """*Part, name=P
+*Node
+1, 0., 0., 0.
+2, 1., 0., 0.
+3, 2., 0., 0.
+*Element, type=T3D2
+1, 1, 2
+2, 2, 3
+*Nset, nset="feet set"
+ 1, 3
+*Nset, nset="top, 1"
+ 2,
+*Elset, elset="tie, 1"
+ 1,
+*Elset, elset=every
+ "tie, 1", 2
+*SolidSection, elset="tie, 1", material="mild, steel"
+ 1e-4,
+*EndPart
+*Assembly, name=A
+*Instance, name=P-1, part=P
+*End Instance
+*End Assembly
+*Material, name="mild, steel"
+*Elastic
+ 2e11,
+*Boundary
+P-1."feet set", PINNED
+"P-1.top, 1", 2, 3
+*Step, nlgeom
+*Cload
+P-1."top, 1", 1, 5.
+*End Step
+"""
+    mesh = read_whole(written(tmp_path, text))
+    assert members(mesh.node_groups) == {"feet set": [0, 2], "top, 1": [1]}
+    assert members(mesh.bar_groups) == {"tie, 1": [0], "every": [0, 1]}
+    assert mesh.tables["section"]["tie, 1"]["material"] == "mild, steel" and "mild, steel" in mesh.tables["material"]
+    held = [(keys["node_set"], keys["fix"]) for keys in mesh.tables["support"].values()]
+    assert held == [("feet set", "xyz"), ("top, 1", "yz")] and list(mesh.tables["load"]) == ["top, 1"]
+
+
+@pytest.mark.parametrize(
+    ("last", "told"),
+    [
+        ("21, 3, -1.\n", "ends without *END STEP: it may have been cut off"),
+        ("ELSET=legs, MATERI", "line 42: *SOLID SECTION: MATERI is left out: it is not read"),
+        ("*SOLID SECTION, ELSET=legs, MATERIAL=steel\n2.E-", "line 43: *SOLID SECTION: '2.E-' is not a number"),
+        ("ELSET=legs, MATERIAL=steel\n2", "ends within the line '2': it may have been cut off"),
+        ("1, 11, 5\n*MATERIAL, NAME=Steel\n*ELAST", "left out *ELAST: keywords that are not read"),
+    ],
+)
+def test_files_that_are_cut_off(tmp_path, last, told):
+    """Of what is missing, everything that is seen is told; whole files have no such warning."""
+    text = FLAT[: FLAT.index(last) + len(last)]
+    try:
+        warnings = read_whole(written(tmp_path, text)).warnings
+    except InputError as error:
+        warnings = [str(error)]
+    assert any(told in warning for warning in warnings)
+    assert not any("cut off" in warning for warning in read_whole(written(tmp_path, FLAT)).warnings)

@@ -9,12 +9,26 @@ from pfem_petsc.errors import InputError
 from pfem_petsc.formats import read_whole
 from pfem_petsc.mesh.whole import skeleton
 
+BEAM = "*BEAM SECTION, ELSET=E, MATERIAL=M, SECTION="
 SECTIONS = {
-    "*BEAM SECTION, SECTION=CIRC, ELSET=E, MATERIAL=M\n2.\n": {"area": 4 * np.pi, "shape": "round"},
-    "*BEAM SECTION, SECTION=RECT, ELSET=E, MATERIAL=M\n2., 3.\n": {"area": 6.0},
-    "*BEAM SECTION, SECTION=BOX, ELSET=E, MATERIAL=M\n4., 5., 1., 1., 1., 1.\n": {"area": 14.0},
+    f"{BEAM}CIRC\n2.\n": {"area": 4 * np.pi, "shape": "round"},
+    f"{BEAM}CIRC\n2., 3.\n": {"area": 1.5 * np.pi},  # of CalculiX: the axes of an ellipse
+    f"{BEAM}PIPE\n2., 0.5\n": {"area": np.pi * (4.0 - 2.25), "shape": "tube", "thickness": 0.5},
+    f"{BEAM}THICK PIPE\n2., 0.5\n": {"area": np.pi * (4.0 - 2.25), "shape": "tube", "thickness": 0.5},
+    f"{BEAM}RECT\n2., 3.\n": {"area": 6.0},
+    f"{BEAM}RECTANGULAR\n2., 3.\n0., 0., -1.\n": {"area": 6.0},
+    f"{BEAM}RECT\n2.\n": {"area": 4.0},
+    f"{BEAM}BOX\n4., 5., 1., 1., 1., 1.\n": {"area": 14.0},
+    f"{BEAM}L\n0.1, 0.1, 0.01, 0.01\n": {"area": 0.0019},
+    f"{BEAM}I\n0.1, 0.2, 0.1, 0.1, 0.01, 0.01, 0.008\n": {"area": 0.00344},
+    f"{BEAM}I\n0.1, 0.2, , 0.1, , 0.01, 0.008\n": {"area": 0.001 + 0.19 * 0.008},  # a T
+    f"{BEAM}HEX\n2., 0.3\n": {"area": 1.5 * np.sqrt(3.0) * (4.0 - (2.0 - 0.6 / np.sqrt(3.0)) ** 2)},
+    f"{BEAM}TRAPEZOID\n4., 3., 2., 1.\n": {"area": 9.0},
+    f"{BEAM}ARBITRARY\n3, 0., 0., 3., 0., 0.1\n3., 4., 0.2\n0., 4., 0.3\n": {"area": 0.3 + 0.8 + 0.9},
     "*BEAM GENERAL SECTION, SECTION=GENERAL, ELSET=E\n7., 1., 0., 1., 1.\n": {"area": 7.0},
-    "*BEAM SECTION, SECTION=I, ELSET=E, MATERIAL=M\n1., 2., 3.\n": {},
+    "*FRAME SECTION, SECTION=PIPE, ELSET=E\n2., 0.5\n": {"area": np.pi * 1.75, "shape": "tube", "thickness": 0.5},
+    f"{BEAM}I\n1., 2., 3.\n": {},
+    f"{BEAM}ELBOW\n1., 2., 3.\n": {},
 }
 
 
@@ -83,6 +97,7 @@ LEGS, P1, 1.
         "Feet": {"node_set": "Feet", "fix": "xyz"},
         "node_7": {"node_set": "node_7", "fix": "xyz"},
         "node_10": {"node_set": "node_10", "fix": "y"},
+        "Top": {"node_set": "Top", "fix": "xyz"},
     }
     assert mesh.tables["load"] == {
         "node_21": {"node_set": "node_21", "force": [0.0, 0.0, -15.0]},
@@ -92,14 +107,14 @@ LEGS, P1, 1.
     assert mesh.node_groups["node_10"].tolist() == [1] and mesh.node_groups["node_21"].tolist() == [3]
     told = [text.partition("a.inp: ")[2] for text in mesh.warnings[1:]]
     assert told == [
-        "line 54: *BOUNDARY: 'Top, 1, 3, 0.5' is left out: prescribed displacements are those of the case",
+        "line 54: *BOUNDARY: 'Top, 1, 3, 0.5' is held where it is: no *STATIC or *DYNAMIC step moves it",
         "line 59: *CLOAD: 'Top, 4, 1.' is left out: only forces along x, y and z are read",
         "line 63: *DLOAD: 'LEGS, GRAV, 1., 1., 0., 0.' is left out: the gravity of a case acts on all bars",
         "line 64: *DLOAD: 'LEGS, P1, 1.' is left out: only GRAV is read of distributed loads",
         "line 68: *STEP: left out with all that follows: only the first step is read",
     ]
     case = Case(Truss.read(tmp_path / "a.inp").tables, mesh=Truss.read(tmp_path / "a.inp"), static={"step": 1.0})
-    assert [support.fix for support in case.support] == ["xyz", "xyz", "y"]
+    assert [support.fix for support in case.support] == ["xyz", "xyz", "y", "xyz"]
     assert case.node_set["node_21"].group == "node_21"
 
 
@@ -121,7 +136,7 @@ def test_nodes_of_element_sets_and_constraints(tmp_path):
     more = "*NSET, NSET=of legs, ELSET=LEGS\n*TIE, NAME=t\na, b\n*MPC\n*TIE, NAME=u\nc, d\n*MATERIAL"
     mesh = read_whole(written(tmp_path, FLAT.replace("*MATERIAL", more)))
     assert mesh.node_groups["of legs"].tolist() == [0, 1, 2, 3]
-    assert mesh.warnings[-1].startswith(f"{tmp_path}/a.inp: left out *TIE, *MPC; nodes that they connect")
+    assert mesh.warnings[0].startswith(f"{tmp_path}/a.inp: left out *TIE, *MPC; nodes that they connect")
     with pytest.raises(InputError, match="'LEX' is neither a number nor an existing element set"):
         read_whole(written(tmp_path, FLAT.replace("*MATERIAL", more.replace("LEGS", "LEX"))))
 
@@ -161,7 +176,7 @@ STEPS = [
 def test_the_first_step_is_the_analysis(tmp_path, procedure, tables, told):
     """It makes a valid case with the loads, which a probe watches; what the program lacks is told."""
     mesh = read_whole(
-        path := written(tmp_path, FLAT.replace("*STEP\n", f"*BOUNDARY\nFeet, PINNED\n*STEP\n{procedure}\n"))
+        path := written(tmp_path, FLAT.replace("*STEP\n", f"*BOUNDARY\nFeet, PINNED\n*STEP, NLGEOM\n{procedure}\n"))
     )
     assert mesh.tables.get("analysis", {}) == tables
     assert [text.partition("a.inp: ")[2] for text in mesh.warnings[1:]] == [told] * bool(told)
@@ -173,13 +188,49 @@ def test_the_first_step_is_the_analysis(tmp_path, procedure, tables, told):
     assert read_whole(path, fields=()).warnings == mesh.warnings[:1]  # a run takes the mesh alone
 
 
-def test_keywords_that_are_left_out_are_named(tmp_path):
-    more = "*AMPLITUDE, NAME=ramp\n0., 0., 1., 1.\n*INITIAL CONDITIONS, TYPE=VELOCITY\n21, 3, -1.\n*STEP"
-    text = FLAT.replace("*STEP", more).replace("*CLOAD", "*STATIC\n*CLOAD, AMPLITUDE=ramp")
+def test_what_is_left_out_is_named(tmp_path):
+    more = "*CREEP\n1., 1., 1.\n*INITIAL CONDITIONS, TYPE=VELOCITY\n21, 3, -1.\n*STEP, LOAD=2"
+    text = FLAT.replace("*STEP", more).replace("*CLOAD", "*STATIC\n*CLOAD, AMPLITUDE=ramp, FOLLOWER")
     text += "*OUTPUT, FIELD\n*STEP\n*FREQUENCY\n5\n*END STEP\n*STEP\n*DYNAMIC\n1., 1.\n*END STEP\n"
-    told = [text.partition("a.inp: ")[2] for text in read_whole(written(tmp_path, text)).warnings[1:]]
+    path = written(tmp_path, text)
+    told = [text.partition("a.inp: ")[2] for text in read_whole(path).warnings]
     assert told == [
-        "line 50: *CLOAD: AMPLITUDE=ramp is left out: give the table over time in the case",
-        "left out *AMPLITUDE, *INITIAL CONDITIONS: keywords that are not read",
+        "line 48: *STEP: LOAD is left out: it is not read",
+        "line 50: *CLOAD: FOLLOWER is left out: it is not read",
+        "line 32: *ELASTIC: values at 20 degrees are taken for all temperatures",
+        "line 50: *CLOAD: AMPLITUDE=ramp is left out: there is none of this name",
+        "line 47: *INITIAL CONDITIONS: '21, 3, -1.' is left out: it has no effect without *DYNAMIC",
+        "left out *CREEP: keywords that are not read",
         "line 54: *STEP: left out with all that follows: only the first step is read",
+        "line 48: *STEP has no NLGEOM: the case has large displacements, as all cases do",
     ]
+    assert len(read_whole(path, fields=()).warnings) == 3  # a run takes the mesh alone
+
+
+def test_conditions_of_the_step_replace_those_of_the_model(tmp_path):
+    """With OP=NEW all, otherwise those of the same components."""
+    text = FLAT.replace("*STEP\n", "*BOUNDARY\nFeet, PINNED\n*STEP, NLGEOM\n*STATIC\n*BOUNDARY\n7, 1, 1, 0.5\n")
+    mesh = read_whole(written(tmp_path, text))
+    held = [(keys["fix"], mesh.node_groups[keys["node_set"]].tolist()) for keys in mesh.tables["support"].values()]
+    assert held == [("x", [0, 1]), ("yz", [0, 1, 2]), ("x", [2])]
+    assert [keys.get("motion") for keys in mesh.tables["support"].values()] == [
+        None,
+        None,
+        [[0, 0, 0, 0], [1, 0.5, 0, 0]],
+    ]
+    mesh = read_whole(written(tmp_path, text.replace("*STATIC\n*BOUNDARY", "*STATIC\n*BOUNDARY, OP=NEW")))
+    assert [(keys["node_set"], keys["fix"]) for keys in mesh.tables["support"].values()] == [("node_7", "x")]
+
+
+def test_motions_of_dynamic_steps(tmp_path):
+    """A velocity is one, an acceleration has rows; a displacement needs an amplitude, without which the node is held."""
+    step = "*STEP\n*DYNAMIC, EXPLICIT\n, 2.\n*BOUNDARY, TYPE={}\n21, 1, 1, 3.\n21, 3, 3, 4.\n"
+    for kind, expected in (
+        ("VELOCITY", {"velocity": [3.0, 0.0, 4.0]}),
+        ("ACCELERATION", {"acceleration": [[0.0, 3.0, 0.0, 4.0], [2.0, 3.0, 0.0, 4.0]]}),
+        ("DISPLACEMENT", {}),
+    ):
+        mesh = read_whole(written(tmp_path, FLAT.replace("*STEP\n", step.format(kind))))
+        assert mesh.tables["support"]["node_21"] == {"node_set": "node_21", "fix": "xz", **expected}
+        told = [text for text in mesh.warnings if "held where it is: at once in a dynamic step" in text]
+        assert len(told) == 2 * (not expected)

@@ -1,0 +1,657 @@
+"""What an Abaqus input file has besides its mesh, as tables of a case: materials, sections, supports, loads, ..."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from ..mesh.whole import PLANE, WholeMesh
+from ._abaqus_keywords import Block
+from ._abaqus_model import AtNodes, Deck, listed
+from ._numbers import number_of
+
+MADE = "_section_"
+"""Beginning of the names of element sets that the writer makes for areas."""
+
+Rows = tuple[tuple[float, float], ...]
+"""Times, or load factors, and values."""
+
+
+def value_of(words: list[str], at: int) -> float:
+    """Return a number, 0 for one that is missing, NaN for another text."""
+    return number_of(words[at]) if at < len(words) and words[at] else 0.0
+
+
+def short(value: float) -> float:
+    """Return a number as people write it."""
+    return float(f"{value:.12g}")
+
+
+def _name_of(groups: dict[str, np.ndarray], members: np.ndarray, wanted: str) -> str:
+    """Return the name of the group with these members, which may be a new one."""
+    for name in (wanted, *groups):
+        if name in groups and np.array_equal(groups[name], members):
+            return name
+    while wanted in groups:
+        wanted += "_"
+    groups[wanted] = members
+    return wanted
+
+
+def _alike(groups: dict[str, np.ndarray], values: np.ndarray, wanted: str) -> Iterator[tuple[list[float], str]]:
+    """Yield the rows of values (n, k) that differ and are not zero, each with the name of the group that has it."""
+    rows, which = np.unique(values, axis=0, return_inverse=True)
+    for i in np.flatnonzero(rows.any(axis=1)):
+        yield rows[i].tolist(), _name_of(groups, np.flatnonzero(which.ravel() == i), wanted)
+
+
+# ---- materials
+
+_PROPERTIES = {"ELASTIC": ("young_modulus", 2), "DENSITY": ("density", 1), "EXPANSION": ("thermal_expansion", 1)}
+"""Keys of keywords with one value, and the column of the temperature."""
+
+
+def add_materials(mesh: WholeMesh, deck: Deck) -> None:
+    """Add the table of materials to a mesh."""
+    for name, blocks in deck.materials.values():
+        values: dict[str, Any] = {}
+        told = [(block, _material_value(block, values)) for block in blocks]
+        if values.get("cable") and len(values.get("plastic", ((), (0.0,)))[1]) > 1:
+            told.append((blocks[-1], "*PLASTIC with hardening is left out: bars without compression have none"))
+            del values["plastic"]
+        mesh.warnings += [f"{block.where}: {text}" for block, text in told if text]
+        mesh.tables.setdefault("material", {})[name] = _material_keys(values)
+
+
+def _material_value(block: Block, material: dict[str, Any]) -> str:
+    """Read what belongs to a material; return what is to be said about it."""
+    if block.keyword == "DAMPING":
+        for name, key in (("ALPHA", "alpha"), ("BETA", "stiffness_damping")):
+            material[key] = number_of(block.get(name)) if name in block.parameters else material.get(key, 0.0)
+            if np.isnan(material[key]):
+                material[key] = 0.0
+                return f"{block.get(name)!r} is not a number: left out"
+        return ""
+    if block.keyword == "NO TENSION":
+        return "left out: there is no law of bars that carry compression alone"
+    if block.keyword == "NO COMPRESSION":
+        material["cable"] = True
+        return ""
+    if block.get("TYPE", "ISOTROPIC").upper() not in ("ISOTROPIC", "ISO"):
+        return f"TYPE={block.get('TYPE')}: left out"
+    key, column = _PROPERTIES.get(block.keyword, ("plastic", 2))
+    rows = block.rows(8, 1)
+    if len(rows) == 0 or not np.isfinite(rows[0, 0]):
+        return "no values: left out"
+    if block.keyword in ("ELASTIC", "DENSITY") and rows[0, 0] <= 0.0:
+        return f"{rows[0, 0]:g} is not positive: left out"
+    first = rows[:, column]
+    cold = np.isnan(first) | (first == first[0]) if key == "plastic" else np.arange(len(rows)) == 0
+    told = "" if cold.all() else f"values at {first[0]:g} degrees are taken for all temperatures"
+    if key != "plastic":
+        material[key] = float(rows[0, 0])
+        return told
+    hardening = block.get("HARDENING", "ISOTROPIC").upper()
+    stress, strain = np.nan_to_num(rows[cold, :2]).T
+    known = hardening == "ISOTROPIC" or (hardening == "KINEMATIC" and len(stress) <= 2)
+    if not known or "RATE" in block.parameters:
+        return f"HARDENING={hardening}: left out" if not known else "RATE: left out"
+    if strain[0] != 0.0 or stress[0] <= 0.0 or (np.diff(strain) <= 0.0).any() or (np.diff(stress) < 0.0).any():
+        return "a curve that does not start at plastic strain 0, or that falls: left out"
+    material["plastic"] = hardening, stress, strain
+    return told
+
+
+def _material_keys(values: dict[str, Any]) -> dict[str, Any]:
+    """A material's keys; rows of stress over plastic strain are a curve over strain, constant after the last row."""
+    keys = {key: values[key] for key in ("young_modulus", "density", "thermal_expansion") if key in values}
+    if values.get("alpha") and "density" in values:
+        keys["damping"] = values["alpha"] * values["density"]
+    if values.get("stiffness_damping"):
+        keys["stiffness_damping"] = values["stiffness_damping"]
+    if values.get("cable"):
+        keys["law"] = "cable"
+    if "plastic" not in values:
+        return keys
+    hardening, stress, strain = values["plastic"]
+    if len(stress) == 1:
+        keys["yield_stress"] = float(stress[0])
+    elif hardening == "KINEMATIC":
+        slope = (stress[1] - stress[0]) / strain[1]
+        keys |= {"yield_stress": float(stress[0]), "kinematic_hardening": float(slope)}
+    elif "young_modulus" in keys:
+        curve = np.stack([stress / keys["young_modulus"] + strain, stress], axis=1)
+        keys |= {"law": "multilinear", "curve": curve.tolist()}
+    return keys
+
+
+# ---- sections
+
+
+def add_sections(mesh: WholeMesh, deck: Deck) -> None:
+    """Add the table of sections, and the areas of bars as a field."""
+    areas = np.full(len(mesh.bars), np.nan)
+    sections: dict[str, dict[str, Any]] = {}
+    without: list[str] = []
+    for block, group, members in deck.section_members():
+        if len(members) == 0:
+            without.append(block.get("ELSET"))
+            continue
+        rows = block.rows(16, 1)
+        found = _section_keys(block, rows, deck.calculix)
+        if not found.get("area", 0.0) > 0.0:
+            what = f"SECTION={block.get('SECTION')}" if block.get("SECTION") else "the data line"
+            mesh.warnings.append(f"{block.where}: no area is known from {what}")
+            found.pop("area", None)
+        areas[members] = found.get("area", np.nan)
+        material = block.get("MATERIAL")
+        if material:
+            found["material"] = deck.materials.get(material.upper(), (material, []))[0]
+        elif block.keyword in ("BEAM GENERAL SECTION", "FRAME SECTION"):
+            found |= _own_material(mesh, block, rows, group)
+        sections[group] = {"bars": group, **found}
+    if without:
+        text = f"left out the sections of {listed(without)}: none of their elements is a bar"
+        mesh.warnings.append(f"{deck.path}: {text}")
+    whole = bool(len(areas)) and bool((areas > 0.0).all())
+    if sections:
+        mesh.tables["section"] = _without_made(mesh, deck, sections) if whole else sections
+    if whole:
+        mesh.bar_fields["area"] = areas
+    elif sections and np.isnan(areas).any():
+        text = f"{int(np.isnan(areas).sum())} bars have no area: there is no field area"
+        mesh.warnings.append(f"{deck.path}: {text}")
+
+
+def _without_made(mesh: WholeMesh, deck: Deck, sections: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return one section with the areas of the field in the place of those whose sets the writer has made for
+    areas, which are no groups then."""
+    own = deck.scopes[""].sets["ELSET"]
+    made = [
+        name for name in sections if name.startswith(MADE) and (name.upper() not in own or own[name.upper()].internal)
+    ]
+    materials = {sections[name].get("material") for name in made}
+    if len(materials) != 1:
+        return sections
+    for name in made:
+        mesh.bar_groups.pop(name, None)
+    material = materials.pop()
+    others = {name: keys for name, keys in sections.items() if name not in made}
+    return others | {"bars": {"area_field": "area", **({"material": material} if material else {})}}
+
+
+def _section_keys(block: Block, rows: np.ndarray, calculix: bool) -> dict[str, Any]:
+    """Return ``area``, and ``shape`` and ``thickness`` of round bars and tubes, as far as a section tells them.
+
+    Parameters
+    ----------
+    rows : (n, 16) its data
+    calculix : circles have diameters, as those of two values, and not a radius
+    """
+    a, b, c, d, e, f, g = (rows[0] if len(rows) else np.full(16, np.nan))[:7].tolist()
+    if block.keyword == "SOLID SECTION":
+        return {"area": a if np.isfinite(a) else 1.0}
+    kind = block.get("SECTION", "" if block.keyword == "BEAM SECTION" else "GENERAL").upper()
+    found: dict[str, Any] = {}
+    if kind == "GENERAL":
+        found = {"area": a}
+    elif kind.startswith("RECT"):
+        found = {"area": a * (b if np.isfinite(b) else a)}
+    elif kind.startswith("CIRC") and (calculix or np.isfinite(b)):
+        b = b if np.isfinite(b) else a
+        found = {"area": math.pi / 4 * a * b, **({"shape": "round"} if a == b else {})}
+    elif kind.startswith("CIRC"):
+        found = {"area": math.pi * a * a, "shape": "round"}
+    elif kind.endswith("PIPE"):
+        found = {"area": math.pi * (2.0 * a - b) * b, "shape": "tube", "thickness": b}
+    elif kind == "BOX":
+        found = {"area": a * b - (a - c - e) * (b - d - f)}
+    elif kind == "HEX":
+        found = {"area": 6.0 * a * b - 2.0 * math.sqrt(3.0) * b * b}
+    elif kind == "TRAPEZOID":
+        found = {"area": (a + c) / 2.0 * b}
+    elif kind == "L":
+        found = {"area": a * c + (b - c) * d}
+    elif kind == "I":  # without a flange, a T
+        c, d, e, f = np.nan_to_num([c, d, e, f]).tolist()
+        found = {"area": c * e + d * f + (b - e - f) * g}
+    elif kind == "ARBITRARY" and np.isfinite(a):
+        corners = np.vstack([rows[0, 1:3], rows[0, 3:5], rows[1 : int(a), :2]])
+        thickness = np.append(f, rows[1 : int(a), 2])
+        found = {"area": float(np.linalg.norm(np.diff(corners, axis=0), axis=1) @ thickness)}
+    if not np.isfinite(found.get("area", np.nan)):
+        return {}
+    return found | {"area": float(f"{found['area']:.15g}")}
+
+
+def _own_material(mesh: WholeMesh, block: Block, rows: np.ndarray, group: str) -> dict[str, Any]:
+    """Add the material that a section has itself, and return the key that names it.
+
+    After the shape come, if it is given, a direction across the bar, and E, G, and the thermal expansion.
+    """
+    rows = rows[int(rows[0, 0]) if block.get("SECTION").upper() == "ARBITRARY" else 1 :]
+    several = np.isfinite(rows[:1, 3:]).any()
+    if len(rows) and not several and (len(rows) > 1 or np.linalg.norm(rows[0, :3]) <= 1.0 + 1e-6):
+        rows = rows[1:]
+    values = {
+        "young_modulus": float(rows[0, 0]) if len(rows) else np.nan,
+        "density": number_of(block.get("DENSITY")),
+        "thermal_expansion": float(rows[0, 2]) if len(rows) else np.nan,
+    }
+    keys = {key: value for key, value in values.items() if value > 0.0}
+    if len(rows) > 1:
+        mesh.warnings.append(f"{block.where}: values at the first temperature are taken for all temperatures")
+    if not keys:
+        return {}
+    materials = mesh.tables.setdefault("material", {})
+    name = next((name for name, own in materials.items() if own == keys), group)
+    while name in materials and materials[name] != keys:
+        name += "_"
+    materials[name] = keys
+    return {"material": name}
+
+
+def add_initial_stress(mesh: WholeMesh, deck: Deck) -> list[str]:
+    """Give sections the initial stresses of their bars, as parts of their own where these differ; return what is to be
+    said."""
+    told, stress = [], np.zeros(len(mesh.bars))
+    for where, words, block in _initial_lines(deck, "STRESS"):
+        value = value_of(words, 1)
+        if len(words) > 7 or not np.isfinite(value):
+            told.append(f"{where}: {', '.join(words)[:60]!r} is left out: expected elements and their stress")
+        else:
+            stress[deck.members_of("ELSET", block, words[0])] = value
+    if not stress.any():
+        return told
+    sections = mesh.tables.setdefault("section", {})
+    rest = np.ones(len(mesh.bars), bool)
+    for keys in sections.values():
+        rest[mesh.bar_groups.get(keys.get("bars", ""), [])] = False
+    if rest.any() and all("bars" in keys for keys in sections.values()):
+        sections["others"] = {}
+    for name, keys in list(sections.items()):
+        members = mesh.bar_groups.get(keys["bars"], np.empty(0, int)) if "bars" in keys else np.flatnonzero(rest)
+        values = np.unique(stress[members])
+        if len(values) == 1 and values[0] != 0.0:
+            keys["prestress"] = float(values[0])
+        for k, value in enumerate(values.tolist() if len(values) > 1 else [], 1):
+            group = _name_of(mesh.bar_groups, members[stress[members] == value], f"{name}_{k}")
+            sections.pop(name, None)
+            sections[group] = {**keys, "bars": group, **({"prestress": value} if value else {})}
+    return told
+
+
+def _initial_lines(deck: Deck, kind: str) -> Iterator[tuple[str, list[str], Block]]:
+    """Yield the lines of the initial conditions of a type."""
+    for block in deck.initial:
+        if block.get("TYPE").upper() == kind:
+            yield from ((where, words, block) for where, words in block.lines())
+
+
+# ---- supports, loads, temperatures, and what belongs to nodes
+
+_FIXED = {"PINNED": "xyz", "ENCASTRE": "xyz", "XSYMM": "x", "YSYMM": "y", "ZSYMM": "z"}
+_FIXED |= {"XASYMM": "yz", "YASYMM": "xz", "ZASYMM": "xy"}
+_AT_REST: tuple[str, Rows] = ("", ())
+
+
+class Conditions:
+    """Supports, forces, gravity, temperatures, initial velocities, masses, springs and dashpots as tables of a case;
+    those of single nodes make groups.
+
+    What varies over time has rows over the load factor if the step is static.
+    """
+
+    def __init__(self, mesh: WholeMesh, deck: Deck) -> None:
+        self._mesh, self._deck = mesh, deck
+        self._told: list[str] = []
+        self._in_step = False
+        step = deck.procedure
+        self._static = step is not None and step.keyword in ("STATIC", "BUCKLE")
+        self._dynamic = step is not None and step.keyword == "DYNAMIC"
+        words = next((words for _, words in step.lines()), []) if step is not None else []
+        period = value_of(words, 1)
+        self._period = period if period > 0.0 else 1.0
+        self._supports: dict[tuple[str, int, tuple[str, Rows]], np.ndarray] = {}
+        self._motions = [_AT_REST]
+        self._held = np.zeros((len(mesh.points), 3), np.int64)
+        """Number of the motion of each component from 1 on; 0: free."""
+        self._forces: dict[tuple[str, Rows], np.ndarray] = {}
+        self._gravity: list[tuple[np.ndarray, Rows]] = []
+        self._temperatures: list[tuple[np.ndarray, float, Block]] = []
+
+    def add(self) -> list[str]:
+        """Add the tables to the mesh, and return what is to be said."""
+        kinds = {"DLOAD": self._weigh, "CLOAD": self._push, "BOUNDARY": self._hold, "TEMPERATURE": self._heat}
+        replaced = False
+        for block, in_step in self._deck.conditions:
+            if block.keyword == "BOUNDARY" and in_step and block.get("OP").upper() == "NEW" and not replaced:
+                replaced = True
+                self._supports.clear()
+                self._held[:] = 0
+            self._in_step = in_step
+            for where, words in block.lines():
+                told = kinds[block.keyword](block, words)
+                if told:
+                    self._told.append(f"{where}: {', '.join(words)[:60]!r} is {told}")
+        tables = {
+            "support": self._support_tables() | self._plane_tables(),
+            "load": self._load_tables(),
+            "gravity": self._gravity_tables(),
+            "temperature": self._temperature_tables(),
+            "initial": self._velocity_tables(),
+            **self._tables_of_nodes(),
+        }
+        self._mesh.tables |= {name: table for name, table in tables.items() if table}
+        for block in self._deck.initial:
+            if block.get("TYPE").upper() not in ("STRESS", "TEMPERATURE", "VELOCITY"):
+                self._told.append(f"{block.where}, TYPE={block.get('TYPE')} is left out: it is not read")
+        return self._told
+
+    # ---- over time
+
+    def _rows(self, block: Block) -> Rows:
+        """Return factors over the time of a dynamic step, or over the load factor; none: as without a table."""
+        usual = "RAMP" if self._static else "STEP"
+        if block.get("AMPLITUDE"):
+            return self._amplitude(block)
+        kind = self._deck.step.get("AMPLITUDE", usual).upper() if self._deck.step else usual
+        if kind == usual:
+            return ()
+        return ((0.0, 1.0), (1.0, 1.0)) if self._static else ((0.0, 0.0), (self._period, 1.0))
+
+    def _amplitude(self, block: Block) -> Rows:
+        name = block.get("AMPLITUDE")
+        found = self._deck.amplitudes.get(name.upper())
+        pairs = found.numbers() if found is not None else None
+        if found is None:
+            told = "there is none of this name"
+        elif (
+            found.get("DEFINITION", "TABULAR").upper() != "TABULAR"
+            or found.get("VALUE", "RELATIVE").upper() != "RELATIVE"
+        ):
+            told = "only tables of factors are read"
+        elif pairs is None or len(pairs) % 2 or len(pairs) == 0 or (np.diff(pairs[::2]) <= 0.0).any():
+            told = "expected pairs of times, which increase, and factors"
+        else:
+            scale = self._period if self._static else 1.0
+            rows = [(short(time / scale), factor) for time, factor in pairs.reshape(-1, 2).tolist()]
+            return tuple(rows if len(rows) > 1 else [rows[0], (rows[0][0] + 1.0, rows[0][1])])
+        text = f"{block.where}: AMPLITUDE={name} is left out: {told}"
+        self._told += [text] if text not in self._told else []
+        return ()
+
+    def _factors(self, rows: Rows, times: np.ndarray) -> np.ndarray:
+        """Return factors at times."""
+        rows = rows or ((0.0, 0.0 if self._static else 1.0), (1.0, 1.0))
+        return np.interp(times, *np.array(rows).T)
+
+    def _times(self, every: list[Rows]) -> np.ndarray:
+        """Return all times of rows, ascending."""
+        return np.unique([time for rows in every for time, _ in rows or ((0.0, 0.0), (1.0, 1.0))])
+
+    # ---- lines
+
+    def _weigh(self, block: Block, words: list[str]) -> str:
+        if len(words) < 2 or words[1].upper() != "GRAV":
+            return "left out: only GRAV is read of distributed loads"
+        values = np.array([value_of(words, at) for at in range(2, 6)])
+        if not np.isfinite(values).all():
+            return "left out: expected numbers"
+        if words[0] and len(self._deck.members_of("ELSET", block, words[0])) < len(self._mesh.bars):
+            return "left out: the gravity of a case acts on all bars"
+        self._gravity.append((values[0] * values[1:], self._rows(block)))
+        return ""
+
+    def _push(self, block: Block, words: list[str]) -> str:
+        axis, value = value_of(words, 1), value_of(words, 2)
+        if axis not in (1.0, 2.0, 3.0) or not np.isfinite(value):
+            return "left out: only forces along x, y and z are read"
+        name, _ = self._group(block, words[0])
+        if name:
+            self._forces.setdefault((name, self._rows(block)), np.zeros(3))[int(axis) - 1] += value
+        return "" if name else "left out: it names no node where a bar ends"
+
+    def _hold(self, block: Block, words: list[str]) -> str:
+        axes, value = _FIXED.get(words[1].upper() if len(words) > 1 else "", ""), 0.0
+        if not axes:
+            first = value_of(words, 1)
+            last = value_of(words, 2) or first
+            value = value_of(words, 3)
+            if not (1.0 <= first <= last <= 6.0 and np.isfinite(value)):
+                return "left out: expected degrees of freedom from 1 to 6, and a number"
+            axes = "xyz"[int(first) - 1 : int(last)]  # bars have no rotations
+        name, members = self._group(block, words[0])
+        if not name:
+            return "left out: it names no node where a bar ends"
+        motion, told = self._motion(block, value) if axes and value else (_AT_REST, "")
+        if motion not in self._motions:
+            self._motions.append(motion)
+        for axis in map("xyz".index, axes):
+            self._supports[name, axis, motion] = members
+            self._held[members, axis] = self._motions.index(motion) + 1
+        return told
+
+    def _motion(self, block: Block, value: float) -> tuple[tuple[str, Rows], str]:
+        """Return a motion, as the key of a support and its rows, and what is to be said about one that is not there."""
+        kind, rows = block.get("TYPE", "DISPLACEMENT").upper(), self._rows(block)
+        told = ""
+        if not self._in_step or not (self._static or self._dynamic):
+            told = "no *STATIC or *DYNAMIC step moves it"
+        elif "FIXED" in block.parameters:
+            return _AT_REST, ""
+        elif kind == "DISPLACEMENT" and (rows or self._static):
+            return ("motion", _times_value(rows or ((0.0, 0.0), (1.0, 1.0)), value)), ""
+        elif kind == "DISPLACEMENT":
+            told = "at once in a dynamic step, without AMPLITUDE"
+        elif kind == "VELOCITY" and not rows and self._dynamic:
+            return ("velocity", ((0.0, value),)), ""
+        elif kind == "ACCELERATION" and self._dynamic:
+            return ("acceleration", _times_value(rows or ((0.0, 1.0), (self._period, 1.0)), value)), ""
+        else:
+            told = f"TYPE={kind} is not read {'in a static step' if self._static else 'with AMPLITUDE'}"
+        return _AT_REST, f"held where it is: {told}"
+
+    def _heat(self, block: Block, words: list[str]) -> str:
+        value = value_of(words, 1)
+        if not np.isfinite(value) or len(words) < 2:
+            return "left out: expected nodes and a temperature"
+        if not (self._static or self._dynamic):
+            return "left out: temperatures act in *STATIC and *DYNAMIC steps"
+        self._temperatures.append((self._deck.members_of("NSET", block, words[0]), value, block))
+        return ""
+
+    def _group(self, block: Block, target: str) -> tuple[str, np.ndarray]:
+        """Return the name of the node group with the nodes of a set, or of the node of a label, and its members; empty
+        without nodes."""
+        members, groups = self._deck.members_of("NSET", block, target), self._mesh.node_groups
+        if len(members) == 0:
+            return "", members
+        wanted = target.replace('"', "").replace("/", "_")
+        for name, own in groups.items():
+            if name.upper() in (wanted.upper(), wanted.upper().rpartition(".")[2]) and np.array_equal(own, members):
+                return name, members
+        label = wanted.rpartition(".")[2].isdecimal()
+        name = f"node_{wanted}" if label else wanted
+        while name in groups and not np.array_equal(groups[name], members):
+            name += "_"
+        groups[name] = members
+        return name, members
+
+    # ---- tables
+
+    def _support_tables(self) -> dict[str, dict[str, Any]]:
+        found: dict[tuple[str, str, tuple[float, ...]], dict[int, list[float]]] = {}
+        for (name, axis, motion), members in self._supports.items():
+            left = members[self._held[members, axis] == self._motions.index(motion) + 1]
+            if len(left):  # of which later lines have given no other motion
+                name = name if len(left) == len(members) else _name_of(self._mesh.node_groups, left, name)
+                times = tuple(time for time, _ in motion[1])
+                found.setdefault((name, motion[0], times), {})[axis] = [value for _, value in motion[1]]
+        tables: dict[str, dict[str, Any]] = {}
+        for (name, kind, times), axes in found.items():
+            keys: dict[str, Any] = {"node_set": name, "fix": "".join("xyz"[axis] for axis in sorted(axes))}
+            columns = [axes.get(axis, [0.0] * len(times)) for axis in range(3)]
+            rows = [list(row) for row in zip(times, *columns)]
+            if kind:
+                keys[kind] = rows[0][1:] if kind == "velocity" else rows
+            if kind == "motion":
+                keys["interpolation"] = "linear"
+            _add(tables, name, keys)
+        return tables
+
+    def _plane_tables(self) -> dict[str, dict[str, Any]]:
+        """Return a support of the nodes at which only plane elements end, along z, the direction that these do not
+        have."""
+        plane, bars = self._deck.plane, self._mesh.bars
+        members = np.setdiff1d(bars[plane], bars[~plane])
+        free = members[self._held[members, 2] == 0]
+        self._held[free, 2] = 1
+        if len(free) == 0:
+            return {}
+        self._told.append(f"{self._deck.path}: the case holds {len(free)} nodes of plane elements along z")
+        return {PLANE: {"node_set": _name_of(self._mesh.node_groups, free, "plane"), "fix": "z"}}
+
+    def _load_tables(self) -> dict[str, dict[str, Any]]:
+        tables: dict[str, dict[str, Any]] = {}
+        for (name, rows), force in self._forces.items():
+            table = {"table": [list(row) for row in rows]} if rows else {}
+            _add(tables, name, {"node_set": name, "force": force.tolist(), **table})
+        return tables
+
+    def _gravity_tables(self) -> dict[str, dict[str, Any]]:
+        total = sum((vector for vector, _ in self._gravity), np.zeros(3))
+        if not any(rows for _, rows in self._gravity):
+            return {"gravity": {"acceleration": total.tolist()}} if total.any() else {}
+        times = self._times([rows for _, rows in self._gravity])
+        over = sum(np.outer(self._factors(rows, times), vector) for vector, rows in self._gravity)
+        return {"gravity": {"acceleration": np.column_stack([times, over]).tolist()}}
+
+    def _temperature_tables(self) -> dict[str, dict[str, Any]]:
+        """Return the temperatures of bars, the means of those of their nodes, above the initial ones."""
+        mesh = self._mesh
+        initial = np.zeros(len(mesh.points))
+        for where, words, block in _initial_lines(self._deck, "TEMPERATURE"):
+            value = value_of(words, 1)
+            if np.isfinite(value):
+                initial[self._deck.members_of("NSET", block, words[0])] = value
+            else:
+                self._told.append(f"{where}: {', '.join(words)[:60]!r} is left out: expected nodes and a temperature")
+        every = [self._rows(block) for _, _, block in self._temperatures]
+        times = self._times(every)
+        above = np.zeros((len(initial), len(times)))
+        for (members, value, _), rows in zip(self._temperatures, every):
+            factors, start = self._factors(rows, times), initial[members][:, None]
+            above[members] = factors * value - start if rows else factors * (value - start)
+        tables: dict[str, dict[str, Any]] = {}
+        if len(times):
+            for values, group in _alike(mesh.bar_groups, above[mesh.bars].mean(axis=1), "temperature"):
+                same = len(set(values)) == 1 and not self._static
+                rows = [list(row) for row in zip(times.tolist(), map(short, values))]
+                _add(tables, group, {"bars": group, **({"value": short(values[0])} if same else {"table": rows})})
+        return tables
+
+    def _velocity_tables(self) -> dict[str, dict[str, Any]]:
+        velocity = np.zeros((len(self._mesh.points), 3))
+        for where, words, block in _initial_lines(self._deck, "VELOCITY"):
+            axis, value = value_of(words, 1), value_of(words, 2)
+            if not self._dynamic or axis not in (1.0, 2.0, 3.0) or not np.isfinite(value):
+                told = (
+                    "expected nodes, 1, 2 or 3, and a number" if self._dynamic else "it has no effect without *DYNAMIC"
+                )
+                self._told.append(f"{where}: {', '.join(words)[:60]!r} is left out: {told}")
+            else:
+                velocity[self._deck.members_of("NSET", block, words[0]), int(axis) - 1] = value
+        groups = self._mesh.node_groups
+        return {name: {"node_set": name, "velocity": row} for row, name in _alike(groups, velocity, "velocity")}
+
+    # ---- masses, springs, dashpots
+
+    def _tables_of_nodes(self) -> dict[str, dict[str, dict[str, Any]]]:
+        groups, n = self._mesh.node_groups, len(self._mesh.points)
+        values = {"MASS": np.zeros((n, 1)), "SPRING": np.zeros((n, 3)), "DASHPOT": np.zeros((n, 3))}
+        tables: dict[str, dict[str, dict[str, Any]]] = {"mass": {}, "spring": {}, "dashpot": {}}
+        known: list[AtNodes] = []
+        for block, elements in self._deck.of_nodes():
+            told: dict[str, int] = {}
+            for element, nodes in elements:
+                known.append(element)
+                reason = self._add_of_nodes(block, element, nodes, values, tables)
+                if reason:
+                    told[reason] = told.get(reason, 0) + 1
+            self._told += [f"{block.where}: left out {count} elements: {reason}" for reason, count in told.items()]
+        every = [element for scope in self._deck.scopes.values() for element in scope.at_nodes]
+        bare = len({id(element) for element in every} - {id(element) for element in known})
+        if bare:
+            text = f"left out {bare} masses, springs or dashpots without *MASS, *SPRING or *DASHPOT"
+            self._told.append(f"{self._deck.path}: {text}")
+        for (value,), name in _alike(groups, values["MASS"], "mass"):
+            tables["mass"][name] = {"node_set": name, "value": value}
+        for row, name in _alike(groups, values["SPRING"], "spring"):
+            _add(tables["spring"], name, {"node_set": name, "stiffness": row})
+        # a dashpot of a case acts in all directions: those in which a node is held do not matter
+        damped = values["DASHPOT"]
+        most = damped.max(axis=1, keepdims=True)
+        uneven = ((damped != most) & (self._held == 0)).any(axis=1)
+        if uneven.any():
+            text = f"left out the dashpots of {int(uneven.sum())} nodes: those of a case act equally in all directions"
+            self._told.append(f"{self._deck.path}: {text}")
+        for (value,), name in _alike(groups, np.where(uneven[:, None], 0.0, most), "dashpot"):
+            _add(tables["dashpot"], name, {"node_set": name, "coefficient": value})
+        return tables
+
+    def _add_of_nodes(
+        self,
+        block: Block,
+        element: AtNodes,
+        nodes: list[int],
+        values: dict[str, np.ndarray],
+        tables: dict[str, dict[str, dict[str, Any]]],
+    ) -> str:
+        """Add an element that belongs to nodes to the values of nodes or to the tables; return why not."""
+        odd = [name for name in ("NONLINEAR", "ORIENTATION") if name in block.parameters]
+        lines = [words for _, words in block.lines()]
+        at_ground = element.kind.endswith("1")
+        directed = at_ground or element.kind.endswith("2")
+        axes = [value_of(lines[0], at) for at in range(len(nodes))] if directed and lines else []
+        if not directed and len(lines) > 1 and lines[0][0] in ("1", "2", "3", "0"):
+            lines = lines[1:]  # degrees of freedom, which do not matter along a line
+        data = lines[1 if directed else 0 :]
+        value = value_of(data[0], 0) if data else np.nan
+        if odd or block.get("TYPE", "ISOTROPIC").upper() not in ("ISOTROPIC", "ISO"):
+            return f"{odd[0] if odd else 'TYPE=' + block.get('TYPE')} is not read"
+        if not value > 0.0:
+            return "expected a positive number"
+        if min(nodes) < 0:
+            return "no bar ends at their nodes"
+        if any(axis not in (1.0, 2.0, 3.0) for axis in axes):
+            return "bars have the degrees of freedom 1, 2 and 3 alone"
+        if len(nodes) == 1:
+            values[block.keyword][nodes[0], int(axes[0]) - 1 if axes else 0] += value
+            return ""
+        line = self._mesh.points[nodes[1]] - self._mesh.points[nodes[0]]
+        if axes and not (axes[0] == axes[1] and np.count_nonzero(line) == 1 and line[int(axes[0]) - 1]):
+            return "those of a case act along the line between their nodes"
+        names = [
+            _name_of(
+                self._mesh.node_groups, np.array([node]), "node_" + (f"{instance}.{label}" if instance else f"{label}")
+            )
+            for node, (instance, label) in zip(nodes, element.nodes)
+        ]
+        key = {"SPRING": "stiffness", "DASHPOT": "coefficient"}[block.keyword]
+        _add(tables[block.keyword.lower()], " to ".join(names), {"between": names, key: value})
+        return ""
+
+
+def _add(tables: dict[str, dict[str, Any]], name: str, keys: dict[str, Any]) -> None:
+    """Add a table by a name that no other one has."""
+    while name in tables:
+        name += " again"
+    tables[name] = keys
+
+
+def _times_value(rows: Rows, value: float) -> Rows:
+    return tuple((time, factor * value) for time, factor in rows)

@@ -1,0 +1,585 @@
+"""The model in an Abaqus input file: parts, instances and sets, as one mesh with groups."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import InputError
+from ..mesh.whole import WholeMesh
+from ._abaqus_keywords import KNOWN, Block
+from ._numbers import number_of, whole_numbers
+
+_ONE_BY_ONE = "write the nodes and elements one by one (Abaqus/CAE and most preprocessors do)"
+_REFUSED = dict.fromkeys(
+    ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SUBSTRUCTURE GENERATE"), _ONE_BY_ONE
+) | {
+    "SYSTEM": "write the nodes in global coordinates",
+    "PARAMETER": "write the values in the place of the names, as 1e7 for <E>",
+}
+"""Keywords without which a mesh would be another one, and what to do."""
+_CONSTRAINTS = ("TIE", "EQUATION", "MPC", "COUPLING", "RIGID BODY", "EMBEDDED ELEMENT", "MULTIPLE POINT CONSTRAINT")
+PROCEDURES = (
+    *("STATIC", "DYNAMIC", "FREQUENCY", "BUCKLE", "VISCO", "GEOSTATIC", "SOILS", "ANNEAL", "HEAT TRANSFER"),
+    *("COUPLED TEMPERATURE-DISPLACEMENT", "DYNAMIC TEMPERATURE-DISPLACEMENT", "MODAL DYNAMIC", "DIRECT CYCLIC"),
+    *("STEADY STATE DYNAMICS", "RESPONSE SPECTRUM", "RANDOM RESPONSE", "COMPLEX FREQUENCY", "MATRIX GENERATE"),
+)
+_PASSED_OVER = (
+    *("HEADING", "PREPRINT", "RESTART", "MONITOR", "CONTROLS", "SURFACE", "ORIENTATION", "PHYSICAL CONSTANTS"),
+    *("DISTRIBUTION", "DISTRIBUTION TABLE", "TRANSVERSE SHEAR STIFFNESS", "HOURGLASS STIFFNESS", "TIME POINTS"),
+    *("DIAGNOSTICS", "STEP", "END STEP", "NODE", "ELEMENT", "NSET", "ELSET"),
+)
+"""Keywords that do not describe what a truss is or does, and those of the model, within a step; those of output are
+others."""
+_BARS = (
+    (re.compile(r"T[23]D2[A-Z]*|TRUSS"), 2, 0, ""),
+    (re.compile(r"T[23]D3[A-Z]*"), 3, 0, "trusses with three nodes are read as bars between their ends"),
+    (re.compile(r"(B[23][13]|PIPE[23]1)[A-Z]*|FRAME[23]D"), 2, 1, "beams are read as bars, without bending stiffness"),
+    (
+        re.compile(r"(B[23]2|PIPE[23]2)[A-Z]*"),
+        3,
+        1,
+        "beams with three nodes are read as bars between their ends, without bending stiffness",
+    ),
+)
+"""Types of elements that are bars, their numbers of nodes and of those that only tell an orientation, and what is to be
+said about them."""
+_PLANE = re.compile(r"[A-Z]+2.*")
+"""Those of bars in the plane of x and y."""
+_CALCULIX = re.compile(r"B3[12]R")
+"""Beams that CalculiX alone has."""
+_AT_NODES = {"MASS": 1, "SPRINGA": 2, "SPRING1": 1, "SPRING2": 2, "DASHPOTA": 2, "DASHPOT1": 1, "DASHPOT2": 2}
+"""Types of elements that belong to nodes, and the numbers of these."""
+SECTIONS = ("SOLID SECTION", "BEAM SECTION", "BEAM GENERAL SECTION", "FRAME SECTION")
+OF_NODES = ("MASS", "SPRING", "DASHPOT")
+"""Keywords of what elements have: bars, and those that belong to nodes."""
+_OPEN = ("PART", "INSTANCE", "ASSEMBLY", "STEP")
+"""Keywords that another one, with END, closes."""
+_ASSEMBLY = "*ASSEMBLY"
+"""Key of the assembly among instances."""
+_WHAT = {"NSET": "node", "ELSET": "element"}
+
+
+class _Labels(NamedTuple):
+    """Members of a set: labels (n,), or first, last and step of labels, of which not all need exist."""
+
+    labels: np.ndarray
+    generated: bool = False
+    instance: str = ""
+    """Whose labels they are, in capitals; empty: those of the place of the set."""
+
+    def within(self, known: np.ndarray) -> np.ndarray:
+        """Return which of some labels (n,) are members."""
+        if not self.generated:
+            return np.isin(known, self.labels)
+        first, last, step = self.labels.tolist()
+        return (known >= first) & (known <= last) & ((known - first) % step == 0)
+
+
+@dataclass
+class _Set:
+    """A set of nodes or elements."""
+
+    name: str
+    entries: list[_Labels] = field(default_factory=list)
+    internal: bool = True
+    """Whether the file says of all its parts that a program has made them."""
+
+
+_NOTHING = np.empty(0, np.int64)
+
+
+class _Elements(NamedTuple):
+    """Elements of a block that are bars: labels (n,), and those of their nodes (n, 2 or 3)."""
+
+    block: Block
+    labels: np.ndarray
+    nodes: np.ndarray
+
+    @property
+    def plane(self) -> bool:
+        """Whether they have no third direction."""
+        return _PLANE.fullmatch(self.block.get("TYPE").upper()) is not None
+
+
+class AtNodes(NamedTuple):
+    """An element that belongs to one or two nodes: its type and label, and the instances and labels of the nodes."""
+
+    kind: str
+    label: int
+    nodes: list[tuple[str, int]]
+
+
+@dataclass
+class _Scope:
+    """A part, an instance, the assembly, or what stands outside of them, each with labels of its own."""
+
+    name: str = ""
+    nodes: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    """Labels (n,) and points (n, 3)."""
+    elements: list[_Elements] = field(default_factory=list)
+    at_nodes: list[AtNodes] = field(default_factory=list)
+    sets: dict[str, dict[str, _Set]] = field(default_factory=lambda: {"NSET": {}, "ELSET": {}})
+    """By names in capitals."""
+    sections: list[tuple[Block, str]] = field(default_factory=list)
+    """Where, and the element set."""
+    place: np.ndarray = field(default_factory=lambda: np.eye(4, 3))
+    at: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    """Labels of nodes and bars, ascending, and their numbers in the mesh."""
+
+    def instance(self, name: str, place: np.ndarray) -> _Scope:
+        """Return an instance of a part, to which content of its own can be added."""
+        sets = {
+            kind: {upper: replace(one, entries=list(one.entries)) for upper, one in found.items()}
+            for kind, found in self.sets.items()
+        }
+        own = (list(self.nodes), list(self.elements), list(self.at_nodes))
+        return _Scope(name, *own, sets, list(self.sections), place)
+
+    def add(self, kind: str, name: str, block: Block, entries: Iterable[_Labels]) -> None:
+        """Add members to a set."""
+        members = list(entries)  # which may name this set as it is so far
+        found = self.sets[kind].setdefault(name.upper(), _Set(name))
+        found.entries += members
+        found.internal &= "INTERNAL" in block.parameters
+
+    def placed(self, path: Path, n_nodes: int, n_bars: int) -> tuple[np.ndarray, ...]:
+        """Number nodes and bars from ``n_nodes`` and ``n_bars``; return labels and points of nodes, bars (n, 2), and
+        which of them are plane."""
+        labels = np.concatenate([_NOTHING, *(own for own, _ in self.nodes)])
+        points = np.concatenate([np.empty((0, 3)), *(own for _, own in self.nodes)])
+        known, first, at = np.unique(labels, return_index=True, return_inverse=True)
+        if len(known) < len(labels):
+            moved = np.flatnonzero((points != points[first[at.ravel()]]).any(axis=1))
+            if len(moved):
+                raise InputError(
+                    f"{path}: *NODE: node {labels[moved[0]]} is listed more than once, at different positions"
+                )
+            keep = np.sort(first)
+            labels, points = labels[keep], points[keep]
+        order = np.argsort(labels, kind="stable")
+        ends = [np.empty((0, 2), np.int64)]
+        plane = [np.empty(0, bool)]
+        for elements in self.elements:
+            block, own, wanted = elements
+            found, there = _found(known, wanted)
+            if not there.all():
+                element, side = np.argwhere(~there)[0]
+                text = f"node {wanted[element, side]} of element {own[element]} is not defined"
+                raise InputError(f"{block.where}: {text}")
+            ends.append(_ends(order[found], points))
+            plane.append(np.full(len(own), elements.plane))
+        bars = np.concatenate([_NOTHING, *(own for _, own, _ in self.elements)])
+        sequence = np.argsort(bars, kind="stable")
+        twice = np.flatnonzero(np.diff(bars[sequence]) == 0)
+        if len(twice):
+            raise InputError(f"{path}: *ELEMENT: element {bars[sequence[twice[0]]]} is listed more than once")
+        self.at = {"NSET": (known, order + n_nodes), "ELSET": (bars[sequence], sequence + n_bars)}
+        if not np.array_equal(self.place, np.eye(4, 3)):
+            points = points @ self.place[:3] + self.place[3]
+        return labels, points, np.concatenate(ends) + n_nodes, np.concatenate(plane)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return the first few names, for messages."""
+    names = list(names)
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def _found(known: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where labels are among ascending ones, and whether they are there."""
+    place = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))
+    return place, known[place] == wanted if len(known) else np.zeros(wanted.shape, bool)
+
+
+def _ends(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the ends (n, 2) of elements with nodes (n, 2 or 3): of three nodes, those that are farthest apart."""
+    if nodes.shape[1] == 2:
+        return nodes
+    pairs = np.array([[1, 2], [0, 2], [0, 1]])
+    span = np.linalg.norm(points[nodes[:, pairs[:, 1]]] - points[nodes[:, pairs[:, 0]]], axis=2)
+    return np.take_along_axis(nodes, pairs[span.argmax(axis=1)], axis=1)
+
+
+def _labels(values: np.ndarray, block: Block, what: str) -> np.ndarray:
+    refused = "{}: {} is not the label of a {}: a whole number from 1 on"
+    return whole_numbers(values, 1, 2**53, lambda found: refused.format(block.where, found, what))
+
+
+def _union(parts: list[np.ndarray]) -> np.ndarray:
+    """Return the members (n,) of sets, ascending; files with a set for each bar have very many of one member."""
+    if len(parts) == 1 and len(parts[0]) == 1:
+        return parts[0]
+    return np.unique(np.concatenate([_NOTHING, *parts]))
+
+
+def _placing(block: Block) -> np.ndarray:
+    """The place of an instance: (4, 3), a rotation applied to rows from the right, then a translation.
+
+    The first data line has the translation, the second two points of an axis and an angle [degrees] about it, which
+    turns the instance after the translation.
+    """
+    from scipy.spatial.transform import Rotation  # takes longer than most files
+
+    rows = np.nan_to_num(block.rows(7, 3))
+    move = rows[0, :3] if len(rows) else np.zeros(3)
+    if len(rows) < 2:
+        return np.vstack([np.eye(3), move])
+    start, axis = rows[1, :3], rows[1, 3:6] - rows[1, :3]
+    if not axis.any():
+        raise InputError(f"{block.where}: the axis of the rotation has no length")
+    turn = Rotation.from_rotvec(np.radians(rows[1, 6]) * axis / np.linalg.norm(axis)).as_matrix()
+    return np.vstack([turn.T, (move - start) @ turn.T + start])
+
+
+class Deck:
+    """What the keywords up to the end of the first step say."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.parts: dict[str, _Scope] = {}
+        self.scopes = {"": _Scope()}
+        """What has nodes and elements: outside of parts, instances by their names in capitals, and the assembly."""
+        self.assembly = _Scope()
+        self.materials: dict[str, tuple[str, list[Block]]] = {}
+        """Names and keywords by names in capitals."""
+        self.conditions: list[tuple[Block, bool]] = []
+        """Of the model, and whether of the step."""
+        self.initial: list[Block] = []
+        self.amplitudes: dict[str, Block] = {}
+        """By names in capitals."""
+        self.step: Block | None = None
+        self.procedure: Block | None = None
+        self.calculix = False
+        """Whether the file is one of CalculiX, where sections differ."""
+        self._scope = self._outer = self.scopes[""]
+        self._ended = False
+        self._beyond: Block | None = None
+        self._open: dict[str, None] = {}
+        self._notes: dict[str, int] = {}
+        self._other_types: set[str] = set()
+        self._constraints: dict[str, None] = {}
+        self._unread: dict[str, None] = {}
+        self._unknown: dict[tuple[str, str], str] = {}
+        self._material: list[Block] = []
+        self._told: list[str] = []
+        self._last: Block | None = None
+
+    def add(self, block: Block) -> bool:
+        """Read a keyword; return whether to go on."""
+        keyword = block.keyword
+        self._last = block
+        for name in block.parameters:
+            if name not in KNOWN.get(keyword, block.parameters):
+                self._unknown.setdefault((keyword, name), block.where)
+        if keyword in _OPEN and not self._ended:
+            self._open[keyword] = None
+        elif keyword.startswith("END "):
+            self._open.pop(keyword.removeprefix("END "), None)
+        if self._ended:
+            self._beyond = block if keyword == "STEP" else None
+        elif keyword in ("BOUNDARY", "CLOAD", "DLOAD", "TEMPERATURE"):
+            self.conditions.append((block, self.step is not None))
+        elif keyword == "AMPLITUDE":
+            self.amplitudes[block.required("NAME").upper()] = block
+        elif keyword == "STEP":
+            self.step = block
+        elif self.step is not None:
+            self._ended = keyword == "END STEP"
+            if self.procedure is None and keyword in PROCEDURES:
+                self.procedure = block
+            else:
+                self._leave_out(keyword)
+        else:
+            self._add_to_model(block)
+        return self._beyond is None
+
+    def _leave_out(self, keyword: str) -> None:
+        if keyword not in _PASSED_OVER and not {"OUTPUT", "PRINT", "FILE"} & set(keyword.split()):
+            self._unread[f"*{keyword}"] = None
+
+    def _add_to_model(self, block: Block) -> None:
+        match block.keyword:
+            case "PART" | "INSTANCE" | "ASSEMBLY" | "END PART" | "END INSTANCE" | "END ASSEMBLY":
+                self._open_scope(block)
+            case "NODE":
+                self._add_nodes(block)
+            case "ELEMENT":
+                self._add_elements(block)
+            case "NSET" | "ELSET" as kind:
+                self._scope.add(kind, block.required(kind), block, self._entries(kind, block))
+            case keyword if keyword in SECTIONS or keyword in OF_NODES:
+                self._scope.sections.append((block, block.required("ELSET")))
+            case "MATERIAL":
+                name = block.required("NAME")
+                _, self._material = self.materials.setdefault(name.upper(), (name, []))
+            case "ELASTIC" | "DENSITY" | "EXPANSION" | "PLASTIC" | "DAMPING" | "NO COMPRESSION" | "NO TENSION":
+                self._material.append(block)
+            case "INITIAL CONDITIONS":
+                self.initial.append(block)
+            case keyword if keyword in _CONSTRAINTS:
+                self._constraints[f"*{keyword}"] = None
+            case keyword if keyword in _REFUSED:
+                raise InputError(f"{block.where} is not read: {_REFUSED[keyword]}")
+            case keyword:
+                self._leave_out(keyword)
+
+    def _open_scope(self, block: Block) -> None:
+        """Make what follows the content of a part, an instance or the assembly, or of what is around it."""
+        name, scope = block.get("NAME"), self._scope
+        match block.keyword:
+            case "PART":
+                self._scope = _Scope(block.required("NAME"))
+                if self.parts.setdefault(name.upper(), self._scope) is not self._scope:
+                    raise InputError(f"{block.where}: there are two parts of the name {name}")
+            case "INSTANCE":
+                part = self.parts.get(block.required("PART").upper())
+                if part is None:
+                    raise InputError(f"{block.where}: there is no part {block.get('PART')}")
+                self._outer, self._scope = scope, part.instance(block.required("NAME"), _placing(block))
+                if self.scopes.setdefault(name.upper(), self._scope) is not self._scope:
+                    raise InputError(f"{block.where}: there are two instances of the name {name}")
+            case "ASSEMBLY":
+                self._scope = self.assembly
+            case "END INSTANCE":
+                self._scope = self._outer
+            case _:
+                self._scope = self.scopes[""]
+
+    def _add_nodes(self, block: Block) -> None:
+        system = block.get("SYSTEM", "R").upper()
+        if system != "R":
+            raise InputError(f"{block.where}: SYSTEM={system} is not read: write the nodes in Cartesian coordinates")
+        rows = block.rows(7)[:, :4]
+        labels = _labels(rows[:, 0], block, "node")
+        self._scope.nodes.append((labels, np.nan_to_num(rows[:, 1:], posinf=np.inf, neginf=-np.inf)))
+        if block.get("NSET"):
+            self._scope.add("NSET", block.get("NSET"), block, [_Labels(labels)])
+
+    def _add_elements(self, block: Block) -> None:
+        kind = block.required("TYPE").upper()
+        found = next(((n, more, note) for pattern, n, more, note in _BARS if pattern.fullmatch(kind)), None)
+        labels = _NOTHING
+        if found is not None:
+            count, more, note = found
+            rows = block.rows(count + more + 1 + bool(more), count + 1)[:, : count + 1]
+            labels = _labels(rows[:, 0], block, "element")
+            nodes = _labels(rows[:, 1:].ravel(), block, "node").reshape(len(rows), count)
+            self._scope.elements.append(_Elements(block, labels, nodes))
+            self.calculix |= _CALCULIX.fullmatch(kind) is not None
+            if note:
+                self._notes[f"{kind}: {note}"] = self._notes.get(f"{kind}: {note}", 0) + len(rows)
+        elif kind in _AT_NODES:
+            labels = np.array([self._at_nodes(kind, block, *line) for line in block.lines()], np.int64)
+        else:
+            self._other_types.add(kind)
+        if block.get("ELSET"):
+            self._scope.add("ELSET", block.get("ELSET"), block, [_Labels(labels)] if len(labels) else [])
+
+    def _at_nodes(self, kind: str, block: Block, where: str, words: list[str]) -> int:
+        """Add an element that belongs to nodes, and return its label."""
+        if len(words) != _AT_NODES[kind] + 1:
+            raise InputError(
+                f"{where}: {', '.join(words)[:60]!r} has {len(words)} values; expected {_AT_NODES[kind] + 1}"
+            )
+        nodes = [entry for word in words[1:] for entry in self._named("NSET", block, word, self._scope)]
+        at = [(entry.instance, int(label)) for entry in nodes for label in entry.labels]
+        label = _labels(np.array([number_of(words[0])]), block, "element")[0]
+        self._scope.at_nodes.append(AtNodes(kind, int(label), at))
+        return int(label)
+
+    def _entries(self, kind: str, block: Block) -> Iterator[_Labels]:
+        """Yield the members that ``*NSET`` or ``*ELSET`` names."""
+        instance = block.get("INSTANCE").upper()
+        if instance and instance not in self.scopes:
+            raise InputError(f"{block.where}: there is no instance {instance}")
+        numbers = None
+        if kind == "NSET" and block.get("ELSET"):
+            named = self._named("ELSET", block, block.get("ELSET"), self._scope, instance)
+            for entry in named or [_Labels(_NOTHING)]:
+                elements = (self.scopes[entry.instance] if entry.instance else self._scope).elements
+                of_set = _union([own.nodes[entry.within(own.labels)].ravel() for own in elements])
+                if len(of_set):
+                    yield _Labels(of_set, instance=entry.instance)
+                else:
+                    self._told.append(f"{block.where}: nodes of elements that are left out are not read")
+        elif "GENERATE" in block.parameters:
+            rows = block.rows(3, 2)
+            for row in _labels(np.where(np.isnan(rows), 1.0, rows).ravel(), block, "member").reshape(-1, 3):
+                if row[1] < row[0]:
+                    raise InputError(f"{block.where}: {row[0]}, {row[1]}, {row[2]} are not first, last and step")
+                yield _Labels(row, True, instance)
+        elif (numbers := block.numbers()) is not None:
+            yield _Labels(_labels(numbers, block, "member"), instance=instance)
+        else:
+            for word in (word for _, words in block.lines() for word in words if word):
+                yield from self._named(kind, block, word, self._scope, instance)
+
+    def _named(self, kind: str, block: Block, word: str, scope: _Scope, instance: str = "") -> list[_Labels]:
+        """Return the members of a set that is named as NAME or INSTANCE.NAME, or of LABEL or INSTANCE.LABEL."""
+        name = word.replace('"', "")
+        first, dot, rest = name.partition(".")
+        if dot and first.upper() in self.scopes:
+            instance, name = first.upper(), rest
+        if name.isdecimal():
+            return [_Labels(_labels(np.array([float(name)]), block, "member"), instance=instance)]
+        found = (self.scopes[instance] if instance else scope).sets[kind].get(name.upper())
+        if found is None:
+            raise InputError(f"{block.where}: {name!r} is neither a number nor an existing {_WHAT[kind]} set")
+        return [entry._replace(instance=entry.instance or instance) for entry in found.entries]
+
+    def mesh(self) -> WholeMesh:
+        """Return nodes and bars of all instances in their order, without nodes where no bar ends, and their groups."""
+        told = [f"{self.path}: {n} elements {note}" for note, n in self._notes.items()]
+        if self._other_types:
+            told.append(f"{self.path}: left out elements of the types {', '.join(sorted(self._other_types))}")
+        told += [f"{where}: {name} is left out: it is not read" for (_, name), where in self._unknown.items()]
+        told += [*self._told, *self._cut_off()]
+        self.scopes[_ASSEMBLY] = self.assembly
+        labels, points, bars = [_NOTHING], [np.empty((0, 3))], [np.empty((0, 2), np.int64)]
+        plane = [np.empty(0, bool)]
+        for scope in self.scopes.values():
+            parts = scope.placed(self.path, sum(map(len, points)), sum(map(len, bars)))
+            for whole, part in zip((labels, points, bars, plane), parts):
+                whole.append(part)
+        self.plane = np.concatenate(plane)
+        all_points, all_bars = np.concatenate(points), np.concatenate(bars)
+        used = np.zeros(len(all_points), bool)
+        used[all_bars] = True
+        self.labels_left_out = np.concatenate(labels)[~used].tolist()
+        number = np.where(used, np.cumsum(used) - 1, -1)
+        for scope in self.scopes.values():
+            known, at = scope.at["NSET"]
+            scope.at["NSET"] = known, number[at]
+        self.groups = {}
+        for kind, what in _WHAT.items():
+            self._lost: dict[int, int] = {}  # a set that another one names counts once
+            self.groups[kind] = self._groups(kind)
+            lost = sum(self._lost.values())
+            others = self._other_types or any(scope.at_nodes for scope in self.scopes.values())
+            if lost and (kind == "NSET" or not others):
+                told.append(f"{self.path}: {lost} members of {what} sets are not there, and are left out")
+            sets = [one for scope in self.scopes.values() for one in scope.sets[kind].values()]
+            bare = {one.name for one in sets if one.entries and not any(len(entry.labels) for entry in one.entries)}
+            empty = [name for name, members in self.groups[kind].items() if not len(members) and name not in bare]
+            for name in empty:
+                del self.groups[kind][name]
+            given = {s.upper() for scope in self.scopes.values() for b, s in scope.sections if b.keyword in OF_NODES}
+            empty = [name for name in empty if kind == "NSET" or name.upper().rpartition(".")[2] not in given]
+            if empty:
+                why = "no bar ends at their nodes" if kind == "NSET" else "none of their elements is a bar"
+                told.append(f"{self.path}: left out the {what} sets {listed(empty)}: {why}")
+        mesh = WholeMesh(all_points[used], number[all_bars], self.groups["NSET"], dict(self.groups["ELSET"]))
+        mesh.warnings = told
+        if self._constraints:
+            text = "nodes that they connect are joined by `mesh clean` if they are at the same place"
+            mesh.warnings.append(f"{self.path}: left out {', '.join(self._constraints)}; {text}")
+        return mesh
+
+    def _groups(self, kind: str) -> dict[str, np.ndarray]:
+        """Return the node sets (``NSET``) or element sets (``ELSET``) as groups.
+
+        A set of a part has its own name where no other set has it, and INSTANCE.NAME otherwise; with several instances
+        NAME is the set of all of them.
+        """
+        found = {one.name: self._members(kind, _ASSEMBLY, one.entries) for one in self.assembly.sets[kind].values()}
+        common: dict[str, tuple[str, list[np.ndarray]]] = {}
+        taken = {name.upper() for name in found}
+        for key, scope in self.scopes.items():
+            for upper, one in scope.sets[kind].items() if key != _ASSEMBLY else ():
+                members = self._members(kind, key, one.entries)
+                common.setdefault(upper, (one.name, []))[1].append(members)
+                if key and (upper in taken or len(self.scopes) > 3):
+                    found[f"{scope.name}.{one.name}"] = members
+        found |= {name: _union(parts) for upper, (name, parts) in common.items() if upper not in taken}
+        return {name.replace("/", "_"): members for name, members in found.items()}
+
+    def members_of(self, kind: str, block: Block, target: str) -> np.ndarray:
+        """Return the members (n,) of a set, or that of a label, which a keyword outside of parts names."""
+        key = _ASSEMBLY if len(self.scopes) > 2 else ""
+        return self._members(kind, key, self._named(kind, block, target, self.scopes[key]))
+
+    def _members(self, kind: str, key: str, entries: list[_Labels]) -> np.ndarray:
+        """Return the members of a set in the mesh, ascending."""
+        parts: list[np.ndarray] = []
+        for entry in entries:
+            known, at = self.scopes[entry.instance or key].at[kind]
+            if entry.generated:
+                members = at[entry.within(known)]
+            else:
+                place, there = _found(known, entry.labels)
+                members = at[place[there]]
+                self._lost[id(entry.labels)] = len(entry.labels) - len(members)
+            parts.append(members[members >= 0])  # without nodes where no bar ends
+        return _union(parts)
+
+    def _cut_off(self) -> Iterator[str]:
+        """Yield signs of a file that has been cut off."""
+        if self._open:
+            missing = ", ".join(f"*END {keyword}" for keyword in self._open)
+            yield f"{self.path}: ends without {missing}: it may have been cut off"
+        pieces = self._last.pieces if self._last else []
+        if pieces and pieces[-1].path == self.path and not pieces[-1].text.endswith(b"\n"):
+            line = pieces[-1].text.rpartition(b"\n")[2].decode("utf-8", "replace")
+            yield f"{self.path}: ends within the line {line[:60]!r}: it may have been cut off"
+
+    def of_nodes(self) -> Iterator[tuple[Block, list[tuple[AtNodes, list[int]]]]]:
+        """Yield what masses, springs and dashpots have, with each element and the numbers of its nodes in the mesh, -1
+        for a node where no bar ends."""
+        for key, scope in self.scopes.items():
+            for block, name in scope.sections:
+                if block.keyword not in OF_NODES:
+                    continue
+                found: list[tuple[AtNodes, list[int]]] = []
+                for entry in self._set(block, scope, name).entries:
+                    own = entry.instance or key
+                    elements = self.scopes[own].at_nodes
+                    for i in np.flatnonzero(entry.within(np.array([element.label for element in elements], np.int64))):
+                        if elements[i].kind.startswith(block.keyword):
+                            numbers = [self._number(instance or own, label) for instance, label in elements[i].nodes]
+                            found.append((elements[i], numbers))
+                yield block, found
+
+    def _number(self, key: str, label: int) -> int:
+        known, at = self.scopes[key].at["NSET"]
+        place, there = _found(known, np.array([label]))
+        return int(at[place[0]]) if there[0] else -1
+
+    def _set(self, block: Block, scope: _Scope, name: str) -> _Set:
+        if name.upper() not in scope.sets["ELSET"]:
+            raise InputError(f"{block.where}: there is no element set {name}")
+        return scope.sets["ELSET"][name.upper()]
+
+    def section_members(self) -> Iterator[tuple[Block, str, np.ndarray]]:
+        """Yield each section with the name of a bar group, and its bars.
+
+        That of a part is one for all instances if the set of its name has these bars, else one for each instance.
+        """
+        groups = self.groups["ELSET"]
+        names = {name.upper(): name for name in groups}
+        found: dict[int, tuple[Block, str, list[tuple[str, np.ndarray]]]] = {}
+        for key, scope in self.scopes.items():
+            for block, name in scope.sections:
+                if block.keyword in OF_NODES:
+                    continue
+                full = f"{scope.name}.{name}".upper().replace("/", "_")
+                members = self._members("ELSET", key, self._set(block, scope, name).entries)
+                found.setdefault(id(block), (block, name, []))[2].append((full, members))
+        for block, name, parts in found.values():
+            short = names.get(name.upper().replace("/", "_"))
+            if short is not None and np.array_equal(groups[short], _union([members for _, members in parts])):
+                yield block, short, groups[short]
+            else:
+                yield from ((block, names.get(full, short or name), members) for full, members in parts)
+
+    def left_out(self) -> Iterator[str]:
+        """Yield what the step has that is not read."""
+        if self._unread:
+            yield f"{self.path}: left out {', '.join(self._unread)}: keywords that are not read"
+        if self._beyond is not None:
+            yield f"{self._beyond.where}: left out with all that follows: only the first step is read"

@@ -146,10 +146,15 @@ def add_sections(mesh: WholeMesh, deck: Deck) -> None:
             what = f"SECTION={block.get('SECTION')}" if block.get("SECTION") else "the data line"
             mesh.warnings.append(f"{block.where}: no area is known from {what}")
             found.pop("area", None)
+        elif deck.ambiguous and found.get("shape") == "round":
+            text = "CIRC is read with a radius, as in Abaqus: in a file of CalculiX it is a diameter"
+            mesh.warnings.append(f"{block.where}: {text}")
         areas[members] = found.get("area", np.nan)
         material = block.get("MATERIAL")
         if material:
             found["material"] = deck.materials.get(material.upper(), (material, []))[0]
+            if "DENSITY" in block.parameters:
+                mesh.warnings.append(f"{block.where}: DENSITY is left out: that of the material is taken")
         elif block.keyword in ("BEAM GENERAL SECTION", "FRAME SECTION"):
             found |= _own_material(mesh, block, rows, group)
         sections[group] = {"bars": group, **found}
@@ -232,7 +237,7 @@ def _own_material(mesh: WholeMesh, block: Block, rows: np.ndarray, group: str) -
 
     After the shape come, if it is given, a direction across the bar, and E, G, and the thermal expansion.
     """
-    rows = rows[int(rows[0, 0]) if block.get("SECTION").upper() == "ARBITRARY" else 1 :]
+    rows = rows[int(np.nan_to_num(rows[0, 0])) if len(rows) and block.get("SECTION").upper() == "ARBITRARY" else 1 :]
     several = np.isfinite(rows[:1, 3:]).any()
     if len(rows) and not several and (len(rows) > 1 or np.linalg.norm(rows[0, :3]) <= 1.0 + 1e-6):
         rows = rows[1:]
@@ -257,15 +262,23 @@ def _own_material(mesh: WholeMesh, block: Block, rows: np.ndarray, group: str) -
 def add_initial_stress(mesh: WholeMesh, deck: Deck) -> list[str]:
     """Give sections the initial stresses of their bars, as parts of their own where these differ; return what is to be
     said."""
-    told, stress = [], np.zeros(len(mesh.bars))
+    told, stress, count = [], np.zeros(len(mesh.bars)), np.zeros(len(mesh.bars))
+    across = mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]]
     for where, words, block in _initial_lines(deck, "STRESS"):
-        value = value_of(words, 1)
-        if len(words) > 7 or not np.isfinite(value):
+        values = [value_of(words, at) for at in range(1, max(len(words), 2))]
+        members = deck.members_of("ELSET", block, words[0])
+        if not np.isfinite(values).all():
             told.append(f"{where}: {', '.join(words)[:60]!r} is left out: expected elements and their stress")
+        elif len(values) == 7:  # of CalculiX: an integration point, and components along the axes of the model
+            _, xx, yy, zz, xy, xz, yz = values
+            pulled = across[members] @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            stress[members] += np.einsum("ij,ij->i", pulled, across[members]) / (across[members] ** 2).sum(axis=1)
+            count[members] += 1.0
         else:
-            stress[deck.members_of("ELSET", block, words[0])] = value
+            stress[members], count[members] = values[0], 1.0
     if not stress.any():
         return told
+    stress = np.array([short(value) for value in stress / np.maximum(count, 1.0)])
     sections = mesh.tables.setdefault("section", {})
     rest = np.ones(len(mesh.bars), bool)
     for keys in sections.values():
@@ -309,6 +322,7 @@ class Conditions:
         self._mesh, self._deck = mesh, deck
         self._told: list[str] = []
         self._in_step = False
+        self._names = {name.upper(): name for name in mesh.node_groups}
         step = deck.procedure
         self._static = step is not None and step.keyword in ("STATIC", "BUCKLE")
         self._dynamic = step is not None and step.keyword == "DYNAMIC"
@@ -316,7 +330,7 @@ class Conditions:
         period = value_of(words, 1)
         self._period = period if period > 0.0 else 1.0
         self._supports: dict[tuple[str, int, tuple[str, Rows]], np.ndarray] = {}
-        self._motions = [_AT_REST]
+        self._motions: dict[tuple[str, Rows], int] = {}
         self._held = np.zeros((len(mesh.points), 3), np.int64)
         """Number of the motion of each component from 1 on; 0: free."""
         self._forces: dict[tuple[str, Rows], np.ndarray] = {}
@@ -333,10 +347,14 @@ class Conditions:
                 self._supports.clear()
                 self._held[:] = 0
             self._in_step = in_step
+            told: dict[str, list[str]] = {}
             for where, words in block.lines():
-                told = kinds[block.keyword](block, words)
-                if told:
-                    self._told.append(f"{where}: {', '.join(words)[:60]!r} is {told}")
+                reason = kinds[block.keyword](block, words)
+                if reason:
+                    told.setdefault(reason, []).append(f"{where}: {', '.join(words)[:60]!r}")
+            for reason, lines in told.items():
+                more = f" (and {len(lines) - 1} more lines)" if len(lines) > 1 else ""
+                self._told.append(f"{lines[0]}{more} is {reason}")
         tables = {
             "support": self._support_tables() | self._plane_tables(),
             "load": self._load_tables(),
@@ -428,11 +446,10 @@ class Conditions:
         if not name:
             return "left out: it names no node where a bar ends"
         motion, told = self._motion(block, value) if axes and value else (_AT_REST, "")
-        if motion not in self._motions:
-            self._motions.append(motion)
+        number = self._motions.setdefault(motion, len(self._motions) + 1)
         for axis in map("xyz".index, axes):
             self._supports[name, axis, motion] = members
-            self._held[members, axis] = self._motions.index(motion) + 1
+            self._held[members, axis] = number
         return told
 
     def _motion(self, block: Block, value: float) -> tuple[tuple[str, Rows], str]:
@@ -471,11 +488,12 @@ class Conditions:
         if len(members) == 0:
             return "", members
         wanted = target.replace('"', "").replace("/", "_")
-        for name, own in groups.items():
-            if name.upper() in (wanted.upper(), wanted.upper().rpartition(".")[2]) and np.array_equal(own, members):
+        last = wanted.rpartition(".")[2]
+        for upper in (wanted.upper(), last.upper()):
+            name = self._names.get(upper, "")
+            if name and np.array_equal(groups[name], members):
                 return name, members
-        label = wanted.rpartition(".")[2].isdecimal()
-        name = f"node_{wanted}" if label else wanted
+        name = f"node_{wanted}" if last.isdecimal() else wanted
         while name in groups and not np.array_equal(groups[name], members):
             name += "_"
         groups[name] = members
@@ -486,7 +504,7 @@ class Conditions:
     def _support_tables(self) -> dict[str, dict[str, Any]]:
         found: dict[tuple[str, str, tuple[float, ...]], dict[int, list[float]]] = {}
         for (name, axis, motion), members in self._supports.items():
-            left = members[self._held[members, axis] == self._motions.index(motion) + 1]
+            left = members[self._held[members, axis] == self._motions[motion]]
             if len(left):  # of which later lines have given no other motion
                 name = name if len(left) == len(members) else _name_of(self._mesh.node_groups, left, name)
                 times = tuple(time for time, _ in motion[1])
@@ -512,7 +530,8 @@ class Conditions:
         self._held[free, 2] = 1
         if len(free) == 0:
             return {}
-        self._told.append(f"{self._deck.path}: the case holds {len(free)} nodes of plane elements along z")
+        bent = ", which is not the same for all" if np.ptp(self._mesh.points[members, 2]) else ""
+        self._told.append(f"{self._deck.path}: the case holds {len(free)} nodes of plane elements along z{bent}")
         return {PLANE: {"node_set": _name_of(self._mesh.node_groups, free, "plane"), "fix": "z"}}
 
     def _load_tables(self) -> dict[str, dict[str, Any]]:

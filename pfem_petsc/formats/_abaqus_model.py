@@ -257,6 +257,7 @@ class Deck:
         self.procedure: Block | None = None
         self.calculix = False
         """Whether the file is one of CalculiX, where sections differ."""
+        self._files = False
         self._scope = self._outer = self.scopes[""]
         self._ended = False
         self._beyond: Block | None = None
@@ -293,14 +294,21 @@ class Deck:
             self._ended = keyword == "END STEP"
             if self.procedure is None and keyword in PROCEDURES:
                 self.procedure = block
+                self.calculix |= "SOLVER" in block.parameters
             else:
                 self._leave_out(keyword)
         else:
             self._add_to_model(block)
         return self._beyond is None
 
+    @property
+    def ambiguous(self) -> bool:
+        """Whether the file may be one of CalculiX: both programs have its output."""
+        return self._files and not self.calculix
+
     def _leave_out(self, keyword: str) -> None:
-        if keyword not in _PASSED_OVER and not {"OUTPUT", "PRINT", "FILE"} & set(keyword.split()):
+        self._files |= keyword.replace(" ", "") in ("NODEFILE", "ELFILE")
+        if keyword not in _PASSED_OVER and not any(word in keyword for word in ("OUTPUT", "PRINT", "FILE")):
             self._unread[f"*{keyword}"] = None
 
     def _add_to_model(self, block: Block) -> None:

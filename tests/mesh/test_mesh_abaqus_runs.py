@@ -86,7 +86,7 @@ def test_prescribed_displacements(tmp_path):
 
 
 def test_temperatures(tmp_path):
-    """Bars have the mean of their nodes above the initial temperature: 50 and 25 K; a clamped line has the mean strain."""
+    """Bars have the mean of their nodes above the initial temperature, 50 and 25 K; a clamped line has their mean."""
     more = "*INITIAL CONDITIONS, TYPE=TEMPERATURE\nENDS, 20.\nMIDDLE, 20.\n"
     step = "*TEMPERATURE\nENDS, 20.\n1, 70.\nMIDDLE, 70.\n"
     force = ran(tmp_path, LINE + more + STEP.format(step)).field("axial_force", -1)
@@ -101,6 +101,15 @@ def test_initial_stresses(tmp_path):
     rest = [1.0 / (1.0 + s / YOUNG) for s in (1e8, 3e8)]
     assert force == pytest.approx([YOUNG * AREA * (2.0 / sum(rest) - 1.0)] * 2, rel=1e-9)
     assert force[0] == pytest.approx(2e8 * AREA, rel=1e-3)
+
+
+def test_stresses_of_integration_points(tmp_path):
+    """As CalculiX has them, by components along the axes: t S t along the bar, the mean of the points."""
+    text = LINE.replace("2, 1, 0, 0\n3, 2, 0, 0", "2, 3, 4, 0\n3, 6, 8, 0") + "*INITIAL CONDITIONS, TYPE=STRESS\n"
+    text += "1, 1, 1e8, 2e8, 9e8, 5e7, 9e8, 9e8\n1, 2, 1e8, 2e8, 0., 0., 0., 0.\n"
+    case, told = converted(tmp_path, text)
+    assert told == [] and case.section["E_1"].prestress is None and case.section["E_1"].area == AREA
+    assert case.section["E_2"].prestress == pytest.approx(0.36e8 + 1.28e8 + 0.48 * 5e7)
 
 
 def test_bars_without_compression(tmp_path):
@@ -139,8 +148,47 @@ def test_masses_and_springs(tmp_path):
     assert result.modes.frequency[0] == pytest.approx(np.sqrt(stiffness / mass) / (2.0 * np.pi), rel=1e-9)
 
 
+def test_nodes_of_instances(tmp_path):
+    """Masses, springs and dashpots of the assembly; springs in one direction that is that of their line."""
+    text = """*PART, NAME=P
+*NODE
+1, 0, 0, 0
+2, 1, 0, 0
+*ELEMENT, TYPE=T3D2, ELSET=E
+1, 1, 2
+*END PART
+*ASSEMBLY, NAME=A
+*INSTANCE, NAME=I, PART=P
+*END INSTANCE
+*INSTANCE, NAME=J, PART=P
+3., 0., 0.
+*END INSTANCE
+*ELEMENT, TYPE=MASS, ELSET=M
+1, J.2
+*MASS, ELSET=M
+5.
+*ELEMENT, TYPE=SPRING2, ELSET=S
+2, I.2, J.1
+*SPRING, ELSET=S
+1, 1
+7.
+*ELEMENT, TYPE=DASHPOTA, ELSET=D
+3, I.2, J.1
+*DASHPOT, ELSET=D
+
+9.
+*END ASSEMBLY
+"""
+    case, told = converted(tmp_path, text)
+    assert told == []
+    nodes = {name: case.node_set[name].group for name in case.node_set}
+    assert [(mass.node_set, mass.value) for mass in case.point_mass] == [("mass", 5.0)] and "mass" in nodes
+    assert case.spring[0].between == ("node_I.2", "node_J.1") == case.dashpot[0].between
+    assert (case.spring[0].stiffness, case.dashpot[0].coefficient) == (7.0, 9.0)
+
+
 def test_dashpots_and_initial_velocities(tmp_path):
-    """A mass that a dashpot stops: v = v0 exp(-c t/m) without stiffness; in the direction that is free, it alone acts."""
+    """v = v0 exp(-c t/m) of a mass without stiffness; the dashpot acts in the one direction that is free."""
     more = """*ELEMENT, TYPE=DASHPOT1, ELSET=D
 21, 2
 *DASHPOT, ELSET=D
@@ -229,7 +277,7 @@ E, 100.
 
 def test_what_cannot_be_is_told(tmp_path):
     more = """*INITIAL CONDITIONS, TYPE=STRESS
-1, 1, 5., 0., 0., 0., 0., 0.
+1, high
 *INITIAL CONDITIONS, TYPE=FIELD
 2, 1.
 *ELEMENT, TYPE=SPRING2, ELSET=S
@@ -256,7 +304,7 @@ def test_what_cannot_be_is_told(tmp_path):
     case, told = converted(tmp_path, LINE + more)
     assert told == [
         "line 41: *STEP: LOAD is left out: it is not read",
-        "line 25: *INITIAL CONDITIONS: '1, 1, 5., 0., 0., 0., 0., 0.' is left out: expected elements and their stress",
+        "line 25: *INITIAL CONDITIONS: '1, high' is left out: expected elements and their stress",
         "line 44: *BOUNDARY: '3, 1, 1, 2.' is held where it is: TYPE=VELOCITY is not read in a static step",
         "line 46: *BOUNDARY: '3, 11, 11, 2.' is left out: expected degrees of freedom from 1 to 6, and a number",
         "line 31: *SPRING: left out 2 elements: those of a case act along the line between their nodes",

@@ -3,10 +3,10 @@
 Each module of this folder is a format. It has ``SUFFIXES``, the suffixes of its files in small letters, and one or more
 of the functions
 
-- ``read(path, fields) -> WholeMesh``, which rank 0 calls: the mesh with those of the named bar fields that the file has
-  (None: all);
+- ``read(path, fields) -> WholeMesh``, which rank 0 calls: the mesh with those of the named fields of bars and nodes
+  that the file has (None: all);
 - ``read_on(path, comm, fields) -> MeshSlab | None``, in its place or beside it, of all ranks together: with exactly
-  these bar fields, by the keys that ask for them; None for files that it leaves to ``read``;
+  these fields, by the keys that ask for them; None for files that it leaves to ``read``;
 - ``write(path, mesh)``, which one rank calls with a :class:`~pfem_petsc.mesh.whole.WholeMesh`. What it writes, one file
   or several in the folder of ``path``, takes its place when it is complete.
 """
@@ -50,8 +50,8 @@ def suffixes(*what: str) -> dict[str, ModuleType]:
 
 
 def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
-    """Read this rank's part of the mesh in a file, with cell fields by name, each with the key that asks for it, for
-    messages. Collective.
+    """Read this rank's part of the mesh in a file, with fields of bars or nodes by name, each with the key that asks
+    for it, for messages. Collective.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = Non
 
 
 def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
-    """Read a mesh file as it is, unchecked, with the named bar fields; None: with all. For one rank.
+    """Read a mesh file as it is, unchecked, with the named fields; None: with all. For one rank.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         whole = _read(reader, path, wanted)
     else:
         whole = WholeMesh(slab.points, slab.bars.astype("int64"), slab.node_groups, slab.bar_groups, slab.bar_fields)
-        whole.warnings = slab.warnings
+        whole.node_fields, whole.warnings = slab.node_fields, slab.warnings
     whole.source = str(path)
     return whole
 
@@ -109,9 +109,10 @@ def _read(reader: Any, path: Path, fields: Mapping[str, str] | None) -> WholeMes
         whole = reader.read(path, fields)
     except MemoryError:
         raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
-    check_fields(path, fields, whole.bar_fields)
+    check_fields(path, fields, {*whole.bar_fields, *whole.node_fields})
     if fields is not None:
-        whole.bar_fields = {name: whole.bar_fields[name] for name in fields}
+        whole.bar_fields = {name: whole.bar_fields[name] for name in fields if name in whole.bar_fields}
+        whole.node_fields = {name: whole.node_fields[name] for name in fields if name in whole.node_fields}
     return whole
 
 

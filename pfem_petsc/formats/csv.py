@@ -1,18 +1,19 @@
-"""Pairs of text tables (NAME_nodes.csv, NAME_bars.csv) with names of columns in the first line.
+"""Pairs of text tables, of nodes and of bars, with names of columns in the first line.
 
-``tower_nodes.csv`` goes with ``tower_bars.csv``; either names the mesh. Nodes have the columns ``x``, ``y``, ``z`` [m]
-(``z`` may be missing), bars ``first`` and ``second``. Where the nodes have a column ``node``, its entries, numbers or
-texts, name them in the other table, else they are numbered from 0. A column ``groups`` has names of groups with
-semicolons between them; other columns of numbers are bar fields. Comma, semicolon (then with decimal commas as well)
-or tab separates; lines that begin with # are left out.
+``tower_nodes.csv`` goes with ``tower_bars.csv``, ``points.csv`` with ``edges.csv``; either names the mesh
+(:func:`_pair`). Nodes have the columns ``x``, ``y``, ``z`` [m] (``z`` may be missing), bars those of their two ends.
+Where the nodes have a column of ids, its entries, numbers or texts, name them in the other table, else they are
+numbered from 0. :data:`_NODE_IDS`, :data:`_ENDS` and :data:`_AXES` have the names that are understood. A column
+``groups`` has names of groups with semicolons between them; other columns of numbers are fields. Comma, semicolon (then
+with decimal commas as well) or tab separates; lines that begin with # are left out.
 """
 
 from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection, Iterator
-from itertools import islice
+from collections.abc import Collection, Iterable, Iterator
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -22,31 +23,119 @@ from ..mesh.whole import WholeMesh
 
 SUFFIXES = (".csv",)
 
-_NAMES = {
-    "node": ("node", "id", "label", "name", "number", "nr", "no"),
-    "x": ("x",),
-    "y": ("y",),
-    "z": ("z",),
-    "bar": ("bar", "id", "label", "name", "number", "nr", "no", "element", "member"),
-    "first": ("first", "start", "from", "a", "i", "node1", "node_1", "n1", "node_a", "node_i", "start_node"),
-    "second": ("second", "end", "to", "b", "j", "node2", "node_2", "n2", "node_b", "node_j", "end_node"),
-    "groups": ("groups", "group", "sets", "set"),
-}
-_WORDS = ("nodes", "bars")
+_FILE_WORDS = (
+    ("nodes", "node", "points", "point", "vertices", "vertex", "verts", "joints", "joint", "coordinates", "coords"),
+    (
+        *("bars", "bar", "elements", "element", "elems", "members", "member", "edges", "edge", "lines", "line"),
+        *("frames", "frame", "beams", "beam", "rods", "rod", "struts", "strut", "links", "link", "trusses", "truss"),
+        *("cables", "cable", "connectivity", "connections", "incidences", "topology"),
+    ),
+)
+"""Words in names of tables of nodes, and of bars; the first of each are written."""
 
 
-def _pair(path: Path) -> tuple[Path, Path]:
-    """Return the names of the tables of nodes and of bars, one of which is ``path``."""
-    for word in _WORDS:
-        head, found, tail = path.stem.lower().rpartition(word)
-        if found:
-            start, stop = len(head), len(path.stem) - len(tail)
-            both = [path.with_name(f"{path.stem[:start]}{each}{path.stem[stop:]}{path.suffix}") for each in _WORDS]
-            both[_WORDS.index(word)] = path
-            return both[0], both[1]
-    raise InputError(
-        f"{path}: a mesh in tables is a pair of files, {path.stem}_nodes.csv and {path.stem}_bars.csv: name one of them"
-    )
+def _spellings(stems: Iterable[str], suffixes: Iterable[str]) -> list[str]:
+    return [stem + suffix for stem in stems for suffix in suffixes]
+
+
+_PLAIN = ("id", "label", "name", "number", "nr", "no", "num", "index", "idx", "key", "tag")
+_TAILS = ("", *_PLAIN)
+_OF_NODES = ("node", "point", "vertex", "joint", "vert", "pt", "nd", "grid")
+_OF_BARS = ("bar", "element", "member", "edge", "line", "frame", "beam", "rod", "strut", "link", "truss", "elem")
+_UNNAMED = ("", "unnamed0")  # what pandas calls the numbers of its rows
+_NODE_IDS = (_spellings(_OF_NODES, _TAILS) + _spellings("nv", _PLAIN), [*_PLAIN, "n", *_UNNAMED])
+"""Names of the column of ids of nodes, explicit ones first; here and below in small letters, without what separates."""
+_BAR_IDS = [*_spellings((*_OF_BARS, "mem"), _TAILS), *_spellings(("e", "el", "m"), _PLAIN), *_PLAIN, *_UNNAMED]
+_PLACES = ("coord", "coordinate", "coordinates", "coor", "pos", "position")
+_AXES = [
+    [axis, *_spellings([axis], (*_PLACES, "m")), *_spellings((*_PLACES, "node", "global"), [axis])] for axis in "xyz"
+]
+_SIDES = (("1", "2"), ("i", "j"), ("a", "b"), ("start", "end"), ("from", "to"), ("first", "second"))
+_SIDES += (("source", "target"), ("begin", "end"), ("0", "1"), ("left", "right"), ("tail", "head"))
+_ENDS = (
+    [
+        ("first", "second"),
+        *(
+            pair
+            for stem in (*_OF_NODES, "end", "uniquept", *"npvjg")
+            for one, two in _SIDES
+            for tail in _TAILS
+            for pair in ((stem + one + tail, stem + two + tail), (one + stem + tail, two + stem + tail))
+        ),
+    ],
+    [(one + tail, two + tail) for one, two in _SIDES if len(one) > 1 for tail in _TAILS],
+    [("i", "j"), ("u", "v"), ("a", "b")],
+    [("I", "J"), ("U", "V"), ("A", "B")],
+)
+"""Pairs of names of the ends of bars, explicit ones first; letters alone count as they are written, because ``A`` and
+``I`` may be areas and moments."""
+_GROUPS = ["groups", "group", "sets", "set"]
+_KNOWN_IDS = "node, node_id, id, nid, label, name, number, no, index"
+_KNOWN_ENDS = "node1 and node2, start_node and end_node, n1 and n2, first and second, from and to, i and j, u and v"
+
+
+def _pair(path: Path) -> tuple[Path, Path, list[str]]:
+    """Return the tables of nodes and of bars, one of which is ``path``, and warnings.
+
+    The other table has the same name with a word for the other kind; else it is the only other one in the folder whose
+    columns are of that kind.
+
+    Raises
+    ------
+    InputError
+        If there is none, or more than one.
+    """
+    others = sorted(p for p in path.parent.iterdir() if p.suffix.lower() in SUFFIXES and p.name != path.name)
+    named = {other.name.lower(): other for other in others}
+    kind: int | None = None
+    found: list[tuple[int, Path]] = []
+    for kind_of_word, start, stop in _words_in(path.stem):
+        kind = kind_of_word
+        for word in _FILE_WORDS[1 - kind]:
+            other = named.get(f"{path.stem[:start]}{word}{path.stem[stop:]}{path.suffix}".lower())
+            if other is not None and (kind, other) not in found:
+                found.append((kind, other))
+    warnings = []
+    if not found:
+        own = _kind(path)
+        kind = kind if own is None else own
+        fitting = [other for other in others if kind is not None and _kind(other) == 1 - kind]
+        found = [(kind, other) for other in fitting if kind is not None]
+        warnings = [f"{path}: goes with {other.name}, by the columns of both" for other in fitting]
+    if len(found) == 1:
+        ((kind, other),) = found
+        return (path, other, warnings) if kind == 0 else (other, path, warnings)
+    if found:
+        names = ", ".join(other.name for _, other in found)
+        hint = f"it may go with {names}: name the table of bars" if kind == 0 else f"it may go with {names}"
+        raise InputError(f"{path}: a mesh in tables is a pair of files, and {hint}, or keep one pair in the folder")
+    stem = path.stem if kind is None else re.sub("|".join(_FILE_WORDS[kind]), "", path.stem, flags=re.I).strip(" _-")
+    pair = [f"{stem}{'_' * bool(stem)}{words[0]}.csv" for words in _FILE_WORDS]
+    missing = "name one of them" if kind is None else f"there is no table of {('bars', 'nodes')[kind]} beside it"
+    raise InputError(f"{path}: a mesh in tables is a pair of files, {pair[0]} and {pair[1]}: {missing}")
+
+
+def _words_in(stem: str) -> Iterator[tuple[int, int, int]]:
+    """Yield the words for a kind of table in a name, the last first: kind, and where it begins and ends."""
+    found = [
+        (match.end(), match.end() - match.start(), kind)
+        for kind, words in enumerate(_FILE_WORDS)
+        for word in words
+        for match in re.finditer(word, stem.lower())
+    ]
+    for stop, length, kind in sorted(found, reverse=True):
+        yield kind, stop - length, stop
+
+
+def _kind(path: Path) -> int | None:
+    """Return 0 for a table with coordinates, 1 for one with ends of bars, None for another one."""
+    try:
+        table = _Table(path, head_only=True)
+    except InputError:
+        return None
+    if table.place(_AXES[0]) is not None and table.place(_AXES[1]) is not None:
+        return 0
+    return 1 if table.pairs_of_ends() else None
 
 
 def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
@@ -57,64 +146,115 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     InputError
         Naming file, line and column, for any content that is not a mesh of bars.
     """
-    of_nodes, of_bars = _pair(path)
-    nodes = _Table(of_nodes)
-    axes = [nodes.numbers(axis) if axis != "z" or nodes.place("z") is not None else np.zeros(nodes.n) for axis in "xyz"]
-    number: dict[str, int] = {}
-    for i, label in enumerate(nodes.labels("node") if nodes.place("node") is not None else map(str, range(nodes.n))):
-        if number.setdefault(label, i) != i:
-            raise InputError(f"{nodes.where(i)}: node {label!r} is listed more than once")
-    groups = nodes.groups()
-    del nodes
-    bars = _Table(of_bars)
+    of_nodes, of_bars, warnings = _pair(path)
+    nodes, bars = _Table(of_nodes), _Table(of_bars)
+    pair = bars.ends()
+    axes = [nodes.numbers(axis, names) for axis, names in zip("xyz", _AXES)]
+    ids, number = _numbers_of_ids(nodes, bars, pair)
     ends = np.empty((bars.n, 2), np.int64)
-    for side, name in enumerate(("first", "second")):
-        ends[:, side] = np.fromiter((number.get(label, -1) for label in bars.labels(name)), np.int64, bars.n)
+    for side, place in enumerate(pair):
+        ends[:, side] = np.fromiter((number.get(label, -1) for label in bars.labels(place)), np.int64, bars.n)
         if (ends[:, side] < 0).any():
             row = int((ends[:, side] < 0).argmax())
-            label = next(islice(bars.labels(name), row, None))
-            raise InputError(f"{bars.where(row)}: there is no node {label!r} in {of_nodes.name}")
-    mesh = WholeMesh(np.stack(axes, axis=1), ends, groups, bars.groups())
-    known = {bars.place(what) for what in ("bar", "first", "second", "groups")}
-    for place, (name, column) in enumerate(zip(bars.headings, bars.columns)):
-        if name and place not in known:
-            values = bars.converted(column)
-            if values is None:
-                mesh.warnings.append(f"{of_bars}: left out column {name!r}, which has text other than numbers")
-            else:
-                mesh.bar_fields[name] = values
+            label = next(islice(bars.labels(place), row, None))
+            told = "where nodes are numbered from 0, because it has no column of ids" if ids is None else ""
+            told = told or f"whose ids are in column {nodes.shown(ids)}, like {', '.join(islice(number, 3))}"
+            raise InputError(f"{bars.where(row)}: there is no node {label!r} in {of_nodes.name}, {told}")
+    mesh = WholeMesh(np.stack(axes, axis=1), ends, nodes.groups(), bars.groups())
+    mesh.warnings = warnings + nodes.units(_AXES) + bars.units([["area"]])
+    used = [nodes.place(names) for names in (*_AXES, _GROUPS)]
+    texts: list[str] = []
+    for name, place in nodes.others([*used, ids, *nodes.places(chain(*_NODE_IDS))]):
+        values = nodes.converted(nodes.columns[place])
+        if values is None:
+            texts.append(name)
+        else:
+            mesh.node_fields[name] = values
+    if texts or (used[2] is None and mesh.node_fields):
+        left = [f"left out columns {', '.join(map(repr, texts))}, which have other text than numbers"] * bool(texts)
+        flat = ["has no column z: all nodes have z = 0"] * (used[2] is None)
+        known = f"known are x, y, z, groups, and for ids {_KNOWN_IDS}; others are fields"
+        mesh.warnings.append(f"{of_nodes}: {'; '.join([*left, *flat, known])}")
+    numbered = [place for place in bars.places(_BAR_IDS) if len(set(bars.columns[place])) == bars.n]
+    for name, place in bars.others([*pair, bars.place(_GROUPS), *numbered]):
+        values = bars.converted(bars.columns[place])
+        if values is None:
+            mesh.warnings.append(f"{of_bars}: left out column {name!r}, which has text other than numbers")
+        else:
+            mesh.bar_fields[name] = values
     return mesh
+
+
+def _numbers_of_ids(nodes: _Table, bars: _Table, pair: tuple[int, int]) -> tuple[int | None, dict[str, int]]:
+    """Return the column of ids, None for numbers from 0, and the number of the node of each.
+
+    Raises
+    ------
+    InputError
+        If several columns may be it, or one whose name is not understood, or a node is listed more than once.
+    """
+
+    def serves(place: int) -> bool:
+        return wanted <= (labels := set(nodes.labels(place))) and len(labels) == nodes.n
+
+    wanted = {label for place in pair for label in bars.labels(place)}
+    candidates = next(filter(None, map(nodes.places, _NODE_IDS)), [])
+    if len(candidates) > 1:
+        candidates = list(filter(serves, candidates)) or candidates
+    if len({tuple(nodes.labels(place)) for place in candidates}) > 1:
+        which = " and ".join(map(nodes.shown, candidates))
+        raise InputError(f"{nodes.path}: line 1: columns {which} may all be the ids of nodes: call one of them 'node'")
+    if not candidates:
+        rows = list(map(str, range(nodes.n)))
+        for name, place in nodes.others(map(nodes.place, (*_AXES, _GROUPS))):
+            if serves(place) and list(nodes.labels(place)) != rows:
+                raise InputError(
+                    f"{nodes.path}: line 1: column {name!r} may have the ids of nodes: call it 'node', or add a column "
+                    f"'node' with the numbers from 0 if it does not (understood are {_KNOWN_IDS})"
+                )
+        return None, {label: i for i, label in enumerate(rows)}
+    number: dict[str, int] = {}
+    for i, label in enumerate(nodes.labels(candidates[0])):
+        if number.setdefault(label, i) != i:
+            column = nodes.shown(candidates[0])
+            raise InputError(f"{nodes.where(i)}: node {label!r} is listed more than once in column {column}")
+    return candidates[0], number
 
 
 class _Table:
     """A table with names of columns; ``headings`` are these without units, ``columns`` the entries."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, head_only: bool = False) -> None:
         self.path = path
         try:
             lines = path.read_bytes().decode("utf-8-sig").splitlines()
-        except FileNotFoundError:
-            raise InputError(f"{path}: there is no such file, the other table of the mesh") from None
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{path}: cannot be read: {error}; save it as text in UTF-8") from None
         kept = [i for i, line in enumerate(lines) if line.strip(" ,;\t") and not line.lstrip().startswith("#")]
         if not kept:
             raise InputError(f"{path}: is empty: the first line has the names of the columns")
         separator = max(";\t,", key=lines[kept[0]].count)
+        above = kept[0] - 1
+        # programs that write arrays put a # before the names of the columns
+        numbers = any(map(_is_number, lines[kept[0]].split(separator)))
+        if numbers and above >= 0 and lines[above].count(separator) == lines[kept[0]].count(separator) > 0:
+            lines[above] = lines[above].lstrip("# ")
+            kept.insert(0, above)
         self._decimal_comma = separator == ";"
         self._lines = np.array(kept[1:], np.int64) + 1
         self.n = len(self._lines)
-        texts = (lines[i] for i in kept)
+        texts = (lines[i] for i in (kept[:1] if head_only else kept))
         rows = csv.reader(texts, delimiter=separator, skipinitialspace=True, strict=True)
         try:
-            self.headings = [_without_unit(name) for name in next(rows)]
+            self._given = next(rows)
+            self.headings = [_without_unit(name) for name in self._given]
             self.columns: list[list[str]] = [[] for _ in self.headings]
             count = self._fill(rows)
         except csv.Error as error:
             raise InputError(f"{path}: {error}") from None
-        if count != self.n:
+        if count != self.n and not head_only:
             raise InputError(f"{path}: a text in quotes goes over several lines")
-        self._keys = [name.lower().replace(" ", "_") for name in self.headings]
+        self._keys = [re.sub(r"[\W_]+", "", name.lower()) for name in self.headings]
 
     def _fill(self, rows: Iterator[list[str]]) -> int:
         """Put the entries into columns, row by row, which needs less memory and time; return the number of rows."""
@@ -131,28 +271,75 @@ class _Table:
         """Return file and line of a row."""
         return f"{self.path}: line {self._lines[row]}"
 
-    def place(self, what: str) -> int | None:
-        """Return the place of the column of this meaning; None without it."""
-        return next((self._keys.index(name) for name in _NAMES[what] if name in self._keys), None)
+    def shown(self, place: int) -> str:
+        """Return the name of a column for messages."""
+        return repr(self.headings[place])
 
-    def _column(self, what: str) -> list[str]:
-        place = self.place(what)
-        if place is None:
-            has = ", ".join(map(repr, self._keys))
-            raise InputError(f"{self.path}: line 1: there is no column {what!r}; it has {has}")
-        return self.columns[place]
+    def places(self, names: Iterable[str]) -> list[int]:
+        """Return the columns with one of these names; one without a name counts only as the first."""
+        known = {*names}
+        return [i for i, key in enumerate(self._keys) if key in known and (key or i == 0)]
 
-    def labels(self, what: str) -> Iterator[str]:
+    def place(self, names: Iterable[str]) -> int | None:
+        """Return the first column with one of these names, in their order; None without it."""
+        return next((self._keys.index(name) for name in names if name in self._keys), None)
+
+    def pairs_of_ends(self) -> list[tuple[int, int]]:
+        """Return the pairs of columns that may be the ends of bars, of the most explicit kind that there is."""
+        for pairs, keys in zip(_ENDS, (self._keys, self._keys, self.headings, self.headings)):
+            found = [(keys.index(one), keys.index(two)) for one, two in pairs if one in keys and two in keys]
+            if found:
+                return list(dict.fromkeys(found))
+        return []
+
+    def ends(self) -> tuple[int, int]:
+        """Return the columns of the ends of bars."""
+        found = self.pairs_of_ends()
+        if len({tuple(map(tuple, (self.columns[one], self.columns[two]))) for one, two in found}) == 1:
+            return found[0]
+        if found:
+            which = ", ".join(f"{self.shown(one)} and {self.shown(two)}" for one, two in found)
+            raise InputError(f"{self.path}: line 1: {which} may be the ends of bars: call those 'node1' and 'node2'")
+        raise InputError(
+            f"{self.path}: line 1: there are no two columns for the ends of bars; it has {self._all()}; known are "
+            f"{_KNOWN_ENDS}, with _id and the like after them"
+        )
+
+    def _all(self) -> str:
+        return ", ".join(map(repr, self.headings))
+
+    def others(self, used: Iterable[int | None]) -> Iterator[tuple[str, int]]:
+        """Yield name and place of the columns that have a name and are not ``used``."""
+        known = {*used}
+        yield from ((name, i) for i, name in enumerate(self.headings) if name and i not in known)
+
+    def units(self, columns: Iterable[Iterable[str]]) -> list[str]:
+        """Return a warning about columns with another unit of length than metres."""
+        found = []
+        for place in map(self.place, columns):
+            unit = re.search(r"[\[(]\s*((?:mm|cm|dm|km|in|inch|ft|yd)[²2]?)\s*[\])]\s*$", self._given[place or 0])
+            if unit and place is not None:
+                found.append(f"{self.shown(place)} in {unit[1]}")
+        scale = "read as if in metres; the verb mesh converts by --scale (0.001 for millimetres)"
+        return [f"{self.path}: has {', '.join(found)}, {scale}"] if found else []
+
+    def labels(self, place: int) -> Iterator[str]:
         """Yield the entries of a column; whole numbers written as 3.0 or +3 are 3."""
-        return map(_label, self._column(what))
+        return map(_label, self.columns[place])
 
-    def numbers(self, what: str) -> np.ndarray:
-        """Return the numbers of a column."""
-        words = self._column(what)
+    def numbers(self, axis: str, names: list[str]) -> np.ndarray:
+        """Return the coordinates along an axis; zero without a column z."""
+        place = self.place(names)
+        if place is None and axis == "z":
+            return np.zeros(self.n)
+        if place is None:
+            known = f"known are {axis}, {axis}_coord, {axis}_coordinate, coord_{axis} and the like"
+            raise InputError(f"{self.path}: line 1: there is no column {axis!r}; it has {self._all()}; {known}")
+        words = self.columns[place]
         values = self.converted(words)
         if values is None:
             row = next(row for row, word in enumerate(words) if self.converted([word]) is None)
-            raise InputError(f"{self.where(row)}: column {what!r}: {words[row][:40]!r} is not a number")
+            raise InputError(f"{self.where(row)}: column {self.shown(place)}: {words[row][:40]!r} is not a number")
         return values
 
     def converted(self, words: list[str]) -> np.ndarray | None:
@@ -167,7 +354,8 @@ class _Table:
     def groups(self) -> dict[str, np.ndarray]:
         """Return the members of the groups of the column ``groups``."""
         found: dict[str, list[int]] = {}
-        for row, word in enumerate(self._column("groups") if self.place("groups") is not None else ()):
+        place = self.place(_GROUPS)
+        for row, word in enumerate(() if place is None else self.columns[place]):
             for name in word.split(";"):
                 if name.strip():
                     found.setdefault(name.strip().replace("/", "_"), []).append(row)
@@ -178,6 +366,10 @@ def _without_unit(name: str) -> str:
     """Return the name of a column without a unit in brackets; ``area`` is written in small letters."""
     name = re.sub(r"\s*[\[(].*?[\])]\s*$", "", name.strip()).strip()
     return "area" if name.lower() == "area" else name
+
+
+def _is_number(word: str) -> bool:
+    return re.fullmatch(r"\s*[-+]?\d*[.,]?\d+(e[-+]?\d+)?\s*", word, re.I) is not None
 
 
 def _label(word: str) -> str:
@@ -193,8 +385,14 @@ def _label(word: str) -> str:
 
 def write(path: Path, mesh: WholeMesh) -> None:
     """Write both tables, to the last digit; groups without members are not in them."""
-    of_nodes, of_bars = _pair(path)
-    _table(of_nodes, "node", {axis: mesh.points[:, i] for i, axis in enumerate("xyz")}, mesh.node_groups)
+    kind, start, stop = next(_words_in(path.stem), (0, 0, 0))
+    if not stop:
+        pair = f"{path.stem}_nodes.csv and {path.stem}_bars.csv"
+        raise InputError(f"{path}: a mesh in tables is a pair of files, {pair}: name one of them")
+    other = path.with_name(f"{path.stem[:start]}{_FILE_WORDS[1 - kind][0]}{path.stem[stop:]}{path.suffix}")
+    of_nodes, of_bars = (path, other) if kind == 0 else (other, path)
+    columns = {axis: mesh.points[:, i] for i, axis in enumerate("xyz")}
+    _table(of_nodes, "node", columns | mesh.node_fields, mesh.node_groups)
     columns = {"first": mesh.bars[:, 0], "second": mesh.bars[:, 1], **mesh.bar_fields}
     _table(of_bars, "bar", columns, mesh.bar_groups)
 

@@ -2,8 +2,9 @@
 
 Two-node lines (element type 1) are the bars, in file order; points (type 15) with a physical group define node groups;
 surfaces and volumes are left out with a warning. Nodes are numbered from 0 in file order. Data of elements
-($ElementData) with one component and a value for every line are bar fields. Rank 0 parses the file in pieces, each of
-which goes to all ranks: no rank has the whole mesh, but for the lines of version 2, which rank 0 has at once.
+($ElementData) and nodes ($NodeData) with one component and a value for every line or node are fields. Rank 0 parses the
+file in pieces, each of which goes to all ranks: no rank has the whole mesh, but for the lines of version 2, which rank
+0 has at once.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ _CURVED = (8, 26, 27, 28)
 
 Rows = Iterator[tuple[Any, np.ndarray]]
 """Kind and rows: ``tags`` (n,) and ``points`` (n, 3) of nodes; ``lines`` (n, 4): tag, tags of both nodes, place of the
-groups; ``marked`` (n, 2): tag of a node, place of its groups; ``("field", k, name)`` (n, 2): tag of a line, value."""
+groups; ``marked`` (n, 2): tag of a node, place of its groups; ``("ElementData" or "NodeData", k, name)`` (n, 2): tag of
+a line or node, value."""
 
 
 @dataclass
@@ -65,7 +67,8 @@ class _Head:
     """Elements that are neither lines nor points."""
     groups: dict[tuple[int, tuple[int, ...]], int] = field(default_factory=dict)
     """Places of dimension and tags of the physical groups that a line or point has."""
-    fields: list[str] = field(default_factory=list)
+    fields: dict[str, list[str]] = field(default_factory=lambda: {"ElementData": [], "NodeData": []})
+    """Names, by section."""
     warnings: list[str] = field(default_factory=list)
 
     def place(self, dimension: int, tags: Iterable[int]) -> int:
@@ -75,7 +78,7 @@ class _Head:
 
 
 def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
-    """Return this rank's slab of the mesh in a Gmsh file, with the named bar fields; None: with all. Collective.
+    """Return this rank's slab of the mesh in a Gmsh file, with the named fields; None: with all. Collective.
 
     Raises
     ------
@@ -87,8 +90,8 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
         parts.add(*piece)
     slab = parts.slab(piece)
     if fields is not None:
-        check_fields(path, fields, {*piece.fields} - ({*fields} - {*slab.bar_fields}))
-        slab.bar_fields = {name: slab.bar_fields[name] for name in fields}
+        others = {name for names in piece.fields.values() for name in names if name not in fields}
+        check_fields(path, fields, others | {*slab.bar_fields, *slab.node_fields})
     return slab
 
 
@@ -292,14 +295,15 @@ def _parsed(path: Path, content: mmap.mmap, fields: Mapping[str, str] | None) ->
         groups = _entities(section("Entities")) if "Entities" in places else {}
         yield from _batched(_elements_4(path, numbers, groups, head))
     numbers.end()
-    for k, (begin, end) in enumerate(places.get("ElementData", [])):
-        where = f"{path}: section $ElementData"
-        content.seek(begin)
-        name, n = _data_head(where, content, head)
-        if n is not None and (fields is None or name in fields):
-            numbers = _Section(f"{where} {name!r}", content, (min(content.tell(), end), end), layout)
-            yield from _batched((("field", k, name), np.column_stack(rows)) for rows in numbers.rows(n, 1))
-            numbers.end()
+    for kind in head.fields:
+        for k, (begin, end) in enumerate(places.get(kind, [])):
+            content.seek(begin)
+            name, n = _data_head(f"{path}: section ${kind}", content, kind, head)
+            if n is not None and (fields is None or name in fields):
+                place = min(content.tell(), end), end
+                numbers = _Section(f"{path}: section ${kind} {name!r}", content, place, layout)
+                yield from _batched(((kind, k, name), np.column_stack(rows)) for rows in numbers.rows(n, 1))
+                numbers.end()
     yield head
 
 
@@ -396,7 +400,8 @@ def _elements_4(path: Path, numbers: _Section, groups: dict[tuple[int, int], lis
         dimension, entity, kind = numbers.ints(3).tolist()
         n, nodes = int(numbers.sizes(1)[0]), _nodes_of(path, kind)
         done += n
-        place = head.place(int(kind == _LINE), groups.get((dimension, entity), ()))
+        named = groups.get((dimension, entity), ()) if kind in (_LINE, _POINT) else ()
+        place = head.place(int(kind == _LINE), named)
         for some in _steps(n):
             rows = numbers.sizes(some * (1 + nodes)).reshape(some, 1 + nodes)
             yield from _kept(kind, rows, np.full(some, place), head)
@@ -433,7 +438,8 @@ def _elements_2(path: Path, numbers: _Section, binary: bool, head: _Head) -> Row
         done += n
         rows = numbers.ints(n * width).reshape(n, width)
         tags, which = np.unique(rows[:, first] if n_tags else np.zeros(n, np.int64), return_inverse=True)
-        places = np.array([head.place(int(kind == _LINE), [tag]) for tag in tags.tolist()])
+        named = [[tag] if kind in (_LINE, _POINT) else [] for tag in tags.tolist()]
+        places = np.array([head.place(int(kind == _LINE), own) for own in named])
         yield from _kept(kind, rows[:, [0, *range(first + n_tags, width)]], places[which.ravel()], head)
 
 
@@ -455,8 +461,8 @@ def _kept(kind: int, rows: np.ndarray, places: np.ndarray, head: _Head) -> Rows:
         head.n_others += len(rows)
 
 
-def _data_head(where: str, content: mmap.mmap, head: _Head) -> tuple[str, int | None]:
-    """Return name and number of rows of a section $ElementData, None if it is left out; its head is always text."""
+def _data_head(where: str, content: mmap.mmap, kind: str, head: _Head) -> tuple[str, int | None]:
+    """Return name and number of rows of a section of data, None if it is left out; its head is always text."""
     words: list[list[bytes]] = []
     for _ in range(3):  # texts, real numbers, whole numbers
         count = content.readline().strip()
@@ -467,9 +473,9 @@ def _data_head(where: str, content: mmap.mmap, head: _Head) -> tuple[str, int | 
     if len(words[2]) < 3 or not all(re.fullmatch(rb"\d{1,18}", word) for word in words[2][:3]):
         raise InputError(f"{where} {name!r}: expected three whole numbers: time step, components, number of elements")
     if int(words[2][1]) != 1 or not name or "/" in name:
-        head.warnings.append(f"{where} {name!r} is left out: a bar field has a name without slash and one component")
+        head.warnings.append(f"{where} {name!r} is left out: a field has a name without slash and one component")
         return name, None
-    head.fields.append(name)
+    head.fields[kind].append(name)
     return name, int(words[2][2])
 
 
@@ -574,13 +580,14 @@ class _Parts:
         slab.node_groups = _groups(0, head, (first_node, len(tags)), own, marks)
         slab.bar_groups = _groups(1, head, (first_bar, len(places)), np.arange(first_bar, last_bar), places)
         for kind in sorted(key for key in self._count if isinstance(key, tuple)):
-            rows = self._all(kind, np.empty((0, 2)))
-            values = _Directory(comm, rows[:, 0].astype(np.int64), rows[:, 1]).find(lines, np.nan)
+            rows, of_nodes = self._all(kind, np.empty((0, 2))), kind[0] == "NodeData"
+            own = tags if of_nodes else lines
+            values = _Directory(comm, rows[:, 0].astype(np.int64), rows[:, 1]).find(own, np.nan)
             if comm.allreduce(bool(np.isnan(values).any()), op=MPI.LOR):
-                text = f"{kind[2]!r} is left out: it does not have a value for each line"
-                head.warnings.append(f"{self._source}: section $ElementData {text}")
+                text = f"{kind[2]!r} is left out: it does not have a value for each {'node' if of_nodes else 'line'}"
+                head.warnings.append(f"{self._source}: section ${kind[0]} {text}")
             else:
-                slab.bar_fields[kind[2]] = values
+                (slab.node_fields if of_nodes else slab.bar_fields)[kind[2]] = values
         if head.n_others:
             text = f"left out {head.n_others} elements that are neither lines nor points"
             head.warnings.insert(0, f"{self._source}: {text}")
@@ -591,7 +598,7 @@ class _Parts:
         fields), and the places of their groups."""
         comm, n = self._comm, slab.n_bars
         places = np.full(len(slab.bars), -1, np.int32)
-        tags = np.empty(len(slab.bars) if head.fields else 0, np.int64)
+        tags = np.empty(len(slab.bars) if head.fields["ElementData"] else 0, np.int64)
         pieces = self._rows.pop("lines", [])
         lowest = min((_lowest(comm, rows[:, 0]) for _, rows in pieces), default=_NONE) if head.ordered else 0
         lost = _NONE
@@ -606,7 +613,7 @@ class _Parts:
             found = nodes.find(rows[:, 1:3], -1)
             lost = min(lost, int(rows[:, 1:3][found < 0].min(initial=_NONE)))
             slab.bars[number], places[number] = found, rows[:, 3]
-            if head.fields:
+            if len(tags):
                 tags[number] = rows[:, 0]
         self._refuse(comm.allreduce(lost, op=MPI.MIN), "$Elements: node {} is not in $Nodes")
         if head.ordered and not comm.allreduce(bool((places >= 0).all()), op=MPI.LAND):
@@ -672,14 +679,15 @@ def _lines(mesh: WholeMesh) -> Iterator[str]:
     for tag, node in enumerate(grouped.tolist(), m + 1):
         yield from (f"0 {node + 1} 15 1", f"{tag} {node + 1}")
     yield "$EndElements"
-    yield from chain.from_iterable(_data_section(name, values) for name, values in mesh.bar_fields.items())
+    for kind, fields in (("ElementData", mesh.bar_fields), ("NodeData", mesh.node_fields)):
+        yield from chain.from_iterable(_data_section(kind, name, values) for name, values in fields.items())
 
 
-def _data_section(name: str, values: np.ndarray) -> Iterator[str]:
-    """Return a section $ElementData: name, time 0, step 0, one component, a value for each bar."""
-    yield from ("$ElementData", "1", f'"{_quoted(name)}"', "1", "0.0", "3", "0", "1", str(len(values)))
+def _data_section(kind: str, name: str, values: np.ndarray) -> Iterator[str]:
+    """Return a section of data: name, time 0, step 0, one component, a value for each bar or node."""
+    yield from (f"${kind}", "1", f'"{_quoted(name)}"', "1", "0.0", "3", "0", "1", str(len(values)))
     yield from (f"{tag} {value!r}" for tag, value in enumerate(values.tolist(), 1))
-    yield "$EndElementData"
+    yield f"$End{kind}"
 
 
 def _combinations(groups: dict[str, np.ndarray], n: int) -> tuple[list[list[int]], np.ndarray]:

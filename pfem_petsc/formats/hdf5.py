@@ -1,7 +1,8 @@
 """The mesh file format of this package (.h5): HDF5, read by all ranks together, each its share.
 
 ``/points`` (n_nodes, 3) float [m], ``/bars`` (n_bars, 2) integers from 0, ``/node_groups/<name>`` and
-``/bar_groups/<name>`` with the numbers of members, in any order; ``/bar_fields/<name>`` (n_bars,) float.
+``/bar_groups/<name>`` with the numbers of members, in any order; ``/bar_fields/<name>`` (n_bars,) and
+``/node_fields/<name>`` (n_nodes,) float.
 """
 
 from __future__ import annotations
@@ -34,17 +35,17 @@ FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeErr
 
 
 class _Content(NamedTuple):
-    """Sizes, names of groups of nodes and bars, and of fields."""
+    """Sizes, names of groups of nodes and bars, and of their fields."""
 
     n_nodes: int
     n_bars: int
     groups: dict[str, list[str]]
-    fields: list[str]
+    fields: dict[str, list[str]]
 
 
 def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
-    """Return this rank's slab of the mesh in an HDF5 file, with the named cell fields; None: with all. Collective; no
-    rank reads more than its part at a time.
+    """Return this rank's slab of the mesh in an HDF5 file, with the named fields; None: with all. Collective; no rank
+    reads more than its part at a time.
 
     Raises
     ------
@@ -53,10 +54,13 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
     """
     content = on_root(comm, _content, path, fields)
     check_memory(content.n_nodes, str(path))
-    names = content.fields if fields is None else fields
     # Every rank opens the file read-only: this needs no MPI driver, which a serial h5py lacks.
     with agreed(comm), _opened(path) as file:
-        slab = read_shares(file, comm, "points", "bars", {name: f"bar_fields/{name}" for name in names})
+        of_bars, of_nodes = (
+            {name: f"{kind}/{name}" for name in content.fields[kind] if fields is None or name in fields}
+            for kind in ("bar_fields", "node_fields")
+        )
+        slab = read_shares(file, comm, "points", "bars", of_bars, of_nodes)
     slab.source = str(path)
     for kind, n in (("node_groups", slab.n_nodes), ("bar_groups", slab.n_bars)):
         for name in content.groups[kind]:
@@ -111,16 +115,21 @@ def _content(path: Path, fields: Mapping[str, str] | None) -> _Content:
                 dataset = group.get(name)
                 if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or dataset.dtype.kind not in "iu":
                     raise InputError(f"{path}: /{kind}/{name} is not a list of integers")
-        group = file.get("bar_fields")
-        sets = {name: group.get(name) for name in group} if isinstance(group, h5py.Group) else {}
-        known = [name for name, data in sets.items() if isinstance(data, h5py.Dataset) and data.shape == (counts[1],)]
-        known = [name for name in known if sets[name].dtype.kind in "fiu"]
-    check_fields(path, fields, known)
+        known = {}
+        for kind, n in (("node_fields", counts[0]), ("bar_fields", counts[1])):
+            group = file.get(kind)
+            sets = {name: group.get(name) for name in group} if isinstance(group, h5py.Group) else {}
+            sets = {name: data for name, data in sets.items() if isinstance(data, h5py.Dataset) and data.shape == (n,)}
+            known[kind] = [name for name, data in sets.items() if data.dtype.kind in "fiu"]
+    check_fields(path, fields, {*known["bar_fields"], *known["node_fields"]})
     return _Content(counts[0], counts[1], groups, known)
 
 
-def read_shares(file: Any, comm: MPI.Comm, points: str, bars: str, fields: Mapping[str, str]) -> MeshSlab:
-    """Return this rank's slab, without groups, from datasets: points (n, 3), bars (n, 2) or (2 n,), and fields by name.
+def read_shares(
+    file: Any, comm: MPI.Comm, points: str, bars: str, fields: Mapping[str, str], node_fields: Mapping[str, str]
+) -> MeshSlab:
+    """Return this rank's slab, without groups, from datasets: points (n, 3), bars (n, 2) or (2 n,), and fields of bars
+    and nodes by name.
 
     Does not communicate. Numbers of nodes that are not there are kept as far as the type can hold them, else they are
     -1: checks find both.
@@ -144,6 +153,7 @@ def read_shares(file: Any, comm: MPI.Comm, points: str, bars: str, fields: Mappi
         first_bar=first,
         bars=ends,
         bar_fields={name: share_of(file[dataset], first, last) for name, dataset in fields.items()},
+        node_fields={name: share_of(file[dataset], first_node, last_node) for name, dataset in node_fields.items()},
     )
 
 
@@ -186,6 +196,6 @@ def write(path: Path, mesh: WholeMesh) -> None:
 
     with h5py.File(path, "w", locking=False) as file:
         file["points"], file["bars"] = mesh.points, mesh.bars
-        for kind in ("node_groups", "bar_groups", "bar_fields"):
+        for kind in ("node_groups", "bar_groups", "bar_fields", "node_fields"):
             for name, values in without_slashes(getattr(mesh, kind)).items():
-                file[f"{kind}/{name}"] = np.asarray(values, np.float64 if kind == "bar_fields" else np.int64)
+                file[f"{kind}/{name}"] = np.asarray(values, np.float64 if kind.endswith("fields") else np.int64)

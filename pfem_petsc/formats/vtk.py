@@ -4,7 +4,7 @@ Other cells are left out, with a warning; a line of several points is as many ba
 named ``group`` or ``section`` assigns every bar with value i to the bar group ``group_i`` or ``section_i``; a field
 array of strings named ``group_names`` or ``section_names`` replaces these names by its i-th entry. Point arrays of the
 same names define node groups (a negative value: no group). An array named ``group:NAME`` is the group NAME of those
-with a value other than 0; these may overlap. Other cell arrays with one component are bar fields.
+with a value other than 0; these may overlap. Other arrays with one component are fields of bars and nodes.
 
 Each rank reads its share of a .vtkhdf file that has lines of two points alone; VTK reads all others, in a process of
 its own, because it aborts the process on some damaged files. That process runs this module as a program, which
@@ -47,7 +47,7 @@ _REFUSED = 3
 
 
 def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
-    """Return the mesh in a VTK file, with all cell fields.
+    """Return the mesh in a VTK file, with all fields.
 
     Raises
     ------
@@ -87,8 +87,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
 
 
 def _extract(path: str) -> int:
-    """Read ``path``; write ``points``, ``bars``, ``node_groups/NAME``, ``bar_groups/NAME``, ``bar_fields/NAME`` of
-    the last of several snapshots to stdout, as a pickled dictionary."""
+    """Read ``path``; write ``points``, ``bars``, ``node_groups/NAME``, ``bar_groups/NAME``, ``bar_fields/NAME`` and
+    ``node_fields/NAME`` of the last of several snapshots to stdout, as a pickled dictionary."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
     if path.lower().endswith(".vtu"):
@@ -155,9 +155,9 @@ def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
     ):
         for name, members in _groups_of(data, grid.GetFieldData(), kept).items():
             yield f"{kind}/{name}", members
-    for name, values in _numbers(grid.GetCellData()).items():
-        if not name.startswith(_MASK) and name not in _NAMED:
-            yield f"bar_fields/{name}", values.astype(np.float64)[lines]
+        for name, values in _numbers(data).items():
+            if not name.startswith(_MASK) and name not in _NAMED:
+                yield f"{kind.replace('groups', 'fields')}/{name}", values.astype(np.float64)[kept]
 
 
 def _numbers(data: Any) -> dict[str, np.ndarray]:
@@ -213,11 +213,12 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
     if plain is None:
         return None
     n_nodes, masks, known = plain
-    check_fields(path, fields, known)
+    check_fields(path, fields, {name for names in known.values() for name in names})
     check_memory(n_nodes, str(path))
     slab, fits = None, True
+    wanted = {kind: [name for name in names if fields is None or name in fields] for kind, names in known.items()}
     try:
-        slab = _share(path, comm, masks, known if fields is None else list(fields))
+        slab = _share(path, comm, masks, wanted)
     except MemoryError:
         fits = False
     if not comm.allreduce(fits, op=MPI.LAND):
@@ -225,7 +226,7 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
     return slab if comm.allreduce(slab is not None, op=MPI.LAND) else None
 
 
-def _plain(path: Path) -> tuple[int, dict[str, list[str]], list[str]] | None:
+def _plain(path: Path) -> tuple[int, dict[str, list[str]], dict[str, list[str]]] | None:
     """Return the number of nodes, names of arrays that mark groups of points and cells, and names of fields, of a file
     in one part, without steps, of lines of two points in the order of ``Connectivity``; None for another one."""
     import h5py
@@ -244,14 +245,14 @@ def _plain(path: Path) -> tuple[int, dict[str, list[str]], list[str]] | None:
             shapes = {"Points": (n_nodes, 3), "Connectivity": (n_ends,), "Offsets": (n_bars + 1,), "Types": (n_bars,)}
             holds = [_holds(root[name], shape, "f" if name == "Points" else "iu") for name, shape in shapes.items()]
             masks: dict[str, list[str]] = {}
+            known: dict[str, list[str]] = {}
             for kind, n in (("PointData", n_nodes), ("CellData", n_bars)):
                 data = root.get(kind, {})
                 masks[kind] = [name for name in data if name.startswith(_MASK) and len(name) > len(_MASK)]
                 holds += [_holds(data[name], (n,), "fiu") for name in masks[kind]]
                 holds += [name not in data for name in _NAMED]
-            cells = root.get("CellData", {})
-            known = [name for name in cells if not name.startswith(_MASK) and cells[name].ndim == 1]
-            holds += [_holds(cells[name], (n_bars,), "fiu") for name in known]
+                known[kind] = [name for name in data if not name.startswith(_MASK) and data[name].ndim == 1]
+                holds += [_holds(data[name], (n,), "fiu") for name in known[kind]]
             return (n_nodes, masks, known) if all(holds) and n_ends == 2 * n_bars and n_nodes and n_bars else None
     except FAILURES:
         return None
@@ -264,7 +265,7 @@ def _holds(dataset: Any, shape: tuple[int, ...], kinds: str) -> bool:
     return dataset.chunks is not None or dataset.id.get_storage_size() >= dataset.size * dataset.dtype.itemsize
 
 
-def _share(path: Path, comm: MPI.Comm, masks: dict[str, list[str]], fields: list[str]) -> MeshSlab | None:
+def _share(path: Path, comm: MPI.Comm, masks: dict[str, list[str]], fields: dict[str, list[str]]) -> MeshSlab | None:
     """Return this rank's slab; None if its cells are not all lines in order, or the file is damaged."""
     import h5py
 
@@ -273,7 +274,9 @@ def _share(path: Path, comm: MPI.Comm, masks: dict[str, list[str]], fields: list
     try:
         with h5py.File(path, "r", locking=False) as file:
             root = file["VTKHDF"]
-            slab = read_shares(root, comm, "Points", "Connectivity", {name: f"CellData/{name}" for name in fields})
+            own = {name: f"CellData/{name}" for name in fields["CellData"]}
+            of_nodes = {name: f"PointData/{name}" for name in fields["PointData"]}
+            slab = read_shares(root, comm, "Points", "Connectivity", own, of_nodes)
             slab.source = str(path)
             first, last = slab.first_bar, slab.first_bar + len(slab.bars)
             for start, stop in pieces(first, last):
@@ -297,11 +300,11 @@ def _share(path: Path, comm: MPI.Comm, masks: dict[str, list[str]], fields: list
 
 
 def write(path: Path, mesh: WholeMesh) -> None:
-    """Write the mesh with its bar fields, to the last digit; groups are arrays of ones and zeros."""
+    """Write the mesh with its fields, to the last digit; groups are arrays of ones and zeros."""
     from ..mesh.whole import without_slashes
 
     if path.suffix.lower() == ".vtkhdf":
-        kinds = ("node_groups", "bar_groups", "bar_fields")
+        kinds = ("node_groups", "bar_groups", "bar_fields", "node_fields")
         _write_vtkhdf(path, replace(mesh, **{kind: without_slashes(getattr(mesh, kind)) for kind in kinds}))
         return
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
@@ -318,7 +321,7 @@ def _escaped(name: str) -> str:
 
 
 def grid_of(mesh: WholeMesh, named: Callable[[str], str] = str) -> pyvista.UnstructuredGrid:
-    """Return a grid of lines with the bar fields; groups are ``group:NAME``, 1 for members; ``named`` gives names."""
+    """Return a grid of lines with the fields; groups are ``group:NAME``, 1 for members; ``named`` gives names."""
     import pyvista
 
     cells = np.column_stack([np.full(len(mesh.bars), 2), mesh.bars]).ravel()
@@ -330,7 +333,7 @@ def grid_of(mesh: WholeMesh, named: Callable[[str], str] = str) -> pyvista.Unstr
 
 
 def _data(mesh: WholeMesh) -> dict[str, dict[str, np.ndarray]]:
-    """Return arrays of points and cells by name: bar fields, and masks of groups."""
+    """Return arrays of points and cells by name: fields, and masks of groups."""
 
     def masks(groups: Mapping[str, np.ndarray], n: int) -> dict[str, np.ndarray]:
         found = {f"{_MASK}{name}": np.zeros(n, np.uint8) for name in groups}
@@ -340,7 +343,7 @@ def _data(mesh: WholeMesh) -> dict[str, dict[str, np.ndarray]]:
 
     return {
         "cell_data": mesh.bar_fields | masks(mesh.bar_groups, len(mesh.bars)),
-        "point_data": masks(mesh.node_groups, len(mesh.points)),
+        "point_data": mesh.node_fields | masks(mesh.node_groups, len(mesh.points)),
     }
 
 

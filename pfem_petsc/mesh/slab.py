@@ -44,8 +44,10 @@ class MeshSlab:
     bar_groups: dict[str, np.ndarray] = field(default_factory=dict)
     """Members (int64 mesh numbers) within this rank's bars; the same names in the same order on all ranks."""
     bar_fields: dict[str, np.ndarray] = field(default_factory=dict)
-    """Values of this rank's bars, (bars here,) float64, of the cell fields that were asked for; the same names on all
+    """Values of this rank's bars, (bars here,) float64, of the fields that were asked for; the same names on all
     ranks."""
+    node_fields: dict[str, np.ndarray] = field(default_factory=dict)
+    """Values of this rank's nodes, in the same way; a field that was asked for is one of bars, of nodes or of both."""
     source: str = "mesh"
     """The file or the generator, for messages."""
     structured: bool = False

@@ -131,6 +131,7 @@ def cleaned(mesh: WholeMesh, tolerance: float | None = None, sum_areas: bool = F
         node_groups=_renumbered(mesh.node_groups, new_node),
         bar_groups=_renumbered(mesh.bar_groups, new_bar),
         bar_fields=fields,
+        node_fields={name: values[used] for name, values in mesh.node_fields.items()},
     ), done
 
 
@@ -161,12 +162,13 @@ def merged(meshes: Sequence[WholeMesh], tolerance: float | None = None) -> tuple
             for name, members in own.items():
                 groups[name] = np.concatenate([groups.get(name, np.empty(0, np.int64)), members])
         setattr(together, kind, groups)
-    every = {name for mesh in meshes for name in mesh.bar_fields}
-    for name in sorted(every):
-        if all(name in mesh.bar_fields for mesh in meshes):
-            together.bar_fields[name] = np.concatenate([mesh.bar_fields[name] for mesh in meshes])
-        else:
-            done.append(f"field {name} left out: not all files have it")
+    for kind in ("bar_fields", "node_fields"):
+        fields = [getattr(mesh, kind) for mesh in meshes]
+        for name in sorted(set().union(*fields)):
+            if all(name in own for own in fields):
+                getattr(together, kind)[name] = np.concatenate([own[name] for own in fields])
+            else:
+                done.append(f"field {name} left out: not all files have it")
     for mesh in meshes:
         together.warnings += mesh.warnings
         for table, rows in mesh.tables.items():
@@ -183,7 +185,8 @@ def merged(meshes: Sequence[WholeMesh], tolerance: float | None = None) -> tuple
 def refined(mesh: WholeMesh, n: int) -> WholeMesh:
     """Divide each bar into n of the same length.
 
-    Bar k becomes the bars from n k to n k + n - 1, with its groups and fields; new nodes are numbered after the others.
+    Bar k becomes the bars from n k to n k + n - 1, with its groups and fields; new nodes are numbered after the others,
+    and have NaN in fields of nodes.
     """
     if n < 1:
         raise InputError(f"refine: {n} parts of a bar; expected a whole number from 1 on")
@@ -204,6 +207,9 @@ def refined(mesh: WholeMesh, n: int) -> WholeMesh:
         node_groups=dict(mesh.node_groups),
         bar_groups=groups,
         bar_fields={name: np.repeat(values, n) for name, values in mesh.bar_fields.items()},
+        node_fields={
+            name: np.concatenate([values, np.full(len(inner), np.nan)]) for name, values in mesh.node_fields.items()
+        },
     )
 
 
@@ -282,9 +288,11 @@ def _named(mesh: WholeMesh) -> Iterator[tuple[str, str]]:
         texts = [f"{name} ({len(members):,})" for name, members in groups.items()]
         if texts:
             yield label, _listed(texts)
-    for name, values in mesh.bar_fields.items():
-        unit = " m2" if name == "area" else ""
-        yield f"field {name}", f"{values.min(initial=np.inf):.6g} to {values.max(initial=-np.inf):.6g}{unit}"
+    for kind, fields in (("field", mesh.bar_fields), ("node field", mesh.node_fields)):
+        for name, values in fields.items():
+            unit = " m2" if name == "area" and kind == "field" else ""
+            low, high = np.fmin.reduce(values, initial=np.inf), np.fmax.reduce(values, initial=-np.inf)
+            yield f"{kind} {name}", f"{low:.6g} to {high:.6g}{unit}"
     for table, rows in mesh.tables.items():
         for name, keys in rows.items():
             yield f"{table} {name}", ", ".join(f"{key} {_short(value)}" for key, value in keys.items()) or "no keys"

@@ -146,6 +146,9 @@ class Truss:
         truss = cls(mesh.points, mesh.bars, **named, source=mesh.source)
         truss.tables = case_tables(mesh.tables)
         truss.warnings = mesh.warnings + truss.warnings
+        if mesh.node_fields:
+            names = ", ".join(mesh.node_fields)
+            truss.warnings.append(f"{mesh.source}: left out fields of nodes ({names}): a truss from arrays has none")
         return truss
 
     def to_mesh(self) -> WholeMesh:

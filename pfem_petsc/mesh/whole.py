@@ -30,6 +30,8 @@ class WholeMesh:
     bar_groups: dict[str, np.ndarray] = field(default_factory=dict)
     bar_fields: dict[str, np.ndarray] = field(default_factory=dict)
     """(n_bars,) float64; the field ``area`` has the areas of cross-sections [m2]."""
+    node_fields: dict[str, np.ndarray] = field(default_factory=dict)
+    """(n_nodes,) float64."""
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)
     """What a file has besides the mesh: ``material``, ``section``, ``support``, ``load``, ``mass``, ``spring``,
     ``dashpot``, ``temperature``, ``initial`` and ``gravity``, each with the keys of a case by name, and ``analysis``:
@@ -69,7 +71,7 @@ def without_slashes(named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def check_fields(path: Path | str, fields: Mapping[str, str] | None, known: Iterable[str]) -> None:
-    """Refuse ``fields``, by the keys that ask for them, that are not among the ``known`` cell fields of a file.
+    """Refuse ``fields``, by the keys that ask for them, that are not among the ``known`` fields of a file.
 
     Raises
     ------
@@ -80,7 +82,7 @@ def check_fields(path: Path | str, fields: Mapping[str, str] | None, known: Iter
         if name not in known:
             there = f"; it has {', '.join(known)}" if known else ""
             raise InputError(
-                f"{key} = {name!r}: {path} has no cell field of this name with one number for each bar{there}"
+                f"{key} = {name!r}: {path} has no field of this name with one number for each bar or node{there}"
             )
 
 
@@ -88,12 +90,17 @@ def scattered(whole: WholeMesh | None, source: str, comm: MPI.Comm) -> MeshSlab:
     """Send every rank its slab of the mesh that rank 0 has; None on the others. Collective."""
     head = None
     if whole is not None:
-        names = [list(named) for named in (whole.node_groups, whole.bar_groups, whole.bar_fields)]
+        named = (whole.node_groups, whole.bar_groups, whole.bar_fields, whole.node_fields)
+        names = [list(each) for each in named]
         head = (len(whole.points), len(whole.bars), *names, whole.warnings)
-    n_nodes, n_bars, node_names, bar_names, field_names, warnings = comm.bcast(head)
+    n_nodes, n_bars, node_names, bar_names, field_names, node_field_names, warnings = comm.bcast(head)
     check_size(n_nodes, source)
     points = _scatter(comm, whole.points if whole else np.empty((0, 3)), n_nodes)
     bars = _scatter(comm, whole.bars if whole else np.empty((0, 2), np.int64), n_bars)
+
+    def field_of(values: np.ndarray | None, n: int) -> np.ndarray:
+        return _scatter(comm, np.empty((0, 1)) if values is None else values[:, None], n)[:, 0]
+
     return MeshSlab(
         n_nodes=n_nodes,
         n_bars=n_bars,
@@ -103,10 +110,8 @@ def scattered(whole: WholeMesh | None, source: str, comm: MPI.Comm) -> MeshSlab:
         bars=bars,
         node_groups={name: _members(comm, whole and whole.node_groups[name], n_nodes) for name in node_names},
         bar_groups={name: _members(comm, whole and whole.bar_groups[name], n_bars) for name in bar_names},
-        bar_fields={
-            name: _scatter(comm, whole.bar_fields[name][:, None] if whole else np.empty((0, 1)), n_bars)[:, 0]
-            for name in field_names
-        },
+        bar_fields={name: field_of(whole and whole.bar_fields[name], n_bars) for name in field_names},
+        node_fields={name: field_of(whole and whole.node_fields[name], n_nodes) for name in node_field_names},
         source=source,
         warnings=warnings,
     )

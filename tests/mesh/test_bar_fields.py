@@ -144,7 +144,7 @@ def test_areas_too_small_for_a_tube(tmp_path):
             {"generator": "rod", "length": 1.0, "elements": 1},
             "generator rod has no cell fields",
         ),
-        ({"area_field": "a"}, {"file": "ring.msh"}, "no cell field of this name"),
+        ({"area_field": "a"}, {"file": "ring.msh"}, "no field of this name"),
     ],
 )
 def test_refused(section, mesh, text, tmp_path):

@@ -69,7 +69,7 @@ def test_a_case_reads_what_was_written(comm, shared_tmp_path, name):
     np.testing.assert_array_equal(mesh.bars, truss.bars)
     areas = np.concatenate(comm.allgather(slab.bar_fields["area"]))
     np.testing.assert_allclose(areas, truss.bar_fields["area"], rtol=4e-16)
-    with pytest.raises(InputError, match=r"section.s.area_field = 'aera': .* has no cell field of this name"):
+    with pytest.raises(InputError, match=r"section.s.area_field = 'aera': .* has no field of this name"):
         load_slab(SimpleNamespace(generator=None, file=path), comm, {"aera": "section.s.area_field"})
 
 

@@ -143,5 +143,5 @@ def test_python_reads_and_cleans(tmp_path):
     truss = Truss.read(path, clean=0.0)
     assert (truss.n_nodes, truss.n_bars, sorted(truss.bar_fields)) == (4, 5, ["area", "w"])
     assert list(Truss.read(truss.write(tmp_path / "t.vtu"), bar_fields=["w"]).bar_fields) == ["w"]
-    with pytest.raises(InputError, match="bar_fields = 'x': .*t.vtu has no cell field of this name"):
+    with pytest.raises(InputError, match="bar_fields = 'x': .*t.vtu has no field of this name"):
         Truss.read(tmp_path / "t.vtu", bar_fields=["x"])

@@ -152,7 +152,7 @@ def test_large_trusses_are_a_digest_in_the_text(monkeypatch):
 
 def test_missing_fields_and_groups_are_told():
     bare = Truss(POINTS, BARS, node_groups=GROUPS["node_groups"])
-    with pytest.raises(InputError, match="section.ring.area_field = 'area': mesh has no cell field of this name"):
+    with pytest.raises(InputError, match="section.ring.area_field = 'area': mesh has no field of this name"):
         Simulation(Case(TABLES, mesh=bare), MPI.COMM_SELF, check_only=True)
     grouped = {**TABLES, "section": {"legs": {"bars": "leg", "area": 2e-4, "material": "steel"}}}
     with pytest.raises(InputError, match="did you mean 'legs'"):

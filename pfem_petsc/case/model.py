@@ -456,14 +456,14 @@ class CaseModel(StrictModel):
     def _bars_once(cls, sections: dict[str, t.Section]) -> dict[str, t.Section]:
         seen: dict[str | None, str] = {}
         for name, section in sections.items():
-            if section.bars not in seen:
-                seen[section.bars] = name
+            group = None if section.bars is None else str(section.bars)
+            if group not in seen:
+                seen[group] = name
             elif section.bars is None:
                 text = f"both this section and {seen[None]} name no bars; only one can be the default"
                 raise refusal(((name,), text, None))
             else:
-                text = f"section {seen[section.bars]} has these bars already"
-                raise refusal(((name, "bars"), text, section.bars))
+                raise refusal(((name, "bars"), f"section {seen[group]} has these bars already", group))
         return sections
 
     @field_validator("remove")
@@ -472,7 +472,7 @@ class CaseModel(StrictModel):
         targets = [(entry.bars, entry.supports) for entry in entries]
         for i, (bars, supports) in enumerate(targets):
             if targets[i] in targets[:i]:
-                raise refusal(((i,), f"{bars or supports!r} is removed by an earlier table already", None))
+                raise refusal(((i,), f"{str(bars or supports)!r} is removed by an earlier table already", None))
         return entries
 
     @field_validator("contact")

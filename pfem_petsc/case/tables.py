@@ -12,6 +12,7 @@ from pydantic import (
     AfterValidator,
     Field,
     PlainSerializer,
+    PlainValidator,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -103,10 +104,38 @@ class MeshKeys(StrictModel):
         return self
 
 
-class NodeSet(StrictModel):
-    """A named set of nodes, selected by exactly one key."""
+class FieldValue(StrictModel):
+    """The bars or nodes at which a field of the mesh has a value, which the mesh then has as a group of this text."""
 
-    exactly_one = (("nearest", "box", "group", "indices", "all"),)
+    field: Annotated[str, Field(min_length=1)]
+    """name of a field of the mesh"""
+    value: Annotated[int, Field(ge=-(2**53), le=2**53)]
+    """a whole number, the value of the field"""
+
+    def __str__(self) -> str:
+        return f"{self.field} = {self.value}"
+
+
+def _of_bars(given: Any, info: ValidationInfo) -> str | FieldValue:
+    if isinstance(given, str | FieldValue):
+        return given
+    if not isinstance(given, Mapping):
+        raise ValueError('expected the name of a bar group, or a value of a field: { field = "NAME", value = 2 }')
+    return FieldValue.model_validate(dict(given), context=info.context)
+
+
+BarGroup = Annotated[
+    FieldValue | str,
+    PlainValidator(_of_bars),
+    PlainSerializer(lambda bars: bars if isinstance(bars, str) else bars.as_table()),
+]
+"""A group of bars: a name in the mesh, or a value of a field; its text is the name in ``bar_groups`` in both cases."""
+
+
+class NodeSet(StrictModel):
+    """A named set of nodes, selected by exactly one key; ``field`` goes with ``value``."""
+
+    exactly_one = (("nearest", "box", "group", "indices", "field", "all"),)
 
     nearest: Vector3 | None = None
     """a point [m]: selects the nearest node"""
@@ -116,6 +145,10 @@ class NodeSet(StrictModel):
     """a node group of the mesh"""
     indices: Indices | None = None
     """node numbers of the mesh, from 0"""
+    field: Annotated[str, Field(min_length=1)] | None = None
+    """a field of the mesh: selects the nodes where it has ``value``; of a field of bars, the ends of these bars"""
+    value: Annotated[int, Field(ge=-(2**53), le=2**53)] | None = None
+    """a whole number, the value of ``field``"""
     all: Literal[True] | None = None
     """true: all nodes"""
 
@@ -127,6 +160,17 @@ class NodeSet(StrictModel):
                 if low > high:
                     raise ValueError(f"the first corner must be the lower one, but {axis} is {low!r} and then {high!r}")
         return box
+
+    @model_validator(mode="after")
+    def _field_with_value(self) -> NodeSet:
+        if (self.field is None) != (self.value is None):
+            raise ValueError('field and value need each other: field = "NAME", value = 2')
+        return self
+
+    @property
+    def selection(self) -> FieldValue | None:
+        """The value of a field that selects the nodes, if one does."""
+        return None if self.field is None else FieldValue.model_construct(field=self.field, value=self.value)
 
     @field_validator("indices")
     @classmethod
@@ -176,8 +220,9 @@ class Section(StrictModel):
     """cell field of the mesh file with the area of each bar [m2], instead of ``area``"""
     material: Annotated[str, refers("material", "material")]
     """name of a material"""
-    bars: str | None = None
-    """bar group of the mesh; default: all bars that no other section names"""
+    bars: BarGroup | None = None
+    """bar group of the mesh, or the bars with a value of a field: { field = "NAME", value = 2 }; default: all bars that
+    no other section names"""
     shape: Literal["round", "tube"] | None = None
     """shape of the cross-section: a solid circle or a tube of this area"""
     thickness: PositiveFloat | None = None
@@ -504,8 +549,8 @@ class Temperature(WithFiles):
     alternatives = ("value",)
     exactly_one = (("value", "table", "table_file"),)
 
-    bars: str | None = None
-    """bar group of the mesh; default: all bars"""
+    bars: BarGroup | None = None
+    """bar group of the mesh, or bars with a value of a field, as in a section; default: all bars"""
     value: Finite | None = None
     """temperature above reference [K]"""
     table: Table2 | None = None
@@ -542,8 +587,8 @@ class Remove(StrictModel):
 
     exactly_one = (("bars", "supports"),)
 
-    bars: str | None = None
-    """bar group of the mesh"""
+    bars: BarGroup | None = None
+    """bar group of the mesh, or bars with a value of a field, as in a section"""
     supports: Annotated[str, refers("support", "support")] | None = None
     """name of a support"""
     time: NonNegativeFloat

@@ -193,6 +193,7 @@ def _made(what: str, overrides: list[str]) -> WholeMesh:
     from mpi4py import MPI
 
     from ..case.schema import Case
+    from ..mechanics.bars import select
     from ..mesh import load_slab
     from ..mesh.whole import WholeMesh
     from ..post.motion import section_areas
@@ -215,13 +216,19 @@ def _made(what: str, overrides: list[str]) -> WholeMesh:
     if case.mesh.file is not None:
         from ..formats import read_whole
 
-        names = read_whole(case.mesh.file).bar_fields
+        whole = read_whole(case.mesh.file)
+        names = whole.bar_fields | whole.node_fields
     slab = load_slab(case.mesh, MPI.COMM_SELF, dict.fromkeys(names, "mesh.bar_fields"))
+    select(slab, [case], MPI.COMM_SELF)
     mesh = WholeMesh(slab.points, slab.bars.astype("int64"), slab.node_groups, slab.bar_groups, dict(slab.bar_fields))
+    mesh.node_fields = slab.node_fields
     if not plain:
         mesh.bar_fields["area"] = section_areas(case, slab)[1]
         given = case.to_dict()
         mesh.tables = {name: given[name] for name in ("material", "section") if name in given}
+        for name, section in case.section.items():  # groups that values of fields select are in the file
+            if section.bars is not None:
+                mesh.tables["section"][name]["bars"] = str(section.bars)
     return mesh
 
 

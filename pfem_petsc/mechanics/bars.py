@@ -11,10 +11,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
+from ..case.tables import FieldValue
 from ..columns import BAR_ENERGIES, STORED
 from ..errors import InputError
 from ..fields import STATUS
+from ..mesh import load_slab
+from ..mesh.exchange import Router
 from ..mesh.node_sets import group_hint
+from ..mesh.slab import slab_of
 from .elements import MEASURES, BarData, ElementFamily, MatrixRows, bar_lengths, first_inverted, make_loops
 from .materials.base import BarShapes, Law, UnsuitableBarError, internal_variables, law_of
 from .runs import Columns, Sweep, exchange_history, make_sweep
@@ -50,18 +54,78 @@ def bar_shapes(section: Section, length: np.ndarray, area: np.ndarray) -> BarSha
     return BarShapes(length, area, moment, modulus, outer, section.effective_length * length)
 
 
+_SHOWN = 12
+"""Number of values of a field that messages list."""
+
+
 def area_fields(case: Case) -> dict[str, str]:
     """Return the cell fields of the mesh that sections take their areas from, each with the key that names it."""
     named = [(s.area_field, f"{case.source}: section.{name}.area_field") for name, s in case.section.items()]
     return {field: key for field, key in reversed(named) if field is not None}
 
 
-def named_groups(case: Case) -> set[str]:
-    """Return the names of all groups of the mesh that a case uses."""
-    names = [section.bars for section in case.section.values()]
-    names += [node_set.group for node_set in case.node_set.values()]
-    names += [entry.bars for entry in (*case.temperature, *case.remove)]
-    return {name for name in names if name is not None}
+def _bar_groups(case: Case) -> Iterator[tuple[str, str | FieldValue]]:
+    """Yield the groups of bars that a case names, each with its key."""
+    tables = [(f"section.{name}", section) for name, section in case.section.items()]
+    for kind in ("temperature", "remove"):
+        tables += [(f"{kind}[{i}]", entry) for i, entry in enumerate(getattr(case, kind))]
+    for key, table in tables:
+        if table.bars is not None:
+            yield f"{case.source}: {key}.bars", table.bars
+
+
+def mesh_of_cases(cases: Sequence[Case], comm: MPI.Comm) -> MeshSlab:
+    """Return this rank's part of the mesh of a case and its stages, with all groups and areas that they use.
+    Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, as :func:`~pfem_petsc.mesh.load_slab`, and if no bar or node has a value that selects some.
+    """
+    case = cases[0]
+    groups = {name for each in cases for _, name in _bar_groups(each) if isinstance(name, str)}
+    groups |= {node_set.group for node_set in case.node_set.values() if node_set.group is not None}
+    areas = area_fields(case)
+    fields = {chosen.field: key for key, chosen, _ in reversed(selections(cases))} | areas
+    slab = load_slab(case.mesh, comm, fields, groups)
+    for name, key in areas.items():
+        if name not in slab.bar_fields:
+            raise InputError(f"{key} = {name!r}: {slab.source} has this field for nodes, not for bars")
+    select(slab, cases, comm)
+    slab.bar_fields, slab.node_fields = {name: slab.bar_fields[name] for name in areas}, {}
+    return slab
+
+
+def selections(cases: Sequence[Case]) -> list[tuple[str, FieldValue, bool]]:
+    """Return what cases select by values of fields of the mesh: the key, the value, and whether these are nodes."""
+    found = [(key, group, False) for case in cases for key, group in _bar_groups(case) if isinstance(group, FieldValue)]
+    for name, node_set in cases[0].node_set.items():
+        if node_set.selection is not None:
+            found.append((f"{cases[0].source}: node_set.{name}.field", node_set.selection, True))
+    return found
+
+
+def select(slab: MeshSlab, cases: Sequence[Case], comm: MPI.Comm) -> None:
+    """Add the groups of a mesh that cases select by values of its fields. Collective."""
+    for key, chosen, nodes in selections(cases):
+        of_nodes = nodes and chosen.field in slab.node_fields
+        values = (slab.node_fields if of_nodes else slab.bar_fields).get(chosen.field)
+        if values is None:
+            raise InputError(f"{key}: {slab.source} has the field {chosen.field!r} for nodes, not for bars")
+        members = np.flatnonzero(values == chosen.value)
+        if comm.allreduce(len(members)) == 0:
+            several = comm.allgather(np.unique(values[np.isfinite(values)])[:_SHOWN].tolist())
+            there = ", ".join(f"{value:g}" for value in sorted({value for own in several for value in own})[:_SHOWN])
+            what = "node" if of_nodes else "bar"
+            raise InputError(f"{key}: no {what} of {slab.source} has {chosen}; the field has values like {there}")
+        if not nodes:
+            slab.bar_groups[str(chosen)] = slab.first_bar + members
+        elif of_nodes:
+            slab.node_groups[str(chosen)] = slab.first_node + members
+        else:
+            ends = np.unique(slab.bars[members]).astype(np.int64)
+            slab.node_groups[str(chosen)] = np.unique(Router(comm, slab_of(ends, slab.n_nodes, comm.size)).send(ends))
 
 
 def check_areas(case: Case, slab: MeshSlab, sections: np.ndarray) -> None:
@@ -106,12 +170,13 @@ def section_of_bars(case: Case, slab: MeshSlab) -> np.ndarray:
     for index, (name, section) in enumerate(case.section.items()):
         if section.bars is None:
             continue
-        if section.bars not in slab.bar_groups:
-            hint = group_hint(case, section.bars, sorted(slab.bar_groups), "Curve")
+        group = str(section.bars)
+        if group not in slab.bar_groups:
+            hint = group_hint(case, group, sorted(slab.bar_groups), "Curve")
             raise InputError(
-                f"{case.source}: section.{name}.bars = {section.bars!r}: no such bar group in {slab.source}{hint}"
+                f"{case.source}: section.{name}.bars = {group!r}: no such bar group in {slab.source}{hint}"
             )
-        members = slab.bar_groups[section.bars] - slab.first_bar
+        members = slab.bar_groups[group] - slab.first_bar
         taken = members[chosen[members] >= 0]
         if len(taken):
             other = list(case.section)[chosen[taken[0]]]

@@ -208,7 +208,7 @@ class Temperatures:
         for index, entry in enumerate(case.temperature):
             members = slice(None)
             if entry.bars is not None:
-                members = bars_of_group(case, mesh, f"temperature[{index}].bars", entry.bars)
+                members = bars_of_group(case, mesh, f"temperature[{index}].bars", str(entry.bars))
             rows = [(0.0, entry.value)] if entry.table is None else entry.table
             self._entries.append((members, Table(rows, entry.interpolation == "smooth")))
         if self.any:

@@ -44,7 +44,7 @@ def group_hint(case: Case, name: str, known: list[str], entity: str = "Point") -
 
 
 def bars_of_group(case: Case, mesh: DistributedMesh, key: str, name: str) -> np.ndarray:
-    """Return the local bars (k,) of a group that a key of the case names.
+    """Return the local bars (k,) of a group, whose text is ``name``, that a key of the case names.
 
     Raises
     ------
@@ -82,6 +82,8 @@ def _members(case: Case, where: str, node_set: NodeSet, mesh: DistributedMesh) -
         known = groups + sorted(mesh.bar_groups)
         hint = group_hint(case, node_set.group, known)
         raise InputError(f"{where}.group = {node_set.group!r}: no such group in the mesh{hint}")
+    if node_set.selection is not None:
+        return np.sort(mesh.node_groups[str(node_set.selection)])
     if node_set.indices is not None:
         wanted = np.array(node_set.indices, dtype=np.int64)
         outside = wanted[(wanted < 0) | (wanted >= mesh.n_nodes)]

@@ -15,8 +15,7 @@ from ..contact.wall_motion import WallMotion
 from ..contact.walls.base import WALLS, Surface, slab
 from ..errors import InputError
 from ..fields import STATUS
-from ..mechanics.bars import area_fields, bar_shapes, named_groups, section_of_bars
-from ..mesh import load_slab
+from ..mechanics.bars import bar_shapes, mesh_of_cases, section_of_bars
 from ..output.units import MODE, Axis
 from ..registry import choices, lookup, nearest
 from .camera import Camera
@@ -410,7 +409,7 @@ def radii_of(result: Any) -> np.ndarray | None:
     length = _lengths(result)
     numbers, areas = np.full(len(length), -1), np.ones(len(length))
     try:
-        mesh = load_slab(case.mesh, MPI.COMM_SELF, area_fields(case), named_groups(case))
+        mesh = mesh_of_cases([case], MPI.COMM_SELF)
         if mesh.n_bars > len(length):
             raise InputError(f"the mesh of {case.source} has {mesh.n_bars} bars now, the result {len(length)}")
         numbers[: mesh.n_bars], areas[: mesh.n_bars] = section_areas(case, mesh)

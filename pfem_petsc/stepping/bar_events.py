@@ -210,7 +210,8 @@ class Removals:
         self.members: dict[str, np.ndarray] = {}
         for index, entry in enumerate(self._entries):
             if entry.bars is not None:
-                self.members[entry.bars] = bars_of_group(model.case, mesh, f"remove[{index}].bars", entry.bars)
+                name = str(entry.bars)
+                self.members[name] = bars_of_group(model.case, mesh, f"remove[{index}].bars", name)
             elif model.links or model.inertia.redistribution is not None:
                 what = "contact pairs and constraints" if model.links else "massless contact nodes"
                 raise InputError(
@@ -275,7 +276,7 @@ class Removals:
         """Give the local bars of the removals that have begun."""
         for entry, time in zip(self._entries, self.times, strict=True):
             if entry.bars is not None and time >= 0.0:
-                yield self.members[entry.bars]
+                yield self.members[str(entry.bars)]
 
     def _replace(self, entry: Remove, begin: float) -> None:
         """Let the reaction of a support act as a load that decreases."""

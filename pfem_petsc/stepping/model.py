@@ -12,13 +12,12 @@ from mpi4py import MPI
 from ..contact.constraint_set import ConstraintSet
 from ..contact.contact import Contact, adjust_start
 from ..errors import InputError
-from ..mechanics.bars import Bars, area_fields, check_areas, named_groups, section_of_bars
+from ..mechanics.bars import Bars, check_areas, mesh_of_cases, section_of_bars
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia, PointInertia, add_at_ends
 from ..mechanics.rest_lengths import RestLengths, Temperatures
 from ..mechanics.springs import add_connectors, connected, make_springs, with_connectors
 from ..mechanics.supports import Supports
-from ..mesh import load_slab
 from ..mesh.distribution import distribute
 from ..mesh.node_sets import resolve_node_sets
 from ..parallel.agreement import agreed
@@ -163,8 +162,7 @@ class Model:
     def _load_mesh(self, cases: Sequence[Case]) -> DistributedMesh:
         case, comm = self.case, self.comm
         try:
-            groups = {name for each in cases for name in named_groups(each)}
-            slab = load_slab(case.mesh, comm, area_fields(case), groups)
+            slab = mesh_of_cases(cases, comm)
         except InputError as error:
             # a generator knows its keys, but not the file that they are in
             if case.mesh.generator is None or str(error).startswith(f"{case.source}: "):

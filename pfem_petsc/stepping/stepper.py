@@ -500,7 +500,7 @@ class Stepper(ABC):
         for entry, share, begins in self.removals.due(self.state.time, self.h):
             changed = True
             if entry.bars is not None:
-                self._remove_bars(self.removals.members[entry.bars], share)
+                self._remove_bars(self.removals.members[str(entry.bars)], share)
             elif begins:
                 self.removals.release(entry, self.recorded()[1], self.state.time)
                 self.supports_changed()

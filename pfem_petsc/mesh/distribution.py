@@ -71,6 +71,8 @@ class DistributedMesh:
     """The partitioner, for the log."""
     volume: float | None = None
     """What a lattice fills [m3]; None for other meshes."""
+    filled: float | None = None
+    """Volume of the cells whose struts are left in a surface [m3]."""
 
     _exchange: GhostExchange
 
@@ -141,7 +143,7 @@ def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, keep: bo
     """
     mesh = DistributedMesh()
     mesh.comm = comm
-    mesh.n_nodes, mesh.n_bars, mesh.volume = slab.n_nodes, slab.n_bars, slab.volume
+    mesh.n_nodes, mesh.n_bars, mesh.volume, mesh.filled = slab.n_nodes, slab.n_bars, slab.volume, slab.filled
     bar_section = np.asarray(bar_section, dtype=np.int32)
     if comm.size == 1:
         mesh.partitioner = "none (one rank)"

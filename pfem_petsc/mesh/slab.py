@@ -58,6 +58,8 @@ class MeshSlab:
     """Warnings of the reader and the checks, for the log."""
     volume: float | None = None
     """What a lattice fills [m3], for its relative density."""
+    filled: float | None = None
+    """Of a lattice in a surface: the volume of the cells that its struts are of [m3], for comparison."""
 
 
 def slab_range(n: int, rank: int, size: int) -> tuple[int, int]:

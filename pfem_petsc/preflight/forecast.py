@@ -175,7 +175,8 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
 
 
 def _density(model: Model) -> dict[str, str]:
-    """Return the relative density of a lattice: the volume of its bars over that of what it fills. Collective."""
+    """Return the relative density of a lattice, the volume of its bars over that of what it fills, and how much of a
+    surface its cells fill. Collective."""
     mesh = model.mesh
     if mesh.volume is None:
         return {}
@@ -183,4 +184,8 @@ def _density(model: Model) -> dict[str, str]:
     own = [float((each.counted_area * lengths[each.start : each.counted]).sum()) for each in model.bars.blocks]
     ratio = model.comm.allreduce(sum(own)) / mesh.volume
     thick = "; struts so thick overlap at nodes, where this counts them more than once" if ratio > _THICK else ""
-    return {"relative density": f"{ratio:.4g} (volume of bars over {engineering(mesh.volume, 'm3')}){thick}"}
+    texts = {"relative density": f"{ratio:.4g} (volume of bars over {engineering(mesh.volume, 'm3')}){thick}"}
+    if mesh.filled is not None:
+        inside = engineering(mesh.volume, "m3")
+        texts["filled"] = f"{engineering(mesh.filled, 'm3')} by the cells of its struts, of {inside} inside the surface"
+    return texts

@@ -208,6 +208,8 @@ class _Left:
     def _cut(self, surface: Surface) -> None:
         """Leave out what of the bars is outside the surface. Collective."""
         clip, longest = self.block.keys.surface.cut == "clip", self._longest()
+        # at a face, struts are left out up to their length, or belong to cells of which half is outside
+        self._unsure = 0.5 * surface.area * longest
         (distance,) = self.block.nodes.arrays(
             self._slab, lambda *nodes: [surface.rough_distances(self.block.positions(*nodes), longest)]
         )
@@ -259,6 +261,19 @@ class _Left:
             used = -1 - self.ends[new]  # ascending, as the bars are
             self.points, self.ends[new] = self.points[used], -1 - np.arange(len(used))
 
+    def _filled(self) -> float:
+        """Return the volume [m3] that the struts left fill: each has its share of its cell, or what is left of that.
+        Collective."""
+        share, cut = np.ones(len(self.bars)), np.flatnonzero((self.ends < 0).any(axis=1))
+        at = self.block.bars.decode(self.bars)
+        if len(cut):
+            places = self.block.bars.decode(self.bars[cut])
+            whole = [self.block.positions(*self.block.end(places, which)) for which in (0, 1)]
+            left = self._end_points(cut)
+            share[cut] = np.linalg.norm(left[1] - left[0], axis=1) / np.linalg.norm(whole[1] - whole[0], axis=1)
+        own = float(share @ self.block.cell_volumes(at)) / len(self.block.cell.ends)
+        return self._comm.allreduce(own)
+
     def renumbered(self, wanted: _Wanted) -> MeshSlab:
         """Return this rank's part of what is left. Collective.
 
@@ -301,7 +316,18 @@ class _Left:
         slab.bar_fields = dict(zip(wanted.fields, marks[len(wanted.groups) :]))
         if keys.keep is None and keys.map is None:  # else it is not known what the lattice fills
             slab.volume = self._surface.volume if self._surface is not None else block.volume
-        return _named(slab, block)
+        _named(slab, block)
+        if self._surface is not None:
+            slab.warnings = self._surface.warnings + slab.warnings
+            if slab.volume is not None and keys.curved is None and not keys.missing:
+                slab.filled = self._filled()
+                if abs(slab.filled - slab.volume) > self._unsure:
+                    slab.warnings.append(
+                        f"mesh.surface: the cells of the struts fill {slab.filled:.4g} m3, and the surface encloses "
+                        f"{slab.volume:.4g} m3, which differs by more than the size of cells explains: use more cells "
+                        "or a smaller pitch, and look at the surface and the lattice"
+                    )
+        return slab
 
 
 def _counted(comm: MPI.Comm, count: int) -> tuple[int, int]:

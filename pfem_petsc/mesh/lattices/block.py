@@ -469,6 +469,14 @@ class Block(Joints):
         check_length(farthest, "mesh.origin and the extent of the block")
         self.volume = self._shell() if keys.curved is not None else float(np.prod(self._extents))
 
+    def cell_volumes(self, places: Places) -> np.ndarray:
+        """Return the volumes (n,) [m3] of the cells at places of bars, before they are curved or mapped."""
+        edges = [
+            np.full(len(index), level) if isinstance(level, float) else level[index + 1] - level[index]
+            for level, index in zip(self._levels, places[1:])
+        ]
+        return np.prod(edges, axis=0)
+
     def _box(self) -> np.ndarray:
         """Return the edges (3,) [m] of the block before it is moved."""
         found = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,12 +27,16 @@ _SAME = 1e-9
 
 @dataclass
 class Surface:
-    """Triangles that enclose a volume, with outward normals."""
+    """Triangles that enclose a volume, with normals outwards from what is filled."""
 
     points: np.ndarray
     """(points, 3) float64 [m]."""
     triangles: np.ndarray
     """(triangles, 3) int64."""
+    layers: list[np.ndarray] = field(default_factory=list)
+    """Triangles of bodies that do not touch each other, if there are several such layers; a point is inside the surface
+    where it is inside an odd number of them."""
+    warnings: list[str] = field(default_factory=list)
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -41,32 +45,44 @@ class Surface:
 
     @property
     def volume(self) -> float:
-        """The volume [m3] inside, by the divergence theorem."""
-        a, b, c = (self.points[self.triangles[:, k]] - self.points.mean(axis=0) for k in range(3))
-        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+        """The volume [m3] inside."""
+        return volume_of(self.points, self.triangles)
+
+    @property
+    def area(self) -> float:
+        """The area [m2] of the triangles."""
+        return area_of(self.points, self.triangles)
 
     @cached_property
-    def _data(self) -> pyvista.PolyData:
+    def _data(self) -> list[pyvista.PolyData]:
         import pyvista
 
-        return pyvista.PolyData.from_regular_faces(self.points, self.triangles)
+        layers = self.layers if len(self.layers) > 1 else [self.triangles]
+        return [pyvista.PolyData.from_regular_faces(self.points, triangles) for triangles in layers]
 
     @cached_property
     def _locator(self) -> Any:
+        import pyvista
         from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
         locator = vtkStaticCellLocator()
-        locator.SetDataSet(self._data)
+        locator.SetDataSet(pyvista.PolyData.from_regular_faces(self.points, self.triangles))
         locator.BuildLocator()
         return locator
 
     def distances(self, points: np.ndarray) -> np.ndarray:
-        """Return the signed distances (n,) [m] of points (n, 3) from the surface: negative inside."""
+        """Return the signed distances (n,) [m] of points (n, 3) from the surface: negative inside.
+
+        Where bodies touch, the distance is that from the nearest of their surfaces.
+        """
         import pyvista
 
-        if len(points) == 0:
-            return np.empty(0)
-        return np.array(pyvista.PolyData(points).compute_implicit_distance(self._data)["implicit_distance"])
+        inside, nearest = np.zeros(len(points), bool), np.full(len(points), np.inf)
+        for layer in self._data if len(points) else ():
+            found = np.array(pyvista.PolyData(points).compute_implicit_distance(layer)["implicit_distance"])
+            inside ^= found < 0.0
+            nearest = np.minimum(nearest, np.abs(found))
+        return np.where(inside, -nearest, nearest)
 
     def rough_distances(self, points: np.ndarray, spacing: float) -> np.ndarray:
         """Return signed distances (n,) [m] that are exact near the surface, and elsewhere too small, never too large.
@@ -106,17 +122,8 @@ class Surface:
         span : (parts, 2) float64
             Where each part begins and ends, from 0 (start) to 1 (end).
         """
-        line, t = self._crossings(starts, ends)
-        certain = np.zeros(len(starts), bool) if inside is None else inside.copy()
-        certain[line] = False
-        n = np.arange(len(starts))
-        line, t = np.concatenate([n, line, n]), np.concatenate([np.zeros(len(n)), t, np.ones(len(n))])
-        order = np.lexsort((t, line))
-        line, t = line[order], t[order]
-        pieces = np.flatnonzero((line[1:] == line[:-1]) & (np.diff(t) > _SAME))
-        line, span = line[pieces], np.stack([t[pieces], t[pieces + 1]], axis=1)
-        # crossings next to an end or to each other are one
-        span[span <= _SAME], span[span >= 1.0 - _SAME] = 0.0, 1.0
+        line, span, crossed = self.pieces(starts, ends)
+        certain = np.zeros(len(starts), bool) if inside is None else inside & ~crossed
         way = ends - starts
         examined = np.flatnonzero(~certain[line])
         middles = starts[line[examined]] + span[examined].mean(axis=1)[:, None] * way[line[examined]]
@@ -128,6 +135,21 @@ class Surface:
         first = np.flatnonzero(np.concatenate([[True], ~joined])[: len(line)])
         last = np.append(first[1:], len(line))[: len(first)] - 1
         return line[first], np.stack([span[first, 0], span[last, 1]], axis=1)
+
+    def pieces(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Divide lines where they meet triangles: the line of each piece, ascending, where it begins and ends, from 0
+        to 1, and which lines (n,) meet some."""
+        line, t = self._crossings(starts, ends)
+        n = np.arange(len(starts))
+        crossed = np.isin(n, line)
+        line, t = np.concatenate([n, line, n]), np.concatenate([np.zeros(len(n)), t, np.ones(len(n))])
+        order = np.lexsort((t, line))
+        line, t = line[order], t[order]
+        pieces = np.flatnonzero((line[1:] == line[:-1]) & (np.diff(t) > _SAME))
+        line, span = line[pieces], np.stack([t[pieces], t[pieces + 1]], axis=1)
+        # crossings next to an end or to each other are one
+        span[span <= _SAME], span[span >= 1.0 - _SAME] = 0.0, 1.0
+        return line, span, crossed
 
     def _crossings(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the lines that intersect triangles, and where: from 0 at their start to 1 at their end."""
@@ -161,7 +183,7 @@ def read_surface(path: Path, scale: float) -> Surface:
     InputError
         If the file is not there, is not of triangles, or the surface is open.
     """
-    import pyvista
+    from .bodies import bodies_of
 
     where = f"mesh.surface.file: {path}"
     if path.suffix.lower() not in _SUFFIXES:
@@ -173,9 +195,6 @@ def read_surface(path: Path, scale: float) -> Surface:
     count, edge = _open_edges(triangles)
     if count:
         points, triangles = _better((points, triangles), _triangles(data, _MERGED))
-        data = pyvista.PolyData.from_regular_faces(points, triangles)
-        turned = data.compute_normals(cell_normals=False, auto_orient_normals=True)
-        points, triangles = _better((points, triangles), _triangles(turned))
         count, edge = _open_edges(triangles)
     if count:
         a, b = (", ".join(f"{x:.6g}" for x in points[node]) for node in edge)
@@ -183,13 +202,10 @@ def read_surface(path: Path, scale: float) -> Surface:
             f"{where}: the surface is not closed: {count} of its edges have a triangle on one side only, like that "
             f"from ({a}) to ({b}) in the file; close it in the program that made it (PyVista: mesh.fill_holes(size))"
         )
-    surface = Surface(scale * points, triangles)
-    size = float(np.prod(surface.bounds[1] - surface.bounds[0]))
-    if not abs(surface.volume) > 1e-9 * size:
-        raise InputError(f"{where}: the surface encloses no volume: {surface.volume:.3g} m3 in a box of {size:.3g} m3")
-    if surface.volume < 0.0:
-        surface = Surface(surface.points, triangles[:, ::-1].copy())
-    return surface
+    bodies = bodies_of(points, triangles, where)
+    if not bodies.layers:
+        raise InputError(f"{where}: the surface encloses no volume")
+    return Surface(scale * points, bodies.triangles, bodies.layers, [f"{where}: {text}" for text in bodies.warnings])
 
 
 def _triangles(data: pyvista.PolyData, tolerance: float = 0.0) -> _Triangles:
@@ -199,17 +215,27 @@ def _triangles(data: pyvista.PolyData, tolerance: float = 0.0) -> _Triangles:
         return np.empty((0, 3)), np.empty((0, 3), np.int64)
     data = data.clean(tolerance=tolerance, absolute=False)
     corners = data.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
-    return data.points.astype(np.float64), corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+    return np.array(data.points, np.float64), corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
 
 
 def _open_edges(triangles: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return how many edges are not passed equally often in both directions, and the first of them."""
-    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    forward = edges[:, 0] < edges[:, 1]
-    pairs, at = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
-    balance = np.bincount(at.ravel(), weights=np.where(forward, 1.0, -1.0), minlength=len(pairs))
-    wrong = np.flatnonzero(balance)
-    return len(wrong), pairs[wrong[0]] if len(wrong) else np.empty(0, np.int64)
+    """Return how many edges have an odd number of triangles, and the first of them."""
+    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    pairs, count = np.unique(edges, axis=0, return_counts=True)
+    wrong = pairs[count % 2 == 1]
+    return len(wrong), wrong[0] if len(wrong) else np.empty(0, np.int64)
+
+
+def area_of(points: np.ndarray, triangles: np.ndarray) -> float:
+    """Return the area of triangles."""
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+
+
+def volume_of(points: np.ndarray, triangles: np.ndarray) -> float:
+    """Return the volume that closed triangles enclose, positive with normals outwards, by the divergence theorem."""
+    a, b, c = (points[triangles[:, k]] - points.mean(axis=0) for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
 
 def _better(one: _Triangles, two: _Triangles) -> _Triangles:

@@ -1,0 +1,162 @@
+"""The bodies that a surface of triangles bounds: each closed and oriented, and which of them lies in which."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...errors import InputError
+from ..tools import components
+from .surface import Surface, area_of, volume_of
+
+_CLOSE = 1e-6
+"""Points closer than this fraction of the diagonal of all bodies touch each other."""
+_FLAT = 1e-9
+"""Bodies with less volume than this fraction of their area times their size are left out."""
+
+
+class Bodies(NamedTuple):
+    """What a surface bounds by the even-odd rule: outer bodies, cavities in them, bodies in these, and so on.
+
+    Attributes
+    ----------
+    triangles : of all bodies, normals outwards from what is filled
+    layers : triangles of bodies that do not touch each other, with normals as if there were no others
+    warnings : list of str
+    """
+
+    triangles: np.ndarray
+    layers: list[np.ndarray]
+    warnings: list[str]
+
+
+def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Bodies:
+    """Return the bodies of a surface, every edge of which has an even number of triangles.
+
+    Raises
+    ------
+    InputError
+        Beginning with ``where``, if bodies intersect, if a body has no inner side, or if triangles at an edge cannot be
+        assigned to bodies.
+    """
+    warnings: list[str] = []
+    triangles = _without_copies(triangles)
+    parts, given = [], []
+    for members, turned in _connected(points, triangles, where) if len(triangles) else ():
+        own = triangles[members]
+        own[turned] = own[turned, ::-1]
+        volume = volume_of(points, own)
+        if abs(volume) <= _FLAT * area_of(points, own) * float(np.ptp(points[own.ravel()], axis=0).max()):
+            x = ", ".join(f"{coordinate:.6g}" for coordinate in points[own[0, 0]])
+            warnings.append(f"left out {len(own)} triangles that enclose no volume, at ({x})")
+            continue
+        parts.append(own if volume > 0.0 else own[:, ::-1].copy())
+        given.append(0 if turned.any() else np.sign(volume))
+    if not parts:
+        return Bodies(np.empty((0, 3), np.int64), [], warnings)
+    inside, touching = _nested(points, parts, where)
+    for i in np.flatnonzero(inside.any(axis=1)):
+        (around,) = [j for j in np.flatnonzero(inside[i]) if inside[j].sum() == inside[i].sum() - 1]
+        if given[i] == given[around] != 0:
+            x = ", ".join(f"{coordinate:.6g}" for coordinate in points[parts[i][0, 0]])
+            what = "a cavity" if inside[i].sum() % 2 else "filled"
+            warnings.append(f"the body at ({x}) lies in another one of the same orientation: it is taken as {what}")
+    layer = np.full(len(parts), -1)
+    for i in range(len(parts)):
+        layer[i] = np.setdiff1d(np.arange(i + 1), layer[touching[i]])[0]
+    layers = [_oriented(parts, inside, np.flatnonzero(layer == number)) for number in range(layer.max() + 1)]
+    return Bodies(_oriented(parts, inside, np.arange(len(parts))), layers, warnings)
+
+
+def _oriented(parts: list[np.ndarray], inside: np.ndarray, members: np.ndarray) -> np.ndarray:
+    """Return the triangles of some bodies, turned where these are cavities if there are no others."""
+    depth = inside[np.ix_(members, members)].sum(axis=1)
+    return np.concatenate([parts[i][:, ::-1] if depth[k] % 2 else parts[i] for k, i in enumerate(members)])
+
+
+def _without_copies(triangles: np.ndarray) -> np.ndarray:
+    """Return the triangles, each once; of those with opposite normals, between two bodies, as many as are left over."""
+    _, same = np.unique(np.sort(triangles, axis=1), axis=0, return_inverse=True)
+    same = same.ravel()
+    lowest = triangles.argmin(axis=1)
+    rows = np.arange(len(triangles))
+    side = np.where(triangles[rows, (lowest + 1) % 3] < triangles[rows, (lowest + 2) % 3], 1, -1)
+    net = np.bincount(same, side)[same]
+    kept = np.flatnonzero(net * side > 0)
+    return triangles[kept[np.sort(np.unique(same[kept], return_index=True)[1])]]
+
+
+def _connected(points: np.ndarray, triangles: np.ndarray, where: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the numbers of the triangles of each body, connected by edges with two triangles, and which are turned
+    against the first."""
+    m = len(triangles)
+    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    forward, owner = edges[:, 0] < edges[:, 1], np.repeat(np.arange(m), 3)
+    _, edge, count = np.unique(
+        edges.min(axis=1) * len(points) + edges.max(axis=1), return_inverse=True, return_counts=True
+    )
+    order = np.argsort(edge, kind="stable")
+    halves = order[count[edge[order]] == 2].reshape(-1, 2)
+    one, two = owner[halves].T
+    against = forward[halves[:, 0]] == forward[halves[:, 1]]
+    # each triangle is in this graph twice: as it is, t, and turned, t + m
+    pairs = [np.stack([one, two + m * against], axis=1), np.stack([one + m, two + m * ~against], axis=1)]
+    part = components(2 * m, np.concatenate(pairs))
+    if (part[:m] == part[m:]).any():
+        x = ", ".join(f"{value:.6g}" for value in points[triangles[int((part[:m] == part[m:]).argmax()), 0]])
+        raise InputError(f"{where}: the surface at ({x}) has one side only, like a Möbius strip: correct its triangles")
+    body, turned = np.minimum(part[:m], part[m:]), part[:m] > part[m:]
+    _, own = np.unique(body[owner] * len(count) + edge, return_inverse=True)
+    balance = np.bincount(own, np.where(forward ^ turned[owner], 1, -1))[own]
+    if balance.any():
+        half = int(np.flatnonzero(balance)[0])
+        a, b = (", ".join(f"{x:.6g}" for x in points[node]) for node in edges[half])
+        raise InputError(
+            f"{where}: the edge from ({a}) to ({b}) in the file has {count[edge[half]]} triangles, and it is not known "
+            "which of them belong to one body: unite bodies that touch in the program that made it"
+        )
+    order = np.argsort(body, kind="stable")
+    starts = np.flatnonzero(np.diff(body[order], prepend=-1))
+    return [(members, turned[members]) for members in np.split(order, starts[1:])]
+
+
+def _nested(points: np.ndarray, parts: list[np.ndarray], where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return (bodies, bodies) bool: whether the first lies in the second, and whether they touch."""
+    n = len(parts)
+    inside, touching = np.zeros((n, n), bool), np.zeros((n, n), bool)
+    if n == 1:
+        return inside, touching
+    corners = [points[own.ravel()] for own in parts]
+    low, high = np.stack([own.min(axis=0) for own in corners]), np.stack([own.max(axis=0) for own in corners])
+    close = _CLOSE * float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
+    for j in range(n):
+        near = ((low <= high[j] + close) & (high >= low[j] - close)).all(axis=1)
+        near[j] = False
+        surface = Surface(points, parts[j])
+        for i in np.flatnonzero(near):
+            sides, touches = _sides(points, parts[i], surface, close)
+            touching[i, j] |= touches
+            touching[j, i] |= touches
+            if len(sides) != 1:
+                a, b = (", ".join(f"{x:.6g}" for x in points[parts[k][0, 0]]) for k in (i, j))
+                raise InputError(
+                    f"{where}: two bodies intersect, one of which has the corner ({a}) in the file, the other ({b}): "
+                    "unite them in the program that made it"
+                )
+            inside[i, j] = sides == {-1}
+    return inside, touching
+
+
+def _sides(points: np.ndarray, own: np.ndarray, other: Surface, close: float) -> tuple[set[int], bool]:
+    """Return on which sides of another body the edges of one are, -1 inside and 1 outside, and whether they touch."""
+    edges = np.concatenate([own[:, [0, 1]], own[:, [1, 2]], own[:, [2, 0]]])
+    edges = edges[edges[:, 0] < edges[:, 1]]
+    ends = points[edges]
+    low, high = other.bounds
+    near = ((ends.min(axis=1) <= high + close) & (ends.max(axis=1) >= low - close)).all(axis=1)
+    starts, stops = ends[near, 0], ends[near, 1]
+    line, span, crossed = other.pieces(starts, stops)
+    distance = other.distances(starts[line] + span.mean(axis=1)[:, None] * (stops - starts)[line])
+    sides = set(np.sign(distance[np.abs(distance) > close]).astype(int).tolist())
+    return sides | ({1} if not near.all() else set()), bool(crossed.any() or (np.abs(distance) <= close).any())

@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from ..errors import InputError
+from ..registry import nearest
 from .base import StrictModel
-from .model import ANALYSES, LISTS, ONE_STAGE, CaseModel, StageOutput, shape_of
-from .toml import DEEPEST, KeyPath, key_text, plain, split_key
+from .model import ANALYSES, LISTS, NUMBERED, ONE_STAGE, CaseModel, StageOutput, shape_of
+from .toml import DEEPEST, KeyPath, key_text, plain, pointed, split_key
 
 V = TypeVar("V")
 
@@ -35,7 +36,8 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[KeyP
     Raises
     ------
     InputError
-        If a text has no ``=``, or its path passes through a value that is not a table, or beyond the end of a list.
+        If a text has no ``=``, its value begins as a list, a table or a text in quotes and is none, or its path passes
+        through a value that is not a table, beyond the end of a list, or to a name that no entry of a list has.
     """
     paths = []
     for text in overrides:
@@ -46,70 +48,121 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[KeyP
         if not equals or parts is None:
             raise InputError(f"--set {text}: expected KEY=VALUE, like time.step=1e-5 or wall.0.point=[1.0, 0.0, 0.0]")
         if not value.strip():
-            take_out(data, parts)
+            take_out(data, parts, f"--set {text}")
             continue
-        paths.append(put(data, parts, _value(value.strip()), f"--set {text}"))
+        paths.append(put(data, parts, _value(value.strip(), f"--set {text}"), f"--set {text}"))
     return paths
 
 
-def _value(text: str) -> Any:
+def _value(text: str, where: str) -> Any:
     try:
         read = tomllib.loads(f"value = {text}")
-    except (ValueError, RecursionError):  # a syntax error, too many digits, nested too deep
+    except (ValueError, RecursionError) as error:  # a syntax error, too many digits, nested too deep
+        if text[0] in "[{\"'" and isinstance(error, tomllib.TOMLDecodeError):
+            about = f"this is not valid TOML, and text that begins with {text[0]} must be in quotes"
+            raise InputError(f"{where}: {about}: {pointed(f'value = {text}', error, 8)}") from error
         return text
     return read["value"] if len(read) == 1 else text
 
 
-def take_out(data: dict[str, Any], parts: list[str]) -> None:
-    """Remove the value at the parts of a key, if it is there."""
+def take_out(data: dict[str, Any], parts: Sequence[str], where: str) -> None:
+    """Remove the value at the parts of a key, if it is there.
+
+    Raises
+    ------
+    InputError
+        Beginning with ``where``, if a list of tables has none of the name, or several.
+    """
     here: Any = data
+    table = ""
     for k, part in enumerate(parts):
-        key = int(part) if isinstance(here, list) and _is_place(part) else part
+        key = _place_of(here, part, table, where) if isinstance(here, list) else part
         if not (key in here if isinstance(here, dict) else isinstance(here, list) and key in range(len(here))):
             return
         if k == len(parts) - 1:
             del here[key]
-        else:
-            here = here[key]
+            return
+        if isinstance(here[key], tuple):
+            here[key] = list(here[key])
+        here = here[key]
+        table = part if isinstance(key, str) else table
 
 
 def _is_place(part: str) -> bool:
     return part.isascii() and part.isdigit() and len(part) <= 18
 
 
-def put(data: dict[str, Any], parts: Sequence[str], value: Any, where: str) -> KeyPath:
-    """Set the value at the parts of a key, and return its path; missing tables are created.
+def _place_of(rows: list[Any], part: str, table: str, where: str) -> int:
+    """Return the index in a list that a part of a key means: a number, or the name of one of the ``rows`` of a table.
 
     Raises
     ------
     InputError
-        Beginning with ``where``, if the key leads through a value, or beyond the end of a list.
+        Beginning with ``where``, if no row has the name, or several.
+    """
+    if _is_place(part):
+        return int(part)
+    default = NUMBERED.get(table)
+    names = [
+        row.get("name", f"{default}{k + 1}" if default else None) if isinstance(row, Mapping) else None
+        for k, row in enumerate(rows)
+    ]
+    found = [k for k, name in enumerate(names) if name == part]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise InputError(
+            f"{where}: {len(found)} entries of {table} have the name {part!r}: give an index, "
+            f"{' or '.join(map(str, found))}"
+        )
+    known = [name for name in names if isinstance(name, str)]
+    if known:
+        raise InputError(
+            f"{where}: no entry of {table} has the name {part!r}{nearest(part, known).rstrip('?')}; or give an index, "
+            f"0 to {len(rows)}, where the last one appends an item"
+        )
+    raise InputError(_no_index(part, rows, where))
+
+
+def _no_index(part: str, rows: list[Any], where: str) -> str:
+    return f"{where}: {part!r} is not an index of this list: 0 to {len(rows)}, where the last one appends an item"
+
+
+def put(data: dict[str, Any], parts: Sequence[str], value: Any, where: str) -> KeyPath:
+    """Set the value at the parts of a key, and return its path; missing tables are created.
+
+    Entries of a list of tables are meant by their index, or by their name.
+
+    Raises
+    ------
+    InputError
+        Beginning with ``where``, if the key leads through a value, beyond the end of a list, or to a name that none or
+        several entries have.
     """
     path: KeyPath = ()
     here: Any = data
     for k, part in enumerate(parts):
         last = k == len(parts) - 1
+        names = tuple(p for p in path if isinstance(p, str))
         if isinstance(here, list):
-            if not _is_place(part) or int(part) > len(here):
-                raise InputError(
-                    f"{where}: {part!r} is not an index of this list: 0 to {len(here)}, where the last one "
-                    "appends an item"
-                )
-            key: str | int = int(part)
+            key: str | int = _place_of(here, part, names[-1], where)
+            if key > len(here):
+                raise InputError(_no_index(part, here, where))
             if key == len(here):
                 here.append({})
         elif isinstance(here, dict):
             key = part
-            names = tuple(p for p in (*path, part) if isinstance(p, str))
             if key not in here:
-                here[key] = [] if names in LISTS else {}
+                here[key] = [] if (*names, part) in LISTS else {}
         else:
             raise InputError(f"{where}: {'.'.join(map(str, path))} is a value, not a table")
         path = (*path, key)
         if last:
             here[key] = value
-        else:
-            here = here[key]
+            break
+        if isinstance(here[key], tuple):  # of the objects of a case
+            here[key] = list(here[key])
+        here = here[key]
     return path
 
 
@@ -248,10 +301,11 @@ def changed_data(case: CaseModel, changes: Iterable[tuple[KeyPath, Any]]) -> dic
         if path[-1:] == ("initial",) and isinstance(value, list):
             value = _initial(value)
         parts = [str(part) for part in path]
+        where = f"{case.source}: {key_text(path)}"
         if value is None:
-            take_out(data, parts)
+            take_out(data, parts, where)
         else:
-            put(data, parts, value, f"{case.source}: {key_text(path)}")
+            put(data, parts, value, where)
     return data
 
 

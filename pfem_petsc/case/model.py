@@ -349,8 +349,13 @@ class _Materials(Family):
         return material
 
 
-def _numbered(name: str) -> BeforeValidator:
-    """Annotation of a list of tables that have names of their own by default: ``wall1``, ``wall2``, ..."""
+NUMBERED = {"wall": "wall", "contact_pair": "pair", "constraint": "constraint", "stage": "stage"}
+"""Lists of tables that have names by default, with their beginning: ``pair1``, ``pair2``, ..."""
+
+
+def _numbered(table: str) -> BeforeValidator:
+    """Annotation of a list of :data:`NUMBERED`."""
+    name = NUMBERED[table]
 
     def named(rows: Any) -> Any:
         if not isinstance(rows, list):
@@ -440,7 +445,7 @@ class CaseModel(StrictModel):
     wind: Annotated[t.Wind | None, STAGED] = None
     temperature: Annotated[list[t.Temperature], STAGED] = []
     wall: Annotated[list[Wall], _numbered("wall"), t.distinct("wall"), STAGED] = []
-    contact_pair: Annotated[list[t.ContactPair], _numbered("pair"), t.distinct("contact pair")] = []
+    contact_pair: Annotated[list[t.ContactPair], _numbered("contact_pair"), t.distinct("contact pair")] = []
     constraint: Annotated[list[Constraint], _numbered("constraint"), t.distinct("constraint")] = []
     remove: Annotated[list[t.Remove], STAGED] = []
     contact: Annotated[t.ContactSettings, STAGED] = Field(default_factory=t.ContactSettings)

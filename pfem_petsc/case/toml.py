@@ -68,7 +68,7 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
     Raises
     ------
     InputError
-        On a syntax error; the message names line and column.
+        On a syntax error; the message names line and column, and shows the line.
     """
     if (found := _LONG_KEY.search(text)) is not None:
         line = text.count("\n", 0, found.start()) + 1
@@ -76,12 +76,36 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{source}: this is not valid TOML: {error}") from error
+        raise InputError(f"{source}: this is not valid TOML: {pointed(text, error)}") from error
     except ValueError as error:
         # Python limits the number of digits of integers
         raise InputError(f"{source}: this is not a case: it has an integer of more than 4,300 digits") from error
     except RecursionError as error:
         raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
+
+
+_PLACE = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
+_SHOWN = 100  # letters of a line
+
+
+def pointed(text: str, error: tomllib.TOMLDecodeError, start: int = 0) -> str:
+    """Return what a parser found wrong in a text, and the line with a mark below the column.
+
+    What it finds at the beginning of a line, such as a list that is still open, has its cause before: the line before
+    is shown too. If the text begins at ``start``, with a value that was not read from a file, lines have no numbers.
+    """
+    found, lines = _PLACE.search(str(error)), text.replace("\r\n", "\n").rstrip().split("\n")
+    line, column = (int(found[1]), int(found[2])) if found and found[1] else (len(lines), len(lines[-1]) + 1)
+    if line > len(lines):
+        line, column = len(lines), len(lines[-1]) + 1
+    column -= start if line == 1 else 0
+    lines[0] = lines[0][start:]
+    first = max(0, column - _SHOWN * 3 // 4)
+    before = [k for k in range(line - 1, 0, -1) if lines[k - 1].strip()][:1] if column == 1 else []
+    heads = {k: "  " if start else f"  {k:{len(str(line))}} | " for k in (*before, line)}
+    shown = [head + lines[k - 1].expandtabs(1)[first : first + _SHOWN] for k, head in heads.items()]
+    mark = " " * (len(heads[line]) + column - 1 - first) + "^"
+    return "\n".join([_PLACE.sub("", str(error)) if start else str(error), *shown, mark])
 
 
 def plain(value: Any) -> Any:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pfem_petsc.case.editing import apply_overrides
 from pfem_petsc.case.schema import Case
-from pfem_petsc.case.toml import built_in_cases, table_text
+from pfem_petsc.case.toml import built_in_cases, parse_toml, table_text
 from pfem_petsc.errors import InputError
 
 
@@ -158,6 +158,59 @@ def test_override_without_a_value_takes_the_key_out():
     assert data == {"time": {"step": 0.1}, "wall": [{"name": "a"}]}
 
 
+def test_override_by_the_name_of_an_entry():
+    """The same as by its index, in lists of the case and of its stages, with names that entries have by default."""
+    rows = [{"name": "a.b"}, {}, {"name": "7"}, {"name": "lid"}, {"name": "lid"}]
+    stages = [{"wall": [{}], "support": [{"name": "foot"}]}, {"name": "x"}]
+    data = {"wall": rows, "stage": stages}
+    texts = ['wall."a.b".mass=1', "wall.wall2.mass=2", "wall[2].mass=3", "stage.stage1.wall.wall1.mass=4"]
+    texts += ["stage.x.time.step=0.1", "stage.stage1.support.foot.fix=x", "stage.stage1.support.foot.name="]
+    paths = apply_overrides(data, texts)
+    assert paths[0] == ("wall", 0, "mass") and paths[3] == ("stage", 0, "wall", 0, "mass")
+    assert [wall.get("mass") for wall in data["wall"]] == [1, 2, 3, None, None]
+    assert data["stage"] == [{"wall": [{"mass": 4}], "support": [{"fix": "x"}]}, {"name": "x", "time": {"step": 0.1}}]
+    with pytest.raises(InputError, match="2 entries of wall have the name 'lid': give an index, 3 or 4"):
+        apply_overrides(data, ["wall.lid.mass=1"])
+
+
+def test_names_of_entries_in_changes_and_messages(case_file):
+    case = Case.load(case_file, ["wall.stop.friction=0.25", "output.probe.tip.name=end"])
+    assert case.wall[0].friction == 0.25 and case.output.probe[0].name == "end"
+    assert case.copy({"wall.stop.friction": 0.5}).wall[0].friction == 0.5
+    case.update({"output.probe.end.name": "top", "wall.stop": None})
+    assert case.output.probe[0].name == "top" and not case.wall
+    with pytest.raises(InputError, match=r"wall\[0\].friction = -1 \(given by --set\)"):
+        Case.load(case_file, ["wall.stop.friction=-1"])
+    with pytest.raises(InputError, match="wall.top.friction: no entry of wall has the name 'top'"):
+        Case.load(case_file).copy({"wall.top.friction": 0.5})
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("a = 1\n\tstep = 1 s\n", "  2 |  step = 1 s\n                ^"),
+        ("a = [1,\r\n\r\n 2\r\nb = 3", "  3 |  2\n  4 | b = 3\n      ^"),
+        ("a = 'x\n\n", "  1 | a = 'x\n            ^"),
+        ("a = [1, 2", "  1 | a = [1, 2\n               ^"),
+        ("", None),
+    ],
+)
+def test_a_syntax_error_shows_its_line(text, shown):
+    if shown is None:
+        assert parse_toml(text, "x.toml") == {}
+        return
+    with pytest.raises(InputError, match="^x.toml: this is not valid TOML: ") as refused:
+        parse_toml(text, "x.toml")
+    assert str(refused.value).partition("\n")[2] == shown
+
+
+def test_of_a_long_line_the_part_with_the_error_is_shown():
+    with pytest.raises(InputError) as refused:
+        parse_toml(f"a = [{'1, ' * 500}?, {'2, ' * 500}]", "x.toml")
+    _, line, mark = str(refused.value).split("\n")
+    assert len(line) < 120 and line[mark.index("^")] == "?"
+
+
 def test_given_tables_stay_as_they_are(case_text):
     data = tomllib.loads(case_text)
     assert Case.from_dict(data, overrides=["time.end=2.0"]).time.end == 2.0
@@ -174,7 +227,11 @@ def test_given_tables_stay_as_they_are(case_text):
         ("wall[x].name=1", "expected KEY=VALUE"),
         ("wall[0]name=1", "expected KEY=VALUE"),
         ("wall.3.name=a", "'3' is not an index of this list: 0 to 1"),
-        ("wall.first.name=a", "'first' is not an index of this list"),
+        ("load.first.force=[1,0,0]", "'first' is not an index of this list"),
+        ("wall.first.name=a", "no entry of wall has the name 'first'; known: stop; or give an index, 0 to 1"),
+        ("wall.stp.mass=", "no entry of wall has the name 'stp', did you mean 'stop'; or give an index"),
+        ("wall.0.point=[1, 2", "text that begins with [ must be in quotes: Unclosed array\n  [1, 2\n       ^"),
+        ('title="three', 'must be in quotes: Unterminated string\n  "three\n        ^'),
         ("time.step.unit=s", "time.step is a value, not a table"),
     ],
 )

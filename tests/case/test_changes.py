@@ -254,3 +254,12 @@ def test_prestress_of_a_stage_is_changed_in_the_stage():
     with pytest.raises(InputError, match=r"stage\[1\]\.section\.all.*: a stage can only change the prestress"):
         case.stage[1].section["all"].area = 1.0
     assert Case.from_toml(case.to_toml()) == case
+
+
+def test_items_of_lists_that_are_tuples(case):
+    """Probes and vectors are tuples in the objects of a case; their items are changed as those of lists."""
+    case.output.probe[0].name = "end"
+    case.update({"wall[0].point[0]": 1.5})
+    assert case.output.probe[0].name == "end" and case.wall[0].point == (1.5, 0.0, 0.0)
+    case.update({"output.probe[0]": None})
+    assert not case.output.probe

@@ -56,10 +56,12 @@ def __getattr__(name: str) -> Any:
     try:
         value = getattr(importlib.import_module(_HOMES[name], __name__), name)
     except (ValueError, ImportError) as error:
-        from .errors import NUMPY_REMEDY, InputError, numpy_is_too_new
+        from .errors import NUMPY_REMEDY, InputError, lacking_module, numpy_is_too_new
 
         if numpy_is_too_new(error):
             raise InputError(NUMPY_REMEDY) from error
+        if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith(__name__):
+            raise InputError(lacking_module(error)) from error
         raise
     globals()[name] = value
     return value

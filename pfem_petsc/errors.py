@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +16,7 @@ __all__ = [
     "NotConverged",
     "PfemError",
     "SimulationFailure",
+    "lacking_module",
     "numpy_is_too_new",
     "printable",
     "raised",
@@ -35,6 +38,17 @@ def numpy_is_too_new(error: BaseException) -> bool:
     return isinstance(error, ValueError | ImportError) and (
         "numpy.dtype size changed" in text or "compiled using NumPy 1" in text
     )
+
+
+def lacking_module(error: ImportError) -> str:
+    """Return what an import that failed lacks, with the remedy, which depends on whether ``setup.sh`` has finished."""
+    prefix = Path(sys.prefix)
+    if not (prefix / "made-from").is_file():
+        return f"{error}; scripts/setup.sh makes an environment that has it: source .venv/bin/activate"
+    words = {".venv": "bash scripts/setup.sh", ".venv-petsc": "bash scripts/setup.sh --build-petsc"}
+    command = words.get(prefix.name, f"PFEM_VENV={shlex.quote(str(prefix))} bash scripts/setup.sh")
+    state = "lacks what it had" if (prefix / "setup-done").is_file() else "is not finished"
+    return f"the environment {prefix} {state}: run {command} ({error})"
 
 
 def raised(error: BaseException, file: str | None = None) -> str:

@@ -355,7 +355,8 @@ class Simulation(WithEquations):
             On all ranks; data recorded before are in the result file.
         """
         if self.finished and self.comm.rank == 0 and not self.quiet:
-            print(finished_message(self.folder, self._reached, self.plan))
+            has_checkpoint = self.restart is not None
+            print(finished_message(self.folder, self._reached, self.plan, self.case, has_checkpoint))
         for _ in self._iterate(batches=True, shown=False):
             pass
         return 0

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Brings a machine to a working virtual environment in the checkout. Does nothing where that is done already.
+# Brings a machine to a working virtual environment in the checkout. Does nothing where that is done already; where it was
+# stopped, or something is missing, it goes on with that.
 #
 # usage: scripts/setup.sh [--build-petsc]
 #
@@ -29,10 +30,35 @@ cd "$root"
 say() { echo "setup: $*"; }
 fail() { echo "setup: $*" >&2; exit 1; }
 
-# failed LOG: the end of what a command said.
+# failed LOG COMMAND: the end of what a command said, and the cause if it is a usual one.
 failed() {
+    local cause
+    cause=$(cause "$1")
     tail -n 40 "$1" >&2
-    fail "failed${2:+: $2}; the end of its output is above"
+    fail "failed${2:+: ${2:0:60}}${cause:+: $cause}; the end of its output is above"
+}
+
+# cause LOG: the usual cause that the output of a command tells, with its remedy; nothing for another one.
+cause() {
+    if grep -qF "No space left on device" "$1"; then
+        echo "the disk is full: make room"
+    elif grep -qE "Could not get lock|is held by process" "$1"; then
+        echo "another program installs packages: wait until it has ended"
+    elif grep -qiE -e "name resolution|could not resolve|new connection|network is unreachable|could not connect" \
+        -e "connection (refused|reset|timed out|broken)|read timed out|proxyerror|sslerror|certificate verify failed" \
+        "$1"; then
+        echo "packages cannot be downloaded: check the network, and https_proxy or PIP_INDEX_URL where they are needed"
+    elif grep -qE "Permission denied|Read-only file system" "$1"; then
+        echo "nothing can be written there: change the permissions, or give another folder by PFEM_VENV"
+    fi
+}
+
+# At the end, whatever it is: an environment that is not finished is named, and how to go on.
+ended() {
+    local status=$?
+    rm -f "$log"
+    [[ $status == 0 ]] ||
+        echo "setup: the environment ${venv#"$root"/} is not finished: the same command goes on from there" >&2
 }
 
 # The active Python, unless it is one of the environments that this script makes, or the distribution's own package.
@@ -60,6 +86,17 @@ PYTHON
 stamp() {
     cat pyproject.toml scripts/setup.sh scripts/build_petsc.sh
     foundation
+}
+
+# Whether everything that pyproject.toml lists is installed; a package whose installation was interrupted is not.
+complete() {
+    { requirements && echo pfem_petsc; } | "$python" -c '
+import re, sys
+from importlib import metadata
+for line in sys.stdin:
+    metadata.version(re.match(r"[\w-]+", line)[0])
+import h5py, mpi4py
+' 2>/dev/null
 }
 
 foundation() { echo "$root $mode $base ${PETSC_DIR:-} ${PETSC_ARCH:-} ${PFEM_PETSC_VERSION:-}"; }
@@ -116,7 +153,8 @@ slepc_package() {
     if apt-cache show "$package" >/dev/null 2>&1; then echo "$package"; fi
 }
 
-# An environment that stands on another Python or PETSc than asked for is made anew.
+# An environment that stands on another Python or PETSc than asked for is made anew, one that was left half made is
+# completed, and one of this script whose pip is beyond that is made anew.
 make_venv() {
     local made_from
     made_from=$(cat "$venv/made-from" 2>/dev/null || foundation)
@@ -125,10 +163,26 @@ make_venv() {
     fi
     if ! "$python" -c "" 2>/dev/null || [[ $made_from != "$(foundation)" ]]; then
         say "making ${venv#"$root"/} with $1"
-        "$1" -m venv --clear "${@:2}" "$venv"
+        run_venv --clear "$@"
+    elif ! usable; then
+        say "completing ${venv#"$root"/}, whose making was interrupted"
+        run_venv "" "$@"
+    fi
+    if ! usable; then
+        [[ -f $venv/made-from ]] || fail "pip does not work in $venv, which this script has not made: give PFEM_VENV" \
+            "another folder"
+        say "making ${venv#"$root"/} anew, because its pip does not work"
+        run_venv --clear "$@"
     fi
     foundation > "$venv/made-from"
 }
+
+# run_venv --clear|"" PYTHON OPTIONS...
+run_venv() {
+    "$2" -m venv ${1:+"$1"} "${@:3}" "$venv" > "$log" 2>&1 || failed "$log" "$2 -m venv $venv"
+}
+
+usable() { [[ -f $venv/bin/activate ]] && "$python" -m pip --version > /dev/null 2>&1; }
 
 site_packages() { "$python" -c "import sysconfig; print(sysconfig.get_path('purelib'))"; }
 
@@ -251,7 +305,7 @@ from_active() {
 
 # What a run needs, on two ranks: PETSc and mpi4py of one MPI.
 check() {
-    on_ranks 2 120 "$python" -c '
+    on_ranks 2 600 "$python" -c '
 from mpi4py import MPI
 import petsc4py; petsc4py.init()
 from petsc4py import PETSc
@@ -261,15 +315,23 @@ assert PETSc.ScalarType is numpy.float64, "PETSc has complex or single-precision
 if MPI.COMM_WORLD.rank == 0:
     petsc = ".".join(map(str, PETSc.Sys.getVersion()))
     print(f"setup: PETSc {petsc}, numpy {numpy.__version__}, h5py {h5py.__version__} (parallel: {h5py.get_config().mpi})")
-' || fail "the environment does not work"
+' > "$log" 2>&1 || failed "$log" "mpirun -n 2 $python"
+    grep "^setup:" "$log"
 }
 
 # One set-up at a time in a checkout.
 exec 9< "$root/scripts/setup.sh"
-flock 9
+if ! flock --nonblock 9; then
+    say "waiting for another set-up of this checkout"
+    flock 9
+fi
 
 log=$(mktemp)
-trap 'rm -f "$log"' EXIT
+trap ended EXIT
+for signal in HUP INT TERM; do
+    # shellcheck disable=SC2064
+    trap "fail stopped by SIG$signal" "$signal"
+done
 if [[ $build == yes ]]; then
     mode=build base=$(command -v /usr/bin/python3 || command -v python3)
 elif base=$(foreign_python); then
@@ -277,10 +339,11 @@ elif base=$(foreign_python); then
 else
     mode=distribution base=/usr/bin/python3
 fi
-if [[ -x $python && -f $venv/setup-done ]] && stamp | cmp -s - "$venv/setup-done" && "$python" -c "import mpi4py, h5py"; then
+if [[ -x $python && -f $venv/setup-done ]] && stamp | cmp -s - "$venv/setup-done" && complete; then
     exit 0
 fi
 start=$SECONDS
+rm -f "$venv/setup-done"
 case $mode in
     build) from_source ;;
     active) say "using $base and its PETSc"; from_active ;;
@@ -291,16 +354,18 @@ compile_loops() {
     local folder
     folder=$(mktemp -d)
     "$python" -m compileall -q pfem_petsc
-    on_ranks 2 400 "$python" -m pfem_petsc bench --compile &&
-        "$python" -m pfem_petsc rod_impact --quiet -o "$folder/rod" --set time.end=0.7 &&
-        "$python" -m pfem_petsc lattice_drop --quiet -o "$folder/drop" &&
-        "$python" -m pfem_petsc hanging_net --quiet -o "$folder/net" &&
+    on_ranks 2 3600 "$python" -m pfem_petsc bench --compile &&
+        compiling rod_impact -o "$folder/rod" --set time.end=0.7 &&
+        compiling lattice_drop -o "$folder/drop" &&
+        compiling hanging_net -o "$folder/net" &&
         "$python" -m pfem_petsc render "$folder/rod" --frames 2 --video none > /dev/null
     local status=$?
     rm -rf "$folder"
     return $status
 }
-say "compiling loops for this machine: one or two minutes"
-compile_loops || say "not all compiled: the first runs compile what they need"
+# compiling CASE OPTIONS...: a run that says what it compiles, and nothing else.
+compiling() { "$python" -m pfem_petsc "$@" | sed -n '/^compiling/p'; }
+say "compiling loops for this machine, which runs load then; what takes long is told"
+compile_loops || say "not all loops are compiled, for the reason above: the first runs compile what they need"
 stamp > "$venv/setup-done"
 say "done in $((SECONDS - start)) s: ${venv#"$root"/}"

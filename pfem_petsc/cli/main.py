@@ -11,6 +11,7 @@ import contextlib
 import difflib
 import errno
 import importlib
+import importlib.util
 import io
 import os
 import sys
@@ -22,7 +23,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..case.toml import built_in_cases
-from ..errors import NUMPY_REMEDY, EarlyStop, InputError, PfemError, SimulationFailure, numpy_is_too_new, printable
+from ..errors import (
+    NUMPY_REMEDY,
+    EarlyStop,
+    InputError,
+    PfemError,
+    SimulationFailure,
+    lacking_module,
+    numpy_is_too_new,
+    printable,
+)
 from ..registry import add_plugin, blame
 from ..signals import give_back_early
 from .parser import PLUGINS, PROGRAM, Parser, Verb, fill
@@ -171,7 +181,7 @@ def refuse(error: PfemError, debug: bool) -> int:
     rank = launched_rank()
     if not rank:
         _print(error, debug)
-    if rank is not None:
+    if rank is not None and importlib.util.find_spec("mpi4py"):
         # A launcher kills the other ranks as soon as one exits with an error: wait until it is printed.
         from mpi4py import MPI
 
@@ -284,8 +294,7 @@ def exit_message(error: BaseException) -> tuple[int, str]:
         case MemoryError():
             return SimulationFailure.exit_status, f"error: out of memory: {error}; use more machines or a smaller mesh"
         case ModuleNotFoundError() if not str(error.name).startswith(__package__.partition(".")[0]):
-            way = "scripts/setup.sh makes an environment that has it: source .venv/bin/activate"
-            return InputError.exit_status, f"error: {error}; {way}"
+            return InputError.exit_status, f"error: {lacking_module(error)}"
         case _ if numpy_is_too_new(error):
             return InputError.exit_status, f"error: {NUMPY_REMEDY}"
         case OSError(errno=errno.ENOSPC | errno.EDQUOT | errno.EIO):
@@ -297,5 +306,7 @@ def exit_message(error: BaseException) -> tuple[int, str]:
     if place := blame(error):
         kind = InputError if type(error).__module__.startswith("numba.") else SimulationFailure
         return kind.exit_status, f"error: the plugin {place}"
+    if isinstance(error, ImportError) and not str(error.name).startswith(__package__.partition(".")[0]):
+        return InputError.exit_status, f"error: {lacking_module(error)}"  # a library that is damaged, or half installed
     detail = f"{type(error).__name__}: {(reason or 'no message')[:500]}"
     return SimulationFailure.exit_status, f"internal error: {detail}; run with --debug to see where"

@@ -219,13 +219,13 @@ class Piercing:
         return len(ids), int(ids.min()) if len(ids) else int(np.iinfo(np.int64).max)
 
     def summary(self) -> list[str]:
-        """Return messages for the end of the run."""
+        """Return messages for the end of the run, about walls that bars intersected again after the first message."""
         names = self._model.contact.names
         return [
             f"bars intersected wall {names[k]!r} in {self.seen[k]} of {self.looks} snapshots, first at "
             f"{self.first[k]}: only nodes touch walls"
             for k in self.walls
-            if k in self.first
+            if self.seen[k] > 1
         ]
 
 

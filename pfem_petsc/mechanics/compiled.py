@@ -35,6 +35,9 @@ from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
 from numba.extending import _Intrinsic, intrinsic, register_jitable
 
+TELL_EVERY = 15.0
+"""Most seconds of compilations between two reports of them."""
+
 
 def code_digest(function: Callable[..., Any]) -> str:
     """Return a digest of the byte code of a function and of all functions, constants and record types it refers to.
@@ -475,17 +478,20 @@ class Compilation(event.Listener):
 
     Parameters
     ----------
-    begun : called once, with the name of the loop that is compiled then; with ``patience``, in another thread
+    tell : called with the name of the loop that is being compiled, and the time [s] of all compilations so far: when
+        that exceeds ``patience``, and again while compilations last, at intervals that grow to :data:`TELL_EVERY`;
+        mostly in another thread
     took : called after each compilation, with its time [s]
-    patience : time [s] of all compilations before ``begun`` is called; those that take less are not reported
+    patience : time [s] of all compilations that is not reported
     """
 
-    def __init__(self, begun: Callable[[str], None], took: Callable[[float], None], patience: float = 0.0) -> None:
-        self._begun, self._took = begun, took
-        self._told = False
+    def __init__(
+        self, tell: Callable[[str, float], None], took: Callable[[float], None], patience: float = 0.0
+    ) -> None:
+        self._tell, self._took = tell, took
         self._nested = 0  # loops compiled for a loop that calls them
-        self._begin = 0.0
-        self._patience = patience
+        self._begin = self._total = 0.0
+        self._next = patience
         self._timer: threading.Timer | None = None
 
     def __enter__(self) -> Compilation:
@@ -501,36 +507,32 @@ class Compilation(event.Listener):
         """Handle the start of a compilation."""
         if self._nested == 0:
             self._begin = time.perf_counter()
-            if not self._told:
-                name = getattr(getattr(event.data.get("dispatcher"), "py_func", None), "__name__", "a loop")
-                self._tell_later(name)
+            self._wait(getattr(getattr(event.data.get("dispatcher"), "py_func", None), "__name__", "a loop"))
         self._nested += 1
 
-    def _tell_later(self, name: str) -> None:
-        if self._patience <= 0.0:
-            self._tell_now(name)
-            return
-        self._timer = threading.Timer(self._patience, self._tell_now, (name,))
+    def _wait(self, name: str) -> None:
+        """Tell the name now if it is time to, and later if the compilation lasts so long."""
+        so_far = self._total + time.perf_counter() - self._begin
+        if so_far >= self._next:
+            self._next = so_far + min(max(so_far, 1.0), TELL_EVERY)
+            self._tell(name, so_far)
+        self._timer = threading.Timer(self._next - so_far, self._wait, (name,))
         self._timer.daemon = True
         self._timer.start()
 
     def _stop_timer(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer.join()  # so that what it says comes before what follows
-            self._timer = None
-
-    def _tell_now(self, name: str) -> None:
-        self._told = True
-        self._begun(name)
+        while self._timer is not None:
+            timer, self._timer = self._timer, None
+            timer.cancel()
+            timer.join()  # so that what it says comes before what follows
 
     def on_end(self, event: event.Event) -> None:
         """Handle the end of a compilation, successful or not."""
         self._nested -= 1
         if self._nested == 0:
-            seconds = time.perf_counter() - self._begin
-            self._patience -= seconds
             self._stop_timer()
+            seconds = time.perf_counter() - self._begin
+            self._total += seconds
             self._took(seconds)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import textwrap
 from collections.abc import Callable
 from logging import Formatter, LogRecord, makeLogRecord
 from logging.handlers import WatchedFileHandler
@@ -23,6 +24,7 @@ __all__ = ["LogFile", "Progress", "Span"]
 
 FIRST_LINE = 2.0  # seconds until the first line, and between the first lines
 LAST_LINE = 10.0  # maximum number of seconds between lines
+SHORT = 160  # letters of a warning, if quiet
 BAR_REFRESH = 0.1  # seconds between two updates of the bar
 
 # Open MPI gives rank 0 a pseudo-terminal, so isatty() alone would draw a bar into the line-wise forwarding of mpirun.
@@ -101,7 +103,7 @@ class Progress:
     ----------
     title : heading of the bar and the log
     span : Span
-    quiet : print nothing on stdout; the log is still written, and warnings still go to stderr
+    quiet : print nothing on stdout; the log is still written, and the beginnings of warnings go to stderr
     log_path : file of the log, None for no log; one that cannot be opened is an
         :class:`~pfem_petsc.errors.InputError` on all ranks (the constructor is collective)
     stream, clock : stdout and the wall clock [s], replaceable in tests
@@ -125,6 +127,7 @@ class Progress:
         self._root = comm.rank == 0
         self._title, self._span, self._clock, self.axis = title, span, clock, span.axis
         self._stream = None if quiet else (stream or sys.stdout)
+        self._short = log_path if quiet else None
         self._log: LogFile | None = None
         with agreed(comm):
             if self._root and log_path is not None:
@@ -195,21 +198,32 @@ class Progress:
                 self._write(line)
 
     def warning(self, text: str) -> None:
-        """Log a warning and print it on stderr (above the bar, if there is one), even if quiet."""
-        if not self._root:
+        """Log a warning and print it on stderr (above the bar, if there is one), even if quiet: then one line of it.
+
+        The same text is told once.
+        """
+        if not self._root or text in self.warnings:
             return
         self.warnings.append(text)
         self._log_line(text, "WARNING")
+        shown = f"warning: {text}"
+        if self._short is not None:
+            brief = textwrap.shorten(shown, SHORT, placeholder=" ...")
+            shown = brief if len(shown) <= SHORT else f"{brief} ({self._short})"
         with contextlib.suppress(OSError):  # it is in the log
-            self._show(f"warning: {text}", sys.stderr, style="yellow")
+            self._show(shown, sys.stderr, style="yellow")
 
     def close(
-        self, outcome: str = "done", reached: tuple[int, float] | None = None, error: BaseException | None = None
+        self,
+        outcome: str = "done",
+        reached: tuple[int, float] | None = None,
+        error: BaseException | None = None,
+        results: Path | None = None,
     ) -> None:
         """Print the state at the end, the wall time and the speed; a second call does nothing.
 
         ``reached``: number and time of the last step, the one that failed included, if it was not reported; ``error``:
-        what ended the run, for the log.
+        what ended the run, for the log; ``results``: their folder, if there are any.
         """
         if not self._root or self._closed:
             return
@@ -235,6 +249,8 @@ class Progress:
         if self._newton:
             text += f", {self._newton:,} Newton and {self._linear:,} linear iterations"
         self._write(text)
+        if results is not None:
+            self._write(f"results in {results}")
         if error is not None:
             self._log_line(f"error: {error}", "ERROR")
         if self._log is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -190,12 +190,28 @@ def finished(case: Case, folder: Path, end: float | None) -> float | None:
     return max(reached) if reached and min(reached) >= end * (1.0 - TIME) else None
 
 
-def finished_message(folder: Path, reached: float, plan: Plan) -> str:
-    """Return the message about a run whose results have ``reached`` its end [s]."""
+def finished_message(folder: Path, reached: float, plan: Plan, case: Case, has_checkpoint: bool) -> str:
+    """Return the message about a run whose results have ``reached`` its end [s]: what ended it, and how to go on."""
     if not plan.end:
         return f"{folder}: finished already: the results have the modes of the initial state"
     beyond = f", {_beyond(plan)}" if reached > plan.end * (1.0 + TIME) else ""
-    return f"{folder}: finished already: the results have {_place(reached, plan)}{beyond}"
+    key = split_key(plan.axis.key)
+    ends = [text for text in case.overrides if _numbered(_key(text), case) == key and text.partition("=")[2].strip()]
+    by = f" (--set {ends[-1]} is in force)" if ends else ""
+    way = ""
+    if key[-1] == "end":
+        way = f"; a later end, --set {plan.axis.key}=..., " + (
+            "continues them" if has_checkpoint else "begins anew, as there is no checkpoint (output.checkpoint_every)"
+        )
+    return f"{folder}: finished already: the results have {_place(reached, plan)}{beyond}{by}{way}"
+
+
+def _numbered(parts: Sequence[str], case: Case) -> list[str]:
+    """Return the parts of a key with the number of a stage instead of its name."""
+    names = [stage.name for stage in case.stage]
+    if len(parts) > 1 and parts[0] == "stage" and parts[1] in names:
+        return ["stage", str(names.index(parts[1])), *parts[2:]]
+    return list(parts)
 
 
 def _place(reached: float, plan: Plan) -> str:

@@ -470,10 +470,10 @@ class Doubts:
         self._count("crossing", found.pairs, (share, found.bars), place, f"{pairs} through each other ({some})")
 
     def summary(self) -> list[str]:
-        """Return sentences for the end of the run."""
+        """Return sentences for the end of the run, about what was seen again after its warning."""
         texts = []
         for kind, counts in self._kept.items():
-            if not counts["seen"]:
+            if counts["seen"] < 2:
                 continue
             often = f"in {counts['seen']:,} of {counts['looks']:,} snapshots, first at {counts['first']}"
             often += f": up to {counts['most']:,}"
@@ -484,5 +484,5 @@ class Doubts:
             else:
                 worst = self._worst(kind, value, bar)
                 text = f"bars were {_BEYOND[kind]} {often} at once, most of all {worst}, at {place}"
-            texts.append(f"{text}: {_REMEDIES[kind]}")
+            texts.append(text)
         return texts

@@ -84,7 +84,7 @@ class History(Observer):
 
     def __init__(self, stages: Stages, synchroniser: Synchroniser, warn: Callable[[str], None]) -> None:
         stepper, model = stages.stepper, stages.model
-        self.every = model.case.output.history_every
+        self.every, self._staged = model.case.output.history_every, bool(stages.case.stage)
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
         self.ledger = stepper.ledger = Ledger(stepper)
         self.recorder = Recorder(stepper, stages.columns)
@@ -199,11 +199,12 @@ class History(Observer):
         for flags in times["flags"]:
             touched |= np.array(flags, dtype=bool)
         names = np.array(contact.names, dtype=object)[~touched]
+        during = f" in stage {self._model.case.name!r}" if self._staged else ""
         # impulses are those of inertial schemes, and of several stages together
         known = self._stepper.scheme.inertial and self.recorder.rest is None
         pairs = [pair.name for pair in self._model.case.contact_pair if known and not self._pressed(pair.name)]
         return [
-            *(f"wall {name!r} was never touched by a node" for name in names),
+            *(f"wall {name!r} was never touched by a node{during}" for name in names),
             *(f"contact pair {name!r} never carried a force" for name in pairs),
         ]
 

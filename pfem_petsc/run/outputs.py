@@ -18,7 +18,7 @@ from ..output.checkpoint import NAME as CHECKPOINT
 from ..output.layout import MODE_VALUES, Contents, Kept
 from ..output.progress import Progress, Span
 from ..output.result import RESULT_NAME
-from ..output.units import MODE, TIME
+from ..output.units import MODE, TIME, duration
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import agreed_call, on_root
 from ..preflight.checks import warnings_before
@@ -41,7 +41,7 @@ _PATIENCE = 2.0
 
 
 class ReportedCompilation(Compilation):
-    """Reports once that loops are compiled, if that takes long, and excludes the time from the rate of steps.
+    """Reports which loops are compiled, and for how long, while that lasts; excludes the time from the rate of steps.
 
     Attributes
     ----------
@@ -49,15 +49,12 @@ class ReportedCompilation(Compilation):
     """
 
     def __init__(self, comm: MPI.Comm, quiet: bool) -> None:
-        super().__init__(self._tell, self._leave_out, _PATIENCE)
+        super().__init__(self._report, self._leave_out, _PATIENCE)
         self.progress: Progress | None = None
         self._speaks = comm.rank == 0 and not quiet
 
-    def _tell(self, name: str) -> None:
-        text = (
-            f"compiling loops for this machine (once, up to a minute in total): {name}, and others that this kind of "
-            "case needs; later runs load them"
-        )
+    def _report(self, name: str, seconds: float) -> None:
+        text = f"compiling loops for this machine, which later runs load: {name}, {duration(seconds)} so far"
         if self.progress is not None:
             self.progress.message(text)
         elif self._speaks:
@@ -214,7 +211,7 @@ class Outputs:
         self._observers: tuple[Observer, ...] = ()
         self._callbacks: list[tuple[Callable[[Step], object], int]] = []
         self._writer: ResultWriter | None = None
-        self._continues = False
+        self._continues = self._recorded = False
 
     @property
     def _stepper(self) -> Stepper:
@@ -328,6 +325,7 @@ class Outputs:
 
     def _write_to(self, writer: ResultWriter) -> None:
         self._writer = self.history.writer = self.events.writer = self.snapshots.writer = writer
+        self._recorded = True
 
     def _observe(self, state: RunState) -> None:
         """Make the observers of the present stage. Collective."""
@@ -480,7 +478,9 @@ class Outputs:
         for observer in self._observers:
             for text in observer.remarks():
                 self.progress.message(text)
-        for text in (self.snapshots.doubts() if self._stages.at_last else []) + self._stepper.doubts():
+        for text in self.snapshots.doubts() if self._stages.at_last else ():
+            self.progress.message(text)
+        for text in self._stepper.doubts():
             self.progress.warning(text)
 
     def close(self, outcome: str) -> None:
@@ -498,4 +498,4 @@ class Outputs:
         """Close the progress report, with the ``error`` that ended the run. Not collective."""
         if self.progress is not None:
             reached = (self._stepper.number, self._stepper.place) if outcome == "failed" else None
-            self.progress.close(outcome, reached, error)
+            self.progress.close(outcome, reached, error, self._folder if self._recorded else None)

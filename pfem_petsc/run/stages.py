@@ -131,7 +131,8 @@ class Stages:
             fields = Fields(model)
             points |= dict.fromkeys(fields.points)
             cells |= dict.fromkeys(fields.cells)
-            warnings += [f"stage {stage.name!r}: {text}" for text in model.warnings]
+            warnings += [f"stage {stage.name!r}: {text}" for text in model.warnings if text not in told]
+            told += model.warnings
             if k >= number:
                 found = warnings_before(stage, model, stepper.plan, first=False)
                 new = [text for text in found if text not in told]

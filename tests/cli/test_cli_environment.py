@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+from pathlib import Path
 from shutil import which
 
 import pytest
@@ -15,7 +17,7 @@ from pfem_petsc.case.schema import Case
 from pfem_petsc.case.toml import built_in_cases
 from pfem_petsc.cli import environment
 from pfem_petsc.cli.environment import Finding, inspect_environment, report
-from pfem_petsc.cli.main import HOMES, exit_message, main
+from pfem_petsc.cli.main import HOMES, exit_message, main, on_first_rank
 
 HERE = {
     "version('": "99.0",
@@ -153,6 +155,47 @@ def test_probes_run_here():
     assert status == 0 and about["scalar"] == "float64" and set(about) >= {"mumps", "hypre", "ptscotch", "index"}
     status, output = environment._run(environment._python("import nothing_of_this_name"))
     assert status and environment._last(output) == "ModuleNotFoundError: No module named 'nothing_of_this_name'"
+
+
+@pytest.mark.parametrize(
+    ("folder", "files", "told"),
+    [
+        ("it", (), "No module named 'numba'; scripts/setup.sh makes an environment that has it"),
+        (".venv", ("made-from",), "the environment {} is not finished: run bash scripts/setup.sh (No module"),
+        (".venv-petsc", ("made-from",), "is not finished: run bash scripts/setup.sh --build-petsc (No module"),
+        ("my own", ("made-from",), "is not finished: run PFEM_VENV='{}' bash scripts/setup.sh (No module"),
+        (
+            ".venv",
+            ("made-from", "setup-done"),
+            "lacks what it had: run bash scripts/setup.sh (No module named 'numba')",
+        ),
+    ],
+)
+def test_an_environment_that_is_not_finished_is_named(tmp_path, monkeypatch, capsys, folder, files, told):
+    (tmp_path / folder).mkdir()
+    for file in files:
+        (tmp_path / folder / file).write_text("")
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / folder))
+
+    def lacking():
+        raise ModuleNotFoundError("No module named 'numba'", name="numba")
+
+    assert on_first_rank(lacking, debug=False, uses_mpi=False) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and told.format(tmp_path / folder) in said and len(said.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_a_bare_environment_names_itself(tmp_path):
+    """Python without any package, in an environment as setup.sh leaves it when it is killed early."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / ".venv")], check=True)
+    (tmp_path / ".venv" / "made-from").write_text("")
+    python, root = tmp_path / ".venv" / "bin" / "python", Path(__file__).parents[2]
+    for words in (["rod_impact"], ["bench"], ["info", "it"], ["render", "it"]):
+        command = [str(python), "-m", "pfem_petsc", *words]
+        done = subprocess.run(command, cwd=root, env={"PATH": os.environ["PATH"]}, capture_output=True, text=True)
+        assert done.returncode == 2 and "Traceback" not in done.stderr
+        assert f"the environment {tmp_path / '.venv'} is not finished: run bash scripts/setup.sh" in done.stderr
 
 
 def test_a_numpy_that_is_too_new_has_its_remedy(tmp_path, monkeypatch):

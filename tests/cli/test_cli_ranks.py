@@ -54,7 +54,7 @@ def test_refusal_is_printed_once(on_ranks, tmp_path, ranks, words, text):
         (
             "ModuleNotFoundError('No module named h5py', name='h5py')",
             2,
-            "error: No module named h5py; scripts/setup.sh",
+            "scripts/setup.sh",
         ),
         ("ModuleNotFoundError('No module named x', name='pfem_petsc.x')", 3, "internal error: ModuleNotFoundError"),
     ],

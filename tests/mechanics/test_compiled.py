@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -50,13 +51,13 @@ def module(tmp_path, monkeypatch):
 
 def test_compiling_is_noticed_once_and_loading_is_not(module):
     told, took = [], []
-    with Compilation(told.append, took.append):
+    with Compilation(lambda name, seconds: told.append(name), took.append):
         assert module().outer(3.0) == 7.0  # the inner one is compiled on the way: one time for both
-        assert (len(told), len(took)) == (1, 1)
+        assert (set(told), len(took)) == ({"outer"}, 1)
         assert 0.0 < took[0] < 60.0
         assert module().outer(3.0) == 7.0  # from disk
         assert module().inner(np.float32(1.0)) == 2.0  # for another type
-        assert (len(told), len(took)) == (1, 2)
+        assert (told[0], len(took)) == ("outer", 2)
     module().outer(np.float32(1.0))
     assert len(took) == 2
 
@@ -99,23 +100,71 @@ def test_machine_code_from_disk_finds_what_it_refers_to(tmp_path):
 def test_short_compilations_are_not_reported():
     """They count together; a report comes while the loop that makes them long is compiled."""
     told, took = [], []
-    with Compilation(told.append, took.append, patience=60.0):
+    with Compilation(lambda *what: told.append(what), took.append, patience=60.0):
         numba.njit(lambda x: x + 1.0)(1.0)
     assert (told, len(took)) == ([], 1)
-    with Compilation(told.append, took.append, patience=1e-6):
+    with Compilation(lambda *what: told.append(what), took.append, patience=1e-6):
         numba.njit(lambda x: x + 1.0)(1.0)
         numba.njit(lambda x: x + 2.0)(1.0)
-    assert (told, len(took)) == (["<lambda>"], 3)
+    assert ([name for name, _ in told], len(took)) == (["<lambda>"], 3)
+    assert 0.0 < told[0][1] < 60.0
+
+
+def test_a_long_compilation_is_told_while_it_lasts(monkeypatch):
+    """With the time of all compilations so far, at intervals that grow up to a limit."""
+    now, told, waits = [0.0], [], []
+
+    class Timer:
+        """Fires when the clock is moved."""
+
+        def __init__(self, wait, function, arguments):
+            waits.append(wait)
+            self.fire = lambda: function(*arguments)
+            self.daemon = False
+
+        def start(self):
+            pass
+
+        cancel = join = start
+
+    monkeypatch.setattr("pfem_petsc.mechanics.compiled.threading.Timer", Timer)
+    monkeypatch.setattr("pfem_petsc.mechanics.compiled.time.perf_counter", lambda: now[0])
+    watch = Compilation(lambda *what: told.append(what), lambda seconds: None, patience=2.0)
+
+    def compile_for(seconds, name):
+        loop = type("Dispatcher", (), {"py_func": type(name, (), {})})
+        watch.on_start(type("Event", (), {"data": {"dispatcher": loop}}))
+        end = now[0] + seconds
+        while now[0] + waits[-1] < end:
+            now[0] += waits[-1]
+            watch._timer.fire()
+        now[0] = end
+        watch.on_end(None)
+
+    compile_for(1.5, "first")
+    now[0] += 100.0  # of steps, which do not count
+    compile_for(60.0, "second")
+    compile_for(0.5, "third")
+    assert told == [("second", 2.0), ("second", 4.0), ("second", 8.0), ("second", 16.0), *told[4:]]
+    assert told[4:] == [("second", 31.0), ("second", 46.0), ("second", 61.0)]
 
 
 @pytest.mark.parametrize("patience, times", [(0.0, 1), (1e-4, 1), (600.0, 0)])
-def test_run_says_that_it_compiles(tmp_path, monkeypatch, capsys, patience, times):
+def test_run_says_what_it_compiles(tmp_path, monkeypatch, capsys, patience, times):
     monkeypatch.setattr("pfem_petsc.run.outputs._PATIENCE", patience)
     simulation = Simulation(Case.load("rod_impact", ["time.end=0.2"]), output=tmp_path / "it")
-    simulation.on_step(lambda step: numba.njit(lambda x: x + 1.0)(1.0), every=5)
+
+    def plus_one(x):
+        return x + 1.0
+
+    simulation.on_step(lambda step: numba.njit(plus_one)(1.0), every=5)
     simulation.run()
     said = capsys.readouterr().out
-    assert said.count("compiling loops for this machine (once") == times
+    found = re.findall(
+        r"^compiling loops for this machine, which later runs load: plus_one, [\d.]+ s so far$", said, re.M
+    )
+    assert len(found) >= times and bool(found) == bool(times)
+    assert "minute" not in said
 
 
 def test_machine_code_is_never_older_than_what_a_loop_inlines(tmp_path, monkeypatch):

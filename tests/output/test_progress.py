@@ -239,3 +239,25 @@ def test_durations():
         "2:05:41",
         "?",
     ]
+
+
+def test_a_warning_is_told_once_and_briefly_if_quiet(tmp_path, capsys):
+    """The log has all of it; the folder of the results is the last line."""
+    long = "bars are thin, " * 30 + "make them thicker"
+    for quiet in (False, True):
+        log = tmp_path / str(quiet) / "log.txt"
+        stream = io.StringIO()
+        progress = Progress(COMM, "it", Span(2, 1.0), quiet, log, stream)
+        for text in (long, "walls are far", long, "walls are far"):
+            progress.warning(text)
+        progress.close(results=log.parent)
+        told = capsys.readouterr().err.splitlines()
+        assert len(told) == 2 and told[1] == "warning: walls are far"
+        if quiet:
+            brief, _, rest = told[0].partition(" ... ")
+            assert 140 < len(brief) <= 156 and brief.startswith("warning: bars are thin, bars are")
+            assert rest == f"({log})"
+        else:
+            assert told[0] == f"warning: {long}"
+        assert log.read_text().count(long) == 1 and log.read_text().endswith(f"results in {log.parent}\n")
+        assert quiet == (stream.getvalue() == "") and (quiet or stream.getvalue().endswith(f"in {log.parent}\n"))

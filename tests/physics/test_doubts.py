@@ -46,7 +46,7 @@ def test_static_loads_beyond_eulers_load(law, comm, shared_tmp_path, capfd):
     material = {"law": law} if law == "elastic" else {"law": law, "yield_stress": 1e9, "isotropic_hardening": 0.0}
     error, log = run(columns(material, STATIC, 2.4 * EULER), comm, shared_tmp_path / "it", capfd)
     # 0.6, 1.2, 1.8, 2.4 in the first bar; half of that in the second
-    assert error.count("Euler's load") == 2  # at the first, and at the end
+    assert error.count("Euler's load") == 1  # at the first; at the end it is counted
     assert (
         "step 2, load factor 0.5: 1 bar is compressed beyond Euler's load, most of all bar 0 with 120 % of it" in error
     )
@@ -76,7 +76,7 @@ def test_motion_in_stages_and_after_a_restart(integrator, comm, shared_tmp_path,
     folder = shared_tmp_path / "it"
     case = columns({}, {"stage": stages}, 0.9 * EULER)
     error, log = run(case, comm, folder, capfd)
-    assert error.count("Euler's load") == 2
+    assert error.count("Euler's load") == 1
     (told,) = [line for line in log.splitlines() if "bars were compressed beyond Euler's load in" in line]
     words = told.split()
     at = words.index("of")
@@ -91,7 +91,7 @@ def test_motion_in_stages_and_after_a_restart(integrator, comm, shared_tmp_path,
                 break
     capfd.readouterr()
     error, log = run(case, comm, stopped, capfd, restart=True)
-    assert error.count("Euler") == 1
+    assert error.count("Euler") == 0  # it has been told before the restart
     assert told.split("bars were")[1] == log.split("bars were")[1].splitlines()[0]
 
 
@@ -107,6 +107,6 @@ def test_strut_beyond_its_range(analysis, comm, shared_tmp_path, capfd):
     ]
     material = {"law": "strut", "yield_stress": 3e8}
     error, log = run(columns(material, analysis, 0.0, support=support, load=[]), comm, shared_tmp_path / "it", capfd)
-    assert error.count("beyond the range") == 2
+    assert error.count("beyond the range") == 1
     assert "1 bar is shortened beyond the range of the law, most of all bar 0 by" in error
     assert "up to 1 at once, most of all bar 0 by 40 %, where law 'strut' describes 20 %" in log

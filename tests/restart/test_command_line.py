@@ -44,7 +44,12 @@ def test_finished_run(tmp_path, capsys, every):
     before = (tmp_path / "done" / "result.vtkhdf").read_bytes()
     capsys.readouterr()
     assert main([*words, "--restart"]) == 0
-    assert "finished already: the results have t = 500.0 ms" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    way = "continues them" if every else "begins anew, as there is no checkpoint (output.checkpoint_every)"
+    ended = (
+        "finished already: the results have t = 500.0 ms (--set time.end=0.5 is in force); a later end, --set time.end"
+    )
+    assert said == f"{tmp_path / 'done'}: {ended}=..., {way}\n"
     assert (tmp_path / "done" / "result.vtkhdf").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["done"]
 
@@ -158,7 +163,7 @@ def test_values_of_set_are_kept_by_a_restart(tmp_path, capsys):
     words = [str(tmp_path / "case.toml"), "-o", str(tmp_path / "out")]
     assert main([*words, "--quiet", "--set", "time.step=0.1", "time.end=1.0", "output.checkpoint_every=5"]) == 0
     assert main([*words, "--restart"]) == 0
-    assert "finished already: the results have t = 1.000 s\n" in capsys.readouterr().out
+    assert "finished already: the results have t = 1.000 s (--set time.end=1.0 is in force)" in capsys.readouterr().out
     assert main([*words, "--restart", "--set", "time.end=2.0"]) == 0
     said = capsys.readouterr().out
     assert "as in the run that is continued: --set time.step=0.1 output.checkpoint_every=5" in said

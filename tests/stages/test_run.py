@@ -131,3 +131,26 @@ def test_the_displacement_of_a_path_counts_from_the_start_of_its_stage(tmp_path)
     z = history["probe/apex/position"][:, 0, 2]
     ends = [int(np.flatnonzero(history["stage"] == stage)[-1]) for stage in (0, 1)]
     np.testing.assert_allclose([z[0] - z[ends[0]], z[ends[0]] - z[ends[1]]], 1e-3, rtol=1e-9)
+
+
+@pytest.mark.parallel
+def test_warnings_of_all_stages_are_told_once(comm, shared_tmp_path, capfd):
+    """That the step is too large for the damping, in the first stage; and walls that are not touched, by stage."""
+    walls = [{"name": "near", "point": [0.0, 0.0, -5e-6]}, {"name": "far", "point": [0.0, 0.0, -9.0]}]
+    time = {"integrator": "central_differences", "step": 1e-6, "end": 2e-5}
+    data = {
+        "mesh": {"generator": "lattice", "kind": "cubic", "cells": [1, 1, 1], "pitch": 1.0},
+        "material": {"it": {"young_modulus": 1e9, "density": 1e3, "damping": 3e8}},
+        "section": {"it": {"area": 1e-4, "material": "it"}},
+        "wall": [{"type": "plane", "normal": [0.0, 0.0, 1.0], **wall} for wall in walls],
+        "stage": [
+            {"name": "rest", "time": time},
+            {"name": "hit", "time": time, "initial": {"velocity": [0.0, 0.0, -4.0]}},
+        ],
+    }
+    run(data, comm, shared_tmp_path / "out")
+    log, told = (shared_tmp_path / "out" / "log.txt").read_text(), capfd.readouterr().err
+    if comm.rank == 0:
+        assert told.count("damping stops nodes") == log.count("damping stops nodes") == 1
+    found = re.findall(r"wall '(\w+)' was never touched by a node in stage '(\w+)'", log)
+    assert found == [("near", "rest"), ("far", "rest"), ("far", "hit")]

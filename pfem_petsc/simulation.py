@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any, Self
 
 import numpy as np
@@ -12,11 +14,12 @@ from mpi4py import MPI
 
 from .case.schema import Case
 from .contact.contact import check_start
-from .errors import EarlyStop, InputError, PfemError
+from .errors import EarlyStop, InputError, PfemError, SimulationFailure
 from .integrators.base import State
 from .mechanics.loads import ForceState
 from .output.lock import FolderLock
-from .parallel.agreement import on_root
+from .parallel.agreement import on_root, outcome
+from .parallel.ending import all_arrive, aside, passes_exception, watch
 from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
 from .preflight.checks import inspect, later_gaps, warnings_before
@@ -32,6 +35,8 @@ from .stepping.model import Model
 from .stepping.stepper import Step, Stepper
 
 __all__ = ["Simulation", "Step"]
+
+watch()  # from the import on: a script may fail before it makes a simulation
 
 
 class Simulation(WithEquations):
@@ -84,6 +89,7 @@ class Simulation(WithEquations):
         # later changes of the case do not affect this simulation
         self.case = case = case.copy(fixed=True)
         self.comm = comm if comm is not None else MPI.COMM_WORLD
+        aside(self.comm)
         self.folder = Path(output) if output is not None else Path("results") / case.name
         self.quiet = quiet
         self._compilation = ReportedCompilation(self.comm, quiet)
@@ -117,14 +123,15 @@ class Simulation(WithEquations):
         interval = 60.0 * minutes if minutes else None
         self._synchroniser = Synchroniser(self._stages, stop, lock, interval)
         self.outputs = Outputs(self._stages, self._synchroniser, self.folder, self.quiet, self._compilation)
-        self._started = self._closed = False
+        self._started = self._closed = self._failed = False
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        # an unexpected error may have occurred on this rank only, and a collective close would wait forever
-        if kind is None or self.comm.size == 1 or issubclass(kind, PfemError):
+        together = kind is None or self._failed or self.comm.size == 1
+        # an error may have occurred on this rank only, and a collective close would wait forever
+        if together or (issubclass(kind, PfemError) and all_arrive(aside(self.comm))):
             self.close()
         else:
             self._closed = True
@@ -265,11 +272,15 @@ class Simulation(WithEquations):
                 instrument(self)
                 self.outputs.record_start()
         except PfemError as error:
-            self._finish("failed", error)
+            self._fail(error)
             raise
 
     def __iter__(self) -> Iterator[Step]:
-        """Run step by step; the output is closed when the iteration ends."""
+        """Run step by step; the output is closed when the iteration ends.
+
+        All ranks leave a loop over the steps after the same step. If only some do, by an exception or otherwise, the
+        others get a :class:`~pfem_petsc.errors.SimulationFailure` in place of their next step.
+        """
         return self._iterate(batches=False)
 
     def batches(self) -> Iterator[Step]:
@@ -282,7 +293,7 @@ class Simulation(WithEquations):
         self._usable()
         if self.finished:
             return
-        stages, outputs = self._stages, self.outputs
+        stages, outputs, shared = self._stages, self.outputs, shown and self.comm.size > 1
         if self._started and not outputs.is_open:
             if stages.at_last and self.state.step >= self.stepper.last_step:
                 return
@@ -301,6 +312,8 @@ class Simulation(WithEquations):
                         if shown:
                             outputs.wait()
                         yield made
+                        if shared:
+                            self._all_stay()
                         outputs.stop_early()
                     if stages.at_last:
                         break
@@ -310,17 +323,37 @@ class Simulation(WithEquations):
                 outputs.record_modes()
                 outputs.tell_remarks()
                 self._finish("done")
-            except (GeneratorExit, EarlyStop):
+            except GeneratorExit:
+                if shared and not self._all_leave(sys._getframe().f_back):
+                    self._fail()
+                else:
+                    self._finish("stopped")
+                raise
+            except EarlyStop:
                 self._finish("stopped")
                 raise
             except PfemError as error:
-                self._finish("failed", error)
+                self._fail(error)
                 raise
             except BaseException as error:
                 # only one rank may be here, so collective operations are not safe
                 end = self._finish if self.comm.size == 1 else self._leave
                 end("failed", error)
                 raise
+
+    def _all_leave(self, frame: FrameType | None) -> bool:
+        """Return whether all ranks leave their loops over steps, as this one does in a frame. Collective."""
+        found = outcome(self.comm, True, lambda: passes_exception(frame))
+        return found is not None and found[1]
+
+    def _all_stay(self) -> None:
+        """Go on if no rank has left its loop over steps. Collective."""
+        first, _ = outcome(self.comm, False)
+        if first < self.comm.size:
+            raise SimulationFailure(
+                f"step {self.stepper.number}: rank {first} has left the loop over steps, by an exception or by itself, "
+                "and the others cannot go on alone; leave it on all ranks after the same step"
+            )
 
     def _advance(self, most: int = 1) -> Step:
         """Make one step, or a batch of at most ``most``, and serve the outputs that are due after it. Collective."""
@@ -336,6 +369,12 @@ class Simulation(WithEquations):
         finally:
             self._leave(outcome, error)
             self._synchroniser.lock.release()
+
+    def _fail(self, error: BaseException | None = None) -> None:
+        """Close the results if all ranks are here, else leave them as they are."""
+        self._failed = self.comm.size == 1 or all_arrive(aside(self.comm))
+        end = self._finish if self._failed else self._leave
+        end("failed", error)
 
     def _leave(self, outcome: str, error: BaseException | None = None) -> None:
         """Clean up without communication; the folder stays locked until the process ends, as others may be writing."""

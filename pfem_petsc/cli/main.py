@@ -15,7 +15,6 @@ import importlib.util
 import io
 import os
 import sys
-import time
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
@@ -60,9 +59,6 @@ RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "SLURM_PROCID
 
 _PETSC_REFUSED = (62, 63, 83, 86)
 """Codes of PETSc errors: wrong or out of range argument, file cannot be opened, unknown type."""
-
-GRACE = 3.0
-"""Seconds in which all ranks must report the same failure; after that the job is aborted."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -234,23 +230,14 @@ def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
         status = function(comm)
         sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - whatever it is becomes a message and a status
-        if not _all_arrive(failures):
+        from ..parallel.ending import all_arrive
+
+        if not all_arrive(failures):
             comm.Abort(_print(error, debug, f"rank {comm.rank}: "))
         status = failures.bcast(_print(error, debug) if comm.rank == 0 else None, root=0)
     failures.Free()
     _let_go_of_closed_streams()
     return status
-
-
-def _all_arrive(comm: MPI.Comm) -> bool:
-    """Return whether every rank arrives within the grace time."""
-    request = comm.Ibarrier()
-    deadline = time.monotonic() + GRACE
-    while not request.Test():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.005)
-    return True
 
 
 def _print(error: BaseException, debug: bool, who: str = "") -> int:

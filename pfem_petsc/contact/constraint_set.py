@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from ..errors import InputError
+from ..errors import InputError, SimulationFailure
 from ..integrators.base import Balance, State
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of, slab_range
-from ..parallel.agreement import agreed
+from ..parallel.agreement import agreed, agreed_call
 from ..parallel.natural import NaturalOrder
 from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND
@@ -118,6 +118,8 @@ class ConstraintSet:
 
     def _make(self) -> None:
         """Make everything that depends on which rows there are. Collective."""
+        for name, source in zip(self.names, self._sources, strict=True):
+            source.name = name
         self.rows = rows = RowSet(self._sources, self.mesh, self.contact.fixed)
         self.two = TwoNodeRows(rows)
         if len(self.two.at) == len(rows.source):
@@ -151,12 +153,16 @@ class ConstraintSet:
 
     def find(self, x: np.ndarray, reach: np.ndarray, time: float) -> None:
         """Find the rows of a step whose nodes end within ``reach`` (owned,) of positions (owned, 3) [m], if any come
-        and go. Rows that stay keep their forces. Collective."""
+        and go. Rows that stay keep their forces. What a search raises on one rank, all raise. Collective."""
         if not self.dynamic:
             return
         numbers = self.mesh.node_ids[: self.mesh.n_owned].astype(np.int64)
         nodes = ExpectedNodes(self.mesh.comm, numbers, x, reach, time)
-        found = [source.find(nodes) if source.dynamic else source for source in self._sources]
+        found = list(self._sources)
+        for k, source in enumerate(found):
+            if source.dynamic:
+                with agreed_call(self.mesh.comm, f"constraint {self.names[k]!r}: find"):
+                    found[k] = source.find(nodes)
         if all(one is other for one, other in zip(found, self._sources, strict=True)):
             return
         self._sources, before, counted = found, self.rows, self._of_counted()
@@ -320,7 +326,12 @@ class ConstraintSet:
                 "pairs or constraints: such a wall must be flat, without mass, friction and restitution, and not tied; "
                 "or give it a node_set without them"
             )
-        values = rows.values(rows.gather(points))
+        x = rows.gather(points)
+        with agreed(comm):
+            try:
+                values = rows.values(x)
+            except SimulationFailure as failure:
+                raise InputError(f"{self.source}: {failure}") from failure
         deepest = (np.inf,)
         if len(values) and not values.min() >= -ON_BOUND * length:
             row = int(np.argmin(values))

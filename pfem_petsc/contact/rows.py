@@ -16,9 +16,11 @@ from ..errors import SimulationFailure
 from ..mechanics.compiled import kernel
 from ..mesh.exchange import GhostExchange, Router, swap
 from ..mesh.slab import slab_of
+from ..parallel.agreement import agreed
 from ..parallel.natural import NaturalOrder
 from ..tolerances import FREE_PART
 from .constraints.base import Constraint
+from .plugins import checked
 from .projection import Groups, System, project_groups
 
 if TYPE_CHECKING:
@@ -295,9 +297,10 @@ class RowSet:
         self._last_owners = self.owners[every, self.last]
         self._keys = self.ids * max(len(self.sources), 1) + self.source
         self.fixed_jacobian = np.zeros((*self.ends.shape, 3))
-        if self.fixed.any():
-            at = np.flatnonzero(self.fixed)
-            self.fixed_jacobian[at] = self.gradients(np.zeros((len(self.numbers), 3)), at)
+        at = np.flatnonzero(self.fixed)
+        with agreed(mesh.comm):
+            if len(at):
+                self.fixed_jacobian[at] = self.gradients(np.zeros((len(self.numbers), 3)), at)
 
     def _find(self, sources: Sequence[Constraint]) -> None:
         """Send the rows of all sources to the ranks of their nodes."""
@@ -426,7 +429,8 @@ class RowSet:
                 some = rows[begin:end] - first
                 if end - begin < len(at):
                     source, at = source.of(source.nodes[some], source.data[some]), at[some]
-            found.append(getattr(source, method)(*(_of_rows(at, array) for array in arrays)))
+            function = checked(getattr(source, method), f"constraint {source.name!r}: {method}")
+            found.append(function(*(_of_rows(at, array) for array in arrays)))
         return found
 
     def values(self, x: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 from ..case.files import Forces, read_forces
 from ..case.tables import LoadFile
 from ..errors import InputError, raised
-from ..parallel.agreement import on_root
+from ..parallel.agreement import on_root, outcome
 from ..registry import nearest
 from .bars import bar_shapes
 from .compiled import kernel
@@ -196,14 +196,19 @@ class FunctionForce:
 
     def __init__(self, function: Callable[[float, ForceState], Any], mesh: DistributedMesh) -> None:
         self.function, self.failure = function, None
-        self._shape = mesh.n_owned, 3
+        self._shape, self._comm = (mesh.n_owned, 3), mesh.comm
 
     def add(self, time: float, state: ForceState, out: np.ndarray) -> None:
         """Add the force at a time [s] to ``out`` (owned, 3) [N]; what is wrong with it becomes the failure, so that no
-        rank is left alone."""
+        rank is left alone. Collective, as the function may be."""
+        error: BaseException | None = None
         try:
             force = np.asarray(self.function(time, state), dtype=np.float64)
-        except BaseException as error:  # noqa: BLE001 - of a user; the other ranks would wait
+        except BaseException as caught:  # noqa: BLE001 - of a user; the other ranks would wait
+            error = caught
+        if outcome(self._comm, error is not None) is None:
+            raise error
+        if error is not None:
             self.failure = raised(error)
             return
         if force.shape != self._shape:

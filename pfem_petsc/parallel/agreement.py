@@ -10,8 +10,9 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import PfemError, SimulationFailure, raised
+from .ending import arrives, aside
 
-__all__ = ["agreed", "agreed_call", "on_root"]
+__all__ = ["agreed", "agreed_call", "on_root", "outcome"]
 
 T = TypeVar("T")
 
@@ -32,27 +33,42 @@ def agreed(comm: MPI.Comm) -> Iterator[None]:
         raise comm.bcast(error, root=first)
 
 
+def outcome(comm: MPI.Comm, fails: bool, hopeless: Callable[[], bool] = lambda: True) -> tuple[int, bool] | None:
+    """Return the lowest rank that fails, the number of ranks if none does, and whether all do. Collective.
+
+    Where this rank fails and the others do not arrive within the grace time, it is None if that is ``hopeless``, and
+    this rank waits on otherwise.
+    """
+    both = np.array([comm.rank if fails else comm.size, fails])
+    request = aside(comm).Iallreduce(MPI.IN_PLACE, both, op=MPI.MIN)
+    if not fails:
+        request.Wait()
+    elif not arrives(request.Test, hopeless):
+        return None
+    return int(both[0]), bool(both[1])
+
+
 @contextmanager
-def agreed_call(comm: MPI.Comm, step: int) -> Iterator[None]:
-    """Context in which all ranks call a function of a user after a step; what it raises on some ranks, all ranks raise.
+def agreed_call(comm: MPI.Comm, what: str) -> Iterator[None]:
+    """Context in which all ranks call code of a user; what it raises on some ranks, all ranks raise.
 
     If all ranks raise, each raises its own exception. Otherwise all raise that of the lowest rank that has one: a
-    :class:`PfemError` as it is, any other as a :class:`SimulationFailure`. Collective; a function that communicates
-    must not raise while others wait for its rank.
+    :class:`PfemError` as it is, any other as a :class:`SimulationFailure` that says ``what`` has raised it. The code
+    may communicate; if others wait there for a rank that has raised, that rank raises its own exception after the grace
+    time. Collective.
     """
     error: BaseException | None = None
     try:
         yield
     except BaseException as caught:  # noqa: BLE001 - of a user; the other ranks would wait
         error = caught
-    outcome = np.array([comm.size if error is None else comm.rank, error is not None])
-    comm.Allreduce(MPI.IN_PLACE, outcome, op=MPI.MIN)
-    first, everywhere = outcome.tolist()
-    if everywhere:
+    found = outcome(comm, error is not None)
+    if found is None or found[1]:
         raise error
+    first = found[0]
     if first < comm.size:
         if error is not None and not isinstance(error, PfemError):
-            failure = SimulationFailure(f"step {step}: on_step: the function {raised(error)} on rank {comm.rank}")
+            failure = SimulationFailure(f"{what} {raised(error)} on rank {comm.rank}")
             failure.__cause__, error = error, failure
         raise comm.bcast(error, root=first)
 

@@ -17,6 +17,7 @@ from numba.extending import intrinsic
 
 from ..errors import SimulationFailure
 from ..mechanics.compiled import generate_call
+from ..parallel.ending import is_alone
 from ..tolerances import PROJECTED
 
 if TYPE_CHECKING:
@@ -105,10 +106,10 @@ class RowCaller:
                 self._solve((self._begin + step + 2) * self.stepper.h)
             else:
                 self._close()
-        except SimulationFailure as failure:
-            self.failure = failure
-            return FAILED
         except BaseException as error:  # noqa: BLE001  # an exception cannot pass the compiled loop: end raises it
+            if isinstance(error, SimulationFailure) and not is_alone():
+                self.failure = error
+                return FAILED
             self._error = error
             return _LOST
         return 0

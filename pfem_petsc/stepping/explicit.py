@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
 from ..mechanics.compiled import kernel
+from ..parallel.ending import is_alone
 from ..tolerances import BEYOND, PROJECTED
 from .batch import Batch
 from .stepper import Solution, Stepper
@@ -107,6 +108,8 @@ class ExplicitStepper(Stepper):
         try:
             yield
         except SimulationFailure as failure:
+            if is_alone():
+                raise
             self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
 
     def _stiffness_for(self, balance: Balance) -> np.ndarray:

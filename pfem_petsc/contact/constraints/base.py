@@ -71,6 +71,7 @@ class Constraint(ABC):
     fixed : whether gradients never turn, so that rows are linear
     dynamic : whether rows come and go: :meth:`find` is then called in each step, before it is solved
     ids : (r,) number of each row in its table, by which a row is the same in another step; None: counted over ranks
+    name : of the table, for messages
     """
 
     nodes: np.ndarray
@@ -78,6 +79,7 @@ class Constraint(ABC):
     fixed = False
     dynamic = False
     ids: np.ndarray | None = None
+    name = ""
 
     def of(self, nodes: np.ndarray, data: np.ndarray) -> Self:
         """Return the constraint with other rows (r, k), (r, m)."""

@@ -12,6 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from ...case.base import Finite, NonNegativeFloat, PositiveFloat, Vector3, WallParameters, listed
 from ...errors import InputError, raised
 from ...registry import added_file, lookup
+from ..plugins import checked
 
 WALLS = "pfem_petsc.contact.walls"
 """The package of the walls."""
@@ -160,11 +161,13 @@ def made_wall(parameters: WallKeys, x: np.ndarray) -> BaseWall:
         return module.Wall(parameters)
     try:
         wall = module.Wall(parameters)
-        flaw = _flaw(wall, x[:100])
+        flaw = _flaw(wall, x)
     except Exception as error:  # noqa: BLE001 - of a user
         flaw = f"it {raised(error, file)}"
     if flaw:
         raise InputError(f"wall {parameters.name!r}: {file}: the class Wall: {flaw}")
+    for name in ("planes", "gaps"):
+        setattr(wall, name, checked(getattr(wall, name), f"wall {parameters.name!r}: {file}: {name}"))
     return wall
 
 
@@ -179,9 +182,12 @@ def _flaw(wall: BaseWall, x: np.ndarray) -> str:
     shapes = [np.shape(each) for each in planes] if isinstance(planes, tuple) else type(planes).__name__
     if shapes != [x.shape, x.shape[:1]]:
         return f"planes returned {shapes} for positions {x.shape}; {must}"
-    for place, normal, offset in zip(x.tolist(), *map(np.ndarray.tolist, map(np.asarray, planes)), strict=True):
-        if not _is_plane(normal, offset):
-            return f"planes returned the normal {normal} and the offset {offset} at {place}; {must}"
+    normals, offsets = map(np.asarray, planes)
+    right = (np.abs(np.linalg.norm(normals, axis=1) - 1.0) < 1e-6) & np.isfinite(offsets)
+    if not right.all():
+        at = int(np.argmin(right))
+        found = f"the normal {normals[at].tolist()} and the offset {offsets[at]} at {x[at].tolist()}"
+        return f"planes returned {found}; {must}"
     return ""
 
 

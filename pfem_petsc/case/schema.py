@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from ..errors import InputError
+from ..mechanics.materials.base import law_of
 from ..registry import add_plugin, has_plugin, nearest
 from .editing import (
     TABLES,
@@ -252,6 +253,8 @@ class Case(_Tables):
         models = [
             _validated(stage.data, each, problems, stage.place) for stage, each in zip(stages, reading[1:], strict=True)
         ]
+        if model is not None and None not in models and not lenient:
+            _check_sections(model, models, problems)
         problems.raise_if_any()
         missing = dict.fromkeys(text for each in reading for text in each.missing)
         if missing:
@@ -412,6 +415,27 @@ def _validated(
     elsewhere = ("stage", *ANALYSES) if "stage" in data else ()
     known = {key: value for key, value in data.items() if key in KEYS and value is not None and key not in elsewhere}
     return problems.validated(CaseModel, known, reading, place)
+
+
+def _check_sections(model: CaseModel, stages: list[CaseModel], problems: Problems) -> None:
+    """Refuse keys of sections that would have no effect."""
+    wind = any(each.wind is not None for each in (model, *stages))
+    for name, section in model.section.items():
+        for key in ("diameter", "drag_coefficient"):
+            if getattr(section, key) is not None and not wind:
+                text = "has an effect in wind alone: remove the key, or give [wind]"
+                problems.add(("section", name, key), text, getattr(section, key))
+        material = model.material.get(section.material)
+        if material is None or law_of(material).bar_data:  # whose law may use the shape
+            continue
+        warned = not material.describes_buckling and (section.shape is not None or section.second_moment is not None)
+        if section.effective_length != 1.0 and not warned:
+            text = "has no effect: bars of this material and section are not checked for buckling; remove the key"
+            problems.add(("section", name, "effective_length"), text, section.effective_length)
+        path = ("section", name, "thickness")
+        if path in problems.overridden and not (wind and section.diameter is None):
+            text = "changes no result: stiffness and mass follow from area, and the law does not buckle; change area"
+            problems.add(path, text, section.thickness)
 
 
 def _add_plugins(given: Any, folder: Path, problems: Problems) -> None:

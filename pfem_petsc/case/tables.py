@@ -667,8 +667,17 @@ class Modes(StrictModel):
     """natural frequencies, or linear buckling factors of the load"""
     mass: Literal["lumped", "consistent"] | None = None
     """mass matrix; default: that of [time], lumped without it"""
+    linear: bool = False
+    """whether buckling factors are of the axial forces that a linear solve gives for what changes from the start of the
+    analysis to its end, or for all loads without one"""
     solver: Literal["auto", "dense", "scipy", "slepc"] = "auto"
     """library that solves the eigenvalue problem"""
+
+    @model_validator(mode="after")
+    def _linear_buckling(self) -> Modes:
+        if self.linear and self.kind != "buckling":
+            raise InputError('linear = true is of kind = "buckling"')
+        return self
 
 
 class Probe(StrictModel):

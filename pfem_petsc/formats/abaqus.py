@@ -91,9 +91,9 @@ def _analysis(block: Block) -> tuple[dict[str, dict[str, Any]], str]:
             return {"time": {"integrator": "generalized_alpha", "step": step, "end": period}}, f"{told}, for all steps"
         case "FREQUENCY" | "BUCKLE" as keyword:
             told = "" if first else "a limit of the frequencies is not supported: modes.count = 10"
-            modes = {"count": int(first) or 10, "kind": "vibration" if keyword == "FREQUENCY" else "buckling"}
-            # buckling factors are those of the loads of the step, which a static analysis applies
-            return ({"static": {"step": 1.0}} if keyword == "BUCKLE" else {}) | {"modes": modes}, told
+            # a linear perturbation: buckling factors are those of the loads of the step
+            kind = {"kind": "vibration"} if keyword == "FREQUENCY" else {"kind": "buckling", "linear": True}
+            return {"modes": {"count": int(first) or 10, **kind}}, told
     return {}, f"the first step is left out: the program has no *{block.keyword}"
 
 

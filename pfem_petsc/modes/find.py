@@ -19,6 +19,7 @@ from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..output.units import TIME
 from ..stepping.plan import Plan, refuse_motion
 from ..stepping.stepper import Solution, Stepper
+from .linear import linear_forces
 from .pencil import Holds, Pencil, StateMatrices, buckling_bars, join
 from .solvers import SOLVERS, Dense, Lanczos, Slepc
 
@@ -197,8 +198,14 @@ def describe_modes(model: Model) -> dict[str, str]:
     free = 3 * model.mesh.n_nodes - model.comm.allreduce(model.supports.number)
     name = choose(case.modes, free, case.source)
     what = "natural vibrations" if case.modes.kind == "vibration" else "buckling modes"
+    state = "linear forces about the start" if case.modes.linear else "the state at the end"
+    if case.modes.linear and case.time is not None:
+        raise InputError(
+            f"{case.source}: modes.linear = true: the forces of a motion ([time]) are not those of a linear solve; "
+            "use [static], or no analysis"
+        )
     mass = f", {case.modes.mass or case.mass} mass" if case.modes.kind == "vibration" else ""
-    return {"modes": f"{min(case.modes.count, free)} {what} of the state at the end{mass}, solver {name}"}
+    return {"modes": f"{min(case.modes.count, free)} {what} of {state}{mass}, solver {name}"}
 
 
 def choose(settings: Modes, free: int, source: str) -> str:
@@ -244,6 +251,7 @@ _AGAIN = 3  # modes requested in a search for missed ones
 _SEARCHES = 40
 _NOTHING = 1e-10  # relative to the largest theta: smaller ones belong to directions in which A is zero
 _DEPENDENT = 1e-10  # eigenvalue of a Gram matrix of unit vectors below which they are dependent
+_NONLINEAR = 0.01  # relative difference of axial forces from those of a linear solve, beyond which users are told
 _NO_LOAD = 1e-12  # relative to the axial stiffness: smaller axial forces over the length count as zero
 
 
@@ -259,6 +267,9 @@ class Found:
     negative : number of negative eigenvalues of vibrations
     solver : description
     at_walls : number of nodes in contact with walls
+    forces : (2, local bars) axial forces of which the second are multiplied by the factors of buckling [N]
+    linear : whether these are of a linear solve
+    doubts : what makes the modes doubtful
     """
 
     kind: str
@@ -267,6 +278,9 @@ class Found:
     negative: int
     solver: str
     at_walls: int
+    forces: np.ndarray | None = None
+    linear: bool = False
+    doubts: tuple[str, ...] = ()
 
     @property
     def values(self) -> np.ndarray:
@@ -300,7 +314,7 @@ class _Search:
     """The search for the modes of a state. Methods are collective."""
 
     def __init__(self, model: Model, state: State, settings: Modes) -> None:
-        self.model, self.state, self.holds = model, state, Holds(model, state)
+        self.model, self.state, self.holds, self.linear = model, state, Holds(model, state), settings.linear
         self.source = model.case.source
         self.free = 3 * model.mesh.n_nodes - self.holds.number
         if self.free == 0:
@@ -340,14 +354,25 @@ class _Search:
 
     def buckling(self, matrices: StateMatrices) -> Found:
         """Return the buckling modes: theta = 1/lambda of -Kg x = theta K0 x."""
-        comm, holds = self.model.comm, self.holds
-        material, geometric = buckling_bars(self.model, self.state.x)
+        comm, holds, doubts = self.model.comm, self.holds, []
+        if self.linear:
+            static = self.model.case.static
+            end = 0.0 if static is None else getattr(static.parameters, "end", None) or 1.0
+            found = linear_forces(self.model, matrices, 0.0, float(end), loaded=static is not None)
+            material, forces = found.stiffness, np.stack([found.start, found.change])
+            geometric = material.copy()
+            geometric[4] = found.change / found.lengths
+            geometric[3] = -geometric[4]
+        else:
+            material, geometric = buckling_bars(self.model, self.state.x)
+            forces = np.stack([np.zeros_like(geometric[4]), geometric[4] * self.model.bars.mesh_lengths])
+            doubts = self._nonlinear(matrices, forces[1])
         largest = np.array([np.abs(geometric[4]).max(initial=0.0), np.abs(material[3]).max(initial=0.0)])
         comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
         if largest[0] <= _NO_LOAD * largest[1]:
             raise SimulationFailure(
-                f'{self.source}: modes: kind = "buckling" uses the axial forces of the state as the reference load, '
-                "and the state has none: give the case an analysis that loads the truss ([static] with a small load)"
+                f'{self.source}: modes: kind = "buckling" multiplies axial forces by the factors, and there are none: '
+                "give the case loads, and modes.linear = true or an analysis that loads the truss ([static])"
             )
         geometric[3:] *= -1.0
         a = matrices.stiffness(geometric, 0.0, springs=False)
@@ -372,7 +397,28 @@ class _Search:
         peaks = np.abs(shapes).max(axis=(1, 2), initial=0.0)
         comm.Allreduce(MPI.IN_PLACE, peaks, op=MPI.MAX)
         shapes /= peaks[:, None, None]
-        return Found("buckling", 1.0 / theta, shapes, 0, solver.name, holds.at_walls)
+        return Found(
+            "buckling", 1.0 / theta, shapes, 0, solver.name, holds.at_walls, forces, self.linear, tuple(doubts)
+        )
+
+    def _nonlinear(self, matrices: StateMatrices, force: np.ndarray) -> list[str]:
+        """Return a text if the axial forces (b,) of a static state differ noticeably from those of a linear solve."""
+        if self.model.case.static is None:
+            return []
+        try:
+            found = linear_forces(self.model, matrices, 0.0, self.state.time, loaded=True)
+        except SimulationFailure:
+            return []
+        linear = found.start + found.change
+        sizes = np.array([np.abs(force - linear).max(initial=0.0), np.abs(linear).max(initial=0.0)])
+        self.model.comm.Allreduce(MPI.IN_PLACE, sizes, op=MPI.MAX)
+        if not sizes[0] > _NONLINEAR * sizes[1]:
+            return []
+        return [
+            f"the axial forces of the state differ from those of a linear solve by up to {sizes[0]:.3g} N, "
+            f"{100.0 * sizes[0] / sizes[1]:.2g} % of the largest of these: the buckling factors depend on the load of "
+            "the state. Set modes.linear = true for the factors of linear forces, or load the truss less"
+        ]
 
     def _lowest(
         self,
@@ -454,21 +500,18 @@ def _products(matrix: PETSc.Mat, vectors: np.ndarray) -> np.ndarray:
     return products
 
 
-def weakest_member(model: Model, x: np.ndarray) -> tuple[float, int] | None:
-    """Return the smallest factor pi^2 E I/((K L)^2 |N|) of the compressed bars, and the number of that bar. Collective.
+def weakest_member(model: Model, forces: np.ndarray) -> tuple[float, int] | None:
+    """Return the smallest factor of the second of two axial forces (2, local bars) [N] at which their sum is Euler's
+    load -pi^2 E I/(K L)^2 of a bar, and the number of that bar. Collective.
 
     L is the length in the mesh, and I, K are those of the section; bars whose section has no shape are left out. None
     if there are no such bars.
 
-    Parameters
-    ----------
-    model : Model
-    x : local positions of the state [m]
     """
-    counted, force = model.mesh.counted, model.bars.fields(x)["axial_force"]
-    ids, force, euler = (values[counted] for values in (model.mesh.bar_ids, force, model.bars.euler_loads()))
+    values = model.mesh.bar_ids, *forces, model.bars.euler_loads()
+    ids, start, force, euler = (each[model.mesh.counted] for each in values)
     pressed = np.flatnonzero((force < 0.0) & (euler < np.inf))
-    factors = euler[pressed] / -force[pressed]
+    factors = (euler + start)[pressed] / -force[pressed]
     best = min(zip(factors.tolist(), ids[pressed].tolist(), strict=True), default=(np.inf, -1))
     factor, bar = min(model.comm.allgather(best))
     return (factor, bar) if bar >= 0 else None

@@ -88,6 +88,8 @@ def record_modes(stepper: Stepper, writer: ResultWriter, folder: Path, progress:
         progress.message(text)
     if found.kind == "buckling":
         _tell_members(stepper, found, progress)
+    for text in found.doubts:
+        progress.warning(text)
     if found.negative:
         are = "eigenvalues are" if found.negative > 1 else "eigenvalue is"
         progress.warning(
@@ -100,7 +102,7 @@ def _tell_members(stepper: Stepper, found: Found, progress: Progress) -> None:
     """Report the first bar that buckles as a column, which the factors of the truss do not contain. Collective."""
     from ..modes.find import weakest_member
 
-    weakest = weakest_member(stepper.model, stepper.state.x)
+    weakest = weakest_member(stepper.model, found.forces)
     if weakest is None:
         return
     factor, bar = weakest
@@ -115,7 +117,8 @@ def _tell_members(stepper: Stepper, found: Found, progress: Progress) -> None:
 
 def _told(found: Found, asked: int) -> list[str]:
     name, unit = MODE_VALUES[found.kind]
-    head = "natural frequencies" if found.kind == "vibration" else "buckling: factors of the axial forces"
+    of = "changes of the axial forces by a linear solve" if found.linear else "axial forces"
+    head = "natural frequencies" if found.kind == "vibration" else f"buckling: factors of the {of}"
     lines = [f"modes by {found.solver}"]
     if found.at_walls:
         lines.append(

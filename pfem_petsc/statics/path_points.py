@@ -142,6 +142,12 @@ class BorderedSystem:
         self.hessian.update(self.problem, u)
         self._ksp.setOperators(self.hessian.mat, self.hessian.mat)
 
+    def linearise_unloading(self) -> None:
+        """Evaluate the stiffness with which the state resists small displacements: of bars that yield, that of
+        unloading. Collective."""
+        self.hessian.put(self.problem, self.model.bars.state_stiffness(self.problem.state.x))
+        self._ksp.setOperators(self.hessian.mat, self.hessian.mat)
+
     def solve(self, b: np.ndarray) -> np.ndarray:
         """Return K^-1 b (owned, 3), zero at prescribed components. Collective.
 
@@ -293,6 +299,9 @@ class Linear:
 
 
 _ITERATIONS = 20  # Newton iterations of a point: more are no sign of a path
+_CAREFUL = 3  # times as many where steps are shortened
+_SEARCHES = 12  # for the share of a step
+_DECREASE = 0.5  # of the residual along a step
 _CLOSE = 1e-10  # value of the constraint, over the length of the step
 _NEAR = 1e-6  # the same, where it no longer falls
 
@@ -444,17 +453,36 @@ class PointSolver:
         NotConverged
             On all ranks.
         """
-        start = self.state.time
-        u, load_factor, newton = self.newton(constraint, u.copy(), load_factor)
+        start, guess = self.state.time, (u, load_factor)
+        try:
+            u, load_factor, newton = self.newton(constraint, u.copy(), load_factor)
+        except NotConverged:
+            if not self.model.bars.kept_names:
+                raise
+            # where bars begin to yield and others to unload, full steps may alternate between two sets of moduli
+            if isinstance(constraint, Arc):
+                constraint = self._work(guess[0])
+            u, load_factor, newton = self.newton(constraint, *self._unloading(constraint, *guess), careful=True)
         tangent, slope = self.tangent(u, load_factor)
         if self.metric.product(u, load_factor - start, tangent, slope) < 0.0:
             tangent, slope = -tangent, -slope
         negatives, nearest = self.spectrum(u)
         return Point(u, load_factor, start, tangent, slope, negatives, nearest, newton)
 
-    def newton(self, constraint: Arc | Linear, u: np.ndarray, load_factor: float) -> tuple[np.ndarray, float, int]:
+    def newton(
+        self, constraint: Arc | Linear, u: np.ndarray, load_factor: float, careful: bool = False
+    ) -> tuple[np.ndarray, float, int]:
+        """Return displacement, load factor and number of iterations of the point, from a guess, in place. Collective.
+
+        ``careful`` : whether steps are along a falling potential, and shortened where the residual along them rises
+
+        Raises
+        ------
+        NotConverged
+            On all ranks.
+        """
         system, start = self.system, self.state.time
-        most = min(self.model.case.solver.max_newton, _ITERATIONS)
+        most = min(self.model.case.solver.max_newton, (_CAREFUL if careful else 1) * _ITERATIONS)
         comm = self.model.comm
         system.prescribe(u, load_factor)
         g, previous, before = np.empty_like(u), np.inf, np.inf
@@ -475,20 +503,70 @@ class PointSolver:
             previous, before = norm, off
             if iteration == most:
                 break
-            system.linearise(u)
-            r, v = system.solve(-g), system.response(u, load_factor)
-            along = comm.allreduce(np.array([(by_u * r).sum(), (by_u * v).sum()]))
-            rate = float(along[1]) + by_load
-            if rate == 0.0:
-                raise NotConverged(f"{self.place}: the load does not move the truss in the direction of the path")
-            change = -(value + along[0]) / rate
-            u += r + change * v
-            load_factor += float(change)
+            step, change = self._step(constraint, u, load_factor, g)
+            share = 1.0
+            if careful:
+                slope = dot(comm, g, step)
+                if slope > 0.0:  # of a saddle
+                    step, change = -step, -change
+                share = self._share(u, load_factor, step, change, -abs(slope))
+            u += share * step
+            load_factor += share * change
             system.prescribe(u, load_factor)
         raise NotConverged(
             f"{self.place}: no convergence after {most} Newton iterations: residual {norm:.3g} N, required "
             f"{tolerance.residual:.3g} N"
         )
+
+    def _work(self, u: np.ndarray) -> Linear:
+        """Return the constraint of the point at which the load has done the work of a displacement (owned, 3), under
+        which equilibria without a change of sign are minima of the potential. Collective."""
+        load = self.system.rate(np.zeros_like(u), self.state.time)
+        target = dot(self.model.comm, load, u)
+        return Linear(self.model.comm, load, target, 1.0, abs(target) or 1.0)
+
+    def _unloading(self, constraint: Arc | Linear, u: np.ndarray, load_factor: float) -> tuple[np.ndarray, float]:
+        """Return the point on the tangent of a state whose bars unload, as far as a guess. Collective."""
+        system, start, g = self.system, self.state.time, np.empty_like(u)
+        value, by_u, by_load = constraint.terms(u, load_factor - start)
+        system.residual(np.zeros_like(u), start, g)
+        system.linearise_unloading()
+        r, v = system.solve(-g), system.response(np.zeros_like(u), start)
+        sums = self.model.comm.allreduce(np.array([(by_u * (u - r)).sum(), (by_u * v).sum()]))
+        change = float((sums[0] + by_load * (load_factor - start) - value) / (sums[1] + by_load))
+        return r + change * v, start + change
+
+    def _step(
+        self, constraint: Arc | Linear, u: np.ndarray, load_factor: float, g: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """Return a Newton step (owned, 3) and its change of the load factor, at residuals (owned, 3). Collective."""
+        system = self.system
+        system.linearise(u)
+        value, by_u, by_load = constraint.terms(u, load_factor - self.state.time)
+        r, v = system.solve(-g), system.response(u, load_factor)
+        along = self.model.comm.allreduce(np.array([(by_u * r).sum(), (by_u * v).sum()]))
+        rate = float(along[1]) + by_load
+        if rate == 0.0:
+            raise NotConverged(f"{self.place}: the load does not move the truss in the direction of the path")
+        change = float(-(value + along[0]) / rate)
+        return r + change * v, change
+
+    def _share(self, u: np.ndarray, load_factor: float, step: np.ndarray, change: float, slope: float) -> float:
+        """Return the share of a step at whose end the residual along it is smaller than at its start, where it is
+        ``slope`` [J]. Collective."""
+        low, high, share, g = 0.0, 1.0, 1.0, np.empty_like(u)
+        for _ in range(_SEARCHES):
+            there, factor = u + share * step, load_factor + share * change
+            self.system.prescribe(there, factor)
+            self.system.residual(there, factor, g)
+            along = dot(self.model.comm, g, step)
+            if abs(along) <= _DECREASE * abs(slope):
+                break
+            low, high = (share, high) if along < 0.0 else (low, share)
+            if high == 1.0 == share:
+                break
+            share = 0.5 * (low + high)
+        return share
 
     def tolerance(self, u: np.ndarray, load_factor: float, size: float) -> Tolerance:
         """Return when a point is balanced: to ``solver.rtol`` of external and internal forces."""

@@ -15,6 +15,7 @@ from ..stepping.stepper import AttributeOf, Solution
 from ..tolerances import TIME
 from .critical import EVENTS, CriticalPoints, Event
 from .equilibrium import PathEquilibrium
+from .jumps import JumpSearch, Place
 from .path_points import (
     Arc,
     ArcControl,
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 
 _UNRESOLVED = 2.0**-6  # of the first length, down to which a step is halved if a critical point is not located
 _TURN = 0.5  # cosine between tangents of successive points, below which the step is halved if possible
+_TURNS_BACK = 0.1  # displacement along the direction per length, over that of the first response, close to a turn
+_JUMPS = "the truss jumps"
 _FACTORS = 0.5, 1.5  # of the length from point to point
 PARTED = "no remaining bar carries the load"
 
@@ -258,9 +261,13 @@ class PathStepper(StaticStepper):
 
     def _no_path(self, failure: NotConverged) -> SimulationFailure:
         """Return the message about a path that cannot be continued."""
-        hint = ""
+        hint = "; a smaller static.min_step or another static.step may pass"
         if self.scale:
-            hint = '; if the displacement along static.direction turns back, static.method = "arc_length" continues'
+            along = self.direction.of(self.state.memory["tangent"]) / self.scale
+            if failure.kind == _JUMPS or along < _TURNS_BACK:
+                hint = '; the displacement along static.direction turns back: static.method = "arc_length" continues'
+            elif self.model.bars.kept_names:
+                hint = f'; bars may begin to yield, unload or slacken there{hint}, or static.method = "arc_length"'
         return SimulationFailure(
             f"the path cannot be followed beyond point {self.state.step} at load factor {self.state.time:.6g} with "
             f"steps down to {self.keys.smallest:.3g}: {failure}{hint}{free_motions(self.model, self.state)}"
@@ -318,7 +325,9 @@ class PathStepper(StaticStepper):
             point = self.points.find(self.control.constraint(size), guess, load_factor)
         self._suspect(point, guess)
         if not self.turning:
-            self._refuse_turn(point, size)
+            point = self._refuse_turn(point, size)
+            if self.scale:
+                self._refuse_jump(point, size)
         point, reached = self._end_at_limit(point)
         if self.turning or self.points.stability is None:
             return point, [], reached
@@ -339,24 +348,51 @@ class PathStepper(StaticStepper):
             events = []
         return point, events, reached
 
-    def _refuse_turn(self, point: Point, size: float) -> None:
+    def _refuse_turn(self, point: Point, size: float) -> Point:
         """Refuse a tangent that has turned too far: it belongs to another path, or the step has cut a corner.
+
+        Returns the point, with the tangent that continues the path.
 
         Raises
         ------
         NotConverged
             On all ranks.
         """
+        cornered = bool(self.scale and self.model.bars.kept_names)
+        if cornered and self.direction.of(point.tangent) < 0.0:  # where bars yield the path may turn by any angle
+            point = replace(point, tangent=-point.tangent, slope=-point.slope)
         cosine = self.metric.product(point.tangent, point.slope, self.state.memory["tangent"], self.slope)
         if cosine < _TURN and 0.5 * size >= self.keys.smallest:
             raise NotConverged(
                 f"{self.points.place}: the path turns by {np.degrees(np.arccos(max(cosine, -1.0))):.3g} degrees"
             )
-        if self.scale and cosine < 0.0:
-            raise NotConverged(
-                f"{self.points.place}: the displacement along static.direction turns back; static.method = "
-                '"arc_length" follows the path'
-            )
+        if self.scale and cosine < 0.0 and not cornered:
+            raise NotConverged(f"{self.points.place}: the path turns by more than 90 degrees", _JUMPS)
+        return point
+
+    def _refuse_jump(self, point: Point, size: float) -> None:
+        """Refuse a point to which the truss jumps, as where the displacement turns back.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks.
+        """
+        state, change = self.state, point.load_factor - self.state.time
+
+        def between(part: float, guess: np.ndarray) -> Place | None:
+            u = guess[: len(point.u)] - state.position
+            try:
+                u, load_factor, _ = self.points.newton(
+                    self.control.constraint(part * size), u, state.time + part * change
+                )
+            except NotConverged:
+                return None
+            return Place(part, load_factor, self.with_ghosts(state.position + u).copy())
+
+        last = Place(1.0, point.load_factor, self.with_ghosts(state.position + point.u).copy())
+        for jump in JumpSearch(self.model, between).look(Place(0.0, state.time, state.x), last):
+            raise NotConverged(f"{self.points.place}: {jump}", _JUMPS)
 
     def _suspect(self, point: Point, guess: np.ndarray) -> None:
         """Refuse a point that is unrelated to the last one.

@@ -398,6 +398,7 @@ class RelaxationStepper(StaticStepper):
 
     kept_numbers = (*StaticStepper.kept_numbers, "pseudo_steps", "residual")
     columns = (*StaticStepper.columns, "pseudo_steps", "residual")
+    finds_jumps = False
 
     def __init__(self, model: Model, choice: LinearChoice, parameters: RelaxationKeys) -> None:
         _check(model)

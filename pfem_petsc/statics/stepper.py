@@ -23,6 +23,7 @@ from ..stepping.plan import Plan, refuse_motion
 from ..stepping.stepper import Solution
 from ..tolerances import TIME
 from .equilibrium import Equilibrium, problem_at_rest
+from .jumps import Jump, JumpSearch, Place
 from .path_points import BorderedSystem
 from .stability import LARGEST, LARGEST_WITH_MUMPS, ZERO, Stability, free_motions, held_nodes, is_indefinite, stiffest
 
@@ -71,10 +72,12 @@ class StaticStepper(ImplicitStepper):
     dissipated : energy dissipated by the viscosity of ``stabilise`` [J]
     exceeded : whether its share has exceeded the largest
     negatives : number of negative eigenvalues of the stiffness at the last load factor, -1 if unknown, UNCOUNTED
+    finds_jumps : whether increments follow a path, and jumps are told
     """
 
     kept_numbers = (*ImplicitStepper.kept_numbers, "increment", "viscosity", "dissipated", "exceeded", "negatives")
     columns = ("load_factor",)
+    finds_jumps = True
     remedy = "reduce static.step"
 
     def __init__(
@@ -88,6 +91,7 @@ class StaticStepper(ImplicitStepper):
         self.viscosity, self.dissipated, self.exceeded = _LEAST, 0.0, False
         self.negatives = -1
         self._external = self.state.external  # of the last load factor
+        self._jumps: list[Jump] = []  # in the last increment
         self.limits, self.increment, self.end = limits, limits.step, limits.end
 
     @property
@@ -163,6 +167,7 @@ class StaticStepper(ImplicitStepper):
                     raise self._no_further(failure) from failure
                 size *= 0.5
                 self.tell_failure(failure, f"halving the increment, to {size:.4g}")
+        self._tell_jumps()
         self.increment = size
         if self.solution.newton <= _FEW:
             self.increment = max(size, min(_GROWTH * size, self.limits.largest))
@@ -309,6 +314,63 @@ class StaticStepper(ImplicitStepper):
         change = self.model.comm.allreduce(float(((self.state.external - self._external) ** 2).sum()))
         guess = self.model.case.solver.rtol * float(np.sqrt(change)) if change else required
         return super()._tolerance(required)._replace(guess=min(guess, required))
+
+    def solve(self, balance: Balance) -> Solution:
+        """See :meth:`~pfem_petsc.stepping.stepper.Stepper.solve`; jumps of an increment are found. Collective."""
+        begun = self._solved
+        solution = super().solve(balance)
+        looks = self.finds_jumps and balance.time > self.state.time
+        self._jumps = self._jumps_to(balance, solution, begun) if looks else []
+        return solution
+
+    @property
+    def _solved(self) -> tuple:
+        """What a solve changes."""
+        state = self.state
+        return state.external, state.contact, state.support, self.held, self.model.links.state, self.resolution.numbers
+
+    @_solved.setter
+    def _solved(self, values: tuple) -> None:
+        state = self.state
+        state.external, state.contact, state.support, self.held, self.model.links.state, self.resolution.numbers = (
+            values
+        )
+
+    def _jumps_to(self, balance: Balance, solution: Solution, begun: tuple) -> list[Jump]:
+        """Return the jumps between the state and the solution of a balance; ``begun``: :attr:`_solved` before it.
+        Collective."""
+        state, solved = self.state, self._solved
+        after = self.with_ghosts(balance.predictor + solution.u).copy()
+
+        def between(part: float, guess: np.ndarray) -> Place | None:
+            inner = self.scheme.balance(state, part * (balance.time - state.time))
+            self._solved = begun
+            state.external = self.load_of(inner)
+            u = guess[: len(inner.predictor)] - inner.predictor
+            self.model.supports.put(u, self.model.supports.lacking(inner.predictor, inner.time))
+            try:
+                found = self._solve(inner, u)
+            except NotConverged:
+                return None
+            return Place(part, inner.time, self.with_ghosts(inner.predictor + found.u).copy())
+
+        try:
+            return JumpSearch(self.model, between).look(
+                Place(0.0, state.time, state.x), Place(1.0, balance.time, after)
+            )
+        finally:
+            self._solved = solved
+
+    def _tell_jumps(self) -> None:
+        """Warn of the jumps of the last increment."""
+        for jump in self._jumps:
+            follow = "[time] follows the motion"
+            if not self.model.can_touch:
+                follow = f'static.method = "arc_length" or "displacement" follows the path in between, and {follow}'
+            self.message(
+                f"step {self.number + 1}: {jump}: it is beyond a limit point or a bifurcation, and at rest again after "
+                f"the motion that the released energy drives; {follow}"
+            )
 
     def _untouched(self) -> bool:
         """Return whether contact is possible and nothing is in contact at the start of the increment. Collective."""

@@ -271,8 +271,10 @@ def add_initial_stress(mesh: WholeMesh, deck: Deck) -> list[str]:
             told.append(f"{where}: {', '.join(words)[:60]!r} is left out: expected elements and their stress")
         elif len(values) == 7:  # of CalculiX: an integration point, and components along the axes of the model
             _, xx, yy, zz, xy, xz, yz = values
-            pulled = across[members] @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-            stress[members] += np.einsum("ij,ij->i", pulled, across[members]) / (across[members] ** 2).sum(axis=1)
+            tensor, along = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), across[members]
+            with np.errstate(invalid="ignore"):  # of bars without length, which a case refuses
+                share = np.einsum("ij,jk,ik->i", along, tensor, along) / (along**2).sum(axis=1)
+            stress[members] += np.nan_to_num(share)
             count[members] += 1.0
         else:
             stress[members], count[members] = values[0], 1.0
@@ -321,7 +323,7 @@ class Conditions:
     def __init__(self, mesh: WholeMesh, deck: Deck) -> None:
         self._mesh, self._deck = mesh, deck
         self._told: list[str] = []
-        self._in_step = False
+        self._in_step, self._over = False, ()
         self._names = {name.upper(): name for name in mesh.node_groups}
         step = deck.procedure
         self._static = step is not None and step.keyword in ("STATIC", "BUCKLE")
@@ -334,8 +336,9 @@ class Conditions:
         self._held = np.zeros((len(mesh.points), 3), np.int64)
         """Number of the motion of each component from 1 on; 0: free."""
         self._forces: dict[tuple[str, Rows], np.ndarray] = {}
-        self._gravity: list[tuple[np.ndarray, Rows]] = []
-        self._temperatures: list[tuple[np.ndarray, float, Block]] = []
+        self._gravity: dict[tuple[tuple[float, ...], Rows], tuple[str, np.ndarray]] = {}
+        """By vectors and their factors: the first line, and how often each bar has it."""
+        self._temperatures: list[tuple[np.ndarray, float, Rows]] = []
 
     def add(self) -> list[str]:
         """Add the tables to the mesh, and return what is to be said."""
@@ -346,12 +349,13 @@ class Conditions:
                 replaced = True
                 self._supports.clear()
                 self._held[:] = 0
-            self._in_step = in_step
+            self._in_step, self._over = in_step, self._rows(block)
             told: dict[str, list[str]] = {}
             for where, words in block.lines():
+                self._line = f"{where}: {', '.join(words)[:60]!r}"
                 reason = kinds[block.keyword](block, words)
                 if reason:
-                    told.setdefault(reason, []).append(f"{where}: {', '.join(words)[:60]!r}")
+                    told.setdefault(reason, []).append(self._line)
             for reason, lines in told.items():
                 more = f" (and {len(lines) - 1} more lines)" if len(lines) > 1 else ""
                 self._told.append(f"{lines[0]}{more} is {reason}")
@@ -392,12 +396,12 @@ class Conditions:
             or found.get("VALUE", "RELATIVE").upper() != "RELATIVE"
         ):
             told = "only tables of factors are read"
-        elif pairs is None or len(pairs) % 2 or len(pairs) == 0 or (np.diff(pairs[::2]) <= 0.0).any():
+        elif pairs is None or len(pairs) % 2 or not np.isfinite(pairs).all() or not (np.diff(pairs[::2]) > 0.0).all():
             told = "expected pairs of times, which increase, and factors"
         else:
             scale = self._period if self._static else 1.0
             rows = [(short(time / scale), factor) for time, factor in pairs.reshape(-1, 2).tolist()]
-            return tuple(rows if len(rows) > 1 else [rows[0], (rows[0][0] + 1.0, rows[0][1])])
+            return tuple(rows if len(rows) != 1 else [rows[0], (rows[0][0] + 1.0, rows[0][1])])
         text = f"{block.where}: AMPLITUDE={name} is left out: {told}"
         self._told += [text] if text not in self._told else []
         return ()
@@ -419,9 +423,9 @@ class Conditions:
         values = np.array([value_of(words, at) for at in range(2, 6)])
         if not np.isfinite(values).all():
             return "left out: expected numbers"
-        if words[0] and len(self._deck.members_of("ELSET", block, words[0])) < len(self._mesh.bars):
-            return "left out: the gravity of a case acts on all bars"
-        self._gravity.append((values[0] * values[1:], self._rows(block)))
+        key = tuple((values[0] * values[1:]).tolist()), self._over
+        _, times = self._gravity.setdefault(key, (self._line, np.zeros(len(self._mesh.bars), np.int64)))
+        times[self._deck.members_of("ELSET", block, words[0]) if words[0] else slice(None)] += 1
         return ""
 
     def _push(self, block: Block, words: list[str]) -> str:
@@ -430,7 +434,7 @@ class Conditions:
             return "left out: only forces along x, y and z are read"
         name, _ = self._group(block, words[0])
         if name:
-            self._forces.setdefault((name, self._rows(block)), np.zeros(3))[int(axis) - 1] += value
+            self._forces.setdefault((name, self._over), np.zeros(3))[int(axis) - 1] += value
         return "" if name else "left out: it names no node where a bar ends"
 
     def _hold(self, block: Block, words: list[str]) -> str:
@@ -454,8 +458,7 @@ class Conditions:
 
     def _motion(self, block: Block, value: float) -> tuple[tuple[str, Rows], str]:
         """Return a motion, as the key of a support and its rows, and what is to be said about one that is not there."""
-        kind, rows = block.get("TYPE", "DISPLACEMENT").upper(), self._rows(block)
-        told = ""
+        kind, rows = block.get("TYPE", "DISPLACEMENT").upper(), self._over
         if not self._in_step or not (self._static or self._dynamic):
             told = "no *STATIC or *DYNAMIC step moves it"
         elif "FIXED" in block.parameters:
@@ -478,7 +481,7 @@ class Conditions:
             return "left out: expected nodes and a temperature"
         if not (self._static or self._dynamic):
             return "left out: temperatures act in *STATIC and *DYNAMIC steps"
-        self._temperatures.append((self._deck.members_of("NSET", block, words[0]), value, block))
+        self._temperatures.append((self._deck.members_of("NSET", block, words[0]), value, self._over))
         return ""
 
     def _group(self, block: Block, target: str) -> tuple[str, np.ndarray]:
@@ -542,11 +545,16 @@ class Conditions:
         return tables
 
     def _gravity_tables(self) -> dict[str, dict[str, Any]]:
-        total = sum((vector for vector, _ in self._gravity), np.zeros(3))
-        if not any(rows for _, rows in self._gravity):
+        every: list[tuple[np.ndarray, Rows]] = []
+        for (vector, rows), (line, count) in self._gravity.items():
+            every.append((count.min() * np.array(vector), rows))
+            if count.max() > count.min():
+                self._told.append(f"{line} is left out: the gravity of a case acts on all bars")
+        total = sum((vector for vector, _ in every), np.zeros(3))
+        if not any(rows for _, rows in every):
             return {"gravity": {"acceleration": total.tolist()}} if total.any() else {}
-        times = self._times([rows for _, rows in self._gravity])
-        over = sum(np.outer(self._factors(rows, times), vector) for vector, rows in self._gravity)
+        times = self._times([rows for _, rows in every])
+        over = sum(np.outer(self._factors(rows, times), vector) for vector, rows in every)
         return {"gravity": {"acceleration": np.column_stack([times, over]).tolist()}}
 
     def _temperature_tables(self) -> dict[str, dict[str, Any]]:
@@ -559,10 +567,9 @@ class Conditions:
                 initial[self._deck.members_of("NSET", block, words[0])] = value
             else:
                 self._told.append(f"{where}: {', '.join(words)[:60]!r} is left out: expected nodes and a temperature")
-        every = [self._rows(block) for _, _, block in self._temperatures]
-        times = self._times(every)
+        times = self._times([rows for _, _, rows in self._temperatures])
         above = np.zeros((len(initial), len(times)))
-        for (members, value, _), rows in zip(self._temperatures, every):
+        for members, value, rows in self._temperatures:
             factors, start = self._factors(rows, times), initial[members][:, None]
             above[members] = factors * value - start if rows else factors * (value - start)
         tables: dict[str, dict[str, Any]] = {}

@@ -217,7 +217,8 @@ def scaled(mesh: WholeMesh, scale: float) -> WholeMesh:
     """Convert a mesh from another unit of length, with newtons and seconds.
 
     Coordinates are multiplied by ``scale`` [m per unit], the field ``area`` and areas of sections by its square,
-    stresses of materials by its power -2, densities by its power -4 (tonnes per cubic millimetre with 0.001).
+    stresses of materials by its power -2, densities by its power -4 (tonnes per cubic millimetre with 0.001), and what
+    else the tables have likewise.
     """
     if not 0.0 < scale < np.inf:
         raise InputError(f"scale: {scale!r} is not a positive number of metres in a unit of the file")

@@ -124,13 +124,20 @@ LEGS, P1, 1.
     assert told == [
         "line 54: *BOUNDARY: 'Top, 1, 3, 0.5' is held where it is: no *STATIC or *DYNAMIC step moves it",
         "line 59: *CLOAD: 'Top, 4, 1.' is left out: only forces along x, y and z are read",
-        "line 63: *DLOAD: 'LEGS, GRAV, 1., 1., 0., 0.' is left out: the gravity of a case acts on all bars",
         "line 64: *DLOAD: 'LEGS, P1, 1.' is left out: only GRAV is read of distributed loads",
+        "line 63: *DLOAD: 'LEGS, GRAV, 1., 1., 0., 0.' is left out: the gravity of a case acts on all bars",
         "line 68: *STEP: left out with all that follows: only the first step is read",
     ]
     case = Case(Truss.read(tmp_path / "a.inp").tables, mesh=Truss.read(tmp_path / "a.inp"), static={"step": 1.0})
     assert [support.fix for support in case.support] == ["xyz", "xyz", "y", "xyz"]
     assert case.node_set["node_21"].group == "node_21"
+
+
+def test_gravity_of_several_sets(tmp_path):
+    """Sets that have all bars together, each once."""
+    step = "*STEP, NLGEOM\n*STATIC\n*DLOAD\nLEGS, GRAV, 2., 0., 0., -1.\nBase, GRAV, 2., 0., 0., -1.\n*END STEP\n"
+    mesh = read_whole(written(tmp_path, FLAT.partition("*STEP")[0] + step))
+    assert mesh.tables["gravity"]["gravity"]["acceleration"] == [0.0, 0.0, -2.0] and len(mesh.warnings) == 1
 
 
 def test_conditions_of_an_assembly(tmp_path):

@@ -200,36 +200,26 @@ def _section_keys(block: Block, rows: np.ndarray, calculix: bool) -> dict[str, A
     if block.keyword == "SOLID SECTION":
         return {"area": a if np.isfinite(a) else 1.0}
     kind = block.get("SECTION", "" if block.keyword == "BEAM SECTION" else "GENERAL").upper()
-    found: dict[str, Any] = {}
-    if kind == "GENERAL":
-        found = {"area": a}
-    elif kind.startswith("RECT"):
-        found = {"area": a * (b if np.isfinite(b) else a)}
-    elif kind.startswith("CIRC") and (calculix or np.isfinite(b)):
-        b = b if np.isfinite(b) else a
-        found = {"area": math.pi / 4 * a * b, **({"shape": "round"} if a == b else {})}
-    elif kind.startswith("CIRC"):
-        found = {"area": math.pi * a * a, "shape": "round"}
-    elif kind.endswith("PIPE"):
-        found = {"area": math.pi * (2.0 * a - b) * b, "shape": "tube", "thickness": b}
-    elif kind == "BOX":
-        found = {"area": a * b - (a - c - e) * (b - d - f)}
-    elif kind == "HEX":
-        found = {"area": 6.0 * a * b - 2.0 * math.sqrt(3.0) * b * b}
-    elif kind == "TRAPEZOID":
-        found = {"area": (a + c) / 2.0 * b}
-    elif kind == "L":
-        found = {"area": a * c + (b - c) * d}
-    elif kind == "I":  # without a flange, a T
-        c, d, e, f = np.nan_to_num([c, d, e, f]).tolist()
-        found = {"area": c * e + d * f + (b - e - f) * g}
-    elif kind == "ARBITRARY" and np.isfinite(a):
+    kind = next((name for name in ("RECT", "CIRC", "PIPE") if name in kind), kind)  # RECTANGULAR, THICK PIPE
+    second = b if np.isfinite(b) else a
+    area = {
+        "GENERAL": a,
+        "RECT": a * second,
+        "CIRC": math.pi * (a * second / 4.0 if calculix or np.isfinite(b) else a * a),
+        "PIPE": math.pi * (2.0 * a - b) * b,
+        "BOX": a * b - (a - c - e) * (b - d - f),
+        "HEX": 6.0 * a * b - 2.0 * math.sqrt(3.0) * b * b,
+        "TRAPEZOID": (a + c) / 2.0 * b,
+        "L": a * c + (b - c) * d,
+        "I": b * g + float(np.nansum([c * e - e * g, d * f - f * g])),  # a T has one flange
+    }.get(kind, np.nan)
+    if kind == "ARBITRARY" and np.isfinite(a):
         corners = np.vstack([rows[0, 1:3], rows[0, 3:5], rows[1 : int(a), :2]])
-        thickness = np.append(f, rows[1 : int(a), 2])
-        found = {"area": float(np.linalg.norm(np.diff(corners, axis=0), axis=1) @ thickness)}
-    if not np.isfinite(found.get("area", np.nan)):
+        area = float(np.linalg.norm(np.diff(corners, axis=0), axis=1) @ np.append(f, rows[1 : int(a), 2]))
+    if not np.isfinite(area):
         return {}
-    return found | {"area": float(f"{found['area']:.15g}")}
+    shapes = {"CIRC": {"shape": "round"} if a == second else {}, "PIPE": {"shape": "tube", "thickness": b}}
+    return {"area": float(f"{area:.15g}"), **shapes.get(kind, {})}
 
 
 def _own_material(mesh: WholeMesh, block: Block, rows: np.ndarray, group: str) -> dict[str, Any]:
@@ -246,7 +236,7 @@ def _own_material(mesh: WholeMesh, block: Block, rows: np.ndarray, group: str) -
         "density": number_of(block.get("DENSITY")),
         "thermal_expansion": float(rows[0, 2]) if len(rows) else np.nan,
     }
-    keys = {key: value for key, value in values.items() if value > 0.0}
+    keys = {key: value for key, value in values.items() if 0.0 < value < np.inf}
     if len(rows) > 1:
         mesh.warnings.append(f"{block.where}: values at the first temperature are taken for all temperatures")
     if not keys:
@@ -649,7 +639,7 @@ class Conditions:
         value = value_of(data[0], 0) if data else np.nan
         if odd or block.get("TYPE", "ISOTROPIC").upper() not in ("ISOTROPIC", "ISO"):
             return f"{odd[0] if odd else 'TYPE=' + block.get('TYPE')} is not read"
-        if not value > 0.0:
+        if not 0.0 < value < np.inf:
             return "expected a positive number"
         if min(nodes) < 0:
             return "no bar ends at their nodes"

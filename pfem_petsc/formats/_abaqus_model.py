@@ -391,14 +391,13 @@ class Deck:
 
     def _at_nodes(self, kind: str, block: Block, where: str, words: list[str]) -> int:
         """Add an element that belongs to nodes, and return its label."""
-        if len(words) != _AT_NODES[kind] + 1:
-            raise InputError(
-                f"{where}: {', '.join(words)[:60]!r} has {len(words)} values; expected {_AT_NODES[kind] + 1}"
-            )
-        nodes = [entry for word in words[1:] for entry in self._named("NSET", block, word, self._scope)]
-        at = [(entry.instance, int(label)) for entry in nodes for label in entry.labels]
+        named = [entry for word in words[1:] for entry in self._named("NSET", block, word, self._scope)]
+        nodes = [(entry.instance, int(entry.labels[0])) for entry in named if len(entry.labels) == 1]
+        if not len(words) - 1 == len(nodes) == _AT_NODES[kind]:
+            text = f"{', '.join(words)[:60]!r} has {len(words)} values"
+            raise InputError(f"{where}: {text}; expected {_AT_NODES[kind] + 1} labels")
         label = _labels(np.array([number_of(words[0])]), block, "element")[0]
-        self._scope.at_nodes.append(AtNodes(kind, int(label), at))
+        self._scope.at_nodes.append(AtNodes(kind, int(label), nodes))
         return int(label)
 
     def _entries(self, kind: str, block: Block) -> Iterator[_Labels]:

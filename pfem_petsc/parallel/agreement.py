@@ -68,7 +68,7 @@ def agreed_call(comm: MPI.Comm, what: str) -> Iterator[None]:
     first = found[0]
     if first < comm.size:
         if error is not None and not isinstance(error, PfemError):
-            failure = SimulationFailure(f"{what} {raised(error)} on rank {comm.rank}")
+            failure = SimulationFailure(f"{what}: the function {raised(error)} on rank {comm.rank}")
             failure.__cause__, error = error, failure
         raise comm.bcast(error, root=first)
 

@@ -12,6 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from functools import cache
 from types import FrameType, TracebackType
 
 from mpi4py import MPI
@@ -21,17 +22,22 @@ __all__ = ["GRACE", "all_arrive", "arrives", "aside", "is_alone", "passes_except
 GRACE = 3.0
 """Seconds in which other ranks must arrive where a rank has failed; after that the job is aborted."""
 
-_ASIDE = MPI.Comm.Create_keyval()
 _TAG = 32001  # of messages at the end
+
+
+@cache
+def _key() -> int:
+    """The key of what :func:`aside` attaches; MPI may start after the import of this module, or not at all."""
+    return MPI.Comm.Create_keyval()
 
 
 def aside(comm: MPI.Comm) -> MPI.Comm:
     """Return a communicator of the same ranks, always the same one, whose messages match no others. The first call is
     collective."""
-    found = comm.Get_attr(_ASIDE)
+    found = comm.Get_attr(_key())
     if found is None:
         found = comm.Dup()
-        comm.Set_attr(_ASIDE, found)
+        comm.Set_attr(_key(), found)
     return found
 
 
@@ -49,7 +55,7 @@ class _Watch:
 
     def begin(self) -> None:
         """Take over exceptions that nobody catches and the status with which the program ends."""
-        if MPI.COMM_WORLD.size == 1 or self._process:
+        if not MPI.Is_initialized() or MPI.COMM_WORLD.size == 1 or self._process:
             return
         self._process = os.getpid()
         self._tell, sys.excepthook = sys.excepthook, self._uncaught

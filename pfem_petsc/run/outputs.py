@@ -408,7 +408,7 @@ class Outputs:
         for function, every in self._callbacks:
             if step % every == 0:
                 self.wait()
-                with agreed_call(self._stages.comm, f"step {step}: on_step: the function"):
+                with agreed_call(self._stages.comm, f"step {step}: on_step"):
                     function(made)
         return made
 

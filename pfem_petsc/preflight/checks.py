@@ -277,7 +277,7 @@ def later_gaps(model: Model) -> dict[str, str]:
 
 
 def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
-    """Return, by wall name, nearest node, gap and approach velocity at the start; and warnings. Collective."""
+    """Return, by wall name, nearest node, gap and how fast it closes at the start; and warnings. Collective."""
     contact, mesh, comm = model.contact, model.mesh, model.comm
     told: dict[str, str] = {}
     warnings: list[str] = []
@@ -296,6 +296,7 @@ def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
         rate = np.nanmin((then - now) / ahead, axis=0, initial=np.inf)
     comm.Allreduce(MPI.IN_PLACE, rate, op=MPI.MIN)
     # a moving wall, or the other node of a link, may push the truss against this wall
+    static = model.case.static is not None
     pushed = model.external.active or contact.moving.any() or bool(model.links) or model.supports.any
     for k, (name, (gap, node)) in enumerate(zip(contact.names, _nearest(model, now), strict=True)):
         if not np.isfinite(gap):
@@ -305,7 +306,8 @@ def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
         if model.case.time is None:  # without velocities
             continue
         if rate[k] < 0.0:
-            told[name] += f", closing at up to {engineering(-float(rate[k]), 'm/s')}"
+            told[name] += f", closing at up to {engineering(-float(rate[k]), 'm' if static else 'm/s')}"
+            told[name] += " per unit of the load factor" if static else ""
         elif not pushed:
             told[name] += ", not approached"
             warnings.append(

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 _UNRESOLVED = 2.0**-6  # of the first length, down to which a step is halved if a critical point is not located
 _TURN = 0.5  # cosine between tangents of successive points, below which the step is halved if possible
-_TURNS_BACK = 0.1  # displacement along the direction per length, over that of the first response, close to a turn
+_AHEAD = 0.0, 1.0, 2.0, 4.0, 8.0  # smallest lengths, up to which a displacement that turns back is looked for
 _JUMPS = "the truss jumps"
 _FACTORS = 0.5, 1.5  # of the length from point to point
 PARTED = "no remaining bar carries the load"
@@ -263,8 +263,7 @@ class PathStepper(StaticStepper):
         """Return the message about a path that cannot be continued."""
         hint = "; a smaller static.min_step or another static.step may pass"
         if self.scale:
-            along = self.direction.of(self.state.memory["tangent"]) / self.scale
-            if failure.kind == _JUMPS or along < _TURNS_BACK:
+            if failure.kind == _JUMPS or self._turns_back():
                 hint = '; the displacement along static.direction turns back: static.method = "arc_length" continues'
             elif self.model.bars.kept_names:
                 hint = f'; bars may begin to yield, unload or slacken there{hint}, or static.method = "arc_length"'
@@ -272,6 +271,19 @@ class PathStepper(StaticStepper):
             f"the path cannot be followed beyond point {self.state.step} at load factor {self.state.time:.6g} with "
             f"steps down to {self.keys.smallest:.3g}: {failure}{hint}{free_motions(self.model, self.state)}"
         )
+
+    def _turns_back(self) -> bool:
+        """Return whether the displacement per load along the direction passes zero on the tangent ahead. Collective."""
+        tangent, rates = self.state.memory["tangent"], []
+        try:
+            length = self.control.length(self.keys.smallest, tangent)
+            for lengths in _AHEAD:
+                move, load_factor = lengths * length * tangent, self.state.time + lengths * length * self.slope
+                self.system.linearise(move)
+                rates.append(self.direction.of(self.system.response(move, load_factor)))
+        except NotConverged:
+            return not rates
+        return any(rate * rates[0] < 0.0 and abs(rate) < abs(rates[0]) for rate in rates)
 
     def _first_point(self) -> tuple[Point, bool]:
         """Return the first point with its tangent, and whether it differs from the state; set the metric. Collective.

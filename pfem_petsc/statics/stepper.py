@@ -24,7 +24,7 @@ from ..stepping.stepper import Solution
 from ..tolerances import TIME
 from .equilibrium import Equilibrium, problem_at_rest
 from .jumps import Jump, JumpSearch, Place
-from .path_points import BorderedSystem
+from .path_points import Arc, BorderedSystem, Metric, PointSolver, dot
 from .stability import LARGEST, LARGEST_WITH_MUMPS, ZERO, Stability, free_motions, held_nodes, is_indefinite, stiffest
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ UNCOUNTED = -2
 """Of negative eigenvalues: there are some, whose number is unknown."""
 _RESISTANCE = 1e-3  # viscosity over stiffness with which a truss that nothing holds yet is moved against walls
 _AHEAD = 2.0, 0.5, 0.1, 0.02  # of an increment: near a limit point the response to a whole one is too large
+_LENGTHS = 2.0 ** np.arange(14)  # of an increment, within which the path beyond it is looked at
 _EXCEEDED = (
     "nodes moved far without load, as in a snap-through, and forces from there on contain the viscous force; compare "
     "with a smaller static.stabilise, or use a dynamic stage"
@@ -518,12 +519,38 @@ class StaticStepper(ImplicitStepper):
                 there = stability.look()
                 if there.negatives or there.nearest < zero:
                     return "it is a limit point: the stiffness becomes singular there"
+            if model.bars.kept_names:
+                cause = self._beyond(system, size)
+                if cause:
+                    return cause
         except (NotConverged, np.linalg.LinAlgError, PETSc.Error):
             return "it may be a limit point: the stiffness cannot be factorised there"
         finally:
             system.destroy()
             stability.destroy()
         return "the stiffness shows no limit point: a smaller static.min_step or a larger solver.max_newton may help"
+
+    def _beyond(self, system: BorderedSystem, size: float) -> str:
+        """What the path of equilibria shows within some lengths of the increment ``size`` beyond the state, where bars
+        yield or unload; empty if the load rises. Collective."""
+        state, rest = self.state, np.zeros_like(self.state.position)
+        system.linearise(rest)
+        response = system.response(rest, state.time)
+        metric = Metric(self.model.comm, False, 1.0 / dot(self.model.comm, response, response))
+        points, reached = PointSolver(state, system, metric, False), 0.0
+        for length in size * _LENGTHS:
+            try:
+                point = points.find(Arc(metric, length), length * response, state.time + length)
+            except NotConverged:
+                continue
+            if point.slope < 0.0:
+                return "it is a limit point: beyond it the load falls, as bars yield or unload"
+            reached = length if point.change < 0.5 * size else 0.0
+            if point.change > size:
+                return ""
+        if reached < size * _LENGTHS[-1]:
+            return ""
+        return "it is a limit load: bars yield so far that the truss moves without more of it"
 
     def _free_guess(self, balance: Balance) -> np.ndarray:
         """Return the increment proportional to the last one."""

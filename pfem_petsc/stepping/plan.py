@@ -168,11 +168,19 @@ def refuse_motion(case: Case, what: str) -> None:
     """Refuse initial velocities and treatments of impact, which ``what`` does not have."""
     if any(any(entry.velocity) or any(entry.angular_velocity) for entry in case.initial):
         raise InputError(f"{case.source}: initial: {what} has no velocities; remove the table [initial], or use [time]")
-    if case.contact.treatment != "scheme":
-        raise InputError(
-            f'{case.source}: contact.treatment = "{case.contact.treatment}" treats impacts, and {what} has none; '
-            "remove the key"
+    name = case.contact.treatment
+    if name == "scheme":
+        return
+    remedy, where = "remove the key", ""
+    if case.editor[0].stage:
+        where = f"stage {case.name!r}: "
+        remedy = (
+            "move it to [stage.contact] of the stages with [stage.time]; as tables stay in force, a stage with "
+            '[stage.static] after those has [stage.contact] with treatment = "scheme"'
         )
+    raise InputError(
+        f'{case.source}: {where}contact.treatment = "{name}" treats impacts, and {what} has none; {remedy}'
+    )
 
 
 def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
+import shlex
 import shutil
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -33,12 +34,14 @@ if TYPE_CHECKING:
 __all__ = ["read_slab", "read_whole", "suffixes", "write_mesh", "write_whole", "writer_of"]
 
 _GEOMETRY = "; this is a geometry: mesh it by `gmsh -1 {name} -o {stem}.msh`"
+_GMSH = "; convert it by `gmsh {name} -save -o {stem}.msh`"
 _MESHIO = "; convert it by `meshio convert {name} {stem}.vtu`"
 _CONVERT = {
     **dict.fromkeys((".geo", ".geo_unrolled", ".step", ".stp", ".brep"), _GEOMETRY),
-    **dict.fromkeys((".vtk", ".med", ".bdf", ".nas", ".fem", ".xdmf", ".mesh", ".unv"), _MESHIO),
+    **dict.fromkeys((".vtk", ".med", ".bdf", ".nas", ".fem", ".xdmf", ".mesh"), _MESHIO),
+    ".unv": _GMSH,
 }
-"""How to make a file that is read out of another; meshio comes with the extra ``mesh``."""
+"""How to make a file that is read out of another; meshio, which does not read .unv, comes with the extra ``mesh``."""
 
 
 def suffixes(*what: str) -> dict[str, ModuleType]:
@@ -130,7 +133,8 @@ def _reader_of(path: Path, key: str) -> Any:
     except OSError as error:
         raise InputError(f"{key}cannot open {path}: {error.strerror}") from None
     if path.suffix.lower() not in known:
-        hint = _CONVERT.get(path.suffix.lower(), "").format(name=path.name, stem=path.stem)
+        names = {"name": shlex.quote(str(path)), "stem": shlex.quote(str(path.with_suffix("")))}
+        hint = _CONVERT.get(path.suffix.lower(), "").format(**names)
         raise InputError(f"{key}no reader for {path.name!r}; known suffixes: {', '.join(known)}{hint}")
     return known[path.suffix.lower()]
 

@@ -140,12 +140,13 @@ def test_the_other_meshes_in_the_repository_are_braced_trusses(comm, name, nodes
         ("house.vtu", "there is no file .*house.vtu; that folder has ring.msh"),
         ("sub/ring.msh", "there is no file .*sub/ring.msh: there is no folder .*sub"),
         ("ring.dxf", "no reader for 'ring.dxf'; known.*.msh"),
-        ("ring.geo", "no reader for 'ring.geo'; .*; this is a geometry: mesh it by `gmsh -1 ring.geo -o ring.msh`"),
-        ("ring.vtk", "no reader for 'ring.vtk'; .*; convert it by `meshio convert ring.vtk ring.vtu`"),
+        ("ring.geo", "no reader for 'ring.geo'; .*; this is a geometry: mesh it by `gmsh -1 .*ring.geo -o .*ring.msh`"),
+        ("ring.vtk", "no reader for 'ring.vtk'; .*; convert it by `meshio convert .*ring.vtk .*ring.vtu`"),
+        ("ring.unv", "no reader for 'ring.unv'; .*; convert it by `gmsh .*ring.unv -save -o .*ring.msh`"),
     ],
 )
 def test_files_that_are_not_there_or_not_known(comm, shared_tmp_path, name, text):
-    for there in ("ring.msh", "ring.dxf", "ring.geo", "ring.vtk"):
+    for there in ("ring.msh", "ring.dxf", "ring.geo", "ring.vtk", "ring.unv"):
         written(comm, shared_tmp_path, there, b"solid")
     with pytest.raises(InputError, match=text):
         read_slab(shared_tmp_path / name, comm)

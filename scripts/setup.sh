@@ -88,9 +88,10 @@ stamp() {
     foundation
 }
 
-# Whether everything that pyproject.toml lists is installed; a package whose installation was interrupted is not.
+# Whether everything that pyproject.toml lists is installed; a package whose installation was interrupted is not. Those of
+# the distribution have no metadata.
 complete() {
-    { requirements && echo pfem_petsc; } | "$python" -c '
+    { requirements petsc4py mpi4py h5py && echo pfem_petsc; } | "$python" -c '
 import re, sys
 from importlib import metadata
 for line in sys.stdin:

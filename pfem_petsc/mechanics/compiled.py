@@ -489,7 +489,7 @@ class Compilation(event.Listener):
         self, tell: Callable[[str, float], None], took: Callable[[float], None], patience: float = 0.0
     ) -> None:
         self._tell, self._took = tell, took
-        self._nested = 0  # loops compiled for a loop that calls them
+        self._names: list[str] = []  # of the loops being compiled, each for the one before it that calls it
         self._begin = self._total = 0.0
         self._next = patience
         self._timer: threading.Timer | None = None
@@ -500,25 +500,30 @@ class Compilation(event.Listener):
 
     def __exit__(self, *_: object) -> None:
         event.unregister("numba:compile", self)
-        self._nested = 0
+        self._names.clear()
         self._stop_timer()
 
     def on_start(self, event: event.Event) -> None:
         """Handle the start of a compilation."""
-        if self._nested == 0:
+        loop = event.data.get("dispatcher")
+        given = [each.dispatcher for each in event.data.get("args") or () if isinstance(each, types.Dispatcher)]
+        if loop is _write and given:  # a loop that is called by its address
+            loop = given[0]
+        self._names.append(getattr(getattr(loop, "py_func", None), "__name__", "a loop"))
+        if len(self._names) == 1:
             self._begin = time.perf_counter()
-            self._wait(getattr(getattr(event.data.get("dispatcher"), "py_func", None), "__name__", "a loop"))
-        self._nested += 1
+            self._wait()
 
-    def _wait(self, name: str) -> None:
-        """Tell the name now if it is time to, and later if the compilation lasts so long."""
+    def _wait(self) -> None:
+        """Tell the loop now if it is time to, and later if the compilation lasts so long."""
         so_far = self._total + time.perf_counter() - self._begin
         if so_far >= self._next:
             self._next = so_far + min(max(so_far, 1.0), TELL_EVERY)
-            self._tell(name, so_far)
-        self._timer = threading.Timer(self._next - so_far, self._wait, (name,))
-        self._timer.daemon = True
-        self._timer.start()
+            self._tell("".join(self._names[:1]), so_far)
+        timer = threading.Timer(self._next - so_far, self._wait)
+        timer.daemon = True
+        timer.start()
+        self._timer = timer
 
     def _stop_timer(self) -> None:
         while self._timer is not None:
@@ -528,8 +533,8 @@ class Compilation(event.Listener):
 
     def on_end(self, event: event.Event) -> None:
         """Handle the end of a compilation, successful or not."""
-        self._nested -= 1
-        if self._nested == 0:
+        self._names.pop()
+        if not self._names:
             self._stop_timer()
             seconds = time.perf_counter() - self._begin
             self._total += seconds

@@ -22,6 +22,8 @@ from ..output.units import TIME, Axis, common_prefix
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6b7280", "#000000")
 """For colour-blind eyes (Okabe and Ito 2008), without their yellow, which is too pale for lines on white."""
 
+DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))
+
 FORMATS = ("png", "svg", "pdf", "csv")
 
 REFERENCE: dict[str, Any] = {"color": "#000000", "linewidth": 1.1, "linestyle": (0, (5, 2.5)), "zorder": 3}
@@ -118,6 +120,31 @@ class Panel:
     def size(self) -> float:
         """The largest number."""
         return max((largest(curve.values) for curve in self.curves), default=0.0)
+
+
+def distinct(k: int, dash: int | None = None) -> dict[str, Any]:
+    """Return the style of the ``k``-th line of a panel, which differs from those of all others.
+
+    There are eight colours, each with four dashes, and these with widths that grow.
+
+    Parameters
+    ----------
+    k : from 0
+    dash : number of another dash, for lines that their colours tell apart
+    """
+    wider, own = divmod(k // len(COLOURS), len(DASHES))
+    # the dashes of closed forms, which are black as well, come last
+    style = {"color": COLOURS[k % len(COLOURS)], "linestyle": DASHES[(0, 2, 3, 1)[own] if dash is None else dash]}
+    return style | ({"linewidth": STYLE["lines.linewidth"] * (1.0 + wider)} if wider else {})
+
+
+def area(k: int) -> dict[str, Any]:
+    """Return the style of the ``k``-th area of a panel: of the first ones plain, of others hatched."""
+    colour = COLOURS[k % len(COLOURS)]
+    if k < len(COLOURS):
+        return {"color": colour, "alpha": 0.85}
+    hatch = ("///", "\\\\\\", "...", "xxx")[(k // len(COLOURS) - 1) % 4]
+    return {"facecolor": colour, "edgecolor": "white", "hatch": hatch, "alpha": 0.85}
 
 
 def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tuple[np.ndarray, np.ndarray]:
@@ -263,7 +290,8 @@ class Chart:
         for number, curve in enumerate(panel.curves):
             place = self.time if curve.place is None else np.asarray(curve.place, dtype=float)
             values = np.asarray(curve.values, dtype=float)
-            style = {"color": COLOURS[number % len(COLOURS)], "label": literal(curve.name), **curve.style}
+            usual = {} if curve.kind in ("area", "band") else distinct(number)
+            style = {**usual, "label": literal(curve.name), **curve.style}
             if curve.kind in ("area", "band"):
                 every = max(1, len(place) // _POINTS)
                 x, y = place[::every] * along[0], values[::every] * factor

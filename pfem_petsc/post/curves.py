@@ -12,7 +12,7 @@ from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.table import over_nodes, selected, source_of, varied
 from ..output.units import TIME, unit_of
-from .chart import COLOURS, REFERENCE, Chart, Curve, Panel, largest
+from .chart import COLOURS, DASHES, REFERENCE, Chart, Curve, Panel, distinct, largest
 from .closed_forms import ClosedForm, closed_form
 from .filters import AS_COMPUTED, Filter, amplitude_spectrum
 
@@ -21,8 +21,6 @@ History = Mapping[str, np.ndarray]
 _LONGEST = 50  # number of letters of a label that tells the values of a run
 
 _PEAKS = 5  # of a spectrum, at most, that are told
-
-DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))
 
 
 def read(history: History, name: str) -> np.ndarray:
@@ -106,6 +104,16 @@ def _is_axis(history: History, name: str) -> bool:
     return np.array_equal(read(history, name), read(history, "time"))
 
 
+def draw_comparison(results: Sequence[Any], forces: Filter, closed_forms: bool = True) -> Chart:
+    """Draw what is compared of results; forces as computed and, in a panel below, after a filter."""
+    panels: list[tuple[str, Filter | None]] = []
+    for name in usual_curves(results):
+        panels.append((name, None))
+        if name.endswith("/force") and forces.name != AS_COMPUTED:
+            panels.append((name, forces))
+    return _draw(results, panels, None, None, closed_forms)
+
+
 def draw_curves(
     results: Sequence[Any],
     names: Sequence[str],
@@ -120,43 +128,70 @@ def draw_curves(
     results : open results
     names : columns, or components of them
     against : a column of numbers, or a component; None: time
-    chosen : filter of the curves
+    chosen : filter of the curves, and of the column that they are drawn over; energies are never filtered
     closed_forms : whether to draw the closed form of the first result
     """
-    first, labels = results[0], labels_of(results)
     if not names:
-        raise InputError("plot: no curves named; columns: " + ", ".join(first.history))
+        raise InputError("plot: no curves named; columns: " + ", ".join(results[0].history))
+    return _draw(results, [(name, chosen) for name in names], against, chosen, closed_forms)
+
+
+def _draw(
+    results: Sequence[Any],
+    panels: Sequence[tuple[str, Filter | None]],
+    against: str | None,
+    chosen: Filter | None,
+    closed_forms: bool,
+) -> Chart:
+    """Draw panels of columns, each with its filter, over time or another column with a filter."""
+    first, labels = results[0], labels_of(results)
     if len({result.axis.symbol for result in results}) > 1 and against is None:
         raise InputError("plot: the results are over different axes: " + ", ".join({r.axis.symbol for r in results}))
     exact = closed_form(first) if closed_forms and against is None else None
     times = [read(result.history, "time") for result in results]
-    places = times if against is None else [_single(result.history, against) for result in results]
+    places = times
+    if against is not None:
+        places = [_filtered(result, chosen, against, _single(result.history, against)) for result in results]
     shared = all(np.array_equal(place, places[0]) for place in places)
     over = None if against is None else (against, unit_of_curve(against))
-    panels = []
-    for name in names:
+    drawn = []
+    for name, smoothing in panels:
         found = [column(result.history, name) for result in results]
         parts = list(dict.fromkeys(part for curves in found for part in curves))
+        # a vector that is zero in some results has all components there
+        parts = [part for part in parts if any(np.any(curves.get(part, 0.0)) for curves in found)] or parts
+        alike = len(results) * len(parts) > len(COLOURS) or len(results) > len(DASHES)  # else dashes tell results apart
         curves = []
         for number, (each, label, result, place) in enumerate(zip(found, labels, results, places, strict=True)):
-            for part, values in each.items():
-                touch = part.startswith(("wall/", "pair/", "constraint/")) and "/force" in part  # zero before the run
-                shown = smoothed(result, chosen, values, touch) if chosen is not None else values
-                k = number * len(parts) + parts.index(part)
-                style = {"color": COLOURS[k % len(COLOURS)], "linestyle": DASHES[number % len(DASHES)]}
+            for k, part in enumerate(parts):
+                if part not in each:
+                    continue
+                shown = _filtered(result, smoothing, part, each[part])
+                style = distinct(number * len(parts) + k, None if alike else number)
                 words_of = (label if len(found) > 1 else "", part if len(parts) > 1 else "")
                 key = f"{part}: {label}" if len(found) > 1 else part
+                key += f", {smoothing.name}" if smoothing is not None and (name, None) in panels else ""
                 text = " ".join(word for word in words_of if word) or part
                 curves.append(Curve(text, shown, style, key, place, "" if shared else label))
-        curves += exact_curves(exact, list(found[0]), places[0])
+        curves += exact_curves(exact, [part for part in parts if part in found[0]], places[0])
         title = parts[0] if len(parts) == 1 else name  # which component it is
-        title = title if chosen is None or chosen.name == AS_COMPUTED else f"{title}: {chosen.name}"
+        if smoothing is not None and smoothing.name != AS_COMPUTED:
+            state = f"{AS_COMPUTED}, as all energies" if unit_of_curve(name) == "J" else smoothing.name
+            title = f"{title}: {state}"
         legend = "beside" if len(curves) > 1 else "none"
-        panels.append(
-            Panel(words(name.rsplit("/", 1)[-1]), unit_of_curve(name), curves, title, 0.9, over, None, legend)
-        )
+        label = words(name.rsplit("/", 1)[-1])
+        height = max(0.9, 0.11 * len(curves))  # of the legend
+        drawn.append(Panel(label, unit_of_curve(name), curves, title, height, over, None, legend))
     axis = max((result.axis for result in results), key=lambda axis: axis.staged)
-    return Chart(panels, first.case.title or first.case.name, np.concatenate(times), axis)
+    return Chart(drawn, first.case.title or first.case.name, np.concatenate(times), axis)
+
+
+def _filtered(result: Any, chosen: Filter | None, name: str, values: np.ndarray) -> np.ndarray:
+    """Return the values (rows,) of a column after a filter, those of energies as they are."""
+    if chosen is None or unit_of_curve(name) == "J":
+        return values
+    touch = name.startswith(("wall/", "pair/", "constraint/")) and "/force" in name  # zero before the run
+    return smoothed(result, chosen, values, touch)
 
 
 def unit_of_curve(name: str) -> str:

@@ -13,9 +13,9 @@ import numpy as np
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.units import engineering, unit_of
-from .chart import COLOURS, REFERENCE, STYLE, Chart, Curve, Panel, largest, opened
+from .chart import COLOURS, REFERENCE, STYLE, Chart, Curve, Panel, area, distinct, largest, opened
 from .closed_forms import ClosedForm, closed_form
-from .curves import History, column, draw_curves, draw_spectra, exact_curves, read, smoothed, usual_curves, words
+from .curves import History, column, draw_comparison, draw_curves, draw_spectra, exact_curves, read, smoothed, words
 from .filters import AS_COMPUTED, Filter, make_filter, window_mean
 from .options import PlotOptions
 
@@ -77,7 +77,8 @@ def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | Non
             chart = draw_curves(results, list(given.curves), given.against, chosen, given.closed_forms)
             return chart.save(_free(folder / "curves", suffixes), suffixes)
         if len(results) > 1:
-            chart = draw_curves(results, usual_curves(results), None, chosen, given.closed_forms)
+            forces = chosen or _usual_filter(results[0])
+            chart = draw_comparison(results, forces, given.closed_forms)
             return chart.save(folder / "comparison", suffixes)
         (result,) = results
         return _usual(result, folder, suffixes, chosen, given.closed_forms)
@@ -140,10 +141,10 @@ def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Pa
     most = max(float(np.nanmax(np.abs(values))) for values in held.values())
     moving = {name: values for name, values in held.items() if np.abs(values).max() > 1e-12 * most}
     still = [words(name) for name in held if name not in moving]
-    colours = {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(moving)}
+    number = {name: k for k, name in enumerate(moving)}
     # supplied energies have no area; negative parts hang below zero
     areas = [
-        Curve(words(name), values, {"color": colours[name], "alpha": 0.85}, name, kind="area")
+        Curve(words(name), values, area(number[name]), name, kind="area")
         for name, values in moving.items()
         if name not in SUPPLIED
     ]
@@ -154,7 +155,7 @@ def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Pa
     available = Curve(label, stored[0] + supplied - supplied[0], {**ink, "linestyle": (0, (4, 2))})
     sums = [Curve("_", stored, {**ink, "linewidth": 0.6}, "stored and lost")]
     sums.append(available._replace(key="at the start and supplied"))
-    lines = [Curve(words(name), values, {"color": colours[name]}, name) for name, values in moving.items()]
+    lines = [Curve(words(name), values, distinct(number[name]), name) for name, values in moving.items()]
     lines += exact_curves(exact, list(moving))
     # a share of the largest energy, so that neither a prefix nor a unit hides how small it is
     worst = float(np.nanmax(np.abs(error))) / (most or 1.0)

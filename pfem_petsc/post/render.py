@@ -215,7 +215,8 @@ class Film:
         for number in range(self.count)[share]:
             if time.monotonic() - told > TELL:
                 told = time.monotonic()
-                note(f"{number} of {self.count} frames are drawn")
+                # by all processes together
+                note(f"{sum(1 for _ in folder.glob('frame_*.png'))} of {self.count} frames are drawn")
             _save(self.frame(number), folder / f"frame_{number:04d}.png")
 
     def start(self, size: tuple[int, int]) -> None:

@@ -12,7 +12,9 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.chart import thinned
+from pfem_petsc.post import chart
+from pfem_petsc.post.chart import DASHES, REFERENCE, distinct, thinned
+from pfem_petsc.post.curves import draw_curves
 from pfem_petsc.post.filters import window_mean
 from pfem_petsc.post.plot import plot
 
@@ -100,6 +102,60 @@ def test_several_results_are_drawn_over_each_other(tmp_path, result):
     assert len(rows) == 260 and [bool(row[3]) for row in rows].count(True) == 100
     (picture,) = plot([result, other], tmp_path / "both")
     assert len(saturated(picture)) > 500
+
+
+def test_energies_are_never_filtered(tmp_path, result):
+    """In a comparison, forces are as computed and, below, filtered; named curves are filtered but for energies."""
+    other = SyntheticResult(tmp_path / "fine" / "result.vtkhdf", *ring())
+    history, mean = result.history, "mean of the 5.00 ms before (−3 dB at 88.6 Hz)"
+    smooth = window_mean(history["time"], history["wall/wall/force"][:, 0], 0.005, True)
+    assert np.abs(smooth - history["wall/wall/force"][:, 0]).max() > 0.1 * np.abs(smooth).max()
+    (file,) = plot([result, other], tmp_path / "both", force_filter="mean:0.005", formats=["csv"])
+    head, columns = table_columns(file)
+    found = dict(zip(head, columns, strict=True))
+    here = tmp_path.name
+    assert found[f"wall/wall/force.x: {here} [N]"] == pytest.approx(history["wall/wall/force"][:, 0])
+    assert found[f"wall/wall/force.x: {here}, {mean} [N]"] == pytest.approx(smooth)
+    energies = [name for name in head if "_energy" in name or "_dissipation" in name]
+    assert len(energies) >= 4
+    for name in energies:
+        assert np.array_equal(found[name], history[name.partition(":")[0]])
+    # without a filter, the usual one
+    (file,) = plot([result, other], tmp_path / "usual", formats=["csv"])
+    assert [name for name in table_columns(file)[0] if name.startswith(f"wall/wall/force.x: {here}, mean of the")]
+    curves = ["kinetic_energy", "wall/wall/force.x"]
+    (file,) = plot(result, tmp_path, curves=curves, force_filter="mean:0.005", formats=["csv"])
+    _, (_, energy, force) = table_columns(file)
+    assert np.array_equal(energy, history["kinetic_energy"]) and force == pytest.approx(smooth)
+    # over another column, which passes the same filter
+    (file,) = plot(
+        result, tmp_path, curves=curves[1:], against="centre_of_mass.x", force_filter="mean:0.005", formats="csv"
+    )
+    _, (place, force) = table_columns(file)
+    moved = window_mean(history["time"], history["centre_of_mass"][:, 0], 0.005)
+    assert place == pytest.approx(moved) and force == pytest.approx(smooth)
+
+
+def test_many_lines_and_areas_differ():
+    """From each other, and lines from closed forms; those of two results differ by their dashes as well."""
+    styles = [distinct(k) for k in range(96)]
+    assert len({(s["color"], str(s["linestyle"]), s.get("linewidth")) for s in styles}) == 96
+    assert len({(s["color"], str(s["linestyle"])) for s in styles[:32]}) == 32
+    assert not any(s["color"] == REFERENCE["color"] and s["linestyle"] == DASHES[1] for s in styles[:31])
+    areas = [chart.area(k) for k in range(16)]
+    assert len({(s.get("color", s.get("facecolor")), s.get("hatch")) for s in areas}) == 16
+    assert distinct(1, 1)["linestyle"] != distinct(0, 0)["linestyle"]
+
+
+def test_ten_results_keep_their_colours_in_all_panels(tmp_path):
+    """Also where a vector is zero in one of them, which has all components there; and all differ."""
+    results = [SyntheticResult(tmp_path / f"r{k}" / "result.vtkhdf", *ring()) for k in range(10)]
+    results[0].history["wall/wall/force"][:] = 0.0
+    drawn = draw_curves(results, ["wall/wall/force", "kinetic_energy"])
+    looks = [[(line.get_color(), str(line.get_linestyle())) for line in axes.lines] for axes in drawn.axes]
+    dashes = [[str(line._unscaled_dash_pattern) for line in axes.lines] for axes in drawn.axes]
+    assert looks[0] == looks[1] and dashes[0] == dashes[1] and len(looks[0]) == 10
+    assert len(set(zip(looks[0], dashes[0], strict=True))) == 10
 
 
 def test_displacements_are_compared_and_not_positions(tmp_path):

@@ -5,11 +5,32 @@ import pytest
 from helpers.runs import inspected
 from helpers.small_models import CUBE, CUBE_EDGES, TRUSSES, case_of
 
-from pfem_petsc import Case, Simulation
+from pfem_petsc import Case, Simulation, Truss
 from pfem_petsc.output.units import engineering
 from pfem_petsc.preflight import forecast
 
 pytestmark = pytest.mark.parallel
+
+
+def test_two_free_bodies_have_no_mechanisms(comm, shared_tmp_path):
+    """Two tetrahedra and a bar: 6, 6 and 5 rigid motions, of which 6 are those of the whole; one of them held: 11."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    points = np.concatenate([corners, corners + 5.0, [[9.0, 0, 0], [9.0, 1, 0]]])
+    edges = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+    mesh = Truss(points, np.concatenate([edges, edges + 4, [[8, 9]]]))
+    data = {
+        "node_set": {"held": {"indices": [0, 1, 2]}},
+        "material": {"it": {"young_modulus": 1e9, "density": 1e3}},
+        "section": {"it": {"area": 1e-4, "material": "it"}},
+        "time": {"integrator": "central_differences", "step": 1e-6, "end": 1e-6},
+    }
+    told = {}
+    for name, more in (("free", {}), ("held", {"support": [{"node_set": "held", "fix": "xyz"}]})):
+        simulation = Simulation(Case({**data, **more}, mesh=mesh), comm, output=shared_tmp_path / name, check_only=True)
+        told[name] = simulation.inspect()[0]["rigidity"]
+    free = "30 free directions, 6 rigid motions, 11 of parts against each other, 0 mechanisms, 0 states of self-stress"
+    assert told["free"] == free
+    assert told["held"].startswith("21 free directions, 0 rigid motions, 11 of parts against each other, 0 mechanisms")
 
 
 @pytest.mark.parametrize("name", TRUSSES)

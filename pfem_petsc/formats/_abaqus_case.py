@@ -320,7 +320,7 @@ class Conditions:
         self._dynamic = step is not None and step.keyword == "DYNAMIC"
         words = next((words for _, words in step.lines()), []) if step is not None else []
         period = value_of(words, 1)
-        self._period = period if period > 0.0 else 1.0
+        self._period = period if 0.0 < period < np.inf else 1.0
         self._supports: dict[tuple[str, int, tuple[str, Rows]], np.ndarray] = {}
         self._motions: dict[tuple[str, Rows], int] = {}
         self._held = np.zeros((len(mesh.points), 3), np.int64)

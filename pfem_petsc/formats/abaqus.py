@@ -76,7 +76,7 @@ def _add_analysis(mesh: WholeMesh, deck: Deck) -> None:
 def _analysis(block: Block) -> tuple[dict[str, dict[str, Any]], str]:
     """Return the tables of a case for a procedure, and what is to be said; none for one that the program lacks."""
     words = next((words for _, words in block.lines()), [])
-    first, period, least, most, end = (value if (value := value_of(words, k)) > 0.0 else 0.0 for k in range(5))
+    first, period, least, most, end = (value if 0.0 < (value := value_of(words, k)) < np.inf else 0.0 for k in range(5))
     match block.keyword:
         case "STATIC":
             return _static(block, first / (period or 1.0), least / (period or 1.0), most / (period or 1.0), end)

@@ -184,6 +184,11 @@ def test_other_elements(tmp_path):
             "*PARAMETER\nE = 1.",
             r"line 1: \*PARAMETER is not read: write the values in the place of the names",
         ),
+        (
+            "*NSET, NSET=Top",
+            "*ELEMENT, TYPE=MASS\n3, All\n*NSET, NSET=Top",
+            r"line 22: \*ELEMENT: .*; expected 2 labels",
+        ),
         ("*NSET, NSET=Top", "*INSTANCE, NAME=I, PART=P\n*END INSTANCE\n*NSET, NSET=Top", r"there is no part P"),
         ("*NSET, NSET=Top", "*NSET, NSET=Top, INSTANCE=J", r"line 21: \*NSET: there is no instance J"),
         ("*HEADING\n A", "A", r"line 1: 'A tripod, written by hand' precedes the first \*KEYWORD"),

@@ -185,6 +185,11 @@ STEPS = [
     ),
     ("*DYNAMIC", {}, "line 47: *DYNAMIC: the period is missing: the first step is left out"),
     ("*FREQUENCY, EIGENSOLVER=LANCZOS\n6,", {"modes": {"count": 6, "kind": "vibration"}}, ""),
+    (
+        "*FREQUENCY\ninf",
+        {"modes": {"count": 10, "kind": "vibration"}},
+        "line 47: *FREQUENCY: a limit of the frequencies is not supported: modes.count = 10",
+    ),
     ("*BUCKLE\n3,", {"static": {"step": 1.0}, "modes": {"count": 3, "kind": "buckling"}}, ""),
     (
         "*HEAT TRANSFER\n1., 1.",

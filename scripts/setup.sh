@@ -159,9 +159,10 @@ slepc_package() {
 make_venv() {
     local made_from
     made_from=$(cat "$venv/made-from" 2>/dev/null || foundation)
-    if [[ ${made_from%% *} != "$root" && $venv != "$root"/* && -d ${made_from%% *} ]]; then
+    if [[ ${made_from%% *} != "$root" && $(realpath -m "$venv") != "$root"/* && -d ${made_from%% *} ]]; then
         fail "$venv belongs to the checkout ${made_from%% *}: give PFEM_VENV another folder, or unset it"
     fi
+    rm -f "$venv/setup-done"
     if ! "$python" -c "" 2>/dev/null || [[ $made_from != "$(foundation)" ]]; then
         say "making ${venv#"$root"/} with $1"
         run_venv --clear "$@"
@@ -344,7 +345,6 @@ if [[ -x $python && -f $venv/setup-done ]] && stamp | cmp -s - "$venv/setup-done
     exit 0
 fi
 start=$SECONDS
-rm -f "$venv/setup-done"
 case $mode in
     build) from_source ;;
     active) say "using $base and its PETSc"; from_active ;;
@@ -356,16 +356,16 @@ compile_loops() {
     folder=$(mktemp -d)
     "$python" -m compileall -q pfem_petsc
     on_ranks 2 3600 "$python" -m pfem_petsc bench --compile &&
-        compiling rod_impact -o "$folder/rod" --set time.end=0.7 &&
-        compiling lattice_drop -o "$folder/drop" &&
-        compiling hanging_net -o "$folder/net" &&
+        "$python" -m pfem_petsc rod_impact -o "$folder/rod" --set time.end=0.7 | what_is_compiled &&
+        "$python" -m pfem_petsc lattice_drop -o "$folder/drop" | what_is_compiled &&
+        "$python" -m pfem_petsc hanging_net -o "$folder/net" | what_is_compiled &&
         "$python" -m pfem_petsc render "$folder/rod" --frames 2 --video none > /dev/null
     local status=$?
     rm -rf "$folder"
     return $status
 }
-# compiling CASE OPTIONS...: a run that says what it compiles, and nothing else.
-compiling() { "$python" -m pfem_petsc "$@" | sed -n '/^compiling/p'; }
+# Of what a run says.
+what_is_compiled() { sed -n '/^compiling/p'; }
 say "compiling loops for this machine, which runs load then; what takes long is told"
 compile_loops || say "not all loops are compiled, for the reason above: the first runs compile what they need"
 stamp > "$venv/setup-done"

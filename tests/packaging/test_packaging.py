@@ -136,20 +136,90 @@ def test_later_installs_keep_numpy(tmp_path, limit, kept):
         assert Path(conf["install"]["constraint"]).read_text() == "numpy<2\n"
 
 
-def test_an_environment_of_another_checkout_is_left_alone(tmp_path):
+@pytest.mark.parametrize("linked", [False, True])
+def test_an_environment_of_another_checkout_is_left_alone(tmp_path, linked):
+    """Also where this checkout has a link to it."""
     text = (ROOT / "scripts" / "setup.sh").read_text()
     (function,) = re.findall(r"^make_venv\(\) \{\n.*?^\}\n", text, re.MULTILINE | re.DOTALL)
     other, venv = tmp_path / "other", tmp_path / "venv"
     other.mkdir()
     venv.mkdir()
     (venv / "made-from").write_text(f"{other} distribution /usr/bin/python3")
-    given = f'root="{tmp_path}/own" venv="{venv}" python=false\nfail() {{ echo "$*" >&2; exit 1; }}\nsay() {{ :; }}\n'
+    given = venv
+    if linked:
+        given = tmp_path / "own" / ".venv"
+        given.parent.mkdir()
+        given.symlink_to(venv)
+    given = f'root="{tmp_path}/own" venv="{given}" python=false\nfail() {{ echo "$*" >&2; exit 1; }}\nsay() {{ :; }}\n'
     code = f"{given}foundation() {{ echo changed; }}\n{function}\nmake_venv false"
     done = subprocess.run(["bash", "-euc", code], capture_output=True, text=True)
     assert done.returncode == 1 and f"belongs to the checkout {other}" in done.stderr
     assert (venv / "made-from").read_text().startswith(str(other))
 
 
+def of_setup(*names, code):
+    """Run shell code with functions of setup.sh."""
+    text = (ROOT / "scripts" / "setup.sh").read_text()
+    functions = [re.findall(rf"^{name}\(\) (?:\{{.*?^\}}|\{{[^\n]*\}})$", text, re.M | re.S)[0] for name in names]
+    return subprocess.run(["bash", "-euc", "\n".join([*functions, code])], capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    ("output", "told"),
+    [
+        ("connection broken by 'NewConnectionError(...): Failed to establish a new connection'", "check the network"),
+        ("W: Failed to fetch http://a/b  Temporary failure resolving\nCould not resolve 'a'", "check the network"),
+        ("OSError: [Errno 28] No space left on device: 'numba'", "the disk is full: make room"),
+        ("E: Could not get lock /var/lib/dpkg/lock-frontend. It is held by process 7", "wait until it has ended"),
+        ("Error: [Errno 13] Permission denied: '/opt/venv/bin'", "another folder by PFEM_VENV"),
+        ("error: something else", ""),
+    ],
+)
+def test_a_set_up_that_fails_says_why(tmp_path, output, told):
+    (tmp_path / "log").write_text(output)
+    found = of_setup("cause", code=f'cause "{tmp_path}/log"').stdout.strip()
+    assert (told in found) if told else found == ""
+    code = f'fail() {{ echo "setup: $*" >&2; exit 1; }}\nfailed "{tmp_path}/log" "pip install all"'
+    done = of_setup("cause", "failed", code=code)
+    assert done.returncode == 1 and done.stderr.startswith(output)
+    assert "setup: failed: pip install all" in done.stderr and told in done.stderr
+
+
+@pytest.mark.parametrize(("status", "signal"), [(0, ""), (1, ""), (1, "TERM")])
+def test_a_set_up_that_ends_early_names_the_environment(tmp_path, status, signal):
+    """And how to go on; what it was made from stays, so that the program can name it too."""
+    ending = f"kill -s {signal} $$" if signal else f"exit {status}"
+    code = f'root="{tmp_path}" venv="{tmp_path}/.venv" log="{tmp_path}/log"\ntouch "$log"\n'
+    code += f'trap ended EXIT\ntrap "fail stopped by SIGTERM" TERM\n{ending}'
+    done = of_setup("fail", "ended", code=code)
+    assert done.returncode == status and not (tmp_path / "log").exists()
+    lines = ["setup: stopped by SIGTERM"] if signal else []
+    lines += ["setup: the environment .venv is not finished: the same command goes on from there"] if status else []
+    assert done.stderr.splitlines() == lines
+
+
+@pytest.mark.parametrize(
+    ("works", "made", "asked"),
+    [(0, True, []), (1, True, [""]), (2, True, ["", "--clear"]), (1, False, [""]), (2, False, [""])],
+)
+def test_a_half_made_environment_is_completed(tmp_path, works, made, asked):
+    """Pip works after ``works`` attempts; an environment that is not of this script is never cleared."""
+    venv = tmp_path / "venv"
+    venv.mkdir()
+    if made:
+        (venv / "made-from").write_text("here")
+    code = f'''root="{tmp_path}" venv="{venv}" python=true left={works}
+say() {{ :; }}
+foundation() {{ echo here; }}
+usable() {{ [[ $left == 0 ]]; }}
+run_venv() {{ echo "asked [$1]"; left=$((left - 1)); }}
+make_venv python3'''
+    done = of_setup("fail", "make_venv", code=code)
+    assert done.stdout.split("\n")[:-1] == [f"asked [{word}]" for word in asked]
+    assert done.returncode == (not made and works == 2)
+    assert (venv / "made-from").exists() == (done.returncode == 0)
+
+
 def test_scripts_are_valid_shell():
-    for script in PACKAGING.glob("*.sh"):
+    for script in (*PACKAGING.glob("*.sh"), *(ROOT / "scripts").glob("*.sh")):
         subprocess.run(["bash", "-n", str(script)], check=True)

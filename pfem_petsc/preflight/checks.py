@@ -303,8 +303,6 @@ def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
             told[name] = "applies to no node"
             continue
         told[name] = f"gap {engineering(gap, 'm')} at node {node}"
-        if model.case.time is None:  # without velocities
-            continue
         if rate[k] < 0.0:
             told[name] += f", closing at up to {engineering(-float(rate[k]), 'm' if static else 'm/s')}"
             told[name] += " per unit of the load factor" if static else ""

@@ -61,11 +61,6 @@ class RestLengths:
             rows = ((0.0, value),) if isinstance(value, float) else value
             blocks = [block for block in bars.blocks if block.section == name]
             law = law_of(material)  # of intact bars, also of those that can break
-            if len(rows) > 1 and law.rate and not law.mean_of_work:
-                raise InputError(
-                    f"{where}: the material {section.material!r} depends on the strain rate, which a rest length that "
-                    "changes over time does not support; give one value"
-                )
             bar = law, material.numbers(), MEASURES[material.strain]
             for _, each in rows:
                 for block in blocks:  # refuses what the law cannot bear

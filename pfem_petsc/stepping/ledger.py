@@ -111,7 +111,7 @@ class BarChanges:
             return
         bars, x = self.model.bars, self.stepper.state.x
         self._stress = bars.fields(x)["stress"]
-        self._variables = [block.history[: len(block.law.internal)].copy() for block in bars.blocks]
+        self._variables = [block.history[: len(block.law.rows)].copy() for block in bars.blocks]
         self._thermal, self._warmth = bars.heat[0].copy(), bars.heat[1].copy()
         self._state = bars.rupture() if bars.can_break else np.empty(0)
         if self.model.rest_lengths.varying or any(block.law.mean_of_work for block in bars.blocks):
@@ -139,14 +139,14 @@ class BarChanges:
                 change = self._thermal[part] - before["_thermal"][part]
                 heating -= float((block.counted_area * rest * mean * change).sum())
                 if block.law.modulus is not None:
-                    heating += float((block.counted_area * rest * self._softening(before, block)).sum())
+                    heating += float((block.counted_area * rest * self._softening(before, k, block)).sum())
         return heating, stressing, scaled
 
     def _mean_stress(self, before: dict, k: int, block: BarBlock) -> np.ndarray:
         """Return the mean stress of the counted bars of a block in the step [Pa]."""
         counted = slice(block.counted - block.start)
-        first, last = self._ends(before, block)
-        mean = 0.5 * (first + last)
+        first, last, viscous = self._ends(before, k, block)
+        mean = 0.5 * (first + last) + viscous
         if block.law.mean_of_work:
             return self._mean_of_work(before, block, mean)
         if block.law.mean_correction is not None:
@@ -166,19 +166,29 @@ class BarChanges:
         large = np.abs(change) > SMALL * (np.abs(first) + np.abs(last))
         return np.divide(work, change, out=mean, where=large)
 
-    def _ends(self, before: dict, block: BarBlock) -> tuple[np.ndarray, np.ndarray]:
-        """Return the stresses of the counted bars of a block at start and end of the step [Pa]."""
+    def _ends(self, before: dict, k: int, block: BarBlock) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
+        """Return the stresses of the counted bars of a block at start and end of the step, without the viscous stress
+        of ``stiffness_damping``, and the mean of the latter [Pa]."""
         part = slice(block.start, block.counted)
         first, last = before["_stress"][part], self._stress[part]
         if block.law.rupture >= 0:
             last = self._with_bars(before["_state"][part], part, last)
-        return first, last
+        if block.law.known_rate < 0:
+            return first, last, 0.0
+        left = 1.0 - np.abs(before["_state"][part]) if block.law.rupture >= 0 else 1.0
+        rows, row, strain = slice(block.counted - block.start), block.law.known_rate - 2, len(block.law.internal)
+        begun, ended = before["_variables"][k][:, rows], self._variables[k][:, rows]
+        viscous = 0.5 * left * (begun[row + 1] + ended[row + 1])
+        change, lost = ended[strain] - begun[strain], left * (ended[row] - begun[row])
+        large = np.abs(change) > SMALL * (np.abs(begun[strain]) + np.abs(ended[strain]))
+        np.divide(lost, change, out=viscous, where=large)
+        return first - left * begun[row + 1], last - left * ended[row + 1], viscous
 
-    def _softening(self, before: dict, block: BarBlock) -> np.ndarray:
+    def _softening(self, before: dict, k: int, block: BarBlock) -> np.ndarray:
         """Return the work per volume [J/m3] that temperatures do by changing the modulus of the counted bars."""
         part = slice(block.start, block.counted)
         moduli = (block.law.modulus(block.parameters, at[part]) for at in (before["_warmth"], self._warmth))
-        product = np.multiply(*self._ends(before, block)) * (1.0 / next(moduli) - 1.0 / next(moduli))
+        product = np.multiply(*self._ends(before, k, block)[:2]) * (1.0 / next(moduli) - 1.0 / next(moduli))
         if block.law.rupture >= 0:  # stresses are those of the share that is left
             left = 1.0 - np.abs(before["_state"][part])
             product = np.divide(product, left, out=np.zeros_like(product), where=left > 0.0)

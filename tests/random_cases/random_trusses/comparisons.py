@@ -30,6 +30,7 @@ from pfem_petsc.stepping.plan import make_plan
 
 from .checks import Loaded, check_result, distance, energy_scale
 from .draw import draw_case, generated, members_of
+from .draw_stages import draw_staged
 from .running import case_text, clear, run_case, run_in_two_parts, steps_of
 
 CHAOS_OF_COPIES = 300.0
@@ -273,6 +274,8 @@ KINDS: dict[str, Callable[[random.Random, dict[str, Any]], Copy]] = {
     "renumbered": _renumbered,
     "scaled": _scaled,
 }
+OF_STAGES = ("turned", "renumbered")
+"""Those for cases of stages."""
 
 
 def judge_copies(
@@ -284,9 +287,10 @@ def judge_copies(
     """
     faults: list[tuple[str, str]] = []
     explicit = "solver" not in table and table["time"].get("mass") != "consistent"
+    kinds = {kind: make for kind, make in KINDS.items() if "stage" not in table or kind in OF_STAGES}
     tight = explicit or table.get("solver", {}).get("rtol", 1.0) < 1e-10
     moved: float | None = None
-    for kind, make in KINDS.items():
+    for kind, make in kinds.items():
         changed = make(random.Random(f"{kind} {seed}"), _as_arrays(table))
         source = f"random-{seed}-{kind.replace(' ', '-')}.toml"
         place = folder / "copy"
@@ -491,20 +495,22 @@ def amplification(text: str, whole: Path, folder: Path, source: str) -> float:
     return worst
 
 
-def work(mode: str, seeds: Iterable[int], folder: Path, every_restart: int, sources: dict[int, str]) -> None:
-    """Process the cases of a worker. Collective.
+def work(
+    mode: str, seeds: Iterable[int], folder: Path, every_restart: int, sources: dict[int, str], staged: bool
+) -> None:
+    """Process the cases of a worker, of stages if they are ``staged``. Collective.
 
     ``mode``: "check" runs and checks, "run" only runs, "judge" compares the results of both and removes them, "schemes"
     compares explicit and implicit schemes, "copies" the copies of a case.
     """
-    comm = MPI.COMM_WORLD
+    comm, draw = MPI.COMM_WORLD, draw_staged if staged else draw_case
     for seed in seeds:
         _tell(comm, "begin", seed, {})
         source = sources.get(seed, f"random-{seed}.toml")
         if seed in sources:
             text, table = Path(source).read_text(), {}
         else:
-            table = draw_case(seed)
+            table = draw(seed)
             text = case_text(table)
         place = folder / str(seed)
         if mode == "check":

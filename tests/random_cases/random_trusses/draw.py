@@ -631,7 +631,7 @@ def draw_case(seed: int) -> dict[str, Any]:
         own = random.Random(f"{name} {seed}")
         if share is None or own.random() <= share:
             change(own, case, body, motion)
-    return _plain(case)
+    return plain(case)
 
 
 CHANGES = (
@@ -842,12 +842,12 @@ def _solver(chance: random.Random, time: dict[str, Any]) -> dict[str, Any]:
     return {"solver": table} if table else {}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Tables and lists of Python's own numbers and texts."""
     if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
+        return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
     if isinstance(value, np.generic):
         return value.item()
     return value

@@ -31,6 +31,7 @@ INFEASIBLE, ADRIFT, JAMMED = range(1, 4)
 its friction has no solution."""
 
 _CURVED_ROUNDS = 100  # projections of a step until tangent planes and positions agree
+_LEAST_PART, _LARGEST_PART = 0.02, 8.0  # of the way to the next position whose planes are tried
 _ROOT = 1e-14  # relative error of squares, more than those of sums of three and of a root
 
 
@@ -243,15 +244,17 @@ def _settle_on_round(j, x, free, strengths, walls, given, planes):
 
 @kernel
 def _rub_on_round(j, x, free, drag, strengths, walls, given, planes):
-    """Repeat the friction of the j-th node, at x (m, 3), with the planes at its position until both agree; return
-    whether it was found."""
+    """Repeat the friction of the j-th node, at x (m, 3), with the planes of other positions until it stays at the
+    position of its planes; return whether it was found. Positions are those of Aitken's relaxation: in large steps, the
+    positions of friction alone alternate or creep."""
     own = slice(j, j + 1)
     normals, offsets, stiffness = planes.normals[own], planes.offsets[own], given.stiffness[own]
     rough = walls.friction[0], walls.friction[1]
     rubbing = Rubbing(given.start[own], walls.way, given.fixed[own], normals, offsets, *rough, stiffness)
+    at, last, part, near = x[j].copy(), np.zeros(3), 1.0, False
     for _ in range(_CURVED_ROUNDS):
         if not _meets_round(j, x, strengths, walls, given):
-            break
+            return True
         earlier, distances = normals[0].copy(), offsets[0].copy()
         _set_planes(j, x, free, walls, given, planes)
         turn, apart = np.abs(normals[0] - earlier).max(), 0.0
@@ -259,14 +262,33 @@ def _rub_on_round(j, x, free, drag, strengths, walls, given, planes):
             if distances[k] > -math.inf:
                 apart = max(apart, abs(offsets[0, k] - distances[k]))
         if turn <= 1e-14 and apart <= walls.tolerance:
-            break
+            return True
+        along = square = largest = 0.0
+        for c in range(3):
+            change = x[j, c] - at[c] - last[c]
+            along -= last[c] * change
+            square += change * change
+            last[c] += change
+            largest = max(largest, abs(last[c]))
+        if largest > 0.0 and largest <= walls.tolerance:
+            if near:  # the rest is rounding
+                return True
+            near = True
+        if along > 0.0:
+            part = min(max(part * along / square, _LEAST_PART), _LARGEST_PART)
+        elif along < 0.0:
+            part = 0.5
+        for c in range(3):
+            at[c] += part * last[c]
+            x[j, c] = at[c]
+        _set_planes(j, x, free, walls, given, planes)
         x[j] = free[j]
         project(x[own], rubbing.fixed, normals, offsets, walls.tolerance, strengths[own])
         for k in range(len(distances)):
             strengths[j, k] *= stiffness[0]
         if add_friction(rubbing, x[own], strengths[own], drag[own]) >= 0:
             return False
-    return True
+    return False
 
 
 @kernel
@@ -465,7 +487,7 @@ class ExplicitContact(NodeWalls):
         """Return the message about an owned node without a solution of its friction at walls with ``normals`` (w,
         3)."""
         return jam(self, node, normals) or (
-            f"the friction of node {self.mesh.node_ids[node]} on several walls did not converge; reduce time.step"
+            f"the friction of node {self.mesh.node_ids[node]} on its walls did not converge; reduce time.step"
         )
 
     def pressed_walls(self, surfaces: Surfaces, part: float, tolerance: float, way: np.ndarray) -> PressedWalls:

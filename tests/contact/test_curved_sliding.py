@@ -7,6 +7,10 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
+from pfem_petsc.contact.explicit import Arrivals, PressedWalls, WallSums, press_nodes
+from pfem_petsc.contact.node_walls import TURN
+from pfem_petsc.contact.surfaces import Surfaces
+from pfem_petsc.errors import SimulationFailure
 
 GRAVITY, ANGLE = 9.81, np.pi / 3.0
 SCHEMES = [
@@ -137,3 +141,69 @@ def test_slides_far_from_the_origin(wall, integrator, tmp_path):
         np.testing.assert_allclose(there, here, atol=1e4 * rounding)
         np.testing.assert_allclose(faster, speed, atol=1e5 * rounding)
         assert gap > -1e2 * rounding
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.6, 2.0])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_friction_on_a_sphere_in_large_steps(side, friction):
+    """Nodes that go any way in a step are on the sphere, and the forces on them follow the law of friction."""
+    rng, m = np.random.default_rng(7), 1000
+    radial = rng.normal(size=(m, 3))
+    start = radial / np.linalg.norm(radial, axis=1)[:, None] * (1.0 + side * rng.uniform(0.0, 0.05, (m, 1)))
+    free = start + rng.normal(size=(m, 3)) * 10.0 ** rng.uniform(-3.0, 0.3, (m, 1))
+    lengths = np.linalg.norm(free, axis=1)
+    turned = np.einsum("mi,mi->m", start, free) / (np.linalg.norm(start, axis=1) * lengths) <= TURN
+    # what turns less is pushed along the first normal, which need not lead back to the sphere from afar
+    some = (side * (lengths - 1.0) < 0.0) & (lengths > 1e-2) & (turned | (lengths < 1.3))
+    start, free, turned = start[some], free[some], turned[some]
+    m, stiffness = len(free), 3.0
+    zero = np.zeros((1, 3))
+    walls = PressedWalls(
+        *(Surfaces(zero, np.zeros(1), zero, zero, np.array([side])), 0.0, np.ones(1, dtype=bool)),
+        *(np.ones((m, 1), dtype=bool), 1e-13, np.empty(m, dtype=np.int64), zero, zero),
+        *(np.full((2, 1), friction), np.empty(0), np.empty((0, 1)), np.empty((0, 1))),
+    )
+    no = np.zeros((m, 1), dtype=bool)
+    given = Arrivals(
+        *(start, np.zeros((m, 3)), np.full(m, stiffness), np.zeros((m, 3), dtype=bool), ~no, no),
+        *(np.empty((m, 0)), np.empty((m, 0)), np.empty((0, 1, 3)), np.empty((0, 1))),
+    )
+    x, sums = free.copy(), WallSums(np.zeros((1, 3)), np.zeros(1, dtype=np.int64), np.zeros((1, 3)))
+    failed, _, _, force, _, dissipated = press_nodes(x, given, walls, sums)
+    assert m > 60 and turned.sum() > 20 and failed < 0
+    np.testing.assert_allclose(np.linalg.norm(x, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(force, stiffness * (x - free), atol=1e-12)
+    normal = side * np.where(turned[:, None], x, start)
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    push = np.einsum("mi,mi->m", force, normal)
+    drag, slip = force - push[:, None] * normal, x - start
+    slip -= np.einsum("mi,mi->m", slip, normal)[:, None] * normal
+    size = np.linalg.norm(slip, axis=1)
+    slides = size > 1e-10
+    assert push.min() > 0.0 and slides.sum() > 10
+    expected = -friction * (push / np.maximum(size, 1e-300))[:, None] * slip
+    np.testing.assert_allclose(drag[slides], expected[slides], atol=1e-9)
+    assert (np.linalg.norm(drag, axis=1) <= friction * push * (1.0 + 1e-9)).all()
+    assert dissipated == pytest.approx((friction * push * size).sum(), rel=1e-9)
+
+
+def test_friction_that_is_not_found_is_told(tmp_path):
+    """A node that a step throws far into the edge of a rough bowl and a rough floor: which node, step and time."""
+    start, free = np.array([-0.89323743, 0.29823369, -0.29926374]), np.array([-1.14142704, 0.23835193, -0.37258924])
+    walls = [
+        {"name": "bowl", "type": "sphere", "point": [0.0, 0.0, 0.0], "radius": 1.0, "side": "inside"},
+        {"name": "floor", "type": "plane", "point": [0.0, 0.0, -0.3], "normal": [0.0, 0.0, 1.0]},
+    ]
+    case = {
+        "mesh": {"generator": "arrays", "points": [start.tolist(), [-0.5, 0.2, 0.1]], "bars": [[0, 1]]},
+        "node_set": {"first": {"indices": [0]}},
+        "material": {"m": {"young_modulus": 1e-3, "density": 1000.0}},
+        "section": {"s": {"area": 1e-3, "material": "m"}},
+        "initial": {"velocity": ((free - start) / 1e-2).tolist()},
+        "wall": [wall | {"node_set": "first", "friction": 0.8} for wall in walls],
+        "time": {"integrator": "central_differences", "step": 1e-2, "end": 0.05},
+        "output": {"fields_every": 0},
+    }
+    told = r"step 1, t = 0.01 s: the friction of node 0 on its walls did not converge; reduce time.step"
+    with pytest.raises(SimulationFailure, match=told), Simulation(Case(case), output=tmp_path, quiet=True) as run:
+        run.run()

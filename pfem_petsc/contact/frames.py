@@ -59,9 +59,8 @@ class Sliding:
 
     def couple(self, x: np.ndarray, g: np.ndarray) -> np.ndarray:
         """Return the residual (m, 3) with friction from the one without, in frame coordinates, at positions (m, 3)."""
-        slip = x[:, None, :] - self.origins
-        slip -= np.einsum("mwi,mwi->mw", slip, self.normals)[:, :, None] * self.normals
-        way = self.start + self.weight[:, None, None] * slip
+        way = self.start + self.weight[:, None, None] * (x[:, None, :] - self.origins)
+        way -= np.einsum("mwi,mwi->mw", way, self.normals)[:, :, None] * self.normals
         size = np.maximum(np.linalg.norm(way, axis=2), 1e-300)
         directions = way / size[:, :, None]
         every = np.arange(len(self.nodes))

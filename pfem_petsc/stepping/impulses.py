@@ -26,7 +26,7 @@ from ..tolerances import RANK
 if TYPE_CHECKING:
     from .stepper import Stepper
 
-__all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "NoImpulses", "wall_shares"]
+__all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "NoImpulses"]
 
 SUPPORT, EXTERNAL, DAMPING, WALLS = 0, 1, 2, 3
 """Rows of the particles: three in the order of the totals of :mod:`~pfem_petsc.stepping.ledger_loops`, then walls and
@@ -38,10 +38,9 @@ IN_COLUMNS = (EXTERNAL, SUPPORT, DAMPING)
 _IMPULSES = slice(HEAD["external_impulse"].start, HEAD["damping_impulse"].stop)
 
 
-def wall_shares(stepper: Stepper, nodes: np.ndarray, jumps: np.ndarray) -> np.ndarray:
-    """Divide vectors (m, 3) at nodes (m,) among the walls that they touch; return (m, walls, 3)."""
+def _wall_shares(stepper: Stepper, nodes: np.ndarray, touching: np.ndarray, jumps: np.ndarray) -> np.ndarray:
+    """Divide vectors (m, 3) at nodes (m,) among the walls that they touch, (m, walls) bool; return (m, walls, 3)."""
     contact = stepper.model.contact
-    touching = stepper.touching[nodes]
     shares = np.where(touching[:, :, None], jumps[:, None, :], 0.0)
     several = np.flatnonzero(touching.sum(axis=1) > 1)
     if len(several):
@@ -94,6 +93,7 @@ class Impulses:
         """Add the forces of the last balance; ``totals`` (3, 3) are support, external and damping force [N]."""
         stepper, state = self.stepper, self.state
         walls = stepper.solution.walls.force
+        self._before = self._of_walls()
         if stepper.step_changed:
             stepper.scheme.step_changed(state)
         balance = stepper.scheme.balance(state, stepper.part)
@@ -111,19 +111,26 @@ class Impulses:
         for name, before in (("v", jump.v), ("a", jump.a), *jump.memory.items()):
             mine = getattr(state, name) if name in ("v", "a") else state.memory[name]
             of_nodes = getattr(stepper.state, name) if name in ("v", "a") else stepper.state.memory[name]
-            self._add(mine, jump.nodes, of_nodes[jump.nodes] - before)
+            self._add(mine, jump.nodes, jump.walls, of_nodes[jump.nodes] - before)
 
-    def _add(self, particles: np.ndarray, nodes: np.ndarray, change: np.ndarray) -> None:
-        inertia = self.stepper.model.inertia
-        every = np.zeros((len(inertia.mass), 3))
-        every[nodes] = change
-        momentum = inertia.mass_times(every, np.empty_like(every))[nodes]
+    def _of_walls(self) -> np.ndarray:
+        """Return the impulses of walls (walls, 3), jumps included [N s]."""
+        v = self.state.v
+        return v[WALLS : WALLS + self.n_walls] + v[self.jumps : self.jumps + self.n_walls]
+
+    def mean_wall_forces(self) -> np.ndarray:
+        """Return the momentum that walls gave in the last step over its size, (walls, 3) [N]."""
+        return (self._of_walls() - self._before) / self.stepper.part
+
+    def _add(self, particles: np.ndarray, nodes: np.ndarray, walls: np.ndarray, change: np.ndarray) -> None:
+        mass = self.stepper.model.inertia.mass  # treatments that set velocities require lumped mass
+        momentum = mass[nodes, None] * change
         first = self.jumps
         if self.n_walls:
-            shares = wall_shares(self.stepper, nodes, momentum)
+            shares = _wall_shares(self.stepper, nodes, walls, momentum)
             particles[first : first + self.n_walls] += shares.sum(axis=0)
             momentum = momentum - shares.sum(axis=1)
-        table = self.links.tables(len(inertia.mass))[nodes]
+        table = self.links.tables(len(mass))[nodes]
         for k in range(self.n_links):
             particles[first + self.n_walls + k] += momentum[table == k].sum(axis=0)
         # links conserve momentum except for the part that supports at their nodes receive
@@ -163,11 +170,21 @@ class Impulses:
 class NoImpulses(Impulses):
     """For balances without inertia, where no time passes: all impulses are zero."""
 
+    def __init__(self, stepper: Stepper) -> None:
+        super().__init__(stepper)
+        self._last = self._mean = stepper.solution.walls.force.copy()
+
     def start(self, totals: np.ndarray) -> None:
         """Nothing."""
 
     def step(self, totals: np.ndarray) -> None:
-        """Nothing."""
+        """Take the forces of walls before and after the step."""
+        before, self._last = self._last, self.stepper.solution.walls.force.copy()
+        self._mean = 0.5 * (before + self._last)
 
     def jump(self) -> None:
         """Nothing."""
+
+    def mean_wall_forces(self) -> np.ndarray:
+        """Return the means of the forces of walls before and after the last step, (walls, 3) [N]."""
+        return self._mean

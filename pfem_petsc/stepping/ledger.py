@@ -12,7 +12,7 @@ from ..mechanics.bars import StrainEnergy, state_before_rupture
 from ..mechanics.elements import MEASURES
 from ..mechanics.materials.base import SMALL
 from .impact import Impacts
-from .impulses import Impulses, NoImpulses, wall_shares
+from .impulses import Impulses, NoImpulses
 from .ledger_loops import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS, power, sum_momenta, total
 
 if TYPE_CHECKING:
@@ -264,7 +264,7 @@ class Ledger:
         self.powers = None
         jumped = 0.0
         jump = stepper.treatment.jump if stepper.treatment is not None else None
-        if jump is not None and not self.model.inertia.products:  # massless nodes carry no momentum that jumps
+        if jump is not None:
             after, jumped = self._before_jump(after)
         first, second = (before, after) if stepper.scheme.balance_at_endpoints else 2 * (balanced(stepper, before),)
         works = self._works(0.5 * (stepper.state.position - stepper.before[:owned]), first, second)
@@ -278,7 +278,7 @@ class Ledger:
             friction += jump.friction
         stored = present.kinetic - jumped - before.kinetic + present.energy.total - before.energy.total
         heating, stressing, scaled = self._changes.works()
-        work, given, weight, lost = self._work_of_walls(before)
+        work, given, weight, lost = self._work_of_walls()
         # velocities at the ends of explicit steps are those of the steps beside
         follows = stepper.scheme.explicit and stepper.scheme.balance_at_endpoints
         if self.model.inertia.damped and not follows:
@@ -443,42 +443,32 @@ class Ledger:
         self._displacements = contact.motion.displacements(self.stepper.state.time)
         if not contact.moving.any():
             return
-        self._push = self.stepper.solution.walls.force.copy()
-        change = self.stepper.state.memory.get("contact_change")
-        if change is not None:
-            nodes = np.flatnonzero(change.any(axis=1))
-            self._push += wall_shares(self.stepper, nodes, change[nodes]).sum(axis=0)
         bodies = contact.motion.bodies
-        self._bodies_a, self._bodies_kinetic = bodies.state.a, bodies.kinetic
+        self._bodies_v, self._bodies_kinetic = bodies.state.v, bodies.kinetic
         self.sums[_AT["wall_kinetic_energy"]] = bodies.kinetic if self.model.comm.rank == 0 else 0.0
 
-    def _work_of_walls(self, before: Moment) -> tuple[float, float, float, float]:
+    def _work_of_walls(self) -> tuple[float, float, float, float]:
         """Return this rank's share of the work on the truss by walls with prescribed motion and by walls with mass, the
-        work of the weight of the latter, and their numerical dissipation [J]."""
+        work of the weight of the latter, and their numerical dissipation [J].
+
+        Walls do work by all the momentum that they give in the step, by forces and by velocity jumps: the mean force
+        times the displacement of the wall. A wall with mass is a particle of the same scheme, so its kinetic energy
+        changes by that momentum, and by that of its weight, times the mean of its velocities before and after.
+        """
         stepper, contact = self.stepper, self.model.contact
         if not contact.moving.any():
             return 0.0, 0.0, 0.0, 0.0
-        displacements, push, ends = self._displacements, self._push, stepper.scheme.balance_at_endpoints
-        force = stepper.solution.walls.force
-        rule = 0.5 * (push + force) if ends else force
-        bodies = contact.motion.bodies
-        accelerated, kinetic = self._bodies_a, self._bodies_kinetic
+        bodies, displacements, v = contact.motion.bodies, self._displacements, self._bodies_v
         self._walls_before()
-        way = self._displacements - displacements
-        works = (rule * way).sum(axis=1)
-        jump = stepper.treatment.jump if stepper.treatment is not None else None
-        if jump is not None and not self.model.inertia.products:
-            momentum = self.model.inertia.mass[jump.nodes, None] * (stepper.state.v[jump.nodes] - jump.v)
-            pushed = wall_shares(stepper, jump.nodes, momentum).sum(axis=0)
-            works += (pushed * contact.motion.rates(stepper.state.time)).sum(axis=1)
+        push, way = self.impulses.mean_wall_forces(), self._displacements - displacements
+        fallen, moved = way[bodies.at], stepper.part * 0.5 * (v + self._bodies_v)
+        way[bodies.at] = moved
+        works = (push * way).sum(axis=1)
         given = float(works[bodies.at].sum())
         work = float(works.sum()) - given
         if self.model.comm.rank:
             return work, given, 0.0, 0.0
-        way = way[bodies.at]
-        a = 0.5 * (accelerated + bodies.state.a) if ends else bodies.balanced
-        lost = float((bodies.mass[:, None] * a * way).sum()) - (self._bodies_kinetic - kinetic)
-        return work, given, float((bodies.weight * way).sum()), lost
+        return work, given, float((bodies.weight * fallen).sum()), float((bodies.weight * (fallen - moved)).sum())
 
     def _before_jump(self, after: Moment) -> tuple[Moment, float]:
         """Return the end of the step before velocity jumps, and the energy of the jumps [J], a work of contact."""
@@ -512,5 +502,3 @@ class Ledger:
         if "powers" in kept:
             self.powers = np.array(kept["powers"])
             self._release()
-        if self.model.contact.moving.any():
-            self._walls_before()

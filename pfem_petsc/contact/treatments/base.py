@@ -24,6 +24,7 @@ class Jump:
     Attributes
     ----------
     nodes : (m,) owned local indices
+    walls : (m, walls) bool, walls that give the momentum of the jump; none at nodes of pairs
     v, a : (m, 3) before the jump [m/s], [m/s2]
     energy : kinetic energy that this rank's nodes gained [J]
     memory : arrays of the scheme's memory at these nodes (m, 3), by name
@@ -31,6 +32,7 @@ class Jump:
     """
 
     nodes: np.ndarray
+    walls: np.ndarray
     v: np.ndarray
     a: np.ndarray
     energy: float
@@ -122,15 +124,16 @@ class Treatment(ABC):
         """Return (m, w) bool: walls to which nodes (m,) that touch them (m, w) stick by friction."""
         return np.zeros(touching.shape, dtype=bool)
 
-    def set(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
-        """Set velocities and accelerations (m, 3) of nodes, and record the previous ones for the ledger."""
+    def set(self, nodes: np.ndarray, walls: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
+        """Set velocities and accelerations (m, 3) of nodes, and record the previous ones for the ledger; ``walls``: see
+        :class:`Jump`."""
         stepper, state = self.stepper, self.stepper.state
         inertia = stepper.model.inertia
         fixed = stepper.model.supports.fixed[nodes]
         old_v, old_a = state.v[nodes], state.a[nodes]
         v, a = np.where(fixed, old_v, v), np.where(fixed, old_a, a)
         energy = 0.5 * float((inertia.mass[nodes, None] * (v * v - old_v * old_v)).sum())
-        self.jump = Jump(nodes, old_v, old_a, energy, self.remembered(nodes))
+        self.jump = Jump(nodes, walls, old_v, old_a, energy, self.remembered(nodes))
         memory = state.memory.setdefault("contact_change", np.zeros_like(state.v))
         memory[nodes] = inertia.mass[nodes, None] * (a - old_a)
         if inertia.damped:
@@ -206,21 +209,24 @@ class Restitution(Treatment):
 
     def put(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
         """Set velocities and accelerations (m, 3) of nodes (m,) in contact and of those just released."""
-        gone, slower = self._let_go()
+        gone, left, slower = self._let_go()
+        walls = self.stepper.touching[nodes]
         if len(gone):
             nodes, v, a = np.append(nodes, gone), np.vstack([v, slower]), np.vstack([a, self.stepper.state.a[gone]])
+            walls = np.vstack([walls, left[:, None] == np.arange(walls.shape[1])])
         if len(nodes):
-            self.set(nodes, v, a)
+            self.set(nodes, walls, v, a)
 
-    def _let_go(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return nodes (m,) of this treatment that walls released in this step, and their velocities (m, 3).
+    def _let_go(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return nodes (m,) of this treatment that walls released in this step, these walls (m,), and the nodes'
+        velocities (m, 3).
 
         With schemes whose forces do work by the trapezoidal rule, the contact force at the start of the step would do
         work on the released node. This work is removed from the velocity away from the wall.
         """
         state, stepper = self.stepper.state, self.stepper
         if not self._frees or not len(self._held):
-            return np.empty(0, dtype=np.int64), np.empty((0, 3))
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3))
         left = ~stepper.touching[self._held].any(axis=1)
         gone, force = self._held[left], self._force[left]
         walls = self._touched[gone].argmax(axis=1)
@@ -231,9 +237,9 @@ class Restitution(Treatment):
         away = force / np.maximum(np.linalg.norm(force, axis=1), 1e-300)[:, None]
         speed = np.einsum("mi,mi->m", away, state.v[gone] - rate)
         left = (work > 0.0) & (speed > 0.0)
-        gone, away, speed, work = gone[left], away[left], speed[left], work[left]
+        gone, walls, away, speed, work = gone[left], walls[left], away[left], speed[left], work[left]
         slower = np.sqrt(np.maximum(speed * speed - 2.0 * work / stepper.model.inertia.mass[gone], 0.0))
-        return gone, state.v[gone] + (slower - speed)[:, None] * away
+        return gone, walls, state.v[gone] + (slower - speed)[:, None] * away
 
     def leaving(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray, rates: np.ndarray) -> np.ndarray:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""

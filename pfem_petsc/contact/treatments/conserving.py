@@ -49,15 +49,16 @@ class Treatment(Base):
             ends, apart, free = self._apart(debt)
             nodes, v, a = np.append(nodes, ends), np.vstack([v, apart]), np.vstack([a, free])
         if len(nodes):
-            self.set(nodes, v, a)
+            self.set(nodes, self.stepper.touching[nodes], v, a)
 
-    def _work(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the work (m,) [J] of contact on nodes (m,) in this part of the step."""
+    def _work(self, nodes: np.ndarray, way: np.ndarray | float = 0.0) -> np.ndarray:
+        """Return the work (m,) [J] of contact on nodes (m,) in this part of the step, beyond that of walls that move by
+        ``way`` (m, 3) [m]: what moving walls give is transferred, not lost."""
         state = self.stepper.state
         force = state.contact[nodes]
         if self.stepper.scheme.balance_at_endpoints:
             force = 0.5 * (force + self._force[nodes])
-        return np.einsum("mi,mi->m", force, state.position[nodes] - self._start[nodes])
+        return np.einsum("mi,mi->m", force, state.position[nodes] - self._start[nodes] - way)
 
     def _accelerations(self, nodes: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Return accelerations (m, 3), without contact along the range of projections (m, 3, 3)."""
@@ -72,9 +73,10 @@ class Treatment(Base):
         stepper, state = self.stepper, self.stepper.state
         nodes, normal, speed = self.held()
         mass = stepper.model.inertia.mass[nodes]
-        # work on a moving wall is transferred, not lost
-        moved = np.einsum("mi,mi->m", state.contact[nodes], speed) * stepper.part
-        work = self._work(nodes) - moved + debt[nodes, 0]
+        # forces act along other normals than those at the end; several walls move a node along all of theirs
+        first = stepper.model.contact.motion.rates(state.time)[stepper.touching[nodes].argmax(axis=1)]
+        carried = first + speed - np.einsum("mij,mj->mi", normal, first)
+        work = self._work(nodes, stepper.part * carried) + debt[nodes, 0]
         push = np.einsum("mij,mj->mi", normal, state.contact[nodes])
         out = push / np.maximum(np.linalg.norm(push, axis=1), 1e-300)[:, None]
         v = state.v[nodes]

@@ -21,7 +21,6 @@ from ...errors import InputError
 from ...integrators.base import Scheme
 from ...parallel.agreement import agreed
 from ...tolerances import FREE_PART
-from .base import Jump
 from .base import Treatment as Base
 
 if TYPE_CHECKING:
@@ -179,10 +178,13 @@ class Treatment(Base):
             return
         moved = stepper.model.inertia.redistribution
         nodes, n = moved.nodes, moved.normals
-        # no momentum jumps along the normals, but the scheme's memory must be set again
-        self.jump = Jump(nodes, state.v[nodes], state.a[nodes], 0.0, self.remembered(nodes))
+        memory = self.remembered(nodes)
         secant = (state.position[nodes] - self._start[nodes]) / stepper.part
         state.v, state.a = state.v.copy(), state.a.copy()
         state.v[nodes] += np.einsum("mi,mi->m", secant - state.v[nodes], n)[:, None] * n
         state.a[nodes] -= np.einsum("mi,mi->m", state.a[nodes], n)[:, None] * n
         stepper.scheme.restart(state, nodes, stepper.part)
+        # along the normals alone, where there is no momentum that jumps
+        for name, kept in memory.items():
+            change = np.einsum("mi,mi->m", state.memory[name][nodes] - kept, n)
+            state.memory[name][nodes] = kept + change[:, None] * n

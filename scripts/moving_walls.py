@@ -1,0 +1,158 @@
+"""The table of moving walls in docs/contact.md: their work, the energy balance, and impacts seen from the wall.
+
+    python scripts/moving_walls.py  # rewrites it, in a quarter of an hour
+
+Bodies hit walls of constant velocity V, and walls with mass: every integrator, treatment and restitution 0, 1/2 and 1,
+at a plane, a rough plane, a sphere and a plate with mass, by a bar that falls flat, a rod that falls on its end and a
+lattice that tumbles. Each runs a second time as seen from the wall: the body has the velocity of the first run less V,
+and the wall rests. Both must have the same motion, impacts and dissipations, and the wall has done the work
+V . (impulse + jump_impulse) in the first. The errors of these are relative to the energy of the motion.
+"""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+from typing import NamedTuple
+
+import numpy as np
+from impact_phases import label
+from mpi4py import MPI
+from pages import insert, markdown
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.errors import InputError
+
+START, END = "<!-- table: scripts/moving_walls.py -->\n", "<!-- end of moving walls -->"
+SCHEMES = (
+    *(("central_differences", {}), ("chung_lee", {}), ("hulbert_chung", {}), ("souza_moura", {})),
+    *(("newmark", {}), ("newmark", {"beta": 0.25, "gamma": 0.5}), ("houbolt", {})),
+    *(("wilson", {"theta": 1.4}), ("wilson", {"theta": 2.0}), ("generalized_alpha", {}), ("energy_momentum", {})),
+)
+TREATMENTS = "scheme", "stick", "conserving", "mass_redistribution"
+RESTITUTIONS = 0.0, 0.5, 1.0
+MOTION, VELOCITY = np.array([0.2, -0.1, 0.3]), np.array([0.1, 0.3, -1.0])
+"""Of the wall, and of the body as seen from it [m/s]."""
+GAP = 0.0133  # [m]
+DISSIPATIONS = tuple(f"{kind}_dissipation" for kind in ("impact", "friction", "numerical"))
+
+_FLAT = {"points": [[-0.2, 0.0, GAP], [0.3, 0.1, GAP]], "bars": [[0, 1]]}
+_UPRIGHT = {"points": [[0.0, 0.0, GAP + 0.1 * k] for k in range(6)], "bars": [[k, k + 1] for k in range(5)]}
+BODIES = {
+    "node": ({"generator": "arrays", **_FLAT}, 1e-3, 1e-3, 0.02),
+    "rod": ({"generator": "arrays", **_UPRIGHT}, 1e-3, 1e-3, 0.05),
+    "truss": ({"generator": "lattice", "kind": "octet", "cells": [1, 1, 1], "pitch": 0.1}, 1e-5, 4e-4, 0.024),
+}
+"""Mesh, area [m2], step and end [s]."""
+PLATE = 0.1  # [kg]
+WALLS = {
+    "plane": {},
+    "rough": {"friction": 0.3},
+    "sphere": {"type": "sphere", "radius": 0.5},
+    "plate": {"mass": PLATE},
+}
+
+
+class Errors(NamedTuple):
+    """Of a run: of the work of the wall, the energy balance, and the energies as seen from the wall, over the energy of
+    the motion; and of momentum, of the body and of a plate, over that of the motion."""
+
+    work: float
+    balance: float
+    frames: float
+    momentum: float
+
+
+def case_of(
+    scheme: tuple[str, dict], treatment: str, restitution: float, wall: str, body: str, motion: np.ndarray
+) -> Case:
+    """Return the case with the ``motion`` (3,) of the wall [m/s]."""
+    mesh, area, step, end = BODIES[body]
+    integrator, parameters = scheme
+    upright = body == "rod" or (body == "truss" and treatment == "mass_redistribution")  # nodes that cannot pass others
+    low = -GAP if body == "truss" else 0.0
+    keys = {"name": "wall", "type": "plane", "node_set": "low" if upright else "all", "restitution": restitution}
+    if wall == "sphere":
+        # under the middle of the bar that falls flat, beside the end of the rod
+        keys["point"] = [0.05, 0.05, low - 0.43] if body == "node" else [0.03, 0.02, low - 0.5]
+    else:
+        keys |= {"point": [0.0, 0.0, low], "normal": [0.1, 0.05, 1.0] if body == "truss" else [0.0, 0.0, 1.0]}
+    if motion.any() or wall == "plate":
+        keys["velocity"] = motion.tolist()
+    spin = [3.0, -2.0, 1.0] if body == "truss" else [0.0, 0.0, 0.0]
+    return Case.from_dict(
+        {
+            "mesh": mesh,
+            "node_set": {"all": {"all": True}, "low": {"box": [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.5 * GAP]]}},
+            "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
+            "section": {"s": {"area": area, "material": "m"}},
+            "initial": {"velocity": (VELOCITY + motion).tolist(), "angular_velocity": spin},
+            "wall": [keys | WALLS[wall]],
+            "contact": {"treatment": treatment},
+            "time": {"integrator": integrator, "step": step, "end": end, **parameters},
+            "solver": {"rtol": 1e-14, "linear": "mumps"},
+            "output": {"fields_every": 0},
+        }
+    )
+
+
+def errors_of(scheme: tuple[str, dict], treatment: str, restitution: float, wall: str, body: str) -> Errors:
+    """Run an impact with a wall that moves, and as seen from the wall.
+
+    Raises
+    ------
+    InputError
+        If the program refuses the combination.
+    """
+    rows = []
+    for motion in (MOTION, np.zeros(3)):
+        case = case_of(scheme, treatment, restitution, wall, body, motion)
+        with tempfile.TemporaryDirectory() as folder:
+            run = Simulation(case, MPI.COMM_SELF, output=folder, quiet=True)
+            rows.append([step.row for step in run])
+    moving, seen = rows[0][-1], rows[1][-1]
+    mass = run.model.total_mass
+    assert max(row["active_contacts"] for row in rows[0]) > 0, "the body misses the wall"
+    energy = 0.5 * mass * (np.linalg.norm(MOTION) + np.linalg.norm(VELOCITY)) ** 2
+    given = moving["wall/wall/impulse"] + moving["wall/wall/jump_impulse"]
+    lost = moving["momentum"] - seen["momentum"] - mass * MOTION
+    if treatment != "mass_redistribution":  # whose masses do not have the momentum of a spin
+        lost = np.append(lost, moving["momentum"] - mass * (VELOCITY + MOTION) - given)
+    if wall == "plate":
+        lost = np.append(lost, PLATE * (moving["wall/wall/velocity"] - MOTION) + given)
+    expected = 0.0 if wall == "plate" else MOTION @ given
+    apart = [abs(moving[name] - seen[name]) for name in (*DISSIPATIONS, "elastic_energy")]
+    return Errors(
+        abs(moving["contact_work"] - expected) / energy,
+        max(abs(row["energy_imbalance"]) for each in rows for row in each) / energy,
+        max(apart) / energy,
+        np.abs(lost).max() / (mass * np.linalg.norm(VELOCITY)),
+    )
+
+
+def table() -> str:
+    """The table: of each integrator and treatment the largest errors over restitutions, walls and bodies."""
+    rows = []
+    for scheme in SCHEMES:
+        cells = []
+        for treatment in TREATMENTS:
+            found = []
+            for others in itertools.product(RESTITUTIONS, WALLS, BODIES):
+                try:
+                    found.append(errors_of(scheme, treatment, *others))
+                except InputError:
+                    continue
+            worst = np.max(found, axis=0) if found else []
+            cells.append(f"{len(found)}: " + ", ".join(f"{error:.0e}" for error in worst) if found else "-")
+            print(label(*scheme), treatment, cells[-1], flush=True)
+        rows.append([label(*scheme), *cells])
+    return markdown(["integrator", *(f"`{treatment}`" for treatment in TREATMENTS)], rows)
+
+
+def main() -> None:
+    """Run everything, and insert the table between its marks in the document."""
+    insert("contact.md", START, END, table() + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -44,7 +44,7 @@ from ..stepping.model import StageStart
 if TYPE_CHECKING:
     from ..stepping.stepper import Stepper
 
-STATE_VERSION = 7
+STATE_VERSION = 8
 """Changed with the meaning of what is saved."""
 
 _MEMORY = "memory."

@@ -20,6 +20,7 @@ from random_trusses.comparisons import (
     judge_schemes,
 )
 from random_trusses.draw import LAWS, draw_case
+from random_trusses.draw_stages import draw_staged
 from random_trusses.running import case_text, run_case
 
 from pfem_petsc import Case
@@ -52,6 +53,16 @@ def test_any_case_holds_what_all_must(seed, tmp_path):
     if seed in KNOWN and faults:
         pytest.xfail(str(faults))
     assert not faults, f"seed {seed}: {faults}"
+
+
+@pytest.mark.few_sets
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(40))
+def test_any_stages_hold_what_all_must(seed, tmp_path):
+    """Energy is balanced across each hand-over, nothing dissipated comes back, and restarts are bitwise."""
+    told = check_case(case_text(draw_staged(seed)), MPI.COMM_SELF, tmp_path, f"random-{seed}.toml", True)
+    assert told["status"] in (0, 2, 3), f"seed {seed}: {told['message']}"
+    assert not [fault for fault in told["faults"] if not fault[0].startswith(COUNTED)], told["faults"]
 
 
 @pytest.mark.slow
@@ -88,6 +99,26 @@ def test_cases_are_files_that_run_as_they_are():
         text = case_text(draw_case(seed))
         assert tomllib.loads(text) == draw_case(seed)
         Case.from_toml(text)
+
+
+def test_generator_draws_stages_with_all_that_they_may_have():
+    tables = [draw_staged(seed) for seed in range(200)]
+    for table in tables[:60]:
+        assert tomllib.loads(case_text(table)) == table
+        Case.from_toml(case_text(table))
+    stages = [stage for table in tables for stage in table["stage"]]
+    methods = {stage["static"]["method"] for stage in stages if "static" in stage}
+    assert methods == {"newton", "relaxation"} and {len(table["stage"]) for table in tables} == {2, 3, 4}
+    assert len({stage["time"]["integrator"] for stage in stages if "time" in stage}) == 9
+    given = {key for stage in stages for key in stage}
+    assert given >= {"support", "load", "gravity", "temperature", "wall", "remove", "section", "initial"}
+    assert {key for table in tables for key in table} >= {"spring", "dashpot", "mass", "contact_pair", "wind"}
+    removed = [entry for each in (*tables, *stages) for entry in each.get("remove", ())]
+    assert {key for entry in removed for key in entry} == {"bars", "supports", "time", "duration"}
+    sections = [keys for each in (*tables, *stages) for keys in each.get("section", {}).values()]
+    rests = [keys[key] for keys in sections for key in ("pretension", "prestress", "rest_length") if key in keys]
+    assert {type(value) for value in rests} == {float, list}
+    assert {table["material"]["m1"]["rupture"]["steps"] for table in tables} == {1, 2, 4, 6}
 
 
 def test_generator_draws_all_of_what_is_documented():

@@ -8,6 +8,7 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.run.observers import History, Snapshots
+from pfem_petsc.solvers.lagged import LaggedPreconditioner
 
 
 @pytest.mark.few_sets
@@ -131,3 +132,50 @@ def test_killed_between_the_last_checkpoint_and_the_end_of_the_results(comm, sha
     assert simulate(case, overrides, folders[1], comm, restart=True) == 33
     assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}
     assert everywhere(comm, _last_steps, folders[1]) == (33, 33)
+
+
+VISCOUS = {
+    "mesh": {"generator": "rod", "length": 1.0, "elements": 3},
+    "node_set": {"start": {"group": "start"}, "every": {"all": True}},
+    "material": {
+        "m": {
+            "law": "perzyna", "young_modulus": 1e6, "density": 1000.0, "yield_stress": 500.0,
+            "isotropic_hardening": 2e4, "fluidity": 20.0, "stiffness_damping": 1e-3,
+        }
+    },
+    "section": {"s": {"area": 1e-3, "material": "m"}},
+    "support": [{"node_set": "start", "fix": "x"}, {"node_set": "every", "fix": "yz"}],
+    "initial": {"velocity": [0.3, 0.0, 0.0]},
+    "time": {"integrator": "wilson", "step": 0.07, "end": 0.7},
+    "solver": {"linear": "gamg"},
+}  # fmt: skip
+
+
+def test_preconditioner_is_set_up_again_with_the_step_of_its_set_up(tmp_path, monkeypatch):
+    """The step of rate-dependent bars, t + theta h less t, differs in its last bits from step to step."""
+    case, made = Case.from_dict(VISCOUS, name="viscous"), []
+
+    def make_again(self, problem, step):
+        problem.model.bars.step *= 2.0  # instead of the last bits
+        again(self, problem, step)
+        problem.model.bars.step /= 2.0
+        made.append(_preconditioner(self))
+
+    with Simulation(case, MPI.COMM_SELF, output=tmp_path, quiet=True) as first:
+        for step in first:
+            if step.step == 2:
+                first.stepper.lagged.drop()
+            if step.step == 3:
+                first.outputs.checkpointing.write()
+                break
+        set_up = _preconditioner(first.stepper.lagged)
+        assert first.row["plastic_heat"] > 0.0
+    again = LaggedPreconditioner._make_again
+    monkeypatch.setattr(LaggedPreconditioner, "_make_again", make_again)
+    with Simulation(case, MPI.COMM_SELF, output=tmp_path, quiet=True, restart=True) as rest:
+        next(iter(rest))
+    np.testing.assert_array_equal(made[0], set_up)
+
+
+def _preconditioner(lagged):
+    return lagged.inner.matrix.mat.getValuesCSR()[2].copy()

@@ -70,10 +70,13 @@ def draw_staged(seed: int) -> dict[str, Any]:
     case["material"] = {name: _material(chance, hot) for name in ("m1", "m2")}
     case["section"] = {"s1": {"area": AREA, "material": "m1", "bars": "some"}}
     case["section"]["s2"] = {"area": AREA * chance.choice((0.5, 1.5)), "material": "m2"}
-    _points(chance, case, two, all(stage.kind != "relaxation" for stage in kinds))
+    relaxed = any(stage.kind == "relaxation" for stage in kinds)
+    _points(chance, case, two, relaxed)
     case["stage"] = []
     for k, stage in enumerate(kinds):
         table = {"name": f"st{k}"} | _tables(chance, case, stage, k, two, hot)
+        if relaxed:  # without friction and ties
+            table |= {"wall": [_smooth(wall) for wall in table["wall"]]} if "wall" in table else {}
         if any(later.static for later in kinds[k:]):
             table.pop("wind", None)  # it stays in force
         if k == 0:
@@ -100,13 +103,25 @@ def _mesh(chance: random.Random, two: bool) -> dict[str, Any]:
     corners = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * PITCH
     points = corners + np.array([[chance.gauss(0.0, 0.02 * PITCH) for _ in range(3)] for _ in corners])
     bars = [pair for pair in combinations(range(8), 2) if pair not in ((1, 6), (2, 5), (3, 4))]
-    groups = {"left": range(4), "right": range(4, 8), "top": range(1, 8, 2), "one": [chance.randrange(4, 8)]}
+    groups = {
+        "left": range(4),
+        "right": range(4, 8),
+        "top": range(1, 8, 2),
+        "one": [chance.randrange(4, 8)],
+        "free": range(4, 8),
+    }
     if two:
         gap = chance.choice((1e-3, 0.02))
         other = points + [PITCH + gap, 0.0, 0.0]
         other[:4] = points[4:] + [gap, 0.0, 0.0]  # faces that meet
         points, bars = np.concatenate([points, other]), bars + [(a + 8, b + 8) for a, b in bars]
-        groups |= {"face1": range(4, 8), "face2": range(8, 12), "right": range(12, 16), "body1": range(8)}
+        groups |= {
+            "face1": range(4, 8),
+            "face2": range(8, 12),
+            "right": range(12, 16),
+            "body1": range(8),
+            "free": range(4, 12),
+        }
     some = sorted(chance.sample(range(len(bars)), len(bars) // 3))
     return {
         "generator": "arrays",
@@ -128,21 +143,21 @@ def _material(chance: random.Random, hot: bool) -> dict[str, Any]:
     return table | {"rupture": {key: limit * YOUNG if key == "stress" else limit, "steps": chance.choice((1, 2, 4, 6))}}
 
 
-def _points(chance: random.Random, case: dict[str, Any], two: bool, grounded: bool) -> None:
-    """Masses, springs, dashpots and pairs; springs to the ground where no stage is a relaxation."""
+def _points(chance: random.Random, case: dict[str, Any], two: bool, relaxed: bool) -> None:
+    """Masses, springs, dashpots and pairs; no springs to the ground and pairs where a stage is a relaxation."""
     between = ["body1" if two else "left", "right"]
     if chance.random() < 0.2:
         case["mass"] = [{"node_set": "top", "value": 0.1}]
     for key, what, size in (("spring", "stiffness", YOUNG * AREA), ("dashpot", "coefficient", 10.0)):
         tables = []
-        if grounded and chance.random() < 0.2:
+        if not relaxed and chance.random() < 0.2:
             value = size * chance.choice((0.01, 0.5))
             tables.append({"node_set": "top", what: [value, 0.0, 0.1 * value] if key == "spring" else value})
         if chance.random() < 0.3:
             tables.append({"between": between, what: size * chance.choice((0.01, 0.2))})
         if tables:
             case[key] = tables
-    if two and chance.random() < 0.3:
+    if two and not relaxed and chance.random() < 0.3:
         pair = {"name": "faces", "first": "face1", "second": "face2", "direction": [1.0, 0.0, 0.0]}
         case["contact_pair"] = [pair]
 
@@ -243,19 +258,25 @@ def _removals(chance: random.Random, table: dict[str, Any], stage: Stage, two: b
 
 
 def _wall(chance: random.Random, case: dict[str, Any], stage: Stage, table: dict[str, Any]) -> dict[str, Any]:
-    """A plane or a ball before the right end, with friction or restitution, at rest or moving."""
-    ahead = float(np.array(case["mesh"]["points"])[:, 0].max()) + PITCH * chance.choice((0.002, 0.02))
-    wall: dict[str, Any] = {"name": "w", "type": "plane", "point": [ahead, 0.0, 0.0], "normal": [-1.0, 0.0, 0.0]}
+    """A plane or a ball beside the nodes that no support holds, with friction or restitution, at rest or moving."""
+    members = case["mesh"]["node_groups"]["free"]
+    ahead = float(np.array(case["mesh"]["points"])[members, 1].max()) + PITCH * chance.choice((0.01, 0.02))
+    wall: dict[str, Any] = {"name": "w", "node_set": "free", "type": "plane"}
+    wall |= {"point": [0.0, ahead, 0.0], "normal": [0.0, -1.0, 0.0]}
     if "contact_pair" in case:
         return wall
     if chance.random() < 0.3:
-        wall = {"name": "w", "type": "sphere", "radius": 3.0, "side": "outside"}
-        wall["point"] = [ahead + 3.0, 0.5 * PITCH, 0.5 * PITCH]
+        wall = {"name": "w", "node_set": "free", "type": "sphere", "radius": 3.0, "side": "outside"}
+        wall["point"] = [PITCH, ahead + 3.0, 0.5 * PITCH]
     kind = chance.choice(("smooth", "friction", "restitution", "tied"))
     wall |= {"friction": 0.3} if kind == "friction" else {"tied": True} if kind == "tied" else {}
     if kind == "restitution" and stage.kind == "central_differences":
         wall["restitution"] = 0.7
     if chance.random() < 0.4:
-        way = np.array([-0.04 * PITCH, 0.0, 0.0])
+        way = np.array([0.0, -0.03 * PITCH, 0.0])
         wall |= {"motion": _rows(chance, stage, (0.0 * way, way, 0.3 * way)), "interpolation": chance.choice(_WAYS)}
     return wall
+
+
+def _smooth(wall: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in wall.items() if key not in ("friction", "tied")}

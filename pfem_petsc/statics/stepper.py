@@ -44,7 +44,8 @@ UNCOUNTED = -2
 """Of negative eigenvalues: there are some, whose number is unknown."""
 _RESISTANCE = 1e-3  # viscosity over stiffness with which a truss that nothing holds yet is moved against walls
 _AHEAD = 2.0, 0.5, 0.1, 0.02  # of an increment: near a limit point the response to a whole one is too large
-_LENGTHS = 2.0 ** np.arange(14)  # of an increment, within which the path beyond it is looked at
+_LENGTHS = 2.0 ** np.arange(10)  # of an increment, within which the path beyond it is looked at
+_SOFT = 0.05  # stiffness along the path over that of the state, below which bars yield up to a limit load
 _EXCEEDED = (
     "nodes moved far without load, as in a snap-through, and forces from there on contain the viscous force; compare "
     "with a smaller static.stabilise, or use a dynamic stage"
@@ -537,7 +538,7 @@ class StaticStepper(ImplicitStepper):
         system.linearise(rest)
         response = system.response(rest, state.time)
         metric = Metric(self.model.comm, False, 1.0 / dot(self.model.comm, response, response))
-        points, reached = PointSolver(state, system, metric, False), 0.0
+        points, softest = PointSolver(state, system, metric, False), 1.0
         for length in size * _LENGTHS:
             try:
                 point = points.find(Arc(metric, length), length * response, state.time + length)
@@ -545,12 +546,15 @@ class StaticStepper(ImplicitStepper):
                 continue
             if point.slope < 0.0:
                 return "it is a limit point: beyond it the load falls, as bars yield or unload"
-            reached = length if point.change < 0.5 * size else 0.0
             if point.change > size:
                 return ""
-        if reached < size * _LENGTHS[-1]:
+            softest = min(softest, point.slope)
+        if not softest < _SOFT:
             return ""
-        return "it is a limit load: bars yield so far that the truss moves without more of it"
+        return (
+            f"it is close to a limit load: bars yield, and the truss moves {1.0 / max(softest, 1e-9):.2g} times as far "
+            "with the load as where they unload"
+        )
 
     def _free_guess(self, balance: Balance) -> np.ndarray:
         """Return the increment proportional to the last one."""

@@ -1,10 +1,13 @@
 """Sections, supports, loads and steps in Abaqus input files."""
 
+import math
+
 import numpy as np
 import pytest
 from helpers.files import FLAT, MESHES, written
+from mpi4py import MPI
 
-from pfem_petsc import Case, Truss
+from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.errors import InputError
 from pfem_petsc.formats import read_whole
 from pfem_petsc.mesh.whole import skeleton
@@ -190,7 +193,7 @@ STEPS = [
         {"modes": {"count": 10, "kind": "vibration"}},
         "line 47: *FREQUENCY: a limit of the frequencies is not supported: modes.count = 10",
     ),
-    ("*BUCKLE\n3,", {"static": {"step": 1.0}, "modes": {"count": 3, "kind": "buckling"}}, ""),
+    ("*BUCKLE\n3,", {"modes": {"count": 3, "kind": "buckling", "linear": True}}, ""),
     (
         "*HEAT TRANSFER\n1., 1.",
         {},
@@ -261,3 +264,45 @@ def test_motions_of_dynamic_steps(tmp_path):
         assert mesh.tables["support"]["node_21"] == {"node_set": "node_21", "fix": "xz", **expected}
         told = [text for text in mesh.warnings if "held where it is: at once in a dynamic step" in text]
         assert len(told) == (not expected)
+
+
+ARCH = """*NODE
+1, 0, 0, 0
+2, 1, 0, 0.1
+3, 2, 0, 0
+*ELEMENT, TYPE=T3D2, ELSET=E
+1, 1, 2
+2, 2, 3
+*NSET, NSET=FEET
+1, 3
+*NSET, NSET=APEX
+2
+*SOLID SECTION, ELSET=E, MATERIAL=ST
+1e-3
+*MATERIAL, NAME=ST
+*ELASTIC
+2.1e11, 0.3
+*DENSITY
+7850.
+*BOUNDARY
+FEET, 1, 3
+APEX, 2, 2
+*STEP
+*BUCKLE
+1
+*CLOAD
+APEX, 3, -FORCE
+*END STEP
+"""
+
+
+@pytest.mark.parametrize("load", ["7e4", "7", "7e6"])
+def test_buckling_of_a_deck_is_a_linear_perturbation(load, tmp_path):
+    """lambda P = 2 E A tan^2 a sin a for every P, also for those that the arch cannot carry."""
+    path = written(tmp_path, ARCH.replace("FORCE", load))
+    mesh = read_whole(path)
+    case = Case.from_toml(skeleton(mesh, path, tmp_path / "a.toml"), tmp_path)
+    with Simulation(case, MPI.COMM_SELF, output=tmp_path / "out", quiet=True) as simulation:
+        simulation.run()
+    factor = open_result(tmp_path / "out").modes.load_factor[0]
+    assert factor * float(load) == pytest.approx(2 * 2.1e8 * 0.1**3 / math.hypot(1.0, 0.1), rel=1e-10)

@@ -88,6 +88,16 @@ def test_wall_that_moves_may_push_against_another(comm, moves):
     assert not any("no node moves" in text for text in inspected(case, comm)[1])
 
 
+def test_gaps_of_a_static_analysis_close_per_load_factor(comm):
+    """A wall that rises by 0.25 m a unit of the load factor has no speed."""
+    wall = "wall=[{name='w', type='plane', point=[0,0,-0.1], normal=[0,0,1], velocity=[0,0,0.25]}]"
+    data = Case.load("lattice_drop", ["mesh.cells=[2,2,2]", wall]).to_dict()
+    del data["time"], data["initial"]
+    entries, _ = inspected(Case.from_dict(data | {"static": {"step": 0.5, "end": 2.0}}), comm)
+    told = next(text for label, text in entries.items() if label.endswith("w") and "gap" in text)
+    assert "closing at up to 250.0 mm per unit of the load factor" in told
+
+
 def test_memory_that_the_machine_lacks(comm, monkeypatch):
     simulation = Simulation(Case.load("rod_impact"), comm, check_only=True)
     assert simulation.inspect()[1] == []

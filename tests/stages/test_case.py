@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 from helpers.small_models import BLOCK
+from mpi4py import MPI
 
-from pfem_petsc import Case
+from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 from pfem_petsc.restart.checkpoints import changed_keys
 
@@ -129,3 +130,9 @@ def test_a_restart_says_what_it_may_change():
     ):
         changed_keys(Path("checkpoint.h5"), before, now, "case")
     assert changed_keys(Path("checkpoint.h5"), before, {**before, "title": "other"}, "case")
+
+
+def test_a_treatment_of_impact_above_a_static_stage_is_told_where_it_belongs():
+    case = Case.from_dict({**BLOCK, "contact": {"treatment": "stick"}})
+    with pytest.raises(InputError, match=r"stage 'press': .* move it to \[stage.contact\] of the stages with"):
+        Simulation(case, MPI.COMM_SELF, check_only=True)

@@ -23,3 +23,12 @@ def test_surface_is_on_the_wall(parameters):
     normals, offsets = module.Wall(parameters).planes(face)
     np.testing.assert_allclose(np.einsum("ij,ij->i", normals, face), offsets, atol=1e-12)
     assert surface.faces.max() < len(surface.points) and len(face) >= 4
+
+
+def test_a_sphere_has_circles_across_each_other():
+    """Three great circles, one in each plane of the axes; without them its picture is a disc."""
+    (surface,) = wall_surfaces([WALLS[0]], np.array([[-1.0, -1, -1], [1.0, 1, 1]]))
+    arms = surface.points[surface.edge] - np.array(WALLS[0].point)
+    np.testing.assert_allclose(np.linalg.norm(arms, axis=2), WALLS[0].radius, rtol=1e-12)
+    within = (np.abs(arms) < 1e-12).all(axis=1)  # which coordinate both ends lack
+    assert within.any(axis=1).all() and (within.sum(axis=0) >= 32).all()

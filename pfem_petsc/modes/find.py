@@ -391,8 +391,8 @@ class _Search:
             pencil.destroy()
         if not len(theta):
             raise SimulationFailure(
-                f"{self.source}: modes: no positive factor of the state's axial forces makes the truss buckle: it is "
-                "in tension"
+                f"{self.source}: modes: no positive factor of the axial forces makes the truss buckle: they put it in "
+                "tension, or relieve it"
             )
         peaks = np.abs(shapes).max(axis=(1, 2), initial=0.0)
         comm.Allreduce(MPI.IN_PLACE, peaks, op=MPI.MAX)

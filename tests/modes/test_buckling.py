@@ -115,7 +115,7 @@ def test_what_has_no_factor_is_told(solver, shared_tmp_path, comm):
         load=[{"node_set": "top", "force": [0.0, 0.0, LOAD]}],
         modes={"kind": "buckling", "solver": solver},
     )
-    with pytest.raises(SimulationFailure, match="in tension"):
+    with pytest.raises(SimulationFailure, match="put it in tension"):
         Simulation(pulled, comm, output=shared_tmp_path / "pulled", quiet=True).run()
     idle = mast(shared_tmp_path, comm, load=[], modes={"kind": "buckling", "solver": solver})
     with pytest.raises(SimulationFailure, match="there are none"):

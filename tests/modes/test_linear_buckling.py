@@ -90,6 +90,16 @@ def test_load_beyond_one_that_acts_at_the_start(linear, shared_tmp_path, comm):
     assert found[0] == pytest.approx((0.5 * SUM - a) / (b - a), rel=1e-9)
 
 
+def test_load_beyond_a_preload(shared_tmp_path, comm):
+    """The base of the last stage is what the stage before has left, bars shorter by a/EA: 2 (a + lambda (b - a)) = k l."""
+    a, b = 500.0, 700.0
+    presses = [{"load": [{"node_set": "top", "force": [0.0, 0.0, -force]}]} for force in (a, b)]
+    stages = [{"name": f"{k}", "static": {"step": 1.0}, **press} for k, press in enumerate(presses)]
+    found, _ = factors(column(stage=stages), shared_tmp_path / "out", comm)
+    shorter = 1.0 - a / (YOUNG * AREA)
+    assert found[0] == pytest.approx((0.5 * SUM * shorter - a) / (b - a), rel=1e-9)
+
+
 def test_gravity_heat_and_prescribed_motion(shared_tmp_path, comm):
     """Each of them as the load; the first bar carries both masses, a clamped column E A (alpha T or d/L)."""
     mass, g = DENSITY * AREA * HALF, 9.81

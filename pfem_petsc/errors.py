@@ -47,8 +47,10 @@ def lacking_module(error: ImportError) -> str:
         return f"{error}; scripts/setup.sh makes an environment that has it: source .venv/bin/activate"
     words = {".venv": "bash scripts/setup.sh", ".venv-petsc": "bash scripts/setup.sh --build-petsc"}
     command = words.get(prefix.name, f"PFEM_VENV={shlex.quote(str(prefix))} bash scripts/setup.sh")
-    state = "lacks what it had" if (prefix / "setup-done").is_file() else "is not finished"
-    return f"the environment {prefix} {state}: run {command} ({error})"
+    if not (prefix / "setup-done").is_file():
+        return f"the environment {prefix} is not finished: run {command} ({error})"
+    place = prefix.name if prefix.name in words else shlex.quote(str(prefix))
+    return f"the environment {prefix} lacks what it had: run {command}, then source {place}/bin/activate ({error})"
 
 
 def raised(error: BaseException, file: str | None = None) -> str:

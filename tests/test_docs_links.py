@@ -102,7 +102,8 @@ def test_one_version():
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert version == __version__
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
-    assert re.findall(r"^## (\S+)$", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[0] == version
+    # the newest heading, whether that version is released or not
+    assert re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[0] == version
 
 
 def test_case_file_is_the_built_in_one(tmp_path):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pfem_petsc import __version__, open_result
+from pfem_petsc import open_result
 from pfem_petsc.cli.main import _parse
 
 ROOT = Path(__file__).parents[2]
@@ -86,19 +86,6 @@ def test_conda_environment_has_every_dependency():
     listed = re.findall(r"^  - ([\w-]+)", (PACKAGING / "environment.yml").read_text(), flags=re.MULTILINE)
     names = {name.removesuffix("-base") for name in listed}
     assert wanted <= names
-
-
-def test_the_version_is_that_of_the_changelog():
-    """The newest heading, the package, its metadata and the citation; what is not released has no date of release."""
-    heading = re.search(r"^## (\S+)(.*)$", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
-    citation = (ROOT / "CITATION.cff").read_text()
-    assert heading[1] == __version__
-    assert re.search(r"^version: (\S+)$", citation, flags=re.MULTILINE)[1] == __version__
-    assert ("date-released:" in citation) == ("unreleased" not in heading[2])
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    dynamic = project["tool"]["setuptools"]["dynamic"]["version"]["attr"]
-    assert project["project"]["dynamic"] == ["version"] and "version" not in project["project"]
-    assert dynamic == "pfem_petsc.version.__version__"
 
 
 def test_data_files_are_in_the_wheel():

@@ -91,7 +91,7 @@ def test_load_beyond_one_that_acts_at_the_start(linear, shared_tmp_path, comm):
 
 
 def test_load_beyond_a_preload(shared_tmp_path, comm):
-    """The base of the last stage is what the stage before has left, bars shorter by a/EA: 2 (a + lambda (b - a)) = k l."""
+    """The last stage begins with the preload a and bars shorter by a/EA: 2 (a + lambda (b - a)) = k l."""
     a, b = 500.0, 700.0
     presses = [{"load": [{"node_set": "top", "force": [0.0, 0.0, -force]}]} for force in (a, b)]
     stages = [{"name": f"{k}", "static": {"step": 1.0}, **press} for k, press in enumerate(presses)]

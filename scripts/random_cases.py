@@ -46,7 +46,9 @@ LOOSE = ("energy balance above 1e-9", "chaotic: ")
 def main() -> int:
     """Run the requested cases, and report faults by cause."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", default="0:200", metavar="A:B", help="from A to before B (default: %(default)s)")
+    parser.add_argument(
+        "--seeds", default="0:200", metavar="A:B", help="from A to before B, or A,B,C (default: %(default)s)"
+    )
     parser.add_argument("--cases", type=Path, nargs="+", default=[], metavar="FILE", help="case files instead")
     parser.add_argument("--ranks", type=int, default=3, metavar="N", help="beside one (default: 3; 1: none)")
     parser.add_argument("--restart-every", type=int, default=3, metavar="N", help="continue every N-th; 0: none")
@@ -68,6 +70,8 @@ def main() -> int:
         return 0
     if arguments.cases:
         seeds = list(range(len(arguments.cases)))
+    elif "," in arguments.seeds:
+        seeds = [int(seed) for seed in arguments.seeds.split(",")]
     else:
         first, _, end = arguments.seeds.partition(":")
         seeds = list(range(int(first), int(end or int(first) + 1)))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from helpers.lattices import TRAPEZOID, rows_of
 from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
+from pages import DOCS
 
 from pfem_petsc import Case
 
@@ -59,6 +60,7 @@ def test_bar_that_falls_on_a_rising_plate(integrator, treatment, restitution, ga
     assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "treatment", "restitution", "wall", "body"),
     [
@@ -82,6 +84,20 @@ def test_impact_seen_from_the_wall(scheme, treatment, restitution, wall, body):
     assert errors.work < 1e-12
     assert max(errors.balance, errors.momentum) < 1e-12
     assert errors.frames < 1e-11
+
+
+def test_page_has_the_whole_scan():
+    """Every scheme and treatment is there, and errors are rounding, or what chatter makes of it."""
+    text = (DOCS / "contact.md").read_text(encoding="utf-8").split(table.START)[1].split(table.END)[0]
+    head, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in text.strip().splitlines())
+    assert head[1:] == [f"`{treatment}`" for treatment in table.TREATMENTS]
+    assert [row[0] for row in rows] == [table.label(*scheme) for scheme in table.SCHEMES]
+    for row in rows:
+        for cell in row[1:]:
+            number, _, errors = cell.partition(": ")
+            if number != "-":
+                work, balance, *others = map(float, errors.split(", "))
+                assert int(number) >= 2 and work < 1e-12 and balance < 1e-11 and max(others) < 1e-8, row
 
 
 @pytest.mark.parametrize(
@@ -117,6 +133,7 @@ def test_work_of_a_wall_that_accelerates_in_batches_and_single_steps(comm, share
         np.testing.assert_allclose([row[name] for row in rows], [row[name] for row in others], atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize(
     ("integrator", "treatment", "restitution"), [("central_differences", "stick", 0.0), ("newmark", "scheme", 0.5)]
@@ -138,6 +155,7 @@ def test_corner_that_moves_on_any_number_of_ranks(integrator, treatment, restitu
     assert_as_on_one_rank(history, Case.from_dict(case), comm, shared_tmp_path, "contact_work", within=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "restitution", "told"),
     [(("hulbert_chung", {"rho_b": 1.0}), 1.0, True), (("newmark", HALF), 0.0, True), (("chung_lee", {}), 0.5, False)],

@@ -72,6 +72,8 @@ class Treatment(Base):
         """Return nodes in contact with walls (m,), their velocities and accelerations (m, 3)."""
         stepper, state = self.stepper, self.stepper.state
         nodes, normal, speed = self.held()
+        if len(nodes) == 0:  # there may be no wall at all
+            return nodes, speed, speed
         mass = stepper.model.inertia.mass[nodes]
         # forces act along other normals than those at the end; several walls move a node along all of theirs
         first = stepper.model.contact.motion.rates(state.time)[stepper.touching[nodes].argmax(axis=1)]

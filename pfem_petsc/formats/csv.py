@@ -161,7 +161,10 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
             told = told or f"whose ids are in column {nodes.shown(ids)}, like {', '.join(islice(number, 3))}"
             raise InputError(f"{bars.where(row)}: there is no node {label!r} in {of_nodes.name}, {told}")
     mesh = WholeMesh(np.stack(axes, axis=1), ends, nodes.groups(), bars.groups())
-    mesh.warnings = warnings + nodes.units(_AXES) + bars.units([["area"]])
+    coordinates = [place for place in map(nodes.place, _AXES) if place is not None]
+    mesh.warnings = warnings + nodes.units(coordinates, "converts by --scale (0.001 for millimetres)")
+    fields = [place for _, place in bars.others([])]
+    mesh.warnings += bars.units(fields, "converts the column area alone, by --scale squared, with the coordinates")
     used = [nodes.place(names) for names in (*_AXES, _GROUPS)]
     texts: list[str] = []
     for name, place in nodes.others([*used, ids, *nodes.places(chain(*_NODE_IDS))]):
@@ -313,15 +316,15 @@ class _Table:
         known = {*used}
         yield from ((name, i) for i, name in enumerate(self.headings) if name and i not in known)
 
-    def units(self, columns: Iterable[Iterable[str]]) -> list[str]:
-        """Return a warning about columns with another unit of length than metres."""
+    def units(self, places: Iterable[int], remedy: str) -> list[str]:
+        """Return a warning about columns in other units of length or area than metres; ``remedy``: of the verb mesh."""
         found = []
-        for place in map(self.place, columns):
-            unit = re.search(r"[\[(]\s*((?:mm|cm|dm|km|in|inch|ft|yd)[²2]?)\s*[\])]\s*$", self._given[place or 0])
-            if unit and place is not None:
+        for place in places:
+            unit = re.search(r"[\[(]\s*((?:mm|cm|dm|km|in|inch|ft|yd)[²2]?)\s*[\])]\s*$", self._given[place])
+            if unit:
                 found.append(f"{self.shown(place)} in {unit[1]}")
-        scale = "read as if in metres; the verb mesh converts by --scale (0.001 for millimetres)"
-        return [f"{self.path}: has {', '.join(found)}, {scale}"] if found else []
+        told = "whose numbers are taken as they are; write them in metres and square metres; the verb mesh"
+        return [f"{self.path}: has {', '.join(found)}, {told} {remedy}"] if found else []
 
     def labels(self, place: int) -> Iterator[str]:
         """Yield the entries of a column; whole numbers written as 3.0 or +3 are 3."""

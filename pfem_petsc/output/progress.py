@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import textwrap
 from collections.abc import Callable
 from logging import Formatter, LogRecord, makeLogRecord
 from logging.handlers import WatchedFileHandler
@@ -208,8 +207,8 @@ class Progress:
         self._log_line(text, "WARNING")
         shown = f"warning: {text}"
         if self._short is not None:
-            brief = textwrap.shorten(shown, SHORT, placeholder=" ...")
-            shown = brief if len(shown) <= SHORT else f"{brief} ({self._short})"
+            first, last = shown[: SHORT // 2].rpartition(" ")[0], shown[-SHORT // 2 :].partition(" ")[2]  # the remedy
+            shown = shown if len(shown) <= SHORT else f"{first} ... {last} ({self._short})"
         with contextlib.suppress(OSError):  # it is in the log
             self._show(shown, sys.stderr, style="yellow")
 

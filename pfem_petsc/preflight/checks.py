@@ -32,6 +32,9 @@ _LEAST = 5e-6
 _PRESTRAINS = 1e-6, 0.2
 """Range of strains that prestress gives engineering structures: cables have 1e-4 to 1e-2, those hardly taut 1e-5."""
 
+_LARGEST_AREA = 10.0
+"""Area of bars [m2] beyond which another unit is likely."""
+
 _STRENGTHS = ("yield_stress", "proof_stress", "tensile_strength")
 
 _OPENING = math.sqrt(2.0)
@@ -125,6 +128,7 @@ def odd_numbers(case: Case, model: Model) -> Iterator[str]:
     """Yield one message for each suspicious value: key, value, reason. Collective."""
     yield from _materials(case)
     yield from _sections(case)
+    yield from _areas(case, model)
     yield from _mesh(model)
     yield from _slender(case, model)
     for wall in case.wall:
@@ -164,7 +168,7 @@ def _materials(case: Case) -> Iterator[str]:
 
 def _sections(case: Case) -> Iterator[str]:
     for name, section in case.section.items():
-        if section.area is not None and not 1e-18 <= section.area <= 10.0:
+        if section.area is not None and not 1e-18 <= section.area <= _LARGEST_AREA:
             yield f"section.{name}.area = {section.area:g} m2: no bar has that; 1 mm2 is 1e-6 m2"
         young = case.material[section.material].young_modulus
         stiffness = None if section.area is None else young * section.area
@@ -175,6 +179,19 @@ def _sections(case: Case) -> Iterator[str]:
             value = float(np.abs(np.atleast_2d(np.array(given, dtype=float))[:, -1]).max())
             if value and not _PRESTRAINS[0] <= value / hard <= _PRESTRAINS[1]:
                 yield f"section.{name}.{key} reaches {value:g} {unit}, a strain of {value / hard:.3g}; {_HINT}"
+
+
+def _areas(case: Case, model: Model) -> Iterator[str]:
+    """Areas from fields of the mesh, which may be in square millimetres."""
+    largest = np.zeros(len(case.section))
+    for block, bars in zip(model.mesh.blocks, model.bars.blocks, strict=True):
+        if not isinstance(bars.area, float):
+            largest[block.section] = max(largest[block.section], float(bars.area.max(initial=0.0)))
+    model.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+    for (name, section), area in zip(case.section.items(), largest.tolist(), strict=True):
+        if area > _LARGEST_AREA:
+            key = f"section.{name}.area_field = {section.area_field!r}"
+            yield f"{key} has areas up to {area:g} m2: no bar has that; 1 mm2 is 1e-6 m2"
 
 
 def _slender(case: Case, model: Model) -> Iterator[str]:

@@ -161,8 +161,14 @@ def test_coordinates_under_other_names(tmp_path, axes):
 def test_a_header_of_numpy_and_units_that_are_not_metres(tmp_path):
     mesh = pair(tmp_path, "# id, x [mm], y [mm]\n4, 1000, 0\n5, 0, 0\n", "#i,j,area [mm2]\n4,5,100\n")
     assert mesh.bars.tolist() == [[0, 1]]
-    texts = ("has 'x' in mm, 'y' in mm, read as if in metres", "has 'area' in mm2, read as if in metres")
+    texts = ("has 'x' in mm, 'y' in mm, whose numbers are taken", "has 'area' in mm2, whose numbers are taken")
     assert all(text in warning for text, warning in zip(texts, mesh.warnings, strict=True))
+
+
+def test_any_column_in_square_millimetres_is_told(tmp_path):
+    mesh = pair(tmp_path, "id,x,y\n4,1,0\n5,0,0\n", "i,j,A [mm2],B (m2)\n4,5,100,1e-4\n")
+    assert mesh.bar_fields["A"].tolist() == [100.0]
+    assert len(mesh.warnings) == 1 and "has 'A' in mm2, whose numbers are taken as they are" in mesh.warnings[0]
 
 
 def test_names_of_nodes_or_their_numbers(tmp_path):

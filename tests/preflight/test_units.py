@@ -87,3 +87,18 @@ def test_numbers_of_bifurcations_that_no_path_has(tmp_path):
         simulation.run()
     log = (tmp_path / "b" / "log.txt").read_text()
     assert "static.branch_at = [1]: the path has no such bifurcation, only 0" in log
+
+
+@pytest.mark.parallel
+def test_areas_of_the_mesh_in_square_millimetres(comm):
+    """As a number does, the largest of a field tells; the rank that has it does not matter."""
+    for area, told in ((2e-4, False), (200.0, True)):
+        mesh = Truss([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]], [[0, 1], [1, 2]], bar_fields={"A": [1e-4, area]})
+        section = {"s": {"area_field": "A", "material": "m"}}
+        support = {"node_set": "feet", "fix": "xyz"}
+        data = {"node_set": {"feet": {"indices": [0, 2]}}, "material": {"m": STEEL}, "section": section}
+        data |= {"support": [support], "time": {"integrator": "newmark", "step": 1e-4, "end": 1e-3}}
+        case = Case(data, mesh=mesh)
+        _, warnings = inspected(case, comm)
+        text = "section.s.area_field = 'A' has areas up to 200 m2: no bar has that; 1 mm2 is 1e-6 m2"
+        assert any(text in warning for warning in warnings) == told

@@ -100,9 +100,9 @@ def make_release(law: Law, measure: Callable[..., Any]) -> Callable[..., Any]:
     """Make the loop that removes a share of bars, for a law that is not breakable itself; see :func:`breakable`.
 
     Its arguments are positions and the bars, as for the loops in :mod:`~pfem_petsc.mechanics.elements`; ``members``,
-    the local bars; the state -r that they are to have, if they have not left further; ``counted``, the end of the bars
-    counted on this rank; and ``moved``, to which the stored energies that are released [J] are added, one for each
-    energy of the law.
+    the local bars; the state -r, or r where they have begun to break, that they are to have, if they have not left
+    further; ``counted``, the end of the bars counted on this rank; and ``moved``, to which the stored energies that are
+    released [J] are added, one for each energy of the law.
     """
     count = len(law.internal)
     stored = tuple(name in STORED for name in law.energies)
@@ -135,7 +135,8 @@ def make_release(law: Law, measure: Callable[..., Any]) -> Callable[..., Any]:
                 bars.history[first + j, column] += lost
                 if stored[j] and k < counted:
                     moved[j] += bar_value(bars.area, column) * bars.rest[k] * lost
-            bars.history[count, column] = -state
+            # one that has begun to break counts as broken
+            bars.history[count, column] = state if bars.history[count, column] > 0.0 else -state
 
     return release
 

@@ -202,3 +202,13 @@ def test_work_of_rest_lengths_and_temperatures_on_damped_bars(run, softening):
     modulus = 0.75 * YOUNG if softening else YOUNG
     elastic = 0.5 * modulus * (strain - 50.0e-5) ** 2 * AREA * length
     np.testing.assert_allclose(found["elastic_energy"][-1], elastic, rtol=1e-9)
+
+
+@pytest.mark.parallel
+def test_bar_that_is_removed_while_it_breaks_counts_as_broken(run):
+    """The count of a stage, and of a continued run, is that of the states of the bars, and never falls."""
+    breaking = weak(rupture={"stress": 1e-6, "steps": 30})
+    removal = [{"bars": "inclined", "time": 0.01}]
+    stages = [{"time": FLY, "load": pull(3.0), "remove": removal}, {"time": FLY}]
+    broken = run(case_of(stages, **breaking))["broken_bars"]
+    assert broken[0] == 0 and broken[-1] == 1 and np.diff(broken).min() == 0

@@ -357,7 +357,7 @@ class _Search:
         comm, holds, doubts = self.model.comm, self.holds, []
         if self.linear:
             static = self.model.case.static
-            end = 0.0 if static is None else getattr(static.parameters, "end", None) or 1.0
+            end = 1.0 if static is None else getattr(static.parameters, "end", None) or 1.0
             found = linear_forces(self.model, matrices, 0.0, float(end), loaded=static is not None)
             material, forces = found.stiffness, np.stack([found.start, found.change])
             geometric = material.copy()
@@ -370,9 +370,12 @@ class _Search:
         largest = np.array([np.abs(geometric[4]).max(initial=0.0), np.abs(material[3]).max(initial=0.0)])
         comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
         if largest[0] <= _NO_LOAD * largest[1]:
+            remedy = "give the case loads, or temperatures, rest lengths or motions that change up to load factor 1"
+            if not self.linear:
+                remedy = "give the case loads, and modes.linear = true or an analysis that loads the truss ([static])"
             raise SimulationFailure(
                 f'{self.source}: modes: kind = "buckling" multiplies axial forces by the factors, and there are none: '
-                "give the case loads, and modes.linear = true or an analysis that loads the truss ([static])"
+                f"{remedy}"
             )
         geometric[3:] *= -1.0
         a = matrices.stiffness(geometric, 0.0, springs=False)

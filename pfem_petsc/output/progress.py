@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import textwrap
 from collections.abc import Callable
 from logging import Formatter, LogRecord, makeLogRecord
 from logging.handlers import WatchedFileHandler
@@ -23,7 +24,7 @@ __all__ = ["LogFile", "Progress", "Span"]
 
 FIRST_LINE = 2.0  # seconds until the first line, and between the first lines
 LAST_LINE = 10.0  # maximum number of seconds between lines
-SHORT = 160  # letters of a warning, if quiet
+SHORT = 240  # letters of a warning, if quiet
 BAR_REFRESH = 0.1  # seconds between two updates of the bar
 
 # Open MPI gives rank 0 a pseudo-terminal, so isatty() alone would draw a bar into the line-wise forwarding of mpirun.
@@ -207,8 +208,8 @@ class Progress:
         self._log_line(text, "WARNING")
         shown = f"warning: {text}"
         if self._short is not None:
-            first, last = shown[: SHORT // 2].rpartition(" ")[0], shown[-SHORT // 2 :].partition(" ")[2]  # the remedy
-            shown = shown if len(shown) <= SHORT else f"{first} ... {last} ({self._short})"
+            brief = textwrap.shorten(shown, SHORT, placeholder=" ...")
+            shown = brief if len(shown) <= SHORT else f"{brief} ({self._short})"
         with contextlib.suppress(OSError):  # it is in the log
             self._show(shown, sys.stderr, style="yellow")
 

@@ -357,11 +357,14 @@ class StaticStepper(ImplicitStepper):
             return Place(part, inner.time, self.with_ghosts(inner.predictor + found.u).copy())
 
         try:
-            return JumpSearch(self.model, between).look(
+            found = JumpSearch(self.model, between).look(
                 Place(0.0, state.time, state.x), Place(1.0, balance.time, after)
             )
         finally:
             self._solved = solved
+        # a later stage may begin with a state that is not in equilibrium, from which no path leads
+        begins = self.model.start is not None and state.step == 0
+        return [jump for jump in found if not (begins and jump.first == state.time)]
 
     def _tell_jumps(self) -> None:
         """Warn of the jumps of the last increment."""

@@ -108,6 +108,24 @@ def test_paths_with_corners_and_strong_curvature_have_no_jump(tmp_path, capfd):
         assert JUMPS not in text and not failed
 
 
+def test_a_stage_that_begins_out_of_equilibrium_is_no_jump(tmp_path, capfd):
+    """A bar that hardens as a root of its plastic strain, stopped in flight and suddenly longer: no path leads there."""
+    law = {"law": "johnson_cook", "yield_stress": 1e3, "strength_coefficient": 1e4, "hardening_exponent": 0.5}
+    data = {
+        "mesh": {"generator": "arrays", "points": [[0.0, 0, 0], [1.0, 0, 0]], "bars": [[0, 1]]},
+        "node_set": {"left": {"indices": [0]}, "all": {"all": True}},
+        "material": {"m": {"young_modulus": 1e6, "density": 1e3, "rate_coefficient": 0.0, **law}},
+        "section": {"s": {"area": 1e-3, "material": "m"}},
+        "support": [{"node_set": "left", "fix": "x"}, {"node_set": "all", "fix": "yz"}],
+        "initial": {"velocity": [1.0, 0.0, 0.0]},
+        "stage": [
+            {"name": "flight", "time": {"integrator": "central_differences", "step": 2e-3, "end": 0.03}},
+            {"name": "rest", "section": {"s": {"rest_length": 1.01}}, "static": {"step": 0.25}},
+        ],
+    }
+    assert "jumps" not in told(Case.from_dict(data), tmp_path, capfd)
+
+
 def test_displacement_that_turns_back_is_no_jump_in_silence(tmp_path, capfd):
     """An arch pressed through a soft bar snaps back under the displacement of that bar's end."""
     rise = 0.2

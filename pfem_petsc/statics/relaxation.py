@@ -508,8 +508,9 @@ class RelaxationStepper(StaticStepper):
         """Return the message about an increment without convergence."""
         motion, most = self.motion, self.parameters.max_iterations
         size, node = largest_at_node(self.model.mesh, motion.residual)
+        where = self.at(self.state.step + 1, motion.time)
         return SimulationFailure(
-            f"load factor {motion.time:.6g}: relaxation has not converged in {most} pseudo-steps: residual "
+            f"{where}: relaxation has not converged in {most} pseudo-steps: residual "
             f"{motion.norm:.3g} N, required {self.parameters.tolerance * motion.load:.3g} N; worst at node {node} "
             f"({size:.3g} N). Increase static.max_iterations or static.tolerance; if the residual does not fall, "
             "nothing balances the load there"

@@ -109,7 +109,7 @@ def test_paths_with_corners_and_strong_curvature_have_no_jump(tmp_path, capfd):
 
 
 def test_a_stage_that_begins_out_of_equilibrium_is_no_jump(tmp_path, capfd):
-    """A bar that hardens as a root of its plastic strain, stopped in flight and suddenly longer: no path leads there."""
+    """A bar that hardens as a root of its plastic strain, stopped in flight and suddenly longer: no path is left."""
     law = {"law": "johnson_cook", "yield_stress": 1e3, "strength_coefficient": 1e4, "hardening_exponent": 0.5}
     data = {
         "mesh": {"generator": "arrays", "points": [[0.0, 0, 0], [1.0, 0, 0]], "bars": [[0, 1]]},

@@ -185,7 +185,7 @@ def _areas(case: Case, model: Model) -> Iterator[str]:
     """Areas from fields of the mesh, which may be in square millimetres."""
     largest = np.zeros(len(case.section))
     for block, bars in zip(model.mesh.blocks, model.bars.blocks, strict=True):
-        if not isinstance(bars.area, float):
+        if not isinstance(bars.area, float) and block.section < len(largest):  # others are springs and dashpots
             largest[block.section] = max(largest[block.section], float(bars.area.max(initial=0.0)))
     model.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     for (name, section), area in zip(case.section.items(), largest.tolist(), strict=True):

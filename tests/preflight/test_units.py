@@ -98,6 +98,8 @@ def test_areas_of_the_mesh_in_square_millimetres(comm):
         support = {"node_set": "feet", "fix": "xyz"}
         data = {"node_set": {"feet": {"indices": [0, 2]}}, "material": {"m": STEEL}, "section": section}
         data |= {"support": [support], "time": {"integrator": "newmark", "step": 1e-4, "end": 1e-3}}
+        data["node_set"] |= {"left": {"indices": [0]}, "right": {"indices": [2]}}
+        data["spring"] = [{"between": ["left", "right"], "stiffness": 1.0}]  # whose bars are of no section of the case
         case = Case(data, mesh=mesh)
         _, warnings = inspected(case, comm)
         text = "section.s.area_field = 'A' has areas up to 200 m2: no bar has that; 1 mm2 is 1e-6 m2"

@@ -185,7 +185,7 @@ def test_machine_code_is_never_older_than_what_a_loop_inlines(tmp_path, monkeypa
             sys.modules.pop(name, None)
         importlib.invalidate_caches()
         took = []
-        with Compilation(lambda name: None, took.append):
+        with Compilation(lambda *what: None, took.append):
             value = importlib.import_module("loop_of_a_test").loop(3.0)
         return value, len(took)
 
@@ -205,7 +205,7 @@ def test_damaged_machine_code_is_compiled_anew(module, tmp_path, left):
     whole = damaged.read_bytes()
     damaged.write_bytes(whole[: int(left * len(whole))])
     took = []
-    with Compilation(lambda name: None, took.append):
+    with Compilation(lambda *what: None, took.append):
         assert module().outer(3.0) == 7.0
         assert module().outer(3.0) == 7.0
     assert len(took) == 1 and damaged.stat().st_size == len(whole)

@@ -124,10 +124,11 @@ class Treatment(ABC):
         """Return (m, w) bool: walls to which nodes (m,) that touch them (m, w) stick by friction."""
         return np.zeros(touching.shape, dtype=bool)
 
-    def set(self, nodes: np.ndarray, walls: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
+    def set(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray, walls: np.ndarray | None = None) -> None:
         """Set velocities and accelerations (m, 3) of nodes, and record the previous ones for the ledger; ``walls``: see
-        :class:`Jump`."""
+        :class:`Jump`, by default those that the nodes touch."""
         stepper, state = self.stepper, self.stepper.state
+        walls = stepper.touching[nodes] if walls is None else walls
         inertia = stepper.model.inertia
         fixed = stepper.model.supports.fixed[nodes]
         old_v, old_a = state.v[nodes], state.a[nodes]
@@ -215,7 +216,7 @@ class Restitution(Treatment):
             nodes, v, a = np.append(nodes, gone), np.vstack([v, slower]), np.vstack([a, self.stepper.state.a[gone]])
             walls = np.vstack([walls, left[:, None] == np.arange(walls.shape[1])])
         if len(nodes):
-            self.set(nodes, walls, v, a)
+            self.set(nodes, v, a, walls)
 
     def _let_go(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return nodes (m,) of this treatment that walls released in this step, these walls (m,), and the nodes'

@@ -49,7 +49,7 @@ class Treatment(Base):
             ends, apart, free = self._apart(debt)
             nodes, v, a = np.append(nodes, ends), np.vstack([v, apart]), np.vstack([a, free])
         if len(nodes):
-            self.set(nodes, self.stepper.touching[nodes], v, a)
+            self.set(nodes, v, a)
 
     def _work(self, nodes: np.ndarray, way: np.ndarray | float = 0.0) -> np.ndarray:
         """Return the work (m,) [J] of contact on nodes (m,) in this part of the step, beyond that of walls that move by

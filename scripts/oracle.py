@@ -39,7 +39,7 @@ CHUNK = 20
 """Cases per process."""
 NOT_RESULTS = {"case/text"}
 """Datasets that describe the run: file names and versions."""
-NOT_COMPARED = ("checkpoint", "iterations", "checksum")
+NOT_COMPARED = ("checkpoint", "iterations", ":checks/")
 """Parts of names of datasets that `--within` leaves out."""
 
 

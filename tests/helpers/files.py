@@ -367,7 +367,9 @@ def verdict(path: Path, place: re.Pattern[str]) -> tuple[str, str]:
     if not said.startswith("error: ") or str(path.parent) not in said:
         return "bad", f"does not name the file: {said}"
     lines = said.strip().removeprefix("error: ").split("\n")
-    lines = [line for line in lines if not re.match(r"\s*\d*\s*\|", line)]  # those of the file, shown after its place
+    lines = [
+        line for line in lines if not re.match(r"\s*(\d+ \||\^)", line)
+    ]  # those of the file, shown after its place
     named = all(place.search(line.partition(": ")[2] if ": " in line else line) for line in lines)
     return ("file and place" if named else "file alone"), said
 

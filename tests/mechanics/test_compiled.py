@@ -208,7 +208,8 @@ def test_damaged_machine_code_is_compiled_anew(module, tmp_path, left):
     with Compilation(lambda *what: None, took.append):
         assert module().outer(3.0) == 7.0
         assert module().outer(3.0) == 7.0
-    assert len(took) == 1 and damaged.stat().st_size > 0.9 * len(whole)
+    # names in machine code count the functions of the process, so that lengths may differ by some digits
+    assert len(took) == 1 and abs(damaged.stat().st_size - len(whole)) < 64
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from pfem_petsc import Case, Simulation, cases
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.lattices.surface import read_surface
+from pfem_petsc.mesh.lattices.bodies import read_surface
 
 
 def ball(path, rings=24):

@@ -17,8 +17,9 @@ from ...errors import InputError
 from ...parallel.agreement import agreed, on_root
 from ..exchange import Router
 from ..lattices.block import FACES, PIECE, Block, Parameters, Places, fitted, random_numbers
+from ..lattices.bodies import read_surface
 from ..lattices.cells import mechanism_warning
-from ..lattices.surface import ON, Surface, read_surface
+from ..lattices.surface import ON, Surface
 from ..slab import MeshSlab, index_type, slab_of, slab_range
 
 __all__ = ["Parameters", "generate", "generate_on"]

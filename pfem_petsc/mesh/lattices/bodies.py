@@ -1,14 +1,27 @@
-"""The bodies that a surface of triangles bounds: each closed and oriented, and which of them lies in which."""
+"""Surfaces in files, and the bodies that they bound: each closed and oriented, and which of them lies in which."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ...errors import InputError
 from ..tools import components
+from .expressions import read_vtk
 from .surface import Surface, area_of, volume_of
+
+if TYPE_CHECKING:
+    import pyvista
+
+_Triangles = tuple[np.ndarray, np.ndarray]
+
+_SUFFIXES = (".stl", ".obj", ".ply")
+
+_MERGED = 1e-7
+"""Points of a file closer than this fraction of its diagonal are merged if it is not closed without that."""
+
 
 _CLOSE = 1e-6
 """Points closer than this fraction of the diagonal of all bodies touch each other."""
@@ -160,3 +173,57 @@ def _sides(points: np.ndarray, own: np.ndarray, other: Surface, close: float) ->
     distance = other.distances(starts[line] + span.mean(axis=1)[:, None] * (stops - starts)[line])
     sides = set(np.sign(distance[np.abs(distance) > close]).astype(int).tolist())
     return sides | ({1} if not near.all() else set()), bool(crossed.any() or (np.abs(distance) <= close).any())
+
+
+def read_surface(path: Path, scale: float) -> Surface:
+    """Read a surface; to be called on one rank.
+
+    Raises
+    ------
+    InputError
+        If the file is not there, is not of triangles, or the surface is open.
+    """
+    where = f"mesh.surface.file: {path}"
+    if path.suffix.lower() not in _SUFFIXES:
+        raise InputError(f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_SUFFIXES)}")
+    data = read_vtk(path, where)
+    points, triangles = _triangles(data)
+    if len(triangles) == 0 or not np.isfinite(points).all():
+        raise InputError(f"{where}: no surface of triangles could be read from it")
+    count, edge = _open_edges(triangles)
+    if count:
+        points, triangles = _better((points, triangles), _triangles(data, _MERGED))
+        count, edge = _open_edges(triangles)
+    if count:
+        a, b = (", ".join(f"{x:.6g}" for x in points[node]) for node in edge)
+        raise InputError(
+            f"{where}: the surface is not closed: {count} of its edges have a triangle on one side only, like that "
+            f"from ({a}) to ({b}) in the file; close it in the program that made it (PyVista: mesh.fill_holes(size))"
+        )
+    bodies = bodies_of(points, triangles, where)
+    if not bodies.layers:
+        raise InputError(f"{where}: the surface encloses no volume")
+    return Surface(scale * points, bodies.triangles, bodies.layers, [f"{where}: {text}" for text in bodies.warnings])
+
+
+def _triangles(data: pyvista.PolyData, tolerance: float = 0.0) -> _Triangles:
+    """Return points and triangles; points within the tolerance, in diagonals, are merged, flat triangles left out."""
+    data = data.triangulate()
+    if data.n_cells == 0:
+        return np.empty((0, 3)), np.empty((0, 3), np.int64)
+    data = data.clean(tolerance=tolerance, absolute=False)
+    corners = data.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
+    return np.array(data.points, np.float64), corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+
+
+def _open_edges(triangles: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return how many edges have an odd number of triangles, and the first of them."""
+    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    pairs, count = np.unique(edges, axis=0, return_counts=True)
+    wrong = pairs[count % 2 == 1]
+    return len(wrong), wrong[0] if len(wrong) else np.empty(0, np.int64)
+
+
+def _better(one: _Triangles, two: _Triangles) -> _Triangles:
+    """Return the points and triangles with fewer open edges; a surface that has lost all triangles is no better."""
+    return two if len(two[1]) and _open_edges(two[1])[0] < _open_edges(one[1])[0] else one

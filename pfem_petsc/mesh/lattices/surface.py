@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...errors import InputError
-from .expressions import read_vtk
-
 if TYPE_CHECKING:
     import pyvista
 
-_Triangles = tuple[np.ndarray, np.ndarray]
 
 ON = 1e-6
 """Points nearer to the surface than this fraction of the bar lengths count as inside: those on it are inside."""
@@ -170,62 +165,6 @@ class Surface:
         return line, np.clip(along, 0.0, 1.0)
 
 
-_SUFFIXES = (".stl", ".obj", ".ply")
-_MERGED = 1e-7
-"""Points of a file closer than this fraction of its diagonal are merged if it is not closed without that."""
-
-
-def read_surface(path: Path, scale: float) -> Surface:
-    """Read a surface; to be called on one rank.
-
-    Raises
-    ------
-    InputError
-        If the file is not there, is not of triangles, or the surface is open.
-    """
-    from .bodies import bodies_of
-
-    where = f"mesh.surface.file: {path}"
-    if path.suffix.lower() not in _SUFFIXES:
-        raise InputError(f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_SUFFIXES)}")
-    data = read_vtk(path, where)
-    points, triangles = _triangles(data)
-    if len(triangles) == 0 or not np.isfinite(points).all():
-        raise InputError(f"{where}: no surface of triangles could be read from it")
-    count, edge = _open_edges(triangles)
-    if count:
-        points, triangles = _better((points, triangles), _triangles(data, _MERGED))
-        count, edge = _open_edges(triangles)
-    if count:
-        a, b = (", ".join(f"{x:.6g}" for x in points[node]) for node in edge)
-        raise InputError(
-            f"{where}: the surface is not closed: {count} of its edges have a triangle on one side only, like that "
-            f"from ({a}) to ({b}) in the file; close it in the program that made it (PyVista: mesh.fill_holes(size))"
-        )
-    bodies = bodies_of(points, triangles, where)
-    if not bodies.layers:
-        raise InputError(f"{where}: the surface encloses no volume")
-    return Surface(scale * points, bodies.triangles, bodies.layers, [f"{where}: {text}" for text in bodies.warnings])
-
-
-def _triangles(data: pyvista.PolyData, tolerance: float = 0.0) -> _Triangles:
-    """Return points and triangles; points within the tolerance, in diagonals, are merged, flat triangles left out."""
-    data = data.triangulate()
-    if data.n_cells == 0:
-        return np.empty((0, 3)), np.empty((0, 3), np.int64)
-    data = data.clean(tolerance=tolerance, absolute=False)
-    corners = data.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
-    return np.array(data.points, np.float64), corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
-
-
-def _open_edges(triangles: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return how many edges have an odd number of triangles, and the first of them."""
-    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
-    pairs, count = np.unique(edges, axis=0, return_counts=True)
-    wrong = pairs[count % 2 == 1]
-    return len(wrong), wrong[0] if len(wrong) else np.empty(0, np.int64)
-
-
 def area_of(points: np.ndarray, triangles: np.ndarray) -> float:
     """Return the area of triangles."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
@@ -236,8 +175,3 @@ def volume_of(points: np.ndarray, triangles: np.ndarray) -> float:
     """Return the volume that closed triangles enclose, positive with normals outwards, by the divergence theorem."""
     a, b, c = (points[triangles[:, k]] - points.mean(axis=0) for k in range(3))
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
-
-
-def _better(one: _Triangles, two: _Triangles) -> _Triangles:
-    """Return the points and triangles with fewer open edges; a surface that has lost all triangles is no better."""
-    return two if len(two[1]) and _open_edges(two[1])[0] < _open_edges(one[1])[0] else one

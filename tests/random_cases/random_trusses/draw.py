@@ -66,7 +66,9 @@ def draw_bar_law(chance: random.Random, case: dict[str, Any], body: Body, motion
         if section["material"] == name:
             shape = {"shape": "tube", "thickness": 0.1 * section["area"] ** 0.5}
             section |= chance.choice(({"shape": "round"}, shape, {"second_moment": 0.05 * section["area"] ** 2}))
-            section["effective_length"] = chance.choice((1.0, 0.7, 0.5))
+            length = chance.choice((1.0, 0.7, 0.5))
+            if law != "cable":  # refused where no bar of the section is checked for buckling
+                section["effective_length"] = length
 
 
 def draw_loads_over_time(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:

@@ -521,7 +521,11 @@ def _shape(
 
     if chance.random() < 0.4:
         centre = members.mean(axis=0) + 0.2 * gap * way
-        wall |= {"point": centre, "side": "inside", "radius": float(distance(centre).max()) + gap + 1e-9 * body.size}
+        wall |= {
+            "point": centre,
+            "side": "inside",
+            "radius": max(float(distance(centre).max()) + gap, 0.0) + 1e-9 * body.size,
+        }
         return
     radius = body.size * chance.uniform(0.15, 1.5)
     centre = first + (gap + radius) * way

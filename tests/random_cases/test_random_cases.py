@@ -257,3 +257,31 @@ def test_copies_give_the_results_of_their_case(tmp_path):
     table["initial"]["velocity"][0] *= 1.001
     found = {cause for cause, _ in judge_copies(table, seed, whole, tmp_path, lambda: 0.0)}
     assert found == {f"{kind}: another result" for kind in KINDS}
+
+
+STAGED = (
+    FALLING.partition("[time]")[0]
+    + """
+[[stage]]
+name = "a"
+time = { integrator = "newmark", step = 0.01, end = 0.02 }
+[[stage]]
+name = "b"
+time = { integrator = "INTEGRATOR", step = 0.01, end = 0.02 }
+"""
+)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "told"), [("newmark", True), ("generalized_alpha", True), ("central_differences", False)]
+)
+def test_damping_may_give_energy_back_only_with_velocities_of_both_ends(tmp_path, integrator, told):
+    """As docs/contact.md says of its formula; in the second stage here, from one row on."""
+    import h5py
+
+    assert run_case(STAGED.replace("INTEGRATOR", integrator), MPI.COMM_SELF, tmp_path).status == 0
+    assert check_result(tmp_path, []) == []
+    with h5py.File(tmp_path / "result.vtkhdf", "a", locking=False) as file:
+        column, stage = file["history/damping_dissipation"], file["history/stage"][:]
+        column[...] = column[...] - (stage == stage.max())
+    assert ("damping_dissipation falls" in [cause for cause, _ in check_result(tmp_path, [])]) == told

@@ -198,7 +198,8 @@ _WAYS = ("linear", "smooth")
 
 def _analysis_keys(chance: random.Random, stage: Stage) -> dict[str, Any]:
     if stage.kind == "relaxation":
-        return {"static": {"method": "relaxation", "step": chance.choice((0.5, 1.0))}}
+        # without an equilibrium the default goes on for minutes
+        return {"static": {"method": "relaxation", "step": chance.choice((0.5, 1.0)), "max_iterations": 30_000}}
     if stage.static:
         static: dict[str, Any] = {"method": "newton", "step": chance.choice((0.25, 0.34, 0.5)), "min_step": 0.01}
         return {"static": static | ({"stabilise": 1e-4} if chance.random() < 0.3 else {})}

@@ -493,10 +493,7 @@ class Ledger:
 
     def load_state(self, kept: dict[str, Any]) -> None:
         """Restore this rank's share from a checkpoint, after the state."""
-        present = self.sums[_TOTALS].copy()
-        self.sums[:] = kept["sums"]
-        self.sums[_TOTALS] = present
-        self.sums[_AT["kinetic_energy"]] = self._before.kinetic
+        self.sums[:] = kept["sums"]  # those of a batch are added in another order than here
         self._pending = [float(value) for value in kept["pending"]]
         self.impulses.load_state(kept["impulses"])
         if "powers" in kept:

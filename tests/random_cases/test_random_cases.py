@@ -3,6 +3,7 @@
 A case that fails: ``python scripts/random_cases.py --seeds SEED --keep DIR`` runs it again and keeps its file.
 """
 
+import random
 import tomllib
 
 import numpy as np
@@ -13,6 +14,7 @@ from random_trusses.comparisons import (
     EXACT,
     KINDS,
     MARGIN,
+    _as_arrays,
     _compare,
     check_case,
     judge_copies,
@@ -285,3 +287,14 @@ def test_damping_may_give_energy_back_only_with_velocities_of_both_ends(tmp_path
         column, stage = file["history/damping_dissipation"], file["history/stage"][:]
         column[...] = column[...] - (stage == stage.max())
     assert ("damping_dissipation falls" in [cause for cause, _ in check_result(tmp_path, [])]) == told
+
+
+def test_copies_of_stages_turn_supports_of_each_stage():
+    """Case 368 has a support along x from its second stage on, and none before: it is turned by axes onto axes."""
+    table = draw_staged(368)
+    assert [support["fix"] for support in table["stage"][1]["support"]] == ["xyz", "x"]
+    turned = KINDS["turned"](random.Random("turned 368"), _as_arrays(table))
+    turn = turned.back(np.eye(3))
+    assert np.count_nonzero(turn) == 3
+    axis = "xyz"[np.abs(turn[:, 0]).argmax()]
+    assert [support["fix"] for support in turned.table["stage"][1]["support"]] == ["xyz", axis]

@@ -158,7 +158,7 @@ def _moved(chance: random.Random, table: dict[str, Any], distance: float) -> Cop
 
 def _turned(chance: random.Random, table: dict[str, Any]) -> Copy:
     """By any angle, or, with supports or springs along axes, by one that maps axes to axes."""
-    along_axes = any("fix" in s and "frame" not in s and s["fix"] != "xyz" for s in table.get("support", ()))
+    along_axes = any("fix" in s and "frame" not in s and s["fix"] != "xyz" for s in _supports(table))
     if along_axes:
         turns = [
             np.eye(3)[list(p)] * np.array(s)[:, None]
@@ -188,11 +188,16 @@ def _turned(chance: random.Random, table: dict[str, Any]) -> Copy:
         if "node_set" in spring and "frame" not in spring:
             spring["frame"] = turn.T[:2].tolist()
     if along_axes:
-        for support in turned["support"]:
+        for support in _supports(turned):
             if "fix" in support and "frame" not in support:
                 axes = [int(np.abs(turn[:, "xyz".index(c)]).argmax()) for c in support["fix"]]
                 support["fix"] = "".join("xyz"[a] for a in sorted(axes))
     return Copy(turned, lambda x: x @ turn)
+
+
+def _supports(table: dict[str, Any]) -> list[dict[str, Any]]:
+    """Those of the case and of its stages."""
+    return [support for part in (table, *table.get("stage", ())) for support in part.get("support", ())]
 
 
 def _renumbered(chance: random.Random, table: dict[str, Any]) -> Copy:

@@ -5,8 +5,8 @@ of the functions
 
 - ``read(path, fields) -> WholeMesh``, which rank 0 calls: the mesh with those of the named fields of bars and nodes
   that the file has (None: all);
-- ``read_on(path, comm, fields) -> MeshSlab | None``, in its place or beside it, of all ranks together: with exactly
-  these fields, by the keys that ask for them; None for files that it leaves to ``read``;
+- ``read_on(path, comm, fields) -> MeshSlab``, in its place, of all ranks together: with exactly these fields, by the
+  keys that ask for them;
 - ``write(path, mesh)``, which one rank calls with a :class:`~pfem_petsc.mesh.whole.WholeMesh`. What it writes, one file
   or several in the folder of ``path``, takes its place when it is complete.
 """
@@ -68,15 +68,15 @@ def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = Non
     # files that rank 0 sends on need not be there on other machines
     reader = importlib.import_module(on_root(comm, lambda: _reader_of(path, "mesh.file: ").__name__))
     wanted = fields or {}
-    slab = reader.read_on(path, comm, wanted) if hasattr(reader, "read_on") else None
-    if slab is None:
-        whole = None
-        with agreed(comm):
-            if comm.rank == 0:
-                whole = _read(reader, path, wanted)
-        return scattered(whole, str(path), comm)
-    check_size(slab.n_nodes, str(path))
-    return slab
+    if hasattr(reader, "read_on"):
+        slab = reader.read_on(path, comm, wanted)
+        check_size(slab.n_nodes, str(path))
+        return slab
+    whole = None
+    with agreed(comm):
+        if comm.rank == 0:
+            whole = _read(reader, path, wanted)
+    return scattered(whole, str(path), comm)
 
 
 def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
@@ -94,12 +94,12 @@ def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     path = Path(path)
     reader = _reader_of(path, "")
     wanted = None if fields is None else dict.fromkeys(fields, "bar_fields")
-    slab = reader.read_on(path, MPI.COMM_SELF, wanted) if hasattr(reader, "read_on") else None
-    if slab is None:
-        whole = _read(reader, path, wanted)
-    else:
+    if hasattr(reader, "read_on"):
+        slab = reader.read_on(path, MPI.COMM_SELF, wanted)
         whole = WholeMesh(slab.points, slab.bars.astype("int64"), slab.node_groups, slab.bar_groups, slab.bar_fields)
         whole.node_fields, whole.warnings = slab.node_fields, slab.warnings
+    else:
+        whole = _read(reader, path, wanted)
     whole.source = str(path)
     return whole
 

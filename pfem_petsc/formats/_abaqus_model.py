@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
 from ._abaqus_keywords import KNOWN, Block
-from ._numbers import number_of, whole_numbers
+from ._numbers import number_of, places_of, whole_numbers
 
 _ONE_BY_ONE = "write the nodes and elements one by one (Abaqus/CAE and most preprocessors do)"
 _REFUSED = dict.fromkeys(
@@ -167,7 +167,7 @@ class _Scope:
         plane = [np.empty(0, bool)]
         for elements in self.elements:
             block, own, wanted = elements
-            found, there = _found(known, wanted)
+            found, there = places_of(known, wanted)
             if not there.all():
                 element, side = np.argwhere(~there)[0]
                 text = f"node {wanted[element, side]} of element {own[element]} is not defined"
@@ -189,12 +189,6 @@ def listed(names: Iterable[str]) -> str:
     """Return the first few names, for messages."""
     names = list(names)
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-
-
-def _found(known: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where labels are among ascending ones, and whether they are there."""
-    place = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))
-    return place, known[place] == wanted if len(known) else np.zeros(wanted.shape, bool)
 
 
 def _ends(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -519,7 +513,7 @@ class Deck:
             if entry.generated:
                 members = at[entry.within(known)]
             else:
-                place, there = _found(known, entry.labels)
+                place, there = places_of(known, entry.labels)
                 members = at[place[there]]
                 self._lost[id(entry.labels)] = len(entry.labels) - len(members)
             parts.append(members[members >= 0])  # without nodes where no bar ends
@@ -554,7 +548,7 @@ class Deck:
 
     def _number(self, key: str, label: int) -> int:
         known, at = self.scopes[key].at["NSET"]
-        place, there = _found(known, np.array([label]))
+        place, there = places_of(known, np.array([label]))
         return int(at[place[0]]) if there[0] else -1
 
     def _set(self, block: Block, scope: _Scope, name: str) -> _Set:

@@ -45,6 +45,12 @@ def whole_numbers(values: np.ndarray, first: int, end: int, refused: Callable[[s
     return values.astype(np.int64)
 
 
+def places_of(known: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where labels are among ascending ones, and whether they are there."""
+    place = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))
+    return place, known[place] == wanted if len(known) else np.zeros(wanted.shape, bool)
+
+
 def shown(text: bytes) -> str:
     """Return the beginning of a text for messages."""
     return text[:60].decode("utf-8", "replace")

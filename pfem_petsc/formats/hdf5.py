@@ -30,7 +30,7 @@ PIECE = 1 << 18
 # HDF5 filters compress real meshes by less than this; a dataset beyond it was never written.
 _COMPRESSION = 1100
 
-FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError)
+_FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError)
 """What h5py and NumPy raise for a damaged file."""
 
 
@@ -54,15 +54,26 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
     """
     content = on_root(comm, _content, path, fields)
     check_memory(content.n_nodes, str(path))
+    n_nodes, n_bars = content.n_nodes, content.n_bars
+    first_node, last_node = slab_range(n_nodes, comm.rank, comm.size)
+    first, last = slab_range(n_bars, comm.rank, comm.size)
+    slab = MeshSlab(n_nodes, n_bars, first_node, np.empty((0, 3)), first, np.empty((0, 2), int), source=str(path))
+    wanted = {kind: [n for n in names if fields is None or n in fields] for kind, names in content.fields.items()}
     # Every rank opens the file read-only: this needs no MPI driver, which a serial h5py lacks.
     with agreed(comm), _opened(path) as file:
-        of_bars, of_nodes = (
-            {name: f"{kind}/{name}" for name in content.fields[kind] if fields is None or name in fields}
-            for kind in ("bar_fields", "node_fields")
-        )
-        slab = read_shares(file, comm, "points", "bars", of_bars, of_nodes)
-    slab.source = str(path)
-    for kind, n in (("node_groups", slab.n_nodes), ("bar_groups", slab.n_bars)):
+        slab.points = _share_of(file["points"], first_node, last_node)
+        slab.bars = np.empty((last - first, 2), index_type(n_nodes))
+        limits = np.iinfo(slab.bars.dtype)
+        for start, stop in _pieces(first, last):
+            piece = file["bars"][start:stop]
+            if piece.min() < limits.min or piece.max() > limits.max:
+                piece = np.where((piece < 0) | (piece >= n_nodes), -1, piece)
+            slab.bars[start - first : stop - first] = piece
+        slab.bar_fields = {name: _share_of(file[f"bar_fields/{name}"], first, last) for name in wanted["bar_fields"]}
+        slab.node_fields = {
+            name: _share_of(file[f"node_fields/{name}"], first_node, last_node) for name in wanted["node_fields"]
+        }
+    for kind, n in (("node_groups", n_nodes), ("bar_groups", n_bars)):
         for name in content.groups[kind]:
             getattr(slab, kind)[name] = _members(path, f"{kind}/{name}", n, comm)
     return slab
@@ -82,7 +93,7 @@ def _opened(path: Path) -> Iterator[Any]:
             yield file
         except MemoryError:
             raise InputError(f"{path}: the mesh does not fit in memory; use more ranks") from None
-        except FAILURES as error:
+        except _FAILURES as error:
             raise InputError(f"{path}: cannot be read ({error}); the file may be damaged: write it again") from None
 
 
@@ -125,48 +136,16 @@ def _content(path: Path, fields: Mapping[str, str] | None) -> _Content:
     return _Content(counts[0], counts[1], groups, known)
 
 
-def read_shares(
-    file: Any, comm: MPI.Comm, points: str, bars: str, fields: Mapping[str, str], node_fields: Mapping[str, str]
-) -> MeshSlab:
-    """Return this rank's slab, without groups, from datasets: points (n, 3), bars (n, 2) or (2 n,), and fields of bars
-    and nodes by name.
-
-    Does not communicate. Numbers of nodes that are not there are kept as far as the type can hold them, else they are
-    -1: checks find both.
-    """
-    n_nodes, n_bars = file[points].shape[0], file[bars].size // 2
-    first_node, last_node = slab_range(n_nodes, comm.rank, comm.size)
-    first, last = slab_range(n_bars, comm.rank, comm.size)
-    kind = index_type(n_nodes)
-    ends = np.empty((last - first, 2), kind)
-    width = 2 if file[bars].ndim == 1 else 1
-    for start, stop in pieces(first, last):
-        piece = file[bars][width * start : width * stop].reshape(-1, 2)
-        if piece.size and (piece.min() < np.iinfo(kind).min or piece.max() > np.iinfo(kind).max):
-            piece = np.where((piece < 0) | (piece >= n_nodes), -1, piece)
-        ends[start - first : stop - first] = piece
-    return MeshSlab(
-        n_nodes=n_nodes,
-        n_bars=n_bars,
-        first_node=first_node,
-        points=share_of(file[points], first_node, last_node),
-        first_bar=first,
-        bars=ends,
-        bar_fields={name: share_of(file[dataset], first, last) for name, dataset in fields.items()},
-        node_fields={name: share_of(file[dataset], first_node, last_node) for name, dataset in node_fields.items()},
-    )
-
-
-def pieces(first: int, last: int) -> Iterator[tuple[int, int]]:
+def _pieces(first: int, last: int) -> Iterator[tuple[int, int]]:
     """Divide the range [first, last) into ranges of at most :data:`PIECE`."""
     for start in range(first, last, PIECE):
         yield start, min(start + PIECE, last)
 
 
-def share_of(dataset: Any, first: int, last: int, kind: type = np.float64) -> np.ndarray:
-    """Return the rows [first, last) of a dataset in another type, without a second copy of them."""
-    rows = np.empty((last - first, *dataset.shape[1:]), kind)
-    for start, stop in pieces(first, last):
+def _share_of(dataset: Any, first: int, last: int) -> np.ndarray:
+    """Return the rows [first, last) of a dataset as float64, without a second copy of them."""
+    rows = np.empty((last - first, *dataset.shape[1:]))
+    for start, stop in _pieces(first, last):
         rows[start - first : stop - first] = dataset[start:stop]
     return rows
 

@@ -6,9 +6,8 @@ array of strings named ``group_names`` or ``section_names`` replaces these names
 same names define node groups (a negative value: no group). An array named ``group:NAME`` is the group NAME of those
 with a value other than 0; these may overlap. Other arrays with one component are fields of bars and nodes.
 
-Each rank reads its share of a .vtkhdf file that has lines of two points alone; VTK reads all others, in a process of
-its own, because it aborts the process on some damaged files. That process runs this module as a program, which
-therefore imports no MPI.
+VTK reads in a process of its own, because it aborts the process on some damaged files. That process runs this module
+as a program, which therefore imports no MPI.
 """
 
 from __future__ import annotations
@@ -31,9 +30,7 @@ from ..errors import InputError
 
 if TYPE_CHECKING:
     import pyvista
-    from mpi4py import MPI
 
-    from ..mesh.slab import MeshSlab
     from ..mesh.whole import WholeMesh
 
 SUFFIXES = (".vtu", ".vtkhdf")
@@ -190,110 +187,6 @@ def _groups_of(data: Any, fields: Any, kept: slice | np.ndarray) -> dict[str, np
             i = int(value)
             groups[names.GetValue(i) if i < n_names else f"{array}_{i}"] = np.flatnonzero(values == value)
     return groups
-
-
-# ---- files of lines alone, of which each rank reads its share
-
-
-def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab | None:
-    """Return this rank's slab of a .vtkhdf file of lines only; None on all ranks for files that VTK must read: it says
-    what is wrong, too. Collective.
-
-    Raises
-    ------
-    InputError
-        On all ranks, if a field is missing, or there are too many nodes or too little memory.
-    """
-    from mpi4py import MPI
-
-    from ..mesh.slab import check_memory
-    from ..mesh.whole import check_fields
-
-    plain = comm.bcast(_plain(path) if comm.rank == 0 and path.suffix.lower() == ".vtkhdf" else None)
-    if plain is None:
-        return None
-    n_nodes, masks, known = plain
-    check_fields(path, fields, {name for names in known.values() for name in names})
-    check_memory(n_nodes, str(path))
-    slab, fits = None, True
-    wanted = {kind: [name for name in names if fields is None or name in fields] for kind, names in known.items()}
-    try:
-        slab = _share(path, comm, masks, wanted)
-    except MemoryError:
-        fits = False
-    if not comm.allreduce(fits, op=MPI.LAND):
-        raise InputError(f"{path}: the mesh does not fit in memory; use more ranks")
-    return slab if comm.allreduce(slab is not None, op=MPI.LAND) else None
-
-
-def _plain(path: Path) -> tuple[int, dict[str, list[str]], dict[str, list[str]]] | None:
-    """Return the number of nodes, names of arrays that mark groups of points and cells, and names of fields, of a file
-    in one part, without steps, of lines of two points in the order of ``Connectivity``; None for another one."""
-    import h5py
-
-    from .hdf5 import FAILURES
-
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            root = file["VTKHDF"]
-            kind = root.attrs["Type"]
-            if (kind.decode() if isinstance(kind, bytes) else str(kind)) != "UnstructuredGrid" or "Steps" in root:
-                return None
-            (n_nodes,), (n_bars,), (n_ends,) = (
-                root[name][:].tolist() for name in ("NumberOfPoints", "NumberOfCells", "NumberOfConnectivityIds")
-            )
-            shapes = {"Points": (n_nodes, 3), "Connectivity": (n_ends,), "Offsets": (n_bars + 1,), "Types": (n_bars,)}
-            holds = [_holds(root[name], shape, "f" if name == "Points" else "iu") for name, shape in shapes.items()]
-            masks: dict[str, list[str]] = {}
-            known: dict[str, list[str]] = {}
-            for kind, n in (("PointData", n_nodes), ("CellData", n_bars)):
-                data = root.get(kind, {})
-                masks[kind] = [name for name in data if name.startswith(_MASK) and len(name) > len(_MASK)]
-                holds += [_holds(data[name], (n,), "fiu") for name in masks[kind]]
-                holds += [name not in data for name in _NAMED]
-                known[kind] = [name for name in data if not name.startswith(_MASK) and data[name].ndim == 1]
-                holds += [_holds(data[name], (n,), "fiu") for name in known[kind]]
-            return (n_nodes, masks, known) if all(holds) and n_ends == 2 * n_bars and n_nodes and n_bars else None
-    except FAILURES:
-        return None
-
-
-def _holds(dataset: Any, shape: tuple[int, ...], kinds: str) -> bool:
-    """Return whether a dataset has this shape, numbers of these kinds, and was written."""
-    if dataset.shape != shape or dataset.dtype.kind not in kinds:
-        return False
-    return dataset.chunks is not None or dataset.id.get_storage_size() >= dataset.size * dataset.dtype.itemsize
-
-
-def _share(path: Path, comm: MPI.Comm, masks: dict[str, list[str]], fields: dict[str, list[str]]) -> MeshSlab | None:
-    """Return this rank's slab; None if its cells are not all lines in order, or the file is damaged."""
-    import h5py
-
-    from .hdf5 import FAILURES, pieces, read_shares, share_of
-
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            root = file["VTKHDF"]
-            own = {name: f"CellData/{name}" for name in fields["CellData"]}
-            of_nodes = {name: f"PointData/{name}" for name in fields["PointData"]}
-            slab = read_shares(root, comm, "Points", "Connectivity", own, of_nodes)
-            slab.source = str(path)
-            first, last = slab.first_bar, slab.first_bar + len(slab.bars)
-            for start, stop in pieces(first, last):
-                in_order = np.array_equal(root["Offsets"][start : stop + 1], np.arange(2 * start, 2 * stop + 1, 2))
-                if not in_order or not (root["Types"][start:stop] == _LINE).all():
-                    return None
-            first_node, last_node = slab.first_node, slab.first_node + len(slab.points)
-            for kind, groups, start, stop in (
-                ("PointData", slab.node_groups, first_node, last_node),
-                ("CellData", slab.bar_groups, first, last),
-            ):
-                for name in masks[kind]:
-                    mask = share_of(root[kind][name], start, stop, bool)
-                    groups[name.removeprefix(_MASK)] = start + np.flatnonzero(mask)
-            return slab
-    except FAILURES:
-        return None
 
 
 # ---- writing

@@ -5,11 +5,10 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from helpers.files import GMSH
 from helpers.meshes import whole
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.formats import gmsh, hdf5, read_slab, read_whole, vtk, write_whole
+from pfem_petsc.formats import hdf5, read_slab, write_whole
 from pfem_petsc.mesh import load_slab
 from pfem_petsc.mesh.generators import lattice
 from pfem_petsc.mesh.slab import slab_range
@@ -20,10 +19,8 @@ pytestmark = pytest.mark.parallel
 
 @pytest.fixture(autouse=True)
 def small_pieces(monkeypatch):
-    """Several pieces of rows and of text a rank."""
+    """Several pieces of rows a rank."""
     monkeypatch.setattr(hdf5, "PIECE", 7)
-    monkeypatch.setattr(gmsh, "PIECE", 5)
-    monkeypatch.setattr(gmsh, "BYTES", 61)
 
 
 def on_rank_0(comm, path, write):
@@ -56,27 +53,13 @@ def check(slab, mesh, comm):
 
 
 @pytest.mark.parametrize("suffix", ["vtkhdf", "h5", "msh"])
-def test_every_rank_reads_its_share(comm, shared_tmp_path, monkeypatch, suffix):
+def test_every_rank_has_its_share(comm, shared_tmp_path, suffix):
     path = shared_tmp_path / f"lattice.{suffix}"
     mesh = lattice_file(comm, path)
-    monkeypatch.setattr(vtk, "read", None)
     slab = load_slab(SimpleNamespace(generator=None, file=path), comm, {"area": "area_field"})
     check(slab, mesh, comm)
     first, last = slab_range(len(mesh.bars), comm.rank, comm.size)
     np.testing.assert_array_equal(slab.bar_fields["area"], mesh.bar_fields["area"][first:last])
-    assert slab.bars.dtype == np.int32
-
-
-def test_vtkhdf_that_is_not_plain_is_left_to_vtk(comm, shared_tmp_path):
-    """One cell that is no line, on the last rank's share."""
-    path = shared_tmp_path / "mixed.vtkhdf"
-    mesh = lattice_file(comm, path)
-    if comm.rank == 0:
-        with h5py.File(path, "r+") as file:
-            file["VTKHDF/Types"][-1] = 4  # a line of several points, here two
-    comm.Barrier()
-    assert vtk.read_on(path, comm, {}) is None
-    check(load_slab(SimpleNamespace(generator=None, file=path), comm), mesh, comm)
 
 
 @pytest.mark.parametrize("suffix", ["vtkhdf", "h5", "msh"])
@@ -106,22 +89,7 @@ def test_members_of_a_group_in_any_order_and_several_times(comm, shared_tmp_path
         read_slab(path, comm)
 
 
-def same_as_of_one_rank(comm, path):
-    """Read a .msh file in parts, and compare with what one rank reads; return the slab."""
-    slab = read_slab(path, comm)
-    mesh = comm.bcast(read_whole(path) if comm.rank == 0 else None)
-    check(slab, mesh, comm)
-    assert list(slab.node_groups) == list(mesh.node_groups) and list(slab.bar_groups) == list(mesh.bar_groups)
-    assert slab.warnings == mesh.warnings
-    return slab
-
-
-@pytest.mark.parametrize("kind", GMSH)
-def test_gmsh_is_read_in_parts(comm, shared_tmp_path, kind):
-    same_as_of_one_rank(comm, on_rank_0(comm, shared_tmp_path / "truss.msh", GMSH[kind]))
-
-
-def test_copies_of_bars_in_gmsh_2_are_joined_across_ranks(comm, shared_tmp_path):
+def test_copies_of_bars_in_gmsh_2_are_joined(comm, shared_tmp_path):
     """Each bar is listed once for each of its groups, all of the second group after those of the first."""
     n = 23
     rows = [f"{k + 1} 1 2 1 1 {k + 1} {k + 2}" for k in range(n)]
@@ -131,14 +99,14 @@ def test_copies_of_bars_in_gmsh_2_are_joined_across_ranks(comm, shared_tmp_path)
         f"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n{n + 1}\n{nodes}\n$EndNodes\n"
         f"$Elements\n{len(rows)}\n" + "\n".join(rows) + "\n$EndElements\n"
     )
-    slab = same_as_of_one_rank(comm, on_rank_0(comm, shared_tmp_path / "two.msh", text.encode()))
+    slab = read_slab(on_rank_0(comm, shared_tmp_path / "two.msh", text.encode()), comm)
     mesh = whole(slab, comm)
     assert mesh.n_bars == n and mesh.bars.tolist() == [[k, k + 1] for k in range(n)]
     groups = {name: members.tolist() for name, members in mesh.bar_groups.items()}
     assert groups == {"group_1": list(range(n)), "group_2": list(range(0, n, 2))}
 
 
-def test_gmsh_with_tags_far_apart_and_in_any_order_is_read_in_parts(comm, shared_tmp_path):
+def test_gmsh_with_tags_far_apart_and_in_any_order(comm, shared_tmp_path):
     tags = [7_000_000_000_000, 3, 900, 12, 5]
     nodes = "\n".join([*map(str, tags), *(f"{k} 0 {k * k}" for k in range(5))])
     lines = "\n".join(f"{90 - k} {tags[k]} {tags[(k + 2) % 5]}" for k in range(5))
@@ -146,7 +114,7 @@ def test_gmsh_with_tags_far_apart_and_in_any_order_is_read_in_parts(comm, shared
         f"$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 5 3 {max(tags)}\n1 1 0 5\n{nodes}\n$EndNodes\n"
         f"$Elements\n1 5 86 90\n1 1 1 5\n{lines}\n$EndElements\n"
     )
-    slab = same_as_of_one_rank(comm, on_rank_0(comm, shared_tmp_path / "sparse.msh", text.encode()))
+    slab = read_slab(on_rank_0(comm, shared_tmp_path / "sparse.msh", text.encode()), comm)
     assert whole(slab, comm).bars.tolist() == [[k, (k + 2) % 5] for k in range(5)]
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .case.schema import Case
     from .errors import EarlyStop, InputError, NotConverged, PfemError, SimulationFailure
     from .formats import write_mesh
-    from .mesh.truss import Truss
+    from .mesh.generators.arrays import Truss
     from .output.result import open_result
     from .output.table import Table
     from .simulation import Simulation
@@ -40,7 +40,7 @@ __all__ = [
 _HOMES = {
     "Case": ".case.schema",
     **dict.fromkeys(("EarlyStop", "InputError", "NotConverged", "PfemError", "SimulationFailure"), ".errors"),
-    "Truss": ".mesh.truss",
+    "Truss": ".mesh.generators.arrays",
     "Simulation": ".simulation",
     "Table": ".output.table",
     "open_result": ".output.result",

@@ -22,8 +22,7 @@ from .parallel.agreement import on_root, outcome
 from .parallel.ending import all_arrive, aside, passes_exception, watch
 from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
-from .preflight.checks import inspect, later_gaps, warnings_before
-from .preflight.forecast import forecast, summarise
+from .preflight.checks import forecast, inspect, later_gaps, summarise, warnings_before
 from .restart.checkpoints import find_restart, finished, finished_message
 from .restart.state import RunState
 from .run.outputs import Outputs, ReportedCompilation

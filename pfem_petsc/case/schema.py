@@ -45,7 +45,7 @@ class Case(_Tables):
     """A validated case. Created by :meth:`load` from a file, from its text, or from tables.
 
     ``Case(mesh=..., material={...}, section={...}, time={...})`` takes the tables of a case file, all at once as nested
-    tables (``Case({...}, mesh=truss)``), or by name; the mesh may be a :class:`~pfem_petsc.mesh.truss.Truss`. NumPy
+    tables (``Case({...}, mesh=truss)``), or by name; the mesh may be a ``Truss``. NumPy
     numbers and arrays, tuples and paths are accepted for the TOML types.
 
     Its tables can be changed: ``case.time.step = 1e-5``, ``case.material["steel"].young_modulus = 2e11``,
@@ -225,8 +225,9 @@ class Case(_Tables):
     ) -> Case:
         """Validate a case given as nested tables with the keys of the case file; see :meth:`load`.
 
-        NumPy numbers and arrays, tuples and paths are accepted for the TOML types. ``mesh.file`` is relative to
-        ``folder``; ``name`` is the default folder of the results.
+            NumPy
+        numbers and arrays, tuples and paths are accepted for the TOML types. ``mesh.file`` is relative to
+            ``folder``; ``name`` is the default folder of the results.
         """
         if not isinstance(data, Mapping):
             raise InputError(

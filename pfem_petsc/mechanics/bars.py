@@ -16,8 +16,8 @@ from ..columns import BAR_ENERGIES, STORED
 from ..errors import InputError
 from ..fields import STATUS
 from ..mesh import load_slab
+from ..mesh.distribution import group_hint
 from ..mesh.exchange import Router
-from ..mesh.node_sets import group_hint
 from ..mesh.slab import slab_of
 from .elements import MEASURES, BarData, ElementFamily, MatrixRows, bar_lengths, first_inverted, make_loops
 from .materials.base import BarShapes, Law, UnsuitableBarError, internal_variables, law_of

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..mesh.node_sets import bars_of_group
+from ..mesh.distribution import bars_of_group
 from .elements import COLLAPSED_STRETCH, MEASURES, virgin
 from .materials.base import law_of
 from .motion import Table

@@ -61,6 +61,29 @@ class MeshSlab:
     filled: float | None = None
     """Of a lattice in a surface: the volume of the cells that its struts are of [m3], for comparison."""
 
+    def share(self, rank: int, size: int) -> MeshSlab:
+        """Return a rank's part of a slab that has the whole mesh."""
+        if size == 1:
+            return self
+        first_node, last_node = slab_range(self.n_nodes, rank, size)
+        first_bar, last_bar = slab_range(self.n_bars, rank, size)
+        nodes, bars = slice(first_node, last_node), slice(first_bar, last_bar)
+
+        def within(groups: Mapping[str, np.ndarray], first: int, last: int) -> dict[str, np.ndarray]:
+            return {name: members[(members >= first) & (members < last)] for name, members in groups.items()}
+
+        return replace(
+            self,
+            first_node=first_node,
+            points=self.points[nodes].copy(),
+            first_bar=first_bar,
+            bars=self.bars[bars].copy(),
+            node_groups=within(self.node_groups, first_node, last_node),
+            bar_groups=within(self.bar_groups, first_bar, last_bar),
+            bar_fields={name: values[bars].copy() for name, values in self.bar_fields.items()},
+            node_fields={name: values[nodes].copy() for name, values in self.node_fields.items()},
+        )
+
 
 def slab_range(n: int, rank: int, size: int) -> tuple[int, int]:
     """Return the range (first, end) of a rank if ``n`` items are distributed evenly and in order."""
@@ -141,25 +164,13 @@ def slab_of_whole(
     size: int,
 ) -> MeshSlab:
     """A rank's part of a mesh that every rank has whole: points (nodes, 3) [m], bars (bars, 2), members."""
-    first_node, last_node = slab_range(len(points), rank, size)
-    first_bar, last_bar = slab_range(len(bars), rank, size)
-
-    def within(groups: Mapping[str, np.ndarray], first: int, last: int) -> dict[str, np.ndarray]:
-        found = {name: np.asarray(members, dtype=np.int64) for name, members in groups.items()}
-        return {name: members[(members >= first) & (members < last)] for name, members in found.items()}
-
-    return MeshSlab(
-        n_nodes=len(points),
-        n_bars=len(bars),
-        first_node=first_node,
-        points=np.array(points[first_node:last_node], dtype=np.float64).reshape(-1, 3),
-        first_bar=first_bar,
-        bars=np.asarray(bars[first_bar:last_bar], dtype=index_type(len(points))).reshape(-1, 2),
-        node_groups=within(node_groups, first_node, last_node),
-        bar_groups=within(bar_groups, first_bar, last_bar),
-        source=source,
-        structured=True,
-    )
+    groups = [
+        {name: np.asarray(members, np.int64) for name, members in each.items()} for each in (node_groups, bar_groups)
+    ]
+    ends = np.asarray(bars, index_type(len(points)))
+    whole = MeshSlab(len(points), len(bars), 0, np.asarray(points, float), 0, ends, *groups, source=source)
+    whole.structured = True
+    return whole.share(rank, size)
 
 
 def with_bars(

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from ..case.toml import table_text
 from ..errors import InputError
 from .exchange import Router
-from .slab import MeshSlab, check_size, slab_of, slab_range
+from .slab import MeshSlab, check_size, slab_of
 
 
 @dataclass
@@ -39,6 +39,16 @@ class WholeMesh:
     warnings: list[str] = field(default_factory=list)
     source: str = "mesh"
     """The file, for messages."""
+
+    def slab(self, source: str) -> MeshSlab:
+        """Return the mesh as the slab of one rank."""
+        groups = [
+            {name: np.unique(members).astype(np.int64) for name, members in each.items()}
+            for each in (self.node_groups, self.bar_groups)
+        ]
+        found = MeshSlab(len(self.points), len(self.bars), 0, self.points, 0, self.bars, *groups, source=source)
+        found.bar_fields, found.node_fields, found.warnings = self.bar_fields, self.node_fields, self.warnings
+        return found
 
 
 _CONDITIONS = ("support", "load", "gravity", "temperature", "initial", "mass", "spring", "dashpot")
@@ -88,58 +98,15 @@ def check_fields(path: Path | str, fields: Mapping[str, str] | None, known: Iter
 
 def scattered(whole: WholeMesh | None, source: str, comm: MPI.Comm) -> MeshSlab:
     """Send every rank its slab of the mesh that rank 0 has; None on the others. Collective."""
-    head = None
-    if whole is not None:
-        named = (whole.node_groups, whole.bar_groups, whole.bar_fields, whole.node_fields)
-        names = [list(each) for each in named]
-        head = (len(whole.points), len(whole.bars), *names, whole.warnings)
-    n_nodes, n_bars, node_names, bar_names, field_names, node_field_names, warnings = comm.bcast(head)
-    check_size(n_nodes, source)
-    points = _scatter(comm, whole.points if whole else np.empty((0, 3)), n_nodes)
-    bars = _scatter(comm, whole.bars if whole else np.empty((0, 2), np.int64), n_bars)
-
-    def field_of(values: np.ndarray | None, n: int) -> np.ndarray:
-        return _scatter(comm, np.empty((0, 1)) if values is None else values[:, None], n)[:, 0]
-
-    return MeshSlab(
-        n_nodes=n_nodes,
-        n_bars=n_bars,
-        first_node=slab_range(n_nodes, comm.rank, comm.size)[0],
-        points=points,
-        first_bar=slab_range(n_bars, comm.rank, comm.size)[0],
-        bars=bars,
-        node_groups={name: _members(comm, whole and whole.node_groups[name], n_nodes) for name in node_names},
-        bar_groups={name: _members(comm, whole and whole.bar_groups[name], n_bars) for name in bar_names},
-        bar_fields={name: field_of(whole and whole.bar_fields[name], n_bars) for name in field_names},
-        node_fields={name: field_of(whole and whole.node_fields[name], n_nodes) for name in node_field_names},
-        source=source,
-        warnings=warnings,
-    )
-
-
-def _scatter(comm: MPI.Comm, rows: np.ndarray, n: int) -> np.ndarray:
-    """Scatter the rows of rank 0 in the ranges of slab_range."""
-    if comm.size == 1:
-        return rows
-    ranges = [slab_range(n, rank, comm.size) for rank in range(comm.size)]
-    mine = np.empty((ranges[comm.rank][1] - ranges[comm.rank][0], rows.shape[1]), rows.dtype)
-    row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * rows.shape[1]).Commit()
-    try:
-        sizes = ([last - first for first, last in ranges], [first for first, _ in ranges])
-        comm.Scatterv([np.ascontiguousarray(rows), sizes, row], [mine, len(mine), row])
-    finally:
-        row.Free()
-    return mine
-
-
-def _members(comm: MPI.Comm, members: np.ndarray | None, n: int) -> np.ndarray:
-    """Return the members of rank 0's group within this rank's range of ``n``, ascending and unique."""
-    parts = None
-    if members is not None:
-        members = np.unique(members).astype(np.int64)
-        firsts = [slab_range(n, rank, comm.size)[0] for rank in range(1, comm.size)]
-        parts = np.split(members, np.searchsorted(members, firsts))
-    return comm.scatter(parts)
+    if whole is None:
+        slab = comm.recv(source=0)
+    else:
+        every = whole.slab(source)
+        for rank in range(1, comm.size):
+            comm.send(every.share(rank, comm.size), rank)
+        slab = every.share(0, comm.size)
+    check_size(slab.n_nodes, source)
+    return slab
 
 
 _STEEL = {"young_modulus": 210e9, "density": 7850.0}
@@ -345,44 +312,23 @@ def _check_lengths(slab: MeshSlab, comm: MPI.Comm, length: np.ndarray) -> list[s
 
 def _check_duplicates(slab: MeshSlab, comm: MPI.Comm) -> None:
     """Refuse bars between the same two nodes: the rank whose slab has the lower end sorts them next to each other."""
-    key = _pairs_of_ends(slab, comm)
-    key.sort()
-    if not comm.allreduce(int((key[1:] == key[:-1]).any())):
-        return
-    # the bars are named by sending all of them once more, with their numbers
-    ends = np.sort(slab.bars, axis=1).astype(np.int64)
-    router = Router(comm, slab_of(ends[:, 0], slab.n_nodes, comm.size))
-    ends, numbers = router.send(ends), router.send(np.arange(slab.first_bar, slab.first_bar + len(slab.bars)))
-    order = np.lexsort((numbers, ends[:, 1], ends[:, 0]))
-    ends, numbers = ends[order], numbers[order]
-    again = np.flatnonzero((ends[1:] == ends[:-1]).all(axis=1))
-    again = again[np.argsort(numbers[again], kind="stable")]
-
+    lower, upper = slab.bars.min(axis=1).astype(np.int64), slab.bars.max(axis=1)
+    router = Router(comm, slab_of(lower, slab.n_nodes, comm.size))
+    ends = router.send(lower * slab.n_nodes + upper)
+    numbers = router.send(np.arange(slab.first_bar, slab.first_bar + len(slab.bars)))
+    order = np.lexsort((numbers, ends))
+    again = np.flatnonzero(np.diff(ends[order]) == 0)
+    first, second = numbers[order[again]], numbers[order[again + 1]]
+    by_number = np.argsort(first, kind="stable")
+    first, second, ends = first[by_number], second[by_number], ends[order[again[by_number]]]
     _refuse(
         slab,
         comm,
         np.ones(len(again), bool),
-        lambda k: "bars {} and {} (nodes {} and {})".format(*numbers[again[k] : again[k] + 2], *ends[again[k]]),
+        lambda k: f"bars {first[k]} and {second[k]} (nodes {ends[k] // slab.n_nodes} and {ends[k] % slab.n_nodes})",
         "bars join the same two nodes as another bar",
         "keep one of each, with the sum of the areas",
     )
-
-
-def _pairs_of_ends(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
-    """Return a number for the two ends of each bar whose lower end is in this rank's slab of nodes. Collective."""
-    arriving = np.zeros(comm.size, np.int64)
-    for start in range(0, len(slab.bars), _PIECE):
-        lower = slab.bars[start : start + _PIECE].min(axis=1)
-        arriving += np.bincount(slab_of(lower, slab.n_nodes, comm.size), minlength=comm.size)
-    comm.Allreduce(MPI.IN_PLACE, arriving)
-    keys, at = np.empty(arriving[comm.rank], np.int64), 0
-    for start in range(0, -(-slab.n_bars // comm.size), _PIECE):
-        bars = slab.bars[start : start + _PIECE].astype(np.int64)
-        lower = bars.min(axis=1)
-        piece = Router(comm, slab_of(lower, slab.n_nodes, comm.size)).send(lower * slab.n_nodes + bars.max(axis=1))
-        keys[at : at + len(piece)] = piece
-        at += len(piece)
-    return keys
 
 
 def _bar(slab: MeshSlab, i: int) -> str:

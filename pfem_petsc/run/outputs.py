@@ -21,8 +21,7 @@ from ..output.result import RESULT_NAME
 from ..output.units import MODE, TIME, duration
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import agreed_call, on_root
-from ..preflight.checks import warnings_before
-from ..preflight.forecast import summarise
+from ..preflight.checks import summarise, warnings_before
 from ..restart.checkpoints import Restart, prepare_folder
 from ..restart.state import RunState
 from ..signals import early

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import InputError
 from ..mechanics.bars import state_before_rupture
 from ..mechanics.rupture import variable_of
-from ..mesh.node_sets import bars_of_group
+from ..mesh.distribution import bars_of_group
 from ..output.units import engineering
 from ..tolerances import TIME
 

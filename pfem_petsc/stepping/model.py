@@ -18,8 +18,7 @@ from ..mechanics.mass import Inertia, PointInertia, add_at_ends
 from ..mechanics.rest_lengths import RestLengths, Temperatures
 from ..mechanics.springs import add_connectors, connected, make_springs, with_connectors
 from ..mechanics.supports import Supports
-from ..mesh.distribution import distribute
-from ..mesh.node_sets import resolve_node_sets
+from ..mesh.distribution import distribute, resolve_node_sets
 from ..parallel.agreement import agreed
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.files import memory_of_machine
 from pfem_petsc.formats import read_whole
-from pfem_petsc.mesh.lattices.expressions import Expression
+from pfem_petsc.mesh.generators.lattice.expressions import Expression
 
 ROD = {
     "mesh": {"generator": "rod", "length": 1.0, "elements": 2},

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.lattices.expressions import Expression
+from pfem_petsc.mesh.generators.lattice.expressions import Expression
 
 ROOT = Path(__file__).parents[2]
 

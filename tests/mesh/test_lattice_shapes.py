@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.meshes import OCTET, degrees, generated, lengths
 
-from pfem_petsc.mesh.lattices.block import random_numbers
+from pfem_petsc.mesh.generators.lattice.block import random_numbers
 
 
 def as_sets(mesh):

@@ -9,10 +9,11 @@ import pytest
 from helpers.meshes import CORNERS, CUBE, assert_part_of, degrees, filled, lengths, write_stl
 from mpi4py import MPI
 
-from pfem_petsc import Case, Simulation, cases
+from pfem_petsc import Case, Simulation
+from pfem_petsc.case.toml import FOLDER
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.lattices.bodies import read_surface
+from pfem_petsc.mesh.generators.lattice.surface import read_surface
 
 
 def ball(path, rings=24):
@@ -111,7 +112,7 @@ def test_struts_across_a_gap_are_cut(tmp_path):
 
 def test_sides_of_points_near_edges():
     """Around the inner edge of the bracket and the rims of a hole, where the nearest place is an edge or a corner."""
-    surface = read_surface(Path(cases.__file__).parent / "bracket.stl", 1.0)
+    surface = read_surface(FOLDER / "bracket.stl", 1.0)
     random, sector = np.random.default_rng(3), 2.0 * np.pi / 48
     points = np.vstack(
         [random.uniform(*box, (2000, 3)) for box in (((14, -1, 14), (18, 49, 18)), ((28, 16, -1), (45, 33, 17)))]
@@ -177,7 +178,7 @@ def test_graded_cells_cover_the_surface(tmp_path, kind, below):
 )
 def test_gradings_that_do_not_fit_the_surface(tmp_path, factor, origin, told, monkeypatch):
     path = write_stl(tmp_path / "cube.stl", CORNERS + (0.0, 0.0, 0.125), CUBE)
-    monkeypatch.setattr("pfem_petsc.mesh.lattices.block._STEPS", 1)
+    monkeypatch.setattr("pfem_petsc.mesh.generators.lattice.block._STEPS", 1)
     with pytest.raises(InputError, match=told):
         filled(kind="cubic", pitch=0.25, surface={"file": str(path)}, grading=(1, 1, factor), origin=origin)
 
@@ -186,7 +187,7 @@ def test_the_graded_bracket_of_the_page_runs(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs/lattices.md").read_text()
     (text,) = [block for block in page.split("```toml\n")[1:] if 'title = "Graded bracket"' in block]
     monkeypatch.chdir(tmp_path)
-    Path("bracket.stl").write_bytes(Path(cases.__file__).with_name("bracket.stl").read_bytes())
+    Path("bracket.stl").write_bytes((FOLDER / "bracket.stl").read_bytes())
     Path("graded.toml").write_text(text.split("```")[0])
     case = Case.load("graded.toml", ["mesh.pitch=0.008"])
     with Simulation(case, comm=MPI.COMM_SELF, quiet=True) as simulation:
@@ -266,7 +267,7 @@ def test_files_that_are_refused(tmp_path, name, text):
 
 def test_damaged_files_are_refused(tmp_path, capfd):
     """With one message, and nothing from VTK beside it."""
-    good = (Path(cases.__file__).parent / "bracket.stl").read_bytes()
+    good = (FOLDER / "bracket.stl").read_bytes()
     random = np.random.default_rng(4)
     for number in range(24):
         data = bytearray(good)

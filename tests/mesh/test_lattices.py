@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.lattices.cells import periodic_mechanisms
+from pfem_petsc.mesh.generators.lattice.cells import periodic_mechanisms
 
 SIZES = [(1, 1, 1), (2, 3, 4)]
 

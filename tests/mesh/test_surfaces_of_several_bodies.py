@@ -10,7 +10,7 @@ from helpers.meshes import CORNERS, CUBE, assert_part_of, filled, write_stl
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.lattices.bodies import read_surface
+from pfem_petsc.mesh.generators.lattice.surface import read_surface
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 

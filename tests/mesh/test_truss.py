@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, InputError, Simulation, Truss, open_result, write_mesh
-from pfem_petsc.mesh import truss as module
+from pfem_petsc.mesh.generators import arrays as module
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 0.8]])
 BARS = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from ...case.base import (
+from ....case.base import (
     FilePath,
     Name,
     NonNegativeInt,
@@ -26,9 +26,9 @@ from ...case.base import (
     is_finite_number,
     listed,
 )
-from ...errors import InputError
-from ..generators.base import Length
-from ..slab import check_length, check_size
+from ....errors import InputError
+from ...slab import check_length, check_size
+from ..base import Length
 from .cells import ANGLE, KINDS, UnitCell, auxetic, cell_of
 from .expressions import COORDINATES, Expression, Fields, MeshField, can_be_variable
 from .surface import Surface

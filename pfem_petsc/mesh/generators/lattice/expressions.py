@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...case.base import is_finite_number
-from ...errors import InputError
-from ...files import readable_whole
+from ....case.base import is_finite_number
+from ....errors import InputError
+from ....files import readable_whole
 
 if TYPE_CHECKING:
     import pyvista

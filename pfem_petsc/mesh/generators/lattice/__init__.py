@@ -13,14 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from ...errors import InputError
-from ...parallel.agreement import agreed, on_root
-from ..exchange import Router
-from ..lattices.block import FACES, PIECE, Block, Parameters, Places, fitted, random_numbers
-from ..lattices.bodies import read_surface
-from ..lattices.cells import mechanism_warning
-from ..lattices.surface import ON, Surface
-from ..slab import MeshSlab, index_type, slab_of, slab_range
+from ....errors import InputError
+from ....parallel.agreement import agreed, on_root
+from ...exchange import Router
+from ...slab import MeshSlab, index_type, slab_of, slab_range
+from .block import FACES, PIECE, Block, Parameters, Places, fitted, random_numbers
+from .cells import mechanism_warning
+from .surface import ON, Surface, read_surface
 
 __all__ = ["Parameters", "generate", "generate_on"]
 

@@ -7,6 +7,7 @@ read, so that references to tables stay valid. A rejected change has no effect.
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -54,6 +55,10 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[KeyP
     return paths
 
 
+_NUMBER = re.compile(r"([-+]?)(\d*)[.,](\d*)((?:[eE][-+]?\d+)?)")
+"""What is meant as a number: a comma, or no digit beside the point."""
+
+
 def _value(text: str, where: str) -> Any:
     try:
         read = tomllib.loads(f"value = {text}")
@@ -61,6 +66,12 @@ def _value(text: str, where: str) -> Any:
         if text[0] in "[{\"'" and isinstance(error, tomllib.TOMLDecodeError):
             about = f"this is not valid TOML, and text that begins with {text[0]} must be in quotes"
             raise InputError(f"{where}: {about}: {pointed(f'value = {text}', error, 8)}") from error
+        found = _NUMBER.fullmatch(text)
+        if found is not None:
+            right = f"{found[1]}{found[2] or '0'}.{found[3] or '0'}{found[4]}"
+            raise InputError(
+                f"{where}: {text} is not a number in TOML, write {right}; a text would be in quotes"
+            ) from None
         return text
     return read["value"] if len(read) == 1 else text
 

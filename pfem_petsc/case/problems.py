@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from pydantic import ValidationError
@@ -30,11 +30,14 @@ class Problems:
     ----------
     source : file or name of the case, for the message
     overridden : key paths that were set on the command line, which the message states if one of them is wrong
+    named : names of tables by top-level key before that
     """
 
-    def __init__(self, source: str, overridden: Iterable[KeyPath] = ()) -> None:
+    def __init__(
+        self, source: str, overridden: Iterable[KeyPath] = (), named: Mapping[str, Sequence[str]] | None = None
+    ) -> None:
         self.source = source
-        self.overridden = list(overridden)
+        self.overridden, self._named = list(overridden), named or {}
         self.lines: list[str] = []
 
     def add(self, path: KeyPath, message: str, value: Any = None) -> None:
@@ -43,6 +46,9 @@ class Problems:
         shown = f"{key} = {short_text(value)}" if value is not None else key
         origin = " (given by --set)" if any(path[: len(p)] == p for p in self.overridden) else ""
         line = f"{self.source}: {shown}{origin}: {message}" if key else f"{self.source}: {message}"
+        known = self._named.get(str(path[0]), ()) if path else ()
+        if known and len(path) > 2 and path[1] not in known and path[:2] in [p[:2] for p in self.overridden]:
+            line += f"; --set makes a new table {key_text(path[:2])}, the case has {', '.join(known)}"
         if line not in self.lines:
             self.lines.append(line)
 

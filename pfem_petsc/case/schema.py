@@ -27,6 +27,9 @@ from .problems import Problems
 from .tables import PRESTRESSES
 from .toml import KeyPath, built_in_path, parse_toml, plain, read_text, table_text
 
+NAMED = ("node_set", "material", "section")
+"""Keys that have tables by name."""
+
 _ARGUMENTS = {
     "name": "the name of a case is that of its file, or an argument: Case(..., name=...), case.copy(name=...)",
     "source": "it is an argument of Case(...) and cannot be changed",
@@ -241,7 +244,8 @@ class Case(_Tables):
         except RecursionError as error:
             raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
         overrides, folder = tuple(overrides), Path(folder)
-        problems = Problems(source, apply_overrides(data, overrides))
+        named = {key: list(table) for key, table in data.items() if key in NAMED and isinstance(table, Mapping)}
+        problems = Problems(source, apply_overrides(data, overrides), named)
         added = tuple(str(Path(each).resolve()) for each in plugins)
         if added:
             own = data.get("plugins", [])

@@ -76,12 +76,22 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{source}: this is not valid TOML: {pointed(text, error)}") from error
+        raise InputError(f"{source}: this is not valid TOML{_both_headings(text)}: {pointed(text, error)}") from error
     except ValueError as error:
         # Python limits the number of digits of integers
         raise InputError(f"{source}: this is not a case: it has an integer of more than 4,300 digits") from error
     except RecursionError as error:
         raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
+
+
+def _both_headings(text: str) -> str:
+    """Return a remark about headings of a table and of lists of tables with the same name."""
+    single, double = (
+        set(re.findall(rf"^[ \t]*{left}[ \t]*([\w.-]+)[ \t]*{right}", text, re.MULTILINE))
+        for left, right in ((r"\[", r"\]"), (r"\[\[", r"\]\]"))
+    )
+    both = sorted(single & double)
+    return f" ([{both[0]}] stands beside [[{both[0]}]], which each entry of the list has as heading)" if both else ""
 
 
 _PLACE = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")

@@ -302,7 +302,9 @@ def _named(mesh: WholeMesh) -> Iterator[tuple[str, str]]:
 def _short(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
-    return f"of {len(value)} rows" if isinstance(value, list) else str(value)
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        return f"of {len(value)} rows"
+    return f"[{', '.join(map(_short, value))}]" if isinstance(value, list) else str(value)
 
 
 def _listed(texts: list[str]) -> str:

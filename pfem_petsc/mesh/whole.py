@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -111,6 +112,8 @@ def scattered(whole: WholeMesh | None, source: str, comm: MPI.Comm) -> MeshSlab:
 
 _STEEL = {"young_modulus": 210e9, "density": 7850.0}
 _AREA = 1e-4
+_AREAS = re.compile(r"(a|area|(cross[ _-]?section(al)?)[ _-]?(area)?)([ _-]?m\^?[2²])?", re.IGNORECASE)
+"""Names of fields with areas [m2]."""
 _PROBED = 100
 """Number of nodes up to which a node set with a load has a probe."""
 
@@ -139,8 +142,10 @@ def tables_of(mesh: WholeMesh) -> tuple[dict[str, Any], list[str]]:
         sections["others" if sections else "bars"] = {}
     for name, keys in sections.items():
         if "area" not in keys and "area_field" not in keys:
-            if "area" in mesh.bar_fields:
-                keys["area_field"] = "area"
+            field = next((name for name in sorted(mesh.bar_fields, key="area".__ne__) if _AREAS.fullmatch(name)), None)
+            if field is not None:
+                keys["area_field"] = field
+                made += [f"section.{name}.area_field, by the name of the field"] if field != "area" else []
             else:
                 keys["area"] = _AREA
                 made.append(f"section.{name}.area")

@@ -237,6 +237,8 @@ def test_refused_table_is_not_missed_again(case_file):
 def test_message_tells_what_the_command_line_set(case_file):
     with pytest.raises(InputError, match=r"time\.end = -1 \(given by --set\)"):
         Case.load(case_file, ["time.end=-1"])
+    with pytest.raises(InputError, match=r"--set makes a new table material\.steal, the case has steel$"):
+        Case.load(case_file, ["material.steal.density=1.0"])
     case_file.write_text(case_file.read_text().replace("end = 1e-3", "end = -1"))
     with pytest.raises(InputError, match=r"time\.end = -1: "):
         Case.load(case_file)

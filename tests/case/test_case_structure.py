@@ -16,6 +16,13 @@ def test_syntax_error_names_the_place(tmp_path, value, told):
         Case.load(path)
 
 
+@pytest.mark.parametrize("headings", [("[support]", "[[support]]"), ("[[support]]", "[support]")])
+def test_headings_of_a_table_and_of_a_list(case_text, headings):
+    text = case_text + "".join(f'\n{heading}\nnode_set = "tip"\nfix = "x"\n' for heading in headings)
+    with pytest.raises(InputError, match=r"\[support\] stands beside \[\[support\]\], which each entry"):
+        Case.from_toml(text)
+
+
 def test_file_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"rod_impct: .*did you mean 'rod_impact'"):
         Case.load("rod_impct")

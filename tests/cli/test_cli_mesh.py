@@ -11,6 +11,8 @@ from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.cli.main import main
 from pfem_petsc.formats import read_whole
 from pfem_petsc.mesh import load_slab
+from pfem_petsc.mesh.tools import summary
+from pfem_petsc.mesh.whole import WholeMesh
 
 MESHES = Path(__file__).parents[2] / "meshes"
 
@@ -86,6 +88,13 @@ def test_convert_info_refine_merge_picture(mesh):
     assert content[:8] == b"\x89PNG\r\n\x1a\n" and content[16:24] == (640).to_bytes(4, "big") + (360).to_bytes(4, "big")
 
 
+def test_info_shows_vectors_and_counts_rows():
+    mesh = WholeMesh(np.eye(2, 3), np.array([[0, 1]]), tables={"load": {"top": {"force": [0.0, 0.5, -1.0]}}})
+    mesh.tables["gravity"] = {"g": {"acceleration": [[0.0, 0, 0, 0], [1.0, 0, 0, -9.81]]}}
+    told = dict(summary(mesh))
+    assert (told["load top"], told["gravity g"]) == ("force [0, 0.5, -1]", "acceleration of 2 rows")
+
+
 def test_pictures_have_the_colours_of_groups():
     import io
 
@@ -109,6 +118,11 @@ def test_a_case_for_a_mesh_that_tells_nothing(mesh):
     case = Case.load("c.toml")
     assert case.mesh.file == Path("sub/b.vtu").resolve() and not case.node_set
     assert load_slab(case.mesh, MPI.COMM_SELF).n_bars == 2
+    Path("t_nodes.csv").write_text("x,y\n0,0\n1,0\n")
+    Path("t_bars.csv").write_text("node1,node2,A_m2\n0,1,3e-4\n")
+    assert mesh("convert", "t_bars.csv", "t.h5", "--case", "t.toml")[0] == 0
+    assert "#   section.bars.area_field, by the name of the field\n" in Path("t.toml").read_text()
+    assert Case.load("t.toml").section["bars"].area_field == "A_m2"
     # an existing case is not replaced
     status, _, err = mesh("convert", "a.h5", "b.vtu", "--case", "c.toml")
     assert status == 2 and "--case c.toml: this file exists" in err and not Path("b.vtu").exists()

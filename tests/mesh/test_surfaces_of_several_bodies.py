@@ -148,7 +148,14 @@ def test_flat_bodies_are_left_out_with_a_warning(tmp_path):
     flat = np.array([(8, 9, 10), (8, 10, 11), (8, 11, 9), (9, 11, 10)])
     surface = read_surface(write_stl(tmp_path / "s.stl", points, np.vstack([CUBE, flat])), 1.0)
     assert surface.volume == pytest.approx(1.0)
-    assert "left out 4 triangles that enclose no volume" in surface.warnings[0]
+    assert "left out 4 triangles that enclose no volume, at (2, 0, 0) in the file" in surface.warnings[0]
+
+
+def test_bodies_at_the_same_place_count_as_one_with_a_warning(tmp_path):
+    surface = read_surface(write_stl(tmp_path / "s.stl", CORNERS, np.vstack([CUBE, CUBE])), 1.0)
+    assert surface.volume == pytest.approx(1.0)
+    (warning,) = surface.warnings
+    assert warning.endswith("12 triangles are in the file more than once: bodies at the same place count as one")
 
 
 def test_the_volume_of_the_cells_is_compared_with_that_inside(tmp_path):

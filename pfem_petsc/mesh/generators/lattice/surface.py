@@ -221,7 +221,9 @@ def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Bodies:
         assigned to bodies.
     """
     warnings: list[str] = []
-    triangles = _without_copies(triangles)
+    triangles, copies = _without_copies(triangles)
+    if copies:
+        warnings.append(f"{copies} triangles are in the file more than once: bodies at the same place count as one")
     parts, given = [], []
     for members, turned in _connected(points, triangles, where) if len(triangles) else ():
         own = triangles[members]
@@ -229,7 +231,7 @@ def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Bodies:
         volume = volume_of(points, own)
         if abs(volume) <= _FLAT * area_of(points, own) * float(np.ptp(points[own.ravel()], axis=0).max()):
             x = ", ".join(f"{coordinate:.6g}" for coordinate in points[own[0, 0]])
-            warnings.append(f"left out {len(own)} triangles that enclose no volume, at ({x})")
+            warnings.append(f"left out {len(own)} triangles that enclose no volume, at ({x}) in the file")
             continue
         parts.append(own if volume > 0.0 else own[:, ::-1].copy())
         given.append(0 if turned.any() else np.sign(volume))
@@ -241,7 +243,9 @@ def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Bodies:
         if given[i] == given[around] != 0:
             x = ", ".join(f"{coordinate:.6g}" for coordinate in points[parts[i][0, 0]])
             what = "a cavity" if inside[i].sum() % 2 else "filled"
-            warnings.append(f"the body at ({x}) lies in another one of the same orientation: it is taken as {what}")
+            warnings.append(
+                f"the body at ({x}) in the file lies in another one of the same orientation: it is taken as {what}"
+            )
     layer = np.full(len(parts), -1)
     for i in range(len(parts)):
         layer[i] = np.setdiff1d(np.arange(i + 1), layer[touching[i]])[0]
@@ -255,8 +259,9 @@ def _oriented(parts: list[np.ndarray], inside: np.ndarray, members: np.ndarray) 
     return np.concatenate([parts[i][:, ::-1] if depth[k] % 2 else parts[i] for k, i in enumerate(members)])
 
 
-def _without_copies(triangles: np.ndarray) -> np.ndarray:
-    """Return the triangles, each once; of those with opposite normals, between two bodies, as many as are left over."""
+def _without_copies(triangles: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the triangles, each once, and the number of others; of those with opposite normals, between two bodies, as
+    many are left as one side has more."""
     _, same = np.unique(np.sort(triangles, axis=1), axis=0, return_inverse=True)
     same = same.ravel()
     lowest = triangles.argmin(axis=1)
@@ -264,7 +269,8 @@ def _without_copies(triangles: np.ndarray) -> np.ndarray:
     side = np.where(triangles[rows, (lowest + 1) % 3] < triangles[rows, (lowest + 2) % 3], 1, -1)
     net = np.bincount(same, side)[same]
     kept = np.flatnonzero(net * side > 0)
-    return triangles[kept[np.sort(np.unique(same[kept], return_index=True)[1])]]
+    once = np.sort(np.unique(same[kept], return_index=True)[1])
+    return triangles[kept[once]], int((np.abs(net[kept[once]]) - 1).sum())
 
 
 def _connected(points: np.ndarray, triangles: np.ndarray, where: str) -> list[tuple[np.ndarray, np.ndarray]]:

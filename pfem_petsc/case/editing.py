@@ -48,10 +48,10 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[KeyP
             raise InputError(f"--set {text[:40]} ...: a key of more than {DEEPEST} parts")
         if not equals or parts is None:
             raise InputError(f"--set {text}: expected KEY=VALUE, like time.step=1e-5 or wall.0.point=[1.0, 0.0, 0.0]")
-        if not value.strip():
-            take_out(data, parts, f"--set {text}")
-            continue
-        paths.append(put(data, parts, _value(value.strip(), f"--set {text}"), f"--set {text}"))
+        where = f"--set {text}"
+        found = _value(value.strip(), where) if value.strip() else None
+        path = put(data, parts, found, where)
+        paths += [path] if found is not None else []
     return paths
 
 
@@ -76,33 +76,6 @@ def _value(text: str, where: str) -> Any:
     return read["value"] if len(read) == 1 else text
 
 
-def take_out(data: dict[str, Any], parts: Sequence[str], where: str) -> None:
-    """Remove the value at the parts of a key, if it is there.
-
-    Raises
-    ------
-    InputError
-        Beginning with ``where``, if a list of tables has none of the name, or several.
-    """
-    here: Any = data
-    table = ""
-    for k, part in enumerate(parts):
-        key = _place_of(here, part, table, where) if isinstance(here, list) else part
-        if not (key in here if isinstance(here, dict) else isinstance(here, list) and key in range(len(here))):
-            return
-        if k == len(parts) - 1:
-            del here[key]
-            return
-        if isinstance(here[key], tuple):
-            here[key] = list(here[key])
-        here = here[key]
-        table = part if isinstance(key, str) else table
-
-
-def _is_place(part: str) -> bool:
-    return part.isascii() and part.isdigit() and len(part) <= 18
-
-
 def _place_of(rows: list[Any], part: str, table: str, where: str) -> int:
     """Return the index in a list that a part of a key means: a number, or the name of one of the ``rows`` of a table.
 
@@ -111,7 +84,7 @@ def _place_of(rows: list[Any], part: str, table: str, where: str) -> int:
     InputError
         Beginning with ``where``, if no row has the name, or several.
     """
-    if _is_place(part):
+    if part.isascii() and part.isdigit() and len(part) <= 18:
         return int(part)
     default = NUMBERED.get(table)
     names = [
@@ -140,7 +113,7 @@ def _no_index(part: str, rows: list[Any], where: str) -> str:
 
 
 def put(data: dict[str, Any], parts: Sequence[str], value: Any, where: str) -> KeyPath:
-    """Set the value at the parts of a key, and return its path; missing tables are created.
+    """Set the value at the parts of a key, or remove it (None), and return its path; missing tables are created.
 
     Entries of a list of tables are meant by their index, or by their name.
 
@@ -153,27 +126,31 @@ def put(data: dict[str, Any], parts: Sequence[str], value: Any, where: str) -> K
     path: KeyPath = ()
     here: Any = data
     for k, part in enumerate(parts):
-        last = k == len(parts) - 1
         names = tuple(p for p in path if isinstance(p, str))
-        if isinstance(here, list):
-            key: str | int = _place_of(here, part, names[-1], where)
-            if key > len(here):
-                raise InputError(_no_index(part, here, where))
-            if key == len(here):
-                here.append({})
-        elif isinstance(here, dict):
-            key = part
-            if key not in here:
-                here[key] = [] if (*names, part) in LISTS else {}
-        else:
+        if not isinstance(here, list | dict):
+            if value is None:
+                return path
             raise InputError(f"{where}: {'.'.join(map(str, path))} is a value, not a table")
+        key = _place_of(here, part, names[-1], where) if isinstance(here, list) else part
+        if key not in (range(len(here)) if isinstance(here, list) else here):
+            if value is None:
+                return path
+            if isinstance(here, list) and key > len(here):
+                raise InputError(_no_index(part, here, where))
+            if isinstance(here, list):
+                here.append({})
+            else:
+                here[key] = [] if (*names, part) in LISTS else {}
         path = (*path, key)
-        if last:
-            here[key] = value
+        if k == len(parts) - 1:
             break
         if isinstance(here[key], tuple):  # of the objects of a case
             here[key] = list(here[key])
         here = here[key]
+    if value is None:
+        del here[key]
+    else:
+        here[key] = value
     return path
 
 
@@ -312,11 +289,7 @@ def changed_data(case: CaseModel, changes: Iterable[tuple[KeyPath, Any]]) -> dic
         if path[-1:] == ("initial",) and isinstance(value, list):
             value = _initial(value)
         parts = [str(part) for part in path]
-        where = f"{case.source}: {key_text(path)}"
-        if value is None:
-            take_out(data, parts, where)
-        else:
-            put(data, parts, value, where)
+        put(data, parts, value, f"{case.source}: {key_text(path)}")
     return data
 
 

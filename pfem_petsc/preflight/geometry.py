@@ -16,6 +16,7 @@ from ..contact.neighbours import Points, Segments, find_pairs
 from ..mechanics.compiled import kernel
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
+from ..mesh.tools import components
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -157,13 +158,13 @@ class Geometry:
         rigid = _rigid_motions(points - points.mean(axis=0), held, span)
         outside = sum(len(_free(np.eye(3), some)) for some in held) - len(reduced)
         where = {1: " along its line", 2: " in its plane", 3: ""}[len(span)]
-        every = sum(
-            _rigid_motions(points[part] - points[part].mean(axis=0), held[part], span) for part in _parts(n, bars)
-        )
+        label = components(n, bars)
+        parts = [np.flatnonzero(label == name) for name in np.unique(label)]
+        every = sum(_rigid_motions(points[part] - points[part].mean(axis=0), held[part], span) for part in parts)
         # parts that no bar connects move against each other, and turn about axes of their own
-        parts = f", {every - rigid} of parts against each other" if every > rigid else ""
+        apart = f", {every - rigid} of parts against each other" if every > rigid else ""
         text = (
-            f"{len(reduced)} free directions{where}, {rigid} rigid motions{parts}, {len(reduced) - rank - every} "
+            f"{len(reduced)} free directions{where}, {rigid} rigid motions{apart}, {len(reduced) - rank - every} "
             f"mechanisms, {len(bars) - rank} states of self-stress"
         )
         return text + (f"; {outside} free directions out of it, which no bar resists" if outside else "")
@@ -177,14 +178,6 @@ def _free(span: np.ndarray, held: np.ndarray) -> np.ndarray:
     """Return orthonormal directions within the span that supports with the projection ``held`` leave free."""
     _, values, vectors = np.linalg.svd(held @ span.T, full_matrices=True)
     return vectors[int((values > 1e-12).sum()) :] @ span
-
-
-def _parts(n: int, bars: np.ndarray) -> list[np.ndarray]:
-    """Return the nodes of each part that bars (b, 2) connect, of ``n`` nodes."""
-    label = np.arange(n)
-    for a, b in bars:
-        label[label == label[b]] = label[a]
-    return [np.flatnonzero(label == name) for name in np.unique(label)]
 
 
 def _rigid_motions(arms: np.ndarray, held: np.ndarray, span: np.ndarray) -> int:

@@ -77,6 +77,16 @@ def refusal(path):
         ),
         ("4.1", "$Entities\n1 2", "$Entities\n1 999999999", "section $Entities: its counts declare"),
         ("4.1", "$Elements", "$Triangles", "section $Triangles has no end"),
+        ("4.1", "300\n21", "300\n300", "section $Nodes: node 300 is listed more than once"),
+        ("4.1", "3 7 300", "3 7 301", "section $Elements: node 301 is not in $Nodes"),
+        ("4.1", "$EndElements", "7\n$EndElements", "section $Elements: has more numbers than its counts declare"),
+        (
+            "4.1",
+            "5 10 21\n6 21 7\n7 300 21\n2 1 2 1\n99 10 7 300\n$EndElements\n",
+            "5 10 21\n6 21 7\n8 300 21\n2 1 2 1\n99 10 7 300\n$EndElements\n"
+            "$Comments\nbars in the order of their tags\n$EndComments\n",
+            "the tags of the lines do not follow one another, as $Comments says: remove that section",
+        ),
         ("4.1", "$Entities", "$PartitionedEntities\n0\n$EndPartitionedEntities\n$Entities", "without partitions"),
     ],
 )

@@ -52,22 +52,13 @@ def check(slab, mesh, comm):
             assert one[name].tolist() == np.sort(other[name]).tolist()
 
 
-@pytest.mark.parametrize("suffix", ["vtkhdf", "h5", "msh"])
-def test_every_rank_has_its_share(comm, shared_tmp_path, suffix):
-    path = shared_tmp_path / f"lattice.{suffix}"
+def test_every_rank_reads_its_share(comm, shared_tmp_path):
+    path = shared_tmp_path / "lattice.h5"
     mesh = lattice_file(comm, path)
     slab = load_slab(SimpleNamespace(generator=None, file=path), comm, {"area": "area_field"})
     check(slab, mesh, comm)
     first, last = slab_range(len(mesh.bars), comm.rank, comm.size)
     np.testing.assert_array_equal(slab.bar_fields["area"], mesh.bar_fields["area"][first:last])
-
-
-@pytest.mark.parametrize("suffix", ["vtkhdf", "h5", "msh"])
-def test_a_field_that_is_missing_is_named(comm, shared_tmp_path, suffix):
-    path = shared_tmp_path / f"lattice.{suffix}"
-    lattice_file(comm, path)
-    with pytest.raises(InputError, match=r"section.strut.area_field = 'thickness'.*it has area"):
-        load_slab(SimpleNamespace(generator=None, file=path), comm, {"thickness": "section.strut.area_field"})
 
 
 def test_members_of_a_group_in_any_order_and_several_times(comm, shared_tmp_path):
@@ -89,23 +80,6 @@ def test_members_of_a_group_in_any_order_and_several_times(comm, shared_tmp_path
         read_slab(path, comm)
 
 
-def test_copies_of_bars_in_gmsh_2_are_joined(comm, shared_tmp_path):
-    """Each bar is listed once for each of its groups, all of the second group after those of the first."""
-    n = 23
-    rows = [f"{k + 1} 1 2 1 1 {k + 1} {k + 2}" for k in range(n)]
-    rows += [f"{n + k + 1} 1 2 2 1 {k + 1} {k + 2}" for k in range(0, n, 2)]
-    nodes = "\n".join(f"{k + 1} {k} 0 0" for k in range(n + 1))
-    text = (
-        f"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n{n + 1}\n{nodes}\n$EndNodes\n"
-        f"$Elements\n{len(rows)}\n" + "\n".join(rows) + "\n$EndElements\n"
-    )
-    slab = read_slab(on_rank_0(comm, shared_tmp_path / "two.msh", text.encode()), comm)
-    mesh = whole(slab, comm)
-    assert mesh.n_bars == n and mesh.bars.tolist() == [[k, k + 1] for k in range(n)]
-    groups = {name: members.tolist() for name, members in mesh.bar_groups.items()}
-    assert groups == {"group_1": list(range(n)), "group_2": list(range(0, n, 2))}
-
-
 def test_gmsh_with_tags_far_apart_and_in_any_order(comm, shared_tmp_path):
     tags = [7_000_000_000_000, 3, 900, 12, 5]
     nodes = "\n".join([*map(str, tags), *(f"{k} 0 {k * k}" for k in range(5))])
@@ -116,28 +90,3 @@ def test_gmsh_with_tags_far_apart_and_in_any_order(comm, shared_tmp_path):
     )
     slab = read_slab(on_rank_0(comm, shared_tmp_path / "sparse.msh", text.encode()), comm)
     assert whole(slab, comm).bars.tolist() == [[k, (k + 2) % 5] for k in range(5)]
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("1 5 3 900", "1 6 3 900", "section $Nodes declares 6 nodes, its blocks hold 5"),
-        ("\n900\n", "\n3\n", "section $Nodes: node 3 is listed more than once"),
-        ("1 3 900", "1 3 901", "section $Elements: node 901 is not in $Nodes"),
-        ("0 0 0", "0 zero 0", "section $Nodes, line 8: 'zero' is not a number"),
-        ("$EndElements", "7\n$EndElements", "section $Elements: has more numbers than its counts declare"),
-        ("$Nodes", "$Comments\nbars in the order of their tags\n$EndComments\n$Nodes", "do not follow one another"),
-    ],
-)
-def test_all_ranks_tell_what_is_wrong_with_gmsh(comm, shared_tmp_path, old, new, message):
-    text = (
-        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Nodes\n1 5 3 900\n1 1 0 5\n3\n900\n12\n5\n6\n"
-        "0 0 0\n1 0 0\n2 1 0\n3 0 1\n4 4 4\n"
-        "$EndNodes\n$Elements\n1 4 1 9\n1 1 1 4\n1 3 900\n2 900 12\n3 12 5\n9 5 6\n$EndElements\n"
-    )
-    assert old in text
-    path = on_rank_0(comm, shared_tmp_path / "wrong.msh", text.replace(old, new, 1).encode())
-    with pytest.raises(InputError) as caught:
-        read_slab(path, comm)
-    assert message in str(caught.value)
-    assert len(set(comm.allgather(str(caught.value)))) == 1

@@ -423,7 +423,25 @@ class Dashpot(_GroundOrNodes):
         return value
 
 
-class Load(WithFiles):
+class _Interpolated(WithFiles):
+    """What may vary over time, by rows."""
+
+    interpolation: Literal["linear", "smooth"] = "linear"
+    """interpolation between the rows: straight lines, or a cubic spline"""
+
+    @property
+    def varies(self) -> bool:
+        """Whether there are rows over time."""
+        return any(has_rows(value) for value in self.__dict__.values())
+
+    @model_validator(mode="after")
+    def _interpolates(self) -> _Interpolated:
+        if self.interpolation == "smooth" and not self.varies:
+            raise ValueError('interpolation = "smooth" requires rows over time')
+        return self
+
+
+class Load(_Interpolated):
     """Force on each node of a node set."""
 
     node_set: NodeSetName
@@ -434,14 +452,6 @@ class Load(WithFiles):
     """rows [t, factor] [s, -], constant outside; default: factor 1"""
     table_file: FileName | None = None
     """the rows of ``table`` from the columns of a CSV or NPZ file: its name, or a table of :class:`TableFile`"""
-    interpolation: Literal["linear", "smooth"] = "linear"
-    """interpolation of ``table`` between its rows: straight lines, or a cubic spline"""
-
-    @model_validator(mode="after")
-    def _interpolates(self) -> Load:
-        if self.interpolation == "smooth" and self.table is None:
-            raise ValueError('interpolation = "smooth" requires table')
-        return self
 
 
 class LoadFile(StrictModel):
@@ -480,11 +490,8 @@ class LoadFile(StrictModel):
         return self
 
 
-class _OverTime(WithFiles):
+class _OverTime(_Interpolated):
     """A vector that may vary over time; the rows of its file are added to a constant vector."""
-
-    interpolation: Literal["linear", "smooth"] = "linear"
-    """interpolation between the rows: straight lines, or a cubic spline"""
 
     @model_validator(mode="before")
     @classmethod
@@ -496,17 +503,6 @@ class _OverTime(WithFiles):
         constant = getattr(cls.model_validate({key: given}), key)
         rest = cls._rows_of_files({name: value for name, value in data.items() if name != key}, info)
         return {**rest, key: [[t, *(a + b for a, b in zip(row, constant, strict=True))] for t, *row in rest[key]]}
-
-    @property
-    def varies(self) -> bool:
-        """Whether the vector is given by rows over time."""
-        return any(has_rows(value) for value in self.__dict__.values())
-
-    @model_validator(mode="after")
-    def _interpolates(self) -> _OverTime:
-        if self.interpolation == "smooth" and not self.varies:
-            raise ValueError('interpolation = "smooth" requires rows over time')
-        return self
 
     def as_table(self, given: bool = False) -> dict[str, Any]:
         """Return the keys; the interpolation of a constant vector says nothing."""
@@ -543,7 +539,7 @@ class Wind(_OverTime):
     """drag coefficient C_d of bars whose section has none"""
 
 
-class Temperature(WithFiles):
+class Temperature(_Interpolated):
     """Temperature above reference of bars."""
 
     alternatives = ("value",)
@@ -557,14 +553,6 @@ class Temperature(WithFiles):
     """rows [t, temperature above reference] [s, K], constant outside"""
     table_file: FileName | None = None
     """the rows of ``table`` from the columns of a CSV or NPZ file: its name, or a table of :class:`TableFile`"""
-    interpolation: Literal["linear", "smooth"] = "linear"
-    """interpolation of ``table`` between its rows: straight lines, or a cubic spline"""
-
-    @model_validator(mode="after")
-    def _interpolates(self) -> Temperature:
-        if self.interpolation == "smooth" and self.table is None:
-            raise ValueError('interpolation = "smooth" requires table')
-        return self
 
 
 class ContactPair(StrictModel):

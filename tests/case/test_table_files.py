@@ -137,7 +137,7 @@ def test_refused_arrays(case_text, tmp_path):
             ["load.0.table=", 'load.0.table_file={file = "x.csv", colums = ["t"]}'],
             "unknown key, did you mean 'columns'?",
         ),
-        (["load.0.table=", "load.0.interpolation=smooth"], 'interpolation = "smooth" requires table'),
+        (["load.0.table=", "load.0.interpolation=smooth"], 'interpolation = "smooth" requires rows over time'),
         (["temperature=[{value = 1.0, table_file = 'x.csv'}]"], "at most one of the keys table_file, value"),
         (
             ["wall.0.motion_file=x.csv", "wall.0.velocity=[1.0, 0.0, 0.0]"],

@@ -97,8 +97,9 @@ def lookup(package: str, name: str, where: str) -> ModuleType:
         try:
             return _installed(package)[name].load()
         except Exception as error:  # noqa: BLE001 - what is installed beside the program may raise anything
-            text = f"{_installed(package)[name].value} cannot be imported: {type(error).__name__}: {error}"
-            raise InputError(f"{where}: {text}") from error
+            raise InputError(
+                f"{where}: {_installed(package)[name].value} cannot be imported: {type(error).__name__}: {error}"
+            ) from error
     known = choices(package)
     hint = nearest(name, known) if known else "; none is built in, CONTRIBUTING.md says how to add one"
     raise InputError(f"{where}: unknown value {name!r}{hint}")

@@ -147,8 +147,9 @@ def add_sections(mesh: WholeMesh, deck: Deck) -> None:
             mesh.warnings.append(f"{block.where}: no area is known from {what}")
             found.pop("area", None)
         elif deck.ambiguous and found.get("shape") == "round":
-            text = "CIRC is read with a radius, as in Abaqus: in a file of CalculiX it is a diameter"
-            mesh.warnings.append(f"{block.where}: {text}")
+            mesh.warnings.append(
+                f"{block.where}: CIRC is read with a radius, as in Abaqus: in a file of CalculiX it is a diameter"
+            )
         areas[members] = found.get("area", np.nan)
         material = block.get("MATERIAL")
         if material:
@@ -159,16 +160,16 @@ def add_sections(mesh: WholeMesh, deck: Deck) -> None:
             found |= _own_material(mesh, block, rows, group)
         sections[group] = {"bars": group, **found}
     if without:
-        text = f"left out the sections of {listed(without)}: none of their elements is a bar"
-        mesh.warnings.append(f"{deck.path}: {text}")
+        mesh.warnings.append(
+            f"{deck.path}: left out the sections of {listed(without)}: none of their elements is a bar"
+        )
     whole = bool(len(areas)) and bool((areas > 0.0).all())
     if sections:
         mesh.tables["section"] = _without_made(mesh, deck, sections) if whole else sections
     if whole:
         mesh.bar_fields["area"] = areas
     elif sections and np.isnan(areas).any():
-        text = f"{int(np.isnan(areas).sum())} bars have no area: there is no field area"
-        mesh.warnings.append(f"{deck.path}: {text}")
+        mesh.warnings.append(f"{deck.path}: {int(np.isnan(areas).sum())} bars have no area: there is no field area")
 
 
 def _without_made(mesh: WholeMesh, deck: Deck, sections: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -602,8 +603,9 @@ class Conditions:
         every = [element for scope in self._deck.scopes.values() for element in scope.at_nodes]
         bare = len({id(element) for element in every} - {id(element) for element in known})
         if bare:
-            text = f"left out {bare} masses, springs or dashpots without *MASS, *SPRING or *DASHPOT"
-            self._told.append(f"{self._deck.path}: {text}")
+            self._told.append(
+                f"{self._deck.path}: left out {bare} masses, springs or dashpots without *MASS, *SPRING or *DASHPOT"
+            )
         for (value,), name in _alike(groups, values["MASS"], "mass"):
             tables["mass"][name] = {"node_set": name, "value": value}
         for row, name in _alike(groups, values["SPRING"], "spring"):
@@ -613,8 +615,10 @@ class Conditions:
         most = damped.max(axis=1, keepdims=True)
         uneven = ((damped != most) & (self._held == 0)).any(axis=1)
         if uneven.any():
-            text = f"left out the dashpots of {int(uneven.sum())} nodes: those of a case act equally in all directions"
-            self._told.append(f"{self._deck.path}: {text}")
+            self._told.append(
+                f"{self._deck.path}: left out the dashpots of {int(uneven.sum())} nodes: those of a case act equally "
+                "in all directions"
+            )
         for (value,), name in _alike(groups, np.where(uneven[:, None], 0.0, most), "dashpot"):
             _add(tables["dashpot"], name, {"node_set": name, "coefficient": value})
         return tables

@@ -170,8 +170,9 @@ class _Scope:
             found, there = places_of(known, wanted)
             if not there.all():
                 element, side = np.argwhere(~there)[0]
-                text = f"node {wanted[element, side]} of element {own[element]} is not defined"
-                raise InputError(f"{block.where}: {text}")
+                raise InputError(
+                    f"{block.where}: node {wanted[element, side]} of element {own[element]} is not defined"
+                )
             ends.append(_ends(order[found], points))
             plane.append(np.full(len(own), elements.plane))
         bars = np.concatenate([_NOTHING, *(own for _, own, _ in self.elements)])
@@ -478,8 +479,10 @@ class Deck:
         mesh = WholeMesh(all_points[used], number[all_bars], self.groups["NSET"], dict(self.groups["ELSET"]))
         mesh.warnings = told
         if self._constraints:
-            text = "nodes that they connect are joined by `mesh clean` if they are at the same place"
-            mesh.warnings.append(f"{self.path}: left out {', '.join(self._constraints)}; {text}")
+            mesh.warnings.append(
+                f"{self.path}: left out {', '.join(self._constraints)}; nodes that they connect are joined by `mesh "
+                "clean` if they are at the same place"
+            )
         return mesh
 
     def _groups(self, kind: str) -> dict[str, np.ndarray]:

@@ -68,8 +68,10 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     if any(_ORDERED in comments for comments in sections.get("Comments", [])):
         lines = lines[np.argsort(lines[:, 0], kind="stable")]
         if (np.diff(lines[:, 0]) != 1).any():
-            text = "the tags of the lines do not follow one another, as $Comments says: remove that section"
-            raise InputError(f"{path}: section $Elements: {text}")
+            raise InputError(
+                f"{path}: section $Elements: the tags of the lines do not follow one another, as $Comments says: "
+                "remove that section"
+            )
     used = np.concatenate([lines[:, 1:3].ravel(), marked[:, 0]])
     place, there = places_of(known, used)
     if not there.all():
@@ -79,8 +81,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     mesh.node_groups = elements.groups(names[0], len(points), of_points, marked[:, 1])
     mesh.bar_groups = elements.groups(names[1], len(lines), np.arange(len(lines)), lines[:, 3])
     if elements.others:
-        text = f"left out {elements.others} elements that are neither lines nor points"
-        mesh.warnings.append(f"{path}: {text}")
+        mesh.warnings.append(f"{path}: left out {elements.others} elements that are neither lines nor points")
     for kind, what, tags, found in (
         ("ElementData", "line", lines[:, 0], mesh.bar_fields),
         ("NodeData", "node", node_tags, mesh.node_fields),
@@ -156,8 +157,7 @@ class _Numbers:
                     try:
                         float(word)
                     except ValueError:
-                        text = f"line {number}: {shown(word)!r} is not a number"
-                        raise InputError(f"{self.where}, {text}") from None
+                        raise InputError(f"{self.where}, line {number}: {shown(word)!r} is not a number") from None
             raise InputError(f"{self.where}: contains text other than numbers") from None
 
     def count(self) -> int:

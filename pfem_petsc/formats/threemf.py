@@ -123,8 +123,9 @@ class _Object:
             default = radius
         bad = np.flatnonzero(~(self.radii >= 0.0).all(axis=1))
         if len(bad):
-            text = f"beam {bad[0]} has no radius (r1, or radius of the beamlattice) that is positive"
-            raise InputError(f"{where}: {text}")
+            raise InputError(
+                f"{where}: beam {bad[0]} has no radius (r1, or radius of the beamlattice) that is positive"
+            )
         self.sets = {}
         for group, numbers in texts.sets:
             members = _numbers(numbers, f"{where}: beamset {group}").ravel()
@@ -295,8 +296,9 @@ def _assembled(path: Path, model: _Model) -> WholeMesh:
         mesh.bar_fields["area"] = area
     mesh.warnings += [f"{path}: requires the extension {uri}, which is not read" for uri in model.not_read]
     if (one != two).any():
-        text = f"{int((one != two).sum())} beams whose radii differ have a constant area, with the same volume"
-        mesh.warnings.append(f"{path}: {text}")
+        mesh.warnings.append(
+            f"{path}: {int((one != two).sum())} beams whose radii differ have a constant area, with the same volume"
+        )
     left = sum(int((~found.used).sum()) for found, _ in placed)
     if left or model.triangles:
         mesh.warnings.append(f"{path}: left out {model.triangles} triangles and {left} vertices where no beam ends")

@@ -75,8 +75,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     if left_out:
         mesh.warnings.append(f"{path}: left out {left_out} cells that are not lines")
     if snapshots > 1:
-        text = f"has {snapshots} snapshots: the mesh and its fields are those of the last one"
-        mesh.warnings.append(f"{path}: {text}")
+        mesh.warnings.append(f"{path}: has {snapshots} snapshots: the mesh and its fields are those of the last one")
     return mesh
 
 

@@ -227,16 +227,15 @@ def scaled(mesh: WholeMesh, scale: float) -> WholeMesh:
     fields = {name: values * scale**2 if name == "area" else values for name, values in mesh.bar_fields.items()}
     tables = {
         table: {
-            name: {key: _scaled_value(value, scale ** _power(table, key)) for key, value in keys.items()}
+            name: {
+                key: _scaled_value(value, scale ** (-1 if table == "mass" else _POWERS.get(key, 0)))
+                for key, value in keys.items()
+            }
             for name, keys in rows.items()
         }
         for table, rows in mesh.tables.items()
     }
     return replace(mesh, points=mesh.points * scale, bar_fields=fields, tables=tables)
-
-
-def _power(table: str, key: str) -> int:
-    return -1 if table == "mass" else _POWERS.get(key, 0)
 
 
 def _scaled_value(value: Any, factor: float) -> Any:

@@ -216,6 +216,10 @@ _NO_LINES = (
     "; if there are physical groups, Gmsh saves nothing else: put the lines into one "
     '(Physical Curve("bars") = {:}), or save all (Mesh.SaveAll = 1)'
 )
+_BARE_NODES = (
+    " (Gmsh saves each point of a physical group: these are points that no line in a group ends at; points at the same "
+    "place are merged by `Coherence;`)"
+)
 
 
 def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
@@ -241,12 +245,37 @@ def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
     if slab.n_nodes == 0 or slab.n_bars == 0:
         hint = _NO_LINES if slab.source.endswith(".msh") and slab.n_nodes else ""
         raise InputError(f"{slab.source}: {slab.n_nodes} nodes and {slab.n_bars} bars: nothing to simulate{hint}")
-    _check_points(slab, comm)
-    _check_ends(slab, comm)
+    refuse, bar = partial(_refuse, slab, comm), partial(_bar, slab)
+    refuse(
+        ~(np.abs(slab.points) < LARGE).all(axis=1),
+        lambda i: f"node {slab.first_node + i} at ({', '.join(f'{x:g}' for x in slab.points[i])})",
+        f"nodes have coordinates that are not numbers below {LARGE:g}",
+        "correct them",
+        mended=False,
+    )
+    missing = ((slab.bars < 0) | (slab.bars >= slab.n_nodes)).any(axis=1)
+    remedy = f"nodes are numbered from 0 to {slab.n_nodes - 1}"
+    refuse(missing, bar, "bars have an end that does not exist", remedy, mended=False)
+    refuse(slab.bars[:, 0] == slab.bars[:, 1], bar, "bars start and end at the same node", "remove them")
     used, length = _lengths(slab, comm)
-    _check_bare_nodes(slab, comm, used)
-    warnings = warnings + _check_lengths(slab, comm, length)
-    del used, length
+    remedy = "remove them: a node without bars has neither mass nor stiffness"
+    if slab.source.endswith(".msh"):
+        remedy += _BARE_NODES
+    refuse(~used, lambda i: f"node {slab.first_node + i}", "nodes belong to no bar", remedy)
+
+    def with_length(i: int) -> str:
+        return f"{bar(i)}, length {length[i]:g} m"
+
+    refuse(
+        ~((length > 0.0) & (length < np.inf)),
+        with_length,
+        "bars have a length that is zero or overflows double precision",
+        "merge the nodes at its ends, or correct their positions",
+    )
+    mean = comm.allreduce(float(length.sum())) / slab.n_bars
+    text = _sentence(comm, length < SHORT * mean, with_length, f"bars are far shorter than the mean length {mean:g} m")
+    if text:
+        warnings = [*warnings, f"{slab.source}: {text}; the explicit time step decreases with the shortest bar"]
     _check_duplicates(slab, comm)
     return warnings
 
@@ -270,49 +299,6 @@ def _lengths(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
             across -= points[place[:, 0]]
             length[start : start + _PIECE] = np.sqrt(np.einsum("ij,ij->i", across, across))
     return used, length
-
-
-def _check_points(slab: MeshSlab, comm: MPI.Comm) -> None:
-    bad = ~(np.abs(slab.points) < LARGE).all(axis=1)
-    _refuse(
-        slab,
-        comm,
-        bad,
-        lambda i: f"node {slab.first_node + i} at ({', '.join(f'{x:g}' for x in slab.points[i])})",
-        f"nodes have coordinates that are not numbers below {LARGE:g}",
-        "correct them",
-        mended=False,
-    )
-
-
-def _check_ends(slab: MeshSlab, comm: MPI.Comm) -> None:
-    bad = ((slab.bars < 0) | (slab.bars >= slab.n_nodes)).any(axis=1)
-    remedy = f"nodes are numbered from 0 to {slab.n_nodes - 1}"
-    _refuse(slab, comm, bad, partial(_bar, slab), "bars have an end that does not exist", remedy, mended=False)
-    bad = slab.bars[:, 0] == slab.bars[:, 1]
-    _refuse(slab, comm, bad, partial(_bar, slab), "bars start and end at the same node", "remove them")
-
-
-def _check_bare_nodes(slab: MeshSlab, comm: MPI.Comm, used: np.ndarray) -> None:
-    remedy = "remove them: a node without bars has neither mass nor stiffness"
-    if slab.source.endswith(".msh"):
-        remedy += (
-            " (Gmsh saves each point of a physical group: these are points that no line in a group ends at; points at "
-            "the same place are merged by `Coherence;`)"
-        )
-    _refuse(slab, comm, ~used, lambda i: f"node {slab.first_node + i}", "nodes belong to no bar", remedy)
-
-
-def _check_lengths(slab: MeshSlab, comm: MPI.Comm, length: np.ndarray) -> list[str]:
-    def named(i: int) -> str:
-        return f"{_bar(slab, i)}, length {length[i]:g} m"
-
-    what = "bars have a length that is zero or overflows double precision"
-    remedy = "merge the nodes at its ends, or correct their positions"
-    _refuse(slab, comm, ~((length > 0.0) & (length < np.inf)), named, what, remedy)
-    mean = comm.allreduce(float(length.sum())) / slab.n_bars
-    text = _sentence(comm, length < SHORT * mean, named, f"bars are far shorter than the mean length {mean:g} m")
-    return [f"{slab.source}: {text}; the explicit time step decreases with the shortest bar"] if text else []
 
 
 def _check_duplicates(slab: MeshSlab, comm: MPI.Comm) -> None:

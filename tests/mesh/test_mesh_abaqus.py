@@ -8,6 +8,16 @@ from pfem_petsc import Truss
 from pfem_petsc.errors import InputError
 from pfem_petsc.formats import read_whole
 
+CHAIN = """*Node
+ 1, 0., 0., 0.
+ 2, 1., 0., 0.
+ 3, 2., 0., 0.
+*Element, type={}
+ 1, 1, 2
+ 2, 2, 3
+"""
+"""Two bars along the x axis."""
+
 
 def members(groups):
     return {name: numbers.tolist() for name, numbers in groups.items()}
@@ -57,18 +67,11 @@ def test_parts_and_instances(tmp_path):
 
 def test_instances_with_content_of_their_own_and_sets_of_the_same_name(tmp_path):
     """As CAE writes independent instances; the set of the assembly has its name, that of the instance a longer one."""
-    text = """*Part, name=P
+    text = f"""*Part, name=P
 *End Part
 *Assembly, name=A
 *Instance, name=I, part=P
-*Node
- 1, 0., 0., 0.
- 2, 1., 0., 0.
- 3, 2., 0., 0.
-*Element, type=B31
- 1, 1, 2
- 2, 2, 3
-*Nset, nset=Set-1
+{CHAIN.format("B31")}*Nset, nset=Set-1
  1,
 *Elset, elset=_PickedSet2, internal
  1, 2
@@ -251,15 +254,8 @@ def test_sets_and_sections_without_bars_are_left_out(tmp_path):
 
 def test_names_in_quotes(tmp_path):
     """They may have blanks, commas and, after a dot, those of instances; blanks in keywords do not matter."""
-    text = """*Part, name=P
-*Node
-1, 0., 0., 0.
-2, 1., 0., 0.
-3, 2., 0., 0.
-*Element, type=T3D2
-1, 1, 2
-2, 2, 3
-*Nset, nset="feet set"
+    text = f"""*Part, name=P
+{CHAIN.format("T3D2")}*Nset, nset="feet set"
  1, 3
 *Nset, nset="top, 1"
  2,

@@ -24,41 +24,26 @@ def test_tables_as_spreadsheets_save_them(tmp_path):
     assert mesh.warnings == [f"{tmp_path}/Bars tower.csv: left out column 'Note', which has text other than numbers"]
 
 
-@pytest.mark.parametrize(
-    ("nodes", "bars", "text"),
-    [
-        ("x,y,z\n0,0,0\n1,0,zero\n", "a,b\n0,1\n", "nodes.csv: line 3: column 'z': 'zero' is not a number"),
-        (
-            "x,z\n0,0\n",
-            "a,b\n0,1\n",
-            "nodes.csv: line 1: there is no column 'y'; it has 'x', 'z'; known are y, y_coord",
-        ),
-        ("x,y\n0,0\n1,1\n", "a,b\n0,2\n", "bars.csv: line 2: there is no node '2' in t_nodes.csv"),
-        ("x,y\n0,0\n1\n", "a,b\n0,1\n", "nodes.csv: line 3: 1 entries; expected 2"),
-        (
-            "node,x,y\n7,0,0\n7,1,0\n",
-            "a,b\n7,7\n",
-            "nodes.csv: line 3: node '7' is listed more than once in column 'node'",
-        ),
-        (
-            "node,x,y\n7,0,0\n8,1,0\n",
-            "a,b\n7,9\n",
-            "no node '9' in t_nodes.csv, whose ids are in column 'node', like 7, 8",
-        ),
-        ("x,y\n0,0\n1,1\n", "a,b\n1,2\n", "numbered from 0, because it has no column of ids"),
-        ("x,y,knotennr\n0,0,2\n1,0,0\n0,1,1\n", "a,b\n0,1\n1,2\n", "column 'knotennr' may have the ids of nodes"),
-        ("id,index,x,y\n1,0,0,0\n0,1,1,1\n", "a,b\n0,1\n", "columns 'id' and 'index' may all be the ids of nodes"),
-        (
-            "x,y\n0,0\n1,1\n",
-            "one,two\n0,1\n",
-            "no two columns for the ends of bars; it has 'one', 'two'; known are node1",
-        ),
-        ("x,y\n0,0\n1,1\n", "i,j,a,b\n0,1,1,0\n", "'i' and 'j', 'a' and 'b' may be the ends of bars"),
-        ("", "a,b\n0,1\n", "nodes.csv: is empty"),
-        ('x,y\n"0,0\n1,1\n', "a,b\n0,1\n", "nodes.csv"),
-        (b"\xff\xfe\x00", "a,b\n0,1\n", "nodes.csv: cannot be read"),
-    ],
-)
+TWO, BAR = "x,y\n0,0\n1,1\n", "a,b\n0,1\n"
+WRONG = [
+    ("x,y,z\n0,0,0\n1,0,zero\n", BAR, "nodes.csv: line 3: column 'z': 'zero' is not a number"),
+    ("x,z\n0,0\n", BAR, "nodes.csv: line 1: there is no column 'y'; it has 'x', 'z'; known are y, y_coord"),
+    (TWO, "a,b\n0,2\n", "bars.csv: line 2: there is no node '2' in t_nodes.csv"),
+    ("x,y\n0,0\n1\n", BAR, "nodes.csv: line 3: 1 entries; expected 2"),
+    ("node,x,y\n7,0,0\n7,1,0\n", "a,b\n7,7\n", "line 3: node '7' is listed more than once in column 'node'"),
+    ("node,x,y\n7,0,0\n8,1,0\n", "a,b\n7,9\n", "no node '9' in t_nodes.csv, whose ids are in column 'node', like 7, 8"),
+    (TWO, "a,b\n1,2\n", "numbered from 0, because it has no column of ids"),
+    ("x,y,knotennr\n0,0,2\n1,0,0\n0,1,1\n", "a,b\n0,1\n1,2\n", "column 'knotennr' may have the ids of nodes"),
+    ("id,index,x,y\n1,0,0,0\n0,1,1,1\n", BAR, "columns 'id' and 'index' may all be the ids of nodes"),
+    (TWO, "one,two\n0,1\n", "no two columns for the ends of bars; it has 'one', 'two'; known are node1"),
+    (TWO, "i,j,a,b\n0,1,1,0\n", "'i' and 'j', 'a' and 'b' may be the ends of bars"),
+    ("", BAR, "nodes.csv: is empty"),
+    ('x,y\n"0,0\n1,1\n', BAR, "nodes.csv"),
+    (b"\xff\xfe\x00", BAR, "nodes.csv: cannot be read"),
+]
+
+
+@pytest.mark.parametrize(("nodes", "bars", "text"), WRONG)
 def test_tables_with_one_thing_wrong(tmp_path, nodes, bars, text):
     (tmp_path / "t_nodes.csv").write_bytes(nodes if isinstance(nodes, bytes) else nodes.encode())
     (tmp_path / "t_bars.csv").write_text(bars)
@@ -159,16 +144,14 @@ def test_coordinates_under_other_names(tmp_path, axes):
 
 
 def test_a_header_of_numpy_and_units_that_are_not_metres(tmp_path):
-    mesh = pair(tmp_path, "# id, x [mm], y [mm]\n4, 1000, 0\n5, 0, 0\n", "#i,j,area [mm2]\n4,5,100\n")
-    assert mesh.bars.tolist() == [[0, 1]]
-    texts = ("has 'x' in mm, 'y' in mm, whose numbers are taken", "has 'area' in mm2, whose numbers are taken")
+    nodes, bars = "# id, x [mm], y [mm]\n4, 1000, 0\n5, 0, 0\n", "#i,j,area [mm2],B (m2)\n4,5,100,1\n"
+    mesh = pair(tmp_path, nodes, bars)
+    assert mesh.bars.tolist() == [[0, 1]] and mesh.bar_fields["area"].tolist() == [100.0]
+    texts = (
+        "has 'x' in mm, 'y' in mm, whose numbers are taken",
+        "has 'area' in mm2, whose numbers are taken as they are",
+    )
     assert all(text in warning for text, warning in zip(texts, mesh.warnings, strict=True))
-
-
-def test_any_column_in_square_millimetres_is_told(tmp_path):
-    mesh = pair(tmp_path, "id,x,y\n4,1,0\n5,0,0\n", "i,j,A [mm2],B (m2)\n4,5,100,1e-4\n")
-    assert mesh.bar_fields["A"].tolist() == [100.0]
-    assert len(mesh.warnings) == 1 and "has 'A' in mm2, whose numbers are taken as they are" in mesh.warnings[0]
 
 
 def test_names_of_nodes_or_their_numbers(tmp_path):

@@ -118,9 +118,7 @@ _IN_A_LINE = 16
 
 def write(path: Path, mesh: WholeMesh) -> None:
     """Write the mesh, to the last digit."""
-    with open(path, "w", encoding="utf-8", newline="\n") as file:
-        for line in _lines(mesh):
-            file.write(line + "\n")
+    path.write_text("".join(f"{line}\n" for line in _lines(mesh)), encoding="utf-8", newline="\n")
 
 
 def _lines(mesh: WholeMesh) -> Iterator[str]:

@@ -166,25 +166,15 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     fields = [place for _, place in bars.others([])]
     mesh.warnings += bars.units(fields, "converts the column area alone, by --scale squared, with the coordinates")
     used = [nodes.place(names) for names in (*_AXES, _GROUPS)]
-    texts: list[str] = []
-    for name, place in nodes.others([*used, ids, *nodes.places(chain(*_NODE_IDS))]):
-        values = nodes.converted(nodes.columns[place])
-        if values is None:
-            texts.append(name)
-        else:
-            mesh.node_fields[name] = values
+    mesh.node_fields, texts = nodes.fields([*used, ids, *nodes.places(chain(*_NODE_IDS))])
     if texts or (used[2] is None and mesh.node_fields):
         left = [f"left out columns {', '.join(map(repr, texts))}, which have other text than numbers"] * bool(texts)
         flat = ["has no column z: all nodes have z = 0"] * (used[2] is None)
         known = f"known are x, y, z, groups, and for ids {_KNOWN_IDS}; others are fields"
         mesh.warnings.append(f"{of_nodes}: {'; '.join([*left, *flat, known])}")
     numbered = [place for place in bars.places(_BAR_IDS) if len(set(bars.columns[place])) == bars.n]
-    for name, place in bars.others([*pair, bars.place(_GROUPS), *numbered]):
-        values = bars.converted(bars.columns[place])
-        if values is None:
-            mesh.warnings.append(f"{of_bars}: left out column {name!r}, which has text other than numbers")
-        else:
-            mesh.bar_fields[name] = values
+    mesh.bar_fields, texts = bars.fields([*pair, bars.place(_GROUPS), *numbered])
+    mesh.warnings += [f"{of_bars}: left out column {name!r}, which has text other than numbers" for name in texts]
     return mesh
 
 
@@ -315,6 +305,12 @@ class _Table:
         """Yield name and place of the columns that have a name and are not ``used``."""
         known = {*used}
         yield from ((name, i) for i, name in enumerate(self.headings) if name and i not in known)
+
+    def fields(self, used: Iterable[int | None]) -> tuple[dict[str, np.ndarray], list[str]]:
+        """Return the columns of numbers that are not ``used``, by name, and the names of those with other text."""
+        found = {name: self.converted(self.columns[place]) for name, place in self.others(used)}
+        texts = [name for name, values in found.items() if values is None]
+        return {name: values for name, values in found.items() if values is not None}, texts
 
     def units(self, places: Iterable[int], remedy: str) -> list[str]:
         """Return a warning about columns in other units of length or area than metres; ``remedy``: of the verb mesh."""

@@ -417,9 +417,7 @@ def write(path: Path, mesh: WholeMesh) -> None:
 
     Tags are the numbers from 1.
     """
-    with open(path, "w", encoding="utf-8", newline="\n") as file:
-        for line in _lines(mesh):
-            file.write(line + "\n")
+    path.write_text("".join(f"{line}\n" for line in _lines(mesh)), encoding="utf-8", newline="\n")
 
 
 def _lines(mesh: WholeMesh) -> Iterator[str]:

@@ -445,19 +445,19 @@ class Block(Joints):
         self.keys, self.expressions = keys, keys.expressions()
         closed = keys.curved is not None and keys.curved.closed
         cell, cells = keys.unit_cell(), np.array(keys.cells, np.int64)
-        # the edge of all cells along an axis, or the coordinates of their borders and of one more
-        self._levels: list[float | np.ndarray] = []
+        super().__init__(cell, cells, closed, plain)
+        # the coordinates of the borders of cells along each axis, and of one more
+        self._levels: list[np.ndarray] = []
         for axis, factor in enumerate(keys.grading or (1.0, 1.0, 1.0)):
-            edge = keys.pitch * cell.aspect[axis]
+            edge, count = keys.pitch * cell.aspect[axis], -(-int(cells[axis]) // cell.layers[axis])
             if isinstance(factor, str):
-                self._levels.append(graded_levels(-(-int(cells[axis]) // cell.layers[axis]), edge, factor, axis))
+                self._levels.append(graded_levels(count, edge, factor, axis))
             else:
                 check_length(edge * factor, f"mesh.pitch times mesh.grading[{axis}]")
-                self._levels.append(float(edge * factor))
-        super().__init__(cell, cells, closed, plain)
+                self._levels.append(edge * factor * np.arange(count + 2))
         self._amplitude = (keys.perturbation or 0.0) * keys.pitch
         self.disturbed = self._amplitude > 0.0
-        edges = [level if isinstance(level, float) else np.diff(level[:-1]).min() for level in self._levels]
+        edges = [np.diff(level[:-1]).min() for level in self._levels]
         shortest = float(np.linalg.norm(cell.spans * np.array(edges), axis=1).min())
         if self._amplitude and 2.0 * math.sqrt(3.0) * self._amplitude >= shortest:
             raise InputError(
@@ -471,23 +471,13 @@ class Block(Joints):
 
     def cell_volumes(self, places: Places) -> np.ndarray:
         """Return the volumes (n,) [m3] of the cells at places of bars, before they are curved or mapped."""
-        edges = [
-            np.full(len(index), level) if isinstance(level, float) else level[index + 1] - level[index]
-            for level, index in zip(self._levels, places[1:])
-        ]
+        edges = [level[index + 1] - level[index] for level, index in zip(self._levels, places[1:])]
         return np.prod(edges, axis=0)
 
     def _box(self) -> np.ndarray:
         """Return the edges (3,) [m] of the block before it is moved."""
-        found = []
-        for level, cells, layers in zip(self._levels, self.cells, self.cell.layers):
-            size = cells / layers
-            if isinstance(level, float):
-                found.append(size * level)
-            else:
-                whole = int(size)
-                found.append(level[whole] + (size - whole) * (level[whole + 1] - level[whole]))
-        return np.array(found)
+        sizes = self.cells / np.array(self.cell.layers)
+        return np.array([np.interp(size, np.arange(len(level)), level) for size, level in zip(sizes, self._levels)])
 
     def _shell(self) -> float:
         """Return the volume of the shell [m3] to which the block is mapped."""
@@ -514,11 +504,7 @@ class Block(Joints):
         """Return the positions (n, 3) [m] of nodes with given numbers and places, with the perturbation or without."""
         keys, points = self.keys, np.empty((len(numbers), 3))
         for axis, (level, index) in enumerate(zip(self._levels, places[1:])):
-            at = self.cell.points[places.item, axis]
-            if isinstance(level, float):
-                points[:, axis] = (index + at) * level
-            else:
-                points[:, axis] = level[index] + at * (level[index + 1] - level[index])
+            points[:, axis] = level[index] + self.cell.points[places.item, axis] * (level[index + 1] - level[index])
         if self.disturbed and disturbed:
             for axis in range(3):  # nodes of outer faces remain in them
                 held = [self.on_face(places, name) for name in self.faces if FACES[name][0] == axis]

@@ -71,7 +71,7 @@ def test_sections_by_the_field_of_a_converter(comm, shared_tmp_path):
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", NAMES)
 def test_values_of_fields_are_groups_everywhere(comm, shared_tmp_path, name):
-    """Sections, temperatures, removals and node sets by fields: the same run as by groups, to the last bit."""
+    """Sections, temperatures, removals and node sets by fields: the same run as by groups, on one rank to the last bit."""
     groups = {f"kind_{k}": np.flatnonzero(KINDS == k) for k in (1, 2, 7)}
     named = write_mesh(
         shared_tmp_path / "named.h5",
@@ -109,7 +109,9 @@ def test_values_of_fields_are_groups_everywhere(comm, shared_tmp_path, name):
     assert expected["kinetic_energy"][-1] > 0.0
     for column in ("kinetic_energy", "elastic_energy", "external_work", "removed_energy", "support_force", "momentum"):
         if column in expected:
-            np.testing.assert_array_equal(found[column], expected[column], err_msg=column)
+            # PT-Scotch divides the same mesh differently in each run of a process
+            scale = 0.0 if comm.size == 1 else 1e-12 * np.abs(expected[column]).max()
+            np.testing.assert_allclose(found[column], expected[column], rtol=0, atol=scale, err_msg=column)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -128,8 +128,8 @@ def surviving(result: str, deep: bool | None = None, refuse: bool = False) -> Pa
     InputError
         If there is no such file, or it cannot be read; with ``refuse`` also if values do not match.
     """
+    from ..output.integrity import SHOWN, examine
     from ..output.result import result_file
-    from ..output.verify import SHOWN, examine
 
     path = result_file(result)
     wrong = examine(path, deep) if path.is_file() else []

@@ -19,8 +19,7 @@ from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..output.units import TIME
 from ..stepping.plan import Plan, refuse_motion
 from ..stepping.stepper import Solution, Stepper
-from .linear import linear_forces
-from .pencil import Holds, Pencil, StateMatrices, buckling_bars, join
+from .pencil import Holds, Pencil, StateMatrices, buckling_bars, join, linear_forces
 from .solvers import SOLVERS, Dense, Lanczos, Slepc
 
 if TYPE_CHECKING:

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 from .hdf5 import create_checked, dataset_names, fsync_all, grow, is_compressed, write_rows
+from .integrity import examine
 from .layout import (
     CHECKS,
     EVENT,
@@ -32,7 +33,6 @@ from .layout import (
     write_case,
 )
 from .result import readable
-from .verify import examine
 
 COPIED = 1 << 28
 """Files up to this size [B] are rewritten for a restart and then replaced."""

@@ -15,8 +15,8 @@ from mpi4py import MPI
 from ..columns import Layout
 from ..errors import InputError, PfemError, SimulationFailure
 from ..parallel.agreement import on_root
-from ..parallel.memory import SharedArrays
-from .hdf5 import Growing, create_new, require_parallel_hdf5, require_room, write_rows, writing
+from ..parallel.heap import SharedArrays
+from .hdf5 import Growing, SharedFile, create_new, require_parallel_hdf5, require_room, write_rows, writing
 from .integrity import RowDigests, mark_digest, numbers_digest, snapshot_digests, summed, word_sum
 from .layout import (
     CHECKS,
@@ -35,7 +35,6 @@ from .layout import (
     row_type,
 )
 from .repair import reopen
-from .shared import SharedFile
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh

@@ -21,10 +21,10 @@ from ..output.checkpoint import (
     asked_checkpoint,
     check_seal,
 )
+from ..output.integrity import examine
 from ..output.result import RESULT_NAME as RESULT
 from ..output.result import open_result
 from ..output.units import engineering
-from ..output.verify import examine
 from ..parallel.agreement import on_root
 from ..tolerances import TIME
 from .state import STATE_VERSION

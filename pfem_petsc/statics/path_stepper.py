@@ -13,9 +13,8 @@ from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
 from ..stepping.stepper import AttributeOf, Solution
 from ..tolerances import TIME
-from .critical import EVENTS, CriticalPoints, Event
+from .critical import EVENTS, CriticalPoints, Event, JumpSearch, Place
 from .equilibrium import PathEquilibrium
-from .jumps import JumpSearch, Place
 from .path_points import (
     Arc,
     ArcControl,

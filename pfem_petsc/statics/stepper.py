@@ -22,8 +22,8 @@ from ..stepping.implicit import ImplicitStepper
 from ..stepping.plan import Plan, refuse_motion
 from ..stepping.stepper import Solution
 from ..tolerances import TIME
+from .critical import Jump, JumpSearch, Place
 from .equilibrium import Equilibrium, problem_at_rest
-from .jumps import Jump, JumpSearch, Place
 from .path_points import Arc, BorderedSystem, Metric, PointSolver, dot
 from .stability import LARGEST, LARGEST_WITH_MUMPS, ZERO, Stability, free_motions, held_nodes, is_indefinite, stiffest
 

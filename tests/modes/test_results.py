@@ -16,8 +16,8 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import EarlyStop, InputError
 from pfem_petsc.modes import find as choice
+from pfem_petsc.output.integrity import examine
 from pfem_petsc.output.result import open_result
-from pfem_petsc.output.verify import examine
 from pfem_petsc.post.motion import ModeFrames
 from pfem_petsc.post.render import render_modes
 

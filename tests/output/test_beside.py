@@ -11,10 +11,10 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import SimulationFailure
-from pfem_petsc.output import shared, vtkhdf
+from pfem_petsc.output import hdf5, vtkhdf
+from pfem_petsc.output.integrity import damages
 from pfem_petsc.output.result import open_result
-from pfem_petsc.output.verify import damages
-from pfem_petsc.parallel.memory import SharedArrays, share_memory
+from pfem_petsc.parallel.heap import SharedArrays, share_memory
 
 STEPS = range(0, 40, 5)
 
@@ -50,7 +50,7 @@ def values(path):
 def test_file_of_snapshots_beside_the_steps_equals_that_of_one_rank(shared_tmp_path, monkeypatch, shares):
     """Values change after the write, as those of the next steps; ranks of several machines share no memory."""
     if not shares:
-        monkeypatch.setattr(shared, "share_memory", lambda comm: False)
+        monkeypatch.setattr(hdf5, "share_memory", lambda comm: False)
     path, truss = shared_tmp_path / "beside.vtkhdf", Truss(COMM, idle=(1,) if COMM.size > 1 else ())
     with vtkhdf.ResultWriter(path, COMM, truss.mesh, **options()) as writer:
         for step in STEPS:

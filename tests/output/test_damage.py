@@ -13,8 +13,8 @@ from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.output import integrity
+from pfem_petsc.output.integrity import damages, examine
 from pfem_petsc.output.result import open_result
-from pfem_petsc.output.verify import damages, examine
 from pfem_petsc.output.vtkhdf import ResultWriter
 
 STEPS = 12

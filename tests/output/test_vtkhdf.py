@@ -24,10 +24,10 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from pfem_petsc.columns import DECLARED, OF_MODES
 from pfem_petsc.errors import InputError
 from pfem_petsc.output import hdf5 as growing
+from pfem_petsc.output.integrity import damages
 from pfem_petsc.output.layout import complete_snapshots
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.units import unit_of
-from pfem_petsc.output.verify import damages
 from pfem_petsc.output.vtkhdf import ResultWriter
 
 WRITTEN = [0, 5, 10, 15, 20]

@@ -117,7 +117,7 @@ def test_restart_of_a_finished_path_ends_at_once(tmp_path):
 @pytest.mark.slow
 def test_damaged_event_is_found(tmp_path):
     """Events have checksums as rows of the history have."""
-    from pfem_petsc.output.verify import examine
+    from pfem_petsc.output.integrity import examine
 
     Simulation(Case.load("von_mises"), MPI.COMM_SELF, output=tmp_path / "a", quiet=True).run()
     path = tmp_path / "a" / "result.vtkhdf"

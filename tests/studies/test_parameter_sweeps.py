@@ -23,8 +23,8 @@ from pfem_petsc.output.result import peak_force
 from pfem_petsc.output.table import Table
 from pfem_petsc.post.curves import labels_of
 from pfem_petsc.solvers import matrix_free as outlive
-from pfem_petsc.studies import pool
-from pfem_petsc.studies.pool import Task
+from pfem_petsc.studies import sweep as pool
+from pfem_petsc.studies.sweep import Task
 
 
 @pytest.fixture(scope="module")

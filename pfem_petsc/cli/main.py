@@ -39,7 +39,7 @@ from .parser import PLUGINS, PROGRAM, Parser, Verb, fill
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-HOMES = {"run": "cases", "list": "cases", "check": "cases", "mesh": "mesh", "render": "render", "plot": "results"}
+HOMES = {"run": "cases", "list": "cases", "check": "cases", "mesh": "mesh", "render": "results", "plot": "results"}
 HOMES |= {"report": "results", "info": "results", "sweep": "cases", "bench": "bench", "completion": "cases"}
 """Verbs, and the modules of this package whose ``VERBS`` have them."""
 

@@ -1,10 +1,9 @@
-"""Cameras of a film: at rest with the whole motion in view, around the structure, along a path, or with it."""
+"""Cameras of a film: at rest with the whole motion in view, around the structure, or with it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,22 +47,6 @@ class Camera:
     distance: float
     half_height: float
     parallel: bool
-
-    def project(self, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Project points (n, 3) [m] into a picture of ``size`` pixels.
-
-        Returns
-        -------
-        Columns and rows (n,) [pixels], and pixels per metre there (n,), 0 behind the eye.
-        """
-        away = points - self.centre
-        across, along, deep = away @ self.right, away @ self.up, away @ self.towards
-        near = np.ones(len(points))
-        if not self.parallel:
-            ahead = 1.0 - deep / self.distance
-            near = np.where(ahead > 0.02, 1.0 / np.where(ahead > 0.02, ahead, 1.0), 0.0)
-        scale = size[1] / (2.0 * self.half_height) * near
-        return 0.5 * size[0] + across * scale, 0.5 * size[1] - along * scale, scale
 
     def zoomed(self, factor: float) -> Camera:
         """Return the camera that shows what is in the middle larger by a factor."""
@@ -164,7 +147,7 @@ def fit(
 
 
 def check_moves(options: Any) -> None:
-    """Refuse ``zoom``, ``orbit`` and ``path`` of options that make no film.
+    """Refuse ``zoom`` and ``orbit`` of options that make no film.
 
     Raises
     ------
@@ -174,47 +157,29 @@ def check_moves(options: Any) -> None:
         raise InputError(f"render: zoom = {options.zoom:g} must be from 0.001 to 1000")
     if not np.isfinite(options.orbit):
         raise InputError(f"render: orbit = {options.orbit:g} is not a number of degrees")
-    if options.path is None:
-        return
-    if options.orbit:
-        raise InputError("render: orbit and path both move the camera; give one of the two")
-    path = np.asarray(options.path, dtype=float)
-    if path.ndim != 2 or path.shape[1] != 4 or not len(path) or not np.isfinite(path).all():
-        raise InputError("render: path takes rows of four numbers: time, azimuth, elevation, zoom")
-    if (np.diff(path[:, 0]) <= 0.0).any():
-        raise InputError("render: path: times must increase from row to row")
-    if (np.abs(path[:, 2]) > 89.0).any() or (path[:, 3] <= 0.0).any():
-        raise InputError("render: path: elevations go from -89 to 89 degrees, and zooms are positive")
 
 
 def cameras(options: Any, motion: Any, aspect: float) -> list[Camera]:
-    """Return the camera of each frame of a motion; all have the same scale, but for the zooms of a path.
+    """Return the camera of each frame of a motion; all have the same scale.
 
     Parameters
     ----------
     options : ``view``: name of a view, or the direction (3,) from the structure to the eye; ``zoom``: factor on the
         size in the picture; ``orbit``: angle [degrees] that the camera goes around the upward direction from the first
-        frame to the last; ``path``: (k, 4) times [s], azimuths and elevations [degrees], zooms, between which it moves
-        smoothly; ``follow``: "structure" or the name of a probe that stays in the middle of the picture
+        frame to the last; ``follow``: "structure" or the name of a probe that stays in the middle of the picture
     motion : of the film
     aspect : width of the picture over its height
     """
     towards, up, parallel = direction(options.view, motion.bounds, motion.normals, motion.upward)
     points, count = motion.surroundings, len(motion.frames)
-    if not options.orbit and options.path is None and options.follow is None:
+    if not options.orbit and options.follow is None:
         return [fit(points, (towards, up, parallel), aspect).zoomed(options.zoom)] * count
-    ways, zooms = [(towards, up, parallel)] * count, np.full(count, options.zoom)
+    ways = [(towards, up, parallel)] * count
     if options.orbit:
         from scipy.spatial.transform import Rotation
 
         turns = np.linspace(0.0, np.radians(options.orbit), count)[:, None] * up / np.linalg.norm(up)
         ways = [(each, up, parallel) for each in Rotation.from_rotvec(turns).apply(towards)]
-    if options.path is not None:
-        when, *rest = np.asarray(options.path, dtype=float).T
-        azimuths, elevations, factors = (_smooth(motion.times, when, each) for each in rest)
-        angles = zip(np.radians(azimuths), np.radians(elevations), strict=True)
-        ways = [(_towards(*each, motion.upward), motion.upward, False) for each in angles]
-        zooms = zooms * factors
     if options.follow is None:
         centre = motion.bounds.mean(axis=0)
         made = [fit(points, way, aspect, centre=centre) for way in ways]
@@ -223,26 +188,7 @@ def cameras(options: Any, motion: Any, aspect: float) -> list[Camera]:
         held = zip(ways, motion.hulls, centres, strict=True)
         made = [fit(hull, way, aspect, margin=1.25, centre=centre) for way, hull, centre in held]
     (made,) = at_one_scale([made])
-    return [camera.zoomed(zoom) for camera, zoom in zip(made, zooms, strict=True)]
-
-
-def camera_path(file: Path | str) -> np.ndarray:
-    """Read the path of a camera (k, 4): columns time, azimuth, elevation, zoom, with or without a line of names.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or a line is not four numbers.
-    """
-    try:
-        lines = [line for line in Path(file).read_text().splitlines() if line.strip() and not line.startswith("#")]
-        names = any(letter.isalpha() for letter in lines[0].lower().replace("e", "")) if lines else False
-        path = np.loadtxt(lines[names:], delimiter=",", ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: the camera's path cannot be read ({error})") from error
-    if path.shape[1] != 4:
-        raise InputError(f"{file}: the camera's path takes four numbers a line: time, azimuth, elevation, zoom")
-    return path
+    return [camera.zoomed(options.zoom) for camera in made]
 
 
 def at_one_scale(films: list[list[Camera]]) -> list[list[Camera]]:
@@ -250,25 +196,3 @@ def at_one_scale(films: list[list[Camera]]) -> list[list[Camera]]:
     every = [camera for film in films for camera in film]
     half, distance = max(camera.half_height for camera in every), max(camera.distance for camera in every)
     return [[replace(camera, half_height=half, distance=distance) for camera in film] for film in films]
-
-
-def _towards(azimuth: float, elevation: float, up: np.ndarray) -> np.ndarray:
-    """Return a direction from angles [rad]; the azimuth is from x, about the upward direction."""
-    first, second = _level(up)
-    return np.cos(elevation) * (np.cos(azimuth) * first + np.sin(azimuth) * second) + np.sin(elevation) * up
-
-
-def _smooth(times: np.ndarray, when: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate values between given times by cubics without overshoot, at rest at both ends.
-
-    The rates at inner times are the weighted harmonic means of the slopes beside them, zero where these have different
-    signs (Fritsch and Butland 1984, eq. 5): the camera passes through them without a stop where it goes on in the same
-    direction.
-    """
-    from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
-
-    if len(when) == 1:
-        return np.full(len(times), values[0])
-    rates = PchipInterpolator(when, values).derivative()(when) if len(when) > 2 else np.zeros(2)
-    rates[[0, -1]] = 0.0
-    return CubicHermiteSpline(when, values, rates)(np.clip(times, when[0], when[-1]))

@@ -120,9 +120,6 @@ class Options:
     )
     zoom: float = _option(1.0, "factor on the size in the picture; default: 1", type=float)
     orbit: float = _option(0.0, "angle of the camera's orbit during the film", metavar="DEGREES", type=float)
-    path: Any = _option(
-        None, "CSV of time, azimuth, elevation [degrees], zoom of the camera; rows of these", metavar="FILE"
-    )
     follow: str | None = _option(
         None,
         "keep the structure, or a probe, in the middle of the picture",
@@ -143,7 +140,7 @@ class Options:
     title: str | None = _option(None, "title of the pictures; default: that of the case")
 
     def __post_init__(self) -> None:
-        from .camera import camera_path, check_moves
+        from .camera import check_moves
 
         video, size = self.video or ("webm" if self.transparent else "mp4"), self.size
         if video not in VIDEOS:
@@ -165,8 +162,6 @@ class Options:
             raise InputError(f"render: radius_scale = {self.radius_scale:g} must be from 1e-6 to 1e6")
         if self.bar_width is not None and not 0.0 < self.bar_width <= 500.0:
             raise InputError(f"render: bar_width = {self.bar_width:g} must be positive, and 500 pixels at most")
-        if isinstance(self.path, str):
-            object.__setattr__(self, "path", camera_path(self.path))
         check_moves(self)
         if isinstance(self.frames, Iterable):
             object.__setattr__(self, "frames", list(self.frames))

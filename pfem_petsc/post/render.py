@@ -1,4 +1,4 @@
-"""Pictures and films of results, side by side when there are several, without a display."""
+"""Pictures and films of results, side by side when there are several, without a display; a web page to turn one."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from .chart import opened
 from .colours import MARKS, ColourField, ColourScale, limits_of
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_times
 from .options import Options
-from .page import Heading, Inset, Page, grid, inset_room, over
-from .scene import FEW, TUBE_LIMIT, Scene, Style, few_threads
+from .page import Heading, Page, grid, inset_room
+from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Segments, Style, few_threads
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -221,7 +221,7 @@ class Film:
 
     def start(self, size: tuple[int, int]) -> None:
         """Prepare frames of a size."""
-        _, _, width, height = Page.region_of(size)
+        left, top, width, height = Page.region_of(size)
         self._columns, tile = 1, (width, height)
         several = len(self.motions) > 1
         if several:
@@ -229,26 +229,24 @@ class Film:
             self._columns, rows = grid(len(self.motions), float(aspect), (width, height))
             tile = (width // self._columns, height // rows - Page.strip_of(size))
         self._prepare(size, tile)
-        self._insets: list[Inset] = []
         if self.options.inset is not None:
-            shown = [
-                self._draw(k, number)
-                for k in range(len(self.motions))
-                for number in {0, self.count // 2, self.count - 1}
-            ]
-            room, self._corner = inset_room(shown, several)
-            results = [motion.result for motion in self.motions]
-            self._insets = [Inset(results, k, self.options.inset, room) for k in range(len(results))]
+            frames = {0, self.count // 2, self.count - 1}
+            shown = [self._draw(k, number) for k in range(len(self.motions)) for number in frames]
+            wide, (x, y) = inset_room(shown, several)
+            results, strip = [motion.result for motion in self.motions], Page.strip_of(size) if several else 0
+            for k in range(len(results)):
+                row, column = divmod(k, self._columns)
+                corner = left + column * tile[0] + x, top + row * (tile[1] + strip) + strip + y
+                self._page.add_inset(results, k, self.options.inset, corner, wide)
 
     def frame(self, number: int) -> np.ndarray:
         """Return a page (height, width, 3 or 4) uint8."""
         drawings = [self._draw(k, number) for k in range(len(self.motions))]
-        for motion, inset, drawing in zip(self.motions, self._insets, drawings, strict=False):
-            picture, (x, y) = inset.at(float(motion.times[number])), self._corner
-            over(drawing[y : y + picture.shape[0], x : x + picture.shape[1]], picture)
         motion, camera = self.motions[0], self._cameras[0][number]
         captions = list(self._labels) if len(drawings) > 1 else []
-        return self._page.compose(drawings, camera, motion.time(motion.frames[number]), captions, self._columns)
+        moments = [float(motion.times[number]) for motion in self.motions]
+        time = motion.time(motion.frames[number])
+        return self._page.compose(drawings, camera, time, captions, self._columns, moments)
 
     def poster(self) -> np.ndarray:
         """Return six instants on one page, in a grid that suits the shape of the motion."""
@@ -278,11 +276,10 @@ class Film:
         self.close()
         options = self.options
         self._cameras = [cameras(options, motion, tile[0] / tile[1]) for motion in self.motions]
-        if len(self.motions) > 1 and options.path is None:
+        if len(self.motions) > 1:
             self._cameras = at_one_scale(self._cameras)
         marks = [MARKS[mark] for mark in options.marks]
-        field, still = self.colours[0].title, options.path is None
-        heading = Heading(self.title, field, self.scale, marks, still, options.transparent)
+        heading = Heading(self.title, self.colours[0].title, self.scale, marks, options.transparent)
         self._page = Page(size, heading, self._cameras[0][0], tile[1])
         _, _, width, height = Page.region_of(size)
         for motion, style, colour, film in zip(self.motions, self.styles, self.colours, self._cameras, strict=True):
@@ -430,3 +427,125 @@ def encode(pattern: Path, target: Path, fps: float) -> Path:
         last = done.stderr.strip().splitlines()[-1:] or ["no message"]
         raise InputError(f"{target}: ffmpeg failed ({last[0]}); the pictures are in {pattern.parent}")
     return target
+
+
+_WIDTHS = ((300, 3.0), (20_000, 1.8))  # least widths of bars in pixels, by the number of bars
+_CONFIG = {"displaylogo": False, "scrollZoom": True}
+_SHAPES = ((2000, 5), (20_000, 3))  # from the initial one to that of the snapshot, by the number of bars
+
+
+def render_html(
+    result_path: Path | str | Any,
+    output: Path | str | None = None,
+    *,
+    frame: int = -1,
+    note: Callable[[str], None] = print,
+    **options: Any,
+) -> Path:
+    """Write ``render.html``: a state for turning, moving and zooming, and between it and the first one.
+
+    Parameters
+    ----------
+    result_path : result file or its folder, or an open result
+    output : folder of the page; None: beside the result
+    frame : number of the snapshot; -1: the last
+    note : receives messages
+    options : ``field, component, clim, symmetric, cmap, scale, style, radius_scale, title, view``, see
+        :class:`~pfem_petsc.post.options.Options`
+
+    Raises
+    ------
+    InputError
+        For options that do not fit the result, a file that cannot be written, or without plotly.
+    """
+    with opened(result_path) as result:
+        film = Film([result], Options(frames=chosen_frames([frame], np.asarray(result.times), note), **options), note)
+        figure = _figure(film)
+        file = (Path(output) if output is not None else Path(result.path).parent) / "render.html"
+    with written(file, "the page"):
+        figure.write_html(file, include_plotlyjs=True, auto_play=False, default_height="98vh", config=_CONFIG)
+    return file
+
+
+def _figure(film: Film) -> Any:
+    """Return the figure of plotly of a film's first frame."""
+    try:
+        import plotly.graph_objects as plotly
+    except ImportError as error:
+        raise InputError("render: --html needs plotly, which is not installed: pip install plotly") from error
+
+    motion, colour, scale = film.motions[0], film.colours[0], film.scale
+    frame, camera = motion.frames[0], cameras(film.options, motion, 1.6)[0]
+    start, now, gone = motion.start, motion.positions(frame), motion.gone(frame)
+    style = film.styles[0]
+    kind = "line" if not style.tubes else "rough" if motion.n_bars <= FEW else "prism"
+    least = next((width for most, width in _WIDTHS if motion.n_bars <= most), 1.2)
+    radius = np.zeros(motion.n_bars) if style.radius is None else style.radius
+    radius = np.maximum(radius, least * camera.half_height / 720)
+    bars = Segments(None, motion.bars, kind, colour.on_nodes)
+    steps = np.linspace(0.0, 1.0, next((count for most, count in _SHAPES if motion.n_bars <= most), 2))
+    places = []
+    for step in steps:
+        bars.move(start + step * (now - start), radius if gone is None else np.where(gone, -1.0, radius))
+        places.append(np.asarray(bars.mesh.points).T.copy())
+    label = colour.title + (f" [{scale.unit}]" if scale.unit else "")
+    stops = [[k / 15, "rgb({:.0f},{:.0f},{:.0f})".format(*(255 * np.array(scale.cmap(k / 15)[:3])))] for k in range(16)]
+    shades: dict[str, Any] = {
+        "colorscale": stops,
+        "cmin": scale.factor * scale.low,
+        "cmax": scale.factor * scale.high,
+        "colorbar": {"title": {"text": label.replace(" ", "<br>", 1)}, "len": 0.7, "thickness": 20},
+    }
+    values = scale.factor * colour.values(frame)[bars.rows].astype(np.float32)
+    look: dict[str, Any] = {"hoverinfo": "skip"}
+    if style.tubes:
+        corners, trace = bars.mesh.regular_faces, plotly.Mesh3d
+        look |= dict(zip("ijk", np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]).T, strict=True))
+        look |= {"intensity": values, "lighting": {"ambient": 0.5, "diffuse": 0.6, "specular": 0.2}, **shades}
+    else:
+        # a line ends where a number is missing
+        places = [np.insert(x.reshape(3, -1, 2), 2, np.nan, axis=2).reshape(3, -1) for x in places]
+        between, trace = np.insert(values.reshape(-1, 2), 2, 0.0, axis=1).ravel(), plotly.Scatter3d
+        look |= {"mode": "lines", "line": {"color": between, "width": 2.0 * least, **shades}}
+    traces = [dict(zip("xyz", x, strict=True)) for x in places]
+    walls = [_wall(plotly, surface) for surface in motion.surfaces[frame]]
+    figure = plotly.Figure([trace(**traces[-1], **look), *walls])
+    figure.frames = [
+        plotly.Frame(name=f"{step:.2f}", data=[trace(**x)], traces=[0]) for step, x in zip(steps, traces, strict=True)
+    ]
+    now = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
+    choices = [{"label": each.name, "method": "animate", "args": [[each.name], now]} for each in figure.frames]
+    hidden = {"visible": False}
+    figure.update_layout(
+        title={"text": f"<b>{_text(film.title)}</b><br>{_text(motion.time(frame))}", "x": 0.01},
+        margin={"l": 0, "r": 0, "t": 60, "b": 20},
+        showlegend=False,
+        sliders=[
+            {"active": len(steps) - 1, "steps": choices, "len": 0.5, "x": 0.03, "currentvalue": {"prefix": "shape: "}}
+        ],
+        scene={
+            "aspectmode": "data",
+            "dragmode": "orbit",
+            **{f"{axis}axis": hidden for axis in "xyz"},
+            "camera": {
+                "eye": dict(zip("xyz", 2.1 * camera.towards, strict=True)),
+                "up": dict(zip("xyz", camera.up, strict=True)),
+                "projection": {"type": "orthographic" if camera.parallel else "perspective"},
+            },
+        },
+    )
+    return figure
+
+
+def _text(words: str) -> str:
+    return words.replace("&", "&amp;").replace("<", "&lt;")
+
+
+def _wall(plotly: Any, surface: Any) -> Any:
+    """Return the face of a wall that nodes touch."""
+    faces = np.asarray(surface.faces)
+    faces = faces[(np.asarray(surface.depth)[faces] == 0.0).all(axis=1)]
+    corners = dict(zip("ijk", np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]]).T, strict=True))
+    x, y, z = np.asarray(surface.points, dtype=float).T
+    shade = "rgb({},{},{})".format(*WALL_COLOUR)
+    return plotly.Mesh3d(x=x, y=y, z=z, **corners, color=shade, opacity=0.35, hoverinfo="skip")

@@ -414,7 +414,7 @@ class Scene:
 
         Returns
         -------
-        (height, width, 3) uint8, or (height, width, 4) with a transparent background, multiplied by the opacity
+        (height, width, 3) uint8, or (height, width, 4) with a transparent background
         """
         for actor in self._extra:
             self._plotter.remove_actor(actor, reset_camera=False, render=False)
@@ -445,7 +445,8 @@ class Scene:
         # reduced as plain channels, because they are multiplied by the opacity already; rows are from below
         mode = "RGB" if self._channels == 3 else "CMYK"
         image = Image.frombuffer(mode, (width, height), pyvista.convert_array(made), "raw", mode, 0, -1)
-        return np.array(image.reduce(self._factor))
+        picture = np.array(image.reduce(self._factor))
+        return picture if self._channels == 3 else _unmultiplied(picture)
 
     def view(self, camera: Camera, least: float, fades: bool = False) -> _View:
         """Return what bars see of a camera, with a least radius in pixels."""
@@ -497,6 +498,13 @@ class Scene:
             if len(edge):
                 actors.append(self._add(Layer(points, edge, EDGE_COLOUR, 1.8), camera))
         return actors
+
+
+def _unmultiplied(picture: np.ndarray) -> np.ndarray:
+    """Return a picture (h, w, 4) that was multiplied by its opacity with plain colours."""
+    alpha = picture[..., 3:].astype(np.uint16)
+    colours = np.minimum(255 * picture[..., :3].astype(np.uint16) // np.maximum(alpha, 1), 255)
+    return np.concatenate([colours, alpha], axis=2).astype(np.uint8)
 
 
 def add_wall(plotter: Any, surface: Surface, points: np.ndarray, strength: int, towards: np.ndarray) -> Any:

@@ -191,6 +191,14 @@ def camera_of(bounds, view="iso", aspect=1.0, normals=()):
     return fit(corners(bounds), direction(view, np.asarray(bounds), normals, (0.0, 0.0, 1.0)), aspect)
 
 
+def projected(camera, points, size) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns and rows [pixels] of points (n, 3) in a picture, and pixels per metre there, 0 behind the eye."""
+    away = points - camera.centre
+    ahead = np.ones(len(points)) if camera.parallel else 1.0 - away @ camera.towards / camera.distance
+    scale = size[1] / (2.0 * camera.half_height) * np.where(ahead > 0.02, 1.0 / np.maximum(ahead, 0.02), 0.0)
+    return 0.5 * size[0] + away @ camera.right * scale, 0.5 * size[1] - away @ camera.up * scale, scale
+
+
 def picture_of(points, bars, colours, camera, size, style, layers=()) -> np.ndarray:
     """Bars without text; layers may be a function of the scene."""
     bounds = np.array([points.min(axis=0), points.max(axis=0)])

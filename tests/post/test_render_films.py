@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from helpers.pictures import TINY, box, draw, drawing, near, pixels
+from helpers.pictures import TINY, box, draw, drawing, near, pixels, projected
 from helpers.synthetic import SyntheticResult, ring
 from PIL import Image
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.units import LOAD_FACTOR
-from pfem_petsc.post.camera import camera_path, cameras
+from pfem_petsc.post.camera import cameras
 from pfem_petsc.post.motion import Motion, Resampled
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.render import Options, render
@@ -72,33 +70,13 @@ def motion_of(result):
     return Motion(result, list(range(len(result.times))), Options(), print)
 
 
-def test_orbit_and_path_keep_everything_in_view(tmp_path, flying):
+def test_orbit_keeps_everything_in_view(tmp_path, flying):
     motion = motion_of(flying)
-    path = np.array([[0.0, -90.0, 10.0, 1.0], [0.05, 90.0, 40.0, 1.0]])
-    for moves in (Options(orbit=180.0, view="iso"), Options(path=path)):
-        made = cameras(moves, motion, 1.5)
-        assert len(made) == 13 and made[0].towards @ made[-1].towards < 0.5
-        for camera in made:
-            x, y, _ = camera.project(motion.surroundings, (300, 200))
-            assert x.min() >= -0.5 and x.max() <= 300.5 and y.min() >= -0.5 and y.max() <= 200.5
-    first, last = (made[k].towards for k in (0, -1))
-    tilt = math.radians(10.0), math.radians(40.0)
-    assert first == pytest.approx([0.0, -math.cos(tilt[0]), math.sin(tilt[0])], abs=1e-12)
-    assert last == pytest.approx([0.0, math.cos(tilt[1]), math.sin(tilt[1])], abs=1e-12)
-
-
-def test_camera_passes_through_the_rows_of_its_path(flying):
-    """Azimuths at the given times, without overshoot between them, and without a stop where it goes on."""
-    motion = motion_of(flying)
-    motion.frames, motion.times = list(range(101)), np.linspace(0.0, 1.0, 101)
-    path = np.array([[0.0, 0.0, 10.0, 1.0], [0.5, 40.0, 10.0, 1.0], [0.8, 90.0, 10.0, 1.0], [1.0, 60.0, 10.0, 1.0]])
-    made = cameras(Options(path=path), motion, 1.5)
-    azimuths = np.degrees([math.atan2(camera.towards[1], camera.towards[0]) for camera in made])
-    assert azimuths[[0, 50, 80, 100]] == pytest.approx(path[:, 1], abs=1e-9)
-    assert azimuths.min() > -1e-9 and azimuths.max() < 90.0 + 1e-9
-    rates = np.gradient(azimuths, motion.times)
-    assert rates[50] > 80.0  # of 80 and 167 degrees a second on both sides
-    assert abs(rates[[0, 80, 100]]).max() < 30.0
+    made = cameras(Options(orbit=180.0, view="iso"), motion, 1.5)
+    assert len(made) == 13 and made[0].towards @ made[-1].towards < 0.5
+    for camera in made:
+        x, y, _ = projected(camera, motion.surroundings, (300, 200))
+        assert x.min() >= -0.5 and x.max() <= 300.5 and y.min() >= -0.5 and y.max() <= 200.5
 
 
 @pytest.mark.parametrize(
@@ -125,32 +103,21 @@ def test_structures_fill_the_picture_from_any_side(tmp_path):
     motion = motion_of(SyntheticResult(tmp_path / "result.vtkhdf", points.reshape(-1, 3), bars, walls=()))
     motion.frames, motion.times, motion._hulls = [0], motion.times[:1], motion._hulls[:1]
     (camera,) = cameras(Options(view="iso"), motion, 1.5)
-    x, y, _ = camera.project(motion.start, (300, 200))
+    x, y, _ = projected(camera, motion.start, (300, 200))
     assert x.min() > 0 and x.max() < 300 and y.min() > 0 and y.max() < 200
     assert np.ptp(x) > 250  # by the corners of its box: 190
     motion.reach = 0.3
     (camera,) = cameras(Options(view="iso"), motion, 1.5)
-    x, y, scale = camera.project(motion.start, (300, 200))
+    x, y, scale = projected(camera, motion.start, (300, 200))
     assert (x - 0.3 * scale).min() > 0 and (x + 0.3 * scale).max() < 300  # of stout bars, too
 
 
 def test_followed_structure_stays_in_the_middle(flying):
     motion = motion_of(flying)
     for camera, bounds in zip(cameras(Options(follow="structure"), motion, 1.5), motion.boxes, strict=True):
-        x, y, _ = camera.project(bounds.mean(axis=0)[None, :], (300, 200))
+        x, y, _ = projected(camera, bounds.mean(axis=0)[None, :], (300, 200))
         assert (x[0], y[0]) == pytest.approx((150.0, 100.0))
     assert len(cameras(Options(follow="tip"), motion, 1.5)) == 13
-
-
-def test_path_files(tmp_path):
-    file = tmp_path / "path.csv"
-    file.write_text("time,azimuth,elevation,zoom\n0,0,10,1\n# closer\n1,90,20,2\n")
-    assert camera_path(file).tolist() == [[0, 0, 10, 1], [1, 90, 20, 2]]
-    file.write_text("0,0,10,1\n1,90,20\n")
-    with pytest.raises(InputError, match="at row 2"):
-        camera_path(file)
-    with pytest.raises(InputError, match="cannot be read"):
-        camera_path(tmp_path / "none.csv")
 
 
 def test_films_for_web_pages(tmp_path, flying):

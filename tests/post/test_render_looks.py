@@ -217,8 +217,6 @@ def test_trajectories_grow(tmp_path, flying):
         ({"rate": 1e9}, "give 2 to 20000 frames"),
         ({"rate": 100.0, "frames": 3}, "give one of the two"),
         ({"span": (0.4, 0.3)}, "two increasing times"),
-        ({"orbit": 10.0, "path": [[0, 0, 0, 1]]}, "give one of the two"),
-        ({"path": [[0, 0, 95, 1]]}, "elevations"),
         ({"follow": "tap"}, "no probe 'tap'"),
     ],
 )

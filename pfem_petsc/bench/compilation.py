@@ -30,8 +30,8 @@ def compile_loops(jobs: list[Job], kind: str, explicit: str, comm: MPI.Comm) -> 
     machine share them: each takes the next one when it is ready, and says what takes long. Collective."""
     tiny = tiny_jobs(explicit)[0]
     work: dict[str, Callable[[], Any]] = {
-        **{job.name: partial(time_job, job, kind, 2, MPI.COMM_SELF, None, 0.0) for job in jobs},
-        tiny.name: partial(time_job, tiny, "cubic", 2, MPI.COMM_SELF, None, 0.0, 3000),
+        **{job.name: partial(time_job, job, kind, 2, MPI.COMM_SELF, 0.0) for job in jobs},
+        tiny.name: partial(time_job, tiny, "cubic", 2, MPI.COMM_SELF, 0.0, 3000),
         **{f"law {name}": partial(_run, name, explicit) for name in choices(LAWS)},
     }
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
@@ -47,7 +47,7 @@ def compile_loops(jobs: list[Job], kind: str, explicit: str, comm: MPI.Comm) -> 
     machine.Free()
     if comm.size > 1:
         with Compilation(partial(_tell, f"{comm.size} ranks", begin), lambda seconds: None, PATIENCE):
-            time_job(jobs[0], kind, 2, comm, None, 0.0)
+            time_job(jobs[0], kind, 2, comm, 0.0)
 
 
 def _tell(place: str, begin: float, loop: str, seconds: float) -> None:

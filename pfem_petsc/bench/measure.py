@@ -1,11 +1,4 @@
-"""Times and memory of the steps of jobs, and the memory traffic that bounds them.
-
-A job is a block of cubic, octet or body-centred cells that flies, or hits a floor.
-
-The bytes of a step are those that the loops move if they find nodes in the cache while they process their bars. As in
-STREAM, an array that is overwritten counts as written only. Arrays are float64 (8 B), ends of bars 32-bit; where bars
-go by runs of constant offset, their ends are not read.
-"""
+"""Times and memory of the steps of jobs: a block of cubic, octet or body-centred cells that flies, or hits a floor."""
 
 from __future__ import annotations
 
@@ -20,13 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from time import perf_counter, process_time
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
     from ..case.schema import Case
-    from ..mechanics.bars import Bars
 
 YOUNG_MODULUS = 110e9  # [Pa] titanium
 DENSITY = 4500.0  # [kg/m3]
@@ -152,80 +144,6 @@ def make_case(job: Job, kind: str, cells: int, steps: int) -> Case:
 
 
 _FEWEST = 4  # minimum number of timed steps, even if each takes longer than the given time
-_VECTOR = 24  # B per node: three components
-
-ASSUMED = {
-    "bar in a run": 8,  # rest length 8
-    "other bar": 12,  # and the far end 4
-    "plastic bar": 16,  # plastic and accumulated plastic strain
-    "explicit node": 4 * _VECTOR + 8,  # x, v read and written; mass read
-    "kept force": 2 * _VECTOR,  # f written and read
-    "residual node": 4 * _VECTOR + 8,  # increment, predictor, known terms read, residual written; mass read
-    "linearised bar": 16,  # two stiffnesses
-    "ends of a linearised bar": 8,
-    "product node": _VECTOR,  # positions, from which bars have their directions
-    "matrix entry": 12,  # value 8, column 4
-    "conjugate gradients node": 12 * _VECTOR,  # x, r, p read and written; A p, z written and read; r . z; diagonal
-}
-"""Bytes per item."""
-
-
-class Work(NamedTuple):
-    """What a step does.
-
-    Attributes
-    ----------
-    bars, nodes : of the whole mesh
-    implicit, assembled, plastic : kind of the step
-    newton, linear : iterations of an implicit step
-    runs : share of the bars that go by runs of constant offset
-    """
-
-    bars: int
-    nodes: int
-    implicit: bool = False
-    assembled: bool = False
-    plastic: bool = False
-    newton: float = 0.0
-    linear: float = 0.0
-    runs: float = 0.0
-
-    @property
-    def entries(self) -> int:
-        """Entries of an assembled matrix."""
-        return 9 * (self.nodes + 2 * self.bars)
-
-    def bytes(self) -> float:
-        """Return the number of bytes that a step moves, over all ranks."""
-        size, bars, nodes = ASSUMED, self.bars, self.nodes
-        far = (1.0 - self.runs) * (size["other bar"] - size["bar in a run"])
-        bar = size["bar in a run"] + far + self.plastic * size["plastic bar"]
-        # forces stay in the cache, if all bars go by runs and keep nothing
-        unread = self.runs == 1.0 and not self.plastic and not self.implicit
-        node = size["explicit node"] + (0.0 if unread else size["kept force"])
-        if self.assembled:
-            matrix = self.entries * size["matrix entry"]
-            update = bars * (bar + 16) + 8 * self.entries  # indices of a bar's four blocks, and their values
-        else:
-            matrix = bars * (far + size["linearised bar"]) + nodes * size["product node"]
-            update = bars * (bar + size["ends of a linearised bar"] + size["linearised bar"])
-        total = bars * bar + nodes * node
-        if self.implicit:
-            total += (self.newton + 1.0) * (bars * bar + nodes * size["residual node"]) + self.newton * update
-            total += self.linear * (matrix + nodes * size["conjugate gradients node"])
-        return float(total)
-
-
-def share_in_runs(bars: Bars) -> float:
-    """Return the share of this rank's bars that go by runs of constant offset."""
-    import numpy as np  # not for the help of the command line, which reads the names of the jobs
-
-    here = 0
-    for block in bars.blocks:
-        sweep = block.sweep
-        sizes = np.diff(sweep.starts[sweep.chunks].astype(np.int64))
-        here += int(sizes[sweep.diagonal].sum())
-    return here / max(len(bars.ends), 1)
 
 
 class PeakMemory:
@@ -261,10 +179,7 @@ class Record:
     cpu : processor time of a step, all ranks together
     setup, first : wall clock of the set-up, and from there to the end of the first step (with output opened)
     newton, linear : mean number of iterations of a step
-    traffic : number of bytes that a step moves
-    share : percent of the bandwidth of all ranks that this traffic needs at the median
     memory : maximum growth of resident memory, all ranks together
-    runs : share of the bars that go by runs of constant offset
     ghosts, neighbours : maximum number of ghosts, and of neighbouring ranks, over all ranks
     evaluated : bars evaluated on all ranks together; those between two ranks are evaluated on both
     """
@@ -282,10 +197,7 @@ class Record:
     first: float
     newton: float
     linear: float
-    traffic: float
-    share: float
     memory: float
-    runs: float
     ghosts: int
     neighbours: int
     evaluated: int
@@ -297,10 +209,8 @@ class Record:
         return self.bars / self.median
 
 
-def time_job(
-    job: Job, kind: str, cells: int, comm: MPI.Comm, bandwidth: float | None, seconds: float, most: int = 100_000
-) -> Record:
-    """Run a job for about ``seconds``, at most ``most`` steps, with the bandwidth of all ranks [B/s]. Collective."""
+def time_job(job: Job, kind: str, cells: int, comm: MPI.Comm, seconds: float, most: int = 100_000) -> Record:
+    """Run a job for about ``seconds``, at most ``most`` steps. Collective."""
     from ..simulation import Simulation
 
     # the foot stays on the floor until the elastic wave has run to the far side and back
@@ -339,18 +249,6 @@ def time_job(
         comm.Barrier()
         if comm.rank == 0:
             shutil.rmtree(folder, ignore_errors=True)
-    middle = comm.bcast(median(times))
-    implicit = plan.linear is not None
-    work = Work(
-        mesh.n_bars,
-        mesh.n_nodes,
-        implicit=implicit,
-        assembled=implicit and not plan.linear.matrix_free,
-        plastic=job.plastic,
-        newton=newton / len(times),
-        linear=linear / len(times),
-        runs=comm.allreduce(share_in_runs(simulation.model.bars)) / comm.size,
-    )
     return Record(
         job=job.name,
         kind=kind,
@@ -358,19 +256,16 @@ def time_job(
         nodes=mesh.n_nodes,
         ranks=comm.size,
         steps=len(times),
-        median=middle,
+        median=comm.bcast(median(times)),
         best=comm.bcast(min(times)),
         cpu=comm.allreduce(cpu),
         setup=comm.bcast(ready - start),
         first=comm.bcast(first),
-        newton=work.newton,
-        linear=work.linear,
-        traffic=work.bytes(),
-        share=100.0 * work.bytes() / bandwidth / middle if bandwidth else 0.0,
+        newton=newton / len(times),
+        linear=linear / len(times),
         memory=grown,
-        runs=work.runs,
         ghosts=max(comm.allgather(mesh.n_local - mesh.n_owned)),
         neighbours=max(comm.allgather(mesh.n_neighbours)),
         evaluated=comm.allreduce(len(mesh.bars)),
-        solver=plan.linear.why if implicit else "none",
+        solver=plan.linear.why if plan.linear is not None else "none",
     )

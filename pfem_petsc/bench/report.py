@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..mechanics.compiled import kernel
-from .measure import ASSUMED, Record
+from .measure import Record
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -86,12 +86,9 @@ def _seconds(work: Callable[[], object], repeats: int, before: Callable[[], obje
     return times
 
 
-_FORMAT = "{:18} {:>11} {:>9} {:>9} {:>9} {:>8} {:>6} {:>6} {:>6} {:>7} {:>6} {:>6}"
-_NAMES = (
-    *("job", "bars", "step ms", "best ms", "cpu ms", "bars/s"),
-    *("moved", "bound", "memory", "newton", "setup", "first"),
-)
-_UNITS = ("", "", "median", "", "", "", "B/bar", "%", "B/bar", "/cg", "s", "step s")
+_FORMAT = "{:18} {:>11} {:>9} {:>9} {:>9} {:>8} {:>6} {:>7} {:>6} {:>6}"
+_NAMES = ("job", "bars", "step ms", "best ms", "cpu ms", "bars/s", "memory", "newton", "setup", "first")
+_UNITS = ("", "", "median", "", "", "", "B/bar", "/cg", "s", "step s")
 HEADER = f"{_FORMAT.format(*_NAMES)}\n{_FORMAT.format(*_UNITS)}"
 """Two lines over the table."""
 
@@ -105,8 +102,6 @@ def line(record: Record) -> str:
         f"{1e3 * record.best:.4g}",
         f"{1e3 * record.cpu:.4g}",
         f"{record.rate:.3g}",
-        f"{record.traffic / record.bars:.0f}",
-        f"{record.share:.0f}" if record.share else "-",
         f"{record.memory / record.bars:.0f}",
         f"{record.newton:.1f}/{record.linear:.0f}" if record.newton or record.linear else "-",
         f"{record.setup:.2f}",
@@ -146,7 +141,6 @@ def document(comm: MPI.Comm, bandwidth: Bandwidth, records: list[Record], tiny: 
             "ratio": bandwidth.ratio,
             "bytes_per_element": BYTES_PER_ELEMENT,
         },
-        "bytes_assumed": ASSUMED,
         "runs": [asdict(record) | {"bars_per_second": record.rate} for record in records],
         "memory_slopes": memory_slopes(records),
         "overhead": [asdict(record) for record in tiny],

@@ -20,9 +20,8 @@ examples:
   {PROGRAM} bench
   mpirun -n 2 {PROGRAM} bench --sizes 100000 1000000 --jobs explicit matrix_free -o bench.json
 
-Steps are wall-clock times (median and best), cpu the processor time of all ranks. 'moved' is the minimum memory traffic
-of a step, as STREAM counts, and 'bound' the share of the median step that it would take at the measured bandwidth; see
-docs/performance.md. Nothing else should run during the measurement.
+Steps are wall-clock times (median and best), cpu the processor time of all ranks; see docs/performance.md. Nothing else
+should run during the measurement.
 
 exit status: 0 done, 2 invalid input, 3 a run failed"""
 
@@ -94,7 +93,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
         say(f"loops for this machine are compiled: {time.perf_counter() - begin:.1f} s")
         return 0
     for job in chosen:  # compile or load kernels and start libraries before the measurements
-        time_job(job, kind, 2, comm, None, 0.0)
+        time_job(job, kind, 2, comm, 0.0)
     title = f"{report.processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {kind} lattices"
     say(title)
     bandwidth = report.measure_bandwidth(comm)
@@ -103,12 +102,12 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     records = []
     for size in sorted(arguments.sizes):
         for job in chosen:
-            records.append(time_job(job, kind, cells_for(kind, size), comm, bandwidth.together, seconds))
+            records.append(time_job(job, kind, cells_for(kind, size), comm, seconds))
             say(report.line(records[-1]))
     say("")
     for name, slope in report.memory_slopes(records).items():
         say(f"memory of {name}: {slope:.0f} B per additional bar")
-    tiny = [time_job(job, "cubic", 2, comm, None, seconds, 3000) for job in tiny_jobs(explicit)]
+    tiny = [time_job(job, "cubic", 2, comm, seconds, 3000) for job in tiny_jobs(explicit)]
     for record in tiny:
         say(f"outside the loops over bars and nodes: {1e6 * record.median:.0f} us a step ({record.job})")
     if arguments.output and comm.rank == 0:

@@ -238,7 +238,7 @@ class Progress:
                 self._bar.stop()
             self._bar = None
         if step > self._marked[1]:
-            self._write(self._line(now))
+            self._write(self._line(now, ended=outcome == "done"))
         wall, steps = now - self._begin, step - self._span.first_step
         text = f"{outcome}: {steps:,} step{'' if steps == 1 else 's'} in {duration(wall)}"
         if self._compiling >= 0.1:
@@ -289,24 +289,26 @@ class Progress:
         except OSError:
             self._let_go_of_stdout()
 
-    def _line(self, now: float) -> str:
-        """Return the state, means and rates since the last line, and the remaining wall time."""
+    def _line(self, now: float, ended: bool = False) -> str:
+        """Return the state, means and rates since the last line, and the remaining wall time unless all is done: a path
+        may end before its last point."""
         step, time, dt, contacts, drift = self._last
         begin, before, newton, linear, start = self._marked
         n_steps, axis, wall, made = self._span.steps, self.axis, now - begin, step - before
         width = len(str(n_steps)) if n_steps is not None else 8
         total = f"/{n_steps}" if n_steps is not None else ""
-        parts = [f"step {step:>{width}}{total} {100 * self._done():3.0f} %", axis.place(time)]
+        done = 1.0 if ended else self._done()
+        parts = [f"step {step:>{width}}{total} {100 * done:3.0f} %", axis.place(time)]
         parts += [f"d{axis.place(dt, 3)}"] if axis.unit else []
         parts += [f"Newton {(self._newton - newton) / max(1, made):.1f}/step"] if self._newton > newton else []
         parts += [f"linear {(self._linear - linear) / max(1, made):.1f}/step"] if self._linear > linear else []
         parts += [f"contacts {contacts:,}"]
         parts += [f"energy drift {drift:+.1e}"] if drift is not None else []
-        remaining = float("inf")
+        remaining = 0.0 if ended else float("inf")
         if wall > 0.0 and made > 0:
             parts += [_speed(made / wall)]
-            left, done = (n_steps - step, made) if n_steps is not None else (self._span.end - time, time - start)
-            remaining = max(left, 0.0) * wall / done if done > 0.0 else remaining
+            left, since = (n_steps - step, made) if n_steps is not None else (self._span.end - time, time - start)
+            remaining = max(left, 0.0) * wall / since if since > 0.0 and not ended else remaining
         return "  ".join([*parts, f"ETA {duration(remaining)}"])
 
     def _write(self, text: str) -> None:

@@ -227,6 +227,12 @@ class Result:
         ends = np.flatnonzero(np.diff(moving)).reshape(-1, 2)
         return [slice(first, end) for first, end in ends.tolist()]
 
+    @property
+    def stage_ends(self) -> np.ndarray:
+        """The first time of the history, and the last one of each stage (stages + 1,)."""
+        times, stages = self.history["time"], self.history["stage"]
+        return np.unique([*times[:1], *times[:-1][np.diff(stages) > 0], *times[-1:]])
+
     def place(self, time: float) -> str:
         """Text of one of its times: ``t = 1.000 s``, in static analyses and stages ``load factor 0.25``."""
         static, history = self._static_stages, self.history

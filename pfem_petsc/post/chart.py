@@ -173,6 +173,22 @@ def _fill_steps(axes: Any, place: np.ndarray, counts: np.ndarray, side: str, sty
     axes.set_ylim(0, max(1.0, 1.08 * float(counts.max(initial=0.0))))
 
 
+def _same_widths(axes: Any, ends: np.ndarray) -> None:
+    """Give stages between their ends the same width: a motion of milliseconds beside a load factor would be a line."""
+    from matplotlib.ticker import MaxNLocator
+
+    at = np.arange(len(ends), dtype=float)
+    axes.set_xscale("function", functions=(lambda x: np.interp(x, ends, at), lambda x: np.interp(x, at, ends)))
+    axes.set_xlim(ends[0], ends[-1])
+    ticks = list(ends)
+    for first, last in itertools.pairwise(ends.tolist()):
+        inner = MaxNLocator(4).tick_values(first, last)
+        ticks += inner[np.abs(inner - 0.5 * (first + last)) < 0.4 * (last - first)].tolist()
+    axes.set_xticks(sorted(ticks))
+    for end in ends[1:-1]:
+        axes.axvline(end, color="#5b6472", linewidth=0.8, linestyle=":")
+
+
 def largest(values: np.ndarray) -> float:
     """Return the largest magnitude of the finite values, 0 without any."""
     sizes = np.abs(values)
@@ -233,6 +249,8 @@ class Chart:
     axis : what the times are
     columns : of the grid
     note : text below the panels
+    ends : start of the first stage and ends of all, which get the same width where load factors and times are on one
+        axis
     """
 
     def __init__(
@@ -243,6 +261,7 @@ class Chart:
         axis: Axis = TIME,
         columns: int = 1,
         note: str = "",
+        ends: Sequence[float] = (),
     ) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -261,7 +280,7 @@ class Chart:
         if note:
             lines = textwrap.fill(note, int((size[0] - 0.3) / _LETTER))
             self.figure.supxlabel(literal(lines), x=0.01, ha="left", fontsize=9, color="#5b6472")
-        self.time, self._axis = np.asarray(time, dtype=float), axis
+        self.time, self._axis, self._ends = np.asarray(time, dtype=float), axis, ends
         self._columns: list[tuple[str, np.ndarray, str, np.ndarray]] = []
         sizes: dict[str, list[float]] = {}
         for panel in drawn:
@@ -321,6 +340,8 @@ class Chart:
         axes.margins(x=0.02 if panel.over else 0.0)
         if panel.log:
             axes.set_yscale("log")
+        if panel.over is None and len(self._ends) > 2:
+            _same_widths(axes, np.asarray(self._ends))
         if lowest or panel.over:
             axes.tick_params(labelbottom=True)
             axes.set_xlabel(label)

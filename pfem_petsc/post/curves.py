@@ -18,6 +18,9 @@ from .filters import AS_COMPUTED, Filter, amplitude_spectrum
 
 History = Mapping[str, np.ndarray]
 
+CLOSED_FORM = " closed form"
+"""What follows the name of a curve in the name of its closed form, in tables."""
+
 _LONGEST = 50  # number of letters of a label that tells the values of a run
 
 _PEAKS = 5  # of a spectrum, at most, that are told
@@ -59,11 +62,11 @@ def smoothed(result: Any, chosen: Filter, values: np.ndarray, touch: bool = Fals
 
     ``touch``: whether the quantity is zero before the run, as contact forces are.
     """
-    time, made = read(result.history, "time"), np.array(values, dtype=float)
+    time, made = read(result.history, "time"), np.nan_to_num(np.array(values, dtype=float))
     for rows in result.stretches:
         zero_before = touch and (rows.start == 0 or made[rows.start - 1] == 0.0)
         made[rows] = chosen.apply(time[rows], made[rows], zero_before)
-    return made
+    return np.where(np.isnan(values), np.nan, made)
 
 
 def exact_curves(exact: ClosedForm | None, names: Sequence[str], place: np.ndarray | None = None) -> list[Curve]:
@@ -73,7 +76,7 @@ def exact_curves(exact: ClosedForm | None, names: Sequence[str], place: np.ndarr
         whole = name if exact is None or name in exact.columns else name.rpartition(".")[0] or name
         if exact is not None and source_of(whole) in exact.columns:
             values = column(exact.columns, name)[name]
-            curves.append(Curve("" if curves else exact.name, values, REFERENCE, f"{name} closed form", place))
+            curves.append(Curve("" if curves else exact.name, values, REFERENCE, name + CLOSED_FORM, place))
     return curves
 
 
@@ -173,7 +176,9 @@ def _draw(
                 key += f", {smoothing.name}" if smoothing is not None and (name, None) in panels else ""
                 text = " ".join(word for word in words_of if word) or part
                 curves.append(Curve(text, shown, style, key, place, "" if shared else label))
-        curves += exact_curves(exact, [part for part in parts if part in found[0]], places[0])
+        for known in exact_curves(exact, [part for part in parts if part in found[0]], places[0]):
+            part = known.key.removesuffix(CLOSED_FORM)
+            curves.append(known._replace(values=_filtered(first, smoothing, part, known.values)))
         title = parts[0] if len(parts) == 1 else name  # which component it is
         if smoothing is not None and smoothing.name != AS_COMPUTED:
             state = f"{AS_COMPUTED}, as all energies" if unit_of_curve(name) == "J" else smoothing.name
@@ -183,7 +188,8 @@ def _draw(
         height = max(0.9, 0.11 * len(curves))  # of the legend
         drawn.append(Panel(label, unit_of_curve(name), curves, title, height, over, None, legend))
     axis = max((result.axis for result in results), key=lambda axis: axis.staged)
-    return Chart(drawn, first.case.title or first.case.name, np.concatenate(times), axis)
+    ends = first.stage_ends if len(results) == 1 and axis.staged else ()
+    return Chart(drawn, first.case.title or first.case.name, np.concatenate(times), axis, ends=ends)
 
 
 def _filtered(result: Any, chosen: Filter | None, name: str, values: np.ndarray) -> np.ndarray:

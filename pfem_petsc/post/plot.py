@@ -105,7 +105,8 @@ def _usual(
     for name, picture in drawn.items():
         panels, note, columns = picture if isinstance(picture, tuple) else (picture, "", 1)
         if panels:
-            chart = Chart(panels, title, read(history, "time"), result.axis, columns, note)
+            ends = result.stage_ends if result.axis.staged else ()
+            chart = Chart(panels, title, read(history, "time"), result.axis, columns, note, ends)
             written += chart.save(folder / name, suffixes)
     if "csv" in suffixes and hasattr(result, "table"):
         written.append(result.table().to_csv(folder / "history.csv"))
@@ -292,7 +293,9 @@ def force_panels(
             curves = [Curve(form, drawn, {"linewidth": width}, f"{key} {label}, {form}")]
             if exact is not None and key in exact.columns:
                 known = _pressing(exact.columns[key], normal)[0]
-                curves.append(Curve(exact.name, known, REFERENCE, f"{key} closed form"))
+                if form != AS_COMPUTED:
+                    known = smoothed(result, smoothing, known, True)
+                curves.append(Curve(exact.name, known, REFERENCE, f"{key} closed form, {form}"))
             panels.append(Panel(label, "N", curves, heading, 0.9))
             heading = ""
         if felt and f"{source}/{name}/contacts" in history:
@@ -356,15 +359,18 @@ def _wall_path(result: Any, wall: Any, smoothing: Filter, exact: ClosedForm | No
         place, sign, over = "centre_of_mass", -1.0, "displacement of the centre of mass since contact"
     if place not in history:
         return []
-    moved = smoothed(result, smoothing, sign * read(history, place) @ normal)
-    smooth = smoothed(result, smoothing, force, True)
-    shown, begin = _touching(force, smooth)
-    values = np.where(_near(force, smooth), smooth, np.nan)[shown]
-    curves = [Curve(smoothing.name, values, place=(moved - moved[begin])[shown])]
+
+    def path(force: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return both after the filter, while nodes touch the wall."""
+        smooth, moved = smoothed(result, smoothing, force, True), smoothed(result, smoothing, moved)
+        shown, begin = _touching(force, smooth)
+        return np.where(_near(force, smooth), smooth, np.nan)[shown], (moved - moved[begin])[shown]
+
+    values, along = path(force, sign * read(history, place) @ normal)
+    curves = [Curve(smoothing.name, values, place=along)]
     if exact is not None and sign < 0.0 and {key, place} <= set(exact.columns):
-        force, moved = exact.columns[key] @ normal, -exact.columns[place] @ normal
-        shown, begin = _touching(force, force)
-        curves.append(Curve(exact.name, force[shown], place=(moved - moved[begin])[shown]))
+        values, along = path(exact.columns[key] @ normal, -exact.columns[place] @ normal)
+        curves.append(Curve(exact.name, values, place=along))
     return [_path(curves, "normal force", "N", f"Wall '{wall.name}'", over)]
 
 

@@ -206,7 +206,7 @@ class Film:
         elif self.options.kinds and self.count > 1 and self.count / fps < SHORT:
             slower = max(1, round(self.count / 5.0))
             lasts = f"the film of {self.count} frames lasts {self.count / fps:.1f} s"
-            note(f"{lasts}; with fps = {slower} (--fps {slower}) it lasts about 5 s")
+            note(f"{lasts}; with fps = {slower} (--fps {slower}) it lasts {self.count / slower:.0f} s")
 
     def write(self, folder: Path, share: slice, note: Callable[[str], None]) -> None:
         """Draw a share of the frames into a folder."""

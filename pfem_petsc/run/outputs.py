@@ -132,8 +132,8 @@ def _told(found: Found, asked: int) -> list[str]:
     for first in range(0, len(found.values), _PER_LINE):
         numbers = "  ".join(f"{value:.6g}" for value in found.values[first : first + _PER_LINE])
         last = min(first + _PER_LINE, len(found.values))
-        which = f"{first + 1}-{last}" if last > first + 1 else f"{last}"
-        lines.append(f"{head} {which}: {numbers} {unit}".rstrip())
+        which = f"modes {first + 1}-{last}" if last > first + 1 else f"mode {last}"
+        lines.append(f"{head}, {which}: {numbers} {unit}".rstrip())
     return lines
 
 

@@ -313,6 +313,12 @@ ZERO = 1e-11
 _MOTIONS = 8  # motions that are looked at
 _TOLD = 3
 _NAMED = 4  # nodes besides the one that moves most
+SUPPORTS = "Add supports or bars that prevent them"
+YIELDING = (
+    ". Bars yield there, and without hardening nothing resists more load: it is at its limit or beyond. Reduce the "
+    "load, or give the material hardening"
+)
+"""What is said of free motions, and where unloading bars would resist them."""
 _MOVES = 0.3  # of the largest displacement of a motion, above which a node is named
 
 
@@ -329,11 +335,20 @@ def free_motions(model: Model, state: State) -> str:
     if not names_motions(model):
         return ""
     stability, zero, free = Stability(model), ZERO * stiffest(model), []
+
+    def found() -> list[np.ndarray]:
+        values, motions = stability.nearest(_MOTIONS, 0.1 * zero)
+        return stability.combined(motions[: int((np.abs(values) < zero).sum())])
+
     try:
         if stability.refusal is None:
-            stability.matrix.update(problem_at_rest(model, state, state.external), np.zeros_like(state.position))
-            values, motions = stability.nearest(_MOTIONS, 0.1 * zero)
-            free = stability.combined(motions[: int((np.abs(values) < zero).sum())])
+            problem = problem_at_rest(model, state, state.external)
+            stability.matrix.update(problem, np.zeros_like(state.position))
+            free = found()
+            if free and model.bars.kept_names:
+                stability.matrix.put(problem, model.bars.state_stiffness(state.x))
+                if not found():
+                    return YIELDING
     except (NotConverged, np.linalg.LinAlgError):
         free = []
     finally:
@@ -353,7 +368,7 @@ def _text(model: Model, state: State, free: list[np.ndarray]) -> str:
     elif rigid:
         text += f", {rigid} of them of the truss as a rigid body"
     told = "; ".join(_nodes(model, motion) for motion in free[:_TOLD])
-    return f"{text}: {told}. Add supports or bars that prevent them"
+    return f"{text}: {told}. {SUPPORTS}"
 
 
 def _rigid(model: Model, state: State, free: list[np.ndarray]) -> int:

@@ -3,6 +3,7 @@ stepper and the plan of a case with a table ``[static]``."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,17 @@ from ..tolerances import TIME
 from .critical import Jump, JumpSearch, Place
 from .equilibrium import Equilibrium, problem_at_rest
 from .path_points import Arc, BorderedSystem, Metric, PointSolver, dot
-from .stability import LARGEST, LARGEST_WITH_MUMPS, ZERO, Stability, free_motions, held_nodes, is_indefinite, stiffest
+from .stability import (
+    LARGEST,
+    LARGEST_WITH_MUMPS,
+    SUPPORTS,
+    ZERO,
+    Stability,
+    free_motions,
+    held_nodes,
+    is_indefinite,
+    stiffest,
+)
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -279,10 +290,8 @@ class StaticStepper(ImplicitStepper):
         found = free_motions(model, self.state)
         if not found:
             return ""
-        return (
-            f"{model.case.source}: static: the stiffness is singular at the start{found}; "
-            'static.method = "relaxation" and [time] do not need them'
-        )
+        others = '; static.method = "relaxation" and [time] do not need them' if found.endswith(SUPPORTS) else ""
+        return f"{model.case.source}: static: the stiffness is singular at the start{found}{others}"
 
     def name_obstacle(self, failure: NotConverged) -> None:
         """Raise an error about motions without stiffness if the first increment has failed by them. Collective."""
@@ -476,8 +485,9 @@ class StaticStepper(ImplicitStepper):
     def _no_further(self, failure: NotConverged) -> SimulationFailure:
         """Return the message about the load factor beyond which no equilibrium was found."""
         others = (
-            'static.method = "arc_length" follows the path beyond a limit point, static.stabilise and dynamic stages '
-            'pass jumps, such as struts that snap, and "relaxation" finds the equilibrium of slack structures'
+            'static.method = "arc_length" follows the path beyond a limit point, up to static.end or '
+            "static.displacement if these are given; static.stabilise and dynamic stages pass jumps, such as struts "
+            'that snap, and "relaxation" finds the equilibrium of slack structures'
         )
         model, smallest = self.model, self.limits.smallest
         free = free_motions(model, self.state)
@@ -489,9 +499,11 @@ class StaticStepper(ImplicitStepper):
                 others = f"walls without friction do not hold nodes along them: add supports; {others}"
             elif model.contact.any:
                 cause += ", or the friction of walls does not hold it"
+        # smaller increments have been tried
+        attempt = re.sub(rf"[.;] {re.escape(self.remedy)}", "", str(failure), flags=re.IGNORECASE)
         return SimulationFailure(
             f"no equilibrium found beyond load factor {self.state.time:.6g} with increments down to {smallest:.3g}: "
-            f"{cause}; {others}. The last attempt: {failure}{free}"
+            f"{cause}; {others}. The last attempt: {attempt}{free}"
         )
 
     def _limit_point(self, size: float) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Simulation
-from pfem_petsc.bench.measure import CROSSING, JOBS, KINDS, Job, PeakMemory, Work, cells_for, make_case, share_in_runs
+from pfem_petsc.bench.measure import CROSSING, JOBS, KINDS, Job, PeakMemory, cells_for, make_case
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -25,28 +25,6 @@ def test_nearest_lattice():
     for kind in KINDS:
         found = KINDS[kind](cells_for(kind, 5000))
         assert all(abs(found - 5000) <= abs(KINDS[kind](n) - 5000) for n in range(1, 20))
-
-
-def test_explicit_bytes_by_hand():
-    # rest length 8 B a bar, and 4 B of an end where it is in no run; x, v, f read and written and mass read a node
-    nodes = 10 * (2 * 3 * 24 + 8)
-    assert Work(100, 10).bytes() == 100 * 12 + nodes
-    assert Work(100, 10, runs=0.75).bytes() == 75 * 8 + 25 * 12 + nodes
-    # forces of bars in runs stay in the cache
-    assert Work(100, 10, runs=1.0).bytes() == 100 * 8 + 10 * 104
-    assert Work(100, 10, runs=1.0, plastic=True).bytes() == 100 * 24 + nodes
-
-
-def test_bars_of_a_lattice_are_in_runs_and_those_in_random_order_are_not():
-    from types import SimpleNamespace
-
-    from pfem_petsc.mechanics.runs import make_sweep
-
-    chain = np.column_stack([np.arange(1000), np.arange(1, 1001)]).astype(np.int32)
-    mixed = np.random.default_rng(1).integers(0, 1000, (1000, 2)).astype(np.int32)
-    for ends, share in ((chain, 1.0), (mixed, 0.0)):
-        block = SimpleNamespace(sweep=make_sweep(ends, 0, 1000, 1000), stop=1000)
-        assert share_in_runs(SimpleNamespace(blocks=[block], ends=ends)) == share
 
 
 def test_memory_sees_what_was_used_and_freed():
@@ -83,7 +61,6 @@ def test_the_verb_writes_what_it_measured(tmp_path):
     for run in found["runs"]:
         assert run["best"] <= run["median"]
         assert run["bars_per_second"] == pytest.approx(run["bars"] / run["median"])
-        assert run["share"] == pytest.approx(100 * run["traffic"] / found["bandwidth"]["together"] / run["median"])
         assert (run["newton"] > 0) == (run["job"] in ("matrix_free", "assembled", "implicit_contact"))
         assert f"{run['bars']:,}" in done.stdout
     assert {record["job"] for record in found["overhead"]} == {"tiny", "tiny, history every 10", "tiny, contact"}

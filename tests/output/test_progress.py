@@ -68,6 +68,17 @@ def test_line_says_where_the_run_is():
     assert " 16 %" in by_time and "ETA 10.5 s" in by_time and "/100" not in by_time
 
 
+def test_a_path_that_ends_before_its_last_point_is_done():
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress(COMM, "Dome", Span(1000, 1000.0), stream=stream, clock=clock)
+    for step in range(1, 21):
+        clock.now += 0.01
+        progress.update(step, float(step), 1.0)
+    progress.close()
+    last = [line for line in stream.getvalue().splitlines() if line.startswith("step")][-1]
+    assert "20/1000 100 %" in last and last.endswith("ETA 0.00 s")
+
+
 def test_intervals_stretch_from_two_to_ten_seconds(tmp_path):
     lines = [line for line in run(1000, 0.1).splitlines() if line.startswith("step")]
     at = [0.1 * int(line.split("/")[0].split()[-1]) for line in lines]

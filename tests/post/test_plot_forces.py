@@ -16,7 +16,7 @@ from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.units import common_prefix
 from pfem_petsc.post.closed_forms import closed_form
-from pfem_petsc.post.filters import cfc
+from pfem_petsc.post.filters import cfc, window_mean
 from pfem_petsc.post.plot import plot
 
 
@@ -121,3 +121,16 @@ def test_forces_over_displacements_begin_at_the_contact(tmp_path, result):
     assert 5 < len(touching) < 0.8 * len(time)
     assert place == pytest.approx(-(time[rows] - time[touching[0] - 1]))
     assert force == pytest.approx(-result.history["wall/wall/force"][rows, 0])
+
+
+@pytest.mark.slow
+def test_closed_forms_pass_the_filter_of_the_forces(tmp_path):
+    """Beside filtered forces stands the filtered wave force, and beside those as computed, the step itself."""
+    with Simulation(Case.load("rod_impact"), output=tmp_path / "r", quiet=True) as simulation:
+        simulation.run()
+    plot(tmp_path / "r", tmp_path, formats=["csv"], force_filter="mean:0.5")
+    head, columns = table_columns(tmp_path / "walls.csv")
+    exact = [values for name, values in zip(head, columns, strict=True) if "closed form" in name]
+    assert len(exact) == 2 and set(np.unique(exact[0])) == {0.0, exact[0].max()}
+    smooth = window_mean(columns[0], exact[0], 0.5, True)
+    assert exact[1] == pytest.approx(smooth, abs=1e-12) and np.abs(smooth - exact[0]).max() > 0.3 * exact[0].max()

@@ -58,6 +58,8 @@ def test_a_limit_point_ends_the_run_with_the_load_factor_that_was_reached(shared
     with pytest.raises(SimulationFailure, match=r"no equilibrium found beyond load factor 0\.49.*arc_length") as error:
         history_of(case, comm, shared_tmp_path)
     assert "static.stabilise and dynamic stages" in str(error.value)
+    assert "static.end" in str(error.value)  # without it a path goes on for as many points as it may have
+    assert "educe static.step" not in str(error.value)  # increments down to a thousandth of it have failed
     assert "solver.linear" not in str(error.value)  # the linear solver is direct already
     history = open_result(shared_tmp_path / "out" / "result.vtkhdf").history
     z = np.linspace(0.0, HEIGHT, 200001)
@@ -173,3 +175,30 @@ def test_energy_is_balanced_from_a_start_that_is_not_in_equilibrium(shared_tmp_p
     history = history_of(case, comm, shared_tmp_path)
     assert abs(history["energy_imbalance"]).max() < 1e-10 * history["elastic_energy"].max()
     assert not history["probe/crown/acceleration"].any()
+
+
+def test_a_viscous_bar_that_yields_under_its_load_does_not_lack_supports(shared_tmp_path, comm):
+    """Of a motion that leaves it above the yield stress, a static stage says that nothing resists more load."""
+    sets = {"every": {"all": True}, "base": {"indices": [0]}, "tip": {"indices": [1]}}
+    tables = {
+        "node_set": sets,
+        "material": {
+            "steel": {
+                "law": "perzyna",
+                "young_modulus": 1e7,
+                "density": 1000.0,
+                "yield_stress": 1e4,
+                "fluidity": 100.0,
+            }
+        },
+        "support": [{"node_set": "every", "fix": "yz"}, {"node_set": "base", "fix": "x"}],
+        "load": [{"node_set": "tip", "force": [1.5, 0.0, 0.0]}],
+        "stage": [
+            {"name": "pull", "time": {"integrator": "newmark", "step": 1e-4, "end": 0.02}},
+            {"name": "rest", "static": {"step": 0.25}},
+        ],
+    }
+    case = case_of(shared_tmp_path, comm, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[0, 1]], **tables)
+    with pytest.raises(SimulationFailure, match="Bars yield there, and without hardening nothing resists") as error:
+        history_of(case, comm, shared_tmp_path)
+    assert "upports" not in str(error.value)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .output.result import open_result
     from .output.table import Table
     from .simulation import Simulation
-    from .studies.sweep import sweep
+    from .studies import sweep
 
 __all__ = [
     "Case",
@@ -44,7 +44,7 @@ _HOMES = {
     "Simulation": ".simulation",
     "Table": ".output.table",
     "open_result": ".output.result",
-    "sweep": ".studies.sweep",
+    "sweep": ".studies",
     "write_mesh": ".formats",
 }
 

@@ -23,8 +23,7 @@ from .parallel.ending import all_arrive, aside, passes_exception, watch
 from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
 from .preflight.checks import forecast, inspect, later_gaps, summarise, warnings_before
-from .restart.checkpoints import find_restart, finished, finished_message
-from .restart.state import RunState
+from .restart import RunState, find_restart, finished, finished_message
 from .run.outputs import Outputs, ReportedCompilation
 from .run.recorder import Recorder
 from .run.stages import Stages

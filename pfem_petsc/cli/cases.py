@@ -101,7 +101,7 @@ def _load(arguments: argparse.Namespace) -> Case:
     overrides, plugins = arguments.overrides, arguments.plugins
     restart = getattr(arguments, "restart", None)
     if restart is not None:
-        from ..restart.checkpoints import joined_overrides, joined_plugins, kept_arguments
+        from ..restart import joined_overrides, joined_plugins, kept_arguments
 
         name = (built_in_path(arguments.case) or Path(arguments.case)).stem
         kept, files = kept_arguments(name, arguments.output or Path("results", name), restart)
@@ -160,7 +160,7 @@ OF_SWEEP = (
 def run_sweep(arguments: argparse.Namespace) -> int:
     """Make the runs, and print the table and the name of its file."""
     from ..case.schema import Case
-    from ..studies.sweep import sweep
+    from ..studies import sweep
 
     vary: dict[str, list[Any]] = {}
     for key, values in map(_values, arguments.vary):

@@ -117,10 +117,6 @@ class DistributedMesh:
         """Fill the ghost rows of ``array`` (n_local, k) float64, C-contiguous, with the owners' values. Collective."""
         self._exchange.update(array)
 
-    def traffic(self, array: np.ndarray) -> tuple[int, int, int, int]:
-        """Return messages sent and received, and bytes sent and received, by :meth:`update_ghosts` of an array."""
-        return self._exchange.traffic(array.dtype.itemsize * array.size // max(len(array), 1))
-
     def messages(self) -> Messages | None:
         """Return the messages that update ghosts of positions, for compiled loops; None if loops cannot call MPI."""
         return self._exchange.messages()

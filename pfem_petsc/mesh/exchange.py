@@ -165,10 +165,6 @@ class GhostExchange:
         """Number of ranks that send rows to this rank or receive rows from it."""
         return len({rank for rank, _, _ in self._leaving} | {rank for rank, _, _ in self._arriving})
 
-    def traffic(self, row: int) -> tuple[int, int, int, int]:
-        """Return messages sent and received, and bytes sent and received, by an update of rows of ``row`` bytes."""
-        return len(self._leaving), len(self._arriving), row * len(self.rows), row * self._n_ghosts
-
     @property
     def alone(self) -> bool:
         """Whether this rank sends nothing and receives nothing."""

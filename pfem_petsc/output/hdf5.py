@@ -18,8 +18,9 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
-from ..parallel.agreement import agreed, on_root
-from ..parallel.heap import share_memory
+from ..parallel.agreement import agreed, on_root, outcome
+from ..parallel.ending import aside
+from ..parallel.heap import SharedArrays, share_memory
 
 CHUNK_BYTES = 1 << 20
 _LARGEST = 1 << 32  # bytes of a chunk of HDF5
@@ -166,18 +167,18 @@ SUPERBLOCK, OBJECTS = ("v108", "v108"), ("v110", "v110")
 # Bytes of the chunk cache per dataset: the default of 1 MiB, times all columns and fields, would fill up in a long run,
 # and rows are never written twice.
 CHUNK_CACHE = 1 << 16
-# Seconds in which the other ranks must report after an operation failed on this one.
-GRACE = 5.0
 
 
 def require_parallel_hdf5(comm: MPI.Comm) -> None:
-    """Refuse several ranks if h5py cannot write one file from all of them.
+    """Refuse several ranks if h5py cannot write one file from all of them. Collective; before any write, as ranks agree
+    aside whether it has succeeded.
 
     Raises
     ------
     InputError
         On all ranks (the build may differ between machines).
     """
+    aside(comm)
     with agreed(comm):
         if comm.size > 1 and not h5py.get_config().mpi:
             raise InputError(
@@ -320,19 +321,11 @@ def writing(comm: MPI.Comm, path: Path) -> Iterator[None]:
         )
         failure.__cause__ = error
     if comm.size > 1:
-        mine = np.array([comm.rank if failure is not None else comm.size])
-        first = np.empty_like(mine)
-        request = comm.Iallreduce(mine, first, op=MPI.MIN)
-        if failure is None:
-            request.Wait()
-        else:
-            deadline = time.monotonic() + GRACE
-            while not request.Test():
-                if time.monotonic() > deadline:
-                    raise failure
-                time.sleep(0.01)
-        if first[0] < comm.size:
-            raise comm.bcast(failure, root=int(first[0]))
+        found = outcome(comm, failure is not None)
+        if found is None:
+            raise failure
+        if found[0] < comm.size:
+            raise comm.bcast(failure, root=found[0])
     elif failure is not None:
         raise failure
 
@@ -403,9 +396,6 @@ def fsync_all(path: Path) -> None:
 
 T = TypeVar("T")
 
-_PIECE = 1 << 18  # rows of a message
-_TAG = 7301
-
 
 class SharedFile:
     """An existing HDF5 file that is open for writing, and at most one piece of work on it beside the steps.
@@ -458,43 +448,22 @@ class SharedFile:
     def write(self, dataset: Growing | None, first: int, rows: np.ndarray, index: tuple[int, ...] = ()) -> None:
         """Write each rank's rows (n, ...) from row ``first`` of a dataset, at an index of the dimensions before.
 
-        ``dataset`` is None on ranks that are no owners, which send their rows. Collective.
+        ``dataset`` is None on ranks that are no owners, whose rows go through memory that ranks share. Collective.
         """
+        if self.comm.size > 1 and not self.together:
+            ends = self.comm.allreduce(first + len(rows), op=MPI.MAX)
+            with writing(self.comm, self.name):
+                memory = SharedArrays(self.comm, {"rows": np.dtype((rows.dtype, (ends, *rows.shape[1:])))})
+            memory.arrays["rows"][first : first + len(rows)] = rows
+            self.comm.Barrier()
+            first, rows = 0, memory.arrays["rows"]
 
-        def put(first: int, rows: np.ndarray) -> None:
+        def put() -> None:
             start = (*index, first, *(0,) * (rows.ndim - 1))
             with self.writing():
                 dataset.write(start, rows.reshape((1,) * len(index) + rows.shape), collective=self.together)
 
-        if self.together:
-            put(first, rows)
-            return
-        failure: SimulationFailure | None = None
-        for start, rank, n in self._pieces(first, len(rows)):
-            piece = rows[start - first : start - first + n] if rank == self.comm.rank else None
-            if self.file is None:
-                if piece is not None:
-                    self.comm.Send(np.ascontiguousarray(piece), 0, _TAG)
-            else:
-                if piece is None:
-                    piece = np.empty((n, *rows.shape[1:]), rows.dtype)
-                    self.comm.Recv(piece, rank, _TAG)
-                try:
-                    put(start, piece)
-                except SimulationFailure as error:  # what is on its way must be received
-                    failure = failure or error
-        with agreed(self.comm):
-            if failure is not None:
-                raise failure
-
-    def _pieces(self, first: int, n: int) -> list[tuple[int, int, int]]:
-        """Return the rows of all ranks in pieces: first row, rank, number of rows. Collective."""
-        parts = enumerate(self.comm.allgather((first, n)))
-        return [
-            (start, rank, min(_PIECE, first + n - start))
-            for rank, (first, n) in parts
-            for start in range(first, first + n, _PIECE)
-        ]
+        self.call(put)
 
     def submit(self, work: Callable[[], None], beside: bool) -> None:
         """Let the owners do some work, ``beside`` the steps or now. What fails beside them, all ranks raise in

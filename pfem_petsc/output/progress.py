@@ -7,11 +7,10 @@ import os
 import sys
 import textwrap
 from collections.abc import Callable
-from logging import Formatter, LogRecord, makeLogRecord
-from logging.handlers import WatchedFileHandler
+from datetime import datetime
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 from ..errors import InputError
 from ..parallel.agreement import agreed
@@ -31,7 +30,7 @@ BAR_REFRESH = 0.1  # seconds between two updates of the bar
 _LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID")
 
 
-class LogFile(WatchedFileHandler):
+class LogFile:
     """Appends lines to a log, each with date and level; an existing one is continued, one that is removed begins anew.
 
     A file that cannot be opened at the start is an error. If it is lost during the run (folder removed, disk full), a
@@ -44,33 +43,30 @@ class LogFile(WatchedFileHandler):
     """
 
     def __init__(self, path: Path | str) -> None:
-        self._lost = False
+        self._path, self._lost = Path(path).absolute(), False
         try:
-            Path(path).parent.mkdir(parents=True, exist_ok=True)
-            super().__init__(path, encoding="utf-8")
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._path.open("a").close()
         except OSError as error:
             raise InputError(
                 f"{path}: the log cannot be written ({error.strerror}); choose another output folder with -o"
             ) from error
-        self.setFormatter(Formatter("%(asctime)s %(levelname)-7s %(message)s", "%Y-%m-%d %H:%M:%S"))
 
     def write(self, text: str, level: str = "INFO") -> None:
         """Append a line."""
+        if self._lost:
+            return
         try:
-            if not self._lost:
-                self.emit(makeLogRecord({"msg": text, "levelname": level}))
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {level:7} {text}\n")
         except OSError as error:
             self._lost = True
             print(
-                f"warning: {self.baseFilename}: the log cannot be written any more ({error.strerror}); "
+                f"warning: {self._path}: the log cannot be written any more ({error.strerror}); "
                 "the run continues without it",
                 file=sys.stderr,
                 flush=True,
             )
-
-    def handleError(self, record: LogRecord) -> NoReturn:  # noqa: N802 - of logging
-        """Raise the error that :meth:`write` reports."""
-        raise
 
 
 class Span(NamedTuple):
@@ -253,8 +249,6 @@ class Progress:
             self._write(f"results in {results}")
         if error is not None:
             self._log_line(f"error: {error}", "ERROR")
-        if self._log is not None:
-            self._log.close()
 
     def _report(self, now: float) -> None:
         if now >= self._next_line:

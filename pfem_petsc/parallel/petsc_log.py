@@ -1,19 +1,15 @@
 """Stages and events of a run for PETSc's ``-log_view``.
 
-They wrap the methods of a simulation only if PETSc logs; otherwise a run calls its methods directly. Floating-point
-operations are those of linear elastic bars and of nodes without damping, as the formulas have them: an addition, a
-product, a division or a root is one. Other laws do more.
+They wrap the methods of a simulation only if PETSc logs; otherwise a run calls its methods directly.
 """
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-__all__ = ["EVENTS", "OF_BALANCE", "OF_FORCE", "OF_PRODUCT", "STAGES", "instrument", "staged"]
+__all__ = ["EVENTS", "STAGES", "instrument", "staged"]
 
 SET_UP, STEPS = "pfem set-up", "pfem steps"
 
@@ -34,26 +30,6 @@ EVENTS: dict[str, tuple[str, ...]] = {
     "pfemCheckpoint": ("outputs.checkpointing.write",),
 }
 """Event to the methods of a simulation that it measures. Nested events are counted in both."""
-
-OF_FORCE, OF_PRODUCT, OF_BALANCE = 28, 27, 5
-"""Operations of the force of a bar with its energy, of its part of a product without matrix, and of the solution of a
-node's balance in an explicit step."""
-
-
-def _of_bars(each: int) -> Callable[[Any], float]:
-    return lambda simulation: each * len(simulation.mesh.bars)
-
-
-def _of_balance(simulation: Any) -> float:
-    return OF_BALANCE * simulation.mesh.n_owned if simulation.stepper.scheme.explicit else 0.0
-
-
-FLOPS: dict[str, Callable[[Any], float]] = {
-    "model.bars.forces": _of_bars(OF_FORCE),
-    "stepper.hessian.apply": lambda simulation: _of_bars(OF_PRODUCT)(simulation) + 3 * simulation.mesh.n_owned,
-    "stepper.solve": _of_balance,
-}
-"""Method to the operations of a call of it on this rank."""
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -83,53 +59,16 @@ def instrument(simulation: Any) -> None:
 
     if not PETSc.Log.isActive():
         return
-    counters = _Counters()
     for name, paths in EVENTS.items():
         event = PETSc.Log.Event(name)
         for path in paths:
-            _cover(simulation, path, event.begin, _counted(simulation, path, event, counters))
+            _cover(simulation, path, event.begin, event.end)
     stage = PETSc.Log.Stage(STEPS)
-    _cover(simulation, "_advance", stage.push, lambda *_: stage.pop())
+    _cover(simulation, "_advance", stage.push, stage.pop)
 
 
-def _counted(simulation: Any, path: str, event: Any, counters: _Counters) -> Callable[..., None]:
-    """Return the function that ends an event after a call with these arguments, and counts what the call did."""
-    from petsc4py import PETSc
-
-    flops = FLOPS.get(path)
-
-    def end(*arguments: Any) -> None:
-        if flops is not None:
-            PETSc.Log.logFlops(flops(simulation))
-        if path == "mesh.update_ghosts":
-            counters.add(simulation.mesh.traffic(arguments[0]))
-        event.end()
-
-    return end
-
-
-class _Counters:
-    """PETSc's own counters of messages, which its table shows for each event; nothing where this PETSc hides them."""
-
-    _NAMES = ("petsc_isend_ct", "petsc_irecv_ct", "petsc_isend_len", "petsc_irecv_len")
-
-    def __init__(self) -> None:
-        from petsc4py import PETSc
-
-        self._places: list[ctypes.c_double] = []
-        with contextlib.suppress(OSError, ValueError):
-            library = ctypes.CDLL(PETSc.__file__)
-            self._places = [ctypes.c_double.in_dll(library, name) for name in self._NAMES]
-
-    def add(self, traffic: tuple[int, int, int, int]) -> None:
-        """Add messages sent and received, and their bytes."""
-        for place, more in zip(self._places, traffic, strict=False):
-            place.value += more
-
-
-def _cover(root: Any, path: str, begin: Callable[[], None], end: Callable[..., None]) -> None:
-    """Wrap a method of one object in ``begin`` and ``end``, which gets the arguments; methods that this run does not
-    have are skipped."""
+def _cover(root: Any, path: str, begin: Callable[[], None], end: Callable[[], None]) -> None:
+    """Wrap a method of one object in ``begin`` and ``end``; methods that this run does not have are skipped."""
     *way, name = path.split(".")
     for step in way:
         root = getattr(root, step, None)
@@ -143,6 +82,6 @@ def _cover(root: Any, path: str, begin: Callable[[], None], end: Callable[..., N
         try:
             return method(*arguments, **keywords)
         finally:
-            end(*arguments)
+            end()
 
     setattr(root, name, covered)

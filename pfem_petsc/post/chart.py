@@ -30,6 +30,7 @@ REFERENCE: dict[str, Any] = {"color": "#000000", "linewidth": 1.1, "linestyle": 
 """The style of closed forms."""
 
 STYLE: dict[str, Any] = {
+    "agg.path.chunksize": 20_000,
     "svg.fonttype": "none",
     "svg.hashsalt": "pfem_petsc",
     "font.size": 10,
@@ -145,22 +146,6 @@ def area(k: int) -> dict[str, Any]:
         return {"color": colour, "alpha": 0.85}
     hatch = ("///", "\\\\\\", "...", "xxx")[(k // len(COLOURS) - 1) % 4]
     return {"facecolor": colour, "edgecolor": "white", "hatch": hatch, "alpha": 0.85}
-
-
-def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tuple[np.ndarray, np.ndarray]:
-    """Return a curve (n,) with fewer points that looks the same: lowest and highest value of each time interval."""
-    if len(time) <= points:
-        return time, values
-    stretch = -(-len(time) // (points // 2))
-    whole = len(time) // stretch
-    body = values[: whole * stretch].reshape(whole, stretch)
-    with np.errstate(invalid="ignore"):
-        picked = np.stack([np.argmin(body, axis=1), np.argmax(body, axis=1)], axis=1)
-    picked = np.sort(picked, axis=1) + stretch * np.arange(whole)[:, None]
-    rest = values[whole * stretch - 1 :]  # shorter than an interval; it overlaps by a point, so that it is never empty
-    last = whole * stretch - 1 + np.array([np.argmin(rest), np.argmax(rest)])
-    picked = np.unique(np.concatenate([picked.ravel(), last, [0, len(time) - 1]]))
-    return time[picked], values[picked]
 
 
 def _fill_steps(axes: Any, place: np.ndarray, counts: np.ndarray, side: str, style: Mapping[str, Any]) -> None:
@@ -323,13 +308,12 @@ class Chart:
                     style["label"] = None
                     axes.fill_between(x, below, below := below + np.minimum(y, 0.0), **style)
             else:
-                ordered = bool(np.all(np.diff(place) >= 0.0))
-                x, y = thinned(place, values) if ordered else (place, values)
-                style |= {"marker": "o"} if len(x) == 1 else {}  # a line needs two points
+                style |= {"marker": "o"} if len(place) == 1 else {}  # a line needs two points
                 if curve.kind.startswith("steps"):
-                    _fill_steps(axes, x * along[0], y, "pre" if curve.kind == "steps before" else "post", style)
+                    side = "pre" if curve.kind == "steps before" else "post"
+                    _fill_steps(axes, place * along[0], values, side, style)
                 else:
-                    axes.plot(x * along[0], y * factor, **style)
+                    axes.plot(place * along[0], values * factor, **style)
             heading = f"{curve.key or curve.name} [{panel.unit}]" if panel.unit else curve.key or curve.name
             over = f"{places}: {curve.source}" if curve.source else places
             if not any(heading == other and over == before for before, _, other, _ in self._columns):

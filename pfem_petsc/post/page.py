@@ -22,7 +22,7 @@ from matplotlib.ticker import MaxNLocator
 from ..errors import InputError
 from ..output.units import prefix_for, unit_of
 from .camera import Camera, direction, fit
-from .chart import STYLE, boxes_allowed, largest, literal, thinned
+from .chart import STYLE, boxes_allowed, largest, literal
 from .colours import ColourScale, Mark
 from .curves import column
 from .scene import Scene, Style
@@ -249,8 +249,9 @@ class Page:
             axes = self._figure.add_axes(self._part(x, y, 246 * pixel, (high - 66) * pixel), animated=True)
             axes.patch.set_alpha(0.88)
             for k, (times, values) in enumerate(curves):
-                line = thinned(times * time_factor, values * factor, 600)
-                axes.plot(*line, color=_CURVE, alpha=1.0 if k == shown else 0.0)  # others for the range alone
+                axes.plot(
+                    times * time_factor, values * factor, color=_CURVE, alpha=1.0 if k == shown else 0.0
+                )  # others for the range alone
             axes.locator_params(nbins=5)
             axes.set_xlabel(axis.label(time_unit), labelpad=1.0)
             axes.margins(y=0.08)

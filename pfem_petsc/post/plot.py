@@ -14,8 +14,19 @@ from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.units import engineering, unit_of
 from .chart import COLOURS, REFERENCE, STYLE, Chart, Curve, Panel, area, distinct, largest, opened
-from .closed_forms import ClosedForm, closed_form
-from .curves import History, column, draw_comparison, draw_curves, draw_spectra, exact_curves, read, smoothed, words
+from .curves import (
+    ClosedForm,
+    History,
+    closed_form,
+    column,
+    draw_comparison,
+    draw_curves,
+    draw_spectra,
+    exact_curves,
+    read,
+    smoothed,
+    words,
+)
 from .filters import AS_COMPUTED, Filter, make_filter, window_mean
 from .options import PlotOptions
 

@@ -15,7 +15,7 @@ from ..contact.monitoring import Piercing, check_positions
 from ..fields import Fields, Snapshot
 from ..output.checkpoint import write_checkpoint
 from ..output.vtkhdf import ResultWriter
-from ..restart.state import STATE_VERSION, RunState
+from ..restart import STATE_VERSION, RunState
 from ..stepping.bar_events import MOST_TOLD
 from ..stepping.ledger import Ledger
 from ..stepping.stepper import Step, Stepper

@@ -22,8 +22,7 @@ from ..output.units import MODE, TIME, duration
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import agreed_call, on_root
 from ..preflight.checks import summarise, warnings_before
-from ..restart.checkpoints import Restart, prepare_folder
-from ..restart.state import RunState
+from ..restart import Restart, RunState, prepare_folder
 from ..signals import early
 from ..stepping.model import Model
 from ..stepping.stepper import Step, Stepper

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -97,8 +97,6 @@ class RelaxationKeys(Increments):
     """increment of the load factor"""
     end: PositiveFloat = 1.0
     """last load factor"""
-    damping: Literal["kinetic", "fire"] = "kinetic"
-    """damping of the pseudo-motion"""
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-9
     """residual relative to the load, in 2-norms, at which relaxation ends"""
     max_iterations: PositiveInt = 200_000

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from .keys import RelaxationKeys
 
 
-RESIDUAL, WEIGHTED, POWER, KINETIC, SUPPORTS, WALLS, BARS, FAILED, WIDTH = range(9)
-"""Sums over all nodes: squares of the residual [N2], the same over masses, power, twice the kinetic energy, squares of
-the forces of supports, of walls, of bars [N2], ranks that failed."""
+RESIDUAL, KINETIC, SUPPORTS, WALLS, BARS, FAILED, WIDTH = range(7)
+"""Sums over all nodes: squares of the residual [N2], twice the kinetic energy, squares of the forces of supports, of
+walls, of bars [N2], ranks that failed."""
 
 
 @kernel
@@ -48,35 +48,29 @@ def free_residual(external, f, fixed, r):
 
 
 @kernel
-def add_up(r, v, mass, sums):
-    """Sums of r.r [N2], r.r/m, r.v and m v.v over the nodes into ``sums`` (4,)."""
-    plain = weighted = power = kinetic = 0.0
+def add_up(r, v, mass):
+    """Sums of r.r [N2] and m v.v over the nodes."""
+    square = kinetic = 0.0
     for i in range(len(r)):
-        square = r[i, 0] * r[i, 0] + r[i, 1] * r[i, 1] + r[i, 2] * r[i, 2]
-        plain += square
-        weighted += square / mass[i]
-        power += r[i, 0] * v[i, 0] + r[i, 1] * v[i, 1] + r[i, 2] * v[i, 2]
+        square += r[i, 0] * r[i, 0] + r[i, 1] * r[i, 1] + r[i, 2] * r[i, 2]
         kinetic += mass[i] * (v[i, 0] * v[i, 0] + v[i, 1] * v[i, 1] + v[i, 2] * v[i, 2])
-    sums[0], sums[1], sums[2], sums[3] = plain, weighted, power, kinetic
+    return square, kinetic
 
 
 @kernel
-def move_freely(r, mass, factors, reach, v, u):
-    """v = keep v + push r/m, and u = step v, both (owned, 3), with these three ``factors``; a node's u is at most
-    ``reach`` (owned,) [m]."""
-    keep, push, step = factors
+def push(r, mass, factor, reach, v):
+    """v = v + factor r/m (owned, 3), which is the displacement in a pseudo-step: of a node at most ``reach`` (owned,)
+    [m]."""
     for i in range(len(r)):
-        share = push / mass[i]
+        share = factor / mass[i]
         square = 0.0
         for c in range(3):
-            v[i, c] = keep * v[i, c] + share * r[i, c]
-            u[i, c] = step * v[i, c]
-            square += u[i, c] * u[i, c]
+            v[i, c] += share * r[i, c]
+            square += v[i, c] * v[i, c]
         if square > reach[i] * reach[i]:
-            factor = reach[i] / square**0.5
+            shorter = reach[i] / square**0.5
             for c in range(3):
-                v[i, c] *= factor
-                u[i, c] *= factor
+                v[i, c] *= shorter
 
 
 @kernel
@@ -114,68 +108,6 @@ def node_stiffness(x, bars, stored, axial, counted, blocks, bound):
     return forces
 
 
-class KineticDamping:
-    """Restarts nodes from rest at peaks of the kinetic energy."""
-
-    def begin(self, motion: PseudoMotion) -> None:
-        """From rest."""
-        self._before = np.zeros_like(motion.residual)
-        self._rest()
-
-    def _rest(self) -> None:
-        self._energy, self._resting = 0.0, True
-
-    def move(self, motion: PseudoMotion) -> None:
-        """Make one pseudo-step. Velocities are those half a step before the positions."""
-        energy = motion.sums[KINETIC]
-        if energy < self._energy:
-            # x - 3/2 v + r/(2 m) of the previous step: the peak, by a parabola through three energies
-            motion.go_back(1.5 * motion.v - 0.5 * self._before / motion.mass[:, None])
-            motion.v[:] = 0.0
-            self._rest()
-            return
-        self._energy = energy
-        self._before[:] = motion.residual
-        push = 0.5 if self._resting else 1.0
-        self._resting = False
-        motion.shift(1.0, push, 1.0)
-
-
-class FireDamping:
-    """Turns velocities towards the forces; uphill motion is stopped, half a step back."""
-
-    start, grows, shrinks, fades, delay = 0.02, 1.1, 0.5, 0.99, 5
-    first, largest, smallest = 0.5, 0.9, 0.02
-
-    def begin(self, motion: PseudoMotion) -> None:
-        """From rest."""
-        self._step, self._turn, self._downhill = self.first, self.start, 0
-
-    def move(self, motion: PseudoMotion) -> None:
-        """Make one pseudo-step: semi-implicit Euler, then the turn."""
-        power, weighted, square = motion.sums[POWER], motion.sums[WEIGHTED], motion.sums[KINETIC]
-        if power > 0.0 or square == 0.0:
-            self._downhill += 1
-            if self._downhill > self.delay:
-                self._step = min(self._step * self.grows, self.largest)
-                self._turn *= self.fades
-        else:
-            motion.go_back(0.5 * self._step * motion.v)
-            motion.v[:] = 0.0
-            power = square = 0.0
-            self._downhill, self._turn = 0, self.start
-            self._step = max(self._step * self.shrinks, self.smallest)
-        h = self._step
-        square += 2.0 * h * power + h * h * weighted  # of the velocities once the forces have acted
-        keep = 1.0 - self._turn
-        push = keep * h + (self._turn * float(np.sqrt(square / weighted)) if weighted > 0.0 else 0.0)
-        motion.shift(keep, push, h)
-
-
-DAMPINGS = {"fire": FireDamping, "kinetic": KineticDamping}
-"""By the name in ``static.damping``."""
-
-
 _SAFETY = 1.1  # s of the mass: bars turn and tighten between two estimates
 _ESTIMATE_EVERY = 10  # pseudo-steps
 _REACH = 0.1  # of its shortest bar: no node moves farther in a pseudo-step, so that none passes through another
@@ -186,6 +118,8 @@ _SELF_STRESS = 1e-6  # of bar forces: smaller loads and reactions are none, the 
 class PseudoMotion:
     """Moves a copy of the positions towards an equilibrium of the model. Construction is collective.
 
+    Nodes go on from rest wherever the kinetic energy has passed a peak (kinetic damping).
+
     Attributes
     ----------
     x : (local, 3) positions with ghosts [m]
@@ -195,11 +129,11 @@ class PseudoMotion:
     contact : (owned, 3) force of walls [N]; ``walls`` their sums, ``held`` the nodes in contact
     mass : (owned,) [N/m]: the pseudo-step is 1
     energy : StrainEnergy at ``x``
-    sums : (9,) see :data:`~pfem_petsc.statics.relaxation.RESIDUAL`
+    sums : (7,) see :data:`~pfem_petsc.statics.relaxation.RESIDUAL`
     steps : pseudo-steps since :meth:`begin`
     """
 
-    def __init__(self, model: Model, damping: str) -> None:
+    def __init__(self, model: Model) -> None:
         self.model = model
         mesh = model.mesh
         owned, local = mesh.n_owned, mesh.n_local
@@ -213,8 +147,8 @@ class PseudoMotion:
         self.steps = 0
         self.time = 0.0
         self.sums = np.zeros(WIDTH)
-        self.damping = DAMPINGS[damping]()
-        self._u = np.zeros((owned, 3))
+        self._before = np.zeros((owned, 3))  # residual of the pseudo-step before
+        self._kinetic = -1.0  # its sum of the kinetic energy, negative at rest
         self._stored = np.zeros((5, len(mesh.bars)))
         self._axial = model.bars.stiffness
         self._counted = np.zeros(len(mesh.bars), dtype=bool)
@@ -235,7 +169,7 @@ class PseudoMotion:
         self._lead_supports(supports.coordinates(state.position), supports.positions(time))
         self.v[:] = 0.0
         self._external_norm = float(np.sqrt(self.model.comm.allreduce(float((external**2).sum()))))
-        self.damping.begin(self)
+        self._kinetic = -1.0
         self._evaluate()
 
     def _lead_supports(self, start: np.ndarray, end: np.ndarray) -> None:
@@ -282,26 +216,31 @@ class PseudoMotion:
         while self.steps < self._arrival or not self.balanced(tolerance):
             if self.steps >= most:
                 return False
-            self.damping.move(self)
+            self._move()
             self.steps += 1
             if self.steps <= self._arrival:
                 self._place_supports()
             self._evaluate()
         return True
 
-    def shift(self, keep: float, push: float, step: float) -> None:
-        """Compute v = keep v + push residual/m, x = x + step v, both with the constraints of walls."""
-        owned = self.model.mesh.n_owned
-        u = self._u
-        move_freely(self.residual, self.mass, (keep, push, step), self._reach, self.v, u)
-        if self.model.contact.any:
-            self._project(u)
-            np.divide(u, step, out=self.v)
-        self.x[:owned] += u
+    def _move(self) -> None:
+        """Make one pseudo-step of length one within the walls, or return to the peak of the kinetic energy.
 
-    def go_back(self, u: np.ndarray) -> None:
-        """Subtract (owned, 3) from the positions [m]; the next step projects them onto the walls again."""
-        self.x[: self.model.mesh.n_owned] -= u
+        Velocities are those half a step before the positions.
+        """
+        x, energy = self.x[: self.model.mesh.n_owned], self.sums[KINETIC]
+        if energy < self._kinetic:
+            # x - 3/2 v + r/(2 m) of the previous step: the peak, by a parabola through three energies
+            x -= 1.5 * self.v - 0.5 * self._before / self.mass[:, None]
+            self.v[:] = 0.0
+            self._kinetic = -1.0
+            return
+        self._before[:] = self.residual
+        push(self.residual, self.mass, 0.5 if self._kinetic < 0.0 else 1.0, self._reach, self.v)
+        self._kinetic = energy
+        if self.model.contact.any:
+            self._project(self.v)
+        x += self.v
 
     def _project(self, u: np.ndarray) -> None:
         """Project increments (owned, 3) from ``x`` onto the walls, and store the forces."""
@@ -332,7 +271,7 @@ class PseudoMotion:
             self._project(u)
             np.multiply(u, self.mass[:, None], out=self.residual)
             sums[WALLS] = (self.contact**2).sum()
-        add_up(self.residual, self.v, self.mass, sums[:SUPPORTS])
+        sums[RESIDUAL], sums[KINETIC] = add_up(self.residual, self.v, self.mass)
         sums[FAILED] = self.energy.failed >= 0 or self._failure is not None or not np.isfinite(sums).all()
         if model.comm.size > 1:
             model.comm.Allreduce(MPI.IN_PLACE, sums)
@@ -405,7 +344,7 @@ class RelaxationStepper(StaticStepper):
         super().__init__(model, choice, parameters)
         self.parameters = parameters
         self.guard = None  # relaxation allows large rotations
-        self.motion = PseudoMotion(model, parameters.damping)
+        self.motion = PseudoMotion(model)
         self.minimum = Stability(model, largest=LARGEST) if parameters.newton else None
         self.pseudo_steps, self.residual = 0, 0.0
 

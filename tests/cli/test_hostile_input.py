@@ -12,7 +12,7 @@ from pfem_petsc import Case
 from pfem_petsc.cli.main import exit_message, main
 from pfem_petsc.cli.parser import PREFIXES, without_effect
 from pfem_petsc.errors import InputError, printable
-from pfem_petsc.restart.checkpoints import prepare_folder
+from pfem_petsc.restart import prepare_folder
 
 ROD = Path("pfem_petsc/cases/rod_impact.toml").resolve()
 

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from pfem_petsc import Case
 from pfem_petsc.errors import InputError
 from pfem_petsc.mechanics.motion import Group, TimeTables, grouped
-from pfem_petsc.restart.checkpoints import changed_keys
+from pfem_petsc.restart import changed_keys
 from pfem_petsc.stepping.model import Model
 
 AT = [-1.0, 0.0, 0.1, 0.5, 1.0, 1.3, 2.0, 2.9999, 3.0, 7.0]

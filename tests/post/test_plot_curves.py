@@ -1,4 +1,4 @@
-"""Curves by name, their tables, spectra, and what they are thinned and averaged by."""
+"""Curves by name, their tables, spectra, and what they are averaged by."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mpi4py import MPI
 from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.errors import InputError
 from pfem_petsc.post import chart
-from pfem_petsc.post.chart import DASHES, REFERENCE, distinct, thinned
+from pfem_petsc.post.chart import DASHES, REFERENCE, distinct
 from pfem_petsc.post.curves import draw_curves
 from pfem_petsc.post.filters import window_mean
 from pfem_petsc.post.plot import plot
@@ -29,16 +29,6 @@ def test_unknown_curve_is_refused_with_the_nearest(tmp_path, result):
         plot(result, tmp_path, curves=["kinetic_enrgy"])
     with pytest.raises(InputError, match="no curves named"):
         plot(result, tmp_path, curves=[])
-
-
-def test_thinned_curve_keeps_spikes_and_ends():
-    time = np.linspace(0, 1, 100_003)
-    values = np.sin(7 * time)
-    values[54_321], values[77_777] = 50.0, -50.0
-    short_time, short = thinned(time, values, 1000)
-    assert len(short) < 1010 and np.all(np.diff(short_time) > 0)
-    assert {50.0, -50.0, values[0], values[-1]} <= set(short)
-    assert short_time[np.argmax(short)] == time[54_321]
 
 
 def integral(values, time):

@@ -13,7 +13,7 @@ from helpers.stopped import rod, steps
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.result import open_result
-from pfem_petsc.restart.checkpoints import kept_arguments
+from pfem_petsc.restart import kept_arguments
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ import pytest
 from pfem_petsc import Case, open_result
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
-from pfem_petsc.restart.state import STATE_VERSION
+from pfem_petsc.restart import STATE_VERSION
 
 FILES = Path(__file__).with_name("older_versions")
 VERSIONS = {"0.2.0": 6}  # of the state in their checkpoints

@@ -68,7 +68,7 @@ def test_checkpoint_that_is_replaced_while_it_is_read(tmp_path):
     comm = MPI.COMM_SELF
     file = Checkpoint(folder / "checkpoint.h5", comm)
     simulation = Simulation(Case.load("rod_impact", ["time.end=0.1"]), output=tmp_path / "other", quiet=True)
-    from pfem_petsc.restart.state import RunState
+    from pfem_petsc.restart import RunState
 
     orders = RunState(simulation.stepper).orders(file.scalars)
     wanted = file.read(orders)["x"]

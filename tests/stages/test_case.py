@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
-from pfem_petsc.restart.checkpoints import changed_keys
+from pfem_petsc.restart import changed_keys
 
 
 def test_tables_stay_in_force_until_a_stage_replaces_them():

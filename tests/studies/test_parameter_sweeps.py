@@ -23,8 +23,7 @@ from pfem_petsc.output.result import peak_force
 from pfem_petsc.output.table import Table
 from pfem_petsc.post.curves import labels_of
 from pfem_petsc.solvers import matrix_free as outlive
-from pfem_petsc.studies import sweep as pool
-from pfem_petsc.studies.sweep import Task
+from pfem_petsc.studies import Task, environment, performed
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +118,7 @@ class Killer:
 @pytest.mark.slow
 def test_a_crash_is_a_report_and_others_go_on(rod, tmp_path):
     tasks = [Task(Killer(), tmp_path / "0", None), Task(rod, tmp_path / "1", None)]
-    reports = dict(pool.performed(tasks, 1))
+    reports = dict(performed(tasks, 1))
     assert [reports[k].status for k in range(2)] == [-9, 0]
     assert reports[0].message == "the process of the run ended by SIGKILL"
 
@@ -127,15 +126,15 @@ def test_a_crash_is_a_report_and_others_go_on(rod, tmp_path):
 @pytest.mark.slow
 def test_leaving_ends_the_runs(rod, tmp_path):
     long = rod.copy({"time.end": 1e4})
-    runs = pool.performed([Task(rod, tmp_path / "0", None), Task(long, tmp_path / "1", None)], 1)
+    runs = performed([Task(rod, tmp_path / "0", None), Task(long, tmp_path / "1", None)], 1)
     assert next(runs)[0] == 0
     runs.close()  # ends the long run, of 10^6 steps
 
 
 def test_a_killed_sweep_leaves_no_run_behind(tmp_path):
     command = ["sweep", "rod_impact", "--vary", "time.end=1e4", "-o", str(tmp_path / "out"), "--quiet"]
-    environment = pool.environment()
-    sweeping = subprocess.Popen([sys.executable, "-m", "pfem_petsc", *command], env=environment)
+    variables = environment()
+    sweeping = subprocess.Popen([sys.executable, "-m", "pfem_petsc", *command], env=variables)
     lock = tmp_path / "out" / "0000.lock"
     wait_for(lock.exists)
     sweeping.kill()
@@ -156,7 +155,7 @@ def test_environment_is_not_that_of_a_rank(monkeypatch):
     monkeypatch.setenv("OMPI_COMM_WORLD_RANK", "3")
     monkeypatch.setenv("PMIX_RANK", "3")
     monkeypatch.setenv("OMPI_MCA_btl", "self")
-    found = pool.environment()
+    found = environment()
     assert "OMPI_COMM_WORLD_RANK" not in found and "PMIX_RANK" not in found and found["OMPI_MCA_btl"] == "self"
 
 

@@ -27,16 +27,16 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
-from ..case.schema import Case
-from ..case.toml import plain
-from ..columns import LOST, STORED, SUPPLIED
-from ..errors import InputError, PfemError
-from ..output.result import Result, open_result, peak_force, touch_impulse
-from ..output.table import SWEEP, Table, flat_columns, selected
-from ..registry import nearest
+from .case.schema import Case
+from .case.toml import plain
+from .columns import LOST, STORED, SUPPLIED
+from .errors import InputError, PfemError
+from .output.result import Result, open_result, peak_force, touch_impulse
+from .output.table import SWEEP, Table, flat_columns, selected
+from .registry import nearest
 
 if TYPE_CHECKING:
-    from ..case.schema import Case
+    from .case.schema import Case
 
 OF_A_LAUNCH = (
     *("PMIX_", "PMI_", "OPAL_", "ORTE_", "PRTE_LAUNCHED", "OMPI_COMM_", "OMPI_APP_", "OMPI_UNIVERSE_", "OMPI_FILE_"),
@@ -84,7 +84,7 @@ class _Process:
             self._errors.seek(0)
             self._errors.truncate()
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "pfem_petsc.studies.sweep"],
+                [sys.executable, "-m", "pfem_petsc.studies"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
@@ -161,8 +161,8 @@ def perform(task: Task) -> Report:
     """Execute a run in this process, and return its outcome."""
     from mpi4py import MPI
 
-    from ..errors import PfemError
-    from ..simulation import Simulation
+    from .errors import PfemError
+    from .simulation import Simulation
 
     begin, steps = time.perf_counter(), 0
     status, message = 0, ""
@@ -383,7 +383,7 @@ def _refuse_unknown(asked: Iterable[str], cases: Iterable[Case]) -> None:
     """Refuse columns of results that no case has; one has all of them as a rule."""
     from mpi4py import MPI
 
-    from ..simulation import Simulation
+    from .simulation import Simulation
 
     refusal = None
     for case in cases if asked else ():

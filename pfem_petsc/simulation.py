@@ -24,10 +24,10 @@ from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
 from .preflight.checks import forecast, inspect, later_gaps, summarise, warnings_before
 from .restart import RunState, find_restart, finished, finished_message
+from .run.observers import StopRequest, Synchroniser
 from .run.outputs import Outputs, ReportedCompilation
 from .run.recorder import Recorder
 from .run.stages import Stages
-from .run.synchroniser import StopRequest, Synchroniser
 from .statics.equilibrium import WithEquations
 from .stepping.model import Model
 from .stepping.stepper import Step, Stepper
@@ -160,9 +160,6 @@ class Simulation(WithEquations):
     def stepper(self) -> Stepper:
         """What advances the state, in the current stage."""
         return self._stages.stepper
-
-    analysis = stepper
-    """Its former name."""
 
     @property
     def model(self) -> Model:

@@ -26,9 +26,8 @@ from ..restart import Restart, RunState, prepare_folder
 from ..signals import early
 from ..stepping.model import Model
 from ..stepping.stepper import Step, Stepper
-from .observers import Checkpointing, Events, History, Observer, RuptureReport, Snapshots
+from .observers import Checkpointing, Events, History, Observer, RuptureReport, Snapshots, Synchroniser
 from .stages import Stages
-from .synchroniser import Synchroniser
 
 if TYPE_CHECKING:
     from ..modes.find import Found

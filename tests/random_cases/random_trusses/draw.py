@@ -666,7 +666,8 @@ def _time(chance: random.Random, body: Body) -> dict[str, Any]:
         step = safety * limit * EXPLICIT[name] / 2.0
         damped = any("damping" in material for material in body.tables["material"].values())
         if chance.random() < 0.5:
-            time |= {"step": "auto", "safety": safety, "end": steps * step}
+            # no whole number of steps, or rounding would decide how many there are
+            time |= {"step": "auto", "safety": safety, "end": (steps - 0.25) * step}
         else:
             step *= 0.7 if damped else 0.95
             time |= {"step": step, "end": steps * step}

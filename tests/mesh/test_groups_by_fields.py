@@ -71,7 +71,7 @@ def test_sections_by_the_field_of_a_converter(comm, shared_tmp_path):
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", NAMES)
 def test_values_of_fields_are_groups_everywhere(comm, shared_tmp_path, name):
-    """Sections, temperatures, removals and node sets by fields: the same run as by groups, on one rank to the last bit."""
+    """Sections, temperatures, removals and node sets by fields: the run is the same as by groups."""
     groups = {f"kind_{k}": np.flatnonzero(KINDS == k) for k in (1, 2, 7)}
     named = write_mesh(
         shared_tmp_path / "named.h5",

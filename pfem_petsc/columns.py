@@ -28,7 +28,7 @@ class Column(NamedTuple):
     parts : columns that a derived energy sums
     value : its value, a number or (size,), at the state of a :class:`~pfem_petsc.stepping.stepper.Stepper`, this rank's
         share if it is summed over ranks; None if the ledger, the contact log or the recorder has it
-    looped : whether the loop of a batch of steps has it too; a row with another value ends a batch
+    looped : whether the loop of a call of compiled steps has it too; a row with another value ends the call
     stages : what a stage does with the value of the stage before: it goes on with a ``summed`` one, keeps a ``lasting``
         one that it does not have itself, and forgets others
     exists : whether the column is recorded, from a :class:`~pfem_petsc.stepping.model.Model`
@@ -114,7 +114,7 @@ COUNTS = (
         value=lambda now: now.model.bars.slack_count(),
         exists=lambda model: model.bars.slackens,
     ),
-    # others can break in the last step of a batch alone
+    # others can break in the last step of a call alone
     Column("broken_bars", kind=np.int64, value=lambda now: now.ruptures.count, looped=True),
 )
 IMBALANCE = Column("energy_imbalance", "J")

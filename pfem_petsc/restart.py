@@ -240,11 +240,12 @@ class RunState:
             values = asking.reply(array[asked])
             if name.startswith(_LAW):
                 history[:, bars.kept_names.index(name.removeprefix(_LAW))] = values
+            elif name == "rest_length":
+                bars.rest = np.array(values).reshape(len(bars.ends))
             elif name.startswith(_KEPT):
                 setattr(self.stepper, name.removeprefix(_KEPT), values)
             else:
-                own = {"thermal_strain": bars.heat[:1], "temperature": bars.heat[1:], "rest_length": bars.rest}
-                own[name][:] = values
+                {"thermal_strain": bars.heat[:1], "temperature": bars.heat[1:]}[name][:] = values
         bars.put_history(history)
         self.model.temperatures.hold(bars.heat)
 

@@ -213,7 +213,7 @@ class Simulation(WithEquations):
         """Register a function to be called on all ranks after each step whose number is a multiple of ``every``.
 
         It receives the finished :class:`Step`, and may read :attr:`state` and call collective functions; its result is
-        ignored. With a large ``every``, :meth:`run` still makes the steps in between in batches. Functions are called
+        ignored. With a large ``every``, :meth:`run` still makes the steps in between in one call. Functions are called
         in the order of registration. What one raises ends the run: if only some ranks raise, all of them get a
         :class:`~pfem_petsc.errors.SimulationFailure` that names the exception.
 
@@ -351,7 +351,7 @@ class Simulation(WithEquations):
             )
 
     def _advance(self, most: int = 1) -> Step:
-        """Make one step, or a batch of at most ``most``, and serve the outputs that are due after it. Collective."""
+        """Make one step, or up to ``most``, and serve the outputs that are due after it. Collective."""
         self._usable()
         made = self.stepper.advance(most)
         self._synchroniser.stop.stepped = True

@@ -13,7 +13,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 COMPILED = {"kernel", "inlined", "intrinsic", "njit", "overload", "register_jitable"}
-COMPILED |= {"borrowing", "borrowing_apart", "borrowing_kernel"}
 """Decorators of functions whose types Numba infers."""
 
 

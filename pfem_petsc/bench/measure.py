@@ -226,7 +226,7 @@ def time_job(job: Job, kind: str, cells: int, comm: MPI.Comm, seconds: float, mo
         running = simulation.batches()  # as in a long run
         next(running)
         first = perf_counter() - ready
-        last = next(running).step  # loads the loop of batches
+        last = next(running).step  # loads the loop of steps
         before, cpu_before = perf_counter(), process_time()
         for step in running:
             now = perf_counter()

@@ -228,9 +228,8 @@ class Case(_Tables):
     ) -> Case:
         """Validate a case given as nested tables with the keys of the case file; see :meth:`load`.
 
-            NumPy
-        numbers and arrays, tuples and paths are accepted for the TOML types. ``mesh.file`` is relative to
-            ``folder``; ``name`` is the default folder of the results.
+        NumPy numbers and arrays, tuples and paths are accepted for the TOML types. ``mesh.file`` is relative to
+        ``folder``; ``name`` is the default folder of the results.
         """
         if not isinstance(data, Mapping):
             raise InputError(

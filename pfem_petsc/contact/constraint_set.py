@@ -131,8 +131,8 @@ class ConstraintSet:
         own = rows.partners.alone and not self.dynamic
         self.separate = self.alone and self.mesh.comm.allreduce(own, op=MPI.LAND)
         self._x = np.empty((len(rows.numbers), 3))
-        self._blocks: FixedRows | None = None  # for nodes of the stiffness
-        self._blocks_of = np.empty(0)
+        self._exported: FixedRows | None = None  # for nodes of the stiffness
+        self._exported_for = np.empty(0)
         self.release()
 
     def __bool__(self) -> bool:
@@ -239,23 +239,23 @@ class ConstraintSet:
         push_nodes(self.rows.where, load, self.rows.free, stiffness, u, contact)
 
     def export_rows(self, stiffness: np.ndarray) -> FixedRows:
-        """Return :attr:`separate` rows with their present forces for a batch of steps; none if they are not.
+        """Return :attr:`separate` rows with their present forces for compiled steps; none if they are not.
 
         ``stiffness`` (owned,) is the force for a displacement of a node [N/m], the same array as long as its values
         stay the same.
         """
-        if self._blocks is None or stiffness is not self._blocks_of:
-            self._blocks, self._blocks_of = self.two.of_blocks(stiffness, self.separate), stiffness
-        rows = self._blocks
+        if self._exported is None or stiffness is not self._exported_for:
+            self._exported, self._exported_for = self.two.arrays(stiffness, self.separate), stiffness
+        rows = self._exported
         if self.separate:
-            rows.force[rows.place], rows.closed[rows.place] = self.force, self.two.record.closed
+            rows.force[:], rows.closed[:] = self.force, self.two.record.closed
         return rows
 
     def import_rows(self, rows: FixedRows) -> None:
         """Take the forces after the last of the steps from rows that were exported."""
         if self.separate:
-            self.force = rows.force[rows.place]
-            self.two.record.closed[:] = rows.closed[rows.place]
+            self.force = rows.force.copy()
+            self.two.record.closed[:] = rows.closed
 
     def pressed(self) -> np.ndarray:
         """Return the owned nodes (m,), ascending, on which rows press."""

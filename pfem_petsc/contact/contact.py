@@ -40,7 +40,7 @@ class Contact(ExplicitContact):
 
     @property
     def steady(self) -> bool:
-        """Whether batches of steps serve the walls: infinite flat ones, spheres and cylinders, at rest or with
+        """Whether compiled steps serve the walls: infinite flat ones, spheres and cylinders, at rest or with
         prescribed motion, but not tied."""
         return not self.any or (self.plain and not self.motion.bodies.any)
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..errors import SimulationFailure
-from ..mechanics.compiled import borrowing, kernel
+from ..mechanics.compiled import inlined, kernel
+from ..mechanics.records import by_reference, record
 from ..mesh.ordering import NODE_BLOCK
 from ..tolerances import FIXED_POINT, PROJECTED, RANK
 from .friction import Rubbing, add_friction, jam
@@ -35,6 +36,7 @@ _LEAST_PART, _LARGEST_PART = 0.02, 8.0  # of the way to the next position whose 
 _ROOT = 1e-14  # relative error of squares, more than those of sums of three and of a root
 
 
+@record
 class PressedWalls(NamedTuple):
     """Walls (w,) and the nodes (n,) of a rank that they can stop, in a step.
 
@@ -101,20 +103,30 @@ class WallSums(NamedTuple):
     moment: np.ndarray
 
 
-@borrowing
-def find_beyond(first, free, walls, found, returning):
-    """Write the nodes, from node ``first`` on, whose positions ``free`` (3 m,) lie beyond :class:`PressedWalls` to
-    ``found``; return their number. With ``returning`` nodes, those that rebound are among them."""
-    surfaces, all_nodes, members = walls.surfaces, walls.all_nodes, walls.members
+@kernel
+def find_penetrating(free, walls, marked):
+    """Write the nodes whose positions ``free`` (3, n) lie beyond :class:`PressedWalls` to their room; return their
+    number. Nodes that rebound are among them in blocks that are ``marked`` (blocks,) bool."""
+    n, m = free.shape[1], 0
+    xs, ys, zs = free[0], free[1], free[2]
+    for first in range(0, n, NODE_BLOCK):
+        last, returning = min(first + NODE_BLOCK, n), marked[first // NODE_BLOCK]
+        if returning or _any_beyond(xs, ys, zs, first, last, walls.surfaces):
+            m = _list_penetrating(free, first, last, walls, returning, m)
+    return m
+
+
+@kernel
+def _any_beyond(xs, ys, zs, first, last, surfaces):
+    """Return whether any of consecutive nodes is beyond a wall, to whichever nodes it applies."""
     normals, offsets, radii = surfaces.normals, surfaces.offsets, surfaces.radii
     centres, axes = surfaces.centres, surfaces.axes
-    n = len(free) // 3
     beyond = 0
     for k in range(len(radii)):  # without branches
         if radii[k] == 0.0:
             nx, ny, nz, offset = normals[k, 0], normals[k, 1], normals[k, 2], offsets[k]
-            for i in range(n):
-                gap = -offset + nx * free[3 * i] + ny * free[3 * i + 1] + nz * free[3 * i + 2]
+            for i in range(first, last):
+                gap = -offset + nx * xs[i] + ny * ys[i] + nz * zs[i]
                 beyond += 1 if gap < 0.0 else 0
             continue
         if not is_round(radii[k]):
@@ -123,25 +135,28 @@ def find_beyond(first, free, walls, found, returning):
         cx, cy, cz, ax, ay, az = centres[k, 0], centres[k, 1], centres[k, 2], axes[k, 0], axes[k, 1], axes[k, 2]
         side = 1.0 if radii[k] > 0.0 else -1.0
         limit = radii[k] * radii[k] * (1.0 + side * _ROOT)
-        for i in range(n):
-            x, y, z = free[3 * i] - cx, free[3 * i + 1] - cy, free[3 * i + 2] - cz
+        for i in range(first, last):
+            x, y, z = xs[i] - cx, ys[i] - cy, zs[i] - cz
             along = x * ax + y * ay + z * az
             x -= along * ax
             y -= along * ay
             z -= along * az
             beyond += 1 if side * (x * x + y * y + z * z - limit) < 0.0 else 0
-    if beyond == 0 and not returning:
-        return 0
-    m = 0
-    for i in range(n):
+    return beyond > 0
+
+
+@kernel
+def _list_penetrating(free, first, last, walls, returning, m):
+    """Append those of consecutive nodes that are beyond a wall that applies to them, or rebound, to the ``m`` found."""
+    surfaces, all_nodes, members = walls.surfaces, walls.all_nodes, walls.members
+    radii = surfaces.radii
+    for i in range(first, last):
         for k in range(len(radii)):
             gap = 0.0
             if radii[k] != OTHER:
-                _, _, _, gap = tangent(k, surfaces, free[3 * i], free[3 * i + 1], free[3 * i + 2])
-            if (gap < 0.0 and (all_nodes[k] or members[first + i, k])) or (
-                returning and walls.rebound[first + i, k] > 0.0
-            ):
-                found[m] = first + i
+                _, _, _, gap = tangent(k, surfaces, free[0, i], free[1, i], free[2, i])
+            if (gap < 0.0 and (all_nodes[k] or members[i, k])) or (returning and walls.rebound[i, k] > 0.0):
+                walls.room[m] = i
                 m += 1
                 break
     return m
@@ -177,7 +192,7 @@ class _Planes(NamedTuple):
     pull: np.ndarray
 
 
-@borrowing
+@inlined
 def _set_planes(j, at, free, walls, given, planes):
     """Set the planes of the j-th node at positions ``at`` (m, 3); it is ``free`` (m, 3) to move there."""
     surfaces, restitution, rebound, arrival = walls.surfaces, walls.restitution, given.rebound, given.arrival
@@ -210,7 +225,7 @@ def _set_planes(j, at, free, walls, given, planes):
                 offsets[j, k] += max(restitution[k] * math.sqrt(whole) - 0.5 * q, 0.0)
 
 
-@borrowing
+@inlined
 def _meets_round(j, x, strengths, walls, given):
     """Return whether a round wall pushes the j-th node to its position (m, 3), or would stop it there."""
     surfaces, bounces = walls.surfaces, len(walls.restitution) > 0
@@ -226,8 +241,10 @@ def _meets_round(j, x, strengths, walls, given):
 def _settle_on_round(j, x, free, strengths, walls, given, planes):
     """Move the j-th node, projected to x (m, 3), until tangent planes and positions agree; return ``INFEASIBLE``,
     ``ADRIFT``, or 0."""
-    at, own = free[j].copy(), slice(j, j + 1)
-    fixed, normals, offsets = given.fixed[own], planes.normals[own], planes.offsets[own]
+    at = np.empty(3)
+    for c in range(3):
+        at[c] = free[j, c]
+    fixed, normals, offsets = given.fixed[j : j + 1], planes.normals[j : j + 1], planes.offsets[j : j + 1]
     for _ in range(_CURVED_ROUNDS):
         change = 0.0
         for c in range(3):
@@ -236,8 +253,9 @@ def _settle_on_round(j, x, free, strengths, walls, given, planes):
         if change <= walls.tolerance or not _meets_round(j, x, strengths, walls, given):
             return 0
         _set_planes(j, x, free, walls, given, planes)
-        x[j] = free[j]
-        if project(x[own], fixed, normals, offsets, walls.tolerance, strengths[own]) >= 0:
+        for c in range(3):
+            x[j, c] = free[j, c]
+        if project(x[j : j + 1], fixed, normals, offsets, walls.tolerance, strengths[j : j + 1]) >= 0:
             return INFEASIBLE
     return ADRIFT
 
@@ -247,18 +265,25 @@ def _rub_on_round(j, x, free, drag, strengths, walls, given, planes):
     """Repeat the friction of the j-th node, at x (m, 3), with the planes of other positions until it stays at the
     position of its planes; return whether it was found. Positions are those of Aitken's relaxation: in large steps, the
     positions of friction alone alternate or creep."""
-    own = slice(j, j + 1)
-    normals, offsets, stiffness = planes.normals[own], planes.offsets[own], given.stiffness[own]
+    normals, offsets, stiffness = planes.normals[j : j + 1], planes.offsets[j : j + 1], given.stiffness[j : j + 1]
     rough = walls.friction[0], walls.friction[1]
-    rubbing = Rubbing(given.start[own], walls.way, given.fixed[own], normals, offsets, *rough, stiffness)
-    at, last, part, near = x[j].copy(), np.zeros(3), 1.0, False
+    rubbing = Rubbing(given.start[j : j + 1], walls.way, given.fixed[j : j + 1], normals, offsets, *rough, stiffness)
+    at, last, part, near = np.empty(3), np.zeros(3), 1.0, False
+    earlier, distances = np.empty((offsets.shape[1], 3)), np.empty(offsets.shape[1])
+    for c in range(3):
+        at[c] = x[j, c]
     for _ in range(_CURVED_ROUNDS):
         if not _meets_round(j, x, strengths, walls, given):
             return True
-        earlier, distances = normals[0].copy(), offsets[0].copy()
-        _set_planes(j, x, free, walls, given, planes)
-        turn, apart = np.abs(normals[0] - earlier).max(), 0.0
         for k in range(len(distances)):
+            distances[k] = offsets[0, k]
+            for c in range(3):
+                earlier[k, c] = normals[0, k, c]
+        _set_planes(j, x, free, walls, given, planes)
+        turn, apart = 0.0, 0.0
+        for k in range(len(distances)):
+            for c in range(3):
+                turn = max(turn, abs(normals[0, k, c] - earlier[k, c]))
             if distances[k] > -math.inf:
                 apart = max(apart, abs(offsets[0, k] - distances[k]))
         if turn <= 1e-14 and apart <= walls.tolerance:
@@ -282,11 +307,12 @@ def _rub_on_round(j, x, free, drag, strengths, walls, given, planes):
             at[c] += part * last[c]
             x[j, c] = at[c]
         _set_planes(j, x, free, walls, given, planes)
-        x[j] = free[j]
-        project(x[own], rubbing.fixed, normals, offsets, walls.tolerance, strengths[own])
+        for c in range(3):
+            x[j, c] = free[j, c]
+        project(x[j : j + 1], rubbing.fixed, normals, offsets, walls.tolerance, strengths[j : j + 1])
         for k in range(len(distances)):
             strengths[j, k] *= stiffness[0]
-        if add_friction(rubbing, x[own], strengths[own], drag[own]) >= 0:
+        if add_friction(rubbing, x[j : j + 1], strengths[j : j + 1], drag[j : j + 1]) >= 0:
             return False
     return False
 
@@ -321,7 +347,12 @@ def press_nodes(places, given, walls, sums):
         wrong = _settle_on_round(j, places, free, strengths, walls, given, planes)
         if wrong > 0 and (failed < 0 or wrong < why or (wrong == why and j < failed)):
             failed, why = j, wrong
-    smooth, pushed = (places.copy(), strengths > 0.0) if bounces else (places, np.empty((0, w), dtype=np.bool_))
+    smooth, pushed = np.empty((m if bounces else 0, 3)), np.empty((m if bounces else 0, w), dtype=np.bool_)
+    for j in range(len(pushed)):
+        for c in range(3):
+            smooth[j, c] = places[j, c]
+        for k in range(w):
+            pushed[j, k] = strengths[j, k] > 0.0
     for j in range(m):
         for k in range(w):
             strengths[j, k] *= stiffness[j]
@@ -372,18 +403,6 @@ def press_nodes(places, given, walls, sums):
             touching[j, k] = True
             contacts[k] += 1
     return failed, why, planes, total, touching, dissipated
-
-
-@kernel
-def find_pressed(x, walls, returning):
-    """Return the nodes (m,) to press: those whose positions (n, 3) lie beyond :class:`PressedWalls`, or that rebound if
-    any are ``returning``."""
-    n, room = len(x), walls.room
-    m = 0
-    for first in range(0, n, NODE_BLOCK):
-        free = x[first : min(first + NODE_BLOCK, n)].reshape(-1)
-        m += find_beyond(first, free, walls, room[m:], returning)
-    return room[:m].copy()
 
 
 def impact_square(approach: np.ndarray, arrival: np.ndarray, pull: np.ndarray) -> np.ndarray:
@@ -618,7 +637,9 @@ class ExplicitContact(NodeWalls):
         walls = self.pressed_walls(self.surfaces.at(displacements), self._part, tolerance, way)
         bounces = len(walls.restitution) > 0
         others = (walls.surfaces.radii == OTHER).any()
-        nodes = find_pressed(x, walls, bounces)
+        marked = np.full(len(x) // NODE_BLOCK + 1, bounces)
+        reference = by_reference(walls)
+        nodes = walls.room[: find_penetrating(x.T, reference, marked)].copy()
         if others:
             nodes = np.union1d(nodes, np.flatnonzero(self.near(x, displacements)))
         if self.ties.any:
@@ -641,7 +662,7 @@ class ExplicitContact(NodeWalls):
             ]
             sums, places = WallSums(np.zeros((w, 3)), np.zeros(w, int), np.zeros((w, 3))), free.copy()
             given = Arrivals(start, drift, *of_nodes, *memory, *planes)
-            failed, why, found, force, touching, friction = press_nodes(places, given, walls, sums)
+            failed, why, found, force, touching, friction = press_nodes(places, given, reference, sums)
             if failed >= 0 or not others or np.abs(places - at).max() <= tolerance:
                 break
             at = places

@@ -1,4 +1,4 @@
-"""Rows over two nodes with a fixed direction, each with nodes of its own: separated in one pass over the rows."""
+"""Rows over two nodes with a fixed direction."""
 
 from __future__ import annotations
 
@@ -6,48 +6,37 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import borrowing, kernel
-from ..mesh.ordering import NODE_BLOCK
+from ..mechanics.compiled import kernel
+from ..mechanics.records import record
 from ..tolerances import FREE_PART
 from .rows import RowSet
 
 
+@record
 class FixedRows(NamedTuple):
-    """Rows over two nodes with fixed directions, n . (x_2 - x_1) >= least (p rows, b blocks of nodes).
+    """Rows over two nodes with fixed directions, n . (x_2 - x_1) >= least (p rows), in the order of the row set.
 
     Attributes
     ----------
-    starts : (b + 1,) the first row of each block: rows are sorted by the block of their later node
-    place : (p,) where the rows are, in the order of the row set, which is that of sums; ``table_starts`` (tables + 1,)
-        the first row of each table in this order
-    ready : (b,) the block after which each block can be finished, ascending; (0,) if there are no rows
-    near : (b,) bool, blocks with nodes of rows
-    nodes, of, node_starts : (2 p,), (2 p,), (b + 1,) all nodes, ascending; their rows; the first node of each block
+    table_starts : (tables + 1,) the first row of each table
+    nodes, of : (2 p,) all nodes, ascending; their rows
     where : (2, p) local indices of the nodes, else -1 minus the row among those of other ranks
     normals, least : (p, 3) unit directions; (p,) bounds [m]
     soft : (p,) displacement by which a unit force separates the nodes [m/N], zero if supports hold both
-    axes : (k,) components in which any direction is not zero
-    free, held : (2, p, 3) 0.0 where supports prescribe a component; (2, p) bool, nodes with such components
+    free : (2, p, 3) 0.0 where supports prescribe a component
     along : (2, p) squared lengths of the free parts of the directions
     totals : (tables, 3) room for the forces on the second nodes of each table [N]
     force, closed : (p,) forces [N]; bool, rows that have closed and not opened since; both are overwritten
     """
 
-    starts: np.ndarray
-    place: np.ndarray
     table_starts: np.ndarray
-    ready: np.ndarray
-    near: np.ndarray
     nodes: np.ndarray
     of: np.ndarray
-    node_starts: np.ndarray
     where: np.ndarray
     normals: np.ndarray
-    soft: np.ndarray
     least: np.ndarray
-    axes: np.ndarray
+    soft: np.ndarray
     free: np.ndarray
-    held: np.ndarray
     along: np.ndarray
     totals: np.ndarray
     force: np.ndarray
@@ -96,47 +85,25 @@ class TwoNodeRows:
         p = len(self.at)
         self.record = ClosingRows(self.normals, self.least, self.along, np.zeros(p), np.zeros(p, dtype=bool))
 
-    def of_blocks(self, stiffness: np.ndarray, some: bool) -> FixedRows:
-        """Return the rows, or none unless ``some``, for batches of steps, sorted by blocks of nodes, without forces.
+    def arrays(self, stiffness: np.ndarray, some: bool) -> FixedRows:
+        """Return the rows, or none unless ``some``, for compiled steps, without forces.
 
         ``stiffness`` (owned,) is the force for a displacement of a node [N/m]; both nodes of all rows must be on this
         rank.
         """
-        own = self.nodes if some else self.nodes[:, :0]
-        p, n_blocks = own.shape[1], -(-len(stiffness) // NODE_BLOCK)
-        blocks = own // NODE_BLOCK
-        later = blocks.max(axis=0)
-        order = np.lexsort((own[0], later))
-        place = np.empty(p, dtype=np.int64)
-        place[order] = np.arange(p)
-        numbers = np.arange(n_blocks + 1)
-        ready = np.arange(n_blocks)
-        for end in blocks:
-            np.maximum.at(ready, end, later)
-        where = np.ascontiguousarray(own[:, order])
-        at = np.argsort(where.ravel(), kind="stable")
-        nodes = where.ravel()[at]
-        near = np.zeros(n_blocks, dtype=bool)
-        near[blocks] = True
-        free, along = np.ascontiguousarray(self._free[:, order]), np.ascontiguousarray(self.along[:, order])
-        soft = 1.0 / stiffness[where] * along
-        tables = len(self.rows.sources)
+        p = len(self.at) if some else 0
+        where, along, tables = self.nodes[:, :p].copy(), self.along[:, :p].copy(), len(self.rows.sources)
+        order = np.argsort(where.ravel(), kind="stable")
+        soft = 1.0 / stiffness[where] * along if p else along
         return FixedRows(
-            starts=np.searchsorted(later[order], numbers),
-            place=place,
             table_starts=np.searchsorted(self.rows.source[self.at][:p], np.arange(tables + 1)),
-            ready=np.maximum.accumulate(ready) if p else np.empty(0, dtype=np.int64),
-            near=near,
-            nodes=nodes,
-            of=at % max(p, 1),
-            node_starts=np.searchsorted(nodes, NODE_BLOCK * numbers),
+            nodes=where.ravel()[order],
+            of=order % max(p, 1),
             where=where,
-            normals=self.normals[order],
+            normals=self.normals[:p],
+            least=self.least[:p],
             soft=np.where(along[0] + along[1] > FREE_PART, soft[0] + soft[1], 0.0),
-            least=self.least[order],
-            axes=np.flatnonzero(np.abs(self.normals).sum(axis=0)),
-            free=free,
-            held=(free == 0.0).any(axis=2),
+            free=self._free[:, :p].copy(),
             along=along,
             totals=np.zeros((tables, 3)),
             force=np.zeros(p),
@@ -174,60 +141,6 @@ class TwoNodeRows:
         """Return 1/(1/m_1 + 1/m_2) (p,) [kg] along the directions, from masses of owned nodes (owned,). Collective."""
         gives = (self.along / self.gather(mass)).sum(axis=0)
         return 1.0 / np.maximum(gives, 1e-300)
-
-
-@borrowing
-def solve_rows(block, rows, nodes, shared, u, contact):
-    """Solve the rows whose later node is in a block, with the bits of single steps: those of
-    :func:`~pfem_petsc.contact.projection.project_groups`.
-
-    ``nodes`` has ``mass`` and ``damping`` (n,), ``shared`` the step ``h``, the numbers ``alpha`` and ``eta``, and
-    positions and velocities at half steps ``x``, ``half`` (n, 3), to which increments ``u`` (n, 3) are added;
-    forces are written to ``contact`` (n, 3) [N], which is zero. Returns the number of rows with a force, and of rows
-    whose force begins or ends with respect to ``rows.closed``.
-    """
-    x, half, h = shared.x, shared.half, shared.h
-    mass, damping, alpha, eta = nodes.mass, nodes.damping, shared.alpha, shared.eta
-    where, normals, axes, force = rows.where, rows.normals, rows.axes, rows.force
-    damped = len(damping) > 0
-    count, changed = 0, 0
-    for p in range(rows.starts[block], rows.starts[block + 1]):
-        i, j = where[0, p], where[1, p]
-        d0 = d1 = d2 = 0.0
-        for m in range(len(axes)):
-            c = axes[m]
-            there = (x[j, c] + h * half[j, c]) + u[j, c]
-            here = (x[i, c] + h * half[i, c]) + u[i, c]
-            d = normals[p, c] * (there - here)
-            if c == 0:
-                d0 = d
-            elif c == 1:
-                d1 = d
-            else:
-                d2 = d
-        short = rows.least[p] - ((d0 + d2) + d1)
-        if short <= 0.0 or not rows.soft[p] > 0.0:
-            force[p] = 0.0
-            if rows.closed[p]:
-                changed += 1
-            continue
-        push = short / max(rows.soft[p], 1e-300)
-        force[p] = push
-        count += 1
-        if not rows.closed[p]:
-            changed += 1
-        for end in range(2):
-            node = where[end, p]
-            hard = alpha * mass[node] + (eta * damping[node] if damped else 0.0)
-            strength = push if end == 1 else -push
-            for m in range(len(axes)):
-                c = axes[m]
-                part = strength * normals[p, c]
-                contact[node, c] = part
-                if rows.held[end, p]:
-                    part *= rows.free[end, p, c]
-                u[node, c] += part / hard
-    return count, changed
 
 
 @kernel

@@ -189,6 +189,48 @@ def _rest(vector, spanned, n, out):
 
 
 @kernel
+def _complete(basis, taken, spanned, n):
+    """Fill the rows of a basis (3, 3) that are not ``taken``; the first n of ``spanned`` (3, 3) are orthonormal vectors
+    of the span of the others."""
+    part, unit, best_part = np.zeros(3), np.zeros(3), np.zeros(3)
+    for slot in range(3):
+        if taken[slot]:
+            continue
+        # prefer the axis of the slot, to avoid needless rotations
+        best = -1.0
+        for shift in range(3):
+            axis = (slot + shift) % 3
+            for c in range(3):
+                unit[c] = 1.0 if c == axis else 0.0
+            length = _rest(unit, spanned, n, part)
+            if length > best + 1e-9:
+                best = length
+                for c in range(3):
+                    best_part[c] = part[c] / length
+        for c in range(3):
+            basis[slot, c] = best_part[c]
+            spanned[n, c] = best_part[c]
+        n += 1
+
+
+@kernel
+def _invert(b, inverse):
+    """Write the inverse of a basis (3, 3); return whether it is the identity."""
+    for r in range(3):
+        p, q = (r + 1) % 3, (r + 2) % 3
+        for c in range(3):
+            s, t = (c + 1) % 3, (c + 2) % 3
+            inverse[c, r] = b[p, s] * b[q, t] - b[p, t] * b[q, s]
+    determinant = b[0, 0] * inverse[0, 0] + b[0, 1] * inverse[1, 0] + b[0, 2] * inverse[2, 0]
+    plain = True
+    for r in range(3):
+        for c in range(3):
+            inverse[r, c] /= determinant
+            plain = plain and b[r, c] == (1.0 if r == c else 0.0)
+    return plain
+
+
+@kernel
 def _build(planes, tolerance, least, output):
     """Fill the arrays of :class:`NodalFrames` that ``_FILLED`` names; return whether any basis is not the identity, and
     a node with infeasible bounds, else -1."""
@@ -198,8 +240,6 @@ def _build(planes, tolerance, least, output):
     taken = np.zeros(3, dtype=np.bool_)
     spanned = np.zeros((3, 3))
     part = np.zeros(3)
-    unit = np.zeros(3)
-    best_part = np.zeros(3)
     done = np.zeros(w, dtype=np.bool_)
     oblique = False
     contradiction = -1
@@ -280,36 +320,9 @@ def _build(planes, tolerance, least, output):
                 lower[i, slot] = max(lower[i, slot], bound)
             else:
                 upper[i, slot] = min(upper[i, slot], bound)
-        for slot in range(3):
-            if taken[slot]:
-                continue
-            # prefer the axis of the slot, to avoid needless rotations
-            best = -1.0
-            for shift in range(3):
-                axis = (slot + shift) % 3
-                for c in range(3):
-                    unit[c] = 1.0 if c == axis else 0.0
-                length = _rest(unit, spanned, n, part)
-                if length > best + 1e-9:
-                    best = length
-                    for c in range(3):
-                        best_part[c] = part[c] / length
-            for c in range(3):
-                basis[i, slot, c] = best_part[c]
-                spanned[n, c] = best_part[c]
-            n += 1
-        b = basis[i]
+        _complete(basis[i], taken, spanned, n)
+        plain = _invert(basis[i], inverse[i])
         for r in range(3):
-            p, q = (r + 1) % 3, (r + 2) % 3
-            for c in range(3):
-                s, t = (c + 1) % 3, (c + 2) % 3
-                inverse[i, c, r] = b[p, s] * b[q, t] - b[p, t] * b[q, s]
-        determinant = b[0, 0] * inverse[i, 0, 0] + b[0, 1] * inverse[i, 1, 0] + b[0, 2] * inverse[i, 2, 0]
-        plain = True
-        for r in range(3):
-            for c in range(3):
-                inverse[i, r, c] /= determinant
-                plain = plain and b[r, c] == (1.0 if r == c else 0.0)
             if lower[i, r] > upper[i, r]:
                 if lower[i, r] > upper[i, r] + tolerance and contradiction < 0:
                     contradiction = i

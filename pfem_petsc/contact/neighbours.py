@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from ..mechanics.compiled import borrowing, borrowing_apart, borrowing_kernel, inlined, kernel
+from ..mechanics.compiled import inlined, kernel
 from ..mesh.exchange import Router
 
 # Limits for each segment: pieces, and comparisons.
@@ -255,7 +255,7 @@ def _make_planes(grid: _Grid, points: Points, held: Segments) -> _Planes:
     return _Planes(starts[:-1], rows, parts, marks.astype(np.int32))
 
 
-@borrowing
+@inlined
 def _pieces(at, segments, n, longest, skin):
     """Return the number of pieces of a segment: not longer than ``longest``, or four times as long as thick."""
     a, b = segments.points[n, 0], segments.points[n, 1]
@@ -291,7 +291,7 @@ def _measure_segments(at, segments, longest, skin, most, sums):
     sums[0], sums[1], sums[2] = number, total, every
 
 
-@borrowing
+@inlined
 def _cell(at, segments, n, part, pieces, grid, c):
     """Return the number of the cell of the middle of a piece along an axis. It grows with the coordinate, by no more
     than one over the edge of a cell."""
@@ -300,7 +300,7 @@ def _cell(at, segments, n, part, pieces, grid, c):
     return int(min(max((middle - grid.low[c]) * grid.inverse[c], 0.0), grid.count[c] - 1.0))
 
 
-@borrowing
+@inlined
 def _holder(i, j, k, ranks):
     """Return the rank of a cell."""
     key = np.uint64((((i // _BLOCK) << 42) | ((j // _BLOCK) << 21) | (k // _BLOCK)) + 1)
@@ -355,7 +355,7 @@ def _sort_planes(at, segments, grid, starts, listed):
     return long
 
 
-@borrowing
+@inlined
 def _sort(work, which, count, most):
     """Sort ``count`` keys, from 0 to ``most``, and places of a plane, stably."""
     keys, order, other_keys, other_order = work.keys[which], work.rows[which], work.keys[2], work.rows[2]
@@ -383,7 +383,7 @@ def _sort(work, which, count, most):
             order[i] = other_order[i]
 
 
-@borrowing
+@inlined
 def _load(plane, planes, points, held, grid, work, which):
     """Sort the pieces of a plane by rows and cells; write their keys, rows, pieces, boxes and the marks of their ends.
     Returns how many."""
@@ -428,7 +428,7 @@ def _load(plane, planes, points, held, grid, work, which):
     return count
 
 
-@borrowing_apart
+@inlined
 def _meet(boxes, ends, which, first, count, box, one, other, near):
     """Write to ``near`` which of the boxes from ``first`` on meet a ``box`` of six numbers and share no end with it."""
     low_x, low_y, low_z = boxes[which, 0, first:], boxes[which, 1, first:], boxes[which, 2, first:]
@@ -492,7 +492,7 @@ def _distance(at, points, a, b):
     return np.sqrt(square), s, t
 
 
-@borrowing_apart
+@inlined
 def _compare_lines(lines, this, hits, count, near):
     """Write to ``near`` whether a piece ``this`` may be close to each of ``count`` others, ``hits``; all in ``lines``.
 
@@ -520,7 +520,7 @@ def _compare_lines(lines, this, hits, count, near):
         near[k] = close | (u * v < _TINY)
 
 
-@borrowing
+@inlined
 def _examine(points, held, grid, factor, one, two, found, out):
     """Return 1 if two pieces, (row, piece) each, are those of a pair, which is written if there is room for it."""
     # rounding must not depend on the order of the segments, which depends on the ranks
@@ -555,7 +555,7 @@ def _examine(points, held, grid, factor, one, two, found, out):
     return 1
 
 
-@borrowing
+@inlined
 def _find_ranges(work, key, wide, this, here, other, there):
     """Move the ranges of the cells around a cell: behind it in its row, in the next row, and in three rows of the next
     plane; in each row the cell before, beside, and after it, as four bounds."""
@@ -569,7 +569,7 @@ def _find_ranges(work, key, wide, this, here, other, there):
             work.bounds[j, bound] = at
 
 
-@borrowing_apart
+@inlined
 def _pick(words, count, place, hits, found, places, numbers):
     """Append the places of the bytes that are 1, of ``count`` in ``words``, to those ``found``; return how many."""
     for word in range((count + 7) // 8):
@@ -583,7 +583,7 @@ def _pick(words, count, place, hits, found, places, numbers):
     return found
 
 
-@borrowing
+@inlined
 def _collect(work, i, this, sides):
     """Write the places of pieces that are not certainly apart from a piece ``i`` of ``this`` plane to ``work.hits``;
     return how many. ``sides``: whether it reaches the next plane, the row before and after, the cell before and after.
@@ -618,7 +618,7 @@ def _collect(work, i, this, sides):
     return found
 
 
-@borrowing_kernel
+@kernel
 def _compare_planes(state, planes, points, held, grid, options, work, out):
     """Write the rows of segments that are pairs, and where they are closest; return how many.
 
@@ -679,7 +679,7 @@ def _compare_planes(state, planes, points, held, grid, options, work, out):
     return found
 
 
-@borrowing
+@inlined
 def _reaches(side, cell, upper, grid, axis):
     """Return whether a box with a ``side`` may meet pieces of the cell before or, if ``upper``, after its own."""
     border = (cell + upper) / (grid.inverse[axis] * grid.unit)
@@ -687,7 +687,7 @@ def _reaches(side, cell, upper, grid, axis):
     return side + reach >= border if upper else side - reach <= border
 
 
-@borrowing
+@inlined
 def _is_here(plane, row, along, grid):
     """Return whether a cell belongs to this rank."""
     i = j = k = np.int64(0)

@@ -8,13 +8,15 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from ..mechanics.compiled import borrowing, inlined, kernel
+from ..mechanics.compiled import inlined, kernel
+from ..mechanics.records import record
 from .walls.base import BaseWall, RoundWall
 
 OTHER = np.inf
 """Radius of walls that are neither flat nor round, which compiled loops do not know."""
 
 
+@record
 class Surfaces(NamedTuple):
     """Walls (w,) where they are at a time.
 
@@ -50,7 +52,7 @@ class Surfaces(NamedTuple):
         return made
 
     def copy(self) -> Self:
-        """Return these surfaces to be moved, see :func:`~pfem_petsc.stepping.batch_contact.place_walls`."""
+        """Return these surfaces to be moved, see :func:`~pfem_petsc.stepping.contact_phase.place_walls`."""
         return self._replace(offsets=self.offsets.copy(), centres=self.centres.copy())
 
     def at(self, displacements: np.ndarray) -> Self:
@@ -65,7 +67,7 @@ def is_round(radius):
     return radius != 0.0 and radius != OTHER
 
 
-@borrowing
+@inlined
 def tangent(k, surfaces, x, y, z):
     """Return the normal of surface k nearest to a position, and the distance from it [m], negative beyond it."""
     normals, radius = surfaces.normals, surfaces.radii[k]

@@ -1,11 +1,10 @@
-"""All bars of a rank, in blocks of one section each, evaluated by the compiled loops of their laws."""
+"""All bars of a rank, in blocks of one section each, evaluated by compiled loops that call their laws."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,10 +18,44 @@ from ..mesh import load_slab
 from ..mesh.distribution import group_hint
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
-from .elements import MEASURES, BarData, ElementFamily, MatrixRows, bar_lengths, first_inverted, make_loops
+from .chunk_laws import STRESS, densities_row, evaluate, first_class, flatten, law_loops, work_rows
+from .elements import (
+    MEASURES,
+    ElementFamily,
+    MatrixRows,
+    add_step_forces,
+    add_step_tangents,
+    add_tangents,
+    bar_lengths,
+    first_inverted,
+    write_directions,
+)
+from .internal_forces import (
+    BarArrays,
+    StepStart,
+    internal_forces,
+    known_rates,
+    new_workspace,
+    states,
+    step_coefficients,
+    stiffnesses,
+)
+from .layout import (
+    FORCES,
+    NO_BAR,
+    BarLayout,
+    aligned,
+    clear,
+    gather_values,
+    join_components,
+    make_layout,
+    new_components,
+    split_components,
+    spread_values,
+)
 from .materials.base import BarShapes, Law, UnsuitableBarError, internal_variables, law_of
-from .runs import Columns, Sweep, exchange_history, make_sweep
-from .rupture import breakable, limit_values, make_release
+from .records import by_reference
+from .rupture import breakable, intact, limit_values
 from .springs import Springs, connected, connector_modulus
 
 if TYPE_CHECKING:
@@ -202,8 +235,8 @@ class BarBlock:
     """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank.
 
     ``area`` [m2] is a number, or (stop - start,) if it differs from bar to bar. ``modulus`` is the largest tangent
-    modulus of the law [Pa]; ``own`` is the array of :attr:`history`, and ``lent`` the columns that have it now, if any;
-    ``release`` removes bars, if they can leave the model.
+    modulus of the law [Pa]; ``columns`` (rows, columns) has the data kept from step to step, ``law.rows`` and after
+    them ``law.bar_data``, in the columns of the ``layout`` for the section of this ``index``.
     """
 
     section: str
@@ -218,25 +251,29 @@ class BarBlock:
     measure: Callable
     parameters: tuple[float, ...]
     modulus: float
-    own: np.ndarray
-    sweep: Sweep
-    loops: SimpleNamespace
-    release: Callable | None
-    lent: Columns | None = None
+    layout: BarLayout
+    index: int
+    columns: np.ndarray
+
+    def row(self, number: int) -> np.ndarray:
+        """Return a copy (stop - start,) of a row of the data kept from step to step."""
+        values = np.empty(self.stop - self.start)
+        gather_values(self.layout, self.index, self.columns[number], values)
+        return values
+
+    def put_row(self, number: int, values: Any) -> None:
+        """Set a row of these data to values (stop - start,) or a number."""
+        values = np.ascontiguousarray(np.broadcast_to(values, self.stop - self.start), dtype=float)
+        spread_values(self.layout, self.index, values, 0.0, self.columns[number])
 
     @property
     def history(self) -> np.ndarray:
-        """Data kept from step to step (rows, stop - start): ``law.rows`` and, after them, ``law.bar_data``."""
-        if self.lent is not None:
-            columns, self.lent = self.lent, None
-            exchange_history(self.sweep, columns, self.own, True)
-        return self.own
-
-    def lend(self, columns: Columns) -> None:
-        """Leave the history to loops over padded runs, which update that of the columns, until someone needs it."""
-        if self.lent is not columns and columns.kept.size:
-            exchange_history(self.sweep, columns, self.history, False)
-            self.lent = columns
+        """Copy of all these data (rows, stop - start), which cannot be changed."""
+        rows = np.empty((len(self.columns), self.stop - self.start))
+        for spread, values in zip(self.columns, rows, strict=True):
+            gather_values(self.layout, self.index, spread, values)
+        rows.flags.writeable = False
+        return rows
 
     @property
     def counted_area(self) -> float | np.ndarray:
@@ -244,9 +281,9 @@ class BarBlock:
         return self.area if isinstance(self.area, float) else self.area[: self.counted - self.start]
 
     def variables(self) -> Iterator[tuple[str, str, np.ndarray]]:
-        """Yield name, unit and values (stop - start,) of all data kept from step to step."""
-        for (name, unit), values in zip(self.law.rows, self.history, strict=False):
-            yield name, unit, values
+        """Yield name, unit and a copy of the values (stop - start,) of all data kept from step to step."""
+        for number, (name, unit) in enumerate(self.law.rows):
+            yield name, unit, self.row(number)
 
 
 def laws_of(case: Case) -> dict[str, Law]:
@@ -259,10 +296,15 @@ def laws_of(case: Case) -> dict[str, Law]:
     return laws
 
 
-def make_blocks(mesh: DistributedMesh, case: Case) -> list[BarBlock]:
-    """Return the blocks of this rank, without data of single bars."""
+def make_blocks(mesh: DistributedMesh, case: Case) -> tuple[list[BarBlock], BarLayout, np.ndarray]:
+    """Return the blocks of this rank, without data of single bars, their layout, and the history of all."""
     laws, names, blocks = laws_of(case), list(case.section), []
-    for block in mesh.blocks:
+    layout = make_layout(mesh.bars, [(block.start, block.counted, block.stop) for block in mesh.blocks])
+    sizes = [layout.columns(k).stop - layout.columns(k).start for k in range(len(mesh.blocks))]
+    kept = [laws[case.section[names[block.section]].material] for block in mesh.blocks]
+    counts = [len(law.rows) + len(law.bar_data) for law in kept]
+    room, begun = aligned(sum(size * count for size, count in zip(sizes, counts, strict=True))), 0
+    for index, block in enumerate(mesh.blocks):
         section = case.section[names[block.section]]
         material = case.material[section.material]
         law, measure = laws[section.material], MEASURES[material.strain]
@@ -281,13 +323,13 @@ def make_blocks(mesh: DistributedMesh, case: Case) -> list[BarBlock]:
                 measure=measure,
                 parameters=(*(limit_values(material.rupture) if law.rupture >= 0 else ()), *material.numbers()),
                 modulus=material.upper_modulus(),
-                own=np.zeros((len(law.rows) + len(law.bar_data), block.stop - block.start)),
-                sweep=make_sweep(mesh.bars, block.start, block.counted, block.stop),
-                loops=make_loops(law, measure),
-                release=make_release(law_of(material), measure) if law.rupture >= 0 else None,
+                layout=layout,
+                index=index,
+                columns=room[begun : begun + sizes[index] * counts[index]].reshape(counts[index], sizes[index]),
             )
         )
-    return blocks
+        begun += sizes[index] * counts[index]
+    return blocks, layout, room
 
 
 _LOADING = 1e-8  # relative change of all lengths that distinguishes the tangents of loading and unloading
@@ -323,12 +365,11 @@ class Bars:
     Attributes
     ----------
     ends : (b, 2) int32, local node indices of each bar
-    far : (b,) uint32, the end of each bar with the larger index
     mesh_lengths : (b,) float64, lengths in the mesh [m], which determine mass and damping
-    rest : (b,) float64, rest lengths [m]: the same array where no section prescribes them
     rest_at_start : (b,) the same at the start of the step, or (0,) if they are constant
-    heat : (2, b) thermal strains and temperatures [K], or (2, 0) without temperatures
-    heat_at_start : the same at the start of the step, if they vary
+    heat_at_start : :attr:`heat` at the start of the step, if it varies
+    arrays : what compiled loops read
+    components : (3, stride) twice, room for positions and forces of nodes by components
     can_break : whether bars of the case can leave the model
     step : time from the start of the step to the evaluated positions [s]; 0 at the start of a run, infinite in static
         analyses
@@ -346,13 +387,16 @@ class Bars:
         self.mesh_lengths = np.empty(len(mesh.bars))
         bar_lengths(mesh.points, mesh.bars, self.mesh_lengths)
         self.families: list[ElementFamily] = []
-        self.rest = self.mesh_lengths
         self.rest_at_start = np.empty(0)
-        self.heat = np.empty((2, 0))
-        self.heat_at_start = self.heat
         self.step = 0.0
         self.internal = internal_variables(case.material)
-        self.blocks = make_blocks(mesh, case)
+        self.blocks, layout, history = make_blocks(mesh, case)
+        self._lists: dict[str, Any] = {}
+        self._reference = self._referred = None
+        self.components = new_components(len(mesh.points)), new_components(len(mesh.points), FORCES)
+        self.arrays = self._make_arrays(layout, history)
+        self.rest = self.mesh_lengths
+        self.heat_at_start = self.heat
         for block in self.blocks:
             if block.law.bar_data:
                 self._fill_bar_data(block)
@@ -362,10 +406,99 @@ class Bars:
         self.viscous = any(law.known_rate >= 0 for law in laws)
         self._watched = np.empty(len(mesh.bars) if self.can_break else 0)
         self.kept_names = list(dict.fromkeys(name for law in laws for name, _ in law.rows))
-        # loops over diagonal runs know the ends from those of the first bar
-        count = 0 if all(block.sweep.diagonal.all() for block in self.blocks) else len(mesh.bars)
-        self.far = np.empty(count, dtype=np.uint32)
-        np.maximum(mesh.bars[:count, 0], mesh.bars[:count, 1], out=self.far, casting="unsafe")
+
+    def _make_arrays(self, layout: BarLayout, history: np.ndarray) -> BarArrays:
+        """Return what compiled loops read, without rest lengths."""
+        blocks, empty = self.blocks, np.empty(0)
+        numbers = [flatten(block.parameters)[0] for block in blocks]
+        parameters = np.zeros((len(blocks), max(map(len, numbers), default=0)))
+        for row, values in zip(parameters, numbers, strict=True):
+            row[: len(values)] = values
+        energies = np.full((len(blocks), len(BAR_ENERGIES)), -1)
+        for row, block in zip(energies, blocks, strict=True):
+            row[: len(block.law.energies)] = [BAR_ENERGIES.index(name) for name in block.law.energies]
+        areas = empty
+        if any(not isinstance(block.area, float) for block in blocks):
+            areas = aligned(int(layout.starts[-1]))
+            for block in blocks:
+                self._spread(block, np.broadcast_to(block.area, block.stop - block.start), 0.0, areas)
+        sizes = np.cumsum([0, *(block.columns.size for block in blocks)])[:-1]
+
+        def numbers_of(value: Callable[[BarBlock], Any], kind: type = np.int64) -> np.ndarray:
+            return np.array([value(block) for block in blocks], dtype=kind)
+
+        return BarArrays(
+            layout,
+            empty,
+            np.empty((2, 0)),
+            numbers_of(lambda block: block.area if isinstance(block.area, float) else np.nan, float),
+            areas,
+            numbers_of(lambda block: list(MEASURES.values()).index(block.measure)),
+            parameters,
+            history,
+            sizes,
+            numbers_of(lambda block: len(block.law.rows)),
+            numbers_of(lambda block: len(block.columns)),
+            numbers_of(lambda block: len(block.law.internal) if block.law.rate else -1),
+            numbers_of(lambda block: block.law.rupture),
+            energies,
+            new_workspace(max((work_rows(block.law) for block in blocks), default=1)),
+        )
+
+    def _spread(self, block: BarBlock, values: np.ndarray, none: float, out: np.ndarray) -> None:
+        part = out[block.layout.columns(block.index)]
+        spread_values(block.layout, block.index, np.ascontiguousarray(values, dtype=float), none, part)
+
+    @property
+    def reference(self) -> Any:
+        """:attr:`arrays` as compiled loops take them."""
+        if self._referred is not self.arrays:
+            self._reference, self._referred = by_reference(self.arrays), self.arrays
+        return self._reference
+
+    @property
+    def rest(self) -> np.ndarray:
+        """Rest lengths (b,) [m]."""
+        return self._rest
+
+    @rest.setter
+    def rest(self, values: np.ndarray) -> None:
+        values = values if values.flags.writeable else values.copy()
+        self._rest, self._lengths = values.view(), values  # compiled loops distinguish arrays that cannot be changed
+        self._rest.flags.writeable = False
+        layout = self.arrays.layout
+        spread = aligned(int(layout.starts[-1]))
+        self.arrays = self.arrays._replace(rest=spread)
+        for block in self.blocks:
+            self._spread(block, values[block.start : block.stop], NO_BAR, spread)
+
+    def set_rest(self, part: slice, values: Any) -> None:
+        """Set the rest lengths of some bars [m]."""
+        rest = self.rest.copy()
+        rest[part] = values
+        self.rest = rest
+
+    @property
+    def heat(self) -> np.ndarray:
+        """Thermal strains and temperatures (2, b) [K], or (2, 0) without temperatures."""
+        return self.arrays.heat
+
+    @heat.setter
+    def heat(self, values: np.ndarray) -> None:
+        self.arrays = self.arrays._replace(heat=values)
+
+    def put_parameters(self, block: BarBlock, parameters: tuple[Any, ...]) -> None:
+        """Give a law other numbers of the same form."""
+        values, block.parameters = flatten(parameters)[0], parameters
+        self.arrays.parameters[block.index, : len(values)] = values
+
+    def loops(self, kind: str) -> Any:
+        """Return the loops of the laws of all blocks, ``brief``, ``full`` or ``mean``, see
+        :func:`~pfem_petsc.mechanics.chunk_laws.law_loops`; they are compiled when they are first needed."""
+        if kind not in self._lists:
+            made = [getattr(law_loops(block.law, flatten(block.parameters)[1]), kind) for block in self.blocks]
+            self._lists[kind] = first_class(made)
+        return self._lists[kind]
 
     @property
     def springs(self) -> Springs | None:
@@ -394,10 +527,11 @@ class Bars:
             if block.law.slack_row < 0:
                 continue
             part = slice(block.start, block.stop)
-            heat, rest = self.heat[:, part], self.rest[part]
+            heat, rest = self.heat[:, part], self.rest[part].copy()
             shift = heat[0] if heat.shape[1] else 0.0
             slack = self.mesh_lengths[part] < (1.0 - 1e-12) * (1.0 + shift) * rest
             rest[slack] = self.mesh_lengths[part][slack]
+            self.set_rest(part, rest)
             if heat.shape[1]:
                 heat[0, slack] = 0.0
             found |= bool(slack.any())
@@ -408,49 +542,22 @@ class Bars:
         status = np.full(len(self.ends), float(STATUS.index("intact")))
         for block in self.blocks:
             if block.law.slack_row >= 0:
-                slack = block.history[block.law.slack_row] != 0.0
+                slack = block.row(block.law.slack_row) != 0.0
                 status[block.start : block.stop][slack] = STATUS.index("slack")
         if self.can_break:
             status[self.rupture() != 0.0] = STATUS.index("broken")
         return status
 
-    def data(self, block: BarBlock, history: np.ndarray | None = None) -> BarData:
-        """Return the bars of a block as compiled loops read them; ``history``: instead of the block's own."""
-        return BarData(
-            np.uint64(block.start),
-            np.uint64(block.stop),
-            self.ends,
-            self.far,
-            block.sweep,
-            self.rest,
-            self.heat,
-            self.rest_at_start,
-            self.heat_at_start,
-            block.parameters,
-            block.area,
-            self.step,
-            block.history if history is None else history,
-        )
-
-    def _for_blocks(self, loop: str, x: np.ndarray, out: Any) -> None:
-        """Call a loop over the bars of each block."""
-        for block in self.blocks:
-            getattr(block.loops, loop)(x, self.data(block), out)
-
     def forces(self, x: np.ndarray, f: np.ndarray, commit: bool) -> StrainEnergy:
         """Compute internal forces ``f`` (local nodes, 3) [N] at positions ``x``; valid for owned nodes. Internal
         variables are updated only if ``commit``."""
-        f[:] = 0.0
-        energies = np.zeros(len(BAR_ENERGIES))
-        failed, shortened, changed = -1, False, 0
-        for block in self.blocks:
-            part = np.zeros(len(BAR_ENERGIES))
-            at, short, broke = block.loops.forces(x, self.data(block), commit, f, part)
-            energies += part
-            shortened |= short
-            changed += broke
-            if failed < 0:
-                failed = at
+        energies, (places, forces) = np.zeros(len(BAR_ENERGIES)), self.components
+        split_components(x, 0, places)
+        clear(forces)
+        failed, shortened, changed = internal_forces(
+            places, forces, self.reference, self.loops("full"), self.step, commit, energies
+        )
+        join_components(forces, 0, f)
         for family in self.families:
             energies[BAR_ENERGIES.index(family.energy)] += family.add_forces(x, f)
         return StrainEnergy(tuple(energies.tolist()), failed, shortened, changed)
@@ -460,9 +567,11 @@ class Bars:
         strain; all (local nodes, 3), with ghosts, and ``x0`` at the start of the step. ``x`` is held fixed for eta = 0.
         """
         for block in self.viscous_blocks:
-            block.loops.rates(x, self.data(block), (x0, v, eta))
+            known = np.empty(block.stop - block.start)
+            known_rates(self.ends, self.reference, block.index, self.step, (x0, x, v, eta), known)
+            block.put_row(block.law.known_rate, known)
             if self.step > 0.0:
-                block.parameters = (*block.parameters[:-1], eta * self.step)
+                self.put_parameters(block, (*block.parameters[:-1], eta * self.step))
 
     @contextmanager
     def at_step(self, step: float, eta: float) -> Iterator[None]:
@@ -470,18 +579,18 @@ class Bars:
         kept = self.step, [block.parameters for block in self.viscous_blocks]
         self.step = step
         for block in self.viscous_blocks if 0.0 < step < np.inf else ():
-            block.parameters = (*block.parameters[:-1], eta * step)
+            self.put_parameters(block, (*block.parameters[:-1], eta * step))
         try:
             yield
         finally:
             self.step = kept[0]
             for block, parameters in zip(self.viscous_blocks, kept[1], strict=True):
-                block.parameters = parameters
+                self.put_parameters(block, parameters)
 
     @contextmanager
     def without_rates(self) -> Iterator[None]:
         """Evaluate bars at rest: laws with a rate have the step zero, and there is no viscous stress."""
-        step, kept = self.step, [block.history[block.law.known_rate].copy() for block in self.viscous_blocks]
+        step, kept = self.step, [block.row(block.law.known_rate) for block in self.viscous_blocks]
         self.step = 0.0
         self.forget_rates()
         try:
@@ -489,12 +598,12 @@ class Bars:
         finally:
             self.step = step
             for block, rates in zip(self.viscous_blocks, kept, strict=True):
-                block.history[block.law.known_rate] = rates
+                block.put_row(block.law.known_rate, rates)
 
     def forget_rates(self) -> None:
         """Set the known strain rates of viscous bars to zero."""
         for block in self.viscous_blocks:
-            block.history[block.law.known_rate] = 0.0
+            block.put_row(block.law.known_rate, 0.0)
 
     def keep_start(self) -> None:
         """Store temperatures and rest lengths as those of the start of the next step."""
@@ -520,19 +629,26 @@ class Bars:
     ) -> None:
         """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to the values of a matrix; with
         positions ``start``, the derivative of :meth:`step_forces` from there in the place of K_t."""
+        rows = MatrixRows(pattern.ptr, pattern.slots, values)
+        mass = np.zeros(len(self.ends))
         for block, m in zip(self.blocks, inertia, strict=True):
-            rows = MatrixRows(weight, m, self.mesh_lengths, pattern.ptr, pattern.slots, values)
-            if start is None:
-                block.loops.tangents(x, self.data(block), rows)
-            else:
-                block.loops.step_tangents(x, self.data(block), (start, rows))
+            mass[block.start : block.stop] = m * self.mesh_lengths[block.start : block.stop]
+        stored = np.zeros((2, len(self.ends)))
+        if start is None:
+            if weight:
+                self.stiffnesses(x, weight, stored)
+            add_tangents(x, self.ends, stored, mass, rows)
+        else:
+            self._step_coefficients(start, x, stored)
+            add_step_tangents(start, x, self.ends, stored, weight, mass, rows)
         for family in self.families:  # in a step, their force is that at its middle
             family.add_tangents(weight if start is None else 0.5 * weight, pattern, values)
 
     def linearise(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
         """Fill ``stored`` (5, b) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, for each bar at ``x``;
         without springs."""
-        self._for_blocks("linearise", x, (weight, stored))
+        self.stiffnesses(x, weight, stored[3:])
+        write_directions(x, self.ends, stored)
 
     def state_stiffness(self, x: np.ndarray) -> np.ndarray:
         """Return the stiffness of the bars (5, b) in the state at ``x``, as :meth:`linearise`.
@@ -555,13 +671,19 @@ class Bars:
     def stiffnesses(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
         """Fill ``stored`` (2, b) with c = (dN/dl - N/l)/l^2 [N/m3] and g = N/l [N/m], times ``weight``: the stiffness
         of a bar with end difference d is c d d^T + g I; without springs."""
-        for block in self.blocks:
-            block.loops.stiffnesses(x, self.data(block), weight, stored)
+        split_components(x, 0, self.components[0])
+        stiffnesses(self.components[0], self.reference, self.loops("full"), self.step, weight, stored)
+
+    def _step_coefficients(self, x0: np.ndarray, x: np.ndarray, out: np.ndarray) -> None:
+        start = StepStart(x0, self.rest_at_start, self.heat_at_start)
+        step_coefficients(x, self.ends, self.reference, self.loops("mean"), self.step, start, out)
 
     def step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
         """Compute discrete-gradient forces ``f`` (local nodes, 3) [N] of a step from ``x0`` to ``x``."""
         f[:] = 0.0
-        self._for_blocks("step_forces", x, (x0, f))
+        coefficients = np.empty((2, len(self.ends)))
+        self._step_coefficients(x0, x, coefficients)
+        add_step_forces(x0, x, self.ends, coefficients, f)
         for family in self.families:
             family.add_step_forces(x0, x, f)
 
@@ -575,7 +697,8 @@ class Bars:
         """Give the law of a block what it reads of each bar."""
         material = self.case.section[block.section].material
         try:
-            block.history[len(block.law.rows) :] = self.case.material[material].pack_bars(self._shapes(block))
+            for number, values in enumerate(self.case.material[material].pack_bars(self._shapes(block))):
+                block.put_row(len(block.law.rows) + number, values)
         except UnsuitableBarError as error:
             bar = self.mesh.bar_ids[block.start + error.bar]
             raise InputError(
@@ -623,10 +746,9 @@ class Bars:
     def fields(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Return, per local bar at the end of the last step, ``strain``, ``stress`` [Pa], ``axial_force`` [N],
         ``plastic_strain``, and the internal variables of the case's laws; zero for bars without such a variable."""
-        out = {name: np.empty(len(self.ends)) for name in ("strain", "stress", "axial_force")}
+        out = dict(zip(("strain", "stress", "axial_force"), self._states(x), strict=True))
         out |= {name: np.zeros(len(self.ends)) for name in ("plastic_strain", *self.internal)}
         for block in self.blocks:
-            block.loops.fields(x, self.data(block), (out["strain"], out["stress"], out["axial_force"]))
             for name, _, values in block.variables():
                 if name in out:
                     out[name][block.start : block.stop] = values
@@ -634,8 +756,16 @@ class Bars:
 
     def densities(self, x: np.ndarray) -> np.ndarray:
         """Return the energies per rest volume (number of BAR_ENERGIES, b) [J/m3] at the end of the last step."""
-        out = np.zeros((len(BAR_ENERGIES), len(self.ends)))
-        self._for_blocks("densities", x, out)
+        densities = np.zeros((len(BAR_ENERGIES), len(self.ends)))
+        self._states(x, densities)
+        return densities
+
+    def _states(self, x: np.ndarray, densities: np.ndarray | None = None) -> np.ndarray:
+        """Return total strain, stress and axial force (3, b); write the ``densities``, if they are given."""
+        split_components(x, 0, self.components[0])
+        out = np.empty((3, len(self.ends)))
+        densities = np.empty((0, 0)) if densities is None else densities
+        states(self.components[0], self.reference, self.loops("full"), out, densities)
         return out
 
     def scaled_dissipation(self, densities: np.ndarray, change: np.ndarray) -> np.ndarray:
@@ -658,13 +788,13 @@ class Bars:
 
     def rupture(self) -> np.ndarray:
         """Return the state of rupture (b,) of all local bars, see :mod:`~pfem_petsc.mechanics.rupture`."""
-        return self.of_blocks(lambda block: block.history[block.law.rupture] if block.law.rupture >= 0 else 0.0)
+        return self.of_blocks(lambda block: block.row(block.law.rupture) if block.law.rupture >= 0 else 0.0)
 
     @property
     def watched(self) -> np.ndarray:
         """Rest lengths (b,) [m], zero for bars that have left the model; the same array in each call."""
         if not self.can_break:
-            return self.rest
+            return self._lengths
         np.copyto(self._watched, np.where(np.abs(self.rupture()) >= 1.0, 0.0, self.rest))
         return self._watched
 
@@ -679,8 +809,8 @@ class Bars:
         bars."""
         names = self.kept_names if names is None else names
         for block in self.blocks:
-            for name, _, values in block.variables():
-                values[:] = history[block.start : block.stop, names.index(name)]
+            for number, (name, _) in enumerate(block.law.rows):
+                block.put_row(number, history[block.start : block.stop, names.index(name)])
 
 
 def state_before_rupture(bars: Bars, x: np.ndarray, bar: int) -> tuple[BarBlock, np.ndarray, float, float]:
@@ -688,15 +818,16 @@ def state_before_rupture(bars: Bars, x: np.ndarray, bar: int) -> tuple[BarBlock,
     strain at positions ``x``, as if it had not broken."""
     block = next(block for block in bars.blocks if block.start <= bar < block.stop)
     k = bar - block.start
-    history = block.history[:, k : k + 1].copy()
-    history[block.law.rupture] = 0.0
-    strain, stress, force = (np.zeros(bar + 1) for _ in range(3))
-    one = bars.data(block, history)._replace(start=np.uint64(bar), stop=np.uint64(bar + 1))
-    if not isinstance(block.area, float):
-        one = one._replace(area=block.area[k : k + 1])
-    block.loops.fields(x, one, (strain, stress, force))
-    shift = bars.heat[0, bar] if bars.heat.shape[1] else 0.0
-    return block, history[:, 0], float(stress[bar]), float(strain[bar] - shift)
+    law, history = block.law, block.history[:, k : k + 1].copy()
+    history[law.rupture] = 0.0
+    length = float(np.linalg.norm(np.subtract(*x[bars.ends[bar]])))
+    shift, temperature = bars.heat[:, bar] if bars.heat.shape[1] else (0.0, 0.0)
+    strain = block.measure(length / bars.rest[bar])[0] - shift
+    if law.rate:
+        stress = history[len(law.internal) + 1, 0]
+    else:
+        stress = evaluate(law, block.parameters, strain, temperature, history)[STRESS, 0]
+    return block, history[:, 0], float(stress), float(strain)
 
 
 def release(bars: Bars, x: np.ndarray, members: np.ndarray, state: float) -> np.ndarray:
@@ -704,12 +835,31 @@ def release(bars: Bars, x: np.ndarray, members: np.ndarray, state: float) -> np.
     energies of the bars counted on this rank change, in the order of :data:`~pfem_petsc.columns.BAR_ENERGIES`."""
     change = np.zeros(len(BAR_ENERGIES))
     for block in bars.blocks:
-        mine = members[(members >= block.start) & (members < block.stop)].astype(np.int64)
-        moved = np.zeros(len(block.law.energies) - 1)
-        block.release(x, bars.data(block), mine, state, block.counted, moved)
-        for name, energy in zip(block.law.energies, moved.tolist(), strict=False):
-            change[BAR_ENERGIES.index(name)] -= energy
-            change[BAR_ENERGIES.index("rupture_dissipation")] += energy
+        mine = members[(members >= block.start) & (members < block.stop)]
+        history = block.history.copy()
+        mine = mine[np.abs(history[block.law.rupture, mine - block.start]) < state]
+        if not len(mine):
+            continue
+        here, count = mine - block.start, block.law.rupture  # variables of the law of intact bars come first
+        law, parameters = intact(block.law, block.parameters)
+        ends = x[bars.ends[mine]]
+        stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / bars.rest[mine]
+        strain = np.array([block.measure(value)[0] for value in stretch])
+        shift, temperature = bars.heat[:, mine] if bars.heat.shape[1] else (0.0, 0.0)
+        rows = history[:count, here], np.zeros((len(law.rows) - count, len(mine))), history[len(block.law.rows) :, here]
+        found = evaluate(law, parameters, strain - shift, temperature, np.vstack(rows))
+        densities = found[densities_row(law) :]
+        lost = (state - np.abs(history[count, here])) * densities
+        history[count + 1 : count + 1 + len(lost), here] += lost
+        # one that has begun to break counts as broken
+        history[count, here] = np.where(history[count, here] > 0.0, state, -state)
+        for number in range(count, count + 1 + len(lost)):
+            block.put_row(number, history[number])
+        volume = np.broadcast_to(block.area, block.stop - block.start)[here] * bars.rest[mine] * (mine < block.counted)
+        for name, energy in zip(law.energies, (lost @ volume).tolist(), strict=True):
+            if name in STORED:
+                change[BAR_ENERGIES.index(name)] -= energy
+                change[BAR_ENERGIES.index("rupture_dissipation")] += energy
     return change
 
 

@@ -17,6 +17,7 @@ from ..registry import nearest
 from .bars import bar_shapes
 from .compiled import kernel
 from .motion import Group, Table, TimeTables, grouped
+from .records import record
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -38,6 +39,7 @@ def _add_forces(first, members, forces, columns, values, out):
             out[i, 2] += z
 
 
+@record
 class LoadSchedule(NamedTuple):
     """Loads and gravity that vary, at the times of some steps.
 

@@ -14,7 +14,6 @@ import numpy as np
 
 from .compiled import kernel
 from .motion import Table
-from .tuples import bar_value
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -34,12 +33,12 @@ def add_at_ends(bars, values, out):
 
 @kernel
 def consistent_product(bars, lengths, start, stop, density, u, out):
-    """Add the consistent mass matrix of a line density [kg/m], a number or (stop - start,), times ``u`` to ``out``;
+    """Add the consistent mass matrix of a line density [kg/m], (1,) or (stop - start,), times ``u`` to ``out``;
     both (local nodes, 3)."""
     for k in range(start, stop):
         a = bars[k, 0]
         b = bars[k, 1]
-        m = bar_value(density, k - start) * lengths[k] / 6.0
+        m = density[k - start if len(density) > 1 else 0] * lengths[k] / 6.0
         for i in range(3):
             out[a, i] += m * (2.0 * u[a, i] + u[b, i])
             out[b, i] += m * (u[a, i] + 2.0 * u[b, i])
@@ -174,7 +173,7 @@ class Inertia:
         self.mesh.update_ghosts(self._u)
         self._out[:] = 0.0
         for block in self.bars.blocks:
-            coefficient = density(block) * block.area
+            coefficient = np.atleast_1d(density(block) * block.area)
             consistent_product(
                 self.bars.ends, self.bars.mesh_lengths, block.start, block.stop, coefficient, self._u, self._out
             )

@@ -2,60 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..mesh.ordering import NODE_BLOCK
-from .compiled import borrowing, borrowing_apart, inlined, kernel
-from .mass import scale_rows
-from .runs import (
-    Groups,
-    Sweep,
-    add_lower_ends,
-    aligned,
-    clear_lower_ends,
-    fill,
-    make_groups,
-    new_planes,
-    new_rows,
-    split_components,
-    spread_values,
-)
-from .tuples import accumulate
+from .chunk_laws import ROW
+from .compiled import inlined, kernel
+from .layout import DIFFERENCES, FORCES, BarLayout, aligned, new_components, split_components, spread_values
 
 if TYPE_CHECKING:
     from .bars import Bars
 
-_add_force = accumulate(3)
 
-
-class PaddedBars(NamedTuple):
-    """Bars of a section by columns of padded runs: ``groups``, c [N/m3] and g [N/m] (columns,), zero where there is no
-    bar, and whether the groups are in the order of their blocks of nodes."""
-
-    groups: Groups
-    along: np.ndarray
-    across: np.ndarray
-    ascending: bool
-
-
-def pad(sweep: Sweep) -> PaddedBars | None:
-    """Return the columns of the bars of a sweep; None if they are not all in diagonal runs."""
-    if not sweep.diagonal.all():
-        return None
-    groups = make_groups(sweep)
-    count = int(groups.starts[-1])
-    ascending = bool((np.diff(groups.heads.astype(np.int64) // NODE_BLOCK) >= 0).all())
-    return PaddedBars(groups, aligned(count), aligned(count), ascending)
+_X, _Y, _Z = (np.uint64(row * ROW) for row in range(3))
 
 
 class BarProducts:
     """Products with the stiffness of all bars of a rank, and its diagonal.
-
-    The bars of a section that are all in diagonal runs are evaluated by columns of :class:`~.runs.Groups`, from
-    positions and vectors by components; others run by run.
 
     Attributes
     ----------
@@ -65,14 +29,17 @@ class BarProducts:
 
     def __init__(self, bars: Bars) -> None:
         self.bars = bars
-        nodes = bars.mesh.n_local
+        nodes, self._layout = bars.mesh.n_local, bars.arrays.layout
         self.x = np.zeros((nodes, 3))
         self.stored = np.zeros((2, len(bars.ends)))
-        self._padded = [pad(block.sweep) for block in bars.blocks]
-        some = any(padded is not None for padded in self._padded)
-        count = nodes if some else 0
-        places, sums = new_planes(count)
-        self._planes = places, new_planes(count)[0], sums
+        self._columns = self.stored
+        columns = int(self._layout.starts[-1])
+        if columns > len(bars.ends):
+            self._columns = aligned(2 * columns).reshape(2, columns)
+        self._places, self._vectors = new_components(nodes), new_components(nodes)
+        self._sums = new_components(nodes, FORCES)
+        self._work = aligned(3 * ROW, DIFFERENCES)
+        self._needed, self._complete = _order(self._layout, nodes)
 
     @classmethod
     def tangent(cls, bars: Bars, x: np.ndarray) -> BarProducts:
@@ -85,234 +52,171 @@ class BarProducts:
 
     def take(self) -> None:
         """Take account of changes of :attr:`x` and :attr:`stored`."""
-        if len(self._planes[0]):
-            split(self.x, self._planes[0])
-        for block, padded in zip(self.bars.blocks, self._padded, strict=True):
-            if padded is not None:
-                for values, spread in zip(self.stored[:, block.start : block.stop], padded[1:3], strict=True):
-                    spread_values(values, block.sweep, padded.groups, 0.0, spread)
+        split_components(self.x, 0, self._places)
+        if self._columns is self.stored:
+            return
+        for block in self.bars.blocks:
+            part = self._layout.columns(block.index)
+            for values, spread in zip(self.stored[:, block.start : block.stop], self._columns[:, part], strict=True):
+                spread_values(self._layout, block.index, values, 0.0, spread)
 
     def times(self, nodal: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
         """Write nodal u + K u to ``out``, both (local, 3); ``nodal`` (owned,) [N/m]."""
-        padded = [bars for bars in self._padded if bars is not None]
-        for k, bars in enumerate(padded):
-            add_padded_products(bars, self._planes, Task(u, out, nodal, k == 0, k == len(padded) - 1))
-        if not padded:
-            scale_rows(nodal, u, out)
-        out[len(nodal) :] = 0.0  # those of ghosts are not complete
-        for block, bars in zip(self.bars.blocks, self._padded, strict=True):
-            if bars is None:
-                add_products(block.sweep, self.bars.far, self.x, self.stored, u, out)
+        task = ProductTask(nodal, u.reshape(-1), out.reshape(-1), self._needed, self._complete)
+        multiply(self._layout, self._places, self._vectors, self._columns, self._sums, self._work, task)
 
     def diagonal(self) -> np.ndarray:
         """Return the diagonal of K (local, 3)."""
         diagonal = np.zeros_like(self.x)
-        for block, padded in zip(self.bars.blocks, self._padded, strict=True):
-            if padded is None:
-                add_diagonals(self.bars.ends, self.x, self.stored, block.start, block.stop, diagonal)
-            else:
-                add_padded_diagonals(padded, self._planes, diagonal)
+        add_diagonals(self.bars.ends, self.x, self.stored, diagonal)
         return diagonal
 
 
-@kernel
-def split(x, planes):
-    """Write vectors (n, 3) to ``planes`` (3 stride,)."""
-    split_components(x, 0, len(x), planes, len(planes) // 3, 0)
+def _order(layout: BarLayout, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each group how many leading nodes must be begun before it, and how many no later one adds to."""
+    lowest, highest = layout.heads // NODE_BLOCK * NODE_BLOCK, layout.fars + np.diff(layout.starts)
+    for group in np.flatnonzero(layout.stars):
+        first, last = layout.runs[group : group + 2]
+        lowest[group] = layout.nodes[first:last].min()
+        highest[group] = layout.far[layout.bars[first] : layout.bars[last]].max() + 1
+    complete = np.append(np.minimum.accumulate(lowest[::-1])[::-1], nodes)[1:]
+    return np.minimum(np.maximum(np.maximum.accumulate(highest), complete), nodes), complete
 
 
-@inlined
-def _add_components(planes, f):
-    """Add vectors in ``planes`` (3 stride,) to ``f`` (n, 3)."""
-    stride = len(planes) // 3
-    xs, ys, zs = planes, planes[stride:], planes[2 * stride :]
-    nodes = f.reshape(-1)
-    for i in range(len(f)):
-        nodes[3 * i] += xs[i]
-        nodes[3 * i + 1] += ys[i]
-        nodes[3 * i + 2] += zs[i]
+class ProductTask(NamedTuple):
+    """What a product reads and writes: ``nodal`` (owned,), vectors ``u`` and ``out`` (3 local,), and for each group how
+    many leading nodes are ``needed``, and which are ``complete`` after it."""
 
-
-class Task(NamedTuple):
-    """A product of all bars: ``u`` and ``out`` (local, 3), ``nodal`` (owned,); and whether those of a section are its
-    ``first``, before which u is split, and its ``last``, after which nodal u and the sums are written to out."""
-
+    nodal: np.ndarray
     u: np.ndarray
     out: np.ndarray
-    nodal: np.ndarray
-    first: bool
-    last: bool
-
-
-@borrowing
-def _begin(task, first, end, vectors, sums):
-    """Write the vectors of the nodes [first, end) to planes, and clear their sums."""
-    stride = len(sums) // 3
-    split_components(task.u, first, end - first, vectors, stride, 0)
-    for c in range(3):
-        fill(sums[c * stride + first : c * stride + end], 0.0)
-
-
-@borrowing
-def _end(task, first, end, sums):
-    """Write the products of the nodes [first, end)."""
-    nodal = task.nodal[first:end]
-    end = first + len(nodal)
-    _join(nodal, task.u[first:end].reshape(-1), sums[first:], len(sums) // 3, task.out[first:end].reshape(-1))
-
-
-@borrowing_apart
-def _join(nodal, u, sums, stride, out):
-    """Write nodal u and sums in planes to vectors (3 n,)."""
-    xs, ys, zs = sums, sums[stride:], sums[2 * stride :]
-    for i in range(len(nodal)):
-        out[3 * i] = nodal[i] * u[3 * i] + xs[i]
-        out[3 * i + 1] = nodal[i] * u[3 * i + 1] + ys[i]
-        out[3 * i + 2] = nodal[i] * u[3 * i + 2] + zs[i]
-
-
-def _group_loop(diagonal: bool) -> Callable[..., Any]:
-    """Make the loop over groups of padded runs that adds products, or the diagonal of the stiffness."""
-    sign = 1.0 if diagonal else -1.0
-
-    @borrowing_apart
-    def add_groups(bars, places, vectors, sums, task, work):
-        """Add to ``sums`` (3 stride,); ``work``: what is due to the lower ends of the bars of a block of nodes.
-
-        Vectors are split shortly before they are needed, and products written as soon as they are complete.
-        """
-        heads, fars, starts = bars.groups.heads, bars.groups.fars, bars.groups.starts
-        stride = len(places) // 3
-        along, across = bars.along, bars.across
-        origin = -1  # first node of the block whose sums are in the workspace
-        wide = 0
-        nodes = len(task.u)
-        ready, done = (0 if task.first else nodes), 0
-        for group in range(len(heads)):
-            first = starts[group]
-            n = starts[group + 1] - first
-            node, far = np.int64(heads[group]), np.int64(fars[group])
-            block = node // NODE_BLOCK * NODE_BLOCK
-            if block != origin:
-                if origin >= 0:
-                    add_lower_ends(work, wide, sums, origin)
-                clear_lower_ends(work)
-                origin = block
-                wide = 0
-                if not diagonal and task.last and bars.ascending:
-                    _end(task, done, block, sums)
-                    done = block
-            if not diagonal and ready < min(far + n, nodes):
-                _begin(task, ready, min(far + n, nodes), vectors, sums)
-                ready = min(far + n, nodes)
-            lower = work[node - block :]
-            wide = max(wide, node - block + n)
-            x0, x1 = node, far
-            y0, y1, z0, z1 = x0 + stride, x1 + stride, x0 + 2 * stride, x1 + 2 * stride
-            for i in range(n):
-                # unsigned: negative indices need not be handled
-                dx = places[np.uint64(x1 + i)] - places[np.uint64(x0 + i)]
-                dy = places[np.uint64(y1 + i)] - places[np.uint64(y0 + i)]
-                dz = places[np.uint64(z1 + i)] - places[np.uint64(z0 + i)]
-                c, g = along[first + i], across[first + i]
-                if diagonal:
-                    fx, fy, fz = c * (dx * dx) + g, c * (dy * dy) + g, c * (dz * dz) + g
-                else:
-                    ux = vectors[np.uint64(x1 + i)] - vectors[np.uint64(x0 + i)]
-                    uy = vectors[np.uint64(y1 + i)] - vectors[np.uint64(y0 + i)]
-                    uz = vectors[np.uint64(z1 + i)] - vectors[np.uint64(z0 + i)]
-                    c *= dx * ux + dy * uy + dz * uz
-                    fx, fy, fz = c * dx + g * ux, c * dy + g * uy, c * dz + g * uz
-                _add_force(lower, i, sign, (fx, fy, fz))
-                sums[np.uint64(x1 + i)] += fx
-                sums[np.uint64(y1 + i)] += fy
-                sums[np.uint64(z1 + i)] += fz
-        if origin >= 0:
-            add_lower_ends(work, wide, sums, origin)
-        if not diagonal:
-            if ready < nodes:
-                _begin(task, ready, nodes, vectors, sums)
-            if task.last:
-                _end(task, done, nodes, sums)
-
-    return add_groups
-
-
-_add_group_products, _add_group_diagonals = _group_loop(False), _group_loop(True)
-
-
-@kernel
-def add_padded_products(bars, planes, task):
-    """Add the products of :class:`PaddedBars` for a :class:`Task`; ``planes`` (3 stride,) of positions, vectors and
-    sums."""
-    places, vectors, sums = planes
-    _add_group_products(bars, places, vectors, sums, task, new_rows(3))
-
-
-@kernel
-def add_padded_diagonals(bars, planes, diagonal):
-    """Add the diagonal of :class:`PaddedBars` to ``diagonal`` (n, 3); ``planes`` as for products."""
-    places, vectors, sums = planes
-    fill(sums, 0.0)
-    _add_group_diagonals(bars, places, vectors, sums, Task(diagonal, diagonal, sums, False, False), new_rows(3))
-    _add_components(sums, diagonal)
-
-
-@kernel
-def add_products(sweep, far, x, stored, u, out):
-    """Add K u to ``out``, run by run of a :class:`~pfem_petsc.mechanics.runs.Sweep`."""
-    heads, starts, chunks = sweep.heads, sweep.starts, sweep.chunks
-    for chunk in range(len(sweep.diagonal)):
-        if sweep.diagonal[chunk]:
-            _add_diagonal_runs(sweep, chunk, x, stored, u, out)
-            continue
-        for run in range(chunks[chunk], chunks[chunk + 1]):
-            a = heads[run]
-            ax, ay, az = x[a, 0], x[a, 1], x[a, 2]
-            px, py, pz = u[a, 0], u[a, 1], u[a, 2]
-            sx = sy = sz = 0.0
-            for k in range(starts[run], starts[run + 1]):
-                b = far[k]
-                dx, dy, dz = x[b, 0] - ax, x[b, 1] - ay, x[b, 2] - az
-                ux, uy, uz = u[b, 0] - px, u[b, 1] - py, u[b, 2] - pz
-                c = stored[0, k] * (dx * ux + dy * uy + dz * uz)
-                g = stored[1, k]
-                fx, fy, fz = c * dx + g * ux, c * dy + g * uy, c * dz + g * uz
-                sx += fx
-                sy += fy
-                sz += fz
-                out[b, 0] += fx
-                out[b, 1] += fy
-                out[b, 2] += fz
-            out[a, 0] -= sx
-            out[a, 1] -= sy
-            out[a, 2] -= sz
+    needed: np.ndarray
+    complete: np.ndarray
 
 
 @inlined
-def _add_diagonal_runs(sweep, chunk, x, stored, u, out):
-    """Add the products of a chunk of diagonal runs."""
-    heads, fars, starts = sweep.heads, sweep.fars, sweep.starts
-    for run in range(sweep.chunks[chunk], sweep.chunks[chunk + 1]):
-        for k in range(starts[run], starts[run + 1]):
-            a, b = heads[run] + k - starts[run], fars[run] + k - starts[run]
-            dx, dy, dz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
-            ux, uy, uz = u[b, 0] - u[a, 0], u[b, 1] - u[a, 1], u[b, 2] - u[a, 2]
-            c = stored[0, k] * (dx * ux + dy * uy + dz * uz)
-            g = stored[1, k]
+def _begin(first, end, u, vectors, sums):
+    """Write the vectors of nodes to components, and clear their sums."""
+    for k in range(first, end):
+        i, at = np.uint64(k), np.uint64(3 * k)
+        vectors[0, i], vectors[1, i], vectors[2, i] = u[at], u[np.uint64(3 * k + 1)], u[np.uint64(3 * k + 2)]
+        sums[0, i] = 0.0
+        sums[1, i] = 0.0
+        sums[2, i] = 0.0
+
+
+@inlined
+def _end(first, end, nodal, u, sums, out):
+    """Write the products of nodes; those of ghosts are not complete, and zero."""
+    for k in range(first, min(end, len(nodal))):
+        i, at, after, last = np.uint64(k), np.uint64(3 * k), np.uint64(3 * k + 1), np.uint64(3 * k + 2)
+        out[at] = nodal[i] * u[at] + sums[0, i]
+        out[after] = nodal[i] * u[after] + sums[1, i]
+        out[last] = nodal[i] * u[last] + sums[2, i]
+    for k in range(3 * max(first, len(nodal)), 3 * end):
+        out[k] = 0.0
+
+
+@inlined
+def _add_products_of_runs(n, head, far, first, origin, x, u, stored, sums, work):
+    """Add the products of n columns to the upper ends, and subtract them from the lower ones in a workspace for the
+    nodes of a block, which begins at ``origin``."""
+    for k in range(n):
+        a, b, i, at = np.uint64(head + k), np.uint64(far + k), np.uint64(first + k), np.uint64(head - origin + k)
+        dx, dy, dz = x[0, b] - x[0, a], x[1, b] - x[1, a], x[2, b] - x[2, a]
+        ux, uy, uz = u[0, b] - u[0, a], u[1, b] - u[1, a], u[2, b] - u[2, a]
+        c, g = stored[0, i] * (dx * ux + dy * uy + dz * uz), stored[1, i]
+        px, py, pz = c * dx + g * ux, c * dy + g * uy, c * dz + g * uz
+        work[_X + at] -= px
+        work[_Y + at] -= py
+        work[_Z + at] -= pz
+        sums[0, b] += px
+        sums[1, b] += py
+        sums[2, b] += pz
+
+
+@inlined
+def _flush(origin, count, sums, work):
+    """Add what is due to the first nodes of a block, and clear it."""
+    for k in range(count):
+        i, at = np.uint64(origin + k), np.uint64(k)
+        sums[0, i] += work[_X + at]
+        sums[1, i] += work[_Y + at]
+        sums[2, i] += work[_Z + at]
+        work[_X + at] = 0.0
+        work[_Y + at] = 0.0
+        work[_Z + at] = 0.0
+
+
+@inlined
+def _add_products_of_stars(first_run, end, first, nodes, bars, far, x, u, stored, sums):
+    """Add the products of a group of stars, whose first column is ``first``."""
+    ahead = first - np.int64(bars[first_run])
+    for run in range(first_run, end):
+        a = np.uint64(nodes[run])
+        ax, ay, az = x[0, a], x[1, a], x[2, a]
+        px, py, pz = u[0, a], u[1, a], u[2, a]
+        sx = sy = sz = 0.0
+        for k in range(np.int64(bars[run]), np.int64(bars[run + 1])):
+            b, i = np.uint64(far[k]), np.uint64(ahead + k)
+            dx, dy, dz = x[0, b] - ax, x[1, b] - ay, x[2, b] - az
+            ux, uy, uz = u[0, b] - px, u[1, b] - py, u[2, b] - pz
+            c = stored[0, i] * (dx * ux + dy * uy + dz * uz)
+            g = stored[1, i]
             fx, fy, fz = c * dx + g * ux, c * dy + g * uy, c * dz + g * uz
-            out[a, 0] -= fx
-            out[a, 1] -= fy
-            out[a, 2] -= fz
-            out[b, 0] += fx
-            out[b, 1] += fy
-            out[b, 2] += fz
+            sx += fx
+            sy += fy
+            sz += fz
+            sums[0, b] += fx
+            sums[1, b] += fy
+            sums[2, b] += fz
+        sums[0, a] -= sx
+        sums[1, a] -= sy
+        sums[2, a] -= sz
 
 
 @kernel
-def add_diagonals(bars, x, stored, begun, ended, diagonal):
-    """Add the diagonal of K by the bars (b, 2) [begun, ended) to ``diagonal`` (local nodes, 3)."""
-    for k in range(begun, ended):
+def multiply(layout, x, vectors, stored, sums, work, task):
+    """Write nodal u + K u; positions, vectors and sums by components, ``stored`` (2, columns) of a
+    :class:`~.layout.BarLayout`, ``work`` (3 ROW,) zeros.
+
+    Vectors are split shortly before they are needed, and products written as soon as they are complete.
+    """
+    nodal, u, out = task.nodal, task.u, task.out
+    begun, ended, origin, wide = np.int64(0), np.int64(0), np.int64(-1), np.int64(0)
+    for group in range(len(layout.heads)):
+        first, head, star = layout.starts[group], layout.heads[group], layout.stars[group]
+        block = np.int64(-1) if star else head // NODE_BLOCK * NODE_BLOCK
+        if block != origin and origin >= 0:
+            _flush(origin, wide, sums, work)
+            wide = np.int64(0)
+        if (block != origin or star) and group > 0 and task.complete[group - 1] > ended:
+            _end(ended, task.complete[group - 1], nodal, u, sums, out)
+            ended = task.complete[group - 1]
+        origin = block
+        if task.needed[group] > begun:
+            _begin(begun, task.needed[group], u, vectors, sums)
+            begun = task.needed[group]
+        if star:
+            runs = layout.runs[group], layout.runs[group + 1]
+            _add_products_of_stars(
+                runs[0], runs[1], first, layout.nodes, layout.bars, layout.far, x, vectors, stored, sums
+            )
+        else:
+            n = layout.starts[group + 1] - first
+            wide = max(wide, head - origin + n)
+            _add_products_of_runs(n, head, layout.fars[group], first, origin, x, vectors, stored, sums, work)
+    if origin >= 0:
+        _flush(origin, wide, sums, work)
+    nodes = len(u) // 3
+    _begin(begun, nodes, u, vectors, sums)
+    _end(ended, nodes, nodal, u, sums, out)
+
+
+@kernel
+def add_diagonals(bars, x, stored, diagonal):
+    """Add the diagonal of K by the bars (b, 2) to ``diagonal`` (local nodes, 3)."""
+    for k in range(len(bars)):
         a, b = bars[k, 0], bars[k, 1]
         for i in range(3):
             d = x[b, i] - x[a, i]

@@ -80,7 +80,7 @@ class RestLengths:
         """Take over the rest lengths (b,) [m] of the previous stage if they remain in force."""
         if self.any:
             for part in self._held:
-                self._bars.rest[part] = rest[part]
+                self._bars.set_rest(part, rest[part])
             if self.varying:
                 self._bars.rest_at_start = self._bars.rest.copy()
 
@@ -93,7 +93,7 @@ class RestLengths:
         """Give all bars the smallest rest lengths that they have at any time, which make them stiffest."""
         for entry in self._entries:
             part = slice(entry.block.start, entry.block.stop)
-            self._bars.rest[part] = self._bars.mesh_lengths[part] / entry.largest()
+            self._bars.set_rest(part, self._bars.mesh_lengths[part] / entry.largest())
 
 
 class _Entry:
@@ -114,7 +114,7 @@ class _Entry:
         """Set the rest lengths of the bars at a time [s], or at a load factor."""
         value = float(self._table(time)[0])
         part = slice(self.block.start, self.block.stop)
-        bars.rest[part] = bars.mesh_lengths[part] / self._stretch(value)
+        bars.set_rest(part, bars.mesh_lengths[part] / self._stretch(value))
 
     def largest(self) -> np.ndarray | float:
         """Return the largest stretch in the mesh at any time."""

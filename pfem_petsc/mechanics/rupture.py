@@ -26,15 +26,13 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ..columns import STORED
-from .compiled import borrowing, inlined, kernel
-from .elements import end_difference, length_of
+from .compiled import inlined
 from .materials.base import Law
-from .tuples import bar_value, blend, sum_with, take, take_from, written_out
 
 if TYPE_CHECKING:
     from ..case.tables import Rupture
 
-__all__ = ["LIMITS", "WHOLE", "breakable", "intact", "limit_values", "make_release", "variable_of"]
+__all__ = ["LIMITS", "WHOLE", "breakable", "intact", "limit_values", "variable_of"]
 
 LIMITS = ("stress", "strain", "compressive_stress", "compressive_strain", "plastic_strain", "damage")
 """Keys of the limits, in the order of their values."""
@@ -95,50 +93,56 @@ def breakable(law: Law) -> Law:
     )
 
 
-@cache
-def make_release(law: Law, measure: Callable[..., Any]) -> Callable[..., Any]:
-    """Make the loop that removes a share of bars, for a law that is not breakable itself; see :func:`breakable`.
+@inlined
+def _choose(one, other, condition):
+    """Return a number if a condition holds, else another."""
+    return one if condition else other
 
-    Its arguments are positions and the bars, as for the loops in :mod:`~pfem_petsc.mechanics.elements`; ``members``,
-    the local bars; the state -r, or r where they have begun to break, that they are to have, if they have not left
-    further; ``counted``, the end of the bars counted on this rank; and ``moved``, to which the stored energies that are
-    released [J] are added, one for each energy of the law.
-    """
-    count = len(law.internal)
-    stored = tuple(name in STORED for name in law.energies)
-    n_energies, n_rows = len(stored), len(breakable(law).rows)
-    respond, first, of_law, n_data = law.response, count + 1, _OF_LAW, len(law.bar_data)
-    variables_of, data_of = take(count), take_from(n_data)
 
-    @borrowing
-    def densities_of(x, bars, k, column):
-        strain, _, _ = measure(length_of(end_difference(x, bars, k)) / bars.rest[k])
-        warmth = 0.0
-        if bars.heat.shape[1] > 0:
-            strain -= bars.heat[0, k]
-            warmth = bars.heat[1, k]
-        p = bars.parameters[of_law:]
-        given = p + data_of(bars.history, n_rows, column) if n_data else p
-        _, _, _, densities = respond(strain, 0.0, 0.0, warmth, given, variables_of(bars.history, column))
-        return densities
+@inlined
+def _add(one, other, factor):
+    return one + factor * other
 
-    @kernel
-    def release(x, bars, members, state, counted, moved):
-        for k in members:
-            column = k - np.int64(bars.start)
-            now = abs(bars.history[count, column])
-            if now >= state:
-                continue
-            densities = densities_of(x, bars, k, column)
-            for j in range(n_energies):
-                lost = (state - now) * densities[j]
-                bars.history[first + j, column] += lost
-                if stored[j] and k < counted:
-                    moved[j] += bar_value(bars.area, column) * bars.rest[k] * lost
-            # one that has begun to break counts as broken
-            bars.history[count, column] = state if bars.history[count, column] > 0.0 else -state
 
-    return release
+@inlined
+def _unless(value, stored, none):
+    return none if stored else value
+
+
+def _each(combine: Callable[..., Any], count: int) -> Callable[..., Any]:
+    """Make a function that combines two tuples of ``count`` numbers, each pair of them with a third number."""
+    if count == 0:
+
+        @inlined
+        def nothing(one, other, number):
+            return ()
+
+        return nothing
+    before, k = _each(combine, count - 1), count - 1
+
+    @inlined
+    def combined(one, other, number):
+        return before(one, other, number) + (combine(one[k], other[k], number),)  # noqa: RUF005 - tuples of Numba
+
+    return combined
+
+
+def _total(stored: tuple[bool, ...]) -> Callable[..., Any]:
+    """Make a function that adds up the numbers of a tuple that are ``stored``."""
+    if not stored:
+
+        @inlined
+        def nothing(values):
+            return 0.0
+
+        return nothing
+    before, k, last = _total(stored[:-1]), len(stored) - 1, stored[-1]
+
+    @inlined
+    def total(values):
+        return before(values) + values[k] if last else before(values)
+
+    return total
 
 
 def _response(
@@ -154,12 +158,9 @@ def _response(
     ``plastic``, ``damage``: places of the variables with a limit, or -1; ``stored``: which energies bars store.
     """
     first, of_law = count + 1, _OF_LAW
-    parts = [f"values[{j}]" if part else "0.0" for j, part in enumerate(stored)]
-    others = ["0.0" if part else f"values[{j}]" for j, part in enumerate(stored)]
-    released = written_out("def function(values): return " + " + ".join(part for part in parts if part != "0.0"), 0)
-    dissipated = written_out("def function(values): return (" + "".join(f"{part}, " for part in others) + ")", 0)
-    none = (0.0,) * len(stored)
-    choose, choose_new, add = blend(len(stored)), blend(count), sum_with(len(stored))
+    n_energies = len(stored)
+    released, unless, choose = _total(stored), _each(_unless, n_energies), _each(_choose, n_energies)
+    choose_new, add, none = _each(_choose, count), _each(_add, n_energies), (0.0,) * n_energies
     by_plastic, by_damage = plastic >= 0, damage >= 0
     plastic, damage = max(plastic, 0), max(damage, 0)
 
@@ -178,12 +179,12 @@ def _response(
         after = state + p[6] if breaks else state
         after = 1.0 if after > WHOLE else after
         remaining = 1.0 - abs(after)
-        densities = choose(there, densities, none)
-        kept = add(q[first:], left - remaining, densities)
-        shown = add(dissipated(kept), remaining, densities)
+        densities = choose(densities, none, there)
+        kept = add(q[first:], densities, left - remaining)
+        shown = add(unless(kept, stored, 0.0), densities, remaining)
         stress = left * stress if there else 0.0
         tangent = left * tangent if there else 0.0
-        new = choose_new(there, new, q[:count])
+        new = choose_new(new, q[:count], there)
         return stress, tangent, new + (after,) + kept, shown + (released(kept),)  # noqa: RUF005 - tuples of Numba
 
     return response

@@ -117,8 +117,8 @@ class DistributedMesh:
         """Fill the ghost rows of ``array`` (n_local, k) float64, C-contiguous, with the owners' values. Collective."""
         self._exchange.update(array)
 
-    def messages(self) -> Messages | None:
-        """Return the messages that update ghosts of positions, for compiled loops; None if loops cannot call MPI."""
+    def messages(self) -> Messages:
+        """Return the messages that update ghosts of positions, for compiled loops."""
         return self._exchange.messages()
 
     def close(self) -> None:

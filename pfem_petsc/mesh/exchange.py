@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numba.experimental.function_type  # noqa: F401  # registers the type of C functions as arguments
 import numpy as np
 from mpi4py import MPI
+from numba import types
 
-__all__ = ["GhostExchange", "Messages", "Router", "swap"]
+__all__ = ["CFunction", "GhostExchange", "Messages", "Router", "mpi_functions", "swap"]
 
 # First tag of the ghost messages; the number of columns is added, so that exchanges of different widths can be in
 # progress at the same time.
@@ -94,26 +97,54 @@ class Messages(NamedTuple):
 
     Attributes
     ----------
+    several : whether there are several ranks
     rows : (r,) owned rows that are sent; leaving : (r, 3), arriving : (g, 3) buffers
     count : number of requests; requests, statuses : their handles, and room for as many statuses, as bytes
-    start_all, wait_all, reduce_all : addresses of ``MPI_Startall``, ``MPI_Waitall`` and ``MPI_Allreduce``
     handles : (3,) of the type int, the maximum, and the communicator
     """
 
+    several: bool
     rows: np.ndarray
     leaving: np.ndarray
     arriving: np.ndarray
     count: int
     requests: np.ndarray
     statuses: np.ndarray
-    start_all: int
-    wait_all: int
-    reduce_all: int
     handles: np.ndarray
 
 
-def _addresses() -> tuple[int, ...] | None:
-    """Return the addresses of the functions of :class:`Messages`; None if they cannot be found."""
+class CFunction(types.WrapperAddressProtocol):
+    """A C function that compiled loops take as an argument.
+
+    Parameters
+    ----------
+    function : of ctypes
+    signature : of Numba
+    """
+
+    def __init__(self, function: Any, signature: Any) -> None:
+        self._function, self._signature = function, signature
+
+    def __wrapper_address__(self) -> int:
+        """Return the address of the function."""
+        return ctypes.cast(self._function, ctypes.c_void_p).value
+
+    def signature(self) -> Any:
+        """Return the signature of the function."""
+        return self._signature
+
+
+_BYTES, _INT = types.CPointer(types.uint8), types.int32
+SIGNATURES = {
+    "MPI_Startall": _INT(_INT, _BYTES),
+    "MPI_Waitall": _INT(_INT, _BYTES, _BYTES),
+    "MPI_Allreduce": _INT(types.CPointer(_INT), types.CPointer(_INT), _INT, types.intp, types.intp, types.intp),
+}
+
+
+@functools.cache
+def mpi_functions() -> tuple[CFunction, ...] | None:
+    """Return ``MPI_Startall``, ``MPI_Waitall`` and ``MPI_Allreduce`` for compiled loops; None if there are none."""
     try:
         library = ctypes.CDLL(MPI.__file__)
         text, length = ctypes.create_string_buffer(MPI.MAX_LIBRARY_VERSION_STRING), ctypes.c_int()
@@ -121,8 +152,7 @@ def _addresses() -> tuple[int, ...] | None:
         # a library of another MPI than mpi4py's would not know its requests
         if text.value.decode().strip() != MPI.Get_library_version().strip("\0 \n"):
             return None
-        names = "MPI_Startall", "MPI_Waitall", "MPI_Allreduce"
-        return tuple(ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in names)
+        return tuple(CFunction(getattr(library, name), signature) for name, signature in SIGNATURES.items())
     except (OSError, AttributeError):
         return None
 
@@ -188,14 +218,8 @@ class GhostExchange:
         MPI.Request.Waitall(buffers.requests)
         return buffers.arriving
 
-    def messages(self) -> Messages | None:
-        """Return the messages of arrays with three columns for compiled loops, valid until :meth:`close`.
-
-        None if the functions of MPI cannot be called by loops. One rank has none, and needs no functions.
-        """
-        addresses = (0, 0, 0) if self._comm.size == 1 else _addresses()
-        if addresses is None:
-            return None
+    def messages(self) -> Messages:
+        """Return the messages of arrays with three columns for compiled loops, valid until :meth:`close`."""
         buffers = self._of(3)
         handle, status = MPI._sizeof(MPI.Request), MPI._sizeof(MPI.Status)
         handles = [ctypes.string_at(MPI._addressof(request), handle) for request in buffers.requests]
@@ -204,7 +228,7 @@ class GhostExchange:
         rows = self.rows.astype(np.int64)
         used = np.array([MPI._handleof(each) for each in (MPI.INT, MPI.MAX, self._comm)], dtype=np.uint64)
         arrays = buffers.leaving, buffers.arriving, len(handles), requests, statuses
-        return Messages(rows, *arrays, *addresses, used.view(np.int64))
+        return Messages(self._comm.size > 1, rows, *arrays, used.view(np.int64))
 
     def update(self, array: np.ndarray) -> None:
         """Send the owned rows of ``array`` (n_local, k) float64 to their ghosts on other ranks."""

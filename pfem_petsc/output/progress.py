@@ -7,9 +7,8 @@ import os
 import sys
 import textwrap
 from collections.abc import Callable
-from datetime import datetime
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, strftime
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 from ..errors import InputError
@@ -57,8 +56,11 @@ class LogFile:
         if self._lost:
             return
         try:
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {level:7} {text}\n")
+            file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+            try:  # without what needs imports, which a run that is left at the end of a program cannot make
+                os.write(file, f"{strftime('%Y-%m-%d %H:%M:%S')} {level:7} {text}\n".encode())
+            finally:
+                os.close(file)
         except OSError as error:
             self._lost = True
             print(

@@ -181,7 +181,7 @@ class Observer(ABC):
         return bool(self.every) and step % self.every == 0
 
     def steps_left(self, step: int) -> int:
-        """Return the number of steps until it must act again, which may be made in a batch."""
+        """Return the number of steps until it must act again, which may be made in a call."""
         return self.every - step % self.every if self.every else NEVER
 
     @abstractmethod
@@ -273,21 +273,21 @@ class History(Observer):
         }
 
     def due(self, step: int) -> bool:
-        """Return whether there is a row to record: of this step or, in a batch, of one before."""
+        """Return whether there is a row to record: of this step or, in a call, of one before."""
         return super().due(step) or self._stepper.instants is not None
 
     def steps_left(self, step: int) -> int:
-        """Never: batches of steps collect what rows need."""
+        """Never: compiled steps collect what rows need."""
         return NEVER
 
     def observe(self, made: Step) -> None:
-        """Record rows: of a batch, and of the present state if it is due and not among them."""
+        """Record rows: of compiled steps, and of the present state if it is due and not among them."""
         self.record()
         if super().due(made.step) and self.row["step"] != made.step:
             self.record()
 
     def record(self) -> None:
-        """Record the rows of the last step or batch, unless a rank has a fault, which is raised on all ranks."""
+        """Record the rows of the last step or call, unless a rank has a fault, which is raised on all ranks."""
         rows, alarms = self.recorder.rows(alarm=self._synchroniser.alarm)
         begun = 0
         for alarm in np.flatnonzero(alarms).tolist():

@@ -8,15 +8,14 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..mechanics.compiled import borrowing_apart, kernel
-from ..mechanics.runs import new_rows
-from ..mechanics.tuples import CHUNK, ROW
+from ..mechanics.chunk_laws import CHUNK
+from ..mechanics.compiled import inlined, kernel
 
 if TYPE_CHECKING:
     from .matrix_free import MatrixFreeHessian
 
 
-@borrowing_apart
+@inlined
 def _advance_part(length, vectors, first, count, work):
     """Advance solution and residual; add the squares of the residual, and its products with that over the diagonal, to
     rows of a workspace."""
@@ -27,7 +26,7 @@ def _advance_part(length, vectors, first, count, work):
         left = r[k] - length * q[k] if inverse[k] != 0.0 else 0.0
         r[k] = left
         work[i] += left * left
-        work[ROW + i] += left * (inverse[k] * left)
+        work[CHUNK + i] += left * (inverse[k] * left)
 
 
 @kernel
@@ -35,12 +34,10 @@ def advance(length, vectors):
     """Make a step of a length along p, with ``vectors`` (n,) p, q = A p, the inverse diagonal, solution and residual;
     return the square of the residual and its product with that over the diagonal. The residual is zero where the
     inverse is, which stands for unknowns that are held."""
-    work = new_rows(2)
-    for i in range(CHUNK):
-        work[i] = work[ROW + i] = 0.0
+    work = np.zeros(2 * CHUNK)
     for first in range(0, len(vectors[0]), CHUNK):
         _advance_part(length, vectors, first, min(CHUNK, len(vectors[0]) - first), work)
-    return work[:CHUNK].sum(), work[ROW : ROW + CHUNK].sum()
+    return work[:CHUNK].sum(), work[CHUNK:].sum()
 
 
 @kernel

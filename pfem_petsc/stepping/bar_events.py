@@ -146,7 +146,7 @@ class Ruptures:
         fresh = np.flatnonzero(broken & ~self._known & self._counted)
         self._known = broken
         self.count += len(fresh)
-        self._bars.watched  # noqa: B018 - batches of steps read the array
+        self._bars.watched  # noqa: B018 - compiled steps read the array
         for bar in fresh[: MOST_TOLD - len(self._pending)]:
             text = f"bar {self._mesh.bar_ids[bar]} broke at {where}: {self._reason(x, int(bar))}"
             self._pending.append(Break(number, int(self._mesh.bar_ids[bar]), text))

@@ -13,7 +13,7 @@ from ..integrators.base import Balance
 from ..mechanics.compiled import kernel
 from ..parallel.ending import is_alone
 from ..tolerances import BEYOND, PROJECTED
-from .batch import Batch
+from .compiled_steps import CompiledSteps
 from .stepper import Solution, Stepper
 
 if TYPE_CHECKING:
@@ -65,42 +65,42 @@ def react(supports, load, contact, stiffness, u, support):
 
 class ExplicitStepper(Stepper):
     """Solves (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat node by node; steps that nothing interrupts are
-    made in batches where these apply."""
+    made in compiled calls where these apply."""
 
     def __init__(self, model: Model, scheme: Scheme, h: float) -> None:
         super().__init__(model, scheme, h)
         self._nobody = np.empty(0, dtype=np.int64)
-        self._batch: Batch | None = None
-        self._batched: bool | None = None  # whether batches apply; None until it is known
+        self._compiled: CompiledSteps | None = None
+        self._serves: bool | None = None  # whether compiled steps apply; None until it is known
         self._stiffness, self._stiffness_of = np.empty(0), (0.0, 0.0, None)
 
     def steps(self, most: int) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. The first step is made alone: the start may have stopped
         nodes."""
         ledger, state = self.ledger, self.state
-        if self._batched is None:
-            self._batched = ledger is not None and Batch.serves(self)
-        if not self._batched or ledger.powers is None:
+        if self._serves is None:
+            self._serves = ledger is not None and CompiledSteps.serves(self)
+        if not self._serves or ledger.powers is None:
             if ledger is not None and ledger.powers is not None:
-                ledger.end_batches()
+                ledger.end_compiled()
             self.step()
-            if self._batched:
-                ledger.begin_batches()
+            if self._serves:
+                ledger.begin_compiled()
             return
-        if self._batch is None:
-            self._batch = Batch(self)
-        self._batch.make(most, self.removals.steps_left(state.time, self.h))
+        if self._compiled is None:
+            self._compiled = CompiledSteps(self)
+        self._compiled.make(most, self.removals.steps_left(state.time, self.h))
         self.leave()
         state.step += 1
 
     def supports_changed(self) -> None:
         super().supports_changed()
         if self.model.supports.moves and self.ledger is not None and self.ledger.powers is not None:
-            self.ledger.end_batches()  # works of components that no longer move are over the ways between positions
+            self.ledger.end_compiled()  # works of components that no longer move are over the ways between positions
         self.load_ended()
 
     def load_ended(self) -> None:
-        self._batch, self._batched = None, None
+        self._compiled, self._serves = None, None
 
     @contextmanager
     def _faults(self, balance: Balance) -> Iterator[None]:

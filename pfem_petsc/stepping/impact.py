@@ -10,6 +10,7 @@ from mpi4py import MPI
 from ..contact.fixed_rows import close_rows
 from ..contact.surfaces import wall_gaps
 from ..mechanics.compiled import kernel
+from ..mechanics.records import record
 from ..tolerances import ON_BOUND
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ class Approach(NamedTuple):
     pulls: np.ndarray
 
 
+@record
 class Touched(NamedTuple):
     """Contacts of the nodes (owned,) of a rank with walls (w,).
 

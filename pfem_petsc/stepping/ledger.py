@@ -13,7 +13,7 @@ from ..mechanics.elements import MEASURES
 from ..mechanics.materials.base import SMALL
 from .impact import Impacts
 from .impulses import Impulses, NoImpulses
-from .ledger_loops import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS, power, sum_momenta, total
+from .phases import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS, power, sum_momenta
 
 if TYPE_CHECKING:
     from ..mechanics.bars import BarBlock
@@ -220,7 +220,7 @@ _TOTALS = slice(HEAD.first("momentum"), HEAD["support_force"].stop)
 
 
 class Ledger:
-    """Accumulates this rank's share of works, dissipations and impulses: step by step, or, of batches of steps, balance
+    """Accumulates this rank's share of works, dissipations and impulses: step by step, or, of compiled steps, balance
     by balance.
 
     Attributes
@@ -232,7 +232,7 @@ class Ledger:
     impacts : Impacts
     powers : (5,) works of all balances of a leapfrog scheme up to the present one, in the order of ``WORKS`` [J]; at
         the place of inertia is the constant that continues the numerical dissipation of what came before. None if the
-        last step was not of a batch
+        last step was not a compiled one
     """
 
     def __init__(self, stepper: Stepper) -> None:
@@ -320,7 +320,7 @@ class Ledger:
         self.sums[_AT["kinetic_energy"]] = present.kinetic
         for k, force in enumerate((state.support, second.external, second.damping)):
             if force is not zero:
-                sums[k] = total(force)
+                sums[k] = force.sum(axis=0)
         sums[2] *= -1.0
         if self.model.bars.springs is not None:  # reactions of the ground: the forces of bars cancel in the sum
             sums[0] -= second.internal.sum(axis=0)
@@ -328,7 +328,7 @@ class Ledger:
         self.sums[_TOTALS] = np.concatenate([momenta, sums[:1]]).reshape(-1)
         return sums
 
-    def begin_batches(self) -> None:
+    def begin_compiled(self) -> None:
         """Continue the works balance by balance, after a step."""
         stepper, present, h, sums = self.stepper, self._before, self.stepper.h, self.sums
         v, a = present.velocity, present.acceleration
@@ -359,7 +359,7 @@ class Ledger:
         self._release()
 
     def _release(self) -> None:
-        """Keep of the moment before only what batches of steps need, which have their own arrays."""
+        """Keep of the moment before only what compiled steps need, which have their own arrays."""
         self._before = Moment(*9 * (self.stepper.zero,), self._before.kinetic, self._before.energy)
 
     @property
@@ -372,15 +372,15 @@ class Ledger:
         """Energy that friction dissipates in the next step, which the last balance has determined [J]."""
         return self._pending[1]
 
-    def follow_batch(self, sums: np.ndarray, friction: float) -> None:
-        """Take the sums (width of HEAD,) at the end of a batch of steps, and :attr:`friction_ahead`."""
+    def follow_compiled(self, sums: np.ndarray, friction: float) -> None:
+        """Take the sums (width of HEAD,) at the end of a call of compiled steps, and :attr:`friction_ahead`."""
         self._pending = [0.0, friction]
         self.sums[:] = sums
         self.sums[_AT_STATE] = 0.0
         self._before.energy = self.stepper.energy
 
-    def end_batches(self) -> None:
-        """Keep the present state, from which a step without batches goes on."""
+    def end_compiled(self) -> None:
+        """Keep the present state, from which a single step goes on."""
         self._before = moment_of(self.stepper)
         self._before.kinetic = self.sums[_AT["kinetic_energy"]]
         self._walls_before()

@@ -213,7 +213,7 @@ class Model:
 
     @property
     def steady(self) -> bool:
-        """Whether steps can be made in batches: supports are along axes, bars and damping constant in time, loads
+        """Whether steps can be compiled ones: supports are along axes, bars and damping constant in time, loads
         depend on time alone, and walls are infinite planes, spheres or cylinders, without mass and not tied."""
         others = any(family is not self.bars.springs for family in self.bars.families)
         changing = self.supports.inclined is not None or self.bars_vary or others or self.inertia.varies

@@ -276,7 +276,7 @@ def _highest_frequency(model: Model) -> Frequency:
     varying = softens or model.rest_lengths.varying
     if not (varying or bars.slackens):
         return frequency
-    kept = bars.rest.copy(), bars.heat.copy()
+    kept = bars.rest, bars.heat.copy()
     if model.rest_lengths.varying:
         model.rest_lengths.shorten()
     if softens:
@@ -284,7 +284,7 @@ def _highest_frequency(model: Model) -> Frequency:
     if model.comm.allreduce(bars.tighten(), op=MPI.LOR) or varying:
         other = highest_frequency(model, model.mesh.points)
         frequency = Frequency(min(frequency.lower, other.lower), max(frequency.upper, other.upper))
-    bars.rest[:], bars.heat[:] = kept
+    bars.rest, bars.heat[:] = kept
     return frequency
 
 

@@ -225,9 +225,9 @@ class Stepper(ABC):
         arrays with a row for each owned node, and for each local bar
     columns : names of attributes, numbers, that are columns of the history
     remedy : what the user can do against steps that are too large
-    row_every : steps between rows of the history, which batches of steps collect in ``instants``; 0: none
+    row_every : steps between rows of the history, which compiled steps collect in ``instants``; 0: none
     probed : nodes whose motion and forces these have
-    instants : of the last batch, until they are recorded, the same on all ranks; None without
+    instants : of the last call, until they are recorded, the same on all ranks; None without
     event_columns : columns of events and their types; empty for steppers without events
     events : found with the last step and not recorded yet, the same on all ranks; each has ``row()`` and a text
     """

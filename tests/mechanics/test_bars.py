@@ -42,7 +42,8 @@ def truss(comm):
             twin.accumulated = np.abs(twin.plastic) + random.uniform(0.0, 2e-3, len(twin.bars))
             for block in model.bars.blocks:
                 ids = model.mesh.bar_ids[block.start : block.stop]
-                block.history[:] = twin.plastic[ids], twin.accumulated[ids]
+                block.put_row(0, twin.plastic[ids])
+                block.put_row(1, twin.accumulated[ids])
         return model, twin
 
     return make

@@ -1,20 +1,21 @@
-"""Loops that a process compiles are reported by the run; loops loaded from the cache are not."""
+"""Loops that a process compiles are reported by the run; loops loaded from disk are not, and are never stale."""
 
-import importlib
 import os
 import re
+import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import FunctionType
 
-import numba
 import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.mechanics.compiled import Compilation, _variant, code_digest
-from pfem_petsc.mechanics.elements import MEASURES, batch_pulls, make_loops
+from pfem_petsc.mechanics import compiled
+from pfem_petsc.mechanics.chunk_laws import law_loops
+from pfem_petsc.mechanics.compiled import Compilation, count_compiled, kernel
 from pfem_petsc.mechanics.materials import elastic, elastoplastic
 from pfem_petsc.mechanics.materials.base import LAWS, damped, softened
 from pfem_petsc.mechanics.rupture import breakable
@@ -30,6 +31,33 @@ def inner(x):
 @kernel
 def outer(x):
     return inner(x) + 1.0
+"""
+
+
+def run_python(program, *words, folder=None, **environment):
+    """Return what a process prints, whose machine code is kept in a folder of its own, and its warnings."""
+    done = subprocess.run(
+        [sys.executable, "-c", program, *map(str, words)],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": f"{compiled._PACKAGE.parent}", **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split(), done.stderr
+
+
+OF_ONE_LAW = """
+import sys
+import numpy as np
+from pfem_petsc.mechanics.chunk_laws import densities_row, evaluate
+from pfem_petsc.mechanics.materials import elastic, elastoplastic
+
+PARAMETERS = {"elastic": (elastic.LAW, (2.0,)), "elastoplastic": (elastoplastic.LAW, (2.0, 0.5, 0.0, 0.0, 0.5))}
+for law, p in map(PARAMETERS.get, sys.argv[1:]):
+    found = evaluate(law, p, 0.5, 0.0, np.zeros((len(law.rows), 1)))
+    print(found[densities_row(law) :].sum())
 """
 
 
@@ -49,17 +77,14 @@ def module(tmp_path, monkeypatch):
     sys.modules.pop("loops_of_a_test", None)
 
 
-def test_compiling_is_noticed_once_and_loading_is_not(module):
-    told, took = [], []
-    with Compilation(lambda name, seconds: told.append(name), took.append):
-        assert module().outer(3.0) == 7.0  # the inner one is compiled on the way: one time for both
-        assert (told[0], len(took)) == ("outer", 1)
-        assert 0.0 < took[0] < 60.0
-        assert module().outer(3.0) == 7.0  # from disk
-        assert module().inner(np.float32(1.0)) == 2.0  # for another type
-        assert (told[0], len(took)) == ("outer", 2)
-    module().outer(np.float32(1.0))
-    assert len(took) == 2
+def test_compiling_is_counted_and_loading_is_not(module):
+    before = count_compiled()
+    assert module().outer(3.0) == 7.0
+    assert count_compiled() == before + 2
+    assert module().outer(3.0) == 7.0  # from disk
+    assert count_compiled() == before + 2
+    assert module().inner(np.float32(1.0)) == 2.0  # for another type
+    assert count_compiled() == before + 3
 
 
 def test_machine_code_from_disk_finds_what_it_refers_to(tmp_path):
@@ -92,219 +117,196 @@ def test_machine_code_from_disk_finds_what_it_refers_to(tmp_path):
         "    print(error)\n"
     )
     for _ in range(2):  # compiled, then loaded
-        command = [sys.executable, "-c", program]
-        said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-        assert said == "[0.5 0.5]\nvalue 0.5\ntoo large\n"
+        said, _ = run_python(program, folder=tmp_path)
+        assert " ".join(said) == "[0.5 0.5] value 0.5 too large"
 
 
 def test_short_compilations_are_not_reported():
-    """They count together; a report comes while the loop that makes them long is compiled."""
+    """They count together; a long one is told with the time of all so far, at intervals that grow up to a limit."""
     told, took = [], []
-    with Compilation(lambda *what: told.append(what), took.append, patience=60.0):
-        numba.njit(lambda x: x + 1.0)(1.0)
-    assert (told, len(took)) == ([], 1)
-    with Compilation(lambda *what: told.append(what), took.append, patience=1e-6):
-        numba.njit(lambda x: x + 1.0)(1.0)
-        numba.njit(lambda x: x + 2.0)(1.0)
-    assert ([name for name, _ in told], len(took)) == (["<lambda>"], 3)
-    assert 0.0 < told[0][1] < 60.0
+    watch = Compilation(lambda *what: told.append(what), took.append, patience=2.0)
+    for name, seconds in (("first", 1.5), ("second", 60.0), ("third", 0.5)):
+        for _ in range(int(seconds / 0.5)):
+            watch.look(name, 0.5)
+    times = [2.0, 4.0, 8.0, 16.0, 31.0, 46.0, 61.0]
+    assert told == [("second", time) for time in times]
+    assert sum(took) == 62.0
 
 
-def test_a_long_compilation_is_told_while_it_lasts(monkeypatch):
-    """With the time of all compilations so far, at intervals that grow up to a limit."""
-    now, told, waits = [0.0], [], []
+def test_a_loop_is_told_while_it_is_compiled(monkeypatch):
+    """One whose compilation has failed is not told as one that lasts."""
+    monkeypatch.setattr(compiled, "LOOK_EVERY", 0.005)
 
-    class Timer:
-        """Fires when the clock is moved."""
+    def compiled_for_a_while():
+        @kernel
+        def many(x):
+            return np.linalg.solve(np.eye(3), np.full(3, x)).sum() + np.sort(np.full(3, x))[0]
 
-        def __init__(self, wait, function):
-            waits.append(wait)
-            self.fire = function
-            self.daemon = False
+        return many(1.0)
 
-        def start(self):
-            pass
+    @kernel
+    def refused(x):
+        return x.no_such_attribute
 
-        cancel = join = start
-
-    monkeypatch.setattr("pfem_petsc.mechanics.compiled.threading.Timer", Timer)
-    monkeypatch.setattr("pfem_petsc.mechanics.compiled.time.perf_counter", lambda: now[0])
-    watch = Compilation(lambda *what: told.append(what), lambda seconds: None, patience=2.0)
-
-    def compile_for(seconds, name):
-        loop = type("Dispatcher", (), {"py_func": type(name, (), {})})
-        watch.on_start(type("Event", (), {"data": {"dispatcher": loop}}))
-        end = now[0] + seconds
-        while now[0] + waits[-1] < end:
-            now[0] += waits[-1]
-            watch._timer.fire()
-        now[0] = end
-        watch.on_end(None)
-
-    compile_for(1.5, "first")
-    now[0] += 100.0  # of steps, which do not count
-    compile_for(60.0, "second")
-    compile_for(0.5, "third")
-    assert told == [("second", 2.0), ("second", 4.0), ("second", 8.0), ("second", 16.0), *told[4:]]
-    assert told[4:] == [("second", 31.0), ("second", 46.0), ("second", 61.0)]
+    told, took = [], []
+    monkeypatch.setattr(compiled, "_FOLDER", None)
+    with Compilation(lambda *what: told.append(what), took.append):
+        assert compiled_for_a_while() == pytest.approx(4.0)
+    assert {name for name, _ in told} == {"many"} and 0.0 < told[0][1] < 60.0
+    assert 0.0 < sum(took) < 60.0
+    with pytest.raises(Exception, match="no_such_attribute"):
+        refused(1.0)
+    told.clear()
+    with Compilation(lambda *what: told.append(what), took.append):
+        time.sleep(0.1)
+    assert told == []
 
 
-@pytest.mark.parametrize("patience, times", [(0.0, 1), (1e-4, 1), (600.0, 0)])
-def test_run_says_what_it_compiles(tmp_path, monkeypatch, capsys, patience, times):
+@pytest.mark.parametrize("patience", [0.0, 600.0])
+def test_run_says_what_it_compiles(tmp_path, monkeypatch, capsys, patience):
     monkeypatch.setattr("pfem_petsc.run.outputs._PATIENCE", patience)
+    monkeypatch.setattr(compiled, "LOOK_EVERY", 0.005)
+    monkeypatch.setattr(compiled, "_FOLDER", None)
     simulation = Simulation(Case.load("rod_impact", ["time.end=0.2"]), output=tmp_path / "it")
 
     def plus_one(x):
         return x + 1.0
 
-    simulation.on_step(lambda step: numba.njit(plus_one)(1.0), every=5)
+    simulation.on_step(lambda step: kernel(plus_one)(1.0), every=5)
     simulation.run()
     said = capsys.readouterr().out
     found = re.findall(
         r"^compiling loops for this machine, which later runs load: plus_one, [\d.]+ s so far$", said, re.M
     )
-    assert len(found) >= times and bool(found) == bool(times)
+    assert bool(found) == (patience == 0.0)
     assert "minute" not in said
 
 
-def test_machine_code_is_never_older_than_what_a_loop_inlines(tmp_path, monkeypatch):
-    """A function in a file of its own changes, or the code of a class that it uses: the loop gives the new value."""
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    names = ("inlined_by_a_test", "loop_of_a_test")
-    (tmp_path / "loop_of_a_test.py").write_text(
-        "from pfem_petsc.mechanics.compiled import kernel\nfrom inlined_by_a_test import law\n"
-        "\n@kernel\ndef loop(x):\n    return law(x)\n"
-    )
+def test_the_folder_depends_on_all_sources(tmp_path):
+    """A changed file of the package leads to another folder, so that no loop inlines what a function was."""
+    copy = tmp_path / "pfem_petsc"
+    shutil.copytree(compiled._PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    program = "from pfem_petsc.mechanics import compiled\nprint(compiled._FOLDER)"
 
-    def result(body: str, first: str = "one", second: str = "two") -> tuple[float, int]:
-        source = "from typing import NamedTuple\nfrom pfem_petsc.mechanics.compiled import inlined\n"
-        source += f"FACTOR = 2.0\n\nclass Pair(NamedTuple):\n    {first}: float\n    {second}: float\n"
-        (tmp_path / "inlined_by_a_test.py").write_text(f"{source}\n@inlined\ndef law(x):\n    {body}\n")
-        for name in names:
-            sys.modules.pop(name, None)
-        importlib.invalidate_caches()
-        took = []
-        with Compilation(lambda *what: None, took.append):
-            value = importlib.import_module("loop_of_a_test").loop(3.0)
-        return value, len(took)
+    def folder():
+        (path,), _ = run_python(program, folder=tmp_path, PYTHONPATH=str(tmp_path))
+        assert Path(path).is_dir()
+        return Path(path)
 
-    assert result("return FACTOR * x") == (6.0, 1)
-    assert result("return FACTOR * x  # a comment changes nothing") == (6.0, 0)
-    assert result("return FACTOR + x") == (5.0, 1)
-    assert result("return Pair(x, FACTOR).one") == (3.0, 1)
-    assert result("return Pair(x, FACTOR).one", "two", "one") == (2.0, 1)
-    for name in names:
-        sys.modules.pop(name, None)
+    first = folder()
+    assert first == folder() and first.parent == copy / "__pycache__"
+    constants = copy / "tolerances.py"
+    constants.write_text(constants.read_text() + "\n# another text\n")
+    second = folder()
+    assert second != first and second.parent == first.parent
+    for k in range(compiled._KEPT):  # those of versions that are used no more are removed
+        old = copy / "__pycache__" / f"pfem_petsc-{k}"
+        old.mkdir()
+        os.utime(old, (k, k))
+    os.utime(first, (1000, 1000))
+    constants.write_text(constants.read_text() + "\n# a third one\n")
+    third = folder()
+    left = set(third.parent.glob("pfem_petsc-*"))
+    assert {first, second, third} <= left and len(left) == compiled._KEPT
 
 
-@pytest.mark.parametrize("left", [0.0, 0.001, 0.5])
-def test_damaged_machine_code_is_compiled_anew(module, tmp_path, left):
-    assert module().outer(3.0) == 7.0
-    (damaged,) = [path for path in tmp_path.rglob("*.nbc") if "outer" in path.name]
-    whole = damaged.read_bytes()
-    damaged.write_bytes(whole[: int(left * len(whole))])
-    took = []
-    with Compilation(lambda *what: None, took.append):
-        assert module().outer(3.0) == 7.0
-        assert module().outer(3.0) == 7.0
-    # names in machine code count the functions of the process, so that lengths may differ by some digits
-    assert len(took) == 1 and abs(damaged.stat().st_size - len(whole)) < 64
+def test_machine_code_is_kept_where_it_can_be(tmp_path):
+    """In the package, in the folder for it of the user, or nowhere, which is told once; a folder that the user gives
+    comes first, and Numba's own choice for other programs is not changed."""
+    copy = tmp_path / "pfem_petsc"
+    shutil.copytree(compiled._PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "__pycache__").write_text("no folder\n")
+    program = "import numba\nfrom pfem_petsc.mechanics import chunk_laws, compiled\n"
+    program += "print(compiled._FOLDER, repr(numba.config.CACHE_DIR))"
+    own, given = tmp_path / "own", tmp_path / "given"
+    settings = {"PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1", "NUMBA_CACHE_DIR": ""}
+    (folder, theirs), told = run_python(program, folder=tmp_path, **settings, XDG_CACHE_HOME=str(own))
+    assert Path(folder).parent == own and (theirs, told) == ("''", "")
+    (folder, theirs), told = run_python(program, folder=tmp_path, **settings | {"NUMBA_CACHE_DIR": str(given)})
+    assert Path(folder).parent == given and (theirs, told) == (repr(str(given)), "")
+    (folder, _), told = run_python(program, folder=tmp_path, **settings, XDG_CACHE_HOME=str(copy / "__pycache__"))
+    assert folder == "None" and told.count("compiled code cannot be cached") == 1
+    of_law = OF_ONE_LAW + "from pfem_petsc.mechanics.compiled import count_compiled\nprint(count_compiled())"
+    for _ in range(2):
+        (value, count), _ = run_python(
+            of_law, "elastic", folder=tmp_path, **settings, XDG_CACHE_HOME=str(copy / "__pycache__")
+        )
+        assert (float(value), int(count)) == (0.25, 1)
+
+
+LAW_OF_A_USER = """
+import sys
+from numba.extending import register_jitable
+from pfem_petsc import registry
+from pfem_petsc.mechanics.chunk_laws import STRESS, evaluate
+from pfem_petsc.mechanics.compiled import count_compiled
+from pfem_petsc.mechanics.materials.base import LAWS
+import numpy as np
+
+registry.add_plugin(sys.argv[1])
+law = registry.lookup(LAWS, "of_a_user", "").LAW
+print(evaluate(law, (2.0,), 0.5, 0.0, np.zeros((0, 1)))[STRESS, 0], count_compiled())
+"""
+
+
+def test_a_law_of_a_user_is_compiled_anew_when_its_file_changes(tmp_path):
+    path = tmp_path / "of_a_user.py"
+
+    def found(factor):
+        path.write_text(
+            "from numba.extending import register_jitable\nfrom .base import Law\n\nFACTOR = "
+            f"{factor}\n\n\n@register_jitable\ndef response(strain, rate, step, temperature, p, q):\n"
+            "    return FACTOR * p[0] * strain, FACTOR * p[0], (), (0.0,)\n\n\n"
+            'LAW = Law(response, energies=("elastic_energy",))\n'
+        )
+        (stress, count), _ = run_python(LAW_OF_A_USER, path)
+        return float(stress), int(count)
+
+    first = found(3.0)
+    assert first == (3.0, 1)
+    assert found(3.0) == (3.0, 0)
+    assert found(5.0) == (5.0, 1)
+    assert found(3.0) == (3.0, 0)  # kept beside the other
+
+
+def loops_of(law):
+    return [loop for loop in vars(law_loops(law, 20 * (0,))).values() if loop is not None]
+
+
+def test_loops_of_all_laws_have_names_of_their_own():
+    """Of each law, softened by temperature or not, damped or not, breakable or not; they are the names of files, which
+    ranks that compile different laws at once must not share."""
+    names = []
+    for name in choices(LAWS):
+        law = lookup(LAWS, name, "").LAW
+        for variant in (law, damped(law), *((softened(law),) if law.softening is not None else ())):
+            names += [loop.py_func.__qualname__ for one in (variant, breakable(variant)) for loop in loops_of(one)]
+    assert len(names) > 100 and len(set(names)) == len(names)
 
 
 @pytest.mark.slow
 def test_every_process_finds_the_machine_code_of_another():
-    """The digest of loops does not depend on the order of sets, which is another in every process."""
-    program = (
-        "from pfem_petsc.contact import frames, projection\n"
-        "from pfem_petsc.mechanics.compiled import code_digest\n"
-        "print(code_digest(frames._build), code_digest(projection.project))"
-    )
-    digests = set()
+    """Names and keys do not depend on the order of sets, nor on whether byte code is read or made."""
+    program = OF_ONE_LAW + "from pfem_petsc.mechanics.compiled import count_compiled\nprint(count_compiled())"
+    run_python(program, "elastic", "elastoplastic")
     for seed in ("1", "2", "3"):
-        environment = os.environ | {"PYTHONHASHSEED": seed}
-        command = [sys.executable, "-c", program]
-        digests.add(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
-    assert len(digests) == 1
-
-
-@pytest.mark.slow
-def test_every_process_finds_the_loop_of_batches_of_another():
-    """Keys of loops that are made of other loops are the same in all processes: a start must not compile them anew."""
-    program = (
-        "from pfem_petsc.mechanics.elements import batch_pulls\n"
-        "from pfem_petsc.mechanics.materials.elastic import LAW\n"
-        "from pfem_petsc.mechanics.elements import engineering\n"
-        "loop = batch_pulls(LAW, engineering).padded\n"
-        "print(loop._cache.path((), loop.targetctx.codegen()), loop._cache.stamp)"
-    )
-    keys = set()
-    for seed in ("1", "2"):
-        environment = os.environ | {"PYTHONHASHSEED": seed}
-        command = [sys.executable, "-c", program]
-        keys.add(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
-    assert len(keys) == 1
-
-
-def test_loops_of_all_laws_have_names_of_their_own():
-    """Of each law and strain measure, softened by temperature or not, and short enough for any file system."""
-    names = []
-    for name in choices(LAWS):
-        law = lookup(LAWS, name, "").LAW
-        for variant in (law, softened(law)) if law.softening is not None else (law,):
-            for measure in MEASURES.values():
-                loops = make_loops(variant, measure)
-                names.append(_variant(loops.forces.py_func))
-                longest = f"{batch_pulls(variant, measure).padded._cache.base}.{16 * 'x'}.nbc"
-                assert len(Path(longest).name) < 220
-    assert len(names) > 40 and len(set(names)) == len(names)
-
-
-def test_loops_of_a_law_with_and_without_damping_have_their_own_files():
-    """Otherwise each overwrites the machine code of the other, and both are compiled at each start."""
-    laws = [elastic.LAW, damped(elastic.LAW), breakable(elastic.LAW), breakable(damped(elastic.LAW))]
-    found = {make_loops(law, MEASURES["green"]).forces._cache.base for law in laws}
-    assert len(found) == len(laws)
-
-
-def test_each_loop_of_a_law_has_its_own_file():
-    """Loops that one function makes would overwrite each other, and be compiled at each start."""
-    loops = [loop for loop in vars(make_loops(elastic.LAW, MEASURES["green"])).values() if hasattr(loop, "_cache")]
-    found = {loop._cache.base for loop in loops}
-    assert len(found) == len(loops) > 5
-
-
-OF_ONE_LAW = """
-import sys
-import numpy as np
-from pfem_petsc.mechanics.elements import BarData, engineering, make_loops
-from pfem_petsc.mechanics.materials import elastic, elastoplastic
-from pfem_petsc.mechanics.runs import make_sweep
-
-def energies(law, p):
-    bars = np.array([[0, 1]], dtype=np.int32)
-    x, far = np.array([[0.0, 0, 0], [1.5, 0, 0]]), np.array([1], dtype=np.uint32)
-    sums = np.zeros(16)
-    rest, heat, history = np.ones(1), np.empty((2, 0)), np.zeros((len(law.rows), 1))
-    given = (far, make_sweep(bars, 0, 1, 1), rest, heat, np.empty(0), heat, p, 1.0, 0.0, history)
-    data = BarData(np.uint64(0), np.uint64(1), bars, *given)
-    make_loops(law, engineering).forces(x, data, True, np.zeros((2, 3)), sums)
-    return float(sums.sum())
-
-PARAMETERS = {"elastic": (elastic.LAW, (2.0,)), "elastoplastic": (elastoplastic.LAW, (2.0, 0.5, 0.0, 0.0, 0.5))}
-print(*(energies(*PARAMETERS[name]) for name in sys.argv[1:]))
-"""
+        for prefix in ("", "/nonexistent"):
+            said, _ = run_python(
+                program,
+                "elastic",
+                "elastoplastic",
+                PYTHONHASHSEED=seed,
+                PYTHONPYCACHEPREFIX=prefix,
+            )
+            assert said[-1] == "0"
 
 
 @pytest.mark.slow
 def test_machine_code_of_two_processes_does_not_mix_laws(tmp_path):
     """Each law is compiled by a process of its own, then a third one loads both."""
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
 
     def run(*laws):
-        command = [sys.executable, "-c", OF_ONE_LAW, *laws]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-        return [float(word) for word in done.stdout.split()]
+        return [float(word) for word in run_python(OF_ONE_LAW, *laws, NUMBA_CACHE_DIR=str(tmp_path))[0]]
 
     assert run("elastic") == [pytest.approx(0.25)]
     # yields at 0.25, then 0.5 along the rest of the strain
@@ -322,17 +324,15 @@ def closures(function, found):
             closures(cell.cell_contents, found)
 
 
-def test_functions_of_one_name_have_the_same_code():
+def test_closures_of_one_name_have_the_same_cells():
     """Machine code of several processes is told apart by names of functions."""
     found = set()
     for law in (elastic.LAW, elastoplastic.LAW, softened(elastic.LAW), softened(elastoplastic.LAW)):
-        for measure in MEASURES.values():
-            loops = make_loops(law, measure)
-            made = [value for value in vars(loops).values() if callable(value)]
-            for loop in (*made, *vars(batch_pulls(law, measure)).values()):
-                closures(loop, found)
-    digests = {}
+        for loop in loops_of(law):
+            closures(loop, found)
+    known = {}
     for function in found:
+        cells = [getattr(cell.cell_contents, "__qualname__", cell.cell_contents) for cell in function.__closure__ or ()]
         name = function.__module__, function.__qualname__
-        assert digests.setdefault(name, code_digest(function)) == code_digest(function), name
-    assert len(digests) > 50
+        assert known.setdefault(name, (cells, function.__code__)) == (cells, function.__code__), name
+    assert len(known) > 50

@@ -50,15 +50,14 @@ def finish(case, comm, folder, function=on_end, **options):
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_force_of_time_is_a_table(scheme, tmp_path):
-    """The same run to the last bit, energies and reactions included; but for sums of batches, which round otherwise."""
+    """The same run to the last bit, energies and reactions included; but for compiled steps, which round otherwise."""
     table = rod(scheme, [{"node_set": "end", "force": FORCE.tolist(), "table": ROWS}])
     run(table, tmp_path / "table", MPI.COMM_SELF)
     finish(rod(scheme), MPI.COMM_SELF, tmp_path / "function")
     first, second = (open_result(tmp_path / name).history for name in ("table", "function"))
     largest = np.abs(second["external_work"]).max()
     for name in first:
-        batched = scheme == "central_differences" and not name.startswith("probe/")
-        rounding = 1e-11 * max(largest, np.abs(first[name]).max()) if batched else 0.0
+        rounding = 1e-11 * max(largest, np.abs(first[name]).max()) if scheme == "central_differences" else 0.0
         np.testing.assert_allclose(first[name], second[name], rtol=0.0, atol=rounding, err_msg=name)
     assert largest > 1e-7
 

@@ -50,8 +50,9 @@ def test_a_plain_explicit_run_holds_few_bytes_a_bar_after_its_set_up(tmp_path, f
     held(lattice(2, **more), tmp_path / "first")  # modules are loaded
     small, few = held(lattice(8, **more), tmp_path / "small")
     large, many = held(lattice(16, **more), tmp_path / "large")
-    # ends 8, rest length 8, far end 4, number 4; eight vectors and eight numbers a node, 0.12 nodes a bar
-    assert (large - small) / (many - few) < 24.0 + 0.122 * (8 * 24 + 8 * 8)
+    # ends 8, rest length 8 and again, in the order of loops, 9, far end 4, number 4; eight vectors and eight numbers a
+    # node, 0.12 nodes a bar
+    assert (large - small) / (many - few) < 33.0 + 0.122 * (8 * 24 + 8 * 8)
 
 
 def test_search_of_crossing_bars_needs_few_bytes_a_bar_and_none_in_the_mesh(tmp_path):
@@ -81,6 +82,7 @@ def test_memory_of_large_arrays_goes_back_to_the_system_when_they_are_freed():
     program = """
 import contextlib
 import ctypes
+from mpi4py import MPI
 import numpy as np
 from pfem_petsc.parallel.heap import returning_freed_memory
 

@@ -303,7 +303,6 @@ class Law:
     rate : whether the law depends on the rate or on the step; strain and stress at the end of the last step are then
         kept as well. Otherwise rate and step are zero
     smooth : whether the tangent is constant
-    relaxed : whether stress and energies are zero at zero strain, so that loops may evaluate places without a bar
     mean_stress : compiled function of (stress0, strain0, strain, rate, step, temperature, p, q): returns the mean
         stress [Pa] over the step from stress0 and strain0 to strain, whose work is the change of energies, and its
         derivative with respect to strain. The energy-momentum scheme requires it; None: the scheme rejects the law
@@ -331,7 +330,6 @@ class Law:
     bar_data: tuple[str, ...] = ()
     rate: bool = False
     smooth: bool = False
-    relaxed: bool = False
     mean_stress: Callable[..., Any] | None = None
     mean_correction: Callable[[tuple[float, ...], np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
     mean_of_work: bool = False

@@ -29,4 +29,4 @@ def scale(p, modulus, strength):
     return (modulus * p[0],)
 
 
-LAW = Law(response, smooth=True, relaxed=True, mean_stress=mean_stress, softening=Softening(scale))
+LAW = Law(response, smooth=True, mean_stress=mean_stress, softening=Softening(scale))

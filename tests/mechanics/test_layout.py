@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pfem_petsc.mechanics.runs import make_sweep
+from pfem_petsc.mechanics.chunk_laws import CHUNK
+from pfem_petsc.mechanics.layout import NO_BAR, gather_values, make_layout, make_sweep, run_column, spread_values
 from pfem_petsc.mesh.ordering import LEAST_RUN, NODE_BLOCK, bar_order
 
 
@@ -37,7 +37,42 @@ def test_every_bar_is_in_one_run_of_one_chunk(ends, drawn_in_order, data):
             np.testing.assert_array_equal(low[bar], sweep.heads[run] + step)
             if sweep.diagonal[number]:
                 np.testing.assert_array_equal(high[bar], sweep.fars[run] + step)
-    assert sweep.parts[0] == 0 and sweep.parts[-1] == sweep.counted or not sweep.counted
+    check_layout(bars, (start, counted, stop))
+
+
+def check_layout(bars, block):
+    """Each bar is in one column, which joins its ends; values of bars come back from their columns."""
+    start, counted, stop = block
+    layout = make_layout(bars[:stop], [(0, 0, start), block] if start else [block])
+    section = len(layout.counted) - 1
+    low, high = bars.min(axis=1), bars.max(axis=1)
+    places = np.full(int(layout.starts[-1]), -1)
+    for group in range(layout.sections[section], layout.sections[section + 1]):
+        first, last = (int(layout.starts[group + k]) for k in (0, 1))
+        assert 0 < last - first <= CHUNK
+        for run in range(layout.runs[group], layout.runs[group + 1]):
+            here = np.arange(layout.bars[run], layout.bars[run + 1])
+            assert (here < counted).all() if group < layout.counted[section] else (here >= counted).all()
+            column = run_column(layout, group, run)
+            places[column : column + len(here)] = here
+            if layout.stars[group]:
+                assert (low[here] == layout.nodes[run]).all()
+                np.testing.assert_array_equal(layout.far[here], high[here])
+            else:
+                inside = np.arange(column, column + len(here)) - first
+                np.testing.assert_array_equal(low[here], layout.heads[group] + inside)
+                np.testing.assert_array_equal(high[here], layout.fars[group] + inside)
+    columns = layout.columns(section)
+    np.testing.assert_array_equal(places[columns][places[columns] >= 0], np.arange(start, stop))
+    values, spread, back = (
+        np.arange(start, stop, dtype=float),
+        np.zeros(columns.stop - columns.start),
+        np.zeros(stop - start),
+    )
+    spread_values(layout, section, values, NO_BAR, spread)
+    np.testing.assert_array_equal(spread, places[columns])
+    gather_values(layout, section, spread, back)
+    np.testing.assert_array_equal(back, values)
 
 
 def lattice(n):
@@ -70,13 +105,12 @@ def test_a_lattice_goes_by_diagonals_and_chance_by_stars():
     assert len(sweep.heads) <= len(np.unique(low)) + len(sweep.diagonal)
 
 
-@pytest.mark.parametrize("chunk", [5, 512])
-def test_parts_are_blocks_of_nodes(chunk):
+def test_groups_are_of_blocks_of_nodes():
     bars = lattice(12)
     bars = bars[bar_order(bars, None, int(bars.max()) + 1)]
-    sweep = make_sweep(bars, 0, len(bars), len(bars), chunk)
-    blocks = bars.min(axis=1) // NODE_BLOCK
-    for part in range(len(sweep.parts) - 1):
-        first, last = (int(sweep.starts[sweep.chunks[sweep.parts[part + k]]]) for k in (0, 1))
-        assert (blocks[first:last] == part).all()
-    assert last == len(bars) and LEAST_RUN > 1
+    layout = make_layout(bars, [(0, len(bars), len(bars))])
+    low = bars.min(axis=1)
+    for group in range(len(layout.heads)):
+        first, last = (int(layout.bars[layout.runs[group + k]]) for k in (0, 1))
+        assert len(np.unique(low[first:last] // NODE_BLOCK)) == 1
+    assert layout.starts[-1] < 1.3 * len(bars) and not layout.stars.any() and LEAST_RUN > 1

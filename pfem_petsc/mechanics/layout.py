@@ -1,0 +1,370 @@
+"""The order in which loops over bars find them: runs of bars whose ends are known from the first one, padded to long
+rows for loops over components of positions and forces, and stars of bars with a common node.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ..mesh.ordering import FEW, LEAST_RUN, NODE_BLOCK
+from .chunk_laws import CHUNK
+from .compiled import inlined, kernel
+from .records import record
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+LANES = 8  # numbers in a line of the cache, and of a vector
+
+
+PAGE = 512
+"""Numbers in a page of memory. Loads wait for earlier stores to other arrays whose addresses end with the bits of a
+place in a page. What loops over bars read and write at the same time therefore begins at different places of a page."""
+
+PLACES, DIFFERENCES, FORCES, LAWS = 0, 168, 336, 384
+
+
+def aligned(count: int, place: int = 0) -> np.ndarray:
+    """Return ``count`` zeros that begin at a place in a page, which is a multiple of a line of the cache."""
+    room = np.zeros(count + PAGE)
+    first = (place - room.ctypes.data // room.itemsize) % PAGE
+    return room[first : first + count]
+
+
+def new_components(nodes: int, place: int = PLACES) -> np.ndarray:
+    """Return zeros (3, stride) for vectors of nodes by components, and for columns without a bar beyond them."""
+    stride = -(-(nodes + 2 * LANES) // PAGE) * PAGE + 5 * LANES  # each row begins at another place of a page
+    return aligned(3 * stride, place).reshape(3, stride)
+
+
+@inlined
+def copy(values, out):
+    """Write the first numbers of ``values`` to all of ``out``."""
+    for i in range(len(out)):
+        out[i] = values[i]
+
+
+@inlined
+def fill(out, value):
+    """Write a value to all of ``out``."""
+    for i in range(len(out)):
+        out[i] = value
+
+
+@kernel
+def split_components(x, first, out):
+    """Write vectors (n, 3) to components (3, stride) of nodes from a first one on."""
+    nodes, xs, ys, zs = x.reshape(-1), out[0, first:], out[1, first:], out[2, first:]
+    for i in range(len(x)):
+        xs[i] = nodes[3 * i]
+        ys[i] = nodes[3 * i + 1]
+        zs[i] = nodes[3 * i + 2]
+
+
+@kernel
+def clear(components):
+    """Set components (3, stride) to zero."""
+    flat = components.reshape(-1)
+    for i in range(len(flat)):
+        flat[i] = 0.0
+
+
+@kernel
+def join_components(components, first, out):
+    """Write components (3, stride) of nodes from a first one on to vectors (n, 3)."""
+    nodes, xs, ys, zs = out.reshape(-1), components[0, first:], components[1, first:], components[2, first:]
+    for i in range(len(out)):
+        nodes[3 * i] = xs[i]
+        nodes[3 * i + 1] = ys[i]
+        nodes[3 * i + 2] = zs[i]
+
+
+class Sweep(NamedTuple):
+    """Runs and chunks of the bars [start, stop) of a block. See :class:`BarLayout`.
+
+    Attributes
+    ----------
+    heads : (runs,) uint32, lower end of the first bar of each run
+    fars : (runs,) uint32, its upper end
+    starts : (runs + 1,) uint32, first bar of each run, and the end
+    chunks : (chunks + 1,) uint32, first run of each chunk, and the end
+    diagonal : (chunks,) bool, whether the runs of a chunk are diagonal, else stars
+    counted : number of leading chunks whose bars are counted on this rank
+    """
+
+    heads: np.ndarray
+    fars: np.ndarray
+    starts: np.ndarray
+    chunks: np.ndarray
+    diagonal: np.ndarray
+    counted: int
+
+
+def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int = CHUNK) -> Sweep:
+    """Make the sweep over ``bars`` (b, 2) [start, stop), of which [start, counted) are counted.
+
+    Chunks end after ``chunk`` bars, at ``counted``, and where the lower end passes to another block of nodes.
+    """
+    firsts = np.empty(_cut(bars, start, counted, stop, chunk, np.empty(0, dtype=np.uint32)) + 1, dtype=np.uint32)
+    _cut(bars, start, counted, stop, chunk, firsts)
+    firsts[-1] = stop
+    diagonal = np.empty(len(firsts) - 1, dtype=np.bool_)
+    chunks = np.empty(len(firsts), dtype=np.uint32)
+    none = (np.empty(0, dtype=np.uint32),) * 3
+    runs = _find_runs(bars, firsts, False, diagonal, chunks, none)
+    short = np.diff(firsts.astype(np.int64))[~diagonal].sum()
+    forced = bool(0 < short <= FEW * (stop - start))
+    if forced:  # few bars: the others have faster loops if all chunks are alike
+        diagonal[:] = True
+        runs = _find_runs(bars, firsts, True, diagonal, chunks, none)
+    heads, fars, starts = (np.empty(n, dtype=np.uint32) for n in (runs, runs, runs + 1))
+    _find_runs(bars, firsts, forced, diagonal, chunks, (heads, fars, starts))
+    starts[runs] = stop
+    chunks_counted = int(np.searchsorted(firsts[:-1], counted))
+    return Sweep(heads, fars, starts, chunks, diagonal, chunks_counted)
+
+
+@kernel
+def _cut(bars, start, counted, stop, chunk, firsts):
+    """Return the number of chunks; write their first bars unless ``firsts`` is empty."""
+    count = 0
+    first = start
+    block = -1
+    for k in range(start, stop):
+        here = min(bars[k, 0], bars[k, 1]) // NODE_BLOCK
+        if k in (start, counted) or here != block or k - first == chunk:
+            if len(firsts) > 0:
+                firsts[count] = k
+            count += 1
+            first = k
+            block = here
+    return count
+
+
+@kernel
+def _find_runs(bars, firsts, forced, diagonal, chunks, runs):
+    """Return the number of runs; write chunks, the first run of each, and the ``runs`` (heads, fars and starts) unless
+    they are empty, and which chunks are ``diagonal``, unless ``forced``."""
+    heads, fars, starts = runs
+    count = 0
+    for c in range(len(firsts) - 1):
+        chunks[c] = count
+        breaks = 1
+        for k in range(firsts[c] + 1, firsts[c + 1]):
+            breaks += 0 if _follows(bars, k) else 1
+        if not forced:
+            diagonal[c] = firsts[c + 1] - firsts[c] >= LEAST_RUN * breaks
+        for k in range(firsts[c], firsts[c + 1]):
+            low = min(bars[k, 0], bars[k, 1])
+            if k > firsts[c]:
+                if diagonal[c]:
+                    if _follows(bars, k):
+                        continue
+                elif low == min(bars[k - 1, 0], bars[k - 1, 1]):
+                    continue
+            if len(heads) > 0:
+                heads[count] = low
+                fars[count] = max(bars[k, 0], bars[k, 1])
+                starts[count] = k
+            count += 1
+    chunks[len(firsts) - 1] = count
+    return count
+
+
+@kernel
+def _follows(bars, k):
+    """Whether both ends of bar k are the nodes after those of bar k - 1."""
+    low = min(bars[k, 0], bars[k, 1]) == min(bars[k - 1, 0], bars[k - 1, 1]) + 1
+    return low and max(bars[k, 0], bars[k, 1]) == max(bars[k - 1, 0], bars[k - 1, 1]) + 1
+
+
+NO_BAR = -1.0
+"""Rest length of a column without a bar [m]."""
+
+_MOST = 1.25  # columns for each bar; beyond, they cost more than the begin and end of each run
+
+
+@record
+class BarLayout(NamedTuple):
+    """The bars of a rank as compiled loops find them, by sections, groups and runs.
+
+    A group has up to CHUNK columns. In a group of runs, column i joins the nodes ``heads + i`` and ``fars + i``, and
+    some columns may have no bar; in a group of stars, each run consists of bars with the same lower node, and there
+    are no other columns. Bars of a section, in their order in memory, are in ascending columns.
+
+    Attributes
+    ----------
+    sections : (s + 1,) first group of each section, and the end
+    counted : (s,) end of the groups of each section whose bars are counted on this rank; others follow
+    stars : (groups,) bool
+    heads, fars : (groups,) ends of the first column of a group of runs
+    starts : (groups + 1,) first column of each group, and the end
+    runs : (groups + 1,) first run of each group, and the end
+    nodes : (runs,) uint32, lower end of the first bar of each run
+    bars : (runs + 1,) uint32, first bar of each run, and the end
+    far : (b,) uint32, upper end of each bar, or (0,) without stars
+    """
+
+    sections: np.ndarray
+    counted: np.ndarray
+    stars: np.ndarray
+    heads: np.ndarray
+    fars: np.ndarray
+    starts: np.ndarray
+    runs: np.ndarray
+    nodes: np.ndarray
+    bars: np.ndarray
+    far: np.ndarray
+
+    def columns(self, section: int) -> slice:
+        """Return the columns of a section."""
+        first, last = self.starts[self.sections[section : section + 2]].tolist()
+        return slice(first, last)
+
+
+def make_layout(bars: np.ndarray, blocks: Sequence[tuple[int, int, int]]) -> BarLayout:
+    """Make the layout of ``bars`` (b, 2) of sections [start, stop) that follow each other, of which [start, counted)
+    are counted; ``blocks``: (start, counted, stop) of each section."""
+    sections, counted, parts, groups, columns = [0], [], [], 0, 0
+    for block in blocks:
+        sweep = make_sweep(bars, *block)
+        part = _make_groups(sweep)
+        first_run = np.searchsorted(part.runs, sweep.chunks[sweep.counted])
+        counted.append(groups + int(first_run))
+        parts.append((sweep, part._replace(starts=part.starts + columns, runs=part.runs)))
+        groups, columns = groups + len(part.heads), int(parts[-1][1].starts[-1])
+        sections.append(groups)
+    n_runs = np.cumsum([0, *(len(sweep.heads) for sweep, _ in parts)])
+
+    def joined(arrays: list[np.ndarray], kind: type, end: int | None = None) -> np.ndarray:
+        return np.concatenate([*arrays, [] if end is None else [end]]).astype(kind)
+
+    stars = joined([part.stars for _, part in parts], np.bool_)
+    far = np.empty(len(bars) if stars.any() else 0, dtype=np.uint32)
+    np.maximum(bars[: len(far), 0], bars[: len(far), 1], out=far, casting="unsafe")
+    return BarLayout(
+        np.array(sections, dtype=np.int64),
+        np.array(counted, dtype=np.int64),
+        stars,
+        joined([part.heads for _, part in parts], np.int64),
+        joined([part.fars for _, part in parts], np.int64),
+        joined([part.starts[:-1] for _, part in parts], np.int64, columns),
+        joined([part.runs[:-1] + first for (_, part), first in zip(parts, n_runs, strict=False)], np.int64, n_runs[-1]),
+        joined([sweep.heads for sweep, _ in parts], np.uint32),
+        joined([sweep.starts[:-1] for sweep, _ in parts], np.uint32, blocks[-1][2] if len(blocks) else 0),
+        far,
+    )
+
+
+class _Groups(NamedTuple):
+    """The groups of a sweep, see :class:`BarLayout`."""
+
+    stars: np.ndarray
+    heads: np.ndarray
+    fars: np.ndarray
+    starts: np.ndarray
+    runs: np.ndarray
+
+
+def _make_groups(sweep: Sweep) -> _Groups:
+    """Make the groups of the runs of a sweep: of one chunk of stars each, or of diagonal runs of one offset, of one
+    block of nodes."""
+    n = len(sweep.heads)
+    firsts = sweep.chunks[:-1].astype(np.int64)
+    star = np.repeat(~sweep.diagonal, np.diff(sweep.chunks.astype(np.int64)))
+    block = sweep.heads[firsts] // NODE_BLOCK
+    begins = np.ones(len(firsts), dtype=np.bool_)  # chunks that begin a group in any case
+    begins[1:] = ~sweep.diagonal[1:] | ~sweep.diagonal[:-1] | (block[1:] != block[:-1])
+    begins[sweep.counted :][:1] = True
+    fresh = np.zeros(n + 1, dtype=np.bool_)
+    fresh[firsts[begins]] = True
+    group_of = np.empty(n, dtype=np.int64)
+    count = _group_runs(sweep.heads, sweep.fars, sweep.starts, fresh, star, group_of)
+    runs = np.searchsorted(group_of, np.arange(count + 1))
+    heads, fars, starts = (np.empty(count + k, dtype=np.int64) for k in (0, 0, 1))
+    stars = star[runs[:-1]]
+    _place_groups(sweep.heads, sweep.fars, sweep.starts, runs, stars, (heads, fars, starts))
+    return _Groups(stars, heads, fars, starts, runs)
+
+
+@kernel
+def _group_runs(heads, fars, starts, fresh, star, group_of):
+    """Return the number of groups of runs; write the group of each run."""
+    groups = 0
+    first = 0  # run that begins the group
+    bars = 0
+    for run in range(len(heads)):
+        count = np.int64(starts[run + 1]) - np.int64(starts[run])
+        head, before = np.int64(heads[run]), np.int64(heads[run - 1]) if run else np.int64(-1)
+        alike = run > 0 and not fresh[run]
+        if alike and not star[run]:
+            alike = np.int64(fars[run]) - head == np.int64(fars[run - 1]) - before and head > before
+            span = head + count - np.int64(heads[first]) // LANES * LANES
+            alike = alike and span <= CHUNK and span <= _MOST * (bars + count) + LANES
+        if not alike:
+            groups += 1
+            first = run
+            bars = 0
+        bars += count
+        group_of[run] = groups - 1
+    return groups
+
+
+@kernel
+def _place_groups(run_heads, run_fars, run_starts, runs, stars, places):
+    """Write the ends of the first column of each group, and the first column: ``places``, heads, fars and starts."""
+    heads, fars, starts = places
+    count = np.int64(0)
+    for g in range(len(heads)):
+        first, last = runs[g], runs[g + 1] - 1
+        starts[g] = count
+        if stars[g]:
+            heads[g] = fars[g] = 0
+            count += np.int64(run_starts[last + 1]) - np.int64(run_starts[first])
+            continue
+        lead = np.int64(run_heads[first]) % LANES
+        wide = np.int64(run_heads[last]) + np.int64(run_starts[last + 1]) - np.int64(run_starts[last])
+        wide -= np.int64(run_heads[first]) - lead
+        heads[g] = np.int64(run_heads[first]) - lead
+        fars[g] = np.int64(run_fars[first]) - lead
+        count += -(-wide // LANES) * LANES
+    starts[len(heads)] = count
+
+
+@inlined
+def run_column(layout, group, run):
+    """Return the column of the first bar of a run."""
+    if layout.stars[group]:
+        ahead = np.int64(layout.bars[run]) - np.int64(layout.bars[layout.runs[group]])
+    else:
+        ahead = np.int64(layout.nodes[run]) - layout.heads[group]
+    return layout.starts[group] + ahead
+
+
+@kernel
+def spread_values(layout, section, values, none, spread):
+    """Write values (n,) of the bars of a section to its columns ``spread``, and ``none`` to the others."""
+    begin = layout.starts[layout.sections[section]]
+    bar = np.int64(layout.bars[layout.runs[layout.sections[section]]])
+    for group in range(layout.sections[section], layout.sections[section + 1]):
+        end = layout.starts[group] - begin
+        for run in range(layout.runs[group], layout.runs[group + 1]):
+            first, last = np.int64(layout.bars[run]) - bar, np.int64(layout.bars[run + 1]) - bar
+            at = run_column(layout, group, run) - begin
+            fill(spread[end:at], none)
+            end = at + last - first
+            copy(values[first:last], spread[at:end])
+        fill(spread[end : layout.starts[group + 1] - begin], none)
+
+
+@kernel
+def gather_values(layout, section, spread, values):
+    """Write what the columns ``spread`` of a section have to the ``values`` (n,) of its bars."""
+    begin = layout.starts[layout.sections[section]]
+    bar = np.int64(layout.bars[layout.runs[layout.sections[section]]])
+    for group in range(layout.sections[section], layout.sections[section + 1]):
+        for run in range(layout.runs[group], layout.runs[group + 1]):
+            first, last = np.int64(layout.bars[run]) - bar, np.int64(layout.bars[run + 1]) - bar
+            copy(spread[run_column(layout, group, run) - begin :], values[first:last])

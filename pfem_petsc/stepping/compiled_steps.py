@@ -1,0 +1,391 @@
+"""Steps of central differences that nothing outside interrupts, made in compiled calls: what the loop needs of a
+stepper, and what the stepper takes from it."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mpi4py import MPI
+from numba import types
+
+from ..columns import BAR_ENERGIES, HEAD, Share, at_state, fill_at_state
+from ..contact.node_walls import NOTED, WallForces
+from ..errors import SimulationFailure
+from ..mechanics.bars import StrainEnergy
+from ..mechanics.compiled import COMPILED
+from ..mechanics.records import References, by_reference
+from ..mesh.exchange import SIGNATURES, CFunction, mpi_functions
+from ..mesh.ordering import NODE_BLOCK
+from ..parallel.ending import is_alone
+from ..parallel.heap import return_freed_memory
+from ..tolerances import PROJECTED
+from .compiled_loop import (
+    CHANGED,
+    COLLAPSED,
+    DONE,
+    FAILED,
+    LOST,
+    LOST_BY_MPI,
+    NEAR,
+    PASSED,
+    PRESSING,
+    RECORDED,
+    SOLVE,
+    TURNED,
+    UNSOLVED,
+    CalledRows,
+    Calls,
+    Contacts,
+    ImpulseArrays,
+    MessageArrays,
+    StateArrays,
+    StepArrays,
+    StepBars,
+    run_compiled,
+)
+from .contact_phase import WallArrays, new_contact_nodes
+from .impact import Touched
+from .phases import GroundSprings, Motion, MovingSupports, Nodes, Prescribed, new_sums
+from .stepper import Instants, Solution
+
+if TYPE_CHECKING:
+    from .stepper import Stepper
+
+
+_BARS, _BROKEN = HEAD.indices(BAR_ENERGIES), HEAD.first("broken_bars")
+
+
+class CompiledSteps:
+    """Makes steps of a stepper in compiled calls, as long as its supports remain.
+
+    Parameters
+    ----------
+    stepper : Stepper that :meth:`serves`
+    """
+
+    def __init__(self, stepper: Stepper) -> None:
+        self.stepper, self.model, self.ledger = stepper, stepper.model, stepper.ledger
+        model, state, n = self.model, stepper.state, len(stepper.state.v)
+        self._u, zero = np.zeros_like(state.v), stepper.zero  # which nothing writes to
+        self._reaction = np.zeros_like(state.v) if model.supports.any else zero
+        self._contact = np.zeros_like(state.v) if model.can_touch else zero
+        if state.contact is not stepper.zero:
+            self._contact[:] = state.contact
+        stepper.balance = None  # its predictor is not needed any more
+        places, forces = model.bars.components
+        self._motion = Motion(stepper.h, places, np.empty((3, n)), np.zeros((3, n)), forces, self._contact)
+        self._nodes, self._held, self._walls = self._make_nodes(), self._make_held(), self._make_walls()
+        self._stiffness = self._nodes.stiffness if model.links else np.empty(0)
+        self._called = RowCaller(stepper, self._stiffness, self._u, self._contact)
+        # what stays the same
+        pressed = new_contact_nodes(n, len(model.contact.names))
+        self._pressed, self._outcome = pressed, np.zeros(10, dtype=np.int64)
+        same = self._nodes, self._motion, self._held, self._springs(), new_sums(), pressed
+        self._nodes_, self._motion_, self._held_, self._springs_, *room = map(by_reference, same)
+        messages, calls = MessageArrays(*model.mesh.messages()), Calls(*self._called.functions)
+        self._room = *room, self._outcome, by_reference(messages), by_reference(calls)
+        self._references, self._at_rest = References(), self._moving_supports(0, 0)
+        self._walls_ = by_reference(self._walls)
+        share = Share(len(model.contact.names), len(model.links.columns), len(stepper.probed))
+        self._width, self._at_state = len(share.numbers), at_state(model)
+        self._ends_at_rows = not all(column.looped for column in self._at_state)
+        return_freed_memory()
+
+    def _make_nodes(self) -> Nodes:
+        model, h = self.model, self.stepper.h
+        inertia = model.inertia
+        external = self.stepper.state.external.T.copy() if model.external.active else np.empty((3, 0))
+        damping = inertia.damping if inertia.damped else np.empty(0)
+        stiffness = 1.0 / (h * h) * inertia.mass + (0.5 / h * inertia.damping if inertia.damped else 0.0)
+        return Nodes(inertia.mass, damping, stiffness, 1.0 / stiffness, external)
+
+    def _make_held(self) -> Prescribed:
+        supports = self.model.supports
+        half, u, load = np.zeros((3, len(supports.nodes)))
+        return Prescribed(supports.nodes, supports.components, supports.origins.copy(), half, u, load, self._reaction)
+
+    def _make_walls(self) -> WallArrays:
+        contact, log, n = self.model.contact, self.model.contact.log, len(self._u)
+        touched = Touched(
+            log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.ledger.impacts.slack
+        )
+        surfaces = contact.surfaces
+        at_end, level = surfaces.copy(), surfaces.copy()
+        acting = self.stepper.scheme.balance(self.stepper.state, self.stepper.h).acting
+        way = np.zeros(level.centres.shape)
+        walls = contact.pressed_walls(at_end, acting, PROJECTED * self.model.size, way)
+        room = np.empty((3, n if len(contact.walls) else 0)), np.zeros(n // NODE_BLOCK + 1, dtype=bool)
+        motions = self._wall_motions(0, 0)
+        return WallArrays(walls, surfaces, level, motions, touched, log.present, log.releases, *room)
+
+    def _bars(self) -> StepBars:
+        bars = self.model.bars
+        return StepBars(
+            bars.reference, bars.loops("brief"), bars.loops("full"), bars.ends, bars.watched, bars.can_break
+        )
+
+    def _springs(self) -> GroundSprings:
+        springs = self.model.bars.springs
+        if springs is None:
+            return GroundSprings(np.empty(0, dtype=np.int64), np.empty((0, 3, 3)), np.empty((0, 3)))
+        return GroundSprings(springs.nodes, springs.stiffness, springs.anchors)
+
+    def _moving_supports(self, begin: int, count: int) -> MovingSupports:
+        """Return the supports that move in ``count`` steps from one of a number on."""
+        supports = self.model.supports
+        motions, columns = supports.schedule(self._times(begin, count if supports.moves else -2), self.stepper.h)
+        at = np.flatnonzero(columns >= 0)
+        moved, probes = np.nonzero(self._held.nodes[at][:, None] == self.stepper.probed)
+        return MovingSupports(at, columns[at], supports.origins[at], motions, np.column_stack([moved, probes]))
+
+    def _times(self, begin: int, count: int) -> np.ndarray:
+        """Return the times of the start of ``count`` steps from one of a number on, of their ends, and of one more."""
+        return np.arange(begin, begin + count + 2) * self.stepper.h
+
+    def _wall_motions(self, begin: int, count: int) -> np.ndarray:
+        contact = self.model.contact
+        return contact.motion.schedule(self._times(begin, count if contact.moving.any() else -2))
+
+    def _walls_at(self, begin: int, count: int) -> Any:
+        """Return the walls in ``count`` steps from one of a number on."""
+        if not self.model.contact.moving.any():
+            return self._walls_
+        return self._walls._replace(motions=self._wall_motions(begin, count))
+
+    @staticmethod
+    def serves(stepper: Stepper) -> bool:
+        """Return whether steps of this stepper can be made in compiled calls. Collective."""
+        from petsc4py import PETSc
+
+        model = stepper.model
+        serves = (
+            stepper.scheme.leapfrog
+            and stepper.treatment is None
+            # -log_view measures the methods of single steps
+            and not PETSc.Log.isActive()
+            and COMPILED
+            and (model.comm.size == 1 or mpi_functions() is not None)
+            and model.steady
+        )
+        return model.comm.allreduce(serves, op=MPI.LAND)
+
+    def make(self, most: int, left: int) -> None:
+        """Make up to ``most`` steps, and up to the one after which bars or supports are removed, of which there are
+        ``left``; the last one remains to be counted. What rows of the history need of those that are due is collected,
+        see :attr:`~pfem_petsc.stepping.stepper.Stepper.instants`, except for a step with a removal, which changes it.
+
+        Fewer steps are made if a bar of any rank breaks, and if something fails; but several ranks whose bars cannot
+        break, and whose rows need no calls, make all steps, though the state remains that of the failure. The stepper
+        then has a fault.
+        """
+        stepper, ledger, state, model = self.stepper, self.ledger, self.stepper.state, self.model
+        log, comm, due = model.contact.log, model.comm, self._due(min(most, left))
+        count = len(due)
+        due[-1] = due[-1] and count < left
+        steps = np.flatnonzero(due)
+        shares = np.zeros((len(steps) + (0 if due[-1] else 1), self._width))
+        begin, impulses = state.step, ledger.impulses.state
+        flags = np.zeros((count, len(log.releases)), dtype=bool)
+        rows = model.links.export_rows(self._stiffness)
+        ledger.sums[_BROKEN] = stepper.ruptures.count
+        half, of = state.memory["half_velocity"], self._references.of
+        arrays = StepArrays(
+            self._nodes_,
+            self._motion_,
+            self._held_,
+            of(self._moving_supports(begin, count) if model.supports.moves else self._at_rest),
+            self._springs_,
+            of(self._bars()),
+            of(model.external.schedule(range(begin + 1, begin + 1 + count), stepper.h)),
+            self._walls_at(begin, count),
+            of(rows),
+            of(self._called.begin(begin, rows.totals)),
+            *self._room,
+            of(StateArrays(state.x, stepper.before, state.f, half, self._u, state.v, state.a)),
+            ledger.sums,
+            ledger.powers,
+            of(ImpulseArrays(impulses.memory["half_velocity"], impulses.a, impulses.v)),
+            stepper.probed,
+            stepper.solution.walls.force.copy(),
+            shares,
+        )
+        contacts = log.last, ledger.impacts.met, log.changes, ledger.friction_ahead
+        contacts = Contacts(*run_compiled(by_reference(arrays), contacts, due, flags))
+        self._called.end()
+        made = self._outcome.tolist()
+        if made[LOST_BY_MPI]:
+            raise MPI.Exception(made[LOST_BY_MPI])
+        model.links.import_rows(rows)
+        end, row = made[PASSED], shares[made[RECORDED] - 1]
+        sound = self._take(made, contacts, row[_BARS])
+        fill_at_state(self._at_state, stepper, row)
+        ledger.follow_compiled(row[: HEAD.width], contacts.friction)
+        log.changes, noted = contacts.changes, np.zeros(end, dtype=np.int64)
+        if len(log.releases):
+            noted += log.note(flags[:end], stepper.h, comm) + 1 + np.arange(end)
+        steps = steps[steps < end]
+        if len(steps):
+            shares, unsound = shares[: len(steps)], steps >= sound
+            shares[unsound] = 0.0
+            shares[unsound, HEAD.first("alarm")] = 1.0
+            number = begin + steps + 1
+            time = number * stepper.h
+            stepper.instants = Instants(model.first_step + number, model.origin + time, time, shares, noted[steps])
+
+    def _take(self, made: list[int], contacts: Contacts, energies: np.ndarray) -> int:
+        """Take the state after the last step, with ``energies`` of the bars [J]; return how many steps are sound."""
+        stepper, state, model = self.stepper, self.stepper.state, self.model
+        model.contact.log.last, self.ledger.impacts.met = contacts.touched, contacts.met
+        state.support = self._reaction if model.supports.any else stepper.zero
+        state.contact = self._contact if made[PRESSING] else stepper.zero
+        if not model.external.steady:
+            state.external = self._nodes.external.T.copy()
+        stepper.energy = StrainEnergy(tuple(energies.tolist()), made[COLLAPSED])
+        walls, pressed = model.contact.nothing, self._pressed
+        if len(model.contact.walls):
+            sums = pressed.force.copy(), pressed.contacts.copy(), pressed.moment.copy()
+            nodes = (of[: made[NEAR]].copy() for of in (pressed.nodes, pressed.touching, pressed.places))
+            walls = WallForces(*sums, *nodes, contacts.friction)
+        stepper.solution = Solution(self._u, state.f, walls, contacts=made[PRESSING])
+        begin = state.step
+        state.step, state.time = begin + made[DONE] - 1, (begin + made[DONE]) * stepper.h
+        if made[CHANGED]:
+            stepper.ruptures.note(state.x, stepper.number + 1, stepper.arrived())
+        sound = made[DONE]
+        if stepper.fault is not None:  # that of an earlier call, of which not all ranks know
+            sound = 0
+        elif (failure := self._failure(made)) is not None:
+            stepper.fault, sound = failure, made[DONE] - 1
+        state.step, state.time = begin + made[PASSED] - 1, (begin + made[PASSED]) * stepper.h
+        return sound
+
+    def _due(self, count: int) -> np.ndarray:
+        """Return which of up to ``count`` steps to come have a row of the history; a row with values that the loop does
+        not have, such as the number of slack bars, ends the call, as they are those of the state."""
+        every = self.stepper.row_every
+        numbers = self.stepper.number + 1 + np.arange(min(count, NOTED))
+        due = numbers % every == 0 if every else np.zeros(len(numbers), dtype=bool)
+        if self._ends_at_rows and due.any():
+            due = due[: int(np.argmax(due)) + 1]
+        return due
+
+    def _failure(self, made: list[int]) -> SimulationFailure | None:
+        """Return the failure in the last step, None for none."""
+        stepper, pressed = self.stepper, self._pressed
+        if made[COLLAPSED] >= 0 or made[TURNED] >= 0:
+            return SimulationFailure(stepper.collapse(max(made[COLLAPSED], made[TURNED])))
+        infeasible, why = pressed.failure.tolist()
+        if infeasible >= 0:
+            node = pressed.nodes[infeasible]
+            return self._at_balance(self.model.contact.placeless(node, why, pressed.normals, pressed.offsets))
+        return self._at_balance(self._called.failure) if made[UNSOLVED] else None
+
+    def _at_balance(self, text: object) -> SimulationFailure:
+        """Return a failure of the balance for the next positions."""
+        stepper = self.stepper
+        return SimulationFailure(f"{stepper.when(stepper.scheme.balance(stepper.state, stepper.h))}: {text}")
+
+
+_CALL = types.int64(types.int64, types.int64)
+
+
+class RowCaller:
+    """Solves the rows that compiled loops cannot solve, when one asks for it: rows that turn, come and go, share nodes,
+    are on several ranks, or whose nodes walls stop too.
+
+    The loop calls once in each step, when the nodes have moved without rows, and again if rows have closed or opened,
+    when the velocities at their nodes are known.
+
+    Attributes
+    ----------
+    record : CalledRows
+    functions : that the loop calls: those of MPI, and this one
+    failure : SimulationFailure of the last call of the loop, or None
+    """
+
+    def __init__(self, stepper: Stepper, stiffness: np.ndarray, u: np.ndarray, contact: np.ndarray) -> None:
+        self.stepper, self.links = stepper, stepper.model.links
+        self._stiffness, self._u, self._contact = stiffness, u, contact
+        self._tolerance = PROJECTED * stepper.model.size
+        self._begin, self._totals, self._error = 0, np.empty((0, 3)), None
+        self.failure: SimulationFailure | None = None
+        self._function = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(self._call)
+        self.functions = (*_mpi(), CFunction(self._function, _CALL))
+        n = 0 if self.links.separate else len(u)
+        nodes, none = np.empty((2, n), dtype=np.int64), np.empty((0, 3))
+        used = (u, np.empty((n, 3))) if n else (none, none)
+        self.record = CalledRows(
+            not self.links.separate, used[1], used[0], *nodes, np.zeros(2, dtype=np.int64), np.zeros(1)
+        )
+        self._keep(0, self.links.pressed())
+        if self.record.any:
+            stepper.balance = stepper.scheme.balance(stepper.state, stepper.h)
+
+    def _keep(self, which: int, nodes: np.ndarray) -> None:
+        if self.record.any:
+            room = self.record.changing if which else self.record.held
+            self.record.counts[which] = len(nodes)
+            room[: len(nodes)] = nodes
+
+    def begin(self, step: int, totals: np.ndarray) -> CalledRows:
+        """Prepare calls in steps from one of a number on; forces on the last nodes of rows are written to ``totals``
+        (tables, 3) [N]."""
+        self._begin, self._totals, self.failure = step, totals, None
+        return self.record
+
+    def end(self) -> None:
+        """Raise what went wrong in a call, except a failure of the simulation."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def _call(self, step: int, what: int) -> int:
+        """Solve the rows of a step, or find the energy that they lose."""
+        try:
+            if what == SOLVE:
+                self._solve((self._begin + step + 2) * self.stepper.h)
+            else:
+                self._close()
+        except BaseException as error:  # noqa: BLE001  # an exception cannot pass the compiled loop: end raises it
+            if isinstance(error, SimulationFailure) and not is_alone():
+                self.failure = error
+                return FAILED
+            self._error = error
+            return LOST
+        return 0
+
+    def _solve(self, time: float) -> None:
+        """Solve the rows of the balance for the positions at a time [s]; if that fails, they have no forces."""
+        links, record = self.links, self.record
+        self._keep(0, np.empty(0, dtype=np.int64))
+        self._keep(1, np.empty(0, dtype=np.int64))
+        self._totals[:] = 0.0
+        stepper = self.stepper
+        stepper.balance = replace(stepper.balance, predictor=record.predictor, time=time)
+        load = links.explicit(stepper.balance, stepper.state, self._u, self._stiffness, self._tolerance)
+        if load is not None:
+            links.push(load, self._stiffness, self._u, self._contact)
+        self._totals[:] = links.totals()
+        self._keep(0, links.pressed())
+        two = links.two
+        changed = (links.force[two.at] > 0.0) != two.record.closed
+        if changed.any():
+            nodes = two.nodes[:, changed]
+            self._keep(1, np.unique(nodes[nodes >= 0]))
+
+    def _close(self) -> None:
+        """Find the energy that rows lose, from velocities and accelerations of the state at their nodes."""
+        state = self.stepper.state
+        state.contact = self._contact
+        self.record.loss[0] = self.stepper.ledger.impacts.of_rows(state.position, (state.v, state.a), None)
+
+
+def _mpi() -> tuple[CFunction, ...]:
+    """Return the functions of MPI that a loop calls on several ranks; one rank calls none."""
+    found = mpi_functions()
+    if found is None:
+        return tuple(CFunction(ctypes.pythonapi.Py_IsInitialized, signature) for signature in SIGNATURES.values())
+    return found

@@ -1,0 +1,273 @@
+"""The contact phase of a step in compiled loops: walls, and rows over two nodes of their own, move nodes to where they
+may be; contacts that close lose energy."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..contact.explicit import Arrivals, PressedWalls, WallSums, find_penetrating, press_nodes
+from ..contact.fixed_rows import close_rows
+from ..contact.surfaces import Surfaces, wall_gaps
+from ..mechanics.compiled import inlined, kernel
+from ..mechanics.records import record
+from ..mesh.ordering import NODE_BLOCK
+from .impact import Approach, Touched, join_nodes, stop_nodes, unpressed
+from .phases import clear_rows, displace, put_rates, rates_of
+
+
+@record
+class WallArrays(NamedTuple):
+    """Walls ``pressed`` and their log, see :mod:`~pfem_petsc.contact.explicit` and
+    :mod:`~pfem_petsc.contact.node_walls`; their surfaces ``at_rest``, without displacement, and at the end of the step,
+    ``level``; and for walls that move ``motions`` (t, 2, w, 3), displacements and velocities at the start of the first
+    step, at the end of each, and of one more, else (0, 2, w, 3); ``free`` (3, n) and ``marked`` (blocks,), workspace.
+    """
+
+    pressed: PressedWalls
+    at_rest: Surfaces
+    level: Surfaces
+    motions: np.ndarray
+    touched: Touched
+    present: np.ndarray
+    releases: np.ndarray
+    free: np.ndarray
+    marked: np.ndarray
+
+
+@record
+class ContactNodes(NamedTuple):
+    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the walls that
+    they are ``touching`` (n, w), their ``places`` (n, 3); ``failure`` (2,): the first of them without a place, or -1,
+    and why, and its planes, ``normals`` (w, 3) and ``offsets`` (w,); and the sums of each wall, ``force`` (w, 3),
+    ``contacts`` (w,) and ``moment`` (w, 3)."""
+
+    nodes: np.ndarray
+    touching: np.ndarray
+    places: np.ndarray
+    failure: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    force: np.ndarray
+    contacts: np.ndarray
+    moment: np.ndarray
+
+
+def new_contact_nodes(n: int, w: int) -> ContactNodes:
+    """Return room for ``n`` nodes and ``w`` walls. Pages of memory that no node needs are not touched."""
+    nodes = np.empty(n if w > 0 else 0, dtype=np.int64)
+    touching, places = np.empty((len(nodes), w), dtype=bool), np.empty((len(nodes), 3))
+    force, contacts, moment = np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3))
+    failure = np.full(2, -1, dtype=np.int64)
+    return ContactNodes(nodes, touching, places, failure, np.empty((w, 3)), np.empty(w), force, contacts, moment)
+
+
+@kernel
+def place_walls(step, walls):
+    """Set the surfaces that walls reach one step after a step, and those at its end."""
+    pressed, motions, normals = walls.pressed, walls.motions, walls.at_rest.normals
+    for surfaces, end in ((walls.level, step + 1), (pressed.surfaces, step + 2)):
+        offsets, centres = surfaces.offsets, surfaces.centres
+        for k in range(len(normals)):
+            offsets[k] = walls.at_rest.offsets[k]
+            for c in range(3):
+                offsets[k] += normals[k, c] * motions[end, 0, k, c]
+                centres[k, c] = walls.at_rest.centres[k, c] + motions[end, 0, k, c]
+    for k in range(len(normals)):
+        for c in range(3):
+            pressed.way[k, c] = motions[step + 2, 0, k, c] - motions[step + 1, 0, k, c]
+
+
+@kernel
+def work_of_walls(step, walls, push, force):
+    """Return the work of walls over the way that a step went, with forces (w, 3) at its start and end."""
+    work = 0.0
+    for k in range(len(force)):
+        for c in range(3):
+            way = walls.motions[step + 1, 0, k, c] - walls.motions[step, 0, k, c]
+            work += 0.5 * (push[k, c] + force[k, c]) * way
+            push[k, c] = force[k, c]
+    return work
+
+
+@kernel
+def _arrivals(found, nodes, motion, walls):
+    """Return what pressing needs of nodes (m,)."""
+    pressed, touched, h = walls.pressed, walls.touched, motion.h
+    m, w = len(found), len(pressed.way)
+    bounces = w if len(pressed.restitution) > 0 else 0
+    start, drift, stiffness = np.empty((m, 3)), np.empty((m, 3)), np.empty(m)
+    fixed, applies = np.empty((m, 3), dtype=np.bool_), np.empty((m, w), dtype=np.bool_)
+    touching, rebound, arrival = np.empty((m, w), dtype=np.bool_), np.empty((m, bounces)), np.empty((m, bounces))
+    for j in range(m):
+        i = found[j]
+        stiffness[j] = nodes.stiffness[i]
+        for c in range(3):
+            start[j, c], drift[j, c] = motion.x[c, i], h * motion.half[c, i] - motion.u[c, i]
+            fixed[j, c] = touched.fixed[i, c]
+        for k in range(w):
+            applies[j, k] = pressed.all_nodes[k] or pressed.members[i, k]
+            touching[j, k] = touched.touching[i, k]
+        for k in range(bounces):
+            rebound[j, k], arrival[j, k] = pressed.rebound[i, k], pressed.arrival[i, k]
+    none = np.empty((0, w, 3)), np.empty((0, w))
+    return Arrivals(start, drift, stiffness, fixed, applies, touching, rebound, arrival, *none)
+
+
+@kernel
+def _mark(marked, nodes, value):
+    """Set the marks of the blocks of nodes."""
+    for i in nodes:
+        marked[i // NODE_BLOCK] = value
+
+
+@kernel
+def project_on_walls(nodes, motion, walls, before, sums, out):
+    """Move nodes beyond walls onto them; return how many there are near walls, and the energy that friction dissipates
+    in the next step [J]. ``before``: nodes that touched walls, and that have touched them and not left; ``out``:
+    ContactNodes."""
+    free, h = walls.free, motion.h
+    for c in range(3):
+        there, where, speed = free[c], motion.x[c], motion.half[c]
+        for i in range(len(there)):
+            there[i] = where[i] + h * speed[i]
+    clear_rows(out.force)
+    clear_rows(out.moment)
+    for k in range(len(out.contacts)):
+        out.contacts[k] = 0
+    if len(walls.pressed.restitution) > 0:
+        _mark(walls.marked, before[0], True)
+        _mark(walls.marked, before[1], True)
+    m = find_penetrating(free, walls.pressed, walls.marked)
+    if len(walls.pressed.restitution) > 0:
+        _mark(walls.marked, before[0], False)
+        _mark(walls.marked, before[1], False)
+    if m == 0:
+        return 0, 0.0
+    found = walls.pressed.room[:m]
+    places, given = np.empty((m, 3)), _arrivals(found, nodes, motion, walls)
+    for j in range(m):
+        for c in range(3):
+            places[j, c] = free[c, found[j]]
+    wall_sums = WallSums(out.force, out.contacts, out.moment)
+    failed, why, planes, total, touching, rubbed = press_nodes(places, given, walls.pressed, wall_sums)
+    for j in range(m):
+        i = found[j]
+        out.nodes[j] = i
+        for c in range(3):
+            displace(c, i, places[j, c] - free[c, i], nodes, motion, sums)
+            motion.contact[i, c] += total[j, c]  # rows may press there too
+            out.places[j, c] = places[j, c]
+        for k in range(given.rebound.shape[1]):
+            walls.pressed.rebound[i, k], walls.pressed.arrival[i, k] = given.rebound[j, k], given.arrival[j, k]
+        for k in range(touching.shape[1]):
+            out.touching[j, k] = touching[j, k]
+    if failed >= 0:
+        out.failure[0], out.failure[1] = failed, why
+        for k in range(len(out.offsets)):
+            out.offsets[k] = planes.offsets[failed, k]
+            for c in range(3):
+                out.normals[k, c] = planes.normals[failed, k, c]
+    return m, rubbed
+
+
+@kernel
+def project_on_rows(rows, nodes, motion, sums):
+    """Separate the nodes of :class:`~pfem_petsc.contact.fixed_rows.FixedRows`; return the number of rows with a force,
+    and of rows whose force begins or ends with respect to ``rows.closed``."""
+    where, normals, force, h = rows.where, rows.normals, rows.force, motion.h
+    count, changed = 0, 0
+    for p in range(len(force)):
+        i, j, apart = where[0, p], where[1, p], 0.0
+        for c in range(3):
+            there, here = motion.x[c, j] + h * motion.half[c, j], motion.x[c, i] + h * motion.half[c, i]
+            apart += normals[p, c] * (there - here)
+        short = rows.least[p] - apart
+        presses = short > 0.0 and rows.soft[p] > 0.0
+        force[p] = short / rows.soft[p] if presses else 0.0
+        changed += 1 if presses != rows.closed[p] else 0
+        if not presses:
+            continue
+        count += 1
+        for end in range(2):
+            node = where[end, p]
+            for c in range(3):
+                part = (force[p] if end == 1 else -force[p]) * normals[p, c]
+                motion.contact[node, c] += part
+                displace(c, node, part * rows.free[end, p, c] / nodes.stiffness[node], nodes, motion, sums)
+    return count, changed
+
+
+@kernel
+def sum_rows(rows, pressing):
+    """Write the forces on the second nodes of each table to ``rows.totals``, as
+    :func:`~pfem_petsc.contact.rows.last_forces` does; ``pressing`` rows have a force."""
+    clear_rows(rows.totals)
+    for k in range(len(rows.totals) if pressing > 0 else 0):
+        for p in range(rows.table_starts[k], rows.table_starts[k + 1]):
+            for c in range(3):
+                rows.totals[k, c] += rows.force[p] * rows.normals[p, c]
+
+
+@inlined
+def _free_rates(around, nodes, motion, moved, state):
+    """Return velocities and accelerations (m, 3) without contact of nodes (m,), and write those with it to ``state``,
+    (n, 3) both; ``moved``: MovingSupports, the step, and Prescribed."""
+    v, a = state
+    h = motion.h
+    for i in around:
+        rates_of(i, motion, v, a)
+    free_v, free_a = unpressed(around, v, a, motion.contact, nodes, 1.0 / (h * h), 0.5 / h)
+    put_rates(*moved, v, a)
+    return free_v, free_a
+
+
+@kernel
+def stop_at_walls(nodes, motion, walls, moved, state, on_walls):
+    """Return the dissipation of contacts that close [J], and the nodes that are on walls afterwards; ``on_walls``:
+    nodes that have touched walls, and that touch them."""
+    v, a = state
+    met, touched = on_walls
+    around = join_nodes(met, touched, walls.present)
+    free_v, free_a = _free_rates(around, nodes, motion, moved, state)
+    normals, gaps = wall_gaps(around, motion.x.T, walls.level)
+    for j in range(len(around)):
+        i = around[j]
+        for c in range(3):
+            if walls.touched.fixed[i, c]:  # wall forces do not change prescribed components
+                free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
+    still, rates = np.zeros((gaps.shape[1], 3)), np.zeros((gaps.shape[1], 3))
+    for k in range(len(rates) if len(walls.motions) > 0 else 0):
+        for c in range(3):
+            rates[k, c] = walls.motions[moved[1] + 1, 1, k, c]
+    approach = Approach(normals, gaps, free_v, free_a, rates, still)
+    counted = np.ones(len(still), dtype=np.bool_)
+    return stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))
+
+
+@kernel
+def stop_at_rows(nodes, motion, rows, changed, moved, state, slack):
+    """Return the dissipation [J] of rows that close; ``changed`` rows have a force that begins or ends."""
+    v, a = state
+    at, count = np.empty(changed, dtype=np.int64), 0
+    ends = np.empty((2, changed, 10))
+    for p in range(len(rows.force)):
+        if (rows.force[p] > 0.0) != rows.closed[p]:
+            at[count] = p
+            count += 1
+    for end in range(2):
+        around = np.empty(count, dtype=np.int64)
+        for m in range(count):
+            around[m] = rows.where[end, at[m]]
+        free_v, free_a = _free_rates(around, nodes, motion, moved, state)
+        for m in range(count):
+            i = around[m]
+            ends[end, m, 9] = nodes.mass[i]
+            for c in range(3):
+                # rows do not change prescribed components
+                fixed = rows.free[end, at[m], c] == 0.0
+                ends[end, m, c] = motion.x[c, i]
+                ends[end, m, 3 + c] = v[i, c] if fixed else free_v[m, c]
+                ends[end, m, 6 + c] = a[i, c] if fixed else free_a[m, c]
+    return close_rows(rows, at, ends, np.ones(len(rows.force), dtype=np.bool_), slack)

@@ -1,0 +1,491 @@
+"""The phases of a step of central differences, each over all nodes of a rank: move, balance, supports, finish, and the
+sums that the energy balance needs.
+
+Positions, velocities at half steps, increments and forces lie by components, (3, n) or longer rows, so that loops are
+vectorised. With velocities at half steps, x1 = x0 + h half, the balance (m/h^2 + c/(2h)) u = f_ext - f_int - c half
+gives the increment u beyond x0 + h half; then half1 = half + u/h, and velocity and acceleration of the balance are
+half1 - u/(2h) and u/h^2. Supports and contact correct u at some nodes, by :func:`displace`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..mechanics.compiled import add_freely, inlined, kernel
+from ..mechanics.records import record
+
+WORKS = ("external", "contact", "damping", "inertial", "internal")
+"""Works of the energy balance [J], in this order; the first includes supports."""
+
+EXTERNAL, CONTACT, DAMPING, INERTIAL, INTERNAL = range(len(WORKS))
+KINETIC = len(WORKS)
+SUPPORTS, LOADS, DRAGS = range(3)
+"""Rows of the forces in a balance."""
+
+
+@record
+class Nodes(NamedTuple):
+    """Constants of the owned nodes.
+
+    Attributes
+    ----------
+    mass : (n,) [kg]; damping : (n,) [kg/s], (0,) without
+    stiffness, inverse : (n,) m/h^2 + c/(2h) [N/m] and its inverse
+    external : (3, n) [N], (3, 0) without
+    """
+
+    mass: np.ndarray
+    damping: np.ndarray
+    stiffness: np.ndarray
+    inverse: np.ndarray
+    external: np.ndarray
+
+
+@record
+class Motion(NamedTuple):
+    """What moves: the step h [s]; positions and internal forces of local nodes, (3, stride); of owned nodes velocities
+    at half steps, and increments, which are written in steps that need them, (3, n); and contact forces (n, 3)."""
+
+    h: float
+    x: np.ndarray
+    half: np.ndarray
+    u: np.ndarray
+    f: np.ndarray
+    contact: np.ndarray
+
+
+@record
+class Prescribed(NamedTuple):
+    """Prescribed components (k,), sorted by node.
+
+    Attributes
+    ----------
+    nodes, components : (k,)
+    positions : (k,) that they reach by the balance [m]
+    half : (k,) velocities half a step before it [m/s]
+    u, load : (k,) their increments [m], and the forces that would move them [N]
+    reaction : (n, 3) [N], written at these components
+    """
+
+    nodes: np.ndarray
+    components: np.ndarray
+    positions: np.ndarray
+    half: np.ndarray
+    u: np.ndarray
+    load: np.ndarray
+    reaction: np.ndarray
+
+
+@record
+class MovingSupports(NamedTuple):
+    """Prescribed components that move in some steps.
+
+    Their velocities at half steps are differences of the positions of their motions, so works are over the ways
+    between these. Velocities, accelerations, inertia, damping and reactions are those of the motions themselves; they
+    differ from the scheme's by its errors, which are added.
+
+    Attributes
+    ----------
+    at, columns : (p,) which of the prescribed components, and the columns of their motions
+    origins : (p,) positions without displacement [m]
+    motions : (t, 3, m) displacements, velocities and accelerations of all motions at the start of the first step, at
+        the end of each, and of one more
+    probed : (q, 2) which of the components are at probes, and at which
+    """
+
+    at: np.ndarray
+    columns: np.ndarray
+    origins: np.ndarray
+    motions: np.ndarray
+    probed: np.ndarray
+
+
+@record
+class GroundSprings(NamedTuple):
+    """Springs to the ground at ``nodes`` (m,), see :class:`~pfem_petsc.mechanics.springs.Springs`."""
+
+    nodes: np.ndarray
+    stiffness: np.ndarray
+    anchors: np.ndarray
+
+
+@record
+class StepSums(NamedTuple):
+    """Of a step: ``works`` (5,) of its balance over the step [J]; ``forces`` (3, 3) of supports, loads and dampers
+    [N]; ``springs`` (4,) force of springs to the ground [N] and their energy [J]; ``jumps`` (2, 3) by how much the
+    momenta of moving supports at the half step and at the end exceed the scheme's [kg m/s]; ``ends`` (6,) works over
+    the last half of the step, and kinetic energy [J]; ``momenta`` (3, 3) momentum, angular momentum and mass times
+    position."""
+
+    works: np.ndarray
+    forces: np.ndarray
+    springs: np.ndarray
+    jumps: np.ndarray
+    ends: np.ndarray
+    momenta: np.ndarray
+
+
+def new_sums() -> StepSums:
+    """Return sums of a step, zero."""
+    return StepSums(np.zeros(5), np.zeros((3, 3)), np.zeros(4), np.zeros((2, 3)), np.zeros(6), np.zeros((3, 3)))
+
+
+@kernel
+def clear_vector(values):
+    """Set numbers to zero; assignments to slices take long to compile."""
+    for i in range(len(values)):
+        values[i] = 0.0
+
+
+@kernel
+def clear_rows(rows):
+    """Set the numbers of some rows to zero."""
+    for k in range(len(rows)):
+        for c in range(rows.shape[1]):
+            rows[k, c] = 0.0
+
+
+@kernel
+def move(x, h, half):
+    """Move the owned nodes by h ``half``."""
+    for c in range(3):
+        where, speed = x[c], half[c]
+        for i in range(len(speed)):
+            where[i] += h * speed[i]
+
+
+@kernel
+def add_springs(springs, x, f, sums):
+    """Add the forces of springs to the ground to ``f``, and force and energy to ``sums`` (4,)."""
+    clear_vector(sums)
+    for k in range(len(springs.nodes)):
+        i = springs.nodes[k]
+        for c in range(3):
+            force = 0.0
+            for d in range(3):
+                force += springs.stiffness[k, c, d] * (x[d, i] - springs.anchors[k, d])
+            f[c, i] += force
+            sums[c] += force
+            sums[3] += 0.5 * force * (x[c, i] - springs.anchors[k, c])
+
+
+@kernel
+def place_supports(moving, step, positions):
+    """Set the positions that moving components reach one step after a step."""
+    for p in range(len(moving.at)):
+        positions[moving.at[p]] = moving.origins[p] + moving.motions[step + 2, 0, moving.columns[p]]
+
+
+@kernel
+def _advance(f, inverse, h, half):
+    """Solve balances with internal forces alone and advance ``half``; return the power of the forces."""
+    rate, eta, power = 1.0 / h, 0.5 / h, 0.0
+    for i in range(len(half)):
+        u = -f[i] * inverse[i]
+        half[i] += rate * u
+        power = add_freely(power, f[i] * (half[i] - eta * u))
+    return power
+
+
+@kernel
+def _advance_loaded(f, inverse, h, half, u):
+    """The same with the forces ``u``, in whose place the increments are written."""
+    rate, eta, power = 1.0 / h, 0.5 / h, 0.0
+    for i in range(len(half)):
+        u[i] *= inverse[i]
+        half[i] += rate * u[i]
+        power = add_freely(power, f[i] * (half[i] - eta * u[i]))
+    return power
+
+
+@kernel
+def _forces(f, external, damping, half, u):
+    """Write all forces of a component to ``u``: those of bars, loads (0,) if there are none, and dampers."""
+    for i in range(len(u)):
+        u[i] = -f[i]
+    for i in range(len(external)):
+        u[i] += external[i]
+    for i in range(len(damping)):
+        u[i] -= damping[i] * half[i]
+
+
+@kernel
+def _load(external, h, half, u):
+    """Return sum and power of loads."""
+    eta, total, power = 0.5 / h, 0.0, 0.0
+    for i in range(len(external)):
+        total = add_freely(total, external[i])
+        power = add_freely(power, external[i] * (half[i] - eta * u[i]))
+    return total, power
+
+
+@kernel
+def _drag(damping, h, half, u):
+    """Return sum and power of what dampers take."""
+    eta, total, power = 0.5 / h, 0.0, 0.0
+    for i in range(len(damping)):
+        v = half[i] - eta * u[i]
+        total = add_freely(total, damping[i] * v)
+        power = add_freely(power, damping[i] * (v * v))
+    return total, power
+
+
+@kernel
+def balance(nodes, motion, held, keep, sums):
+    """Solve the balances of all nodes without supports and contact, and begin the sums of the step; increments are
+    written if ``keep``."""
+    h, f, half, u = motion.h, motion.f, motion.half, motion.u
+    loaded, damped = nodes.external.shape[1] > 0, len(nodes.damping) > 0
+    works, forces = sums.works, sums.forces
+    clear_vector(works)
+    clear_rows(forces)
+    for k in range(len(held.nodes)):
+        held.half[k] = half[held.components[k], held.nodes[k]]
+    for c in range(3):
+        if keep or loaded or damped:
+            _forces(f[c], nodes.external[c], nodes.damping, half[c], u[c])
+            works[INTERNAL] += h * _advance_loaded(f[c], nodes.inverse, h, half[c], u[c])
+        else:
+            works[INTERNAL] += h * _advance(f[c], nodes.inverse, h, half[c])
+        if loaded:
+            total, power = _load(nodes.external[c], h, half[c], u[c])
+            forces[LOADS, c] += total
+            works[EXTERNAL] += h * power
+        if damped:
+            total, power = _drag(nodes.damping, h, half[c], u[c])
+            forces[DRAGS, c] -= total
+            works[DAMPING] += h * power
+
+
+@inlined
+def displace(c, i, du, nodes, motion, sums):
+    """Add to the increment of component c of node i, and to all sums of the balance."""
+    h = motion.h
+    change = 0.5 * du  # h times that of the velocity
+    motion.u[c, i] += du
+    motion.half[c, i] += du / h
+    sums.works[INTERNAL] += motion.f[c, i] * change
+    if nodes.external.shape[1] > 0:
+        sums.works[EXTERNAL] += nodes.external[c, i] * change
+    if len(nodes.damping) > 0:
+        v = motion.half[c, i] - 0.5 * motion.u[c, i] / h
+        before = v - change / h
+        sums.works[DAMPING] += h * nodes.damping[i] * (v * v - before * before)
+        sums.forces[DRAGS, c] -= nodes.damping[i] * (v - before)
+
+
+@kernel
+def apply_supports(held, nodes, motion, sums):
+    """Give prescribed components their increments, by the velocities that :func:`balance` has kept."""
+    h, loaded, damped = motion.h, nodes.external.shape[1] > 0, len(nodes.damping) > 0
+    for k in range(len(held.nodes)):
+        i, c = held.nodes[k], held.components[k]
+        force = -motion.f[c, i]
+        if loaded:
+            force += nodes.external[c, i]
+        if damped:
+            force -= nodes.damping[i] * held.half[k]
+        free = force * nodes.inverse[i]
+        held.load[k] = nodes.stiffness[i] * free
+        held.u[k] = held.positions[k] - (motion.x[c, i] + h * held.half[k])
+        displace(c, i, held.u[k] - free, nodes, motion, sums)
+        motion.half[c, i] = held.half[k] + held.u[k] / h  # exact at rest
+
+
+@kernel
+def react(held, nodes, motion, sums):
+    """Write the reactions of supports, when contact forces are known."""
+    for k in range(len(held.nodes)):
+        i, c = held.nodes[k], held.components[k]
+        reaction = nodes.stiffness[i] * held.u[k] - held.load[k] - motion.contact[i, c]
+        held.reaction[i, c] = reaction
+        sums.forces[SUPPORTS, c] += reaction
+
+
+@kernel
+def work_of_contact(touched, motion, sums):
+    """Add the work of contact forces at some nodes."""
+    h, power = motion.h, 0.0
+    for i in touched:
+        for c in range(3):
+            power += motion.contact[i, c] * (motion.half[c, i] - 0.5 / h * motion.u[c, i])
+    sums.works[CONTACT] += h * power
+
+
+@kernel
+def restore_increments(nodes, motion, held):
+    """Write the increments of a step that has not kept them, which has neither dampers nor contact."""
+    for c in range(3):
+        _forces(motion.f[c], nodes.external[c], nodes.damping, motion.half[c], motion.u[c])
+        for i in range(len(nodes.inverse)):
+            motion.u[c, i] *= nodes.inverse[i]
+    for k in range(len(held.nodes)):
+        motion.u[held.components[k], held.nodes[k]] = held.u[k]
+
+
+@inlined
+def rates_of(i, motion, v, a):
+    """Write velocity and acceleration of the balance at node i to ``v``, ``a`` (n, 3)."""
+    h = motion.h
+    for c in range(3):
+        v[i, c] = motion.half[c, i] - 0.5 / h * motion.u[c, i]
+        a[i, c] = motion.u[c, i] / (h * h)
+
+
+@inlined
+def _scheme_rates(p, moving, held, motion):
+    """Return node, component, velocity and acceleration by the scheme of a component that moves."""
+    k = moving.at[p]
+    i, c = held.nodes[k], held.components[k]
+    return i, c, motion.half[c, i] - 0.5 / motion.h * held.u[k], held.u[k] / (motion.h * motion.h)
+
+
+@kernel
+def correct_moving(moving, step, held, nodes, motion, sums):
+    """Correct the balance of a step for supports that move, and write ``jumps``."""
+    h, damped = motion.h, len(nodes.damping) > 0
+    works, forces, jumps = sums.works, sums.forces, sums.jumps
+    clear_rows(jumps)
+    for p in range(len(moving.at)):
+        i, c, v, a = _scheme_rates(p, moving, held, motion)
+        speed, rate = moving.motions[step + 1, 1, moving.columns[p]], moving.motions[step + 1, 2, moving.columns[p]]
+        mass = nodes.mass[i]
+        change = mass * (rate - a)
+        if damped:
+            drag = nodes.damping[i] * (speed - v)
+            change += drag
+            forces[DRAGS, c] -= drag
+            works[DAMPING] += h * (drag * v)
+        held.reaction[i, c] += change
+        forces[SUPPORTS, c] += change
+        works[EXTERNAL] += h * (held.reaction[i, c] * v)
+        works[INERTIAL] += h * (mass * rate * v)
+        jumps[0, c] += mass * (h * (a - rate))
+        jumps[1, c] += mass * (speed - (motion.half[c, i] - h * a + 0.5 * h * rate))
+
+
+@kernel
+def correct_moving_ends(moving, step, held, nodes, motion, sums, values):
+    """Correct the sums at the end of a step, and the ``values`` (p, 4, 3) of probes, for supports that move."""
+    h, x, damped = motion.h, motion.x, len(nodes.damping) > 0
+    works, momenta = sums.ends, sums.momenta
+    for p in range(len(moving.at)):
+        i, c, v, a = _scheme_rates(p, moving, held, motion)
+        speed, rate = moving.motions[step + 1, 1, moving.columns[p]], moving.motions[step + 1, 2, moving.columns[p]]
+        mass, left = nodes.mass[i], (0.5 * h) * (v - (0.5 * h) * a)
+        works[EXTERNAL] += held.reaction[i, c] * left
+        if damped:
+            works[DAMPING] += nodes.damping[i] * (speed - v) * left
+        works[INERTIAL] += 0.5 * mass * speed * speed - mass * rate * left - 0.125 * h * h * (mass * a * a)
+        works[KINETIC] += 0.5 * mass * (speed * speed - v * v)
+        momentum = mass * (speed - v)
+        one, other = (c + 1) % 3, (c + 2) % 3
+        momenta[0, c] += momentum
+        momenta[1, one] += x[other, i] * momentum
+        momenta[1, other] -= x[one, i] * momentum
+    for k in range(len(moving.probed)):
+        p, at = moving.probed[k, 0], moving.probed[k, 1]
+        c = held.components[moving.at[p]]
+        values[at, 1, c] = moving.motions[step + 1, 1, moving.columns[p]]
+        values[at, 2, c] = moving.motions[step + 1, 2, moving.columns[p]]
+
+
+@kernel
+def put_rates(moving, step, held, v, a):
+    """Set velocities and accelerations (n, 3) of the components that move at the end of a step."""
+    for p in range(len(moving.at)):
+        i, c = held.nodes[moving.at[p]], held.components[moving.at[p]]
+        v[i, c] = moving.motions[step + 1, 1, moving.columns[p]]
+        a[i, c] = moving.motions[step + 1, 2, moving.columns[p]]
+
+
+@kernel
+def accumulate(nodes, motion, touched, sums):
+    """Write the works over the last half of a step, kinetic energy and momenta; ``touched`` have contact forces."""
+    h, ends, momenta, x, half, u = motion.h, sums.ends, sums.momenta, motion.x, motion.half, motion.u
+    clear_vector(ends)
+    for c in range(3):
+        work, square, kinetic, momenta[0, c] = _sum_component(half[c], u[c], motion.f[c], nodes.mass, h)
+        ends[INTERNAL] += work
+        ends[INERTIAL] += 0.125 / (h * h) * square
+        ends[KINETIC] += 0.5 * kinetic
+        one, other = (c + 1) % 3, (c + 2) % 3
+        turn = x[one], half[one], u[one], x[other], half[other], u[other]
+        momenta[1, c], momenta[2, one] = _sum_turn(turn, nodes.mass, h)
+        ends[EXTERNAL] += _sum_left(nodes.external[c], half[c], u[c], h)
+        if len(nodes.damping) > 0:
+            ends[DAMPING] += _sum_drag_left(nodes.damping, half[c], u[c], h)
+    for i in touched:
+        for c in range(3):
+            left = 0.5 * (h * half[c, i] - u[c, i])
+            ends[CONTACT] += motion.contact[i, c] * left
+
+
+@kernel
+def _sum_component(half, u, f, mass, h):
+    """Return sums of a component: work of internal forces over the last half of the step, m u^2, m v^2, and m v."""
+    eta = 0.5 / h
+    work = square = kinetic = momentum = 0.0
+    for i in range(len(mass)):
+        m, v = mass[i], half[i] - eta * u[i]
+        work = add_freely(work, f[i] * (h * half[i] - u[i]))
+        square = add_freely(square, m * (u[i] * u[i]))
+        kinetic = add_freely(kinetic, m * (v * v))
+        momentum = add_freely(momentum, m * v)
+    return 0.5 * work, square, kinetic, momentum
+
+
+@kernel
+def _sum_turn(components, mass, h):
+    """Return sums of two components: angular momentum about the third axis, and mass times the first position."""
+    x, half, u, y, rate, w = components
+    eta, turned, moment = 0.5 / h, 0.0, 0.0
+    for i in range(len(mass)):
+        m = mass[i]
+        moment = add_freely(moment, m * x[i])
+        turned = add_freely(turned, m * (x[i] * (rate[i] - eta * w[i]) - y[i] * (half[i] - eta * u[i])))
+    return turned, moment
+
+
+@kernel
+def _sum_left(external, half, u, h):
+    """Return the work of loads over the last half of the step, (h half - u)/2."""
+    total = 0.0
+    for i in range(len(external)):
+        total = add_freely(total, external[i] * (0.5 * (h * half[i] - u[i])))
+    return total
+
+
+@kernel
+def _sum_drag_left(damping, half, u, h):
+    """Return what dampers take over the last half of the step."""
+    eta, total = 0.5 / h, 0.0
+    for i in range(len(damping)):
+        total = add_freely(total, damping[i] * (half[i] - eta * u[i]) * (0.5 * (h * half[i] - u[i])))
+    return total
+
+
+@kernel
+def power(force, v):
+    """Return the sum of force times velocity, or of force times displacement, (n, 3) both, over nodes and
+    components."""
+    one, other, total = force.reshape(-1), v.reshape(-1), 0.0
+    for j in range(len(one)):
+        total = add_freely(total, one[j] * other[j])
+    return total
+
+
+@kernel
+def sum_momenta(x, mass, momentum):
+    """Return momentum, angular momentum and mass times position (3, 3) of nodes at ``x`` (n, 3) with ``momentum`` (n,
+    3) and lumped ``mass`` (n,)."""
+    sums = np.zeros((3, 3))
+    for i in range(len(x)):
+        for c in range(3):
+            one, other = (c + 1) % 3, (c + 2) % 3
+            sums[0, c] += momentum[i, c]
+            sums[1, c] += x[i, one] * momentum[i, other] - x[i, other] * momentum[i, one]
+            sums[2, c] += mass[i] * x[i, c]
+    return sums

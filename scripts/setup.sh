@@ -358,6 +358,7 @@ compile_loops() {
     on_ranks 2 3600 "$python" -m pfem_petsc bench --compile &&
         "$python" -m pfem_petsc rod_impact -o "$folder/rod" --set time.end=0.7 | what_is_compiled &&
         "$python" -m pfem_petsc lattice_drop -o "$folder/drop" | what_is_compiled &&
+        on_ranks 2 3600 "$python" -m pfem_petsc lattice_drop -o "$folder/ranks" --set time.end=1e-5 | what_is_compiled &&
         "$python" -m pfem_petsc hanging_net -o "$folder/net" | what_is_compiled &&
         "$python" -m pfem_petsc render "$folder/rod" --frames 2 --video none > /dev/null
     local status=$?

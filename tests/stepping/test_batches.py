@@ -260,11 +260,11 @@ def compare(one, other, exact=True, same_order=True):
         rounding = 0.0 if exact and same_order else 1e-9 * np.abs(ours).max(initial=0.0)
         np.testing.assert_allclose(ours, others, rtol=0.0, atol=rounding, err_msg=what)
     first, second = (open_result(simulation.folder).history for simulation in (one, other))
-    compare_histories(first, second, exact, same_order)
+    compare_histories(first, second, exact)
     return first
 
 
-def compare_histories(first, second, exact=True, same_order=True):
+def compare_histories(first, second, exact=True):
     """As :func:`compare`."""
     assert sorted(first) == sorted(second)
     scale = max(np.abs(first[column]).max() for column in first if column.endswith(("energy", "work")))
@@ -405,7 +405,7 @@ def test_all_columns_of_all_steps_are_those_of_single_steps(declared, comm, shar
     if comm.size > 1:
         others.append(made(given, shared_tmp_path / f"alone{comm.rank}", "batches", MPI.COMM_SELF)[0])
     for other in others:
-        compare_histories(history, open_result(other.folder).history, exact=False, same_order=False)
+        compare_histories(history, open_result(other.folder).history, exact=False)
     empty = {"step_size", "newton_iterations", "linear_iterations", "damage_dissipation", "viscous_dissipation"}
     empty |= {"thermal_work", "prestress_work", "wall/floor/jump_impulse", "wall/side/jump_impulse"}
     constant = {name for name in history if np.ptp(history[name]) == 0.0}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.lattices import lattice_case, planes, simulation
 
-from pfem_petsc import Case, Simulation
+from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.errors import InputError
 
 TRAPEZOID = {"beta": 0.25, "gamma": 0.5}
@@ -219,3 +219,31 @@ def test_refusals(tables, message, comm, shared_tmp_path):
     case = lattice_case(planes([[0.0, 0.0, 1.0]], [-0.01]), **tables)
     with pytest.raises(InputError, match=message):
         simulation(case, comm, shared_tmp_path)
+
+
+def test_stick_with_friction_far_from_the_origin(tmp_path):
+    """Slips of rounding errors have no direction: a rod that arrives on a rough plane moves alike a kilometre away."""
+
+    def velocity(away):
+        points = np.column_stack([np.linspace(0.0, 0.7, 13), np.zeros((13, 2))]) + away
+        table = {
+            "material": {"m": {"young_modulus": 2.25e7, "density": 2100.0}},
+            "section": {"s": {"area": 9e-3, "material": "m"}},
+            "node_set": {"start": {"indices": [0]}, "every": {"all": True}},
+            "initial": {"velocity": [-0.077, 0.017, 0.31]},
+            "wall": [
+                {"name": "w", "node_set": "start", "type": "plane", "point": [away] * 3, "normal": [0.54, 0.14, -2.95]}
+                | {"friction": 0.11, "static_friction": 0.16}
+            ],
+            "contact": {"treatment": "stick"},
+            "time": {"integrator": "wilson", "step": 2.2e-4, "end": 2.2e-3},
+            "output": {"fields_every": 0, "probe": [{"name": "p", "node_set": "every"}]},
+        }
+        bars = np.column_stack([np.arange(12), np.arange(1, 13)])
+        folder = tmp_path / str(away)
+        Simulation(Case.from_dict(table, mesh=Truss(points, bars)), output=folder, quiet=True).run()
+        return open_result(folder).history["probe/p/velocity"]
+
+    near = velocity(0.0)
+    assert np.abs(near).max() > 0.05
+    np.testing.assert_allclose(velocity(1000.0), near, rtol=0.0, atol=1e-6)

@@ -83,7 +83,7 @@ class Treatment(Restitution):
         if not stepper.scheme.solves_end:  # friction acts along the slip to the position solved for, if any
             solved = self._moved_to_solution(nodes)
             solved -= np.einsum("mwi,mwi->mw", solved, normals)[:, :, None] * normals
-            slip = np.where(np.linalg.norm(solved, axis=2)[:, :, None] > STILL * stepper.model.length, solved, slip)
+            slip = np.where(np.linalg.norm(solved, axis=2)[:, :, None] > STILL * stepper.model.size, solved, slip)
         slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
         size = np.linalg.norm(slip, axis=2)
         slips = touching & (size > STILL * stepper.model.size) & (contact.friction > 0.0)

@@ -552,12 +552,12 @@ class Bars:
         """Compute internal forces ``f`` (local nodes, 3) [N] at positions ``x``; valid for owned nodes. Internal
         variables are updated only if ``commit``."""
         energies, (places, forces) = np.zeros(len(BAR_ENERGIES)), self.components
-        split_components(x, 0, places)
+        split_components(x, places)
         clear(forces)
         failed, shortened, changed = internal_forces(
             places, forces, self.reference, self.loops("full"), self.step, commit, energies
         )
-        join_components(forces, 0, f)
+        join_components(forces, f)
         for family in self.families:
             energies[BAR_ENERGIES.index(family.energy)] += family.add_forces(x, f)
         return StrainEnergy(tuple(energies.tolist()), failed, shortened, changed)
@@ -671,7 +671,7 @@ class Bars:
     def stiffnesses(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
         """Fill ``stored`` (2, b) with c = (dN/dl - N/l)/l^2 [N/m3] and g = N/l [N/m], times ``weight``: the stiffness
         of a bar with end difference d is c d d^T + g I; without springs."""
-        split_components(x, 0, self.components[0])
+        split_components(x, self.components[0])
         stiffnesses(self.components[0], self.reference, self.loops("full"), self.step, weight, stored)
 
     def _step_coefficients(self, x0: np.ndarray, x: np.ndarray, out: np.ndarray) -> None:
@@ -762,7 +762,7 @@ class Bars:
 
     def _states(self, x: np.ndarray, densities: np.ndarray | None = None) -> np.ndarray:
         """Return total strain, stress and axial force (3, b); write the ``densities``, if they are given."""
-        split_components(x, 0, self.components[0])
+        split_components(x, self.components[0])
         out = np.empty((3, len(self.ends)))
         densities = np.empty((0, 0)) if densities is None else densities
         states(self.components[0], self.reference, self.loops("full"), out, densities)

@@ -40,7 +40,7 @@ from .elements import (
     mean_ratio,
     measured,
 )
-from .layout import DIFFERENCES, BarLayout, aligned, run_column
+from .layout import DIFFERENCES, BarLayout, aligned, group_of, run_column
 from .records import record
 
 # Functions that are called for each group take whole arrays and where to begin: a part of an array, or a record of
@@ -87,22 +87,6 @@ class BarArrays(NamedTuple):
     gone: np.ndarray
     energies: np.ndarray
     work: np.ndarray
-
-
-class Group(NamedTuple):
-    """A group of a :class:`~pfem_petsc.mechanics.layout.BarLayout`: its first column and their number, the ends of the
-    first column, the first run and the end, and whether it consists of stars; and where the history of the first
-    column begins, and the distance from one row of it to the next."""
-
-    first: int
-    n: int
-    head: int
-    far: int
-    run: int
-    end: int
-    star: bool
-    at: int
-    stride: int
 
 
 @inlined
@@ -169,17 +153,11 @@ def _measure(n, measure, work):
 
 
 @inlined
-def _column(g, run, nodes, bars):
-    """Return the column of the first bar of a run, counted from the first one of its group."""
-    return np.int64(bars[run]) - np.int64(bars[g.run]) if g.star else np.int64(nodes[run]) - g.head
-
-
-@inlined
 def _read_heat(g, nodes, bars, heat, work):
     """Subtract thermal strains, and write temperatures."""
     for run in range(g.run, g.end):
         bar = np.int64(bars[run])
-        column = _column(g, run, nodes, bars)
+        column = run_column(g, run, nodes, bars)
         for k in range(bar, np.int64(bars[run + 1])):
             i = np.uint64(column + k - bar)
             work[_STRAIN + i] -= heat[0, k]
@@ -294,7 +272,7 @@ def _add_to_stars(g, nodes, bars, far, f, work):
 def _bar_of(g, column, nodes, bars):
     """Return the bar in a column of a group, counted from its first one; -1 for none."""
     for run in range(g.run, g.end):
-        ahead = column - _column(g, run, nodes, bars)
+        ahead = column - run_column(g, run, nodes, bars)
         if 0 <= ahead < np.int64(bars[run + 1]) - np.int64(bars[run]):
             return np.int64(bars[run]) + ahead
     return np.int64(-1)
@@ -352,39 +330,26 @@ def internal_forces(x, f, bars, laws, step, commit, energies):
     nodes, ends, far = layout.nodes, layout.bars, layout.far
     for s in range(len(bars.area)):
         law, p, area, gone = laws[s], bars.parameters[s], bars.area[s], bars.gone[s]
-        begin = layout.starts[layout.sections[s]]
-        stride = layout.starts[layout.sections[s + 1]] - begin
         for group in range(layout.sections[s], layout.sections[s + 1]):
-            first = layout.starts[group]
-            g = Group(
-                first,
-                layout.starts[group + 1] - first,
-                layout.heads[group],
-                layout.fars[group],
-                layout.runs[group],
-                layout.runs[group + 1],
-                layout.stars[group],
-                bars.places[s] + first - begin,
-                stride,
-            )
+            g = group_of(layout, s, group, bars.places[s])
             short = _read_bars(g, bars.measures[s], nodes, ends, far, x, rest, bars.heat, work)
             _read_history(g, bars.rows[s], history, work)
             law(p, step, work, g.n)
-            _pull(g.n, area, areas, first, work)
+            _pull(g.n, area, areas, g.first, work)
             for j in range(bars.energies.shape[1] if len(energies) > 0 and group < layout.counted[s] else 0):
                 if bars.energies[s, j] >= 0:
                     row = HISTORY + bars.rows[s] + j
-                    energies[bars.energies[s, j]] += _sum_energy(g.n, row, first, rest, area, areas, work)
-            broken = g.at + gone * stride if gone >= 0 else np.int64(-1)
+                    energies[bars.energies[s, j]] += _sum_energy(g.n, row, g.first, rest, area, areas, work)
+            broken = g.at + gone * g.stride if gone >= 0 else np.int64(-1)
             if short > 0:
-                column, inverted = _check_short(g.n, first, rest, broken, history, commit, work)
+                column, inverted = _check_short(g.n, g.first, rest, broken, history, commit, work)
                 shortened = shortened or inverted
                 if column >= 0 and failed < 0:
                     failed = _bar_of(g, column, nodes, ends)
             if gone >= 0:
-                broke += _count_broken(g.n, first, rest, broken, history, (HISTORY + gone) * ROW, work)
+                broke += _count_broken(g.n, g.first, rest, broken, history, (HISTORY + gone) * ROW, work)
             for j in range(bars.kept[s] if commit else 0):
-                _copy(g.n, work, (HISTORY + j) * ROW, history, g.at + j * stride)
+                _copy(g.n, work, (HISTORY + j) * ROW, history, g.at + j * g.stride)
             if g.star:
                 _add_to_stars(g, nodes, ends, far, f, work)
             else:
@@ -437,31 +402,18 @@ def stiffnesses(x, bars, laws, step, weight, stored):
     nodes, ends, far = layout.nodes, layout.bars, layout.far
     for s in range(len(bars.area)):
         law, p, area, gone = laws[s], bars.parameters[s], bars.area[s], bars.gone[s]
-        begin = layout.starts[layout.sections[s]]
-        stride = layout.starts[layout.sections[s + 1]] - begin
         for group in range(layout.sections[s], layout.sections[s + 1]):
-            first = layout.starts[group]
-            g = Group(
-                first,
-                layout.starts[group + 1] - first,
-                layout.heads[group],
-                layout.fars[group],
-                layout.runs[group],
-                layout.runs[group + 1],
-                layout.stars[group],
-                bars.places[s] + first - begin,
-                stride,
-            )
+            g = group_of(layout, s, group, bars.places[s])
             _read_bars(g, bars.measures[s], nodes, ends, far, x, rest, bars.heat, work)
             _read_history(g, bars.rows[s], history, work)
             law(p, step, work, g.n)
-            _stiffness_of_group(g.n, bars.measures[s], area, areas, first, rest, work)
+            _stiffness_of_group(g.n, bars.measures[s], area, areas, g.first, rest, work)
             if gone >= 0:
                 for k in range(g.n):
-                    if abs(history[g.at + gone * stride + k]) >= 1.0:
+                    if abs(history[g.at + gone * g.stride + k]) >= 1.0:
                         work[_DX + np.uint64(k)] = work[_DY + np.uint64(k)] = 0.0
             for run in range(g.run, g.end):
-                _put_stiffness(ends[run], ends[run + 1], _column(g, run, nodes, ends), weight, work, stored)
+                _put_stiffness(ends[run], ends[run + 1], run_column(g, run, nodes, ends), weight, work, stored)
 
 
 @kernel
@@ -473,38 +425,25 @@ def states(x, bars, laws, out, densities):
     for s in range(len(layout.counted)):
         law, p, gone, last, measure = laws[s], bars.parameters[s], bars.gone[s], bars.last[s], bars.measures[s]
         row = HISTORY + bars.rows[s]
-        begin = layout.starts[layout.sections[s]]
-        stride = layout.starts[layout.sections[s + 1]] - begin
         for group in range(layout.sections[s], layout.sections[s + 1]):
-            first = layout.starts[group]
-            g = Group(
-                first,
-                layout.starts[group + 1] - first,
-                layout.heads[group],
-                layout.fars[group],
-                layout.runs[group],
-                layout.runs[group + 1],
-                layout.stars[group],
-                bars.places[s] + first - begin,
-                stride,
-            )
+            g = group_of(layout, s, group, bars.places[s])
             _read_bars(g, measure, layout.nodes, layout.bars, layout.far, x, bars.rest, bars.heat, work)
             _read_history(g, bars.rows[s], history, work)
             law(p, 0.0, work, g.n)
-            for run in range(layout.runs[group], layout.runs[group + 1]):
+            for run in range(g.run, g.end):
                 bar = np.int64(layout.bars[run])
-                column = _column(g, run, layout.nodes, layout.bars)
+                column = run_column(g, run, layout.nodes, layout.bars)
                 for k in range(bar, np.int64(layout.bars[run + 1])):
                     i = column + k - bar
                     stretch, state = work[_STRETCH + np.uint64(i)], 0.0
                     if gone >= 0:
-                        state = abs(history[g.at + gone * stride + i])
+                        state = abs(history[g.at + gone * g.stride + i])
                         stretch = 0.0 if state >= 1.0 and math.isnan(stretch) else stretch  # it may have no length
                     strain, slope, _ = measured(measure, stretch)
                     stress = work[_STRESS + np.uint64(i)]
                     if last >= 0:  # the rate of the last step is not known any more, but its stress is
-                        stress = history[g.at + (last + 1) * stride + i] * (1.0 - state)
-                    out[0, k], out[1, k], out[2, k] = strain, stress, _area(bars, s, first + i) * stress * slope
+                        stress = history[g.at + (last + 1) * g.stride + i] * (1.0 - state)
+                    out[0, k], out[1, k], out[2, k] = strain, stress, _area(bars, s, g.first + i) * stress * slope
                     for j in range(bars.energies.shape[1] if len(densities) > 0 else 0):
                         if bars.energies[s, j] >= 0:
                             densities[bars.energies[s, j], k] = work[(row + j) * ROW + i]
@@ -534,21 +473,16 @@ def step_coefficients(x, ends, bars, laws, step, start, out):
     work = bars.work
     for s in range(len(layout.counted)):
         law, p, gone, measure = laws[s], bars.parameters[s], bars.gone[s], bars.measures[s]
-        begin = layout.starts[layout.sections[s]]
-        stride = layout.starts[layout.sections[s + 1]] - begin
         for group in range(layout.sections[s], layout.sections[s + 1]):
-            first = layout.starts[group]
-            n = layout.starts[group + 1] - first
-            at = bars.places[s] + first - begin
+            g = group_of(layout, s, group, bars.places[s])
             work[STRAIN * ROW : HISTORY * ROW] = 0.0
-            for j in range(bars.rows[s]):
-                _copy(n, bars.history, at + j * stride, work, (HISTORY + j) * ROW)
-            for run in range(layout.runs[group], layout.runs[group + 1]):
+            _read_history(g, bars.rows[s], bars.history, work)
+            for run in range(g.run, g.end):
                 bar = np.int64(layout.bars[run])
-                column = run_column(layout, group, run) - first
+                column = run_column(g, run, layout.nodes, layout.bars)
                 for k in range(bar, np.int64(layout.bars[run + 1])):
                     i = np.uint64(column + k - bar)
-                    rest = bars.rest[first + column + k - bar]
+                    rest = bars.rest[g.first + column + k - bar]
                     rest0 = start.rest[k] if len(start.rest) > 0 else rest
                     length0, length = _length(start.x, ends[k, 0], ends[k, 1]), _length(x, ends[k, 0], ends[k, 1])
                     work[_STRAIN0 + i] = measured(measure, length0 / rest0)[0]
@@ -557,17 +491,17 @@ def step_coefficients(x, ends, bars, laws, step, start, out):
                         work[_STRAIN0 + i] -= start.heat[0, k]
                         work[_STRAIN + i] -= bars.heat[0, k]
                         work[_TEMPERATURE0 + i], work[_TEMPERATURE + i] = start.heat[1, k], bars.heat[1, k]
-            law(p, step, work, n)
-            for run in range(layout.runs[group], layout.runs[group + 1]):
+            law(p, step, work, g.n)
+            for run in range(g.run, g.end):
                 bar = np.int64(layout.bars[run])
-                column = run_column(layout, group, run) - first
+                column = run_column(g, run, layout.nodes, layout.bars)
                 for k in range(bar, np.int64(layout.bars[run + 1])):
                     i = np.uint64(column + k - bar)
                     if gone >= 0:  # noqa: SIM102
-                        if abs(bars.history[at + gone * stride + column + k - bar]) >= 1.0:
+                        if abs(bars.history[g.at + gone * g.stride + column + k - bar]) >= 1.0:
                             out[0, k], out[1, k] = 0.0, 0.0
                             continue
-                    rest1 = bars.rest[first + column + k - bar]
+                    rest1 = bars.rest[g.first + column + k - bar]
                     rest = 0.5 * (rest1 + start.rest[k]) if len(start.rest) > 0 else rest1
                     length0, length = _length(start.x, ends[k, 0], ends[k, 1]), _length(x, ends[k, 0], ends[k, 1])
                     if not length / rest > COLLAPSED_STRETCH:
@@ -575,7 +509,7 @@ def step_coefficients(x, ends, bars, laws, step, start, out):
                         continue
                     slope = measured(measure, length / rest1)[1] * (rest / rest1)
                     r, dr = mean_ratio(measure, length0 / rest, length / rest)
-                    area = _area(bars, s, first + column + k - bar)
+                    area = _area(bars, s, g.first + column + k - bar)
                     out[0, k] = area * work[_STRESS + i] * r / rest
                     out[1, k] = (
                         area * (work[_MODULUS + i] * slope * r + work[_STRESS + i] * dr) / (rest * rest) / length
@@ -588,15 +522,14 @@ def known_rates(ends, bars, s, step, motion, known):
     positions at the start, positions, velocities, all (local, 3), and eta."""
     x0, x, v, eta = motion
     layout = bars.layout
-    begin = layout.starts[layout.sections[s]]
-    stride = layout.starts[layout.sections[s + 1]] - begin
     for group in range(layout.sections[s], layout.sections[s + 1]):
-        for run in range(layout.runs[group], layout.runs[group + 1]):
+        g = group_of(layout, s, group, bars.places[s])
+        for run in range(g.run, g.end):
             bar = np.int64(layout.bars[run])
-            first = run_column(layout, group, run)
+            first = run_column(g, run, layout.nodes, layout.bars)
             for k in range(bar, np.int64(layout.bars[run + 1])):
                 a, b, column = ends[k, 0], ends[k, 1], first + k - bar
-                rest = bars.rest[column]
+                rest = bars.rest[g.first + column]
                 length = _length(x, a, b)
                 strain, slope, _ = measured(bars.measures[s], length / rest)
                 along = 0.0
@@ -606,7 +539,7 @@ def known_rates(ends, bars, s, step, motion, known):
                 if step > 0.0:
                     begun = measured(bars.measures[s], _length(x0, a, b) / rest)[0]
                     shift = bars.heat[0, k] if bars.heat.shape[1] > 0 else 0.0
-                    before = bars.history[bars.places[s] + bars.last[s] * stride + column - begin]
+                    before = bars.history[g.at + bars.last[s] * g.stride + column]
                     # what temperatures and rest lengths change the strain by in the step, and the strain at x
                     rate += (begun - shift - before) / step + eta * (before - (strain - shift))
                 known[k - np.int64(layout.bars[layout.runs[layout.sections[s]]])] = rate

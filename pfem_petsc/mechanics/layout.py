@@ -54,9 +54,9 @@ def fill(out, value):
 
 
 @kernel
-def split_components(x, first, out):
-    """Write vectors (n, 3) to components (3, stride) of nodes from a first one on."""
-    nodes, xs, ys, zs = x.reshape(-1), out[0, first:], out[1, first:], out[2, first:]
+def split_components(x, out):
+    """Write vectors (n, 3) to components (3, stride)."""
+    nodes, xs, ys, zs = x.reshape(-1), out[0], out[1], out[2]
     for i in range(len(x)):
         xs[i] = nodes[3 * i]
         ys[i] = nodes[3 * i + 1]
@@ -72,9 +72,9 @@ def clear(components):
 
 
 @kernel
-def join_components(components, first, out):
-    """Write components (3, stride) of nodes from a first one on to vectors (n, 3)."""
-    nodes, xs, ys, zs = out.reshape(-1), components[0, first:], components[1, first:], components[2, first:]
+def join_components(components, out):
+    """Write components (3, stride) to vectors (n, 3)."""
+    nodes, xs, ys, zs = out.reshape(-1), components[0], components[1], components[2]
     for i in range(len(out)):
         nodes[3 * i] = xs[i]
         nodes[3 * i + 1] = ys[i]
@@ -333,38 +333,67 @@ def _place_groups(run_heads, run_fars, run_starts, runs, stars, places):
     starts[len(heads)] = count
 
 
+class Group(NamedTuple):
+    """A group of a :class:`BarLayout`: its first column and their number, the ends of the first column, the first run
+    and the end, and whether it consists of stars; and where rows of the columns of its section have the first column,
+    and the distance from one row to the next."""
+
+    first: int
+    n: int
+    head: int
+    far: int
+    run: int
+    end: int
+    star: bool
+    at: int
+    stride: int
+
+
 @inlined
-def run_column(layout, group, run):
-    """Return the column of the first bar of a run."""
-    if layout.stars[group]:
-        ahead = np.int64(layout.bars[run]) - np.int64(layout.bars[layout.runs[group]])
-    else:
-        ahead = np.int64(layout.nodes[run]) - layout.heads[group]
-    return layout.starts[group] + ahead
+def group_of(layout, section, number, place):
+    """Return a group of a section, whose rows begin at a ``place``."""
+    first, begin = layout.starts[number], layout.starts[layout.sections[section]]
+    return Group(
+        first,
+        layout.starts[number + 1] - first,
+        layout.heads[number],
+        layout.fars[number],
+        layout.runs[number],
+        layout.runs[number + 1],
+        layout.stars[number],
+        place + first - begin,
+        layout.starts[layout.sections[section + 1]] - begin,
+    )
+
+
+@inlined
+def run_column(g, run, nodes, bars):
+    """Return the column of the first bar of a run, counted from the first one of its group."""
+    return np.int64(bars[run]) - np.int64(bars[g.run]) if g.star else np.int64(nodes[run]) - g.head
 
 
 @kernel
 def spread_values(layout, section, values, none, spread):
     """Write values (n,) of the bars of a section to its columns ``spread``, and ``none`` to the others."""
-    begin = layout.starts[layout.sections[section]]
     bar = np.int64(layout.bars[layout.runs[layout.sections[section]]])
-    for group in range(layout.sections[section], layout.sections[section + 1]):
-        end = layout.starts[group] - begin
-        for run in range(layout.runs[group], layout.runs[group + 1]):
+    for number in range(layout.sections[section], layout.sections[section + 1]):
+        g = group_of(layout, section, number, 0)
+        end = g.at
+        for run in range(g.run, g.end):
             first, last = np.int64(layout.bars[run]) - bar, np.int64(layout.bars[run + 1]) - bar
-            at = run_column(layout, group, run) - begin
+            at = g.at + run_column(g, run, layout.nodes, layout.bars)
             fill(spread[end:at], none)
             end = at + last - first
             copy(values[first:last], spread[at:end])
-        fill(spread[end : layout.starts[group + 1] - begin], none)
+        fill(spread[end : g.at + g.n], none)
 
 
 @kernel
 def gather_values(layout, section, spread, values):
     """Write what the columns ``spread`` of a section have to the ``values`` (n,) of its bars."""
-    begin = layout.starts[layout.sections[section]]
     bar = np.int64(layout.bars[layout.runs[layout.sections[section]]])
-    for group in range(layout.sections[section], layout.sections[section + 1]):
-        for run in range(layout.runs[group], layout.runs[group + 1]):
+    for number in range(layout.sections[section], layout.sections[section + 1]):
+        g = group_of(layout, section, number, 0)
+        for run in range(g.run, g.end):
             first, last = np.int64(layout.bars[run]) - bar, np.int64(layout.bars[run + 1]) - bar
-            copy(spread[run_column(layout, group, run) - begin :], values[first:last])
+            copy(spread[g.at + run_column(g, run, layout.nodes, layout.bars) :], values[first:last])

@@ -52,7 +52,7 @@ class BarProducts:
 
     def take(self) -> None:
         """Take account of changes of :attr:`x` and :attr:`stored`."""
-        split_components(self.x, 0, self._places)
+        split_components(self.x, self._places)
         if self._columns is self.stored:
             return
         for block in self.bars.blocks:

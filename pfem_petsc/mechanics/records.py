@@ -47,14 +47,6 @@ def _maker(cls: type) -> Any:
     return make
 
 
-def by_reference(values: Any) -> Any:
-    """Return the record of a named tuple, and of those among its fields whose classes are records too."""
-    cls = type(values)
-    if not COMPILED or not hasattr(sys.modules[cls.__module__], f"{cls.__name__}Reference"):
-        return values
-    return _maker(cls)(*(by_reference(value) if isinstance(value, tuple) else value for value in values))
-
-
 class References:
     """Records of named tuples, one of each class, which are kept as long as their fields are the same objects."""
 
@@ -62,9 +54,18 @@ class References:
         self._kept: dict[type, tuple[Any, Any]] = {}
 
     def of(self, values: Any) -> Any:
-        """Return the record of a named tuple, see :func:`by_reference`."""
-        before, reference = self._kept.get(type(values), (None, None))
+        """Return the record of a named tuple, with those of its fields whose classes are records too; anything else as
+        it is."""
+        cls = type(values)
+        if not COMPILED or not hasattr(sys.modules[cls.__module__], f"{cls.__name__}Reference"):
+            return values
+        before, reference = self._kept.get(cls, (None, None))
         if before is None or any(one is not other for one, other in zip(before, values, strict=True)):
-            reference = by_reference(values)
-            self._kept[type(values)] = values, reference
+            reference = _maker(cls)(*(self.of(value) if isinstance(value, tuple) else value for value in values))
+            self._kept[cls] = values, reference
         return reference
+
+
+def by_reference(values: Any) -> Any:
+    """Return the record of a named tuple, see :meth:`References.of`."""
+    return References().of(values)

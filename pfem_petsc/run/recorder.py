@@ -34,6 +34,7 @@ from ..columns import (
     fill_at_state,
 )
 from ..mechanics.springs import Ground
+from ..stepping.impulses import ContactSums, record_forces
 from ..stepping.stepper import Instants
 
 if TYPE_CHECKING:
@@ -261,14 +262,9 @@ class Recorder:
         head[_BARS] += stepper.energy.energies
         head[HEAD.first("alarm")] = alarm
         fill_at_state(self._at_state, stepper, head)
-        if contact.any:
-            share.changes[:], contact.log.changes = contact.log.changes, 0
-            for name, values in (("force", walls.force), ("moment", walls.moment)):
-                share.walls[:, WALL[name]] = values
-            share.walls[:, WALL.first("contacts")] = walls.contacts
-            share.walls[:, WALL.first("releases")] = contact.log.releases
-        share.tables[:, PAIR["force"]] = self.model.links.totals()
-        impulses.fill_contact(share)
+        changes, contact.log.changes = contact.log.changes, 0
+        sums = ContactSums(walls.force, walls.moment, walls.contacts, contact.log.releases, self.model.links.totals())
+        record_forces(impulses.state.v, sums, changes, share.numbers)
         held = self.model.supports.any or self.model.bars.springs is not None
         reacts = held and not stepper.scheme.balance_at_endpoints
         if self.probe_nodes or reacts:

@@ -16,6 +16,7 @@ from ..mechanics.internal_forces import BarArrays, internal_forces
 from ..mechanics.layout import clear, join_components, split_components
 from ..mechanics.loads import LoadSchedule, set_forces
 from ..mechanics.records import record
+from ..mesh.exchange import Messages
 from .contact_phase import (
     ContactNodes,
     WallArrays,
@@ -28,7 +29,7 @@ from .contact_phase import (
     work_of_walls,
 )
 from .impact import join_nodes
-from .impulses import IN_COLUMNS, SUPPORT, WALLS
+from .impulses import SUPPORT, WALLS, ContactSums, record_forces
 from .phases import (
     CONTACT,
     DAMPING,
@@ -52,6 +53,7 @@ from .phases import (
     correct_moving_ends,
     displace,
     move,
+    numerical_dissipation,
     place_supports,
     put_rates,
     rates_of,
@@ -65,6 +67,9 @@ SOLVE, CLOSE = range(2)
 
 FAILED, LOST = -1, -2
 """Results of calls: a failure of the simulation, any other error."""
+
+
+record(Messages)
 
 
 @record
@@ -137,20 +142,6 @@ class Calls(NamedTuple):
 
 
 @record
-class MessageArrays(NamedTuple):
-    """See :class:`~pfem_petsc.mesh.exchange.Messages`."""
-
-    several: bool
-    rows: np.ndarray
-    leaving: np.ndarray
-    arriving: np.ndarray
-    count: int
-    requests: np.ndarray
-    statuses: np.ndarray
-    handles: np.ndarray
-
-
-@record
 class StepArrays(NamedTuple):
     """All that compiled steps read and write, of which the latter parts are: the sums of the ledger, of which the
     dissipations by impact and friction and the work of walls are added to; works (5,) of all balances; particles of
@@ -171,7 +162,7 @@ class StepArrays(NamedTuple):
     sums: StepSums
     pressed: ContactNodes
     outcome: np.ndarray
-    messages: MessageArrays
+    messages: Messages
     calls: Calls
     state: StateArrays
     ledger: np.ndarray
@@ -255,18 +246,18 @@ def any_rank(messages, here, calls):
 @kernel
 def take_state(state, motion):
     """Read positions and velocities at half steps by components."""
-    split_components(state.x, 0, motion.x)
-    split_components(state.half, 0, motion.half)
+    split_components(state.x, motion.x)
+    split_components(state.half, motion.half)
 
 
 @kernel
 def give_state(state, motion):
     """Write the state at the end of a step, by the scheme alone."""
     n, h = len(state.half), motion.h
-    join_components(motion.x, 0, state.x)
-    join_components(motion.f, 0, state.f)
-    join_components(motion.half, 0, state.half)
-    join_components(motion.u, 0, state.u)
+    join_components(motion.x, state.x)
+    join_components(motion.f, state.f)
+    join_components(motion.half, state.half)
+    join_components(motion.u, state.u)
     for i in range(n):
         rates_of(i, motion, state.v, state.a)
         for c in range(3):
@@ -284,24 +275,25 @@ def begin_step(s, step):
 
 
 @kernel
-def evaluate_forces(bars, springs, motion, energies, sums):
+def evaluate_forces(s, energies):
     """Compute internal forces, and the energies unless this array is empty; see
     :func:`~pfem_petsc.mechanics.internal_forces.internal_forces`."""
+    bars, springs, motion = s.bars, s.springs, s.motion
     clear(motion.f)
     laws = bars.full if len(energies) > 0 else bars.brief
     clear_vector(energies)
     found = internal_forces(motion.x, motion.f, bars.arrays, laws, motion.h, True, energies)
     if len(springs.nodes) > 0:
-        add_springs(springs, motion.x, motion.f, sums.springs)
+        add_springs(springs, motion.x, motion.f, s.sums.springs)
     return found
 
 
 @kernel
-def solve_called(s, step, sums):
+def solve_called(s, step):
     """Have Python solve the rows of a step; return what it returns."""
     called, motion, n = s.called, s.motion, len(s.called.u)
     h, x, half, u = motion.h, motion.x, motion.half, motion.u
-    join_components(x, 0, s.state.x)
+    join_components(x, s.state.x)
     for i in range(n):
         for c in range(3):
             called.u[i, c] = u[c, i]
@@ -310,7 +302,7 @@ def solve_called(s, step, sums):
     for i in range(n):
         for c in range(3):
             if called.u[i, c] != u[c, i]:
-                displace(c, i, called.u[i, c] - u[c, i], s.nodes, motion, sums)
+                displace(c, i, called.u[i, c] - u[c, i], s.nodes, motion, s.sums)
     return result
 
 
@@ -350,10 +342,11 @@ def push_particles(forces, walls, links, h, impulses, u):
 
 
 @kernel
-def record_row(s, step, pressed, counts, particles, energies, sums, row):
+def record_row(s, step, counts, particles, energies, row):
     """Write this rank's share of the row of a step; ``counts``: active contacts, and contacts that have changed;
     ``particles`` (rows, 3): increments of the impulses."""
-    h, ledger, impulses, works, ends = s.motion.h, s.ledger, s.impulses, s.works, sums.ends
+    h, ledger, impulses, works, sums = s.motion.h, s.ledger, s.impulses, s.works, s.sums
+    ends = sums.ends
     for k in range(len(particles)):
         for c in range(3):
             impulses.v[k, c] = impulses.half[k, c] - 0.5 / h * particles[k, c]
@@ -373,40 +366,17 @@ def record_row(s, step, pressed, counts, particles, energies, sums, row):
     row[_KINETIC] = ends[KINETIC]
     row[_EXTERNAL_WORK] = works[EXTERNAL] + ends[EXTERNAL]
     row[_DAMPED] = works[DAMPING] + ends[DAMPING]
-    inertial = ((works[INTERNAL] + ends[INTERNAL]) - stored) + works[INERTIAL] - ends[INERTIAL]
-    pushed = works[CONTACT] + ends[CONTACT] - ledger[_PUSHED] + ledger[_RUBBED]
-    row[_NUMERICAL] = inertial - pushed - ledger[_IMPACT]
+    inertial, internal = works[INERTIAL] - ends[INERTIAL], works[INTERNAL] + ends[INTERNAL]
+    excess = works[CONTACT] + ends[CONTACT] - ledger[_PUSHED]
+    row[_NUMERICAL] = numerical_dissipation(inertial, internal, stored, excess, ledger[_RUBBED] + ledger[_IMPACT])
     for c in range(3):
         row[_SUPPORT + c] = sums.forces[SUPPORTS, c]
         for k in range(3):
             row[_MOMENTA + 3 * k + c] = sums.momenta[k, c]
-            row[_IMPULSES + 3 * k + c] = impulses.v[IN_COLUMNS[k], c]
     row[_PRESSING] = counts[0]
-    _record_contact(s, pressed, counts[1], row)
-
-
-@kernel
-def _record_contact(s, pressed, changes, row):
-    """Write sums and impulses of walls and tables of rows."""
-    particles, totals = s.impulses.v, s.rows.totals
-    w, t = len(pressed.contacts), len(totals)
-    at, jumps = _CHANGES + (1 if w > 0 else 0), WALLS + w + t
-    if w > 0:
-        row[_CHANGES] = changes
-    for k in range(w):
-        for c in range(3):
-            row[at + _WALL_FORCE + c] = pressed.force[k, c]
-            row[at + _WALL_MOMENT + c] = pressed.moment[k, c]
-            row[at + _WALL_IMPULSE + c] = particles[WALLS + k, c]
-            row[at + _WALL_JUMP + c] = particles[jumps + k, c]
-        row[at + _CONTACTS], row[at + _RELEASES] = pressed.contacts[k], s.walls.releases[k]
-        at += _WALL
-    for k in range(t):
-        for c in range(3):
-            row[at + _PAIR_FORCE + c] = totals[k, c]
-            row[at + _PAIR_IMPULSE + c] = particles[WALLS + w + k, c]
-            row[at + _PAIR_JUMP + c] = particles[jumps + w + k, c]
-        at += _PAIR
+    pressed = s.pressed
+    contact = ContactSums(pressed.force, pressed.moment, pressed.contacts, s.walls.releases, s.rows.totals)
+    record_forces(impulses.v, contact, counts[1], row)
 
 
 @kernel
@@ -428,9 +398,9 @@ def run_compiled(s, contacts, due, flags):
 
     Its arguments are StepArrays; Contacts as a tuple; ``due`` (count,) bool, the steps with a row; and ``flags``
     (count, walls) bool, which receives the walls that are touched in each step. The state is that after the last step.
-    Fewer steps are made where bars of any
-    rank change their state of rupture, and where something fails, except on several ranks that need not agree: these
-    make all steps then, as others wait for their messages. It returns Contacts as a tuple, and writes the outcome.
+    Fewer steps are made where bars of any rank change their state of rupture, and where something fails, except on
+    several ranks that need not agree: these make all steps then, as others wait for their messages. It returns Contacts
+    as a tuple, and writes the outcome.
     """
     touched, met, changes, friction = contacts
     outcome = s.outcome
@@ -473,14 +443,14 @@ def run_compiled(s, contacts, due, flags):
                 break
             take_positions(messages, n, motion.x, s.state.before)
         wanted = energies if ending or s.bars.can_break else no_energies  # a bar that breaks ends the steps
-        failed, shortened, changed = evaluate_forces(s.bars, s.springs, motion, wanted, sums)
+        failed, shortened, changed = evaluate_forces(s, wanted)
         balance(nodes, motion, held, keeps or ending, sums)
         apply_supports(held, nodes, motion, sums)
         some, altered, found = 0, 0, 0
         if linked:
             some, altered = project_on_rows(rows, nodes, motion, sums)
         if calling:
-            unsolved = call = solve_called(s, step, sums)
+            unsolved = call = solve_called(s, step)
             if call < FAILED:
                 break
         if n_walls > 0:
@@ -535,7 +505,7 @@ def run_compiled(s, contacts, due, flags):
         if ending or wrong:
             accumulate(nodes, motion, pressing, sums)
             energies[_SPRINGS] = sums.springs[3]
-            record_row(s, step, pressed, (len(pressing), changes), particles, energies, sums, s.shares[recorded])
+            record_row(s, step, (len(pressing), changes), particles, energies, s.shares[recorded])
             changes = 0 if due[step] else changes
             recorded += 1
         for c in range(3):

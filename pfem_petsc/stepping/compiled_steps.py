@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -16,7 +16,7 @@ from ..contact.node_walls import NOTED, WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.compiled import COMPILED
-from ..mechanics.records import References, by_reference
+from ..mechanics.records import References
 from ..mesh.exchange import SIGNATURES, CFunction, mpi_functions
 from ..mesh.ordering import NODE_BLOCK
 from ..parallel.ending import is_alone
@@ -40,7 +40,6 @@ from .compiled_loop import (
     Calls,
     Contacts,
     ImpulseArrays,
-    MessageArrays,
     StateArrays,
     StepArrays,
     StepBars,
@@ -78,17 +77,12 @@ class CompiledSteps:
         places, forces = model.bars.components
         self._motion = Motion(stepper.h, places, np.empty((3, n)), np.zeros((3, n)), forces, self._contact)
         self._nodes, self._held, self._walls = self._make_nodes(), self._make_held(), self._make_walls()
+        self._springs, self._sums, self._at_rest = self._make_springs(), new_sums(), self._moving_supports(0, 0)
+        self._pressed, self._outcome = new_contact_nodes(n, len(model.contact.names)), np.zeros(10, dtype=np.int64)
         self._stiffness = self._nodes.stiffness if model.links else np.empty(0)
         self._called = RowCaller(stepper, self._stiffness, self._u, self._contact)
-        # what stays the same
-        pressed = new_contact_nodes(n, len(model.contact.names))
-        self._pressed, self._outcome = pressed, np.zeros(10, dtype=np.int64)
-        same = self._nodes, self._motion, self._held, self._springs(), new_sums(), pressed
-        self._nodes_, self._motion_, self._held_, self._springs_, *room = map(by_reference, same)
-        messages, calls = MessageArrays(*model.mesh.messages()), Calls(*self._called.functions)
-        self._room = *room, self._outcome, by_reference(messages), by_reference(calls)
-        self._references, self._at_rest = References(), self._moving_supports(0, 0)
-        self._walls_ = by_reference(self._walls)
+        self._messages, self._calls = model.mesh.messages(), Calls(*_mpi(), self._called.function)
+        self._references = References()
         share = Share(len(model.contact.names), len(model.links.columns), len(stepper.probed))
         self._width, self._at_state = len(share.numbers), at_state(model)
         self._ends_at_rows = not all(column.looped for column in self._at_state)
@@ -127,7 +121,7 @@ class CompiledSteps:
             bars.reference, bars.loops("brief"), bars.loops("full"), bars.ends, bars.watched, bars.can_break
         )
 
-    def _springs(self) -> GroundSprings:
+    def _make_springs(self) -> GroundSprings:
         springs = self.model.bars.springs
         if springs is None:
             return GroundSprings(np.empty(0, dtype=np.int64), np.empty((0, 3, 3)), np.empty((0, 3)))
@@ -148,12 +142,6 @@ class CompiledSteps:
     def _wall_motions(self, begin: int, count: int) -> np.ndarray:
         contact = self.model.contact
         return contact.motion.schedule(self._times(begin, count if contact.moving.any() else -2))
-
-    def _walls_at(self, begin: int, count: int) -> Any:
-        """Return the walls in ``count`` steps from one of a number on."""
-        if not self.model.contact.moving.any():
-            return self._walls_
-        return self._walls._replace(motions=self._wall_motions(begin, count))
 
     @staticmethod
     def serves(stepper: Stepper) -> bool:
@@ -191,29 +179,35 @@ class CompiledSteps:
         flags = np.zeros((count, len(log.releases)), dtype=bool)
         rows = model.links.export_rows(self._stiffness)
         ledger.sums[_BROKEN] = stepper.ruptures.count
-        half, of = state.memory["half_velocity"], self._references.of
+        half, walls = state.memory["half_velocity"], self._walls
+        if model.contact.moving.any():
+            walls = walls._replace(motions=self._wall_motions(begin, count))
         arrays = StepArrays(
-            self._nodes_,
-            self._motion_,
-            self._held_,
-            of(self._moving_supports(begin, count) if model.supports.moves else self._at_rest),
-            self._springs_,
-            of(self._bars()),
-            of(model.external.schedule(range(begin + 1, begin + 1 + count), stepper.h)),
-            self._walls_at(begin, count),
-            of(rows),
-            of(self._called.begin(begin, rows.totals)),
-            *self._room,
-            of(StateArrays(state.x, stepper.before, state.f, half, self._u, state.v, state.a)),
+            self._nodes,
+            self._motion,
+            self._held,
+            self._moving_supports(begin, count) if model.supports.moves else self._at_rest,
+            self._springs,
+            self._bars(),
+            model.external.schedule(range(begin + 1, begin + 1 + count), stepper.h),
+            walls,
+            rows,
+            self._called.begin(begin, rows.totals),
+            self._sums,
+            self._pressed,
+            self._outcome,
+            self._messages,
+            self._calls,
+            StateArrays(state.x, stepper.before, state.f, half, self._u, state.v, state.a),
             ledger.sums,
             ledger.powers,
-            of(ImpulseArrays(impulses.memory["half_velocity"], impulses.a, impulses.v)),
+            ImpulseArrays(impulses.memory["half_velocity"], impulses.a, impulses.v),
             stepper.probed,
             stepper.solution.walls.force.copy(),
             shares,
         )
         contacts = log.last, ledger.impacts.met, log.changes, ledger.friction_ahead
-        contacts = Contacts(*run_compiled(by_reference(arrays), contacts, due, flags))
+        contacts = Contacts(*run_compiled(self._references.of(arrays), contacts, due, flags))
         self._called.end()
         made = self._outcome.tolist()
         if made[LOST_BY_MPI]:
@@ -302,7 +296,7 @@ class RowCaller:
     Attributes
     ----------
     record : CalledRows
-    functions : that the loop calls: those of MPI, and this one
+    function : that the loop calls
     failure : SimulationFailure of the last call of the loop, or None
     """
 
@@ -313,13 +307,10 @@ class RowCaller:
         self._begin, self._totals, self._error = 0, np.empty((0, 3)), None
         self.failure: SimulationFailure | None = None
         self._function = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(self._call)
-        self.functions = (*_mpi(), CFunction(self._function, _CALL))
+        self.function = CFunction(self._function, _CALL)
         n = 0 if self.links.separate else len(u)
-        nodes, none = np.empty((2, n), dtype=np.int64), np.empty((0, 3))
-        used = (u, np.empty((n, 3))) if n else (none, none)
-        self.record = CalledRows(
-            not self.links.separate, used[1], used[0], *nodes, np.zeros(2, dtype=np.int64), np.zeros(1)
-        )
+        nodes, counts, loss = np.empty((2, n), dtype=np.int64), np.zeros(2, dtype=np.int64), np.zeros(1)
+        self.record = CalledRows(not self.links.separate, np.empty((n, 3)), u[:n], *nodes, counts, loss)
         self._keep(0, self.links.pressed())
         if self.record.any:
             stepper.balance = stepper.scheme.balance(stepper.state, stepper.h)

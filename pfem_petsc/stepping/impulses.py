@@ -15,12 +15,13 @@ and so is the difference between prescribed velocities and those of the scheme.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..columns import HEAD, PAIR, WALL, Share
+from ..columns import HEAD, PAIR, WALL
 from ..integrators.base import State
+from ..mechanics.compiled import kernel
 from ..tolerances import RANK
 
 if TYPE_CHECKING:
@@ -35,7 +36,50 @@ pairs, then the jumps of walls and pairs."""
 IN_COLUMNS = (EXTERNAL, SUPPORT, DAMPING)
 """The first rows of the particles in the order of the columns of the history."""
 
-_IMPULSES = slice(HEAD["external_impulse"].start, HEAD["damping_impulse"].stop)
+_IMPULSES, _CHANGES = HEAD.first("external_impulse"), HEAD.width
+_WALL, _PAIR = WALL.width, PAIR.width
+_WALL_FORCE, _WALL_MOMENT, _WALL_IMPULSE, _WALL_JUMP, _CONTACTS, _RELEASES = map(
+    WALL.first, ("force", "moment", "impulse", "jump_impulse", "contacts", "releases")
+)
+_PAIR_FORCE, _PAIR_IMPULSE, _PAIR_JUMP = map(PAIR.first, ("force", "impulse", "jump_impulse"))
+
+
+class ContactSums(NamedTuple):
+    """This rank's sums at the end of a step: ``force`` [N] and ``moment`` [N m] of walls (walls, 3), ``contacts`` and
+    ``releases`` (walls,) of nodes, ``totals`` (tables, 3) forces of tables of pairs and constraints [N]."""
+
+    force: np.ndarray
+    moment: np.ndarray
+    contacts: np.ndarray
+    releases: np.ndarray
+    totals: np.ndarray
+
+
+@kernel
+def record_forces(particles, sums, changes, row):
+    """Write all impulses, and the sums of contact, into this rank's share of a row, see
+    :class:`~pfem_petsc.columns.Share`; ``particles`` (rows, 3) [N s], ``changes``: of contacts since the last row."""
+    w, t = len(sums.contacts), len(sums.totals)
+    at, jumps = _CHANGES + (1 if w > 0 else 0), WALLS + w + t
+    for k in range(3):
+        for c in range(3):
+            row[_IMPULSES + 3 * k + c] = particles[IN_COLUMNS[k], c]
+    if w > 0:
+        row[_CHANGES] = changes
+    for k in range(w):
+        for c in range(3):
+            row[at + _WALL_FORCE + c] = sums.force[k, c]
+            row[at + _WALL_MOMENT + c] = sums.moment[k, c]
+            row[at + _WALL_IMPULSE + c] = particles[WALLS + k, c]
+            row[at + _WALL_JUMP + c] = particles[jumps + k, c]
+        row[at + _CONTACTS], row[at + _RELEASES] = sums.contacts[k], sums.releases[k]
+        at += _WALL
+    for k in range(t):
+        for c in range(3):
+            row[at + _PAIR_FORCE + c] = sums.totals[k, c]
+            row[at + _PAIR_IMPULSE + c] = particles[WALLS + w + k, c]
+            row[at + _PAIR_JUMP + c] = particles[jumps + w + k, c]
+        at += _PAIR
 
 
 def _wall_shares(stepper: Stepper, nodes: np.ndarray, touching: np.ndarray, jumps: np.ndarray) -> np.ndarray:
@@ -135,18 +179,6 @@ class Impulses:
             particles[first + self.n_walls + k] += momentum[table == k].sum(axis=0)
         # links conserve momentum except for the part that supports at their nodes receive
         particles[SUPPORT] += momentum.sum(axis=0)
-
-    def fill(self, head: np.ndarray) -> None:
-        """Write the impulses of support, external and damping forces into sums (width of HEAD,)."""
-        head[_IMPULSES] = self.state.v[list(IN_COLUMNS)].ravel()
-
-    def fill_contact(self, share: Share) -> None:
-        """Write the impulses of walls and links into a share of a row."""
-        impulses, walls, tables = self.state.v, share.walls, share.tables
-        walls[:, WALL["impulse"]] = impulses[WALLS : WALLS + self.n_walls]
-        walls[:, WALL["jump_impulse"]] = impulses[self.jumps : self.jumps + self.n_walls]
-        tables[:, PAIR["impulse"]] = impulses[WALLS + self.n_walls : self.jumps]
-        tables[:, PAIR["jump_impulse"]] = impulses[self.jumps + self.n_walls :]
 
     def kept(self) -> dict[str, Any]:
         """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""

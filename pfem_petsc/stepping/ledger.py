@@ -13,7 +13,7 @@ from ..mechanics.elements import MEASURES
 from ..mechanics.materials.base import SMALL
 from .impact import Impacts
 from .impulses import Impulses, NoImpulses
-from .phases import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS, power, sum_momenta
+from .phases import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS, numerical_dissipation, power, sum_momenta
 
 if TYPE_CHECKING:
     from ..mechanics.bars import BarBlock
@@ -271,7 +271,6 @@ class Ledger:
         self.impulses.step(self._sum_state(present, second))
         if jump is not None:
             self.impulses.jump()
-        self.impulses.fill(self.sums)
         stepper.step_changed = False
         impact, friction = self._dissipated(before)
         if jump is not None:
@@ -285,9 +284,9 @@ class Ledger:
             damping = self._damped()
             works[INERTIAL] += works[DAMPING] - damping
             works[DAMPING] = damping
-        # the work of contact on nodes in excess of the work of walls and the losses by friction and impact
-        left = works[CONTACT] + jumped - work - given + friction
-        numerical = works[INERTIAL] + works[INTERNAL] + heating - stored - left - impact + lost
+        excess = works[CONTACT] + jumped - work - given
+        internal = works[INTERNAL] + heating
+        numerical = numerical_dissipation(works[INERTIAL], internal, stored, excess, friction + impact) + lost
         for name, value in (
             ("external_work", works[EXTERNAL] + weight),
             ("contact_work", work),

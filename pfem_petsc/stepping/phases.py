@@ -132,6 +132,14 @@ def new_sums() -> StepSums:
     return StepSums(np.zeros(5), np.zeros((3, 3)), np.zeros(4), np.zeros((2, 3)), np.zeros(6), np.zeros((3, 3)))
 
 
+@inlined
+def numerical_dissipation(inertial, internal, stored, excess, lost):
+    """Return what the scheme dissipates [J], of any steps: the works of inertia and of the forces of bars, less the
+    growth of the ``stored`` energy of nodes and bars, the ``excess`` of the work of contact on nodes over that of
+    moving walls, and what friction and impact took, ``lost``."""
+    return inertial + internal - stored - excess - lost
+
+
 @kernel
 def clear_vector(values):
     """Set numbers to zero; assignments to slices take long to compile."""

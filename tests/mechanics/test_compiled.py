@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 from types import FunctionType
+from uuid import uuid4
 
 import numpy as np
 import pytest
@@ -249,11 +250,11 @@ print(evaluate(law, (2.0,), 0.5, 0.0, np.zeros((0, 1)))[STRESS, 0], count_compil
 
 
 def test_a_law_of_a_user_is_compiled_anew_when_its_file_changes(tmp_path):
-    path = tmp_path / "of_a_user.py"
+    path, unique = tmp_path / "of_a_user.py", uuid4()  # no earlier run has compiled this file
 
     def found(factor):
         path.write_text(
-            "from numba.extending import register_jitable\nfrom .base import Law\n\nFACTOR = "
+            f"# {unique}\nfrom numba.extending import register_jitable\nfrom .base import Law\n\nFACTOR = "
             f"{factor}\n\n\n@register_jitable\ndef response(strain, rate, step, temperature, p, q):\n"
             "    return FACTOR * p[0] * strain, FACTOR * p[0], (), (0.0,)\n\n\n"
             'LAW = Law(response, energies=("elastic_energy",))\n'

@@ -7,7 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pfem_petsc.mechanics.chunk_laws import CHUNK
-from pfem_petsc.mechanics.layout import NO_BAR, gather_values, make_layout, make_sweep, run_column, spread_values
+from pfem_petsc.mechanics.layout import (
+    NO_BAR,
+    gather_values,
+    group_of,
+    make_layout,
+    make_sweep,
+    run_column,
+    spread_values,
+)
 from pfem_petsc.mesh.ordering import LEAST_RUN, NODE_BLOCK, bar_order
 
 
@@ -48,12 +56,12 @@ def check_layout(bars, block):
     low, high = bars.min(axis=1), bars.max(axis=1)
     places = np.full(int(layout.starts[-1]), -1)
     for group in range(layout.sections[section], layout.sections[section + 1]):
-        first, last = (int(layout.starts[group + k]) for k in (0, 1))
+        g, (first, last) = group_of(layout, section, group, 0), layout.starts[group : group + 2].tolist()
         assert 0 < last - first <= CHUNK
         for run in range(layout.runs[group], layout.runs[group + 1]):
             here = np.arange(layout.bars[run], layout.bars[run + 1])
             assert (here < counted).all() if group < layout.counted[section] else (here >= counted).all()
-            column = run_column(layout, group, run)
+            column = g.first + run_column(g, run, layout.nodes, layout.bars)
             places[column : column + len(here)] = here
             if layout.stars[group]:
                 assert (low[here] == layout.nodes[run]).all()

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..columns import BAR_ENERGIES, HEAD, PAIR, PROBED, WALL
+from ..columns import BAR_ENERGIES, HEAD, PROBED
 from ..contact.fixed_rows import FixedRows, pressed_nodes
 from ..contact.node_walls import compare_contacts
 from ..mechanics.compiled import kernel
@@ -194,20 +194,15 @@ _PUSHED, _RUBBED, _IMPACT = map(HEAD.first, ("contact_work", "friction_dissipati
 _EXTERNAL_WORK, _DAMPED, _NUMERICAL, _KINETIC = map(
     HEAD.first, ("external_work", "damping_dissipation", "numerical_dissipation", "kinetic_energy")
 )
-_MOMENTA, _SUPPORT, _IMPULSES, _PRESSING = map(
+_MOMENTA, _SUPPORT, _PRESSING = map(
     HEAD.first,
     (
         "momentum",  # followed by angular momentum and centre of mass
         "support_force",
-        "external_impulse",  # followed by those of supports and damping
         "active_contacts",
     ),
 )
-_BARS, _CHANGES, _WALL, _PAIR, _PROBED = HEAD.indices(BAR_ENERGIES), HEAD.width, WALL.width, PAIR.width, len(PROBED)
-_WALL_FORCE, _WALL_MOMENT, _WALL_IMPULSE, _WALL_JUMP, _CONTACTS, _RELEASES = map(
-    WALL.first, ("force", "moment", "impulse", "jump_impulse", "contacts", "releases")
-)
-_PAIR_FORCE, _PAIR_IMPULSE, _PAIR_JUMP = map(PAIR.first, ("force", "impulse", "jump_impulse"))
+_BARS, _PROBED = HEAD.indices(BAR_ENERGIES), len(PROBED)
 _ENERGIES, _SPRINGS = len(BAR_ENERGIES), BAR_ENERGIES.index("spring_energy")
 
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
-from ..mechanics.compiled import kernel
 from ..parallel.ending import is_alone
 from ..tolerances import BEYOND, PROJECTED
 from .compiled_steps import CompiledSteps
@@ -19,48 +18,6 @@ from .stepper import Solution, Stepper
 if TYPE_CHECKING:
     from ..integrators.base import Scheme
     from .model import Model
-
-
-@kernel
-def explicit_increments(external, f, a_hat, v_hat, inertia, stiffness, u):
-    """Solve (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat for every node.
-
-    ``inertia``: m and c (owned,); ``stiffness`` (owned,): alpha m + eta c. The external force, a_hat and v_hat are
-    (owned, 3), or None for zero: the loop is compiled for those that there are, and without conditions is vectorised.
-    ``u`` (owned, 3) is written.
-    """
-    mass, damping = inertia
-    for i in range(len(u)):
-        inverse = 1.0 / stiffness[i]
-        for c in range(3):
-            load = -f[i, c]
-            if external is not None:
-                load += external[i, c]
-            if a_hat is not None:
-                load -= mass[i] * a_hat[i, c]
-            if v_hat is not None:
-                load -= damping[i] * v_hat[i, c]
-            u[i, c] = load * inverse
-
-
-@kernel
-def hold(supports, predictor, stiffness, u, load):
-    """Set prescribed components of ``u`` (owned, 3) to their values; ``load`` (k,) output: force that would move them
-    [N]. ``supports``: nodes, components and positions (k,)."""
-    nodes, components, positions = supports
-    for k in range(len(nodes)):
-        i, c = nodes[k], components[k]
-        load[k] = stiffness[i] * u[i, c]
-        u[i, c] = positions[k] - predictor[i, c]
-
-
-@kernel
-def react(supports, load, contact, stiffness, u, support):
-    """Write support forces into ``support`` (owned, 3) [N], from the loads that :func:`hold` computed."""
-    nodes, components, _ = supports
-    for k in range(len(nodes)):
-        i, c = nodes[k], components[k]
-        support[i, c] = stiffness[i] * u[i, c] - load[k] - contact[i, c]
 
 
 class ExplicitStepper(Stepper):
@@ -72,7 +29,6 @@ class ExplicitStepper(Stepper):
         self._nobody = np.empty(0, dtype=np.int64)
         self._compiled: CompiledSteps | None = None
         self._serves: bool | None = None  # whether compiled steps apply; None until it is known
-        self._stiffness, self._stiffness_of = np.empty(0), (0.0, 0.0, None)
 
     def steps(self, most: int) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. The first step is made alone: the start may have stopped
@@ -112,32 +68,19 @@ class ExplicitStepper(Stepper):
                 raise
             self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
 
-    def _stiffness_for(self, balance: Balance) -> np.ndarray:
-        """Return alpha m + eta c (owned,), computed again where it changes."""
-        alpha, eta, damping = self._stiffness_of
-        inertia = self.model.inertia
-        if (alpha, eta) != (balance.alpha, balance.eta) or damping is not inertia.damping:
-            self._stiffness_of = balance.alpha, balance.eta, inertia.damping
-            self._stiffness = balance.alpha * inertia.mass
-            if inertia.damped:
-                self._stiffness += balance.eta * inertia.damping
-        return self._stiffness
-
     def solve(self, balance: Balance) -> Solution:
         model, state = self.model, self.state
-        inertia = model.inertia
-        u, stiffness = np.empty_like(state.v), self._stiffness_for(balance)
-        external, v_hat = state.external if model.external.active else None, balance.v_hat if inertia.damped else None
-        explicit_increments(external, state.f, balance.a_hat, v_hat, (inertia.mass, inertia.damping), stiffness, u)
-        supports = model.supports
-        state.contact = self.zero
+        inertia, supports = model.inertia, model.supports
+        stiffness, load = balance.alpha * inertia.mass, state.external - state.f[: len(state.v)]
+        if balance.a_hat is not None:
+            load -= inertia.mass[:, None] * balance.a_hat
+        if inertia.damped:
+            stiffness += balance.eta * inertia.damping
+            load -= inertia.damping[:, None] * balance.v_hat
+        u = load / stiffness[:, None]
         if supports.any:
-            load = np.empty(len(supports.nodes))
-            if supports.inclined is not None:
-                others = self._hold(balance, stiffness, u)
-            positions = supports.positions(balance.time)[: len(supports.nodes)]
-            held_at = supports.nodes, supports.components, positions
-            hold(held_at, balance.predictor, stiffness, u, load)
+            supports.put(u, supports.lacking(balance.predictor, balance.time))
+        state.contact = self.zero
         walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.size
         with self._faults(balance):
             pushes = model.links.explicit(balance, state, u, stiffness, tolerance)
@@ -148,27 +91,14 @@ class ExplicitStepper(Stepper):
             # also after a failure of links: with walls with mass this call is collective
             with self._faults(balance):
                 arguments = balance.predictor, u, stiffness, balance.time, tolerance, balance.acting
-                nodes, force, walls = model.contact.explicit(*arguments)
-                if len(nodes):
+                held, force, walls = model.contact.explicit(*arguments)
+                if len(held):
                     if state.contact is self.zero:
                         state.contact = np.zeros_like(u)
-                    state.contact[nodes] += force
-                held = nodes
+                    state.contact[held] += force
         if supports.any:
-            state.support = np.zeros_like(u)
-            react(held_at, load, state.contact, stiffness, u, state.support)
-            if supports.inclined is not None:
-                state.support[supports.inclined.nodes] = others - supports.inclined.part(state.contact)
+            state.support = supports.part(stiffness[:, None] * u - load - state.contact)
         return Solution(u, state.f, walls, contacts=model.links.count_held(held))
-
-    def _hold(self, balance: Balance, stiffness: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Set components of ``u`` (owned, 3) along directions to their values; return the forces (m, 3) that do so."""
-        supports = self.model.supports
-        inclined = supports.inclined
-        before = u[inclined.nodes]
-        inclined.clear(u)
-        inclined.add(u, supports.lacking(balance.predictor, balance.time)[len(supports.nodes) :])
-        return stiffness[inclined.nodes, None] * (u[inclined.nodes] - before)
 
 
 class RedistributedStepper(Stepper):

@@ -101,8 +101,8 @@ class Scheme(ABC):
     solves_end : the position solved for is x_{n+1}
     discrete_gradient : the internal force of its balances is that of the step (``Balance.discrete_gradient``)
     force_acts_once : a contact force affects only its own step if its acceleration is removed
-    leapfrog : whether its steps are those of :mod:`~pfem_petsc.integrators._leapfrog`, with velocities at half steps in
-        the memory ``half_velocity``, so that they can be made in compiled calls (``stepping/compiled_loop.py``)
+    leapfrog : whether its steps are those of :mod:`~pfem_petsc.stepping.phases`, with velocities at half steps in the
+        memory ``half_velocity``, so that they can be made in compiled calls
     symmetric : whether the Hessian is symmetric
     remembers : names of the scheme's nodal arrays in the state's memory, which are linear in the motion
     turns_held : x1 - x0 = h (v0 + v1)/2 and nothing else relates velocity to position, so the velocity of a node that

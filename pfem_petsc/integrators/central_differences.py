@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._leapfrog import drift
-from ._leapfrog import finish as finish_step
 from .base import Balance, ExplicitScheme, NoParameters, State, lagged_limit
 
 __all__ = ["Parameters", "Scheme"]
@@ -38,17 +36,14 @@ class Scheme(ExplicitScheme):
 
     def advance(self, state: State, h: float) -> None:
         """Move to x_{n+1}, which the last balance has determined."""
-        position = state.position.reshape(-1)
-        drift(position, h, state.memory["half_velocity"].reshape(-1), position)
+        state.position[:] += h * state.memory["half_velocity"]
 
     def balance(self, state: State, h: float) -> Balance:
         half = state.memory["half_velocity"]
-        predictor = np.empty_like(half)
-        drift(state.position.reshape(-1), h, half.reshape(-1), predictor.reshape(-1))
         return Balance(
             alpha=1.0 / (h * h),
             eta=0.5 / h,
-            predictor=predictor,
+            predictor=state.position + h * half,
             v_hat=half,
             a_hat=None,
             time=state.time + h,
@@ -57,6 +52,7 @@ class Scheme(ExplicitScheme):
         )
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
-        state.a, state.v = np.empty_like(u), np.empty_like(u)
-        arrays = (array.reshape(-1) for array in (state.memory["half_velocity"], state.v, state.a))
-        finish_step(u.reshape(-1), balance.alpha, balance.eta, h, *arrays)
+        half = state.memory["half_velocity"]
+        state.a = balance.alpha * u
+        half += h * state.a
+        state.v = half - balance.eta * u

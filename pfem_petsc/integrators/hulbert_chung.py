@@ -14,7 +14,6 @@ import numpy as np
 from pydantic import Field
 
 from ..case.base import StrictModel
-from ..mechanics.compiled import kernel
 from .base import Balance, ExplicitScheme, State, lagged_limit
 
 __all__ = ["Parameters", "Scheme"]
@@ -25,27 +24,6 @@ class Parameters(StrictModel):
 
     rho_b: Annotated[float, Field(ge=0.0, le=1.0)] = 0.8
     """spectral radius rho_b at the bifurcation frequency; smaller values damp high frequencies more"""
-
-
-# the loops run over arrays (3 n,), so that they are vectorised
-
-
-@kernel
-def _predict(x, h, v, c, a, predictor):
-    for i in range(len(v)):
-        predictor[i] = x[i] + h * v[i] + c * a[i]
-
-
-@kernel
-def _complete(factors, start, u, end):
-    """Write positions, velocities and accelerations of the ``end``; ``start``: predictor, velocities, accelerations."""
-    square, old, new = factors
-    predictor, v, a = start
-    x, v1, a1 = end
-    for i in range(len(u)):
-        x[i] = predictor[i] + u[i]
-        a1[i] = u[i] / square
-        v1[i] = v[i] + old * a[i] + new * a1[i]
 
 
 class Scheme(ExplicitScheme):
@@ -68,9 +46,7 @@ class Scheme(ExplicitScheme):
         return lagged_limit(self.alpha_m, self.beta, self.gamma, damping_ratio + viscous_ratio)
 
     def balance(self, state: State, h: float) -> Balance:
-        x, v, a = (array.reshape(-1) for array in (state.position, state.v, state.a))
-        predictor = np.empty_like(state.v)
-        _predict(x, h, v, h * h * (0.5 - self.beta), a, predictor.reshape(-1))
+        predictor = state.position + h * state.v + (h * h * (0.5 - self.beta)) * state.a
         return Balance(
             alpha=(1.0 - self.alpha_m) / (self.beta * h * h),
             eta=0.0,
@@ -83,8 +59,7 @@ class Scheme(ExplicitScheme):
         )
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
-        v1, a1 = np.empty_like(u), np.empty_like(u)
-        factors = self.beta * h * h, h * (1.0 - self.gamma), h * self.gamma
-        start = balance.predictor.reshape(-1), state.v.reshape(-1), state.a.reshape(-1)
-        _complete(factors, start, u.reshape(-1), (state.position.reshape(-1), v1.reshape(-1), a1.reshape(-1)))
-        state.v, state.a = v1, a1
+        state.position[:] = balance.predictor + u
+        a = u / (self.beta * h * h)
+        state.v = state.v + h * ((1.0 - self.gamma) * state.a + self.gamma * a)
+        state.a = a

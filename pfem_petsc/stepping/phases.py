@@ -475,14 +475,10 @@ def _sum_drag_left(damping, half, u, h):
     return total
 
 
-@kernel
-def power(force, v):
+def power(force: np.ndarray, v: np.ndarray) -> float:
     """Return the sum of force times velocity, or of force times displacement, (n, 3) both, over nodes and
     components."""
-    one, other, total = force.reshape(-1), v.reshape(-1), 0.0
-    for j in range(len(one)):
-        total = add_freely(total, one[j] * other[j])
-    return total
+    return float(np.einsum("ij,ij->", force, v))
 
 
 @kernel

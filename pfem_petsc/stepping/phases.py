@@ -198,14 +198,43 @@ def _advance(f, inverse, h, half):
 
 
 @kernel
-def _advance_loaded(f, inverse, h, half, u):
-    """The same with the forces ``u``, in whose place the increments are written."""
+def _advance_kept(f, inverse, h, half, u):
+    """The same, and write the increments."""
     rate, eta, power = 1.0 / h, 0.5 / h, 0.0
     for i in range(len(half)):
-        u[i] *= inverse[i]
+        u[i] = -f[i] * inverse[i]
         half[i] += rate * u[i]
         power = add_freely(power, f[i] * (half[i] - eta * u[i]))
     return power
+
+
+@kernel
+def _advance_loaded(f, external, inverse, h, half, u):
+    """The same with loads; return the powers of the forces of bars and of the loads, and the sum of these."""
+    rate, eta, power, given, total = 1.0 / h, 0.5 / h, 0.0, 0.0, 0.0
+    for i in range(len(half)):
+        u[i] = (external[i] - f[i]) * inverse[i]
+        half[i] += rate * u[i]
+        v = half[i] - eta * u[i]
+        power = add_freely(power, f[i] * v)
+        given = add_freely(given, external[i] * v)
+        total = add_freely(total, external[i])
+    return power, given, total
+
+
+@kernel
+def _advance_damped(f, damping, inverse, h, half, u):
+    """The same with all forces in ``u``, in whose place the increments are written; return the powers of the forces of
+    bars and of what dampers take, and the sum of this."""
+    rate, eta, power, taken, total = 1.0 / h, 0.5 / h, 0.0, 0.0, 0.0
+    for i in range(len(half)):
+        u[i] *= inverse[i]
+        half[i] += rate * u[i]
+        v = half[i] - eta * u[i]
+        power = add_freely(power, f[i] * v)
+        taken = add_freely(taken, damping[i] * (v * v))
+        total = add_freely(total, damping[i] * v)
+    return power, taken, total
 
 
 @kernel
@@ -230,17 +259,6 @@ def _load(external, h, half, u):
 
 
 @kernel
-def _drag(damping, h, half, u):
-    """Return sum and power of what dampers take."""
-    eta, total, power = 0.5 / h, 0.0, 0.0
-    for i in range(len(damping)):
-        v = half[i] - eta * u[i]
-        total = add_freely(total, damping[i] * v)
-        power = add_freely(power, damping[i] * (v * v))
-    return total, power
-
-
-@kernel
 def balance(nodes, motion, held, keep, sums):
     """Solve the balances of all nodes without supports and contact, and begin the sums of the step; increments are
     written if ``keep``."""
@@ -252,19 +270,22 @@ def balance(nodes, motion, held, keep, sums):
     for k in range(len(held.nodes)):
         held.half[k] = half[held.components[k], held.nodes[k]]
     for c in range(3):
-        if keep or loaded or damped:
-            _forces(f[c], nodes.external[c], nodes.damping, half[c], u[c])
-            works[INTERNAL] += h * _advance_loaded(f[c], nodes.inverse, h, half[c], u[c])
-        else:
-            works[INTERNAL] += h * _advance(f[c], nodes.inverse, h, half[c])
-        if loaded:
-            total, power = _load(nodes.external[c], h, half[c], u[c])
-            forces[LOADS, c] += total
-            works[EXTERNAL] += h * power
+        given = 0.0
         if damped:
-            total, power = _drag(nodes.damping, h, half[c], u[c])
+            _forces(f[c], nodes.external[c], nodes.damping, half[c], u[c])
+            power, taken, total = _advance_damped(f[c], nodes.damping, nodes.inverse, h, half[c], u[c])
             forces[DRAGS, c] -= total
-            works[DAMPING] += h * power
+            works[DAMPING] += h * taken
+            if loaded:
+                forces[LOADS, c], given = _load(nodes.external[c], h, half[c], u[c])
+        elif loaded:
+            power, given, forces[LOADS, c] = _advance_loaded(f[c], nodes.external[c], nodes.inverse, h, half[c], u[c])
+        elif keep:
+            power = _advance_kept(f[c], nodes.inverse, h, half[c], u[c])
+        else:
+            power = _advance(f[c], nodes.inverse, h, half[c])
+        works[INTERNAL] += h * power
+        works[EXTERNAL] += h * given
 
 
 @inlined

@@ -27,11 +27,11 @@ from ..tolerances import RANK
 if TYPE_CHECKING:
     from .stepper import Stepper
 
-__all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "NoImpulses"]
+__all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "ContactSums", "Impulses", "NoImpulses", "record_forces"]
 
 SUPPORT, EXTERNAL, DAMPING, WALLS = 0, 1, 2, 3
-"""Rows of the particles: three in the order of the totals of :mod:`~pfem_petsc.stepping.ledger_loops`, then walls and
-pairs, then the jumps of walls and pairs."""
+"""Rows of the particles: three in the order of the totals of :class:`~pfem_petsc.stepping.ledger.Ledger`, then walls
+and pairs, then the jumps of walls and pairs."""
 
 IN_COLUMNS = (EXTERNAL, SUPPORT, DAMPING)
 """The first rows of the particles in the order of the columns of the history."""

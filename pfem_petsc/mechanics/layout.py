@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..mesh.ordering import FEW, LEAST_RUN, NODE_BLOCK
+from ..mesh.ordering import LEAST_RUN, NODE_BLOCK
 from .chunk_laws import CHUNK
 from .compiled import inlined, kernel
 from .records import record
@@ -113,14 +113,9 @@ def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int
     diagonal = np.empty(len(firsts) - 1, dtype=np.bool_)
     chunks = np.empty(len(firsts), dtype=np.uint32)
     none = (np.empty(0, dtype=np.uint32),) * 3
-    runs = _find_runs(bars, firsts, False, diagonal, chunks, none)
-    short = np.diff(firsts.astype(np.int64))[~diagonal].sum()
-    forced = bool(0 < short <= FEW * (stop - start))
-    if forced:  # few bars: the others have faster loops if all chunks are alike
-        diagonal[:] = True
-        runs = _find_runs(bars, firsts, True, diagonal, chunks, none)
+    runs = _find_runs(bars, firsts, diagonal, chunks, none)
     heads, fars, starts = (np.empty(n, dtype=np.uint32) for n in (runs, runs, runs + 1))
-    _find_runs(bars, firsts, forced, diagonal, chunks, (heads, fars, starts))
+    _find_runs(bars, firsts, diagonal, chunks, (heads, fars, starts))
     starts[runs] = stop
     chunks_counted = int(np.searchsorted(firsts[:-1], counted))
     return Sweep(heads, fars, starts, chunks, diagonal, chunks_counted)
@@ -144,9 +139,9 @@ def _cut(bars, start, counted, stop, chunk, firsts):
 
 
 @kernel
-def _find_runs(bars, firsts, forced, diagonal, chunks, runs):
+def _find_runs(bars, firsts, diagonal, chunks, runs):
     """Return the number of runs; write chunks, the first run of each, and the ``runs`` (heads, fars and starts) unless
-    they are empty, and which chunks are ``diagonal``, unless ``forced``."""
+    they are empty, and which chunks are ``diagonal``."""
     heads, fars, starts = runs
     count = 0
     for c in range(len(firsts) - 1):
@@ -154,8 +149,7 @@ def _find_runs(bars, firsts, forced, diagonal, chunks, runs):
         breaks = 1
         for k in range(firsts[c] + 1, firsts[c + 1]):
             breaks += 0 if _follows(bars, k) else 1
-        if not forced:
-            diagonal[c] = firsts[c + 1] - firsts[c] >= LEAST_RUN * breaks
+        diagonal[c] = firsts[c + 1] - firsts[c] >= LEAST_RUN * breaks
         for k in range(firsts[c], firsts[c + 1]):
             low = min(bars[k, 0], bars[k, 1])
             if k > firsts[c]:

@@ -79,13 +79,13 @@ class StopRequest(SignalNotes):
 
 _INTERVAL = 0.2  # seconds between synchronisations
 _NONE = -(2**62)  # for ranks without a fault
-_MOST = 100  # maximum number of steps between them, so that all ranks know of a fault within a bounded number of steps
+_MOST = 1000  # maximum number of steps between them, so that all ranks know of a fault within a bounded number of steps
 
 
 class Synchroniser:
     """Infrequent agreement of all ranks on faults, requests to stop, and checkpoints that are due.
 
-    About every 0.2 s, and at most every hundred steps, the ranks make one reduction of four numbers, in which they also
+    About every 0.2 s, and at least every thousand steps, the ranks make one reduction of four numbers, in which they also
     agree on the step of the next one.
 
     Parameters

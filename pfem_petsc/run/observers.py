@@ -85,8 +85,8 @@ _MOST = 1000  # maximum number of steps between them, so that all ranks know of 
 class Synchroniser:
     """Infrequent agreement of all ranks on faults, requests to stop, and checkpoints that are due.
 
-    About every 0.2 s, and at least every thousand steps, the ranks make one reduction of four numbers, in which they also
-    agree on the step of the next one.
+    About every 0.2 s, and at least every thousand steps, the ranks make one reduction of four numbers, in which they
+    also agree on the step of the next one.
 
     Parameters
     ----------

@@ -264,18 +264,14 @@ class Share:
 
     Attributes
     ----------
-    numbers : (width,)
+    numbers : (width,) the sums of HEAD; with walls, the changes of the active set; the sums of WALL of each wall, those
+        of PAIR of each table, and the probes
     head : (width of HEAD,)
-    changes : (1,) changes of the active set; (0,) without walls
-    walls : (walls, width of WALL)
-    tables : (tables, width of PAIR)
     probes : (nodes, number of PROBED, 3)
     """
 
     def __init__(self, walls: int, tables: int, probes: int) -> None:
         parts = (HEAD.width, int(walls > 0), walls * WALL.width, tables * PAIR.width, probes * len(PROBED) * 3)
         self.numbers = np.zeros(sum(parts))
-        self.head, self.changes, flat, pairs, probed = np.split(self.numbers, np.cumsum(parts)[:-1])
-        self.walls = flat.reshape(walls, WALL.width)
-        self.tables = pairs.reshape(tables, PAIR.width)
-        self.probes = probed.reshape(probes, len(PROBED), 3)
+        self.head = self.numbers[: HEAD.width]
+        self.probes = self.numbers[sum(parts[:-1]) :].reshape(probes, len(PROBED), 3)

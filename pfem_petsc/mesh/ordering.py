@@ -20,7 +20,7 @@ LEAST_RUN = 8
 """Mean number of bars of the runs of constant offset from which a block goes by these: shorter loops do not pay."""
 
 FEW = 0.15
-"""Share of the bars whose runs may be shorter, so that all go by runs of constant offset."""
+"""Share of the bars whose runs may be shorter, so that all are in the order of the others."""
 
 _PLANES = 4
 """Maximum number of planes of nodes, as a multiple of those of a cubic grid with as many nodes."""

@@ -403,7 +403,7 @@ def run_compiled(s, contacts, due, flags):
     count, n, n_walls = len(due), len(nodes.mass), len(walls.pressed.way)
     several, linked, calling = messages.several, len(rows.force) > 0, s.called.any
     agree = several and (s.bars.can_break or calling)  # ranks that make the same steps
-    keeps = n_walls > 0 or linked or calling or len(nodes.damping) > 0
+    keeps = n_walls > 0 or linked or calling or len(nodes.damping) > 0 or nodes.external.shape[1] > 0
     sums, pressed, particles = s.sums, s.pressed, np.empty(s.impulses.v.shape)
     pressed.failure[0] = -1
     energies, no_energies = np.zeros(_ENERGIES), np.empty(0)

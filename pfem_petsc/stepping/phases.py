@@ -261,7 +261,7 @@ def _load(external, h, half, u):
 @kernel
 def balance(nodes, motion, held, keep, sums):
     """Solve the balances of all nodes without supports and contact, and begin the sums of the step; increments are
-    written if ``keep``."""
+    written if ``keep``, and always with loads or dampers."""
     h, f, half, u = motion.h, motion.f, motion.half, motion.u
     loaded, damped = nodes.external.shape[1] > 0, len(nodes.damping) > 0
     works, forces = sums.works, sums.forces
@@ -345,11 +345,10 @@ def work_of_contact(touched, motion, sums):
 
 @kernel
 def restore_increments(nodes, motion, held):
-    """Write the increments of a step that has not kept them, which has neither dampers nor contact."""
+    """Write the increments of a step that has not kept them, which has neither loads nor dampers nor contact."""
     for c in range(3):
-        _forces(motion.f[c], nodes.external[c], nodes.damping, motion.half[c], motion.u[c])
         for i in range(len(nodes.inverse)):
-            motion.u[c, i] *= nodes.inverse[i]
+            motion.u[c, i] = -motion.f[c, i] * nodes.inverse[i]
     for k in range(len(held.nodes)):
         motion.u[held.components[k], held.nodes[k]] = held.u[k]
 

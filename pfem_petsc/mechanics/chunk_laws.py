@@ -214,18 +214,16 @@ def law_loops(law: Law, form: tuple[Any, ...]) -> SimpleNamespace:
         numbers = numbers_of(p)
         for k in range(n):
             i = np.uint64(k)
-            strain0, strain, rate = work[_STRAIN0 + i], work[_STRAIN + i], 0.0
+            strain0, strain = work[_STRAIN0 + i], work[_STRAIN + i]
             q = variables_of(work, i)
             given = numbers + data_of(work, i) if n_data else numbers
             if by_rate:
                 stress0 = work[last_stress + i]
                 if can_break:
                     stress0 *= 1.0 - abs(work[gone + i])
-                if step > 0.0:
-                    rate = (strain - strain0) / step
             else:
                 stress0, _, _, _ = response(strain0, 0.0, 0.0, work[_TEMPERATURE0 + i], given, q)
-            found, modulus = mean_stress(stress0, strain0, strain, rate, step, work[_TEMPERATURE + i], given, q)
+            found, modulus = mean_stress(stress0, strain0, strain, step, work[_TEMPERATURE + i], given, q)
             work[_STRESS + i], work[_MODULUS + i] = found, modulus
 
     return SimpleNamespace(brief=brief, full=full, mean=mean)

@@ -194,11 +194,11 @@ def _mean_stress(law: Callable[..., Any], count: int) -> Callable[..., Any]:
     of_law = _OF_LAW
 
     @inlined
-    def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
+    def mean_stress(stress0, strain0, strain, step, temperature, p, q):
         left = 1.0 - abs(q[count])
         if left <= 0.0:
             return 0.0, 0.0
-        mean, modulus = law(stress0 / left, strain0, strain, rate, step, temperature, p[of_law:], q[:count])
+        mean, modulus = law(stress0 / left, strain0, strain, step, temperature, p[of_law:], q[:count])
         return left * mean, left * modulus
 
     return mean_stress

@@ -271,7 +271,7 @@ def follow(name, path, steps, temperature=0.0, **keys):
     for strain, h in zip(path, steps, strict=True):
         rate = (strain - before) / h if law.rate else 0.0
         if law.mean_stress is not None:
-            work += law.mean_stress(stress, before, strain, rate, h, temperature, p, q)[0] * (strain - before)
+            work += law.mean_stress(stress, before, strain, h, temperature, p, q)[0] * (strain - before)
         stress, tangent, q, densities = law.response(strain, rate, h, temperature, p, q)
         rows.append((stress, tangent, q, densities, work))
         before = strain

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...case.base import NonNegativeFloat, PositiveFloat
 from ..compiled import inlined, kernel
-from .base import Law, MaterialKeys, Softening, yield_texts
+from .base import Law, MaterialKeys, Softening, mean_rate, yield_texts
 
 NOISE = 4.0 * 2.0**-52
 """Residual relative to its terms below which it is rounding."""
@@ -140,9 +140,9 @@ def isotropic_law(curve: Callable, mean: Callable, scale: Callable, find: Callab
         return (found / young + flow * (plastic - stress)) / change
 
     @inlined
-    def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
+    def mean_stress(stress0, strain0, strain, step, temperature, p, q):
         """Return the mean stress of the step and its derivative; see the module."""
-        stress, modulus, new, _ = response(strain, rate, step, temperature, p, q)
+        stress, modulus, new, _ = response(strain, mean_rate(strain0, strain, step), step, temperature, p, q)
         change = strain - strain0
         if new[1] == q[1] or abs(change) * p[0] <= _ROUNDING * abs(stress):
             return 0.5 * (stress0 + stress), 0.5 * modulus

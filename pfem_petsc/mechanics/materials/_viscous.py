@@ -8,7 +8,7 @@ from collections.abc import Callable
 from ...case.base import NonNegativeFloat
 from ..compiled import inlined
 from ._isotropic import ENERGIES, NOISE, VARIABLES, PlasticKeys, make_solver
-from .base import DENSITIES, Law, Softening
+from .base import DENSITIES, Law, Softening, mean_rate
 from .voce import curve
 
 
@@ -103,9 +103,9 @@ def viscous_law(
             return stress, tangent, new, (elastic, new[2], new[3])
 
     @inlined
-    def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
+    def mean_stress(stress0, strain0, strain, step, temperature, p, q):
         """Return the mean stress of the step and its derivative; see the module."""
-        stress, modulus, new, _ = response(strain, rate, step, temperature, p, q)
+        stress, modulus, new, _ = response(strain, mean_rate(strain0, strain, step), step, temperature, p, q)
         mean, change = 0.5 * (stress0 + stress), strain - strain0
         modulus *= 0.5
         if new[1] != q[1] and change != 0.0:

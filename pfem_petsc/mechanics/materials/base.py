@@ -77,9 +77,9 @@ def softened(law: Law) -> Law:
         return stress, tangent, after + kept, (densities[0],) + kept
 
     @inlined
-    def mean_at_temperature(stress0, strain0, strain, rate, step, temperature, p, q):
+    def mean_at_temperature(stress0, strain0, strain, step, temperature, p, q):
         modulus, strength = interpolate(temperature, p[1])
-        return mean_stress(stress0, strain0, strain, rate, step, temperature, scale(p[0], modulus, strength), q)
+        return mean_stress(stress0, strain0, strain, step, temperature, scale(p[0], modulus, strength), q)
 
     def modulus(p: tuple, temperatures: np.ndarray) -> np.ndarray:
         base, table = p
@@ -137,12 +137,12 @@ def damped(law: Law) -> Law:
         return stress + viscous, tangent, after + (lost, viscous, known), densities + (lost,)
 
     @inlined
-    def mean_with_damping(stress0, strain0, strain, rate, step, temperature, p, q):
+    def mean_with_damping(stress0, strain0, strain, step, temperature, p, q):
         elastic = stress0 - q[n + 1]
-        mean, modulus = mean_stress(elastic, strain0, strain, rate, step, temperature, own(p), q[:n])
+        mean, modulus = mean_stress(elastic, strain0, strain, step, temperature, own(p), q[:n])
         if step > 0.0:
             modulus += p[1] / step
-        return mean + p[1] * rate, modulus
+        return mean + p[1] * mean_rate(strain0, strain, step), modulus
 
     return replace(
         law,
@@ -303,9 +303,9 @@ class Law:
     rate : whether the law depends on the rate or on the step; strain and stress at the end of the last step are then
         kept as well. Otherwise rate and step are zero
     smooth : whether the tangent is constant
-    mean_stress : compiled function of (stress0, strain0, strain, rate, step, temperature, p, q): returns the mean
-        stress [Pa] over the step from stress0 and strain0 to strain, whose work is the change of energies, and its
-        derivative with respect to strain. The energy-momentum scheme requires it; None: the scheme rejects the law
+    mean_stress : compiled function of (stress0, strain0, strain, step, temperature, p, q): returns the mean stress
+        [Pa] over the step from stress0 and strain0 to strain, whose work is the change of energies, and its derivative
+        with respect to strain; the rate over the step is :func:`mean_rate`. The energy-momentum scheme requires it; None: the scheme rejects the law
     mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p without data of bars, the
         change of stress and the internal variables before and after, (variables, bars), for the work of changing
         temperatures; None for zero
@@ -401,8 +401,8 @@ def mean_of_work(response: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @inlined
-    def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
-        stress, tangent, _, after = response(strain, rate, step, temperature, p, q)
+    def mean_stress(stress0, strain0, strain, step, temperature, p, q):
+        stress, tangent, _, after = response(strain, 0.0, step, temperature, p, q)
         change = strain - strain0
         if not abs(change) > SMALL * (abs(strain) + abs(strain0)):
             return 0.5 * (stress0 + stress), 0.5 * tangent
@@ -414,6 +414,12 @@ def mean_of_work(response: Callable[..., Any]) -> Callable[..., Any]:
         return mean, (stress - mean) / change
 
     return mean_stress
+
+
+@inlined
+def mean_rate(strain0, strain, step):
+    """Return the rate [1/s] over a step from one strain to another, 0 for the step 0."""
+    return (strain - strain0) / step if step > 0.0 else 0.0
 
 
 LAWS = "pfem_petsc.mechanics.materials"

@@ -18,7 +18,7 @@ def response(strain, rate, step, temperature, p, q):
 
 
 @register_jitable
-def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
+def mean_stress(stress0, strain0, strain, step, temperature, p, q):
     """Return (s0 + s1)/2, whose work is the change of the elastic energy."""
     return 0.5 * (stress0 + p[0] * strain), 0.5 * p[0]
 

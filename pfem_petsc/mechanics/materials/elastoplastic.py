@@ -77,9 +77,9 @@ def response(strain, rate, step, temperature, p, q):
 
 
 @register_jitable
-def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
+def mean_stress(stress0, strain0, strain, step, temperature, p, q):
     """Return the mean stress of the step and its derivative; see the module."""
-    stress, modulus, (flowed, _), _ = response(strain, rate, step, temperature, p, q)
+    stress, modulus, (flowed, _), _ = response(strain, 0.0, step, temperature, p, q)
     mean = 0.5 * (stress0 + stress)
     if flowed != q[0]:
         young, change = p[0], strain - strain0

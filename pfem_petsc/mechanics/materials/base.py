@@ -305,7 +305,8 @@ class Law:
     smooth : whether the tangent is constant
     mean_stress : compiled function of (stress0, strain0, strain, step, temperature, p, q): returns the mean stress
         [Pa] over the step from stress0 and strain0 to strain, whose work is the change of energies, and its derivative
-        with respect to strain; the rate over the step is :func:`mean_rate`. The energy-momentum scheme requires it; None: the scheme rejects the law
+        with respect to strain; the rate over the step is :func:`mean_rate`. The energy-momentum scheme requires it;
+        None: the scheme rejects the law
     mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p without data of bars, the
         change of stress and the internal variables before and after, (variables, bars), for the work of changing
         temperatures; None for zero

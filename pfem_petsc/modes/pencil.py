@@ -267,18 +267,12 @@ class StateMatrices:
 
     def mass(self) -> PETSc.Mat:
         """Return the mass matrix [kg]; held components keep their lumped mass. Collective."""
-        mesh, inertia = self.model.mesh, self.inertia
+        model, inertia = self.model, self.inertia
         if not inertia.consistent:
-            return _diagonal(mesh.comm, np.repeat(inertia.mass, 3))
-        matrix = HessianMatrix(mesh)
-
-        def fill(values: np.ndarray) -> None:
-            coefficients = inertia.coefficients(1.0, 0.0)
-            self.model.bars.tangents(mesh.points, 0.0, coefficients, matrix.pattern, values)
-            if inertia.points.any:
-                matrix.add_lumped(inertia.points.mass, values)
-
-        return self.holds.taken_out(matrix.fill(fill), inertia.mass)
+            return _diagonal(model.comm, np.repeat(inertia.mass, 3))
+        matrix = HessianMatrix(model.mesh)
+        filled = matrix.fill(lambda values: matrix.add_mass(model.bars, inertia, values))
+        return self.holds.taken_out(filled, inertia.mass)
 
     def bounds(self, bars: np.ndarray, blocks: tuple | None = None) -> tuple[float, float]:
         """Return bounds below and above all eigenvalues of the bars' stiffness (5, b) and the mass [1/s2]. Collective.

@@ -291,10 +291,7 @@ class MassSolver:
         self._matrix = matrix = HessianMatrix(model.mesh, model.supports)
 
         def add(values: np.ndarray) -> None:
-            coefficients = model.inertia.coefficients(1.0, 0.0)
-            model.bars.tangents(model.mesh.points, 0.0, coefficients, matrix.pattern, values)
-            if model.inertia.points.any:
-                matrix.add_lumped(model.inertia.points.mass, values)
+            matrix.add_mass(model.bars, model.inertia, values)
             matrix.constrain(float(model.inertia.mass.max(initial=1.0)), values)
 
         matrix.fill(add)

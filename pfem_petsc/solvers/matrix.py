@@ -14,6 +14,8 @@ from ..mechanics.compiled import kernel
 
 if TYPE_CHECKING:
     from ..contact.transform import Transform
+    from ..mechanics.bars import Bars
+    from ..mechanics.mass import Inertia
     from ..mechanics.supports import Directions, Supports
     from ..mesh.distribution import DistributedMesh
     from .problem import StepProblem
@@ -267,6 +269,12 @@ class HessianMatrix:
     def add_lumped(self, inertia: np.ndarray, values: np.ndarray) -> None:
         """Add a nodal inertia (owned,) to the diagonal."""
         _add_lumped(self.pattern.ptr, self.pattern.diagonal, inertia, values)
+
+    def add_mass(self, bars: Bars, inertia: Inertia, values: np.ndarray) -> None:
+        """Add the consistent mass of bars and the masses of points."""
+        bars.tangents(self.mesh.points, 0.0, inertia.coefficients(1.0, 0.0), self.pattern, values)
+        if inertia.points.any:
+            self.add_lumped(inertia.points.mass, values)
 
     def add_bars(self, stored: np.ndarray, values: np.ndarray) -> None:
         """Add the bars' stiffness from the data of :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`, (5, b)."""

@@ -13,11 +13,10 @@ from petsc4py import PETSc
 
 from ..errors import InputError
 from ..tolerances import ROUNDING
-from .conjugate_gradients import pass_less_often
 from .lagged import LaggedPreconditioner, Preconditioning
 from .linear import USUAL_REDUCTION, LinearChoice, configure, is_failed_factorisation, linear_reason, newton_reason
 from .matrix import HessianMatrix
-from .matrix_free import MatrixFreeHessian, at_exit, outlive
+from .matrix_free import MatrixFreeHessian, at_exit, outlive, pass_less_often
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -319,12 +318,8 @@ class NewtonSolver:
         configure(ksp, LinearChoice("gmres", choice.preconditioner, "indefinite"), True, ours)
         report = self._attempt(start, contact, careful)
         configure(ksp, choice, contact, ours)
-        self._pass_less_often(ksp)
+        pass_less_often(ksp, self.hessian)
         return report
-
-    def _pass_less_often(self, ksp: PETSc.KSP) -> None:
-        if isinstance(self.hessian, MatrixFreeHessian):
-            pass_less_often(ksp, self.hessian)
 
     def _solver(self, contact: bool, careful: bool = False) -> PETSc.SNES:
         key = contact, careful
@@ -360,7 +355,7 @@ class NewtonSolver:
         finally:
             for name in defaults:
                 options.delValue(name)
-        self._pass_less_often(snes.getKSP())
+        pass_less_often(snes.getKSP(), self.hessian)
         self._solvers[key] = snes
         at_exit(outlive, snes)
         return snes

@@ -5,7 +5,7 @@ import pytest
 from petsc4py import PETSc
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.solvers.conjugate_gradients import pass_less_often
+from pfem_petsc.solvers.matrix_free import pass_less_often
 from pfem_petsc.solvers.node_loops import extend, extrapolate
 
 STEP = 4e-6  # twice the passage of a wave through a cell

@@ -89,33 +89,19 @@ def _collective() -> h5py.h5p.PropDXID:
     return transfer
 
 
-def chunk_rows(n_rows: int, row_bytes: int) -> int:
+def chunk_rows(n_rows: int, row_bytes: int, compressed: bool = False) -> int:
     """Return the number of rows per chunk for blocks of ``n_rows`` rows: blocks up to 1 MiB, else equal parts.
 
     It depends on the global size only, so that files from any number of ranks have the same chunks. A divisor of the
-    block is preferred, because then no chunk contains rows of two snapshots.
+    block is preferred, because then no chunk contains rows of two snapshots. A compressed one would be written anew
+    with the second snapshot, and a kill would lose the first: if there is no divisor for chunks of 16 KiB to 1 MiB, it
+    is a whole block, unless HDF5 has no chunks of that size.
     """
-    most = max(1, CHUNK_BYTES // row_bytes)
-    if n_rows <= most:
-        return max(1, n_rows)
-    parts = -(-n_rows // most)
-    for divisor in range(parts, 4 * parts):
-        if n_rows % divisor == 0:
-            return n_rows // divisor
-    return -(-n_rows // parts)
-
-
-def compressed_rows(n_rows: int, row_bytes: int) -> int:
-    """Return the number of rows per compressed chunk for blocks of ``n_rows`` rows: always a divisor of the block.
-
-    A chunk with rows of two snapshots would be written anew with the second one, and a kill would lose the first. If
-    there is no divisor for chunks of 16 KiB to 1 MiB, a chunk is a whole block, unless HDF5 has no chunks of that size.
-    """
-    parts = max(1, -(-n_rows * row_bytes // CHUNK_BYTES))
-    for divisor in range(parts, _SMALLER * parts):
+    parts = max(1, -(-n_rows // max(1, CHUNK_BYTES // row_bytes)))
+    for divisor in range(parts, (_SMALLER if compressed else 4) * parts):
         if n_rows % divisor == 0:
             return max(1, n_rows // divisor)
-    return n_rows if n_rows * row_bytes < _LARGEST else chunk_rows(n_rows, row_bytes)
+    return n_rows if compressed and n_rows * row_bytes < _LARGEST else -(-n_rows // parts)
 
 
 def is_compressed(dataset: h5py.Dataset) -> bool:
@@ -252,11 +238,6 @@ def open_shared(path: Path, comm: MPI.Comm) -> h5py.File:
     if comm.size == 1:
         return h5py.File(path, "r+", locking=False, rdcc_nbytes=CHUNK_CACHE, libver=OBJECTS)
     return h5py.File(path, "r+", driver="mpio", comm=comm, libver=OBJECTS)
-
-
-def grow(dataset: h5py.Dataset, n_rows: int) -> None:
-    """Set the number of rows. Collective for a shared file."""
-    dataset.id.set_extent((n_rows, *dataset.shape[1:]))
 
 
 def dataset_names(group: h5py.Group) -> list[str]:

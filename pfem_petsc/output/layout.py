@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from ..version import __version__
-from .hdf5 import chunk_rows, compressed_rows, create_growing, dataset_names, is_compressed, set_text, set_unit
+from .hdf5 import chunk_rows, create_growing, dataset_names, is_compressed, set_text, set_unit
 from .units import field_unit, unit_of
 
 LONGEST_ATTRIBUTE = 1 << 15
@@ -150,8 +150,7 @@ def create_result(file: h5py.File, n_nodes: int, n_bars: int, contents: Contents
     vtk.create_dataset("Offsets", shape=(n_bars + 1,), dtype=np.int64)
     vtk.create_dataset("Types", data=np.full(n_bars, VTK_LINE, dtype=np.uint8))
     compressed = contents.compressed
-    rows = compressed_rows(n_nodes, 24) if compressed else chunk_rows(n_nodes, 24)
-    create_growing(vtk, "Points", (3,), np.float64, rows, compressed)
+    create_growing(vtk, "Points", (3,), np.float64, chunk_rows(n_nodes, 24, compressed), compressed)
     steps = vtk.create_group("Steps")
     steps.attrs["NSteps"] = np.int64(0)
     create_growing(steps, "Values", (), np.float64, STEPS_PER_CHUNK)
@@ -216,7 +215,7 @@ def create_field(vtk: h5py.Group, kind: str, name: str, row_shape: tuple[int, ..
     n_rows = int(vtk["NumberOfPoints" if kind == "PointData" else "NumberOfCells"][0])
     row_bytes = dtype.itemsize * int(np.prod(row_shape, dtype=np.int64))
     compressed = is_compressed(vtk["Points"])
-    rows = compressed_rows(n_rows, row_bytes) if compressed else chunk_rows(n_rows, row_bytes)
+    rows = chunk_rows(n_rows, row_bytes, compressed)
     dataset = create_growing(vtk[kind], name, row_shape, dtype, rows, compressed)
     set_unit(dataset, field_unit(name))
     vtk["Steps"][kind + "Offsets"][name] = vtk["Steps"]["PointOffsets" if kind == "PointData" else "CellDataRows"]

@@ -155,14 +155,6 @@ def _machine() -> str:
 
 def _start_time(pid: int) -> str | None:
     """Return the start time of a process in ticks since boot; None if it has ended, "" if unknown."""
-    if not Path("/proc/self/stat").exists():
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            return None
-        except OSError:
-            pass
-        return ""
     try:
         fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
     except OSError:

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from ..errors import InputError
-from .hdf5 import create_checked, dataset_names, fsync_all, grow, is_compressed, write_rows
+from .hdf5 import create_checked, dataset_names, fsync_all, is_compressed, write_rows
 from .integrity import examine
 from .layout import (
     CHECKS,
@@ -59,7 +59,7 @@ def repair(path: Path | str, kept: Kept | None = None) -> tuple[int, int]:
         n_snapshots, vtk, steps = counts[0], file["VTKHDF"], file["VTKHDF/Steps"]
         # A kill in between must leave a file that VTK can read: VTK crashes on more times than steps, so the times are
         # removed first; it shows nothing for steps without data, so the data are removed last.
-        grow(steps["Values"], n_snapshots)
+        steps["Values"].resize(n_snapshots, axis=0)
         write_rows(steps["Values"], 0, file["snapshots/time"][:n_snapshots])
         file.flush()
         _count(file, counts)
@@ -71,7 +71,7 @@ def repair(path: Path | str, kept: Kept | None = None) -> tuple[int, int]:
                 for name in list(group):
                     del group[name]
         for name, n in _extents(file, counts).items():
-            grow(file[name], n)
+            file[name].resize(n, axis=0)
     fsync_all(path)
     return counts[:2]
 
@@ -195,7 +195,7 @@ def _rebuild(target: h5py.File, source: h5py.File, counts: tuple[int, int, int],
     for name, n in rows.items():
         old, new = source[name], target[name]
         if new.maxshape[0] is None:
-            grow(new, n)
+            new.resize(n, axis=0)
         piece = max(1, PIECE // max(1, old.dtype.itemsize * int(np.prod(old.shape[1:], dtype=np.int64))))
         if is_compressed(new):
             piece = max(1, piece // new.chunks[0]) * new.chunks[0]

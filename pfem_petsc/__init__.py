@@ -14,8 +14,7 @@ from .version import __version__
 if TYPE_CHECKING:
     from .case.schema import Case
     from .errors import EarlyStop, InputError, NotConverged, PfemError, SimulationFailure
-    from .formats import write_mesh
-    from .mesh.generators.arrays import Truss
+    from .mesh.generators.arrays import Truss, write_mesh
     from .output.result import open_result
     from .output.table import Table
     from .simulation import Simulation
@@ -45,7 +44,7 @@ _HOMES = {
     "Table": ".output.table",
     "open_result": ".output.result",
     "sweep": ".studies",
-    "write_mesh": ".formats",
+    "write_mesh": ".mesh.generators.arrays",
 }
 
 

@@ -26,12 +26,11 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     from mpi4py import MPI
-    from numpy.typing import ArrayLike
 
     from ..mesh.slab import MeshSlab
     from ..mesh.whole import WholeMesh
 
-__all__ = ["read_slab", "read_whole", "suffixes", "write_mesh", "write_whole", "writer_of"]
+__all__ = ["read_slab", "read_whole", "suffixes", "write_whole", "writer_of"]
 
 _GEOMETRY = "; this is a geometry: mesh it by `gmsh -1 {name} -o {stem}.msh`"
 _GMSH = "; convert it by `gmsh {name} -save -o {stem}.msh`"
@@ -203,51 +202,3 @@ def write_whole(path: Path | str, mesh: WholeMesh) -> Path:
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
     return path
-
-
-def write_mesh(
-    path: Path | str,
-    points: ArrayLike,
-    bars: ArrayLike,
-    *,
-    node_groups: Mapping[str, ArrayLike] | None = None,
-    bar_groups: Mapping[str, ArrayLike] | None = None,
-    bar_fields: Mapping[str, ArrayLike] | None = None,
-    comm: MPI.Comm | None = None,
-) -> Path:
-    """Write nodes and bars to a file for ``mesh.file``; an earlier file of this name is replaced. Collective.
-
-    Parameters
-    ----------
-    path : name of the file; its suffix selects the format (``docs/meshes.md``); ``.h5`` stores everything exactly
-    points : (nodes, 3) positions [m]
-    bars : (bars, 2) integers, the nodes at both ends of each bar, numbered from 0
-    node_groups, bar_groups : numbers of the members, or a boolean mask, for each name
-    bar_fields : (bars,) numbers for each name, such as areas [m2] for ``area_field`` of sections
-    comm : communicator whose rank 0 writes its arrays; default: COMM_WORLD
-
-    Returns
-    -------
-    The absolute path.
-
-    Raises
-    ------
-    InputError
-        On all ranks, for arrays of wrong shape or type; a mesh that cannot be simulated (coordinates that are not
-        finite, bars of zero length, two bars between the same nodes, nodes without bars); a file that cannot be
-        written.
-    """
-    from mpi4py import MPI
-
-    from ..mesh.slab import slab_from_arrays
-    from ..mesh.whole import WholeMesh, check_mesh
-    from ..parallel.agreement import on_root
-
-    def write(path: Path) -> Path:
-        writer_of(path)
-        slab = slab_from_arrays(str(path), points, bars, node_groups or {}, bar_groups or {}, bar_fields or {})
-        check_mesh(slab, MPI.COMM_SELF)
-        mesh = WholeMesh(slab.points, slab.bars, slab.node_groups, slab.bar_groups, slab.bar_fields)
-        return write_whole(path, mesh)
-
-    return on_root(MPI.COMM_WORLD if comm is None else comm, write, Path(path).absolute())

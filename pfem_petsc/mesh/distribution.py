@@ -108,10 +108,7 @@ class DistributedMesh:
 
     def extremes(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest and largest coordinates (3,) of all nodes [m]. Collective."""
-        points = self.points[: self.n_owned]
-        ends = np.stack([points.min(axis=0, initial=np.inf), -points.max(axis=0, initial=-np.inf)])
-        self.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MIN)
-        return ends[0], -ends[1]
+        return bounding_box(self.points[: self.n_owned], self.comm)
 
     def update_ghosts(self, array: np.ndarray) -> None:
         """Fill the ghost rows of ``array`` (n_local, k) float64, C-contiguous, with the owners' values. Collective."""

@@ -287,9 +287,7 @@ def partition(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, str]:
 
 def bounding_box(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest corners (3,) [m] of the box around the points of all ranks. Collective."""
-    box = np.full((2, 3), np.inf)
-    if len(points):
-        box[0], box[1] = points.min(axis=0), -points.max(axis=0)
+    box = np.stack([points.min(axis=0, initial=np.inf), -points.max(axis=0, initial=-np.inf)])
     comm.Allreduce(MPI.IN_PLACE, box, op=MPI.MIN)
     return box[0], -box[1]
 

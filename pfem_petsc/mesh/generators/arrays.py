@@ -210,6 +210,48 @@ class Truss:
         return f"<Truss of {self.n_nodes} nodes and {self.n_bars} bars{named}>"
 
 
+def write_mesh(
+    path: Path | str,
+    points: ArrayLike,
+    bars: ArrayLike,
+    *,
+    node_groups: Mapping[str, ArrayLike] | None = None,
+    bar_groups: Mapping[str, ArrayLike] | None = None,
+    bar_fields: Mapping[str, ArrayLike] | None = None,
+    comm: MPI.Comm | None = None,
+) -> Path:
+    """Write nodes and bars to a file for ``mesh.file``; an earlier file of this name is replaced. Collective.
+
+    Parameters
+    ----------
+    path : name of the file; its suffix selects the format (``docs/meshes.md``); ``.h5`` stores everything exactly
+    points : (nodes, 3) positions [m]
+    bars : (bars, 2) integers, the nodes at both ends of each bar, numbered from 0
+    node_groups, bar_groups : numbers of the members, or a boolean mask, for each name
+    bar_fields : (bars,) numbers for each name, such as areas [m2] for ``area_field`` of sections
+    comm : communicator whose rank 0 writes its arrays; default: COMM_WORLD
+
+    Returns
+    -------
+    The absolute path.
+
+    Raises
+    ------
+    InputError
+        On all ranks, for arrays of wrong shape or type; a mesh that cannot be simulated (coordinates that are not
+        finite, bars of zero length, two bars between the same nodes, nodes without bars); a file that cannot be
+        written.
+    """
+    from ...formats import writer_of
+
+    def write(path: Path) -> Path:
+        writer_of(path)
+        named = {"node_groups": node_groups, "bar_groups": bar_groups, "bar_fields": bar_fields}
+        return Truss(points, bars, **named, source=str(path)).write(path)
+
+    return on_root(MPI.COMM_WORLD if comm is None else comm, write, Path(path).absolute())
+
+
 def _kept(array: np.ndarray) -> np.ndarray:
     kept = array.copy()
     kept.flags.writeable = False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import os
 import shlex
 import tomllib
@@ -55,16 +54,9 @@ OF_RUN = (
 def run_case(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     """Simulate, and return the exit status. Collective."""
     restart = arguments.restart if arguments.restart in (None, True) else Path(arguments.restart)
-    collects = gc.isenabled()
-    gc.disable()  # most of what is imported stays: looking there for garbage takes a twentieth of a short run
-    try:
-        case = load_case(arguments, comm)
-        from ..simulation import Simulation
-    finally:
-        if collects:
-            gc.freeze()
-            gc.unfreeze()  # into the oldest generation, so that the first collections do not look there either
-            gc.enable()
+    case = load_case(arguments, comm)
+    from ..simulation import Simulation
+
     output = arguments.output or Path("results", case.name)
     command = _command(arguments, case, comm.size)
     try:
@@ -96,7 +88,6 @@ def load_case(arguments: argparse.Namespace, comm: MPI.Comm) -> Case:
 
 def _load(arguments: argparse.Namespace) -> Case:
     from ..case.schema import Case
-    from ..case.toml import built_in_path
 
     overrides, plugins = arguments.overrides, arguments.plugins
     restart = getattr(arguments, "restart", None)

@@ -197,8 +197,10 @@ def render(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     """Draw, and print the names of the files written."""
     if arguments.petsc_options:
         raise InputError(f"render takes no PETSc options: {' '.join(arguments.petsc_options)}")
+    from ..parallel.agreement import on_root
+
     options: dict[str, Any] = {each.name: getattr(arguments, each.name) for each in fields(Options)}
-    paths = [_checked_once(result, comm) for result in arguments.result]
+    paths = [on_root(comm, surviving, result) for result in arguments.result]
     if arguments.html:
         return _page(paths, arguments) if comm.rank == 0 else 0
     if arguments.modes is not None:
@@ -216,15 +218,6 @@ def render(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     if frames:
         print(f"{frames[0]} ... {frames[-1].name}: {len(frames)} frames" if len(frames) > 1 else frames[0])
     return 0
-
-
-def _checked_once(result: str, comm: MPI.Comm) -> Path:
-    """Return the result file after one rank has examined it."""
-    from ..parallel.agreement import agreed
-
-    with agreed(comm):
-        path = surviving(result) if comm.rank == 0 else None
-    return comm.bcast(path)
 
 
 def _page(paths: list[Path], arguments: argparse.Namespace) -> int:

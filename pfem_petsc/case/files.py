@@ -206,10 +206,7 @@ def rows_of(given: TableFile, file: Columns, names: tuple[str, ...]) -> list[lis
     """
     found = _chosen(file, given.columns, names)
     _check(file, found, names)
-    times = found[0] if given.time_scale == 1.0 else given.time_scale * found[0]
-    times = times if given.time_offset == 0.0 else times + given.time_offset
-    values = found[1:] if given.scale == 1.0 else given.scale * found[1:]
-    values = values if given.offset == 0.0 else values + given.offset
+    times, values = given.time_scale * found[0] + given.time_offset, given.scale * found[1:] + given.offset
     return np.vstack([times, values]).T.tolist()
 
 

@@ -43,15 +43,6 @@ def watched(row: Mapping[str, Any]) -> np.ndarray:
     return np.array([[float(row[name]) for name in WATCHED]])
 
 
-@kernel
-def _first_not_finite(rows: np.ndarray) -> int:
-    """Return the first of ``rows`` (m, k) of :data:`WATCHED` whose kinetic or elastic energy is not finite, or m."""
-    for k in range(len(rows)):
-        if not math.isfinite(rows[k, _KINETIC] + rows[k, _ELASTIC]):
-            return k
-    return len(rows)
-
-
 # numbers of a check between rows; after them follow the lowest works
 _STRANGE, _MOST, _MOST_LOST, _LIMIT, _STARTED, _START_ELASTIC, _START_SPRINGS = range(7)
 _LOWEST = _START_SPRINGS + 1
@@ -129,7 +120,8 @@ class BlowUp:
 
     def first_wrong(self, rows: np.ndarray) -> int:
         """Return the first of ``rows`` (m, k) of :data:`WATCHED` that :meth:`failure` tells of, or m."""
-        finite = _first_not_finite(rows)
+        bad = np.flatnonzero(~np.isfinite(rows[:, [_KINETIC, _ELASTIC]]).all(axis=1))
+        finite = int(bad[0]) if len(bad) else len(rows)
         if not self.inertial:
             return finite
         at, self._created = _first_created(rows[:finite], self._kept)

@@ -52,6 +52,15 @@ class Camera:
         """Return the camera that shows what is in the middle larger by a factor."""
         return replace(self, half_height=self.half_height / factor, distance=self.distance / factor)
 
+    def ahead(self, points: np.ndarray) -> np.ndarray:
+        """Return the direction (3,) or directions (n, 3) from points (n, 3) [m] to the eye."""
+        return self.towards if self.parallel else self.centre + self.distance * self.towards - points
+
+    def metres(self, points: np.ndarray) -> np.ndarray:
+        """Return the vertical extent (n,) [m] of the picture at points (n, 3) [m], zero behind the eye."""
+        depth = 0.0 if self.parallel else (points - self.centre) @ self.towards / self.distance
+        return 2.0 * self.half_height * np.maximum(0.0, 1.0 - depth) * np.ones(len(points))
+
 
 def direction(
     view: str | Sequence[float], bounds: np.ndarray, normals: Sequence[np.ndarray], upward: Sequence[float]
@@ -94,7 +103,8 @@ def direction(
 
 def _oblique(normals: Sequence[np.ndarray], upward: np.ndarray) -> np.ndarray:
     """Return the direction of the eye: slightly from above, from the quadrant that sees most walls from the front."""
-    first, second = _level(upward)
+    first = np.array(_X if abs(upward[0]) < 0.9 else _Y)
+    second = np.cross(upward, first)
     # -second points towards the viewer in a right-handed picture, the default quadrant
     quarters = [a * first + b * second for b in (-1.3, 1.3) for a in (0.9, -0.9)]
     quarters += [1.3 * a * first + 0.9 * b * second for b in (-1.0, 1.0) for a in (1.0, -1.0)]
@@ -103,20 +113,13 @@ def _oblique(normals: Sequence[np.ndarray], upward: np.ndarray) -> np.ndarray:
     return directions[int(np.argmax(np.round(seen, 6)))]
 
 
-def _level(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two unit vectors across an upward direction, the first one along x if that is not upward."""
-    first = np.array(_X if abs(up[0]) < 0.9 else _Y)
-    first -= (first @ up) * up
-    first /= np.linalg.norm(first)
-    return first, np.cross(up, first)
-
-
 def fit(
     points: np.ndarray,
     way: tuple[np.ndarray, np.ndarray, bool],
     aspect: float,
     margin: float = 1.05,
     centre: np.ndarray | None = None,
+    reach: float = 0.0,
 ) -> Camera:
     """Return the camera in a direction that has all points (n, 3) [m] in view.
 
@@ -126,6 +129,7 @@ def fit(
     aspect : width over height of the picture
     margin : factor on the visible extent
     centre : (3,) [m], what is in the middle of the picture; None: the middle of the points
+    reach : [m], how far pictures of points extend around them
     """
     towards, up, parallel = way
     right = np.cross(up, towards)
@@ -134,29 +138,16 @@ def fit(
     axes = np.stack([right, up, towards])
     spans = points @ axes.T
     middle = 0.5 * (spans.min(axis=0) + spans.max(axis=0)) if centre is None else axes @ centre
-    across, along, deep = (spans - middle).T
+    across, along, deep = np.abs((spans - middle).T) + reach
     centre = middle @ axes
-    half = max(float(np.abs(along).max()), float(np.abs(across).max()) / aspect) * margin or 1.0
+    high = np.maximum(along, across / aspect) * margin
+    half = float(high.max()) or 1.0
     if parallel:
-        return Camera(towards, up, right, centre, 10.0 * (half * max(1.0, aspect) + np.ptp(deep)), half, True)
+        return Camera(towards, up, right, centre, 10.0 * (half * max(1.0, aspect) + 2.0 * deep.max()), half, True)
     # with perspective each point requires its own distance, larger for nearer points
     slope = np.tan(np.radians(_OPENING) / 2)
-    needed = np.maximum(np.abs(along), np.abs(across) / aspect) * margin / slope
-    distance = float((needed + deep).max()) or 1.0
+    distance = float((high / slope + (spans - middle)[:, 2] + reach).max()) or 1.0
     return Camera(towards, up, right, centre, distance, distance * slope, False)
-
-
-def check_moves(options: Any) -> None:
-    """Refuse ``zoom`` and ``orbit`` of options that make no film.
-
-    Raises
-    ------
-    InputError
-    """
-    if not 1e-3 <= options.zoom <= 1e3:
-        raise InputError(f"render: zoom = {options.zoom:g} must be from 0.001 to 1000")
-    if not np.isfinite(options.orbit):
-        raise InputError(f"render: orbit = {options.orbit:g} is not a number of degrees")
 
 
 def cameras(options: Any, motion: Any, aspect: float) -> list[Camera]:
@@ -170,11 +161,11 @@ def cameras(options: Any, motion: Any, aspect: float) -> list[Camera]:
     motion : of the film
     aspect : width of the picture over its height
     """
-    towards, up, parallel = direction(options.view, motion.bounds, motion.normals, motion.upward)
-    points, count = motion.surroundings, len(motion.frames)
+    way = towards, up, parallel = direction(options.view, motion.bounds, motion.normals, motion.upward)
+    points, reach, count = motion.surroundings, motion.reach, len(motion.frames)
     if not options.orbit and options.follow is None:
-        return [fit(points, (towards, up, parallel), aspect).zoomed(options.zoom)] * count
-    ways = [(towards, up, parallel)] * count
+        return [fit(points, way, aspect, reach=reach).zoomed(options.zoom)] * count
+    ways = [way] * count
     if options.orbit:
         from scipy.spatial.transform import Rotation
 
@@ -182,11 +173,11 @@ def cameras(options: Any, motion: Any, aspect: float) -> list[Camera]:
         ways = [(each, up, parallel) for each in Rotation.from_rotvec(turns).apply(towards)]
     if options.follow is None:
         centre = motion.bounds.mean(axis=0)
-        made = [fit(points, way, aspect, centre=centre) for way in ways]
+        made = [fit(points, way, aspect, centre=centre, reach=reach) for way in ways]
     else:
         centres = motion.boxes.mean(axis=1) if options.follow == "structure" else motion.probe(options.follow)
         held = zip(ways, motion.hulls, centres, strict=True)
-        made = [fit(hull, way, aspect, margin=1.25, centre=centre) for way, hull, centre in held]
+        made = [fit(hull, way, aspect, margin=1.25, centre=centre, reach=reach) for way, hull, centre in held]
     (made,) = at_one_scale([made])
     return [camera.zoomed(options.zoom) for camera in made]
 

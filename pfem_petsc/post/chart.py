@@ -103,7 +103,7 @@ class Panel:
     height : relative to others
     over : name and unit of the horizontal axis; None: that of the chart
     scale : factor and unit of the vertical axis; None: by the values
-    legend : ``above`` or ``beside`` the panel, or ``none``
+    legend : whether there is one, beside the panel
     log : whether the vertical axis is logarithmic
     """
 
@@ -114,7 +114,7 @@ class Panel:
     height: float = 1.0
     over: tuple[str, str] | None = None
     scale: tuple[float, str] | None = None
-    legend: str = "above"
+    legend: bool = True
     log: bool = False
 
     @property
@@ -329,24 +329,12 @@ class Chart:
         if lowest or panel.over:
             axes.tick_params(labelbottom=True)
             axes.set_xlabel(label)
-        if panel.legend == "none" or not axes.get_legend_handles_labels()[0]:
-            return
-        if panel.legend == "beside":
+        if panel.legend and axes.get_legend_handles_labels()[0]:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, handlelength=1.8)
-        else:
-            self._legend_above(axes)
 
     def scale(self, unit: str) -> tuple[float, str]:
         """Return the factor and the prefixed unit of all numbers of a unit."""
         return self._scales[unit]
-
-    def _legend_above(self, axes: Any) -> None:
-        """Put the legend above a panel, beside the title if there is room, so that it hides no curve."""
-        texts = axes.get_legend_handles_labels()[1]
-        title, width = axes.get_title(loc="left"), self.figure.get_figwidth() / self.axes[0].get_gridspec().ncols
-        if title and (1.4 * len(title) + sum(len(text) + 5.0 for text in texts)) * _LETTER > width - 0.9:
-            axes.set_title(f"{title}\n")
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(texts), handlelength=1.4, borderaxespad=0.1)
 
     def save(self, file: Path, formats: Iterable[str] = ("png",)) -> list[Path]:
         """Write the picture, or its table, in formats of :data:`FORMATS`; return the files.

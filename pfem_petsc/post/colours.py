@@ -89,16 +89,11 @@ class ColourField:
         """
         indices = list(indices)
         chosen = [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, _SAMPLES).astype(int))]
-        bulk, largest, lowest = 0.0, 0.0, 0.0
-        for index in chosen:
-            values = self.values(index)
-            values = values[np.isfinite(values)]
-            if values.size == 0:
-                continue
-            sizes = np.abs(values)
-            bulk = max(bulk, float(np.quantile(sizes, 0.99)))
-            largest = max(largest, float(sizes.max()))
-            lowest = min(lowest, float(values.min()))
+        shown = [values[np.isfinite(values)] for values in map(self.values, chosen)]
+        sizes = [np.abs(values) for values in shown if values.size]
+        bulk = max((float(np.quantile(size, 0.99)) for size in sizes), default=0.0)
+        largest = max((float(size.max()) for size in sizes), default=0.0)
+        lowest = min((float(values.min(initial=0.0)) for values in shown), default=0.0)
         limit = largest if largest <= 2.0 * bulk or bulk == 0.0 else bulk
         self.rounded = 0.0 < largest <= self._rounding
         if self.rounded or limit == 0.0:
@@ -125,17 +120,13 @@ def _rounding_of(result: Any, name: str) -> float:
 
 
 class ColourScale:
-    """Maps values to colours by a table of 256 entries.
+    """Maps values to colours.
 
     Parameters
     ----------
     limits : lower and upper value
     cmap : a matplotlib colour map or its name; None: chosen by the sign of the lower limit
     unit : unit of the values
-
-    Attributes
-    ----------
-    table : (256, 3) uint8
 
     Raises
     ------
@@ -159,12 +150,11 @@ class ColourScale:
             cmap = matplotlib.colormaps[cmap]
         self.low, self.high, self.cmap = float(low), float(high), cmap
         self.factor, self.unit = prefix_for(max(abs(low), abs(high)), unit)
-        self.table = (255 * cmap(np.linspace(0.0, 1.0, 256))[:, :3] + 0.5).astype(np.uint8)
 
     def colours(self, values: np.ndarray) -> np.ndarray:
         """Return colours (n, 3) uint8 of values (n,), clipped at the limits; NaN has the lowest colour."""
-        place = np.nan_to_num((values - self.low) * (255.0 / (self.high - self.low)), nan=0.0, posinf=255, neginf=0)
-        return self.table[np.clip(place, 0, 255).astype(np.uint8)]
+        place = np.nan_to_num((values - self.low) / (self.high - self.low), nan=0.0)
+        return self.cmap(np.clip(place, 0.0, 1.0), bytes=True)[:, :3]
 
 
 def limits_of(

@@ -259,19 +259,14 @@ def usual_curves(results: Sequence[Any]) -> list[str]:
     for name in common:
         if name.startswith("probe/") and name.endswith("/position"):
             moved = name.removesuffix("position") + "displacement"
-            chosen += (
-                [moved] if any(np.any(np.concatenate([*column(r.history, moved).values()])) for r in results) else []
-            )
+            chosen += [moved] if any(np.any([*column(r.history, moved).values()]) for r in results) else []
     # over load factors, the load factor is a straight line; it is a curve over the points of a path
-    paths = "load_factor" in common and results[0].axis.symbol != TIME.symbol
-    chosen += ["load_factor"] if paths and not all(_is_axis(r.history, "load_factor") for r in results) else []
+    if "load_factor" in common and results[0].axis.symbol != TIME.symbol:
+        every = [(read(r.history, "load_factor"), read(r.history, "time")) for r in results]
+        chosen += ["load_factor"] if not all(np.array_equal(*pair) for pair in every) else []
     if not chosen:
         raise InputError("plot: the results have no columns in common that change; name some as curves")
     return chosen
-
-
-def _is_axis(history: History, name: str) -> bool:
-    return np.array_equal(read(history, name), read(history, "time"))
 
 
 def draw_comparison(results: Sequence[Any], forces: Filter, closed_forms: bool = True) -> Chart:
@@ -321,7 +316,10 @@ def _draw(
     times = [read(result.history, "time") for result in results]
     places = times
     if against is not None:
-        places = [_filtered(result, chosen, against, _single(result.history, against)) for result in results]
+        found = [column(result.history, against) for result in results]
+        if any(list(each) != [against] for each in found):
+            raise InputError(f"plot: against = {against!r} is a vector: name a component, {against}.x, .y, .z or .norm")
+        places = [_filtered(r, chosen, against, each[against]) for r, each in zip(results, found, strict=True)]
     shared = all(np.array_equal(place, places[0]) for place in places)
     over = None if against is None else (against, unit_of_curve(against))
     drawn = []
@@ -350,10 +348,9 @@ def _draw(
         if smoothing is not None and smoothing.name != AS_COMPUTED:
             state = f"{AS_COMPUTED}, as all energies" if unit_of_curve(name) == "J" else smoothing.name
             title = f"{title}: {state}"
-        legend = "beside" if len(curves) > 1 else "none"
         label = words(name.rsplit("/", 1)[-1])
         height = max(0.9, 0.11 * len(curves))  # of the legend
-        drawn.append(Panel(label, unit_of_curve(name), curves, title, height, over, None, legend))
+        drawn.append(Panel(label, unit_of_curve(name), curves, title, height, over, None, len(curves) > 1))
     axis = max((result.axis for result in results), key=lambda axis: axis.staged)
     ends = first.stage_ends if len(results) == 1 and axis.staged else ()
     return Chart(drawn, first.case.title or first.case.name, np.concatenate(times), axis, ends=ends)
@@ -370,13 +367,6 @@ def _filtered(result: Any, chosen: Filter | None, name: str, values: np.ndarray)
 def unit_of_curve(name: str) -> str:
     """Return the SI unit of a column or a component of one."""
     return unit_of(source_of(name))
-
-
-def _single(history: History, name: str) -> np.ndarray:
-    found = column(history, name)
-    if list(found) != [name]:
-        raise InputError(f"plot: against = {name!r} is a vector: name a component, {name}.x, .y, .z or .norm")
-    return found[name]
 
 
 def labels_of(results: Sequence[Any]) -> list[str]:
@@ -424,20 +414,20 @@ def draw_spectra(
     for result in results:
         if not result.stretches:
             raise InputError(f"{result.path}: spectra need a run over time, not a static analysis")
+    natural = first.modes.frequency if getattr(first, "n_modes", 0) and first.modes.kind == "vibration" else ()
     panels = []
     for name in names:
         unit = unit_of_curve(name)
         curves = []
         for label, result in zip(labels_of(results), results, strict=True):
+            time = read(result.history, "time")
+            rows = max(result.stretches, key=lambda rows, time=time: float(np.ptp(time[rows])))
             for part, values in column(result.history, name).items():
                 key = f"{part}: {label}" if len(results) > 1 else part
-                rows = _longest(result)
-                time = read(result.history, "time")[rows]
-                frequency, amplitude = amplitude_spectrum(time, values[rows], window)
+                frequency, amplitude = amplitude_spectrum(time[rows], values[rows], window)
                 curves.append(Curve(key, amplitude, place=frequency))
         label = f"amplitude of\n{words(name.rsplit('/', 1)[-1])}"
-        legend = "beside" if len(curves) > 1 else "none"
-        title = f"{name}, window: {window}"
+        legend, title = len(curves) > 1, f"{name}, window: {window}"
         panels.append(Panel(label, unit, curves, title, 1.1, ("frequency", "Hz"), (1.0, unit), legend, log=True))
     title = first.case.title or first.case.name
     chart = Chart(panels, title, np.zeros(1))
@@ -446,28 +436,15 @@ def draw_spectra(
         end = highest or max(curve.place[-1] for curve in panel.curves)
         inside = [(curve.place > 0.0) & (curve.place <= end) for curve in panel.curves]
         top = max(largest(curve.values[part]) for curve, part in zip(panel.curves, inside, strict=True))
-        for line, curve, part in zip(axes.lines, panel.curves, inside, strict=True):  # the mean is none of it
-            line.set_data(curve.place[part] * factor, curve.values[part])
         if len(panel.curves) == 1:
             _tell_peaks(axes, panel.curves[0].place[inside[0]], panel.curves[0].values[inside[0]], factor, shown)
         if top > 0.0:
             axes.set_ylim(1e-6 * top, 4.0 * top)
         axes.set_xlim(0.0, end * factor)
-        for value in _natural(first):
+        for value in natural:
             if 0.0 < value <= end:
                 axes.axvline(value * factor, color="#6b7280", linewidth=0.8, linestyle=":", zorder=0)
     return chart
-
-
-def _longest(result: Any) -> slice:
-    """Return the rows of the longest stretch of motion."""
-    time = read(result.history, "time")
-    return max(result.stretches, key=lambda rows: float(np.ptp(time[rows])))
-
-
-def _natural(result: Any) -> np.ndarray:
-    modes = result.modes if getattr(result, "n_modes", 0) else None
-    return modes.frequency if modes is not None and modes.kind == "vibration" else np.zeros(0)
 
 
 def _tell_peaks(axes: Any, frequency: np.ndarray, amplitude: np.ndarray, factor: float, unit: str) -> None:

@@ -132,8 +132,8 @@ def cfc(time: np.ndarray, values: np.ndarray, size: float, zero_before: bool = F
     InputError
         If the history is too coarse or too short for the class, or has less than three rows.
     """
-    passes = _Passes(CFC_CORNER * size, 2, _ROWS * size, f"CFC {size:g}")
-    return passes.applied(time, values, lambda interval: CFC_CORNER * size, zero_before)
+    passes = _Passes(f"CFC {size:g}", 2, _ROWS * size, lambda interval: CFC_CORNER * size)
+    return _filtered(passes, time, values, zero_before)
 
 
 def butterworth(
@@ -151,56 +151,53 @@ def butterworth(
         return math.atan(ratio * math.tan(math.pi * cutoff * interval)) / (math.pi * interval)
 
     # more than two rows per period: tan(pi f_d h) is infinite there
-    passes = _Passes(cutoff, order, 2.01 * cutoff, f"a cut-off of {engineering(cutoff, 'Hz', 3)}")
-    return passes.applied(time, values, corner, zero_before)
+    passes = _Passes(f"a cut-off of {engineering(cutoff, 'Hz', 3)}", order, 2.01 * cutoff, corner)
+    return _filtered(passes, time, values, zero_before)
 
 
 class _Passes(NamedTuple):
-    """Corner frequency [Hz] and order of a pass, the fewest rows per second, and what a message calls the filter."""
+    """The name in messages, the order, the fewest rows per second, and the corner [Hz] at an interval [s]."""
 
-    corner: float
+    what: str
     order: int
     rate: float
-    what: str
+    corner: Callable[[float], float]
 
-    def applied(
-        self, time: np.ndarray, values: np.ndarray, corner: Callable[[float], float], zero_before: bool
-    ) -> np.ndarray:
-        """Return the values after both passes with the corner [Hz] of an interval [s]."""
-        from scipy.signal import butter, sosfiltfilt
 
-        time, values = np.asarray(time, dtype=float), np.asarray(values, dtype=float)
-        self._check(time)
-        grid, even = _evenly(time, values)
-        interval = (grid[-1] - grid[0]) / (len(grid) - 1)
-        # what the slowest pole forgets to rounding error
-        pad = math.ceil(36.0 / (2 * math.pi * self.corner * interval * math.sin(math.pi / (2 * self.order))))
-        longer = np.pad(even, pad, mode="reflect", reflect_type="odd")
-        if zero_before:
-            longer[:pad] = 0.0
-        sections = butter(self.order, corner(interval), fs=1.0 / interval, output="sos")
-        smooth = sosfiltfilt(sections, longer, padtype=None)[pad : pad + len(even)]
-        return smooth if grid is time else np.interp(time, grid, smooth)
+def _filtered(passes: _Passes, time: np.ndarray, values: np.ndarray, zero_before: bool) -> np.ndarray:
+    """Return the values (n,) at times (n,) [s] after both passes."""
+    from scipy.signal import butter, sosfiltfilt
 
-    def _check(self, time: np.ndarray) -> None:
-        steps = np.diff(time)
-        steps = steps[steps > 0.0]
-        if len(steps) < 2:
-            raise InputError(
-                f"filter: {self.what} needs a history of three rows or more, and this one has {len(steps) + 1}: "
-                "set [output] history_every, or give filter none"
-            )
-        longest = float(steps.max())
-        if longest * self.rate > 1.0 + 1e-6:
-            raise InputError(
-                f"filter: {self.what} needs {self.rate:.5g} rows of the history per second, and this one has "
-                f"{1 / longest:.4g} where they are farthest apart: set [output] history_every, or give a lower one"
-            )
-        if self.corner * (time[-1] - time[0]) < 1.0:
-            raise InputError(
-                f"filter: {self.what} is slower than the history of {engineering(time[-1] - time[0], 's')}: it has "
-                f"less than a period of {engineering(1 / self.corner, 's', 3)}; give a higher one"
-            )
+    time, values = np.asarray(time, dtype=float), np.asarray(values, dtype=float)
+    what, order, rate, corner = passes
+    steps = np.diff(time)[np.diff(time) > 0.0]
+    if len(steps) < 2:
+        raise InputError(
+            f"filter: {what} needs a history of three rows or more, and this one has {len(steps) + 1}: "
+            "set [output] history_every, or give filter none"
+        )
+    longest = float(steps.max())
+    if longest * rate > 1.0 + 1e-6:
+        raise InputError(
+            f"filter: {what} needs {rate:.5g} rows of the history per second, and this one has "
+            f"{1 / longest:.4g} where they are farthest apart: set [output] history_every, or give a lower one"
+        )
+    grid, even = _evenly(time, values)
+    interval = (grid[-1] - grid[0]) / (len(grid) - 1)
+    cutoff = corner(interval)
+    if cutoff * (time[-1] - time[0]) < 1.0:
+        raise InputError(
+            f"filter: {what} is slower than the history of {engineering(time[-1] - time[0], 's')}: it has "
+            f"less than a period of {engineering(1 / cutoff, 's', 3)}; give a higher one"
+        )
+    # what the slowest pole forgets to rounding error
+    pad = math.ceil(36.0 / (2 * math.pi * cutoff * interval * math.sin(math.pi / (2 * order))))
+    longer = np.pad(even, pad, mode="reflect", reflect_type="odd")
+    if zero_before:
+        longer[:pad] = 0.0
+    sections = butter(order, cutoff, fs=1.0 / interval, output="sos")
+    smooth = sosfiltfilt(sections, longer, padtype=None)[pad : pad + len(even)]
+    return smooth if grid is time else np.interp(time, grid, smooth)
 
 
 def _evenly(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

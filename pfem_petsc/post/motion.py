@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..contact.wall_motion import WallMotion
-from ..contact.walls.base import WALLS, Surface, slab
+from ..contact.walls.base import WALLS, Surface, perpendicular, slab
 from ..errors import InputError
 from ..fields import STATUS
 from ..mechanics.bars import bar_shapes, mesh_of_cases, section_of_bars
@@ -53,6 +52,7 @@ class Motion:
     Attributes
     ----------
     bounds : (2, 3) [m], corners of the motion
+    hulls : for each frame (n, 3) [m]: outermost nodes, or the corners of a large structure
     boxes : (frames, 2, 3) [m], corners of the structure in each frame
     reach : [m], how far the picture of a node extends around it
     times : (frames,) [s]
@@ -74,13 +74,8 @@ class Motion:
         self.n_bars = len(self.bars)
         self._check_marks()
         self._trails = {name: self._trail(name) for name in options.trails}
-        self.reach, boxes = 0.0, []
-        self._hulls: list[np.ndarray] = []
-        for frame in self.frames:
-            points = self._held(frame)
-            boxes.append([points.min(axis=0), points.max(axis=0)])
-            self._hulls.append(_outermost(points))
-        self.boxes = np.array(boxes)
+        self.reach, self.hulls = 0.0, [_outermost(self._held(frame)) for frame in self.frames]
+        self.boxes = np.array([[points.min(axis=0), points.max(axis=0)] for points in self.hulls])
         low, high = self.boxes[:, 0].min(axis=0), self.boxes[:, 1].max(axis=0)
         if options.ghost:
             low, high = np.fmin(low, self.start.min(axis=0)), np.fmax(high, self.start.max(axis=0))
@@ -90,7 +85,8 @@ class Motion:
         self.normals = [wall.normal / np.linalg.norm(wall.normal) for wall in walls if hasattr(wall, "normal")]
         every = np.asarray(result.times, dtype=float)
         self.time_factor, self.time_unit = result.axis.scale(float(np.abs(every).max()))
-        self._decimals = _decimals(self.time_factor * every)
+        steps = np.diff(np.unique(self.time_factor * every))
+        self._decimals = int(np.clip(np.ceil(0.3 - np.log10(np.median(steps))), 0, 6)) if len(steps) else 2
 
     def _check_marks(self) -> None:
         for mark in self._options.marks:
@@ -111,26 +107,15 @@ class Motion:
         shifts, present = walls_at(self.result, times)
         still = {surface.name: surface for surface in wall_surfaces(walls, self.bounds, self.note)}
         surfaces: dict[int, list[Surface]] = {frame: [] for frame in self.frames}
-        for k, wall in enumerate(walls):
-            for row, frame in enumerate(self.frames):
-                if wall.name not in still or not present[row, k]:
-                    continue
-                surface, shift = still[wall.name], shifts[row, k]
-                if shift.any() and hasattr(wall, "point"):  # a plane is drawn beside the structure, wherever it is
-                    point = tuple((np.asarray(wall.point) + shift).tolist())
-                    (surface,) = wall_surfaces([wall.model_copy(update={"point": point})], self.bounds)
-                elif shift.any():
-                    surface = replace(surface, points=surface.points + shift)
-                surfaces[frame].append(surface)
+        for row, k in np.argwhere(present).tolist():
+            surface, shift = still.get(walls[k].name), shifts[row, k]
+            if walls[k].type == "plane":  # which is drawn beside the structure, wherever it is
+                normal = np.asarray(walls[k].normal) / np.linalg.norm(walls[k].normal)
+                shift = (shift @ normal) * normal
+            if surface is not None:
+                moved = replace(surface, points=surface.points + shift) if shift.any() else surface
+                surfaces[self.frames[row]].append(moved)
         return surfaces
-
-    @property
-    def hulls(self) -> list[np.ndarray]:
-        """For each frame (n, 3) [m]: outermost nodes, or the corners of a large structure, with what is around them."""
-        if self.reach == 0.0:
-            return list(self._hulls)
-        around = self.reach * (np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T)
-        return [(hull[:, None] + around).reshape(-1, 3) for hull in self._hulls]
 
     @property
     def surroundings(self) -> np.ndarray:
@@ -149,11 +134,9 @@ class Motion:
     def upward(self) -> np.ndarray:
         """Upward direction (3,) of pictures: against gravity along y, else z."""
         gravity = getattr(self.result.case, "gravity", None)
-        if gravity is not None:
-            pull = np.asarray(gravity.mean, dtype=float)
-            axis = int(np.argmax(np.abs(pull)))
-            if np.count_nonzero(pull) == 1 and axis == 1:
-                return np.array([0.0, -float(np.sign(pull[1])), 0.0])
+        pull = np.zeros(3) if gravity is None else np.asarray(gravity.mean, dtype=float)
+        if pull[1] and np.count_nonzero(pull) == 1:
+            return np.array([0.0, -float(np.sign(pull[1])), 0.0])
         return np.array([0.0, 0.0, 1.0])
 
     def positions(self, frame: int) -> np.ndarray:
@@ -195,11 +178,7 @@ class Motion:
         history, column = self.result.history, f"probe/{name}/position"
         known = [key.split("/")[1] for key in history if key.startswith("probe/") and key.endswith("/position")]
         if column not in history:
-            way = (
-                f"its probes are {', '.join(known)}{nearest(name, known)}"
-                if known
-                else "give the case an [[output.probe]]"
-            )
+            way = f"its probes are {', '.join(known)}{nearest(name, known)}" if known else "give an [[output.probe]]"
             raise InputError(f"render: the result has no probe '{name}'; {way}")
         when, places = np.asarray(history["time"], dtype=float), np.asarray(history[column], dtype=float)
         return when, places if self.scale == 1.0 else places[0] + self.scale * (places - places[0])
@@ -212,18 +191,16 @@ class Motion:
     def layers(self, frame: int, scene: Scene, camera: Camera) -> list[Layer]:
         """Return what is drawn in addition to the bars of a frame."""
         made, points, thick = [], self.positions(frame), scene.thickness(camera)
+        width, gone = scene.width / scene.unit, self.gone(frame)
         if self._options.ghost:
-            width = float(np.clip(0.6 * scene.width / scene.unit, 1.2, 2.4))
-            made.append(Layer(self.start, self.bars, GHOST, width, -thick))
-        gone = self.gone(frame)
+            made.append(Layer(self.start, self.bars, GHOST, float(np.clip(0.6 * width, 1.2, 2.4)), -thick))
         if "yielded" in self._options.marks:
             yielded = np.asarray(self.result.field("plastic_strain", frame)) != 0.0
             if gone is not None:
                 yielded &= ~gone
-            if yielded.any():
-                made.append(scene.rim(points, np.flatnonzero(yielded), MARKS["yielded"].colour))
-        if "broken" in self._options.marks and gone is not None and gone.any():
-            made.append(self._stubs(points, gone, scene.width / scene.unit))
+            made.append(scene.rim(points, np.flatnonzero(yielded), MARKS["yielded"].colour))
+        if "broken" in self._options.marks and gone is not None:
+            made.append(self._stubs(points, gone, width))
         for number, (when, places) in enumerate(self._trails.values()):
             past = max(1, int(np.searchsorted(when, self.result.times[frame], side="right")))
             rows = np.stack([np.arange(past - 1), np.arange(1, past)], axis=1)
@@ -233,40 +210,19 @@ class Motion:
 
     def _stubs(self, points: np.ndarray, gone: np.ndarray, width: float) -> Layer:
         """Return both ends of each broken bar, which point at each other."""
-        bars = self.bars[gone]
-        one, two = points[bars[:, 0]], points[bars[:, 1]]
-        along = two - one
-        now = np.linalg.norm(along, axis=1)
-        initial = np.linalg.norm(self.start[bars[:, 1]] - self.start[bars[:, 0]], axis=1)
-        part = (_STUB * np.minimum(1.0, initial / np.where(now > 0.0, now, 1.0)))[:, None] * along
-        count = len(bars)
-        numbers = np.arange(2 * count)
-        lines = np.stack([numbers, numbers + 2 * count], axis=1)
-        stubs = np.concatenate([one, two, one + part, two - part])
-        return Layer(stubs, lines, MARKS["broken"].colour, max(2.0, width))
+        one, two = points[self.bars[gone, 0]], points[self.bars[gone, 1]]
+        now, initial = np.linalg.norm(two - one, axis=1), _lengths(self.result)[gone]
+        part = (_STUB * np.minimum(1.0, initial / np.maximum(now, 1e-300)))[:, None] * (two - one)
+        lines = np.arange(4 * len(one)).reshape(2, -1).T
+        return Layer(np.concatenate([one, two, one + part, two - part]), lines, MARKS["broken"].colour, max(2.0, width))
 
 
 def _outermost(points: np.ndarray) -> np.ndarray:
     """Return the points of (n, 3) that are farthest in evenly spread directions, or the corners of the box of many."""
     if len(points) > _MOST_NODES:
         return np.array(np.meshgrid(*np.array([points.min(axis=0), points.max(axis=0)]).T)).reshape(3, -1).T
-    # a spiral of equal areas on the sphere
-    height = 1.0 - (2.0 * np.arange(_WAYS) + 1.0) / _WAYS
-    angle = np.pi * (1.0 + 5.0**0.5) * np.arange(_WAYS)
-    ways = np.stack([np.sqrt(1.0 - height**2) * np.cos(angle), np.sqrt(1.0 - height**2) * np.sin(angle), height])
-    ways = np.concatenate([ways, np.eye(3), -np.eye(3)], axis=1)
-    return points[np.unique(np.argmax(points @ ways, axis=0))]
-
-
-def _decimals(times: np.ndarray) -> int:
-    """Return with how many decimals times (n,) are told apart, to a twentieth of the usual step between them."""
-    steps = np.diff(np.unique(times))
-    if not len(steps):
-        return 2
-    step = float(np.median(steps))
-    most = int(np.clip(np.ceil(-np.log10(step)) + 2, 0, 6))
-    exact = (n for n in range(most) if np.abs(np.round(times, n) - times).max() < 0.05 * step)
-    return next(exact, most)
+    ways = np.concatenate([np.random.default_rng(0).normal(size=(_WAYS, 3)), np.eye(3), -np.eye(3)])
+    return points[np.unique(np.argmax(points @ ways.T, axis=0))]
 
 
 def chosen_frames(
@@ -509,21 +465,14 @@ def plane(wall: Any, bounds: np.ndarray) -> Surface:
     """
     normal = np.asarray(wall.normal, dtype=float)
     normal = normal / np.linalg.norm(normal)
-    # two tangents, the first one in the plane of least normal component, so that axis-aligned walls get such edges
-    helper = np.eye(3)[np.argmin(np.abs(normal))]
-    first = np.cross(helper, normal)
-    first /= np.linalg.norm(first)
+    first = perpendicular(normal)
     second = np.cross(normal, first)
-    corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    along = np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T @ np.stack([first, second], axis=1)
     size = np.linalg.norm(bounds[1] - bounds[0]) or 1.0
-    spans = []
-    for tangent in (first, second):
-        along = corners @ tangent
-        # a structure without extent in this direction still gets a visible wall
-        margin = 0.04 * size + 0.5 * max(0.0, 0.2 * size - np.ptp(along))
-        spans.append((along.min() - margin, along.max() + margin))
+    # a structure without extent in this direction still gets a visible wall
+    margin = 0.04 * size + 0.5 * np.maximum(0.0, 0.2 * size - np.ptp(along, axis=0))
+    (a, c), (b, d) = along.min(axis=0) - margin, along.max(axis=0) + margin
     foot = normal * (np.asarray(wall.point, dtype=float) @ normal)
-    (a, b), (c, d) = spans
     face = np.array([foot + u * first + v * second for u, v in ((a, c), (b, c), (b, d), (a, d))])
     return slab(wall.name, face, normal, 0.05 * size)
 
@@ -556,8 +505,8 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
     """Return displacements (times, walls, 3) [m] of a result's walls from where they are first given, and which of them
     are there (times, walls) bool.
 
-    Positions of walls with mass are interpolated linearly between rows of the history; others follow from the case. The
-    end of a stage belongs to it, and not to the next one. A wall that a stage no longer has remains where it was.
+    Positions are interpolated linearly between rows of the history. The end of a stage belongs to it, and not to the
+    next one. A wall that a stage no longer has remains where it was.
     """
     walls, history = result.case.every_wall, result.history
     names = [wall.name for wall in walls]
@@ -566,21 +515,16 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
     numbers = np.asarray(history["stage"]) if "stage" in history else np.zeros(len(when), dtype=int)
     for row, time in enumerate(times):
         for number, stage in enumerate(result.case.stages):
-            begin, rows = when[numbers < number].max(initial=0.0), when[numbers == number]
-            if number and (not len(rows) or begin >= time):
+            if number and (number not in numbers or when[numbers < number].max(initial=0.0) >= time):
                 break
             present[row] = np.isin(names, [wall.name for wall in stage.wall])
-            end = min(time, rows[-1]) if len(rows) else time
-            for wall, moved in zip(stage.wall, WallMotion(stage.wall).displacements(end - begin), strict=True):
+            for wall in stage.wall:
                 k = names.index(wall.name)
-                if wall.mass is not None:
-                    places = np.asarray(history[f"wall/{wall.name}/position"], dtype=float)
-                    now = [np.interp(time, when, places[:, axis]) for axis in range(3)]
-                    shifts[row, k] = now - places[numbers == number][0]
-                elif number == 0:
-                    shifts[row, k] = moved
-                elif not stage.holds("wall"):
-                    shifts[row, k] = _place(wall) - _place(walls[k]) + moved
+                shifts[row, k] = _place(wall) - _place(walls[k]) if number else 0.0
+    for k, name in enumerate(names):
+        if f"wall/{name}/position" in history:
+            places = np.asarray(history[f"wall/{name}/position"], dtype=float)
+            shifts[:, k] = np.stack([np.interp(times, when, column - column[0]) for column in places.T], axis=1)
     return shifts, present
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,6 +19,7 @@ VIDEOS = {
     "webm": ("webm",),
     "webp": ("webp",),
 }
+_RANGES = {"fps": (1e-3, 1e3), "zoom": (1e-3, 1e3), "radius_scale": (1e-6, 1e6)}
 SIZES = {"720p": (1280, 720), "1080p": (1920, 1080), "4k": (3840, 2160)}
 
 
@@ -140,8 +142,6 @@ class Options:
     title: str | None = _option(None, "title of the pictures; default: that of the case")
 
     def __post_init__(self) -> None:
-        from .camera import check_moves
-
         video, size = self.video or ("webm" if self.transparent else "mp4"), self.size
         if video not in VIDEOS:
             raise InputError(f"render: video = {video!r} is not known; it is one of {', '.join(VIDEOS)}")
@@ -154,15 +154,15 @@ class Options:
                 f"render: size = {size[0]} x {size[1]} pixels is out of range; widths are 160 to 8192, heights 120 to "
                 "8192"
             )
-        if not 1e-3 <= self.fps <= 1e3:
-            raise InputError(f"render: fps = {self.fps:g} must be from 0.001 to 1000 frames per second")
         if self.style not in STYLES:
             raise InputError(f"render: style = {self.style!r} is not known; it is one of {', '.join(STYLES)}")
-        if not 1e-6 <= self.radius_scale <= 1e6:
-            raise InputError(f"render: radius_scale = {self.radius_scale:g} must be from 1e-6 to 1e6")
+        for name, (low, high) in _RANGES.items():
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"render: {name} = {getattr(self, name):g} must be from {low:g} to {high:g}")
         if self.bar_width is not None and not 0.0 < self.bar_width <= 500.0:
             raise InputError(f"render: bar_width = {self.bar_width:g} must be positive, and 500 pixels at most")
-        check_moves(self)
+        if not math.isfinite(self.orbit):
+            raise InputError(f"render: orbit = {self.orbit:g} is not a number of degrees")
         if isinstance(self.frames, Iterable):
             object.__setattr__(self, "frames", list(self.frames))
 

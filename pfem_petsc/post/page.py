@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 
 from ..errors import InputError
@@ -28,7 +28,6 @@ from .curves import column
 from .scene import Scene, Style
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
     from ..mesh.whole import WholeMesh
@@ -96,25 +95,25 @@ class Page:
     def __init__(self, size: tuple[int, int], heading: Heading, camera: Camera, drawn_height: int) -> None:
         self._unit = _unit_of(size)
         self.size, self.region, self.strip = size, self.region_of(size), self.strip_of(size)
-        self._channels, self._insets = 4 if heading.transparent else 3, list[_Inset]()
+        self._channels = 4 if heading.transparent else 3
+        self._insets, self._changing = list[_Inset](), list[Artist]()
         self._figure = figure = _figure(size, 0.0 if heading.transparent else 1.0)
         self._triad = figure.add_axes(self._part(size[0] - 148 * self._unit, size[1] - 118 * self._unit, 112, 112))
-        self._triad.set(xlim=(-1.65, 1.65), ylim=(-1.65, 1.65), animated=True)
+        self._triad.set(xlim=(-1.65, 1.65), ylim=(-1.65, 1.65))
         self._triad.axis("off")
-        self._seen: Camera | None = None
-        with boxes_allowed():
-            self._write_title(heading.title)
-            self._colour_bar(heading)
-            if heading.marks:
-                shades = [tuple(value / 255 for value in mark.colour) for mark in heading.marks]
-                keys = [Line2D([], [], color=shade, linewidth=4) for shade in shades]
-                texts, corner = [mark.text for mark in heading.marks], self._share(size[0] - 150 * self._unit, size[1])
-                place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": corner, "ncols": len(keys)}
-                figure.legend(keys, texts, frameon=False, fontsize=11.5, **place)
-            if camera.parallel:
-                self._length_scale(2 * camera.half_height / drawn_height)
-            figure.canvas.draw()
-        self._background = figure.canvas.copy_from_bbox(figure.bbox)
+        left, _, width, _ = self.region
+        letters = max(4, int((width / self._unit - 230) / 10.5))  # space for the time is left empty
+        title = heading.title if len(heading.title) <= letters else heading.title[: letters - 1].rstrip() + "…"
+        self._write(left, 38 * self._unit, literal(title), fontsize=16, weight="bold")
+        self._colour_bar(heading)
+        keys = [
+            Line2D([], [], color=np.divide(mark.colour, 255), linewidth=4, label=mark.text) for mark in heading.marks
+        ]
+        corner = self._share(size[0] - 150 * self._unit, size[1])
+        place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": corner, "ncols": max(1, len(keys))}
+        figure.legend(handles=keys, frameon=False, fontsize=11.5, **place)
+        if camera.parallel:
+            self._length_scale(2 * camera.half_height / drawn_height)
 
     @staticmethod
     def region_of(size: tuple[int, int]) -> tuple[int, int, int, int]:
@@ -158,33 +157,29 @@ class Page:
         """
         canvas, (left, top, width, _) = self._figure.canvas, self.region
         strip = self.strip if captions else 0
-        texts = [(*self._share(left + width, 41 * self._unit), time, "right")]
-        canvas.restore_region(self._background)
-        page = np.asarray(canvas.buffer_rgba())
+        for artist in (*self._changing, *self._triad.texts):
+            artist.remove()
+        self._changing = [self._write(left + width, 41 * self._unit, time, ha="right")]
         for number, drawing in enumerate(drawings):
             high, wide = drawing.shape[:2]
             x, y = left + (number % columns) * wide, top + (number // columns) * (high + strip) + strip
-            page[y : y + high, x : x + wide, : self._channels] = drawing
-            texts += [(*self._share(x, y - 0.3 * strip), captions[number], "left")] if captions else []
-        if camera is not self._seen:
-            self._turn_axes(camera)
-        changing: list[Artist] = [self._triad]
+            self._changing.append(self._figure.figimage(drawing, x, self.size[1] - y - high, origin="upper", zorder=-1))
+            if captions:
+                self._changing.append(self._write(x, y - 0.3 * strip, captions[number]))
+        self._turn_axes(camera)
         for inset, moment in zip(self._insets, moments, strict=False):
             places = [np.interp(moment, inset.times, values) for values in inset.curve.T] if len(inset.times) else []
             inset.marker.set_data(*([place] for place in places or ((), ())))
-            changing.append(inset.axes)
-        place: dict[str, Any] = {"transform": self._figure.transFigure, "figure": self._figure}
-        changing += [Text(x, y, text, ha=side, color=INK, fontsize=14.5, **place) for x, y, text, side in texts]
         with boxes_allowed():
-            for artist in changing:
-                artist.draw(canvas.get_renderer())
-        return page[..., : self._channels].copy()
+            canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., : self._channels].copy()
+
+    def _write(self, x: float, y: float, text: str, **style: Any) -> Artist:
+        """Write a text on a baseline at a place in pixels."""
+        return self._figure.text(*self._share(x, y), text, **{"color": INK, "fontsize": 14.5, **style})
 
     def _turn_axes(self, camera: Camera) -> None:
         """Draw the coordinate axes as seen by a camera, the nearest last."""
-        self._seen = camera
-        for old in list(self._triad.texts):
-            old.remove()
         for name, way in sorted(zip("xyz", np.eye(3)), key=lambda axis: float(axis[1] @ camera.towards)):
             tip = np.array([way @ camera.right, way @ camera.up])
             length = float(np.linalg.norm(tip))
@@ -193,15 +188,6 @@ class Page:
                 self._triad.annotate("", tip, (0.0, 0.0), arrowprops=arrow)
                 label = tip * (1.0 + 0.33 / length)
                 self._triad.text(*label, name, color=PALE, fontsize=11, ha="center", va="center")
-
-    def _write_title(self, title: str) -> None:
-        left, _, width, _ = self.region
-        style: dict[str, Any] = {"va": "top", "color": INK, "weight": "bold", "fontsize": 16}
-        text = self._figure.text(*self._share(left, 22 * self._unit), literal(title), **style)
-        # space for the time is left empty
-        while len(title) > 4 and text.get_window_extent().width > width - 230 * self._unit:
-            title = title[:-2].rstrip(" …") + "…"
-            text.set_text(literal(title))
 
     def _colour_bar(self, heading: Heading) -> None:
         (left, top, width, height), unit, scale = self.region, self._unit, heading.scale
@@ -223,8 +209,8 @@ class Page:
         ends = np.array([self._share(x, y), self._share(x + end, y)])
         self._figure.add_artist(Line2D(*ends.T, color=PALE, linewidth=1.0, marker="|", markersize=8))
         factor, name = prefix_for(length, "m")
-        text, place = f"{length * factor:g} {name}", self._share(x + end + 10 * self._unit, y)
-        self._figure.text(*place, text, color=PALE, va="center_baseline", fontsize=11.5)
+        style = {"color": PALE, "va": "center_baseline", "fontsize": 11.5}
+        self._write(x + end + 10 * self._unit, y, f"{length * factor:g} {name}", **style)
 
     def add_inset(self, results: Sequence[Any], shown: int, name: str, corner: tuple[int, int], wide: int) -> None:
         """Add a curve of the history with a marker, which :meth:`compose` moves.
@@ -246,7 +232,7 @@ class Page:
         pixel = wide / self._unit / 290.0  # the margins of the axes in an inset of this width are 34, 30, 10 and 40
         x, y, high = corner[0] + 34 * pixel * self._unit, corner[1] + 26 * pixel * self._unit, 0.62 * 290.0
         with rc_context({**STYLE, "font.size": 8.0 * pixel, "axes.titlesize": 8.5 * pixel}):
-            axes = self._figure.add_axes(self._part(x, y, 246 * pixel, (high - 66) * pixel), animated=True)
+            axes = self._figure.add_axes(self._part(x, y, 246 * pixel, (high - 66) * pixel), zorder=1)
             axes.patch.set_alpha(0.88)
             for k, (times, values) in enumerate(curves):
                 axes.plot(

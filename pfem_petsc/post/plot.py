@@ -175,9 +175,9 @@ def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Pa
     share = (1.0 / most, "") if most > 0.0 else (1.0, "J")
     balance = Curve(told, error, {"color": COLOURS[1]}, "balance error")
     panels = [
-        Panel("stored and lost,\nstacked", "J", [*areas, *sums], "", 1.3, legend="beside"),
-        Panel("energy", "J", lines, "", 1.3, legend="beside"),
-        Panel("balance error,\nshare of largest", "J", [balance], "", 0.7, scale=share, legend="beside"),
+        Panel("stored and lost,\nstacked", "J", [*areas, *sums], "", 1.3),
+        Panel("energy", "J", lines, "", 1.3),
+        Panel("balance error,\nshare of largest", "J", [balance], "", 0.7, scale=share),
     ]
     return panels, f"Zero throughout: {', '.join(still)}." if still else "", 1
 
@@ -276,7 +276,7 @@ def solver(history: History) -> list[Panel]:
     for name in names:
         kind = "steps before" if name.endswith("_iterations") else "steps"
         curve = Curve("", history[name], {"color": COLOURS[len(panels)]}, " ".join(labels[name].split()), kind=kind)
-        panels.append(Panel(labels[name], "", [curve], height=0.7, legend="none"))
+        panels.append(Panel(labels[name], "", [curve], height=0.7, legend=False))
     return panels
 
 
@@ -312,7 +312,7 @@ def force_panels(
         if felt and f"{source}/{name}/contacts" in history:
             counts = history[f"{source}/{name}/contacts"]
             curve = Curve("", counts, {"color": COLOURS[1]}, f"{source}/{name}/contacts", kind="steps")
-            panels.append(Panel("nodes in\ncontact", "", [curve], height=0.5, legend="none"))
+            panels.append(Panel("nodes in\ncontact", "", [curve], height=0.5, legend=False))
     silent = [f"'{name}'" for name in names if felt and name not in felt]
     return panels, f"No force throughout: {', '.join(silent)}." if silent else "", 1
 
@@ -374,8 +374,9 @@ def _wall_path(result: Any, wall: Any, smoothing: Filter, exact: ClosedForm | No
     def path(force: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return both after the filter, while nodes touch the wall."""
         smooth, moved = smoothed(result, smoothing, force, True), smoothed(result, smoothing, moved)
-        shown, begin = _touching(force, smooth)
-        return np.where(_near(force, smooth), smooth, np.nan)[shown], (moved - moved[begin])[shown]
+        near, begin = _near(force, smooth), max(0, int(np.argmax(force != 0.0)) - 1)
+        shown = slice(np.argmax(near), len(near) - np.argmax(near[::-1]))
+        return np.where(near, smooth, np.nan)[shown], (moved - moved[begin])[shown]
 
     values, along = path(force, sign * read(history, place) @ normal)
     curves = [Curve(smoothing.name, values, place=along)]
@@ -388,16 +389,7 @@ def _wall_path(result: Any, wall: Any, smoothing: Filter, exact: ClosedForm | No
 def _near(force: np.ndarray, smooth: np.ndarray) -> np.ndarray:
     """Return which rows (n,) bool have a force as computed or filtered, or are beside such a row."""
     felt = (force != 0.0) | (np.abs(smooth) > 1e-3 * largest(smooth))
-    near = felt.copy()
-    near[:-1] |= felt[1:]
-    near[1:] |= felt[:-1]
-    return near
-
-
-def _touching(force: np.ndarray, smooth: np.ndarray) -> tuple[slice, int]:
-    """Return the rows from before the first force to after the last one, and the last row before the first force."""
-    near = np.flatnonzero(_near(force, smooth))
-    return slice(near[0], near[-1] + 1), max(0, int(np.flatnonzero(force)[0]) - 1)
+    return np.convolve(felt, np.ones(3), mode="same") > 0.0
 
 
 def _usual_filter(result: Any) -> Filter:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import os
 import pickle
 import subprocess
@@ -517,7 +518,7 @@ def _figure(film: Film) -> Any:
     choices = [{"label": each.name, "method": "animate", "args": [[each.name], now]} for each in figure.frames]
     hidden = {"visible": False}
     figure.update_layout(
-        title={"text": f"<b>{_text(film.title)}</b><br>{_text(motion.time(frame))}", "x": 0.01},
+        title={"text": f"<b>{html.escape(film.title)}</b><br>{html.escape(motion.time(frame))}", "x": 0.01},
         margin={"l": 0, "r": 0, "t": 60, "b": 20},
         showlegend=False,
         sliders=[
@@ -535,10 +536,6 @@ def _figure(film: Film) -> Any:
         },
     )
     return figure
-
-
-def _text(words: str) -> str:
-    return words.replace("&", "&amp;").replace("<", "&lt;")
 
 
 def _wall(plotly: Any, surface: Any) -> Any:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import base64
 import html
-import os
 import re
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ from ..errors import InputError, written
 from ..output.layout import EVENT, MODE_VALUES
 from ..output.result import peak_force, touch_impulse
 from ..output.units import engineering
+from .chart import opened
 from .plot import balance_error, plot
 
 NAME = "report.html"
@@ -69,10 +68,7 @@ def write_report(
     InputError
         If the result cannot be read, its history is empty, or the file cannot be written.
     """
-    from ..output.result import open_result
-
-    known = not isinstance(result_path, (str, os.PathLike))
-    with nullcontext(result_path) if known else open_result(result_path) as result:
+    with opened(result_path) as result:
         file = Path(output) if output is not None else Path(result.path).parent / NAME
         if file.is_dir():
             raise InputError(f"{file}: is a folder; name a file for the report, {file / NAME}")
@@ -176,11 +172,15 @@ def _energies(history: Mapping[str, np.ndarray]) -> str:
     if error is None:
         return ""
     side = {**dict.fromkeys(STORED, "stored"), **dict.fromkeys(LOST, "lost"), **dict.fromkeys(SUPPLIED, "supplied")}
-    lines = []
-    for name, values in held.items():
-        if np.any(values):
-            numbers = (values[0], float(values.max()), values[-1])
-            lines.append([name.replace("_", " "), side[name], *(engineering(float(v), "J") for v in numbers)])
+    lines = [
+        [
+            name.replace("_", " "),
+            side[name],
+            *(engineering(float(v), "J") for v in (values[0], values.max(), values[-1])),
+        ]
+        for name, values in held.items()
+        if np.any(values)
+    ]
     largest = max(float(np.abs(values).max()) for values in held.values())
     worst = float(np.abs(error).max())
     share = f" ({worst / largest:.1e} of the largest energy)" if largest > 0.0 else ""

@@ -14,7 +14,6 @@ import numpy as np
 
 from ..contact.walls.base import Surface
 from ..errors import InputError
-from ..mechanics.compiled import kernel
 from .camera import Camera
 
 TUBE_LIMIT = 20_000
@@ -27,7 +26,7 @@ VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 
 _LIGHT = np.array([-0.4, 0.7, 1.0]) / np.linalg.norm([-0.4, 0.7, 1.0])  # right, up, to the eye
 _AMBIENT, _DIFFUSE, _SPECULAR = 0.42, 0.66, 0.35
-_GL_BLEND = 0x0BE2
+_ANYWHERE = np.array([0.36, 0.48, 0.8])
 _ROUND = 2.5  # pixels: radius from which a bar has a round surface; thinner ones are flat, with a shade across
 _MOST_PIXELS = (1.5e6, 1e7)  # up to which 3 x 3 (small models) and 2 x 2 pixels are averaged to one
 
@@ -94,92 +93,13 @@ def few_threads() -> None:
     os.environ.setdefault("LP_NUM_THREADS", "0")  # in the thread that draws
 
 
-class _Mesh(NamedTuple):
-    """Points and normals (p, 3) float32 and colours (p, 3) uint8 of all bars; no normals where bars are flat."""
-
-    points: np.ndarray
-    normals: np.ndarray
-    colours: np.ndarray
-
-
-class _Bars(NamedTuple):
-    """Nodes (b, 2), radii (b,) [m], rows (b, 2) of the colours of both ends, and the form (m, 4) of a bar."""
-
-    ends: np.ndarray
-    radius: np.ndarray
-    rows: np.ndarray
-    form: np.ndarray
-
-
-class _View(NamedTuple):
-    """What bars see of the camera, each (4,): ``a[:3]·x + a[3]`` is the least radius [m] and the fade (0 to 1) at x;
-    the direction to the eye is ``eye[:3] - eye[3] x``; and the direction to the light (3,)."""
-
-    eye: np.ndarray
-    least: np.ndarray
-    fade: np.ndarray
-    light: np.ndarray
-
-
-@kernel
-def _unit(a, other):
-    """Return a vector over its length, or another one if it has none."""
-    length = (a[0] * a[0] + a[1] * a[1] + a[2] * a[2]) ** 0.5
-    return (a[0] / length, a[1] / length, a[2] / length) if length > 0.0 else other
-
-
-@kernel
-def _across(a, b):
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@kernel
-def _along(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@kernel
-def _fill(mesh, x, colours, bars, view):
-    """Place the points of all bars, in a frame of their axis and the direction to the eye, and colour them.
-
-    A point of the form is (end, along, across, facing): ``x[end] + radius (along a + across u + facing v)``. Bars of a
-    negative radius are shrunk to nothing.
-    """
-    eye, least, fade, light = view
-    form, flat = bars.form, len(mesh.normals) == 0
-    shaded = flat and _along(light, light) > 0.0
-    for k in range(len(bars.ends)):
-        first, last = x[bars.ends[k, 0]], x[bars.ends[k, 1]]
-        axis = _unit((last[0] - first[0], last[1] - first[1], last[2] - first[2]), (1.0, 0.0, 0.0))
-        ahead = (eye[0] - eye[3] * first[0], eye[1] - eye[3] * first[1], eye[2] - eye[3] * first[2])
-        side = _across(axis, ahead)
-        if _along(side, side) < 1e-18 * _along(ahead, ahead):  # seen along its axis: any direction is across
-            side = _across(axis, (0.0, 1.0, 0.0) if abs(axis[1]) < 0.9 else (1.0, 0.0, 0.0))
-        side = _unit(side, (0.0, 0.0, 1.0))
-        facing = _across(side, axis)
-        lit, slope = 0.785 * max(0.0, _along(light, facing)), 0.35 * _along(light, side)
-        there = bars.radius[k] >= 0.0
-        for q in range(len(form)):
-            end = int(form[q, 0])
-            place, row, hue = x[bars.ends[k, end if there else 0]], k * len(form) + q, bars.rows[k, end]
-            radius = max(bars.radius[k], _along(least, place) + least[3]) if there else 0.0
-            pale = 0.5 * min(1.0, max(0.0, _along(fade, place) + fade[3]))
-            # of the light that a cylinder sends back in the mean, with a slope from its bright to its dark side
-            share = min(1.0, _AMBIENT + _DIFFUSE * max(0.0, lit + slope * form[q, 2])) if shaded else 1.0
-            for c in range(3):
-                normal = form[q, 1] * axis[c] + form[q, 2] * side[c] + form[q, 3] * facing[c]
-                mesh.points[row, c] = place[c] + radius * normal
-                colour = float(colours[hue, c])
-                mesh.colours[row, c] = np.uint8((colour + (255.0 - colour) * pale) * share + 0.5)
-                if not flat:
-                    mesh.normals[row, c] = normal
-
-
 def _form(kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (m, 4) of a bar, see :func:`_fill`, and its cells (c, 2 or 4).
+    """Return the points (m, 4) of a bar and its cells (c, 2 or 4).
 
-    A ``line`` is two points, a ``strip`` faces the eye, a ``prism`` has open ends, and ``round`` bars and ``rough``
-    ones, of fewer sides, are cylinders with half a sphere at each end.
+    A point is (end, along, across, facing): ``x[end] + radius (along a + across u + facing v)`` with the direction a of
+    the bar, u across it and the view, and v towards the eye. A ``line`` is two points, a ``strip`` faces the eye, a
+    ``prism`` has open ends, and ``round`` bars and ``rough`` ones, of fewer sides, are cylinders with half a sphere at
+    each end.
     """
     if kind == "line":
         return np.array([[0.0, 0, 0, 0], [1, 0, 0, 0]]), np.array([[0, 1]])
@@ -219,51 +139,78 @@ class Segments:
     def __init__(self, plotter: Any, ends: np.ndarray, kind: str, on_nodes: bool, width: float = 1.0) -> None:
         import pyvista
 
-        ends = np.ascontiguousarray(ends, dtype=np.int64)
-        form, cells = _form(kind)
-        count, m = len(ends), len(form)
-        rows = ends if on_nodes else np.repeat(np.arange(count), 2).reshape(-1, 2)
-        self.rows = rows[:, form[:, 0].astype(int)].ravel()
-        self._bars = _Bars(ends, np.zeros(count), rows, form)
-        kept = (cells + m * np.arange(count)[:, None, None]).reshape(-1, cells.shape[1])
-        self.mesh = pyvista.PolyData()
-        self.mesh.points = np.zeros((count * m, 3), dtype=np.float32)
-        cells = pyvista.CellArray.from_regular_cells(kept)
-        self.mesh.SetLines(cells) if kind == "line" else self.mesh.SetPolys(cells)
+        self._form, cells = _form(kind)
+        self._ends, self._end = np.asarray(ends, dtype=np.int64), self._form[:, 0].astype(int)
+        count, m = len(ends), len(self._form)
+        self._nodes = self._ends[:, self._end].ravel()
+        self.rows = self._nodes if on_nodes else np.repeat(np.arange(count), m)
+        kept = pyvista.CellArray.from_regular_cells(
+            (cells + m * np.arange(count)[:, None, None]).reshape(-1, cells.shape[1])
+        )
+        places, self._solid = np.zeros((count * m, 3), dtype=np.float32), kind not in ("line", "strip")
+        self.mesh = pyvista.PolyData(places, lines=kept) if kind == "line" else pyvista.PolyData(places, faces=kept)
         self.mesh.point_data["colour"] = np.zeros((count * m, 3), dtype=np.uint8)
-        solid = kind not in ("line", "strip")
-        if solid:
-            self.mesh.point_data.active_normals = np.zeros((count * m, 3), dtype=np.float32)
+        if self._solid:
+            self.mesh.point_data.active_normals = places.copy()
         if plotter is None:
             return
-        shine = (
-            {"ambient": _AMBIENT, "diffuse": _DIFFUSE, "specular": _SPECULAR, "specular_power": 10.0} if solid else {}
-        )
+        shine = {"ambient": _AMBIENT, "diffuse": _DIFFUSE, "specular": _SPECULAR} if self._solid else {}
         options: dict[str, Any] = {"scalars": "colour", "rgb": True, "preference": "point", "line_width": width}
-        self.actor = plotter.add_mesh(self.mesh, lighting=solid, reset_camera=False, render=False, **options, **shine)
-        self.actor.prop.specular_color = "white"
+        self.actor = plotter.add_mesh(
+            self.mesh, lighting=self._solid, reset_camera=False, render=False, specular_power=10.0, **options, **shine
+        )
         self.actor.prop.interpolation = "Phong" if kind == "round" else "Gouraud"
 
     def move(
-        self, points: np.ndarray, radius: np.ndarray, colours: np.ndarray | None = None, view: _View | None = None
+        self,
+        points: np.ndarray,
+        radius: np.ndarray,
+        colours: np.ndarray | None = None,
+        ahead: np.ndarray = _ANYWHERE,
+        pale: np.ndarray | None = None,
+        light: np.ndarray | None = None,
     ) -> None:
-        """Draw bars between points (n, 3) [m] with radii (b,) [m], negative for none, and colours (n or b, 3) uint8.
+        """Draw bars between points.
 
-        Without a view, from any side.
+        Parameters
+        ----------
+        points : (n, 3) [m]
+        radius : (b, 1), or (b, 2) at both ends [m]; negative: the bar is not drawn
+        colours : (n or b, 3) uint8
+        ahead : (3,), or (b, 3) for each bar: the direction to the eye
+        pale : (n,), the share of white at each node
+        light : (3,), the direction to the light, by which flat bars have a shade
         """
-        if view is None:
-            view = _View(np.array([0.36, 0.48, 0.8, 0.0]), np.zeros(4), np.zeros(4), np.zeros(3))
+        there = radius[:, :1] >= 0.0
+        first, last = points[self._ends[:, 0]], points[self._ends[:, 1]]
+        places = np.stack([first, np.where(there, last, first)], axis=1)[:, self._end]
+        axis = _unit(last - first)
+        ahead = _unit(np.broadcast_to(ahead, axis.shape))
+        side = np.cross(axis, ahead)
+        along = (side**2).sum(axis=1) < 1e-18  # seen along its axis: any direction is across
+        side[along] = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis), axis=1)])[along]
+        side = _unit(side)
+        facing = np.cross(side, axis)
+        normals = self._form[:, 1:] @ np.stack([axis, side, facing], axis=1)
+        wide = np.broadcast_to(np.where(there, radius, 0.0), self._ends.shape)[:, self._end, None]
+        self.mesh.points[:] = (places + wide * normals).reshape(-1, 3)
+        if self._solid:
+            self.mesh.point_data["Normals"][:] = normals.reshape(-1, 3)
         if colours is None:
-            colours = np.zeros((int(self._bars.rows.max(initial=-1)) + 1, 3), dtype=np.uint8)
-        data = self.mesh.point_data
-        normals = np.asarray(data["Normals"]) if "Normals" in data else np.zeros((0, 3), dtype=np.float32)
-        mesh = _Mesh(np.asarray(self.mesh.points), normals, np.asarray(data["colour"]))
-        bars = self._bars._replace(radius=np.ascontiguousarray(radius, dtype=float))
-        _fill(mesh, np.ascontiguousarray(points, dtype=float), np.ascontiguousarray(colours), bars, view)
-        self.mesh.GetPoints().Modified()
-        for name in data:
-            data[name].VTKObject.Modified()
-        self.mesh.Modified()
+            return
+        shades = colours[self.rows].astype(np.float32)
+        if pale is not None:
+            shades += (255.0 - shades) * pale[self._nodes, None].astype(np.float32)
+        if light is not None and not self._solid:
+            shares = np.minimum(1.0, _AMBIENT + _DIFFUSE * np.maximum(0.0, facing @ light))
+            shades *= np.repeat(shares.astype(np.float32), len(self._form))[:, None]
+        self.mesh.point_data["colour"][:] = (shades + 0.5).astype(np.uint8)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors (b, 3) over their lengths, and the x axis for those that have none."""
+    length = np.linalg.norm(vectors, axis=1)[:, None]
+    return np.where(length > 0.0, vectors / np.where(length > 0.0, length, 1.0), [1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -304,7 +251,7 @@ class Layer(NamedTuple):
     colour: tuple[int, int, int]
     width: float
     shift: float = 0.0
-    radius: np.ndarray | None = None
+    radius: np.ndarray | float = 0.0
 
 
 class Scene:
@@ -334,12 +281,12 @@ class Scene:
         require_rendering()
         import pyvista
 
-        bars, count, area = motion.bars, len(motion.bars), size[0] * size[1]
-        self._bars, self.size, self.unit = bars, size, unit
+        self._bars, self.size, self.unit, count = motion.bars, size, unit, len(motion.bars)
         # more pixels than asked for are drawn and averaged, for smooth edges
+        area = size[0] * size[1]
         self._factor = 3 if count <= FEW and area <= _MOST_PIXELS[0] else 2 if area <= _MOST_PIXELS[1] else 1
         pixels = size[1] / (2.0 * camera.half_height)
-        lengths = pixels * np.linalg.norm(motion.start[bars[:, 1]] - motion.start[bars[:, 0]], axis=1)
+        lengths = pixels * np.linalg.norm(np.diff(motion.start[self._bars], axis=1)[:, 0], axis=1)
         shortest = float(np.quantile(lengths, 0.1)) if count else 1.0
         self.width = style.bar_width or _width(count, lengths, shortest, unit)
         self._radius = np.zeros(count) if not style.tubes or style.radius is None else np.asarray(style.radius, float)
@@ -347,46 +294,26 @@ class Scene:
         window = [side * self._factor for side in size]
         self._plotter = pyvista.Plotter(off_screen=True, window_size=window, lighting="none")
         self._plotter.disable_anti_aliasing()
-        self._light = pyvista.Light(light_type="scene light")
-        self._plotter.add_light(self._light)
+        self._plotter.add_light(pyvista.Light(position=_LIGHT, light_type="camera light"))
         self._plotter.renderer.SetUseOIT(False)  # walls are drawn in their order
-        # a third of the time of a frame is blending, which only walls need; they are drawn last
-        self._plotter.renderer.AddObserver("StartEvent", self._without_blending)
         self._plotter.background_color = "black" if transparent else "white"
-        self._channels = 4 if transparent else 3
-        if transparent:  # colours over nothing are multiplied by their opacity
-            self._plotter.render_window.SetAlphaBitPlanes(1)
-            self._plotter.renderer.SetBackgroundAlpha(0.0)
-        thick = max(0.5 * self.width, pixels * float(np.quantile(self._radius, 0.9)) if count else 0.0)
-        wide = thick >= _ROUND * unit
-        self._shaded = style.shaded
-        if not style.shaded:
-            kind = "strip"
-        elif count <= FEW:
-            kind = "round" if wide else "rough"
+        self._transparent, self._shaded = transparent, style.shaded
+        thick = max(self.width, 2.0 * pixels * float(np.quantile(self._radius, 0.9)) if count else 0.0)
+        solid = style.shaded and (count <= FEW or (thick >= 2.0 * _ROUND * unit and count <= TUBE_LIMIT))
+        if solid:
+            kind = "round" if thick >= 2.0 * _ROUND * unit and count <= FEW else "rough"
         else:
-            kind = (
-                "line"
-                if count > TUBE_LIMIT and not style.tubes
-                else "rough"
-                if wide and count <= TUBE_LIMIT
-                else "strip"
-            )
-        self.segments = Segments(self._plotter, bars, kind, on_nodes, self.width * self._factor)
+            kind = "line" if count > TUBE_LIMIT and not style.tubes else "strip"
+        self.segments = Segments(self._plotter, self._bars, kind, on_nodes, self.width * self._factor)
         nodes = count <= 400 and shortest > 3.0 * self.width if style.nodes is None else style.nodes
         self._nodes = self._balls() if nodes else None
         self._extra: list[Any] = []
 
-    def _balls(self) -> tuple[Segments, np.ndarray, np.ndarray]:
-        """Return nodes as bars without length, their numbers, and their radii."""
+    def _balls(self) -> tuple[Segments, np.ndarray]:
+        """Return nodes as bars without length, and their radii."""
         used, radius = np.unique(self._bars), np.zeros(int(self._bars.max(initial=-1)) + 1)
-        for end in (0, 1):
-            np.maximum.at(radius, self._bars[:, end], self._radius)
-        kind = "round" if len(used) <= FEW else "rough"
-        return Segments(self._plotter, np.stack([used, used], axis=1), kind, False), used, 1.2 * radius[used]
-
-    def _without_blending(self, *_: Any) -> None:
-        self._plotter.render_window.GetState().vtkglDisable(_GL_BLEND)
+        np.maximum.at(radius, self._bars, self._radius[:, None])
+        return Segments(self._plotter, np.stack([used, used], axis=1), "rough", False), 1.2 * radius[used]
 
     def close(self) -> None:
         """Give the window back."""
@@ -416,50 +343,38 @@ class Scene:
         -------
         (height, width, 3) uint8, or (height, width, 4) with a transparent background
         """
-        for actor in self._extra:
-            self._plotter.remove_actor(actor, reset_camera=False, render=False)
-        radius = self._radius if gone is None else np.where(gone, -1.0, self._radius)
-        self.segments.move(points, radius, colours, self.view(camera, 0.5 * self.width, fades=True))
+        from PIL import Image
+
+        self._plotter.remove_actor(self._extra, reset_camera=False, render=False)
+        pixel = camera.metres(points) / self.size[1]
+        radius = np.maximum(self._radius[:, None], 0.5 * self.width * pixel[self._bars])
+        if gone is not None:
+            radius[gone] = -1.0
+        pale = light = None
+        if not camera.parallel:  # what is far away is paler, to show thousands of bars in space
+            depths = self._corners @ camera.towards
+            pale = 0.5 * np.clip((depths.max() - points @ camera.towards) / max(np.ptp(depths), 1e-300), 0.0, 1.0)
+        if self._shaded:
+            light = _LIGHT @ np.stack([camera.right, camera.up, camera.towards])
+        self.segments.move(points, radius, colours, camera.ahead(points[self._bars[:, 0]]), pale, light)
         if self._nodes is not None:
-            balls, used, sizes = self._nodes
+            balls, sizes = self._nodes
+            used = np.unique(self._bars)
             ink = np.tile(np.array(NODE_COLOUR, dtype=np.uint8), (len(used), 1))
-            balls.move(points, sizes, ink, self.view(camera, 0.7 * self.width))
+            balls.move(points, np.maximum(sizes, 0.7 * self.width * pixel[used])[:, None], ink)
         self._extra = [self._add(layer, camera) for layer in layers if len(layer.lines)]
         self._extra += self._add_walls(surfaces, camera)
-        return self.picture(camera)
-
-    def picture(self, camera: Camera) -> np.ndarray:
-        """Return what the window shows from a camera, as :meth:`draw`."""
-        import pyvista
-        from PIL import Image
-        from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
-
-        point_camera(self._plotter, camera)
-        self._light.position = camera.centre + camera.distance * self.view(camera, 0.0).light
-        self._light.focal_point = camera.centre
-        window, (width, height) = self._plotter.render_window, self._plotter.window_size
-        window.Render()
-        made = vtkUnsignedCharArray()
-        read = window.GetPixelData if self._channels == 3 else window.GetRGBACharPixelData
-        read(0, 0, width - 1, height - 1, 0, made, 0)
-        # reduced as plain channels, because they are multiplied by the opacity already; rows are from below
-        mode = "RGB" if self._channels == 3 else "CMYK"
-        image = Image.frombuffer(mode, (width, height), pyvista.convert_array(made), "raw", mode, 0, -1)
-        picture = np.array(image.reduce(self._factor))
-        return picture if self._channels == 3 else _unmultiplied(picture)
-
-    def view(self, camera: Camera, least: float, fades: bool = False) -> _View:
-        """Return what bars see of a camera, with a least radius in pixels."""
-        metres = 2.0 * camera.half_height / self.size[1] * least
-        near = 0.0 if camera.parallel else 1.0 / camera.distance
-        flat = np.append(-near * metres * camera.towards, metres * (1.0 + near * camera.centre @ camera.towards))
-        fade = np.zeros(4)
-        if fades and not camera.parallel:  # what is far away is paler, to show thousands of bars in space
-            depths = self._corners @ camera.towards
-            fade = np.append(-camera.towards, depths.max()) / max(float(np.ptp(depths)), 1e-300)
-        eye = camera.towards if camera.parallel else camera.centre + camera.distance * camera.towards
-        light = float(self._shaded) * (_LIGHT @ np.stack([camera.right, camera.up, camera.towards]))
-        return _View(np.append(eye, float(not camera.parallel)), flat, fade, light)
+        eye = camera.centre + camera.distance * camera.towards
+        self._plotter.camera_position = [eye, camera.centre, camera.up]
+        view = self._plotter.camera
+        view.parallel_projection, view.parallel_scale = camera.parallel, camera.half_height
+        view.view_angle = 2.0 * np.degrees(np.arctan2(camera.half_height, camera.distance))
+        self._plotter.renderer.ResetCameraClippingRange()
+        self._plotter.render_window.Render()  # a screenshot alone is that of the frame before
+        made = np.asarray(self._plotter.screenshot(return_img=True, transparent_background=self._transparent))
+        if self._transparent:  # colours over nothing are multiplied by their opacity
+            made = np.concatenate([_divided(made[..., :3], made[..., 3:]), made[..., 3:]], axis=2)
+        return np.array(Image.fromarray(made).reduce(self._factor))
 
     def thickness(self, camera: Camera) -> float:
         """Return the width of the widest bar, in pixels of a page of 1280 by 720."""
@@ -468,81 +383,47 @@ class Scene:
 
     def rim(self, points: np.ndarray, bars: np.ndarray, colour: tuple[int, int, int]) -> Layer:
         """Return a layer that outlines bars (numbers) by two pixels."""
-        return Layer(points, self._bars[bars], colour, self.width / self.unit + 4.0, -1.0, self._radius[bars])
+        return Layer(points, self._bars[bars], colour, self.width / self.unit + 4.0, -1.0, self._radius[bars, None])
 
     def _add(self, layer: Layer, camera: Camera) -> Any:
         pixel = 2.0 * camera.half_height / self.size[1] * self.unit
-        radius = np.zeros(len(layer.lines))
-        if layer.radius is not None:
-            radius = layer.radius + 2.0 * pixel
         points = np.asarray(layer.points, dtype=float) + layer.shift * pixel * camera.towards
+        least = max(0.5 * layer.width * self.unit, 0.4) * camera.metres(points)[layer.lines] / self.size[1]
+        radius = layer.radius + 2.0 * pixel if np.any(layer.radius) else 0.0
         made = Segments(self._plotter, layer.lines, "strip", False)
-        view = self.view(camera, max(0.5 * layer.width * self.unit, 0.4))._replace(light=np.zeros(3))
         colours = np.tile(np.array(layer.colour, dtype=np.uint8), (len(layer.lines), 1))
-        made.move(points, radius, colours, view)
+        made.move(points, np.maximum(radius, least), colours, camera.ahead(points[layer.lines[:, 0]]))
         return made.actor
 
     def _add_walls(self, surfaces: Sequence[Surface], camera: Camera) -> list[Any]:
-        """Draw walls from the farthest to the nearest, and their edges."""
+        """Draw walls, which one sees through and which fade out behind, and their edges, from the farthest to the
+        nearest."""
+        import pyvista
+
         actors = []
         # without perspective, walls are behind all bars, so that they hide none
         depth = 4.0 * np.linalg.norm(np.ptp(self._corners, axis=0)) if camera.parallel else 0.0
         for surface in sorted(surfaces, key=lambda each: float((np.asarray(each.points) @ camera.towards).mean())):
-            points = np.asarray(surface.points, dtype=float) - depth * camera.towards
-            normal = np.cross(*np.diff(points[np.asarray(surface.faces)[0]][:3], axis=0))
+            points, faces = np.asarray(surface.points, dtype=float) - depth * camera.towards, np.asarray(surface.faces)
+            normal = np.cross(*np.diff(points[faces[0]][:3], axis=0))
             facing = float(normal @ camera.towards) > 1e-12 * float(np.linalg.norm(normal))
             # a wall between the eye and the structure must be transparent
             strength = 150 if camera.parallel else 110 if facing else 35
-            actors.append(add_wall(self._plotter, surface, points, strength, camera.towards))
-            edge = np.asarray(surface.edge, dtype=np.int64).reshape(-1, 2)
-            if len(edge):
-                actors.append(self._add(Layer(points, edge, EDGE_COLOUR, 1.8), camera))
+            order = np.argsort((points @ camera.towards)[faces].mean(axis=1), kind="stable")
+            mesh = pyvista.PolyData.from_regular_faces(points.astype(np.float32), faces[order])
+            opacity = strength * (1.0 - np.clip(np.asarray(surface.depth), 0.0, 1.0))
+            shade = np.column_stack([np.tile(WALL_COLOUR, (len(points), 1)), opacity]).astype(np.uint8)
+            options: dict[str, Any] = {"reset_camera": False, "render": False, "lighting": False}
+            actors.append(self._plotter.add_mesh(mesh, scalars=shade, rgb=True, **options))
+            actors[-1].ForceTranslucentOn()
+            if len(surface.edge):
+                actors.append(self._add(Layer(points, np.asarray(surface.edge), EDGE_COLOUR, 1.8), camera))
         return actors
 
 
-def _unmultiplied(picture: np.ndarray) -> np.ndarray:
-    """Return a picture (h, w, 4) that was multiplied by its opacity with plain colours."""
-    alpha = picture[..., 3:].astype(np.uint16)
-    colours = np.minimum(255 * picture[..., :3].astype(np.uint16) // np.maximum(alpha, 1), 255)
-    return np.concatenate([colours, alpha], axis=2).astype(np.uint8)
-
-
-def add_wall(plotter: Any, surface: Surface, points: np.ndarray, strength: int, towards: np.ndarray) -> Any:
-    """Add a wall, which one sees through and which fades out behind, to a plotter; return the actor.
-
-    Parameters
-    ----------
-    points : (n, 3) [m], where its points are
-    strength : opacity at its face, up to 255
-    towards : (3,), the direction to the eye: polygons are drawn from the farthest to the nearest
-    """
-    import pyvista
-    from vtkmodules.vtkRenderingCore import vtkPolyDataMapper
-
-    faces = np.asarray(surface.faces)
-    order = np.argsort((points @ towards)[faces].mean(axis=1), kind="stable")
-    mesh = pyvista.PolyData.from_regular_faces(points.astype(np.float32), faces[order])
-    opacity = strength * (1.0 - np.clip(np.asarray(surface.depth), 0.0, 1.0))
-    mesh.point_data["shade"] = np.column_stack([np.tile(WALL_COLOUR, (len(points), 1)), opacity]).astype(np.uint8)
-    options: dict[str, Any] = {"reset_camera": False, "render": False, "lighting": False}
-    actor = plotter.add_mesh(mesh, scalars="shade", rgb=True, preference="point", **options)
-    actor.ForceTranslucentOn()
-    state = plotter.render_window.GetState()
-    mapper = vtkPolyDataMapper()  # that of pyvista passes no events on
-    mapper.ShallowCopy(actor.mapper)
-    mapper.SetInputData(mesh)
-    mapper.AddObserver("UpdateShaderEvent", lambda *_: state.vtkglEnable(_GL_BLEND))
-    actor.SetMapper(mapper)
-    return actor
-
-
-def point_camera(plotter: Any, camera: Camera) -> None:
-    """Have a plotter look as a camera does."""
-    plotter.camera.position = camera.centre + camera.distance * camera.towards
-    plotter.camera.focal_point, plotter.camera.up = camera.centre, camera.up
-    plotter.camera.parallel_projection, plotter.camera.parallel_scale = camera.parallel, camera.half_height
-    plotter.camera.view_angle = 2.0 * np.degrees(np.arctan2(camera.half_height, camera.distance))
-    plotter.renderer.ResetCameraClippingRange()
+def _divided(colours: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Return colours (h, w, 3) that were multiplied by their opacity (h, w, 1) without it."""
+    return np.minimum(255 * colours.astype(np.uint16) // np.maximum(alpha, 1), 255).astype(np.uint8)
 
 
 def _width(count: int, lengths: np.ndarray, shortest: float, unit: float) -> float:

@@ -83,9 +83,9 @@ def test_orbit_keeps_everything_in_view(tmp_path, flying):
     ("times", "text"),
     [
         (np.linspace(0.0, 5.0, 101), "t = 0.05 s"),
-        (np.linspace(0.0, 0.2, 201), "t = 1 ms"),
+        (np.linspace(0.0, 0.2, 201), "t = 1.0 ms"),
         (np.linspace(0.0, 6e-4, 31), "t = 20 µs"),
-        (np.linspace(0.0, 3.0, 4), "t = 1 s"),
+        (np.linspace(0.0, 3.0, 4), "t = 1.0 s"),
         (np.arange(5) * 1.2345e-3, "t = 1.2 ms"),
     ],
 )
@@ -101,7 +101,7 @@ def test_structures_fill_the_picture_from_any_side(tmp_path):
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.3 * (4.0 - radius**2) / 4.0], axis=-1)
     bars = np.array([[3 * k + j, 3 * k + j + 1] for k in range(12) for j in (0, 1)])
     motion = motion_of(SyntheticResult(tmp_path / "result.vtkhdf", points.reshape(-1, 3), bars, walls=()))
-    motion.frames, motion.times, motion._hulls = [0], motion.times[:1], motion._hulls[:1]
+    motion.frames, motion.times, motion.hulls = [0], motion.times[:1], motion.hulls[:1]
     (camera,) = cameras(Options(view="iso"), motion, 1.5)
     x, y, _ = projected(camera, motion.start, (300, 200))
     assert x.min() > 0 and x.max() < 300 and y.min() > 0 and y.max() < 200

@@ -487,7 +487,7 @@ def _figure(film: Film) -> Any:
     steps = np.linspace(0.0, 1.0, next((count for most, count in _SHAPES if motion.n_bars <= most), 2))
     places = []
     for step in steps:
-        bars.move(start + step * (now - start), radius if gone is None else np.where(gone, -1.0, radius))
+        bars.move(start + step * (now - start), (radius if gone is None else np.where(gone, -1.0, radius))[:, None])
         places.append(np.asarray(bars.mesh.points).T.copy())
     label = colour.title + (f" [{scale.unit}]" if scale.unit else "")
     stops = [[k / 15, "rgb({:.0f},{:.0f},{:.0f})".format(*(255 * np.array(scale.cmap(k / 15)[:3])))] for k in range(16)]

@@ -487,7 +487,7 @@ def _figure(film: Film) -> Any:
     steps = np.linspace(0.0, 1.0, next((count for most, count in _SHAPES if motion.n_bars <= most), 2))
     places = []
     for step in steps:
-        bars.move(start + step * (now - start), (radius if gone is None else np.where(gone, -1.0, radius))[:, None])
+        bars.move(start + step * (now - start), radius if gone is None else np.where(gone, -1.0, radius))
         places.append(np.asarray(bars.mesh.points).T.copy())
     label = colour.title + (f" [{scale.unit}]" if scale.unit else "")
     stops = [[k / 15, "rgb({:.0f},{:.0f},{:.0f})".format(*(255 * np.array(scale.cmap(k / 15)[:3])))] for k in range(16)]
@@ -505,8 +505,8 @@ def _figure(film: Film) -> Any:
         look |= {"intensity": values, "lighting": {"ambient": 0.5, "diffuse": 0.6, "specular": 0.2}, **shades}
     else:
         # a line ends where a number is missing
-        places = [np.insert(x.reshape(3, -1, 2), 2, np.nan, axis=2).reshape(3, -1) for x in places]
-        between, trace = np.insert(values.reshape(-1, 2), 2, 0.0, axis=1).ravel(), plotly.Scatter3d
+        places = [np.insert(x.reshape(3, 2, -1).swapaxes(1, 2), 2, np.nan, axis=2).reshape(3, -1) for x in places]
+        between, trace = np.insert(values.reshape(2, -1).T, 2, 0.0, axis=1).ravel(), plotly.Scatter3d
         look |= {"mode": "lines", "line": {"color": between, "width": 2.0 * least, **shades}}
     traces = [dict(zip("xyz", x, strict=True)) for x in places]
     walls = [_wall(plotly, surface) for surface in motion.surfaces[frame]]

@@ -122,6 +122,8 @@ def _form(kind: str) -> tuple[np.ndarray, np.ndarray]:
 class Segments:
     """Bars as one PolyData in a plotter of pyvista, whose points and colours change in place.
 
+    Its points are in the order of the points of a form, and of the bars for each of these.
+
     Parameters
     ----------
     plotter : of pyvista; None: the mesh is in none
@@ -133,23 +135,24 @@ class Segments:
     Attributes
     ----------
     mesh : the PolyData
+    ends : (2, b) int, the nodes at both ends
     rows : (p,) int, the node or the bar whose colour each point of the mesh has
     """
 
     def __init__(self, plotter: Any, ends: np.ndarray, kind: str, on_nodes: bool, width: float = 1.0) -> None:
         import pyvista
 
-        self._form, cells = _form(kind)
-        self._ends, self._end = np.asarray(ends, dtype=np.int64), self._form[:, 0].astype(int)
-        count, m = len(ends), len(self._form)
-        self._nodes = self._ends[:, self._end].ravel()
-        self.rows = self._nodes if on_nodes else np.repeat(np.arange(count), m)
+        form, cells = _form(kind)
+        self.ends = np.ascontiguousarray(np.transpose(ends), dtype=np.int64)
+        self._end, self._form, count = form[:, 0].astype(int), form[:, 1:].astype(np.float32), len(ends)
+        self._colour_rows = self.ends if on_nodes else np.stack([np.arange(count)] * 2)
+        self.rows = self._colour_rows[self._end].ravel()
         kept = pyvista.CellArray.from_regular_cells(
-            (cells + m * np.arange(count)[:, None, None]).reshape(-1, cells.shape[1])
+            (count * cells + np.arange(count)[:, None, None]).reshape(-1, cells.shape[1])
         )
-        places, self._solid = np.zeros((count * m, 3), dtype=np.float32), kind not in ("line", "strip")
+        places, self._solid = np.zeros((count * len(form), 3), dtype=np.float32), kind not in ("line", "strip")
         self.mesh = pyvista.PolyData(places, lines=kept) if kind == "line" else pyvista.PolyData(places, faces=kept)
-        self.mesh.point_data["colour"] = np.zeros((count * m, 3), dtype=np.uint8)
+        self.mesh.point_data["colour"] = np.zeros(places.shape, dtype=np.uint8)
         if self._solid:
             self.mesh.point_data.active_normals = places.copy()
         if plotter is None:
@@ -175,42 +178,53 @@ class Segments:
         Parameters
         ----------
         points : (n, 3) [m]
-        radius : (b, 1), or (b, 2) at both ends [m]; negative: the bar is not drawn
+        radius : (b,), or (2, b) at both ends [m]; negative: the bar is not drawn
         colours : (n or b, 3) uint8
-        ahead : (3,), or (b, 3) for each bar: the direction to the eye
+        ahead : (3,), or (n, 3) at each node: the direction to the eye
         pale : (n,), the share of white at each node
         light : (3,), the direction to the light, by which flat bars have a shade
         """
-        there = radius[:, :1] >= 0.0
-        first, last = points[self._ends[:, 0]], points[self._ends[:, 1]]
-        places = np.stack([first, np.where(there, last, first)], axis=1)[:, self._end]
+        # single precision, component by component: passes over a million bars
+        first, last = ends = np.stack([x.astype(np.float32)[self.ends] for x in points.T], axis=1)
+        shape = len(self._end), -1, 3
         axis = _unit(last - first)
-        ahead = _unit(np.broadcast_to(ahead, axis.shape))
-        side = np.cross(axis, ahead)
-        along = (side**2).sum(axis=1) < 1e-18  # seen along its axis: any direction is across
-        side[along] = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis), axis=1)])[along]
+        towards = np.broadcast_to(ahead, points.shape).astype(np.float32).T
+        side = np.cross(axis, _unit(np.stack([x[self.ends[0]] for x in towards])), axis=0)
+        along = np.flatnonzero((side**2).sum(axis=0) < 1e-10)  # seen along its axis: any direction is across
+        side[:, along] = np.cross(axis[:, along], np.eye(3)[:, np.abs(axis[:, along]).argmin(axis=0)], axis=0)
         side = _unit(side)
-        facing = np.cross(side, axis)
-        normals = self._form[:, 1:] @ np.stack([axis, side, facing], axis=1)
-        wide = np.broadcast_to(np.where(there, radius, 0.0), self._ends.shape)[:, self._end, None]
-        self.mesh.points[:] = (places + wide * normals).reshape(-1, 3)
-        if self._solid:
-            self.mesh.point_data["Normals"][:] = normals.reshape(-1, 3)
+        facing = np.cross(side, axis, axis=0)
+        wide = np.broadcast_to(radius, self.ends.shape).astype(np.float32)
+        if (hidden := wide[0] < 0.0).any():
+            wide[:, hidden], last[:, hidden] = 0.0, first[:, hidden]
+        places = self.mesh.points.reshape(shape)
+        if self._form.any():
+            normals = self._form @ np.stack([axis, side, facing], axis=1)
+            for k in range(3):
+                places[..., k] = ends[self._end, k] + wide[self._end] * normals[k]
+            if self._solid:
+                self.mesh.point_data["Normals"].reshape(shape)[:] = np.moveaxis(normals, 0, 2)
+        else:
+            places[:] = np.moveaxis(ends, 1, 2)
         if colours is None:
             return
-        shades = colours[self.rows].astype(np.float32)
-        if pale is not None:
-            shades += (255.0 - shades) * pale[self._nodes, None].astype(np.float32)
+        white = 0.0 if pale is None else pale.astype(np.float32)[self.ends]
+        share = np.float32(1.0)
         if light is not None and not self._solid:
-            shares = np.minimum(1.0, _AMBIENT + _DIFFUSE * np.maximum(0.0, facing @ light))
-            shades *= np.repeat(shares.astype(np.float32), len(self._form))[:, None]
-        self.mesh.point_data["colour"][:] = (shades + 0.5).astype(np.uint8)
+            share = np.minimum(1.0, _AMBIENT + _DIFFUSE * np.maximum(0.0, light.astype(np.float32) @ facing))
+        shades = self.mesh.point_data["colour"].reshape(shape)
+        for k in range(3):
+            ink = colours[:, k].astype(np.float32)[self._colour_rows]
+            shades[..., k] = (share * (ink + white * (255.0 - ink)) + 0.5).astype(np.uint8)[self._end]
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors (b, 3) over their lengths, and the x axis for those that have none."""
-    length = np.linalg.norm(vectors, axis=1)[:, None]
-    return np.where(length > 0.0, vectors / np.where(length > 0.0, length, 1.0), [1.0, 0.0, 0.0])
+    """Return vectors (3, b) over their lengths, and the x axis for those that have none."""
+    length = np.sqrt((vectors**2).sum(axis=0))
+    none = length == 0.0
+    made = vectors / np.where(none, 1.0, length)
+    made[0, none] = 1.0
+    return made
 
 
 @dataclass(frozen=True)
@@ -297,6 +311,7 @@ class Scene:
         self._plotter.add_light(pyvista.Light(position=_LIGHT, light_type="camera light"))
         self._plotter.renderer.SetUseOIT(False)  # walls are drawn in their order
         self._plotter.background_color = "black" if transparent else "white"
+        self._plotter.screenshot(return_img=True)  # the first one draws by itself, and chooses a camera
         self._transparent, self._shaded = transparent, style.shaded
         thick = max(self.width, 2.0 * pixels * float(np.quantile(self._radius, 0.9)) if count else 0.0)
         solid = style.shaded and (count <= FEW or (thick >= 2.0 * _ROUND * unit and count <= TUBE_LIMIT))
@@ -347,21 +362,21 @@ class Scene:
 
         self._plotter.remove_actor(self._extra, reset_camera=False, render=False)
         pixel = camera.metres(points) / self.size[1]
-        radius = np.maximum(self._radius[:, None], 0.5 * self.width * pixel[self._bars])
+        radius = np.maximum(self._radius, 0.5 * self.width * pixel[self.segments.ends])
         if gone is not None:
-            radius[gone] = -1.0
+            radius[:, gone] = -1.0
         pale = light = None
         if not camera.parallel:  # what is far away is paler, to show thousands of bars in space
             depths = self._corners @ camera.towards
             pale = 0.5 * np.clip((depths.max() - points @ camera.towards) / max(np.ptp(depths), 1e-300), 0.0, 1.0)
         if self._shaded:
             light = _LIGHT @ np.stack([camera.right, camera.up, camera.towards])
-        self.segments.move(points, radius, colours, camera.ahead(points[self._bars[:, 0]]), pale, light)
+        self.segments.move(points, radius, colours, camera.ahead(points), pale, light)
         if self._nodes is not None:
             balls, sizes = self._nodes
             used = np.unique(self._bars)
             ink = np.tile(np.array(NODE_COLOUR, dtype=np.uint8), (len(used), 1))
-            balls.move(points, np.maximum(sizes, 0.7 * self.width * pixel[used])[:, None], ink)
+            balls.move(points, np.maximum(sizes, 0.7 * self.width * pixel[used]), ink)
         self._extra = [self._add(layer, camera) for layer in layers if len(layer.lines)]
         self._extra += self._add_walls(surfaces, camera)
         eye = camera.centre + camera.distance * camera.towards
@@ -370,7 +385,7 @@ class Scene:
         view.parallel_projection, view.parallel_scale = camera.parallel, camera.half_height
         view.view_angle = 2.0 * np.degrees(np.arctan2(camera.half_height, camera.distance))
         self._plotter.renderer.ResetCameraClippingRange()
-        self._plotter.render_window.Render()  # a screenshot alone is that of the frame before
+        self._plotter.render_window.Render()  # which a screenshot does not
         made = np.asarray(self._plotter.screenshot(return_img=True, transparent_background=self._transparent))
         if self._transparent:  # colours over nothing are multiplied by their opacity
             made = np.concatenate([_divided(made[..., :3], made[..., 3:]), made[..., 3:]], axis=2)
@@ -383,16 +398,16 @@ class Scene:
 
     def rim(self, points: np.ndarray, bars: np.ndarray, colour: tuple[int, int, int]) -> Layer:
         """Return a layer that outlines bars (numbers) by two pixels."""
-        return Layer(points, self._bars[bars], colour, self.width / self.unit + 4.0, -1.0, self._radius[bars, None])
+        return Layer(points, self._bars[bars], colour, self.width / self.unit + 4.0, -1.0, self._radius[bars])
 
     def _add(self, layer: Layer, camera: Camera) -> Any:
         pixel = 2.0 * camera.half_height / self.size[1] * self.unit
         points = np.asarray(layer.points, dtype=float) + layer.shift * pixel * camera.towards
-        least = max(0.5 * layer.width * self.unit, 0.4) * camera.metres(points)[layer.lines] / self.size[1]
-        radius = layer.radius + 2.0 * pixel if np.any(layer.radius) else 0.0
         made = Segments(self._plotter, layer.lines, "strip", False)
+        least = max(0.5 * layer.width * self.unit, 0.4) * camera.metres(points)[made.ends] / self.size[1]
+        radius = layer.radius + 2.0 * pixel if np.any(layer.radius) else 0.0
         colours = np.tile(np.array(layer.colour, dtype=np.uint8), (len(layer.lines), 1))
-        made.move(points, np.maximum(radius, least), colours, camera.ahead(points[layer.lines[:, 0]]))
+        made.move(points, np.maximum(radius, least), colours, camera.ahead(points))
         return made.actor
 
     def _add_walls(self, surfaces: Sequence[Surface], camera: Camera) -> list[Any]:

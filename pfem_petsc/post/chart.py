@@ -61,7 +61,9 @@ STYLE: dict[str, Any] = {
 _WIDTHS = {1: 8.6, 2: 10.4}
 """Widths of pictures by the number of columns [inch]."""
 _LETTER = 0.075
-"""Width of a letter of a note [inch]."""
+"""Width of a letter of a note or a legend [inch]."""
+_LETTERS = 20
+"""Length of names for which legends have room in the usual width."""
 
 _POINTS = 3000  # approximate maximum number of points of a curve, more than a picture has columns
 
@@ -253,7 +255,10 @@ class Chart:
 
         drawn = [panel for panel in panels if panel]
         heights = [max(p.height for p in panels[k : k + columns] if p) for k in range(0, len(panels), columns)]
-        size = (_WIDTHS.get(columns, 4.4 * columns), 0.9 + 2.5 * sum(heights))
+        names = [curve.name for panel in drawn if panel.legend for curve in panel.curves]
+        # long names in legends make the picture wider, and no panel narrower
+        wider = max(0.0, _LETTER * (max(map(len, names), default=0) - _LETTERS))
+        size = (_WIDTHS.get(columns, 4.4 * columns) + columns * wider, 0.9 + 2.5 * sum(heights))
         self.figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(self.figure)
         own = any(panel.over for panel in drawn)

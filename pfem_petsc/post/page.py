@@ -1,4 +1,4 @@
-"""The page around drawings: title, colour bar, scale, axes and curves, drawn once; the time and the marker change."""
+"""The page around drawings: title, colour bar, scale, axes and curves, with the time and a marker that change."""
 
 from __future__ import annotations
 

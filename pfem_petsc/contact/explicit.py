@@ -107,7 +107,7 @@ class WallSums(NamedTuple):
 def find_penetrating(free, walls, marked):
     """Write the nodes whose positions ``free`` (3, n) lie beyond :class:`PressedWalls` to their room; return their
     number. Nodes that rebound are among them in blocks that are ``marked`` (blocks,) bool."""
-    n, m = free.shape[1], 0
+    n, m = free.shape[1], np.int64(0)
     xs, ys, zs = free[0], free[1], free[2]
     for first in range(0, n, NODE_BLOCK):
         last, returning = min(first + NODE_BLOCK, n), marked[first // NODE_BLOCK]
@@ -639,7 +639,7 @@ class ExplicitContact(NodeWalls):
         others = (walls.surfaces.radii == OTHER).any()
         marked = np.full(len(x) // NODE_BLOCK + 1, bounces)
         reference = by_reference(walls)
-        nodes = walls.room[: find_penetrating(x.T, reference, marked)].copy()
+        nodes = walls.room[: find_penetrating(np.ascontiguousarray(x.T), reference, marked)].copy()
         if others:
             nodes = np.union1d(nodes, np.flatnonzero(self.near(x, displacements)))
         if self.ties.any:

@@ -60,7 +60,7 @@ def find_multipliers(matrix, values, tolerance, z):
     active = np.empty(n, dtype=np.int64)
     held = np.zeros(n, dtype=np.bool_)
     system, lost = np.empty((n, n)), np.empty(n)
-    count = 0
+    count = np.int64(0)
     for i in range(n):
         z[i] = 0.0
     for _ in range(10 * n + 10):

@@ -19,7 +19,7 @@ import numpy as np
 from numba import types
 from numba.typed import List
 
-from .compiled import COMPILED, inlined, kernel
+from .compiled import COMPILED, addressed, inlined, kernel
 from .materials.base import Law
 
 CHUNK = 512
@@ -190,14 +190,14 @@ def law_loops(law: Law, form: tuple[Any, ...]) -> SimpleNamespace:
         work[_STRESS + i] = stress
         return modulus, densities
 
-    @kernel
+    @addressed
     def brief(p, step, work, n):
         numbers = numbers_of(p)
         for k in range(n):
             i = np.uint64(k)
             respond(numbers, step, work, i)
 
-    @kernel
+    @addressed
     def full(p, step, work, n):
         numbers = numbers_of(p)
         for k in range(n):
@@ -209,7 +209,7 @@ def law_loops(law: Law, form: tuple[Any, ...]) -> SimpleNamespace:
     if mean_stress is None:
         return SimpleNamespace(brief=brief, full=full, mean=None)
 
-    @kernel
+    @addressed
     def mean(p, step, work, n):
         numbers = numbers_of(p)
         for k in range(n):

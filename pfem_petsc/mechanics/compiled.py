@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -47,7 +47,8 @@ def _contents(top: Path) -> Iterator[bytes]:
                     yield file.read()
 
 
-def _digest(texts: Iterable[str | bytes]) -> str:
+def digest(*texts: str | bytes) -> str:
+    """Return a digest of some texts."""
     found = hashlib.sha256()
     for text in texts:
         found.update(text.encode() if isinstance(text, str) else text)
@@ -72,7 +73,7 @@ def _find_folder() -> Path | None:
     Numba's own keys do not contain the functions that a loop calls.
     """
     versions = numba.__version__, sys.version, _processor()
-    name = f"pfem_petsc-{_digest([*versions, *_contents(_PACKAGE)])}"
+    name = f"pfem_petsc-{digest(*versions, *_contents(_PACKAGE))}"
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     roots = [numba.config.CACHE_DIR] if numba.config.CACHE_DIR else [_PACKAGE / "__pycache__", home]
     for folder in (Path(root, name) for root in roots):
@@ -110,27 +111,34 @@ def _remove_old(root: Path) -> None:
 _FOLDER = _find_folder() if COMPILED else None
 
 
-def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a loop; the machine code is kept on disk if a folder for it is writable."""
+def kernel(function: Callable[..., Any], first_class: bool = False) -> Callable[..., Any]:
+    """Compile a loop; the machine code is kept on disk if a folder for it is writable. Only a ``first_class`` one can be
+    called by its address, see :func:`~pfem_petsc.mechanics.chunk_laws.first_class`: others compile faster."""
     if not COMPILED:
         return function
     _distinguish(function)
     given, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(_FOLDER or "")  # which Numba reads now
     try:
-        made = numba.njit(cache=_FOLDER is not None, nogil=True, **_OPTIONS)(function)
+        options = {**_OPTIONS, "no_cfunc_wrapper": not first_class}
+        made = numba.njit(cache=_FOLDER is not None, nogil=True, **options)(function)
     finally:
         numba.config.CACHE_DIR = given
     KERNELS.append(made)
     return made
 
 
+def addressed(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a loop that other loops call as a first-class function."""
+    return kernel(function, first_class=True)
+
+
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function into the loops that call it, with the options of :func:`kernel`."""
     _distinguish(function)
-    return register_jitable(**_OPTIONS)(function)
+    return register_jitable(**_OPTIONS, no_cfunc_wrapper=True)(function)
 
 
-@register_jitable(fastmath={"nsz", "reassoc"}, error_model="numpy")
+@register_jitable(fastmath={"nsz", "reassoc"}, error_model="numpy", no_cfunc_wrapper=True)
 def add_freely(total: float, value: float) -> float:
     """Return a sum whose additions a loop may reorder, and keep in vectors of partial sums: for sums of the history
     that one loop alone makes, and that nothing else depends on."""
@@ -146,7 +154,7 @@ def _distinguish(function: Callable[..., Any]) -> None:
     """
     if "<locals>" in function.__qualname__:
         cells = [cell.cell_contents for cell in function.__closure__ or ()]
-        function.__qualname__ += f".{_digest([_described(function), *map(_described, cells)])}"
+        function.__qualname__ += f".{digest(_described(function), *map(_described, cells))}"
 
 
 def _described(thing: Any) -> str:
@@ -167,7 +175,7 @@ def _digest_of(path: Path) -> str:
     top = path
     while (top.parent / "__init__.py").exists():
         top = top.parent
-    return _digest(_contents(top) if top.is_dir() else [path.read_bytes()] if path.exists() else [])
+    return digest(*(_contents(top) if top.is_dir() else [path.read_bytes()] if path.exists() else []))
 
 
 def count_compiled() -> int:

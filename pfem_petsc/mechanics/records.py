@@ -14,9 +14,17 @@ from typing import Any
 from numba import types
 from numba.experimental import structref
 
-from .compiled import COMPILED, kernel
+from .compiled import COMPILED, digest, kernel
 
 __all__ = ["References", "by_reference", "record"]
+
+
+class _Kind(types.StructRef):
+    """Type of a record by a name that is short however many records it consists of: names of functions contain it."""
+
+    def __init__(self, fields: Any) -> None:
+        super().__init__(fields)
+        self.name = f"{type(self).__name__}.{digest(self.name)}"
 
 
 def _unliteral(self: Any, fields: Any) -> tuple[tuple[str, Any], ...]:
@@ -28,7 +36,7 @@ def record(cls: type) -> type:
     these, which machine code on disk refers to."""
     module, name = sys.modules[cls.__module__], cls.__name__
     of_module = {"__module__": cls.__module__}
-    kind = structref.register(type(f"{name}Type", (types.StructRef,), {**of_module, "preprocess_fields": _unliteral}))
+    kind = structref.register(type(f"{name}Type", (_Kind,), {**of_module, "preprocess_fields": _unliteral}))
     proxy = type(f"{name}Reference", (structref.StructRefProxy,), of_module)
     structref.define_proxy(proxy, kind, cls._fields)
     for made in (kind, proxy):

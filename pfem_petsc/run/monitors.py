@@ -11,7 +11,6 @@ import numpy as np
 from ..columns import LOST, STORED, SUPPLIED
 from ..contact.monitoring import CrossingBars
 from ..errors import SimulationFailure
-from ..mechanics.compiled import kernel
 from ..output.units import LOAD_FACTOR, TIME
 
 if TYPE_CHECKING:
@@ -35,7 +34,7 @@ _KINETIC, _WALLS, _LOST, _ACTIVE = map(
 )
 _BARS = ("elastic_energy", "spring_energy")
 _ELASTIC, _SPRINGS = map(_AT.get, _BARS)
-_SUPPLIED, _STORED = (np.array([_AT[name] for name in names]) for names in (SUPPLIED, STORED))
+_SUPPLIED, _STORED = ([_AT[name] for name in names] for names in (SUPPLIED, STORED))
 
 
 def watched(row: Mapping[str, Any]) -> np.ndarray:
@@ -48,8 +47,7 @@ _STRANGE, _MOST, _MOST_LOST, _LIMIT, _STARTED, _START_ELASTIC, _START_SPRINGS = 
 _LOWEST = _START_SPRINGS + 1
 
 
-@kernel
-def _first_created(rows: np.ndarray, kept: np.ndarray) -> tuple[int, float]:
+def _first_created(rows: list[list[float]], kept: list[float]) -> tuple[int, float]:
     """Return the first of ``rows`` (m, k) of :data:`WATCHED` with which too many have more energy than was supplied,
     or m, and the energy created [J]; update the numbers ``kept`` between rows."""
     created = 0.0
@@ -91,16 +89,14 @@ class BlowUp:
 
     def __init__(self, model: Model, inertial: bool = True) -> None:
         self.model, self.inertial = model, inertial
-        self._kept = np.array(
-            [0.0, model.rounding * model.length, 0.0, _CREATED, 0.0, 0.0, 0.0] + len(SUPPLIED) * [np.inf]
-        )
+        self._kept = [0.0, model.rounding * model.length, 0.0, _CREATED, 0.0, 0.0, 0.0] + len(SUPPLIED) * [np.inf]
         self._created = 0.0  # by the last row [J]
 
     def kept(self) -> dict[str, Any]:
         """Return the state for a checkpoint: the number of consecutive suspicious rows, energy input, the largest
         numerical dissipation [J], the factor of the input up to which rows are not suspicious, energies of the first
         row, and lowest works."""
-        kept = self._kept.tolist()
+        kept = self._kept
         started = kept[_STARTED] > 0.0
         return {
             "strange": int(kept[_STRANGE]),
@@ -124,7 +120,7 @@ class BlowUp:
         finite = int(bad[0]) if len(bad) else len(rows)
         if not self.inertial:
             return finite
-        at, self._created = _first_created(rows[:finite], self._kept)
+        at, self._created = _first_created(rows[:finite].tolist(), self._kept)
         return at
 
     def check(self, row: Mapping[str, Any], state: State) -> None:
@@ -199,23 +195,22 @@ CAUSES = {
     "damping_dissipation": "damping stops nodes",
 }
 """What dissipates besides friction and impact, and how messages tell it."""
-_CAUSES = np.array([_AT[name] for name in CAUSES])
+_CAUSES = [_AT[name] for name in CAUSES]
 
 # numbers of a check between rows
 _BEGUN, _START, _SCALE, _TOUCHED, _ROWS = range(5)
 
 
-@kernel
-def _sum(row: np.ndarray, columns: np.ndarray) -> float:
+def _sum(row: list[float], columns: list[int]) -> float:
+    """Return the sum of some columns, in their order."""
     total = 0.0
-    for k in range(len(columns)):
-        total += row[columns[k]]
+    for k in columns:
+        total += row[k]
     return total
 
 
-@kernel
 def _first_gain(
-    rows: np.ndarray, numbers: np.ndarray, limits: tuple[bool, float, float, float], kept: np.ndarray
+    rows: list[list[float]], numbers: np.ndarray, limits: tuple[bool, float, float, float], kept: list[float]
 ) -> tuple[int, float]:
     """Return the first of ``rows`` (m, k) of :data:`WATCHED`, with the ``numbers`` (m,) of their steps, that is to be
     told, or m, and the energy gained [J]; update the numbers ``kept`` between rows.
@@ -276,7 +271,7 @@ class ContactWatch:
         swing = min((0.5 * plan.step * plan.frequency.upper) ** 2, 1.0)  # of the elastic energy
         # of energies [J]: what is at rest has no other
         self._limits = (plan.scheme.explicit, float(swing), float(model.rounding * model.length), float(plan.steps))
-        self._kept = np.zeros(5)
+        self._kept = [0.0] * 5
         contact, time = model.case.contact, model.case.time
         self.key = "time.safety" if time.step == "auto" else "time.step"
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
@@ -296,7 +291,7 @@ class ContactWatch:
         :meth:`tell_gain` is to tell of, or m."""
         if self.told:
             return len(rows)
-        at, self._gain = _first_gain(rows, numbers, self._limits, self._kept)
+        at, self._gain = _first_gain(rows.tolist(), numbers, self._limits, self._kept)
         return at
 
     def check(self, row: Mapping[str, Any]) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from ..tolerances import ON_BOUND
 from .friction import Rubbing
 from .node_walls import WallForces
-from .projection import project
+from .projection import projection
 
 if TYPE_CHECKING:
     from ..integrators.base import State
@@ -96,7 +96,7 @@ def start_at_rest(
         between = links.rest(apart, share * mass, closed, held)
         free = apart[nodes] + between[nodes] / weight[:, None]
         moved = free.copy()
-        project(moved, fixed, normals, planes, 0.0, strengths)
+        projection(normals.shape[1] > 1)(moved, fixed, normals, planes, 0.0, strengths)
         if contact.has_friction:
             strengths *= weight[:, None]
             rough = contact.friction, contact.static_friction

@@ -64,7 +64,7 @@ class Surfaces(NamedTuple):
 @inlined
 def is_round(radius):
     """Return whether a wall with one of the ``radii`` of :class:`Surfaces` is a sphere or a cylinder."""
-    return radius != 0.0 and radius != OTHER
+    return (radius != 0.0) & (radius != OTHER)
 
 
 @inlined

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from numba import types
 from numba.typed import List
 
-from .compiled import COMPILED, addressed, inlined, kernel
+from .compiled import COMPILED, inlined, kernel
 from .materials.base import Law
 
 CHUNK = 512
@@ -42,8 +42,6 @@ LOOP = types.void(_VALUES, types.float64, _VALUES, types.int64)
 
 _STRAIN, _TEMPERATURE, _STRESS, _MODULUS = (np.uint64(row * ROW) for row in (STRAIN, TEMPERATURE, STRESS, MODULUS))
 _STRAIN0, _TEMPERATURE0 = _STRESS, _MODULUS
-
-_FUNCTION = types.FunctionType(LOOP)
 
 # functions as arguments are marked so; this module and the loops that take its lists are all that uses them
 warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
@@ -190,14 +188,14 @@ def law_loops(law: Law, form: tuple[Any, ...]) -> SimpleNamespace:
         work[_STRESS + i] = stress
         return modulus, densities
 
-    @addressed
+    @partial(kernel, first_class=True)
     def brief(p, step, work, n):
         numbers = numbers_of(p)
         for k in range(n):
             i = np.uint64(k)
             respond(numbers, step, work, i)
 
-    @addressed
+    @partial(kernel, first_class=True)
     def full(p, step, work, n):
         numbers = numbers_of(p)
         for k in range(n):
@@ -209,7 +207,7 @@ def law_loops(law: Law, form: tuple[Any, ...]) -> SimpleNamespace:
     if mean_stress is None:
         return SimpleNamespace(brief=brief, full=full, mean=None)
 
-    @addressed
+    @partial(kernel, first_class=True)
     def mean(p, step, work, n):
         numbers = numbers_of(p)
         for k in range(n):
@@ -229,31 +227,34 @@ def law_loops(law: Law, form: tuple[Any, ...]) -> SimpleNamespace:
     return SimpleNamespace(brief=brief, full=full, mean=mean)
 
 
-def first_class(loops: Sequence[Callable[..., Any]]) -> Any:
-    """Return loops of laws, compiled, in a list that other loops take as an argument, whichever and however many they
-    are. The loops must be kept as long as it is used."""
+def first_class(loops: Sequence[Callable[..., Any]], signature: Any = LOOP) -> Any:
+    """Return loops of one signature, as those of laws are, compiled, in a list that other loops take as an argument,
+    whichever and however many they are. The loops must be kept as long as it is used."""
     if not COMPILED:
         return list(loops)
-    if not _append.signatures:
-        _append.compile((types.ListType(_FUNCTION), _FUNCTION))
-        _append.disable_compile()  # a loop is otherwise an argument of a type of its own
-    found = _empty()
+    empty, append = _list_of(types.FunctionType(signature))
+    found = empty()
     for loop in loops:
-        loop.compile(LOOP.args)
-        _append(found, loop)
+        loop.compile(signature.args)
+        append(found, loop)
     return found
 
 
-@kernel
-def _empty():
-    """Return an empty list of loops."""
-    return List.empty_list(_FUNCTION)
+@cache
+def _list_of(kind: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Make the loops that return an empty list of functions of a kind, and that append one to it."""
 
+    @kernel
+    def empty():
+        return List.empty_list(kind)
 
-@kernel
-def _append(loops, loop):
-    """Append a loop to a list."""
-    loops.append(loop)
+    @kernel
+    def append(loops, loop):
+        loops.append(loop)
+
+    append.compile((types.ListType(kind), kind))
+    append.disable_compile()  # a loop is otherwise an argument of a type of its own
+    return empty, append
 
 
 def evaluate(law: Law, numbers: tuple[Any, ...], strain: Any, temperature: Any, history: np.ndarray) -> np.ndarray:

@@ -111,16 +111,19 @@ def _remove_old(root: Path) -> None:
 _FOLDER = _find_folder() if COMPILED else None
 
 
-def kernel(function: Callable[..., Any], first_class: bool = False) -> Callable[..., Any]:
-    """Compile a loop; the machine code is kept on disk if a folder for it is writable. Only a ``first_class`` one can be
-    called by its address, see :func:`~pfem_petsc.mechanics.chunk_laws.first_class`: others compile faster."""
+def kernel(function: Callable[..., Any], first_class: bool = False, called: bool = True) -> Callable[..., Any]:
+    """Compile a loop; the machine code is kept on disk if a folder for it is writable.
+
+    Loops compile faster without code that is not needed: to call a ``first_class`` one by its address, see
+    :func:`~pfem_petsc.mechanics.chunk_laws.first_class`, and for one that is ``called`` by Python.
+    """
     if not COMPILED:
         return function
     _distinguish(function)
     given, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(_FOLDER or "")  # which Numba reads now
+    wrappers = {"no_cfunc_wrapper": not first_class, "no_cpython_wrapper": not called}
     try:
-        options = {**_OPTIONS, "no_cfunc_wrapper": not first_class}
-        made = numba.njit(cache=_FOLDER is not None, nogil=True, **options)(function)
+        made = numba.njit(cache=_FOLDER is not None, nogil=True, **wrappers, **_OPTIONS)(function)
     finally:
         numba.config.CACHE_DIR = given
     KERNELS.append(made)
@@ -128,8 +131,8 @@ def kernel(function: Callable[..., Any], first_class: bool = False) -> Callable[
 
 
 def addressed(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a loop that other loops call as a first-class function."""
-    return kernel(function, first_class=True)
+    """Compile a loop that only other loops call, by its address."""
+    return kernel(function, first_class=True, called=False)
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -110,13 +110,21 @@ def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int
     firsts = np.empty(_cut(bars, start, counted, stop, chunk, np.empty(0, dtype=np.uint32)) + 1, dtype=np.uint32)
     _cut(bars, start, counted, stop, chunk, firsts)
     firsts[-1] = stop
-    diagonal = np.empty(len(firsts) - 1, dtype=np.bool_)
-    chunks = np.empty(len(firsts), dtype=np.uint32)
-    none = (np.empty(0, dtype=np.uint32),) * 3
-    runs = _find_runs(bars, firsts, diagonal, chunks, none)
-    heads, fars, starts = (np.empty(n, dtype=np.uint32) for n in (runs, runs, runs + 1))
-    _find_runs(bars, firsts, diagonal, chunks, (heads, fars, starts))
-    starts[runs] = stop
+    low, high = np.sort(bars[start:stop], axis=1).T
+    follows = np.zeros(stop - start, dtype=np.bool_)  # both ends are the nodes after those of the bar before
+    follows[1:] = (np.diff(low) == 1) & (np.diff(high) == 1)
+    at = firsts[:-1].astype(np.int64) - start
+    follows[at] = False
+    sizes = np.diff(firsts.astype(np.int64))
+    diagonal = sizes >= LEAST_RUN * np.add.reduceat(~follows, at, dtype=np.int64) if len(at) else sizes > 0
+    alike = np.zeros(stop - start, dtype=np.bool_)
+    alike[1:] = low[1:] == low[:-1]
+    alike[at] = False
+    runs = np.flatnonzero(~np.where(np.repeat(diagonal, sizes), follows, alike))
+    chunks = np.searchsorted(runs, firsts.astype(np.int64) - start)
+    heads, fars, starts, chunks = (
+        values.astype(np.uint32) for values in (low[runs], high[runs], np.append(runs + start, stop), chunks)
+    )
     chunks_counted = int(np.searchsorted(firsts[:-1], counted))
     return Sweep(heads, fars, starts, chunks, diagonal, chunks_counted)
 
@@ -136,42 +144,6 @@ def _cut(bars, start, counted, stop, chunk, firsts):
             first = k
             block = here
     return count
-
-
-@kernel
-def _find_runs(bars, firsts, diagonal, chunks, runs):
-    """Return the number of runs; write chunks, the first run of each, and the ``runs`` (heads, fars and starts) unless
-    they are empty, and which chunks are ``diagonal``."""
-    heads, fars, starts = runs
-    count = 0
-    for c in range(len(firsts) - 1):
-        chunks[c] = count
-        breaks = 1
-        for k in range(firsts[c] + 1, firsts[c + 1]):
-            breaks += 0 if _follows(bars, k) else 1
-        diagonal[c] = firsts[c + 1] - firsts[c] >= LEAST_RUN * breaks
-        for k in range(firsts[c], firsts[c + 1]):
-            low = min(bars[k, 0], bars[k, 1])
-            if k > firsts[c]:
-                if diagonal[c]:
-                    if _follows(bars, k):
-                        continue
-                elif low == min(bars[k - 1, 0], bars[k - 1, 1]):
-                    continue
-            if len(heads) > 0:
-                heads[count] = low
-                fars[count] = max(bars[k, 0], bars[k, 1])
-                starts[count] = k
-            count += 1
-    chunks[len(firsts) - 1] = count
-    return count
-
-
-@kernel
-def _follows(bars, k):
-    """Whether both ends of bar k are the nodes after those of bar k - 1."""
-    low = min(bars[k, 0], bars[k, 1]) == min(bars[k - 1, 0], bars[k - 1, 1]) + 1
-    return low and max(bars[k, 0], bars[k, 1]) == max(bars[k - 1, 0], bars[k - 1, 1]) + 1
 
 
 NO_BAR = -1.0

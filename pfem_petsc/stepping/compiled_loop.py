@@ -9,8 +9,7 @@ import numpy as np
 
 from ..columns import BAR_ENERGIES, HEAD, PROBED
 from ..contact.fixed_rows import FixedRows, pressed_nodes
-from ..contact.node_walls import compare_contacts
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import addressed, inlined, kernel
 from ..mechanics.elements import first_inverted
 from ..mechanics.internal_forces import BarArrays, internal_forces
 from ..mechanics.layout import clear, join_components, split_components
@@ -22,9 +21,7 @@ from .contact_phase import (
     WallArrays,
     place_walls,
     project_on_rows,
-    project_on_walls,
     stop_at_rows,
-    stop_at_walls,
     sum_rows,
     work_of_walls,
 )
@@ -45,9 +42,13 @@ from .phases import (
     Prescribed,
     StepSums,
     accumulate,
+    accumulate_drags,
+    accumulate_loads,
     add_springs,
     apply_supports,
     balance,
+    balance_dampers,
+    balance_loads,
     clear_vector,
     correct_moving,
     correct_moving_ends,
@@ -142,13 +143,59 @@ class Calls(NamedTuple):
 
 
 @record
+class Contacts(NamedTuple):
+    """Contacts from step to step, which compiled steps assign.
+
+    Attributes
+    ----------
+    touched, met : nodes (m,) that touch walls; that have touched walls and not left them
+    changes : contacts that have closed or opened since the last row
+    friction : energy that friction dissipates in the next step [J]
+    near, others, pressing : nodes (m,) with contact forces of walls, of rows, and of both
+    rows, altered : (2,) numbers of rows with a force, and of those whose force begins or ends
+    impact : energy that contacts lose in the step [J]
+    """
+
+    touched: np.ndarray
+    met: np.ndarray
+    changes: int
+    friction: float
+    near: np.ndarray
+    others: np.ndarray
+    pressing: np.ndarray
+    rows: int
+    altered: int
+    impact: float
+
+
+@record
+class Course(NamedTuple):
+    """How a step goes on, which compiled steps assign: whether increments and energies are needed; what
+    :func:`~pfem_petsc.mechanics.internal_forces.internal_forces` returns; the number of shares of rows that are
+    written; whether a condition holds here, and after :func:`agree` on any rank; the error code of MPI; and what a call
+    of Python returned."""
+
+    keeps: bool
+    needs_energies: bool
+    failed: int
+    shortened: bool
+    changed: int
+    recorded: int
+    holds: bool
+    lost: int
+    unsolved: int
+
+
+@record
 class StepArrays(NamedTuple):
     """All that compiled steps read and write, of which the latter parts are: the sums of the ledger, of which the
-    dissipations by impact and friction and the work of walls are added to; works (5,) of all balances; particles of
-    impulses; the nodes of probes; forces of walls (w, 3) at the start [N]; and this rank's shares (m, width) of the
-    rows of the steps that are due, and at last of the last step if it is not, see
-    :class:`~pfem_petsc.columns.Share`."""
+    dissipations by impact and friction and the work of walls are added to; works (5,) of all balances; energies of
+    bars; particles of impulses, and their increments (rows, 3) in a step; the nodes of probes; forces of walls (w, 3)
+    at the start [N]; and this rank's shares (m, width) of the rows of the steps that are due, and at last of the last
+    step if it is not, see :class:`~pfem_petsc.columns.Share`."""
 
+    contacts: Contacts
+    course: Course
     nodes: Nodes
     motion: Motion
     held: Prescribed
@@ -167,20 +214,12 @@ class StepArrays(NamedTuple):
     state: StateArrays
     ledger: np.ndarray
     works: np.ndarray
+    energies: np.ndarray
     impulses: ImpulseArrays
+    particles: np.ndarray
     probes: np.ndarray
     push: np.ndarray
     shares: np.ndarray
-
-
-class Contacts(NamedTuple):
-    """Contacts from step to step: nodes (m,) that touch walls; that have touched walls and not left them; changes
-    since the last row; and the energy that friction dissipates in the next step [J]."""
-
-    touched: np.ndarray
-    met: np.ndarray
-    changes: int
-    friction: float
 
 
 DONE, PASSED, RECORDED, LOST_BY_MPI, CHANGED, COLLAPSED, TURNED, UNSOLVED, NEAR, PRESSING = range(10)
@@ -206,46 +245,58 @@ _BARS, _PROBED = HEAD.indices(BAR_ENERGIES), len(PROBED)
 _ENERGIES, _SPRINGS = len(BAR_ENERGIES), BAR_ENERGIES.index("spring_energy")
 
 
-@kernel
-def send_positions(messages, x, calls):
-    """Send positions (3, stride) of owned nodes and wait for those of ghosts, in ``messages.arriving``; return MPI's
-    error code."""
+BEGIN, SEND, TAKE, FORCES, PRESS, IMPACTS, BOOK, AGREE, END, RECORD = range(10)
+"""When phases of a step are made: at its start; messages between ranks; forces and balance; contact and reactions;
+contacts that close; the books of the step; agreement of ranks; where the state is needed; in a step with a row."""
+
+
+@inlined
+def _perform(when, phases, starts, s, step):
+    """Make the phases of a step that are due at a time."""
+    for k in range(starts[when], starts[when + 1]):
+        phases[k](s, step)
+
+
+@addressed
+def send_positions(s, step):
+    """Send positions of owned nodes and wait for those of ghosts."""
+    messages, x, calls = s.messages, s.motion.x, s.calls
     for k in range(len(messages.rows)):
         for c in range(3):
             messages.leaving[k, c] = x[c, messages.rows[k]]
     lost = calls.start_all(np.int32(messages.count), messages.requests.ctypes)
     if lost == 0:
         lost = calls.wait_all(np.int32(messages.count), messages.requests.ctypes, messages.statuses.ctypes)
-    return lost
+    s.course.lost = lost
 
 
-@kernel
-def take_positions(messages, n, x, before):
-    """Update the ghosts, which follow ``n`` owned nodes, in ``x`` (3, stride), with their previous positions in
-    ``before`` (local, 3)."""
+@addressed
+def take_positions(s, step):
+    """Update the ghosts, which follow the owned nodes, and their previous positions."""
+    messages, x, before, n = s.messages, s.motion.x, s.state.before, len(s.nodes.mass)
     for k in range(len(messages.arriving)):
         for c in range(3):
             before[n + k, c] = x[c, n + k]
             x[c, n + k] = messages.arriving[k, c]
 
 
-@kernel
-def any_rank(messages, here, calls):
-    """Return whether a condition holds on any rank, and MPI's error code. Collective."""
-    mine, every, handles = np.zeros(1, dtype=np.int32), np.zeros(1, dtype=np.int32), messages.handles
-    mine[0] = 1 if here else 0
-    lost = calls.reduce_all(mine.ctypes, every.ctypes, np.int32(1), handles[0], handles[1], handles[2])
-    return every[0] > 0, lost
+@addressed
+def agree(s, step):
+    """Find whether the condition holds on any rank. Collective."""
+    mine, every, handles = np.zeros(1, dtype=np.int32), np.zeros(1, dtype=np.int32), s.messages.handles
+    mine[0] = 1 if s.course.holds else 0
+    s.course.lost = s.calls.reduce_all(mine.ctypes, every.ctypes, np.int32(1), handles[0], handles[1], handles[2])
+    s.course.holds = every[0] > 0
 
 
-@kernel
+@inlined
 def take_state(state, motion):
     """Read positions and velocities at half steps by components."""
     split_components(state.x, motion.x)
     split_components(state.half, motion.half)
 
 
-@kernel
+@inlined
 def give_state(state, motion):
     """Write the state at the end of a step, by the scheme alone."""
     n, h = len(state.half), motion.h
@@ -259,33 +310,80 @@ def give_state(state, motion):
             state.before[i, c] = state.x[i, c] - (h * state.half[i, c] - state.u[i, c])
 
 
-@kernel
-def begin_step(s, step):
-    """Set supports, walls and loads of a step."""
+@addressed
+def move_supports(s, step):
+    """Set the positions that moving supports reach."""
     place_supports(s.moving, step, s.held.positions)
-    if len(s.walls.motions) > 0:
-        place_walls(step, s.walls)
+
+
+@addressed
+def move_walls(s, step):
+    """Set the surfaces of walls that move."""
+    place_walls(step, s.walls)
+
+
+@addressed
+def set_loads(s, step):
+    """Set loads and gravity that vary."""
     if len(s.loads.gravity) > 0:
         set_forces(step, s.loads, s.nodes.mass, s.nodes.external.T)
 
 
-@kernel
-def evaluate_forces(s, energies):
-    """Compute internal forces, and the energies unless this array is empty; see
-    :func:`~pfem_petsc.mechanics.internal_forces.internal_forces`."""
-    bars, springs, motion = s.bars, s.springs, s.motion
+@addressed
+def evaluate_forces(s, step):
+    """Compute internal forces, and the energies if they are needed."""
+    bars, motion, course = s.bars, s.motion, s.course
     clear(motion.f)
-    laws = bars.full if len(energies) > 0 else bars.brief
-    clear_vector(energies)
-    found = internal_forces(motion.x, motion.f, bars.arrays, laws, motion.h, True, energies)
-    if len(springs.nodes) > 0:
-        add_springs(springs, motion.x, motion.f, s.sums.springs)
-    return found
+    if course.needs_energies:
+        clear_vector(s.energies)
+    laws = bars.full if course.needs_energies else bars.brief
+    energies = s.energies[: len(s.energies) if course.needs_energies else 0]
+    course.failed, course.shortened, course.changed = internal_forces(
+        motion.x, motion.f, bars.arrays, laws, motion.h, np.bool_(True), energies
+    )
 
 
-@kernel
+@addressed
+def evaluate_springs(s, step):
+    """Add the forces of springs to the ground."""
+    add_springs(s.springs, s.motion.x, s.motion.f, s.sums.springs)
+
+
+@addressed
+def advance(s, step):
+    """Solve the balances of nodes, without loads and dampers."""
+    balance(s.nodes, s.motion, s.held, s.course.keeps, s.sums)
+
+
+@addressed
+def advance_loaded(s, step):
+    """Solve the balances of nodes with loads."""
+    balance_loads(s.nodes, s.motion, s.held, s.sums)
+
+
+@addressed
+def advance_damped(s, step):
+    """Solve the balances of nodes with dampers."""
+    balance_dampers(s.nodes, s.motion, s.held, s.sums)
+
+
+@addressed
+def hold(s, step):
+    """Give prescribed components their increments."""
+    apply_supports(s.held, s.nodes, s.motion, s.sums)
+
+
+@addressed
+def press_rows(s, step):
+    """Separate the nodes of rows of their own."""
+    contacts = s.contacts
+    contacts.rows, contacts.altered = project_on_rows(s.rows, s.nodes, s.motion, s.sums)
+    contacts.others = pressed_nodes(s.rows, contacts.rows)
+
+
+@addressed
 def solve_called(s, step):
-    """Have Python solve the rows of a step; return what it returns."""
+    """Have Python solve the rows of a step."""
     called, motion, n = s.called, s.motion, len(s.called.u)
     h, x, half, u = motion.h, motion.x, motion.half, motion.u
     join_components(x, s.state.x)
@@ -293,36 +391,81 @@ def solve_called(s, step):
         for c in range(3):
             called.u[i, c] = u[c, i]
             called.predictor[i, c] = x[c, i] + (h * half[c, i] - u[c, i])
-    result = s.calls.python(step, SOLVE)
+    s.course.unsolved = s.calls.python(step, SOLVE)
     for i in range(n):
         for c in range(3):
             if called.u[i, c] != u[c, i]:
                 displace(c, i, called.u[i, c] - u[c, i], s.nodes, motion, s.sums)
-    return result
+    s.contacts.others = called.held[: called.counts[0]]
 
 
-@kernel
-def lose_energy(s, step, on_walls, altered):
-    """Return the dissipation of contacts that close [J], the nodes that are on walls, and what a call returned."""
-    moved, state, impact, result = (s.moving, step, s.held), (s.state.v, s.state.a), 0.0, 0
-    met = on_walls[0]
-    if len(on_walls[0]) > 0 or len(on_walls[1]) > 0:
-        impact, met = stop_at_walls(s.nodes, s.motion, s.walls, moved, state, on_walls)
-    if altered > 0:
-        impact += stop_at_rows(s.nodes, s.motion, s.rows, altered, moved, state, s.walls.touched.slack)
-    if s.called.any and s.called.counts[1] > 0:
-        for i in s.called.changing[: s.called.counts[1]]:
+@addressed
+def react_to_contact(s, step):
+    """Write the reactions of supports."""
+    react(s.held, s.nodes, s.motion, s.sums)
+
+
+@addressed
+def join_pressing(s, step):
+    """Find all nodes with contact forces, and the work of these."""
+    contacts = s.contacts
+    contacts.pressing = join_nodes(contacts.near, contacts.others, s.walls.present)
+    work_of_contact(contacts.pressing, s.motion, s.sums)
+
+
+@addressed
+def close_on_rows(s, step):
+    """Find the energy that rows lose which close."""
+    contacts = s.contacts
+    if contacts.altered > 0:
+        moved, state = (s.moving, step, s.held), (s.state.v, s.state.a)
+        contacts.impact += stop_at_rows(
+            s.nodes, s.motion, s.rows, contacts.altered, moved, state, s.walls.touched.slack
+        )
+
+
+@addressed
+def close_called(s, step):
+    """Have Python find the energy that rows lose."""
+    called = s.called
+    if called.counts[1] > 0:
+        for i in called.changing[: called.counts[1]]:
             rates_of(i, s.motion, s.state.v, s.state.a)
         put_rates(s.moving, step, s.held, s.state.v, s.state.a)
-        result = s.calls.python(step, CLOSE)
-        impact += s.called.loss[0]
-    return impact, met, result
+        if s.calls.python(step, CLOSE) != 0:
+            s.course.unsolved = LOST
+        s.contacts.impact += called.loss[0]
 
 
-@kernel
-def push_particles(forces, walls, links, h, impulses, u):
-    """Advance the particles of the impulses by a step; ``forces`` (3, 3), of ``walls`` (walls, 3) and ``links``
-    (tables, 3) [N]; their increments are written to ``u`` (rows, 3)."""
+@addressed
+def book_springs(s, step):
+    """Add the forces of springs to those of supports."""
+    for c in range(3):
+        s.sums.forces[SUPPORTS, c] -= s.sums.springs[c]
+
+
+@addressed
+def book_moving(s, step):
+    """Correct the balance for supports that move."""
+    correct_moving(s.moving, step, s.held, s.nodes, s.motion, s.sums)
+
+
+@addressed
+def book_rows(s, step):
+    """Write the forces of tables of rows."""
+    sum_rows(s.rows, s.contacts.rows)
+
+
+@addressed
+def book_walls(s, step):
+    """Add the work of walls that move."""
+    s.ledger[_PUSHED] += work_of_walls(step, s.walls, s.push, s.pressed.force)
+
+
+@addressed
+def push_particles(s, step):
+    """Advance the particles of the impulses by a step, with the forces of the balance, of walls and of rows."""
+    forces, walls, links, u, h = s.sums.forces, s.pressed.force, s.rows.totals, s.particles, s.motion.h
     first = WALLS + len(walls)
     for k in range(len(u)):
         for c in range(3):
@@ -333,25 +476,62 @@ def push_particles(forces, walls, links, h, impulses, u):
             else:  # the last rows are those of jumps, which need Python
                 load = links[k - first, c] if k < first + len(links) else 0.0
             u[k, c] = h * h * load
-            impulses.half[k, c] += h * load
+            s.impulses.half[k, c] += h * load
 
 
-@kernel
-def record_row(s, step, counts, particles, energies, row):
-    """Write this rank's share of the row of a step; ``counts``: active contacts, and contacts that have changed;
-    ``particles`` (rows, 3): increments of the impulses."""
-    h, ledger, impulses, works, sums = s.motion.h, s.ledger, s.impulses, s.works, s.sums
-    ends = sums.ends
+@inlined
+def _probed(s):
+    """Return this rank's share of the row that is due, and its values of probes (p, 4, 3)."""
+    row = s.shares[s.course.recorded]
+    return row, row[len(row) - 3 * _PROBED * len(s.probes) :].reshape(len(s.probes), _PROBED, 3)
+
+
+@addressed
+def sum_ends(s, step):
+    """Find sums at the end of a step, and write motion and forces of supports and contact at the probes."""
+    accumulate(s.nodes, s.motion, s.contacts.pressing, s.sums)
+    h, motion = s.motion.h, s.motion
+    _, values = _probed(s)
+    for k in range(len(s.probes)):
+        i = s.probes[k]
+        for c in range(3):
+            values[k, 0, c] = motion.x[c, i]
+            values[k, 1, c] = motion.half[c, i] - 0.5 / h * motion.u[c, i]
+            values[k, 2, c] = motion.u[c, i] / (h * h)
+            values[k, 3, c] = s.held.reaction[i, c] + motion.contact[i, c]
+    impulses, particles = s.impulses, s.particles
     for k in range(len(particles)):
         for c in range(3):
             impulses.v[k, c] = impulses.half[k, c] - 0.5 / h * particles[k, c]
             impulses.a[k, c] = particles[k, c] / (h * h)
-    values = row[len(row) - 3 * _PROBED * len(s.probes) :].reshape(len(s.probes), _PROBED, 3)
-    _record_probes(s, values)
-    if len(s.moving.at) > 0:
-        correct_moving_ends(s.moving, step, s.held, s.nodes, s.motion, sums, values)
-        for c in range(3):
-            impulses.v[SUPPORT, c] += sums.jumps[1, c]
+
+
+@addressed
+def sum_loads(s, step):
+    """Add the work of loads to the sums at the end of a step."""
+    accumulate_loads(s.nodes, s.motion, s.sums)
+
+
+@addressed
+def sum_drags(s, step):
+    """Add what dampers take to the sums at the end of a step."""
+    accumulate_drags(s.nodes, s.motion, s.sums)
+
+
+@addressed
+def sum_moving(s, step):
+    """Correct the sums at the end of a step for supports that move."""
+    correct_moving_ends(s.moving, step, s.held, s.nodes, s.motion, s.sums, _probed(s)[1])
+    for c in range(3):
+        s.impulses.v[SUPPORT, c] += s.sums.jumps[1, c]
+
+
+@addressed
+def record_row(s, step):
+    """Write this rank's share of the row of a step."""
+    ledger, works, sums, energies, (row, _) = s.ledger, s.works, s.sums, s.energies, _probed(s)
+    ends = sums.ends
+    energies[_SPRINGS] = sums.springs[3]
     for k in range(len(ledger)):
         row[k] = ledger[k]
     stored = 0.0
@@ -368,148 +548,108 @@ def record_row(s, step, counts, particles, energies, row):
         row[_SUPPORT + c] = sums.forces[SUPPORTS, c]
         for k in range(3):
             row[_MOMENTA + 3 * k + c] = sums.momenta[k, c]
-    row[_PRESSING] = counts[0]
+    row[_PRESSING] = len(s.contacts.pressing)
     pressed = s.pressed
     contact = ContactSums(pressed.force, pressed.moment, pressed.contacts, s.walls.releases, s.rows.totals)
-    record_forces(impulses.v, contact, counts[1], row)
+    record_forces(s.impulses.v, contact, s.contacts.changes, row)
+
+
+@addressed
+def put_state(s, step):
+    """Write the state at the end of a step."""
+    if not (s.course.keeps):
+        restore_increments(s.nodes, s.motion, s.held)
+    give_state(s.state, s.motion)
+    put_rates(s.moving, step, s.held, s.state.v, s.state.a)
 
 
 @kernel
-def _record_probes(s, values):
-    """Write motion and forces of supports and contact at the probes, (p, 4, 3)."""
-    h, motion = s.motion.h, s.motion
-    for k in range(len(s.probes)):
-        i = s.probes[k]
-        for c in range(3):
-            values[k, 0, c] = motion.x[c, i]
-            values[k, 1, c] = motion.half[c, i] - 0.5 / h * motion.u[c, i]
-            values[k, 2, c] = motion.u[c, i] / (h * h)
-            values[k, 3, c] = s.held.reaction[i, c] + motion.contact[i, c]
-
-
-@kernel
-def run_compiled(s, contacts, due, flags):
+def run_compiled(s, phases, starts, due, flags):
     """Make some steps, with bars of any law.
 
-    Its arguments are StepArrays; Contacts as a tuple; ``due`` (count,) bool, the steps with a row; and ``flags``
-    (count, walls) bool, which receives the walls that are touched in each step. The state is that after the last step.
-    Fewer steps are made where bars of any rank change their state of rupture, and where something fails, except on
-    several ranks that need not agree: these make all steps then, as others wait for their messages. It returns Contacts
-    as a tuple, and writes the outcome.
+    Its arguments are StepArrays; the phases of a step, those of each time from one of the ``starts`` on; ``due``
+    (count,) bool, the steps with a row; and ``flags`` (count, walls) bool, which receives the walls that are touched in
+    each step. The state is that after the last step. Fewer steps are made where bars of any rank change their state of
+    rupture, and where something fails, except on several ranks that need not agree: these make all steps then, as
+    others wait for their messages. It returns the first four of Contacts, and writes the outcome.
     """
-    touched, met, changes, friction = contacts
-    outcome = s.outcome
-    nodes, motion, held, walls, rows, messages = s.nodes, s.motion, s.held, s.walls, s.rows, s.messages
-    count, n, n_walls = len(due), len(nodes.mass), len(walls.pressed.way)
-    several, linked, calling = messages.several, len(rows.force) > 0, s.called.any
-    agree = several and (s.bars.can_break or calling)  # ranks that make the same steps
-    keeps = n_walls > 0 or linked or calling or len(nodes.damping) > 0 or nodes.external.shape[1] > 0
-    sums, pressed, particles = s.sums, s.pressed, np.empty(s.impulses.v.shape)
+    contacts, course, motion, sums, pressed = s.contacts, s.course, s.motion, s.sums, s.pressed
+    count, several, linked, calling = len(due), s.messages.several, len(s.rows.force) > 0, s.called.any
+    agrees = several and (s.bars.can_break or calling)  # ranks that make the same steps
+    keeps = flags.shape[1] > 0 or linked or calling or len(s.nodes.damping) > 0 or s.nodes.external.shape[1] > 0
     pressed.failure[0] = -1
-    energies, no_energies = np.zeros(_ENERGIES), np.empty(0)
-    # nodes with contact forces of walls, of rows, and of both
-    near, others = touched, s.called.held[: s.called.counts[0]]
-    if linked:
-        others = pressed_nodes(rows, np.count_nonzero(rows.force > 0.0))
-    pressing = join_nodes(near, others, walls.present)
-    failed, turned, changed, lost, unsolved = np.int64(-1), np.int64(-1), 0, 0, np.int64(0)
-    done, passed, recorded, stops, shortened = 0, 0, 0, False, False
+    turned, done, passed, stops = np.int64(-1), 0, 0, False
     take_state(s.state, motion)
     for step in range(count):
-        if failed >= 0 or turned >= 0 or pressed.failure[0] >= 0:
+        if course.failed >= 0 or turned >= 0 or pressed.failure[0] >= 0:
             # the other ranks still need messages, until all know of the failure
-            lost = send_positions(messages, motion.x, s.calls)
+            _perform(SEND, phases, starts, s, step)
             passed += 1
-            if lost != 0:
+            if course.lost != 0:
                 break
             continue
         last_one = step == count - 1
         ending = due[step] or last_one
-        for i in pressing:
+        for i in contacts.pressing:
             for c in range(3):
                 motion.contact[i, c] = 0.0
-        begin_step(s, step)
-        s.ledger[_RUBBED] += friction  # on the way that the balance before has determined
-        friction = 0.0
+        _perform(BEGIN, phases, starts, s, step)
+        s.ledger[_RUBBED] += contacts.friction  # on the way that the balance before has determined
+        contacts.friction = contacts.impact = 0.0
         move(motion.x, motion.h, motion.half)
-        if several:
-            lost = send_positions(messages, motion.x, s.calls)
-            if lost != 0:
-                break
-            take_positions(messages, n, motion.x, s.state.before)
-        wanted = energies if ending or s.bars.can_break else no_energies  # a bar that breaks ends the steps
-        failed, shortened, changed = evaluate_forces(s, wanted)
-        balance(nodes, motion, held, keeps or ending, sums)
-        apply_supports(held, nodes, motion, sums)
-        some, altered, found = 0, 0, 0
-        if linked:
-            some, altered = project_on_rows(rows, nodes, motion, sums)
-        if calling:
-            unsolved = call = solve_called(s, step)
-            if call < FAILED:
-                break
-        if n_walls > 0:
-            found, friction = project_on_walls(nodes, motion, walls, (touched, met), sums, pressed)
-            near = pressed.nodes[:found]
-            more, touched = compare_contacts(
-                walls.touched.touching, touched, near, pressed.touching, walls.present, walls.releases
-            )
-            changes += more
-        react(held, nodes, motion, sums)
-        others = pressed_nodes(rows, some) if linked else s.called.held[: s.called.counts[0]]
-        pressing = join_nodes(near, others, walls.present)
-        work_of_contact(pressing, motion, sums)
-        impact, met, call = lose_energy(s, step, (met, touched), altered)
-        if call != 0:
-            unsolved = np.int64(LOST)
+        _perform(SEND, phases, starts, s, step)
+        if course.lost != 0:
             break
-        s.ledger[_IMPACT] += impact
-        for c in range(3 if len(s.springs.nodes) > 0 else 0):
-            sums.forces[SUPPORTS, c] -= sums.springs[c]
-        correct_moving(s.moving, step, held, nodes, motion, sums)
-        if linked:
-            sum_rows(rows, some)
-        push_particles(sums.forces, pressed.force, rows.totals, motion.h, s.impulses, particles)
-        if len(walls.motions) > 0:
-            s.ledger[_PUSHED] += work_of_walls(step, walls, s.push, pressed.force)
-        for k in range(n_walls):
+        _perform(TAKE, phases, starts, s, step)
+        course.keeps = keeps or ending
+        course.needs_energies = ending or s.bars.can_break  # a bar that breaks ends the steps
+        _perform(FORCES, phases, starts, s, step)
+        _perform(PRESS, phases, starts, s, step)
+        if course.unsolved < FAILED:
+            break
+        _perform(IMPACTS, phases, starts, s, step)
+        if course.unsolved < FAILED:
+            break
+        s.ledger[_IMPACT] += contacts.impact
+        _perform(BOOK, phases, starts, s, step)
+        for k in range(flags.shape[1]):
             flags[step, k] = pressed.contacts[k] > 0
         done += 1
         passed += 1
-        stops = changed > 0
-        wrong = stops or failed >= 0 or pressed.failure[0] >= 0 or unsolved != 0
+        stops = course.changed > 0
+        wrong = stops or course.failed >= 0 or pressed.failure[0] >= 0 or course.unsolved != 0
         wrong = wrong or not np.isfinite(sums.works[INTERNAL])
-        looks = wrong or shortened
-        if agree:
-            looks, lost = any_rank(messages, looks, s.calls)
-            if lost != 0:
+        looks = course.holds = wrong or course.shortened
+        if agrees:
+            _perform(AGREE, phases, starts, s, step)
+            looks = course.holds
+            if course.lost != 0:
                 break
         if looks or last_one:
-            if not (keeps or ending):
-                restore_increments(nodes, motion, held)
-            give_state(s.state, motion)
-            if failed < 0 and shortened:
+            _perform(END, phases, starts, s, step)
+            if course.failed < 0 and course.shortened:
                 turned = np.int64(first_inverted(s.state.x, s.state.before, s.bars.ends, s.bars.watched))
             wrong = wrong or turned >= 0
-            put_rates(s.moving, step, held, s.state.v, s.state.a)
-        if agree and looks:
-            stops, lost = any_rank(messages, wrong, s.calls)
-            if lost != 0:
+        if agrees and looks:
+            course.holds = wrong
+            _perform(AGREE, phases, starts, s, step)
+            stops = course.holds
+            if course.lost != 0:
                 break
             wrong = wrong or stops
         if ending or wrong:
-            accumulate(nodes, motion, pressing, sums)
-            energies[_SPRINGS] = sums.springs[3]
-            record_row(s, step, (len(pressing), changes), particles, energies, s.shares[recorded])
-            changes = 0 if due[step] else changes
-            recorded += 1
+            _perform(RECORD, phases, starts, s, step)
+            contacts.changes = 0 if due[step] else contacts.changes
+            course.recorded += 1
         for c in range(3):
             s.impulses.half[SUPPORT, c] += sums.jumps[0, c]
         for k in range(len(s.works)):
             s.works[k] += sums.works[k]
         if stops or (wrong and not several):
             break
-    found = done, passed, recorded, lost, changed, failed, turned, unsolved, len(near), len(pressing)
-    for k in range(len(outcome)):
+    found = done, passed, course.recorded, course.lost, course.changed, course.failed, turned, course.unsolved
+    outcome = s.outcome
+    for k in range(len(found)):
         outcome[k] = found[k]
-    return touched, met, changes, friction
+    outcome[NEAR], outcome[PRESSING] = len(contacts.near), len(contacts.pressing)
+    return contacts.touched, contacts.met, contacts.changes, contacts.friction

@@ -5,47 +5,91 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numba
 import numpy as np
 from mpi4py import MPI
 from numba import types
 
 from ..columns import BAR_ENERGIES, HEAD, Share, at_state, fill_at_state
+from ..contact.explicit import kind_of
+from ..contact.fixed_rows import FixedRows
 from ..contact.node_walls import NOTED, WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
+from ..mechanics.chunk_laws import first_class
 from ..mechanics.compiled import COMPILED
-from ..mechanics.records import References
+from ..mechanics.records import References, by_reference
 from ..mesh.exchange import SIGNATURES, CFunction, mpi_functions
 from ..mesh.ordering import NODE_BLOCK
 from ..parallel.ending import is_alone
 from ..parallel.heap import return_freed_memory
 from ..tolerances import PROJECTED
 from .compiled_loop import (
+    AGREE,
+    BEGIN,
+    BOOK,
     CHANGED,
     COLLAPSED,
     DONE,
+    END,
     FAILED,
+    FORCES,
+    IMPACTS,
     LOST,
     LOST_BY_MPI,
     NEAR,
     PASSED,
+    PRESS,
     PRESSING,
+    RECORD,
     RECORDED,
+    SEND,
     SOLVE,
+    TAKE,
     TURNED,
     UNSOLVED,
     CalledRows,
     Calls,
     Contacts,
+    Course,
     ImpulseArrays,
     StateArrays,
     StepArrays,
     StepBars,
+    advance,
+    advance_damped,
+    advance_loaded,
+    agree,
+    book_moving,
+    book_rows,
+    book_springs,
+    book_walls,
+    close_called,
+    close_on_rows,
+    evaluate_forces,
+    evaluate_springs,
+    hold,
+    join_pressing,
+    move_supports,
+    move_walls,
+    press_rows,
+    push_particles,
+    put_state,
+    react_to_contact,
+    record_row,
     run_compiled,
+    send_positions,
+    set_loads,
+    solve_called,
+    sum_drags,
+    sum_ends,
+    sum_loads,
+    sum_moving,
+    take_positions,
 )
-from .contact_phase import WallArrays, new_contact_nodes
+from .contact_phase import WallArrays, close_on_walls, new_contact_nodes, press_walls
 from .impact import Touched
 from .phases import GroundSprings, Motion, MovingSupports, Nodes, Prescribed, new_sums
 from .stepper import Instants, Solution
@@ -55,6 +99,15 @@ if TYPE_CHECKING:
 
 
 _BARS, _BROKEN = HEAD.indices(BAR_ENERGIES), HEAD.first("broken_bars")
+
+
+class ContactsAfter(NamedTuple):
+    """What steps leave of :class:`~pfem_petsc.stepping.compiled_loop.Contacts`."""
+
+    touched: np.ndarray
+    met: np.ndarray
+    changes: int
+    friction: float
 
 
 class CompiledSteps:
@@ -82,7 +135,8 @@ class CompiledSteps:
         self._stiffness = self._nodes.stiffness if model.links else np.empty(0)
         self._called = RowCaller(stepper, self._stiffness, self._u, self._contact)
         self._messages, self._calls = model.mesh.messages(), Calls(*_mpi(), self._called.function)
-        self._references = References()
+        self._references, self._phases = References(), None
+        self._energies, self._particles = np.zeros(len(BAR_ENERGIES)), np.empty(self.ledger.impulses.state.v.shape)
         share = Share(len(model.contact.names), len(model.links.columns), len(stepper.probed))
         self._width, self._at_state = len(share.numbers), at_state(model)
         self._ends_at_rows = not all(column.looped for column in self._at_state)
@@ -135,6 +189,52 @@ class CompiledSteps:
         moved, probes = np.nonzero(self._held.nodes[at][:, None] == self.stepper.probed)
         return MovingSupports(at, columns[at], supports.origins[at], motions, np.column_stack([moved, probes]))
 
+    def _contacts(self, rows: FixedRows, called: CalledRows) -> Contacts:
+        """Return the contacts before the first step."""
+        log, ledger = self.model.contact.log, self.ledger
+        held = called.held[: called.counts[0]]
+        others = np.concatenate([held, rows.nodes[rows.force[rows.of] > 0.0]])
+        pressing = np.concatenate([log.last, others])
+        friction = float(ledger.friction_ahead)
+        return Contacts(log.last, ledger.impacts.met, log.changes, friction, log.last, others, pressing, 0, 0, 0.0)
+
+    def _make_phases(self, signature: Any, linked: bool) -> tuple[Any, np.ndarray]:
+        """Return the phases of a step that this case needs, and where those of each time begin."""
+        model = self.model
+        damped, loaded, held = model.inertia.damped, model.external.active, len(self._held.nodes) > 0
+        called, walls = self._called.record.any, len(model.contact.walls) > 0
+        several, springs, moves = model.comm.size > 1, len(self._springs.nodes) > 0, model.supports.moves
+        touch, sent = walls or linked or called, model.contact.moving.any()
+        press = press_walls(*kind_of(self._walls.pressed)) if walls else None
+        chosen = {
+            BEGIN: ((move_supports, moves), (move_walls, sent), (set_loads, loaded and not model.external.steady)),
+            SEND: ((send_positions, several),),
+            TAKE: ((take_positions, several),),
+            FORCES: (
+                *((evaluate_forces, True), (evaluate_springs, springs)),
+                *((advance_damped, damped), (advance_loaded, loaded and not damped)),
+                *((advance, not (loaded or damped)), (hold, held)),
+            ),
+            PRESS: (
+                *((press_rows, linked), (solve_called, called), (press, walls)),
+                *((react_to_contact, held), (join_pressing, touch)),
+            ),
+            IMPACTS: ((close_on_walls, walls), (close_on_rows, linked), (close_called, called)),
+            BOOK: (
+                *((book_springs, springs), (book_moving, moves), (book_rows, linked), (push_particles, True)),
+                *((book_walls, sent),),
+            ),
+            AGREE: ((agree, several),),
+            END: ((put_state, True),),
+            RECORD: (
+                *((sum_ends, True), (sum_loads, loaded), (sum_drags, damped), (sum_moving, moves)),
+                *((record_row, True),),
+            ),
+        }
+        phases = [[phase for phase, needed in chosen[when] if needed] for when in sorted(chosen)]
+        starts = np.cumsum([0, *map(len, phases)])
+        return first_class([phase for some in phases for phase in some], signature), starts
+
     def _times(self, begin: int, count: int) -> np.ndarray:
         """Return the times of the start of ``count`` steps from one of a number on, of their ends, and of one more."""
         return np.arange(begin, begin + count + 2) * self.stepper.h
@@ -178,11 +278,14 @@ class CompiledSteps:
         begin, impulses = state.step, ledger.impulses.state
         flags = np.zeros((count, len(log.releases)), dtype=bool)
         rows = model.links.export_rows(self._stiffness)
+        called = self._called.begin(begin, rows.totals)
         ledger.sums[_BROKEN] = stepper.ruptures.count
         half, walls = state.memory["half_velocity"], self._walls
         if model.contact.moving.any():
             walls = walls._replace(motions=self._wall_motions(begin, count))
         arrays = StepArrays(
+            by_reference(self._contacts(rows, called)),
+            by_reference(Course(False, False, -1, False, 0, 0, False, 0, 0)),
             self._nodes,
             self._motion,
             self._held,
@@ -192,7 +295,7 @@ class CompiledSteps:
             model.external.schedule(range(begin + 1, begin + 1 + count), stepper.h),
             walls,
             rows,
-            self._called.begin(begin, rows.totals),
+            called,
             self._sums,
             self._pressed,
             self._outcome,
@@ -201,13 +304,17 @@ class CompiledSteps:
             StateArrays(state.x, stepper.before, state.f, half, self._u, state.v, state.a),
             ledger.sums,
             ledger.powers,
+            self._energies,
             ImpulseArrays(impulses.memory["half_velocity"], impulses.a, impulses.v),
+            self._particles,
             stepper.probed,
             stepper.solution.walls.force.copy(),
             shares,
         )
-        contacts = log.last, ledger.impacts.met, log.changes, ledger.friction_ahead
-        contacts = Contacts(*run_compiled(self._references.of(arrays), contacts, due, flags))
+        reference = self._references.of(arrays)
+        if self._phases is None:
+            self._phases = self._make_phases(types.void(numba.typeof(reference), types.int64), len(rows.force) > 0)
+        contacts = ContactsAfter(*run_compiled(reference, *self._phases, due, flags))
         self._called.end()
         made = self._outcome.tolist()
         if made[LOST_BY_MPI]:
@@ -229,7 +336,7 @@ class CompiledSteps:
             time = number * stepper.h
             stepper.instants = Instants(model.first_step + number, model.origin + time, time, shares, noted[steps])
 
-    def _take(self, made: list[int], contacts: Contacts, energies: np.ndarray) -> int:
+    def _take(self, made: list[int], contacts: ContactsAfter, energies: np.ndarray) -> int:
         """Take the state after the last step, with ``energies`` of the bars [J]; return how many steps are sound."""
         stepper, state, model = self.stepper, self.stepper.state, self.model
         model.contact.log.last, self.ledger.impacts.met = contacts.touched, contacts.met

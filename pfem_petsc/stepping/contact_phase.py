@@ -3,14 +3,16 @@ may be; contacts that close lose energy."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..contact.explicit import Arrivals, PressedWalls, WallSums, find_penetrating, press_nodes
+from ..contact.explicit import Arrivals, PressedWalls, WallSums, find_penetrating, presses
 from ..contact.fixed_rows import close_rows
+from ..contact.node_walls import compare_contacts
 from ..contact.surfaces import Surfaces, wall_gaps
-from ..mechanics.compiled import inlined, kernel
+from ..mechanics.compiled import addressed, inlined
 from ..mechanics.records import record
 from ..mesh.ordering import NODE_BLOCK
 from .impact import Approach, Touched, join_nodes, stop_nodes, unpressed
@@ -38,7 +40,7 @@ class WallArrays(NamedTuple):
 
 @record
 class ContactNodes(NamedTuple):
-    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the walls that
+    """Results of :func:`~pfem_petsc.contact.explicit.presses` in a step: room for ``nodes`` (n,), the walls that
     they are ``touching`` (n, w), their ``places`` (n, 3); ``failure`` (2,): the first of them without a place, or -1,
     and why, and its planes, ``normals`` (w, 3) and ``offsets`` (w,); and the sums of each wall, ``force`` (w, 3),
     ``contacts`` (w,) and ``moment`` (w, 3)."""
@@ -63,7 +65,7 @@ def new_contact_nodes(n: int, w: int) -> ContactNodes:
     return ContactNodes(nodes, touching, places, failure, np.empty((w, 3)), np.empty(w), force, contacts, moment)
 
 
-@kernel
+@inlined
 def place_walls(step, walls):
     """Set the surfaces that walls reach one step after a step, and those at its end."""
     pressed, motions, normals = walls.pressed, walls.motions, walls.at_rest.normals
@@ -79,7 +81,7 @@ def place_walls(step, walls):
             pressed.way[k, c] = motions[step + 2, 0, k, c] - motions[step + 1, 0, k, c]
 
 
-@kernel
+@inlined
 def work_of_walls(step, walls, push, force):
     """Return the work of walls over the way that a step went, with forces (w, 3) at its start and end."""
     work = 0.0
@@ -91,7 +93,7 @@ def work_of_walls(step, walls, push, force):
     return work
 
 
-@kernel
+@inlined
 def _arrivals(found, nodes, motion, walls):
     """Return what pressing needs of nodes (m,)."""
     pressed, touched, h = walls.pressed, walls.touched, motion.h
@@ -115,64 +117,73 @@ def _arrivals(found, nodes, motion, walls):
     return Arrivals(start, drift, stiffness, fixed, applies, touching, rebound, arrival, *none)
 
 
-@kernel
+@inlined
 def _mark(marked, nodes, value):
     """Set the marks of the blocks of nodes."""
     for i in nodes:
         marked[i // NODE_BLOCK] = value
 
 
-@kernel
-def project_on_walls(nodes, motion, walls, before, sums, out):
-    """Move nodes beyond walls onto them; return how many there are near walls, and the energy that friction dissipates
-    in the next step [J]. ``before``: nodes that touched walls, and that have touched them and not left; ``out``:
-    ContactNodes."""
-    free, h = walls.free, motion.h
-    for c in range(3):
-        there, where, speed = free[c], motion.x[c], motion.half[c]
-        for i in range(len(there)):
-            there[i] = where[i] + h * speed[i]
-    clear_rows(out.force)
-    clear_rows(out.moment)
-    for k in range(len(out.contacts)):
-        out.contacts[k] = 0
-    if len(walls.pressed.restitution) > 0:
-        _mark(walls.marked, before[0], True)
-        _mark(walls.marked, before[1], True)
-    m = find_penetrating(free, walls.pressed, walls.marked)
-    if len(walls.pressed.restitution) > 0:
-        _mark(walls.marked, before[0], False)
-        _mark(walls.marked, before[1], False)
-    if m == 0:
-        return 0, 0.0
-    found = walls.pressed.room[:m]
-    places, given = np.empty((m, 3)), _arrivals(found, nodes, motion, walls)
-    for j in range(m):
+@cache
+def press_walls(curved: bool, rough: bool, several: bool) -> Any:
+    """Make the phase that moves nodes beyond walls onto them, for walls of a kind, see
+    :func:`~pfem_petsc.contact.explicit.presses`."""
+    press_nodes = presses(curved, rough, several)
+
+    @addressed
+    def press(s, step):
+        nodes, motion, walls, out, contacts = s.nodes, s.motion, s.walls, s.pressed, s.contacts
+        free, h, pressed = walls.free, motion.h, walls.pressed
         for c in range(3):
-            places[j, c] = free[c, found[j]]
-    wall_sums = WallSums(out.force, out.contacts, out.moment)
-    failed, why, planes, total, touching, rubbed = press_nodes(places, given, walls.pressed, wall_sums)
-    for j in range(m):
-        i = found[j]
-        out.nodes[j] = i
-        for c in range(3):
-            displace(c, i, places[j, c] - free[c, i], nodes, motion, sums)
-            motion.contact[i, c] += total[j, c]  # rows may press there too
-            out.places[j, c] = places[j, c]
-        for k in range(given.rebound.shape[1]):
-            walls.pressed.rebound[i, k], walls.pressed.arrival[i, k] = given.rebound[j, k], given.arrival[j, k]
-        for k in range(touching.shape[1]):
-            out.touching[j, k] = touching[j, k]
-    if failed >= 0:
-        out.failure[0], out.failure[1] = failed, why
-        for k in range(len(out.offsets)):
-            out.offsets[k] = planes.offsets[failed, k]
-            for c in range(3):
-                out.normals[k, c] = planes.normals[failed, k, c]
-    return m, rubbed
+            there, where, speed = free[c], motion.x[c], motion.half[c]
+            for i in range(len(there)):
+                there[i] = where[i] + h * speed[i]
+        clear_rows(out.force)
+        clear_rows(out.moment)
+        for k in range(len(out.contacts)):
+            out.contacts[k] = 0
+        if len(pressed.restitution) > 0:
+            _mark(walls.marked, contacts.touched, np.bool_(True))
+            _mark(walls.marked, contacts.met, np.bool_(True))
+        m = find_penetrating(free, pressed, walls.marked)
+        if len(pressed.restitution) > 0:
+            _mark(walls.marked, contacts.touched, np.bool_(False))
+            _mark(walls.marked, contacts.met, np.bool_(False))
+        if m > 0:
+            found = pressed.room[:m]
+            places, given = np.empty((m, 3)), _arrivals(found, nodes, motion, walls)
+            for j in range(m):
+                for c in range(3):
+                    places[j, c] = free[c, found[j]]
+            sums = WallSums(out.force, out.contacts, out.moment)
+            failed, why, planes, total, touching, contacts.friction = press_nodes(places, given, pressed, sums)
+            for j in range(m):
+                i = found[j]
+                out.nodes[j] = i
+                for c in range(3):
+                    displace(c, i, places[j, c] - free[c, i], nodes, motion, s.sums)
+                    motion.contact[i, c] += total[j, c]  # rows may press there too
+                    out.places[j, c] = places[j, c]
+                for k in range(given.rebound.shape[1]):
+                    pressed.rebound[i, k], pressed.arrival[i, k] = given.rebound[j, k], given.arrival[j, k]
+                for k in range(touching.shape[1]):
+                    out.touching[j, k] = touching[j, k]
+            if failed >= 0:
+                out.failure[0], out.failure[1] = failed, why
+                for k in range(len(out.offsets)):
+                    out.offsets[k] = planes.offsets[failed, k]
+                    for c in range(3):
+                        out.normals[k, c] = planes.normals[failed, k, c]
+        contacts.near = out.nodes[:m]
+        more, contacts.touched = compare_contacts(
+            walls.touched.touching, contacts.touched, contacts.near, out.touching, walls.present, walls.releases
+        )
+        contacts.changes += more
+
+    return press
 
 
-@kernel
+@inlined
 def project_on_rows(rows, nodes, motion, sums):
     """Separate the nodes of :class:`~pfem_petsc.contact.fixed_rows.FixedRows`; return the number of rows with a force,
     and of rows whose force begins or ends with respect to ``rows.closed``."""
@@ -199,7 +210,7 @@ def project_on_rows(rows, nodes, motion, sums):
     return count, changed
 
 
-@kernel
+@inlined
 def sum_rows(rows, pressing):
     """Write the forces on the second nodes of each table to ``rows.totals``, as
     :func:`~pfem_petsc.contact.rows.last_forces` does; ``pressing`` rows have a force."""
@@ -223,14 +234,15 @@ def _free_rates(around, nodes, motion, moved, state):
     return free_v, free_a
 
 
-@kernel
-def stop_at_walls(nodes, motion, walls, moved, state, on_walls):
-    """Return the dissipation of contacts that close [J], and the nodes that are on walls afterwards; ``on_walls``:
-    nodes that have touched walls, and that touch them."""
+@addressed
+def close_on_walls(s, step):
+    """Find the energy that nodes lose which close on walls, and which nodes are on walls."""
+    contacts, nodes, motion, walls, state = s.contacts, s.nodes, s.motion, s.walls, (s.state.v, s.state.a)
+    if len(contacts.met) == 0 and len(contacts.touched) == 0:
+        return
     v, a = state
-    met, touched = on_walls
-    around = join_nodes(met, touched, walls.present)
-    free_v, free_a = _free_rates(around, nodes, motion, moved, state)
+    around = join_nodes(contacts.met, contacts.touched, walls.present)
+    free_v, free_a = _free_rates(around, nodes, motion, (s.moving, step, s.held), state)
     normals, gaps = wall_gaps(around, motion.x.T, walls.level)
     for j in range(len(around)):
         i = around[j]
@@ -240,13 +252,14 @@ def stop_at_walls(nodes, motion, walls, moved, state, on_walls):
     still, rates = np.zeros((gaps.shape[1], 3)), np.zeros((gaps.shape[1], 3))
     for k in range(len(rates) if len(walls.motions) > 0 else 0):
         for c in range(3):
-            rates[k, c] = walls.motions[moved[1] + 1, 1, k, c]
+            rates[k, c] = walls.motions[step + 1, 1, k, c]
     approach = Approach(normals, gaps, free_v, free_a, rates, still)
     counted = np.ones(len(still), dtype=np.bool_)
-    return stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))
+    loss, contacts.met = stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))
+    contacts.impact += loss
 
 
-@kernel
+@inlined
 def stop_at_rows(nodes, motion, rows, changed, moved, state, slack):
     """Return the dissipation [J] of rows that close; ``changed`` rows have a force that begins or ends."""
     v, a = state

@@ -140,14 +140,14 @@ def numerical_dissipation(inertial, internal, stored, excess, lost):
     return inertial + internal - stored - excess - lost
 
 
-@kernel
+@inlined
 def clear_vector(values):
     """Set numbers to zero; assignments to slices take long to compile."""
     for i in range(len(values)):
         values[i] = 0.0
 
 
-@kernel
+@inlined
 def clear_rows(rows):
     """Set the numbers of some rows to zero."""
     for k in range(len(rows)):
@@ -164,7 +164,7 @@ def move(x, h, half):
             where[i] += h * speed[i]
 
 
-@kernel
+@inlined
 def add_springs(springs, x, f, sums):
     """Add the forces of springs to the ground to ``f``, and force and energy to ``sums`` (4,)."""
     clear_vector(sums)
@@ -179,14 +179,14 @@ def add_springs(springs, x, f, sums):
             sums[3] += 0.5 * force * (x[c, i] - springs.anchors[k, c])
 
 
-@kernel
+@inlined
 def place_supports(moving, step, positions):
     """Set the positions that moving components reach one step after a step."""
     for p in range(len(moving.at)):
         positions[moving.at[p]] = moving.origins[p] + moving.motions[step + 2, 0, moving.columns[p]]
 
 
-@kernel
+@inlined
 def _advance(f, inverse, h, half):
     """Solve balances with internal forces alone and advance ``half``; return the power of the forces."""
     rate, eta, power = 1.0 / h, 0.5 / h, 0.0
@@ -197,7 +197,7 @@ def _advance(f, inverse, h, half):
     return power
 
 
-@kernel
+@inlined
 def _advance_kept(f, inverse, h, half, u):
     """The same, and write the increments."""
     rate, eta, power = 1.0 / h, 0.5 / h, 0.0
@@ -208,7 +208,7 @@ def _advance_kept(f, inverse, h, half, u):
     return power
 
 
-@kernel
+@inlined
 def _advance_loaded(f, external, inverse, h, half, u):
     """The same with loads; return the powers of the forces of bars and of the loads, and the sum of these."""
     rate, eta, power, given, total = 1.0 / h, 0.5 / h, 0.0, 0.0, 0.0
@@ -222,7 +222,7 @@ def _advance_loaded(f, external, inverse, h, half, u):
     return power, given, total
 
 
-@kernel
+@inlined
 def _advance_damped(f, damping, inverse, h, half, u):
     """The same with all forces in ``u``, in whose place the increments are written; return the powers of the forces of
     bars and of what dampers take, and the sum of this."""
@@ -237,7 +237,7 @@ def _advance_damped(f, damping, inverse, h, half, u):
     return power, taken, total
 
 
-@kernel
+@inlined
 def _forces(f, external, damping, half, u):
     """Write all forces of a component to ``u``: those of bars, loads (0,) if there are none, and dampers."""
     for i in range(len(u)):
@@ -248,7 +248,7 @@ def _forces(f, external, damping, half, u):
         u[i] -= damping[i] * half[i]
 
 
-@kernel
+@inlined
 def _load(external, h, half, u):
     """Return sum and power of loads."""
     eta, total, power = 0.5 / h, 0.0, 0.0
@@ -258,34 +258,54 @@ def _load(external, h, half, u):
     return total, power
 
 
-@kernel
-def balance(nodes, motion, held, keep, sums):
-    """Solve the balances of all nodes without supports and contact, and begin the sums of the step; increments are
-    written if ``keep``, and always with loads or dampers."""
-    h, f, half, u = motion.h, motion.f, motion.half, motion.u
-    loaded, damped = nodes.external.shape[1] > 0, len(nodes.damping) > 0
-    works, forces = sums.works, sums.forces
-    clear_vector(works)
-    clear_rows(forces)
+@inlined
+def _begin_balance(held, half, sums):
+    """Begin the sums of a step, and keep the velocities of prescribed components."""
+    clear_vector(sums.works)
+    clear_rows(sums.forces)
     for k in range(len(held.nodes)):
         held.half[k] = half[held.components[k], held.nodes[k]]
+
+
+@inlined
+def balance(nodes, motion, held, keep, sums):
+    """Solve the balances of all nodes without supports, contact, loads and dampers, and begin the sums of the step;
+    increments are written if ``keep``."""
+    h, f, half, u = motion.h, motion.f, motion.half, motion.u
+    _begin_balance(held, half, sums)
     for c in range(3):
-        given = 0.0
-        if damped:
-            _forces(f[c], nodes.external[c], nodes.damping, half[c], u[c])
-            power, taken, total = _advance_damped(f[c], nodes.damping, nodes.inverse, h, half[c], u[c])
-            forces[DRAGS, c] -= total
-            works[DAMPING] += h * taken
-            if loaded:
-                forces[LOADS, c], given = _load(nodes.external[c], h, half[c], u[c])
-        elif loaded:
-            power, given, forces[LOADS, c] = _advance_loaded(f[c], nodes.external[c], nodes.inverse, h, half[c], u[c])
-        elif keep:
+        if keep:
             power = _advance_kept(f[c], nodes.inverse, h, half[c], u[c])
         else:
             power = _advance(f[c], nodes.inverse, h, half[c])
-        works[INTERNAL] += h * power
-        works[EXTERNAL] += h * given
+        sums.works[INTERNAL] += h * power
+
+
+@inlined
+def balance_loads(nodes, motion, held, sums):
+    """The same with loads; increments are written."""
+    h, f, half, u, external = motion.h, motion.f, motion.half, motion.u, nodes.external
+    _begin_balance(held, half, sums)
+    for c in range(3):
+        power, given, sums.forces[LOADS, c] = _advance_loaded(f[c], external[c], nodes.inverse, h, half[c], u[c])
+        sums.works[INTERNAL] += h * power
+        sums.works[EXTERNAL] += h * given
+
+
+@inlined
+def balance_dampers(nodes, motion, held, sums):
+    """The same with dampers, and loads if there are any."""
+    h, f, half, u, external = motion.h, motion.f, motion.half, motion.u, nodes.external
+    _begin_balance(held, half, sums)
+    for c in range(3):
+        _forces(f[c], external[c], nodes.damping, half[c], u[c])
+        power, taken, total = _advance_damped(f[c], nodes.damping, nodes.inverse, h, half[c], u[c])
+        sums.forces[DRAGS, c] -= total
+        sums.works[INTERNAL] += h * power
+        sums.works[DAMPING] += h * taken
+        if external.shape[1] > 0:
+            sums.forces[LOADS, c], given = _load(external[c], h, half[c], u[c])
+            sums.works[EXTERNAL] += h * given
 
 
 @inlined
@@ -305,7 +325,7 @@ def displace(c, i, du, nodes, motion, sums):
         sums.forces[DRAGS, c] -= nodes.damping[i] * (v - before)
 
 
-@kernel
+@inlined
 def apply_supports(held, nodes, motion, sums):
     """Give prescribed components their increments, by the velocities that :func:`balance` has kept."""
     h, loaded, damped = motion.h, nodes.external.shape[1] > 0, len(nodes.damping) > 0
@@ -323,7 +343,7 @@ def apply_supports(held, nodes, motion, sums):
         motion.half[c, i] = held.half[k] + held.u[k] / h  # exact at rest
 
 
-@kernel
+@inlined
 def react(held, nodes, motion, sums):
     """Write the reactions of supports, when contact forces are known."""
     for k in range(len(held.nodes)):
@@ -333,7 +353,7 @@ def react(held, nodes, motion, sums):
         sums.forces[SUPPORTS, c] += reaction
 
 
-@kernel
+@inlined
 def work_of_contact(touched, motion, sums):
     """Add the work of contact forces at some nodes."""
     h, power = motion.h, 0.0
@@ -343,7 +363,7 @@ def work_of_contact(touched, motion, sums):
     sums.works[CONTACT] += h * power
 
 
-@kernel
+@inlined
 def restore_increments(nodes, motion, held):
     """Write the increments of a step that has not kept them, which has neither loads nor dampers nor contact."""
     for c in range(3):
@@ -370,7 +390,7 @@ def _scheme_rates(p, moving, held, motion):
     return i, c, motion.half[c, i] - 0.5 / motion.h * held.u[k], held.u[k] / (motion.h * motion.h)
 
 
-@kernel
+@inlined
 def correct_moving(moving, step, held, nodes, motion, sums):
     """Correct the balance of a step for supports that move, and write ``jumps``."""
     h, damped = motion.h, len(nodes.damping) > 0
@@ -394,7 +414,7 @@ def correct_moving(moving, step, held, nodes, motion, sums):
         jumps[1, c] += mass * (speed - (motion.half[c, i] - h * a + 0.5 * h * rate))
 
 
-@kernel
+@inlined
 def correct_moving_ends(moving, step, held, nodes, motion, sums, values):
     """Correct the sums at the end of a step, and the ``values`` (p, 4, 3) of probes, for supports that move."""
     h, x, damped = motion.h, motion.x, len(nodes.damping) > 0
@@ -420,7 +440,7 @@ def correct_moving_ends(moving, step, held, nodes, motion, sums, values):
         values[at, 2, c] = moving.motions[step + 1, 2, moving.columns[p]]
 
 
-@kernel
+@inlined
 def put_rates(moving, step, held, v, a):
     """Set velocities and accelerations (n, 3) of the components that move at the end of a step."""
     for p in range(len(moving.at)):
@@ -429,7 +449,7 @@ def put_rates(moving, step, held, v, a):
         a[i, c] = moving.motions[step + 1, 2, moving.columns[p]]
 
 
-@kernel
+@inlined
 def accumulate(nodes, motion, touched, sums):
     """Write the works over the last half of a step, kinetic energy and momenta; ``touched`` have contact forces."""
     h, ends, momenta, x, half, u = motion.h, sums.ends, sums.momenta, motion.x, motion.half, motion.u
@@ -442,16 +462,27 @@ def accumulate(nodes, motion, touched, sums):
         one, other = (c + 1) % 3, (c + 2) % 3
         turn = x[one], half[one], u[one], x[other], half[other], u[other]
         momenta[1, c], momenta[2, one] = _sum_turn(turn, nodes.mass, h)
-        ends[EXTERNAL] += _sum_left(nodes.external[c], half[c], u[c], h)
-        if len(nodes.damping) > 0:
-            ends[DAMPING] += _sum_drag_left(nodes.damping, half[c], u[c], h)
     for i in touched:
         for c in range(3):
             left = 0.5 * (h * half[c, i] - u[c, i])
             ends[CONTACT] += motion.contact[i, c] * left
 
 
-@kernel
+@inlined
+def accumulate_loads(nodes, motion, sums):
+    """Write the work of loads over the last half of a step."""
+    for c in range(3):
+        sums.ends[EXTERNAL] += _sum_left(nodes.external[c], motion.half[c], motion.u[c], motion.h)
+
+
+@inlined
+def accumulate_drags(nodes, motion, sums):
+    """Write what dampers take over the last half of a step."""
+    for c in range(3):
+        sums.ends[DAMPING] += _sum_drag_left(nodes.damping, motion.half[c], motion.u[c], motion.h)
+
+
+@inlined
 def _sum_component(half, u, f, mass, h):
     """Return sums of a component: work of internal forces over the last half of the step, m u^2, m v^2, and m v."""
     eta = 0.5 / h
@@ -465,7 +496,7 @@ def _sum_component(half, u, f, mass, h):
     return 0.5 * work, square, kinetic, momentum
 
 
-@kernel
+@inlined
 def _sum_turn(components, mass, h):
     """Return sums of two components: angular momentum about the third axis, and mass times the first position."""
     x, half, u, y, rate, w = components
@@ -477,7 +508,7 @@ def _sum_turn(components, mass, h):
     return turned, moment
 
 
-@kernel
+@inlined
 def _sum_left(external, half, u, h):
     """Return the work of loads over the last half of the step, (h half - u)/2."""
     total = 0.0
@@ -486,7 +517,7 @@ def _sum_left(external, half, u, h):
     return total
 
 
-@kernel
+@inlined
 def _sum_drag_left(damping, half, u, h):
     """Return what dampers take over the last half of the step."""
     eta, total = 0.5 / h, 0.0

@@ -19,8 +19,12 @@ from pfem_petsc.stepping.phases import (
     Nodes,
     Prescribed,
     accumulate,
+    accumulate_drags,
+    accumulate_loads,
     apply_supports,
     balance,
+    balance_dampers,
+    balance_loads,
     new_sums,
     react,
     work_of_contact,
@@ -85,7 +89,12 @@ def test_a_balance_with_supports_and_contact_has_the_works_of_its_forces(damped,
     at, components = np.array([1, 1, 4]), np.array([0, 2, 1])
     x, before = here.x.copy(), here.half.copy()
     held = Prescribed(at, components, x[components, at] + 1e-3, *np.zeros((3, 3)), np.zeros((N, 3)))
-    balance(nodes, here, held, keep, sums)
+    if damped:
+        balance_dampers(nodes, here, held, sums)
+    elif loaded:
+        balance_loads(nodes, here, held, sums)
+    else:
+        balance(nodes, here, held, keep, sums)
     apply_supports(held, nodes, here, sums)
     react(held, nodes, here, sums)
     after = here.half
@@ -111,6 +120,10 @@ def test_a_balance_with_supports_and_contact_has_the_works_of_its_forces(damped,
     here.contact[touched] = RNG.normal(size=(2, 3))
     work_of_contact(touched, here, sums)
     accumulate(nodes, here, touched, sums)
+    if damped:
+        accumulate_drags(nodes, here, sums)
+    if loaded:
+        accumulate_loads(nodes, here, sums)
     push, left = here.contact.T, 0.5 * H * before
     np.testing.assert_allclose(sums.works[CONTACT], H * (push * v).sum(), rtol=1e-10)
     ends = sums.ends

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..columns import BAR_ENERGIES, HEAD, PROBED
-from ..contact.fixed_rows import FixedRows, pressed_nodes
+from ..contact.fixed_rows import FixedRows
 from ..mechanics.compiled import addressed, inlined, kernel
 from ..mechanics.elements import first_inverted
 from ..mechanics.internal_forces import BarArrays, internal_forces
@@ -17,13 +17,9 @@ from ..mechanics.loads import LoadSchedule, set_forces
 from ..mechanics.records import record
 from ..mesh.exchange import Messages
 from .contact_phase import (
+    PUSHED,
     ContactNodes,
     WallArrays,
-    place_walls,
-    project_on_rows,
-    stop_at_rows,
-    sum_rows,
-    work_of_walls,
 )
 from .impact import join_nodes
 from .impulses import SUPPORT, WALLS, ContactSums, record_forces
@@ -42,23 +38,13 @@ from .phases import (
     Prescribed,
     StepSums,
     accumulate,
-    accumulate_drags,
-    accumulate_loads,
-    add_springs,
-    apply_supports,
-    balance,
-    balance_dampers,
-    balance_loads,
     clear_vector,
-    correct_moving,
     correct_moving_ends,
     displace,
     move,
     numerical_dissipation,
-    place_supports,
     put_rates,
     rates_of,
-    react,
     restore_increments,
     work_of_contact,
 )
@@ -229,7 +215,7 @@ their state of rupture; the first bar that collapsed, and that went through zero
 failed; the number of nodes near walls, in ContactNodes; and of nodes with contact forces."""
 
 
-_PUSHED, _RUBBED, _IMPACT = map(HEAD.first, ("contact_work", "friction_dissipation", "impact_dissipation"))
+_RUBBED, _IMPACT = map(HEAD.first, ("friction_dissipation", "impact_dissipation"))
 _EXTERNAL_WORK, _DAMPED, _NUMERICAL, _KINETIC = map(
     HEAD.first, ("external_work", "damping_dissipation", "numerical_dissipation", "kinetic_energy")
 )
@@ -311,18 +297,6 @@ def give_state(state, motion):
 
 
 @addressed
-def move_supports(s, step):
-    """Set the positions that moving supports reach."""
-    place_supports(s.moving, step, s.held.positions)
-
-
-@addressed
-def move_walls(s, step):
-    """Set the surfaces of walls that move."""
-    place_walls(step, s.walls)
-
-
-@addressed
 def set_loads(s, step):
     """Set loads and gravity that vary."""
     if len(s.loads.gravity) > 0:
@@ -344,44 +318,6 @@ def evaluate_forces(s, step):
 
 
 @addressed
-def evaluate_springs(s, step):
-    """Add the forces of springs to the ground."""
-    add_springs(s.springs, s.motion.x, s.motion.f, s.sums.springs)
-
-
-@addressed
-def advance(s, step):
-    """Solve the balances of nodes, without loads and dampers."""
-    balance(s.nodes, s.motion, s.held, s.course.keeps, s.sums)
-
-
-@addressed
-def advance_loaded(s, step):
-    """Solve the balances of nodes with loads."""
-    balance_loads(s.nodes, s.motion, s.held, s.sums)
-
-
-@addressed
-def advance_damped(s, step):
-    """Solve the balances of nodes with dampers."""
-    balance_dampers(s.nodes, s.motion, s.held, s.sums)
-
-
-@addressed
-def hold(s, step):
-    """Give prescribed components their increments."""
-    apply_supports(s.held, s.nodes, s.motion, s.sums)
-
-
-@addressed
-def press_rows(s, step):
-    """Separate the nodes of rows of their own."""
-    contacts = s.contacts
-    contacts.rows, contacts.altered = project_on_rows(s.rows, s.nodes, s.motion, s.sums)
-    contacts.others = pressed_nodes(s.rows, contacts.rows)
-
-
-@addressed
 def solve_called(s, step):
     """Have Python solve the rows of a step."""
     called, motion, n = s.called, s.motion, len(s.called.u)
@@ -400,28 +336,11 @@ def solve_called(s, step):
 
 
 @addressed
-def react_to_contact(s, step):
-    """Write the reactions of supports."""
-    react(s.held, s.nodes, s.motion, s.sums)
-
-
-@addressed
 def join_pressing(s, step):
     """Find all nodes with contact forces, and the work of these."""
     contacts = s.contacts
     contacts.pressing = join_nodes(contacts.near, contacts.others, s.walls.present)
     work_of_contact(contacts.pressing, s.motion, s.sums)
-
-
-@addressed
-def close_on_rows(s, step):
-    """Find the energy that rows lose which close."""
-    contacts = s.contacts
-    if contacts.altered > 0:
-        moved, state = (s.moving, step, s.held), (s.state.v, s.state.a)
-        contacts.impact += stop_at_rows(
-            s.nodes, s.motion, s.rows, contacts.altered, moved, state, s.walls.touched.slack
-        )
 
 
 @addressed
@@ -442,24 +361,6 @@ def book_springs(s, step):
     """Add the forces of springs to those of supports."""
     for c in range(3):
         s.sums.forces[SUPPORTS, c] -= s.sums.springs[c]
-
-
-@addressed
-def book_moving(s, step):
-    """Correct the balance for supports that move."""
-    correct_moving(s.moving, step, s.held, s.nodes, s.motion, s.sums)
-
-
-@addressed
-def book_rows(s, step):
-    """Write the forces of tables of rows."""
-    sum_rows(s.rows, s.contacts.rows)
-
-
-@addressed
-def book_walls(s, step):
-    """Add the work of walls that move."""
-    s.ledger[_PUSHED] += work_of_walls(step, s.walls, s.push, s.pressed.force)
 
 
 @addressed
@@ -507,18 +408,6 @@ def sum_ends(s, step):
 
 
 @addressed
-def sum_loads(s, step):
-    """Add the work of loads to the sums at the end of a step."""
-    accumulate_loads(s.nodes, s.motion, s.sums)
-
-
-@addressed
-def sum_drags(s, step):
-    """Add what dampers take to the sums at the end of a step."""
-    accumulate_drags(s.nodes, s.motion, s.sums)
-
-
-@addressed
 def sum_moving(s, step):
     """Correct the sums at the end of a step for supports that move."""
     correct_moving_ends(s.moving, step, s.held, s.nodes, s.motion, s.sums, _probed(s)[1])
@@ -542,7 +431,7 @@ def record_row(s, step):
     row[_EXTERNAL_WORK] = works[EXTERNAL] + ends[EXTERNAL]
     row[_DAMPED] = works[DAMPING] + ends[DAMPING]
     inertial, internal = works[INERTIAL] - ends[INERTIAL], works[INTERNAL] + ends[INTERNAL]
-    excess = works[CONTACT] + ends[CONTACT] - ledger[_PUSHED]
+    excess = works[CONTACT] + ends[CONTACT] - ledger[PUSHED]
     row[_NUMERICAL] = numerical_dissipation(inertial, internal, stored, excess, ledger[_RUBBED] + ledger[_IMPACT])
     for c in range(3):
         row[_SUPPORT + c] = sums.forces[SUPPORTS, c]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
@@ -58,40 +58,50 @@ from .compiled_loop import (
     StateArrays,
     StepArrays,
     StepBars,
-    advance,
-    advance_damped,
-    advance_loaded,
     agree,
-    book_moving,
-    book_rows,
     book_springs,
-    book_walls,
     close_called,
-    close_on_rows,
     evaluate_forces,
-    evaluate_springs,
-    hold,
     join_pressing,
-    move_supports,
-    move_walls,
-    press_rows,
     push_particles,
     put_state,
-    react_to_contact,
     record_row,
     run_compiled,
     send_positions,
     set_loads,
     solve_called,
-    sum_drags,
     sum_ends,
-    sum_loads,
     sum_moving,
     take_positions,
 )
-from .contact_phase import WallArrays, close_on_walls, new_contact_nodes, press_walls
+from .contact_phase import (
+    WallArrays,
+    close_on_rows,
+    close_on_walls,
+    new_contact_nodes,
+    place_walls,
+    press_walls,
+    project_on_rows,
+    sum_rows,
+    work_of_walls,
+)
 from .impact import Touched
-from .phases import GroundSprings, Motion, MovingSupports, Nodes, Prescribed, new_sums
+from .phases import (
+    GroundSprings,
+    Motion,
+    MovingSupports,
+    Nodes,
+    Prescribed,
+    accumulate_drags,
+    accumulate_loads,
+    add_springs,
+    apply_supports,
+    balancing,
+    correct_moving,
+    new_sums,
+    place_supports,
+    react,
+)
 from .stepper import Instants, Solution
 
 if TYPE_CHECKING:
@@ -99,15 +109,6 @@ if TYPE_CHECKING:
 
 
 _BARS, _BROKEN = HEAD.indices(BAR_ENERGIES), HEAD.first("broken_bars")
-
-
-class ContactsAfter(NamedTuple):
-    """What steps leave of :class:`~pfem_petsc.stepping.compiled_loop.Contacts`."""
-
-    touched: np.ndarray
-    met: np.ndarray
-    changes: int
-    friction: float
 
 
 class CompiledSteps:
@@ -207,27 +208,26 @@ class CompiledSteps:
         touch, sent = walls or linked or called, model.contact.moving.any()
         press = press_walls(*kind_of(self._walls.pressed)) if walls else None
         chosen = {
-            BEGIN: ((move_supports, moves), (move_walls, sent), (set_loads, loaded and not model.external.steady)),
+            BEGIN: ((place_supports, moves), (place_walls, sent), (set_loads, loaded and not model.external.steady)),
             SEND: ((send_positions, several),),
             TAKE: ((take_positions, several),),
             FORCES: (
-                *((evaluate_forces, True), (evaluate_springs, springs)),
-                *((advance_damped, damped), (advance_loaded, loaded and not damped)),
-                *((advance, not (loaded or damped)), (hold, held)),
+                *((evaluate_forces, True), (add_springs, springs)),
+                *((balancing(loaded, damped), True), (apply_supports, held)),
             ),
             PRESS: (
-                *((press_rows, linked), (solve_called, called), (press, walls)),
-                *((react_to_contact, held), (join_pressing, touch)),
+                *((project_on_rows, linked), (solve_called, called), (press, walls)),
+                *((react, held), (join_pressing, touch)),
             ),
             IMPACTS: ((close_on_walls, walls), (close_on_rows, linked), (close_called, called)),
             BOOK: (
-                *((book_springs, springs), (book_moving, moves), (book_rows, linked), (push_particles, True)),
-                *((book_walls, sent),),
+                *((book_springs, springs), (correct_moving, moves), (sum_rows, linked), (push_particles, True)),
+                *((work_of_walls, sent),),
             ),
             AGREE: ((agree, several),),
             END: ((put_state, True),),
             RECORD: (
-                *((sum_ends, True), (sum_loads, loaded), (sum_drags, damped), (sum_moving, moves)),
+                *((sum_ends, True), (accumulate_loads, loaded), (accumulate_drags, damped), (sum_moving, moves)),
                 *((record_row, True),),
             ),
         }
@@ -279,12 +279,13 @@ class CompiledSteps:
         flags = np.zeros((count, len(log.releases)), dtype=bool)
         rows = model.links.export_rows(self._stiffness)
         called = self._called.begin(begin, rows.totals)
+        contacts = self._contacts(rows, called)
         ledger.sums[_BROKEN] = stepper.ruptures.count
         half, walls = state.memory["half_velocity"], self._walls
         if model.contact.moving.any():
             walls = walls._replace(motions=self._wall_motions(begin, count))
         arrays = StepArrays(
-            by_reference(self._contacts(rows, called)),
+            by_reference(contacts),
             by_reference(Course(False, False, -1, False, 0, 0, False, 0, 0)),
             self._nodes,
             self._motion,
@@ -314,7 +315,7 @@ class CompiledSteps:
         reference = self._references.of(arrays)
         if self._phases is None:
             self._phases = self._make_phases(types.void(numba.typeof(reference), types.int64), len(rows.force) > 0)
-        contacts = ContactsAfter(*run_compiled(reference, *self._phases, due, flags))
+        contacts = Contacts(*run_compiled(reference, *self._phases, due, flags), *contacts[4:])
         self._called.end()
         made = self._outcome.tolist()
         if made[LOST_BY_MPI]:
@@ -336,7 +337,7 @@ class CompiledSteps:
             time = number * stepper.h
             stepper.instants = Instants(model.first_step + number, model.origin + time, time, shares, noted[steps])
 
-    def _take(self, made: list[int], contacts: ContactsAfter, energies: np.ndarray) -> int:
+    def _take(self, made: list[int], contacts: Contacts, energies: np.ndarray) -> int:
         """Take the state after the last step, with ``energies`` of the bars [J]; return how many steps are sound."""
         stepper, state, model = self.stepper, self.stepper.state, self.model
         model.contact.log.last, self.ledger.impacts.met = contacts.touched, contacts.met

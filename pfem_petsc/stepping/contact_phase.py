@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..columns import HEAD
 from ..contact.explicit import Arrivals, PressedWalls, WallSums, find_penetrating, presses
-from ..contact.fixed_rows import close_rows
+from ..contact.fixed_rows import close_rows, pressed_nodes
 from ..contact.node_walls import compare_contacts
 from ..contact.surfaces import Surfaces, wall_gaps
 from ..mechanics.compiled import addressed, inlined
@@ -17,6 +18,8 @@ from ..mechanics.records import record
 from ..mesh.ordering import NODE_BLOCK
 from .impact import Approach, Touched, join_nodes, stop_nodes, unpressed
 from .phases import clear_rows, displace, put_rates, rates_of
+
+PUSHED = HEAD.first("contact_work")
 
 
 @record
@@ -65,9 +68,10 @@ def new_contact_nodes(n: int, w: int) -> ContactNodes:
     return ContactNodes(nodes, touching, places, failure, np.empty((w, 3)), np.empty(w), force, contacts, moment)
 
 
-@inlined
-def place_walls(step, walls):
+@addressed
+def place_walls(s, step):
     """Set the surfaces that walls reach one step after a step, and those at its end."""
+    walls = s.walls
     pressed, motions, normals = walls.pressed, walls.motions, walls.at_rest.normals
     for surfaces, end in ((walls.level, step + 1), (pressed.surfaces, step + 2)):
         offsets, centres = surfaces.offsets, surfaces.centres
@@ -81,16 +85,16 @@ def place_walls(step, walls):
             pressed.way[k, c] = motions[step + 2, 0, k, c] - motions[step + 1, 0, k, c]
 
 
-@inlined
-def work_of_walls(step, walls, push, force):
-    """Return the work of walls over the way that a step went, with forces (w, 3) at its start and end."""
-    work = 0.0
+@addressed
+def work_of_walls(s, step):
+    """Add the work of walls over the way that a step went, with forces (w, 3) at its start and end."""
+    walls, push, force, work = s.walls, s.push, s.pressed.force, 0.0
     for k in range(len(force)):
         for c in range(3):
             way = walls.motions[step + 1, 0, k, c] - walls.motions[step, 0, k, c]
             work += 0.5 * (push[k, c] + force[k, c]) * way
             push[k, c] = force[k, c]
-    return work
+    s.ledger[PUSHED] += work
 
 
 @inlined
@@ -183,10 +187,11 @@ def press_walls(curved: bool, rough: bool, several: bool) -> Any:
     return press
 
 
-@inlined
-def project_on_rows(rows, nodes, motion, sums):
-    """Separate the nodes of :class:`~pfem_petsc.contact.fixed_rows.FixedRows`; return the number of rows with a force,
-    and of rows whose force begins or ends with respect to ``rows.closed``."""
+@addressed
+def project_on_rows(s, step):
+    """Separate the nodes of :class:`~pfem_petsc.contact.fixed_rows.FixedRows`; find rows with a force, and those whose
+    force begins or ends with respect to ``rows.closed``."""
+    rows, nodes, motion, contacts = s.rows, s.nodes, s.motion, s.contacts
     where, normals, force, h = rows.where, rows.normals, rows.force, motion.h
     count, changed = 0, 0
     for p in range(len(force)):
@@ -206,16 +211,17 @@ def project_on_rows(rows, nodes, motion, sums):
             for c in range(3):
                 part = (force[p] if end == 1 else -force[p]) * normals[p, c]
                 motion.contact[node, c] += part
-                displace(c, node, part * rows.free[end, p, c] / nodes.stiffness[node], nodes, motion, sums)
-    return count, changed
+                displace(c, node, part * rows.free[end, p, c] / nodes.stiffness[node], nodes, motion, s.sums)
+    contacts.rows, contacts.altered, contacts.others = count, changed, pressed_nodes(rows, count)
 
 
-@inlined
-def sum_rows(rows, pressing):
+@addressed
+def sum_rows(s, step):
     """Write the forces on the second nodes of each table to ``rows.totals``, as
-    :func:`~pfem_petsc.contact.rows.last_forces` does; ``pressing`` rows have a force."""
+    :func:`~pfem_petsc.contact.rows.last_forces` does."""
+    rows = s.rows
     clear_rows(rows.totals)
-    for k in range(len(rows.totals) if pressing > 0 else 0):
+    for k in range(len(rows.totals) if s.contacts.rows > 0 else 0):
         for p in range(rows.table_starts[k], rows.table_starts[k + 1]):
             for c in range(3):
                 rows.totals[k, c] += rows.force[p] * rows.normals[p, c]
@@ -237,10 +243,10 @@ def _free_rates(around, nodes, motion, moved, state):
 @addressed
 def close_on_walls(s, step):
     """Find the energy that nodes lose which close on walls, and which nodes are on walls."""
-    contacts, nodes, motion, walls, state = s.contacts, s.nodes, s.motion, s.walls, (s.state.v, s.state.a)
+    contacts, nodes, motion, walls = s.contacts, s.nodes, s.motion, s.walls
     if len(contacts.met) == 0 and len(contacts.touched) == 0:
         return
-    v, a = state
+    v, a = state = s.state.v, s.state.a
     around = join_nodes(contacts.met, contacts.touched, walls.present)
     free_v, free_a = _free_rates(around, nodes, motion, (s.moving, step, s.held), state)
     normals, gaps = wall_gaps(around, motion.x.T, walls.level)
@@ -259,10 +265,13 @@ def close_on_walls(s, step):
     contacts.impact += loss
 
 
-@inlined
-def stop_at_rows(nodes, motion, rows, changed, moved, state, slack):
-    """Return the dissipation [J] of rows that close; ``changed`` rows have a force that begins or ends."""
-    v, a = state
+@addressed
+def close_on_rows(s, step):
+    """Find the energy that rows lose which close."""
+    nodes, motion, rows, changed = s.nodes, s.motion, s.rows, s.contacts.altered
+    if changed == 0:
+        return
+    v, a = state = s.state.v, s.state.a
     at, count = np.empty(changed, dtype=np.int64), 0
     ends = np.empty((2, changed, 10))
     for p in range(len(rows.force)):
@@ -273,7 +282,7 @@ def stop_at_rows(nodes, motion, rows, changed, moved, state, slack):
         around = np.empty(count, dtype=np.int64)
         for m in range(count):
             around[m] = rows.where[end, at[m]]
-        free_v, free_a = _free_rates(around, nodes, motion, moved, state)
+        free_v, free_a = _free_rates(around, nodes, motion, (s.moving, step, s.held), state)
         for m in range(count):
             i = around[m]
             ends[end, m, 9] = nodes.mass[i]
@@ -283,4 +292,5 @@ def stop_at_rows(nodes, motion, rows, changed, moved, state, slack):
                 ends[end, m, c] = motion.x[c, i]
                 ends[end, m, 3 + c] = v[i, c] if fixed else free_v[m, c]
                 ends[end, m, 6 + c] = a[i, c] if fixed else free_a[m, c]
-    return close_rows(rows, at, ends, np.ones(len(rows.force), dtype=np.bool_), slack)
+    counted = np.ones(len(rows.force), dtype=np.bool_)
+    s.contacts.impact += close_rows(rows, at, ends, counted, s.walls.touched.slack)

@@ -9,11 +9,12 @@ half1 - u/(2h) and u/h^2. Supports and contact correct u at some nodes, by :func
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import add_freely, inlined, kernel
+from ..mechanics.compiled import add_freely, addressed, inlined, kernel
 from ..mechanics.records import record
 
 WORKS = ("external", "contact", "damping", "inertial", "internal")
@@ -164,9 +165,10 @@ def move(x, h, half):
             where[i] += h * speed[i]
 
 
-@inlined
-def add_springs(springs, x, f, sums):
-    """Add the forces of springs to the ground to ``f``, and force and energy to ``sums`` (4,)."""
+@addressed
+def add_springs(s, step):
+    """Add the forces of springs to the ground."""
+    springs, x, f, sums = s.springs, s.motion.x, s.motion.f, s.sums.springs
     clear_vector(sums)
     for k in range(len(springs.nodes)):
         i = springs.nodes[k]
@@ -179,11 +181,12 @@ def add_springs(springs, x, f, sums):
             sums[3] += 0.5 * force * (x[c, i] - springs.anchors[k, c])
 
 
-@inlined
-def place_supports(moving, step, positions):
+@addressed
+def place_supports(s, step):
     """Set the positions that moving components reach one step after a step."""
+    moving = s.moving
     for p in range(len(moving.at)):
-        positions[moving.at[p]] = moving.origins[p] + moving.motions[step + 2, 0, moving.columns[p]]
+        s.held.positions[moving.at[p]] = moving.origins[p] + moving.motions[step + 2, 0, moving.columns[p]]
 
 
 @inlined
@@ -258,54 +261,38 @@ def _load(external, h, half, u):
     return total, power
 
 
-@inlined
-def _begin_balance(held, half, sums):
-    """Begin the sums of a step, and keep the velocities of prescribed components."""
-    clear_vector(sums.works)
-    clear_rows(sums.forces)
-    for k in range(len(held.nodes)):
-        held.half[k] = half[held.components[k], held.nodes[k]]
+@cache
+def balancing(loaded: bool, damped: bool) -> Any:
+    """Make the phase that solves the balances of all nodes without supports and contact, and begins the sums of the
+    step; increments are written in steps that need them, and always with loads or dampers."""
 
+    @addressed
+    def balance(s, step):
+        nodes, motion, held, works, forces = s.nodes, s.motion, s.held, s.sums.works, s.sums.forces
+        h, f, half, u, external = motion.h, motion.f, motion.half, motion.u, nodes.external
+        clear_vector(works)
+        clear_rows(forces)
+        for k in range(len(held.nodes)):
+            held.half[k] = half[held.components[k], held.nodes[k]]
+        for c in range(3):
+            given = 0.0
+            if damped:
+                _forces(f[c], external[c], nodes.damping, half[c], u[c])
+                power, taken, total = _advance_damped(f[c], nodes.damping, nodes.inverse, h, half[c], u[c])
+                forces[DRAGS, c] -= total
+                works[DAMPING] += h * taken
+                if loaded:
+                    forces[LOADS, c], given = _load(external[c], h, half[c], u[c])
+            elif loaded:
+                power, given, forces[LOADS, c] = _advance_loaded(f[c], external[c], nodes.inverse, h, half[c], u[c])
+            elif s.course.keeps:
+                power = _advance_kept(f[c], nodes.inverse, h, half[c], u[c])
+            else:
+                power = _advance(f[c], nodes.inverse, h, half[c])
+            works[INTERNAL] += h * power
+            works[EXTERNAL] += h * given
 
-@inlined
-def balance(nodes, motion, held, keep, sums):
-    """Solve the balances of all nodes without supports, contact, loads and dampers, and begin the sums of the step;
-    increments are written if ``keep``."""
-    h, f, half, u = motion.h, motion.f, motion.half, motion.u
-    _begin_balance(held, half, sums)
-    for c in range(3):
-        if keep:
-            power = _advance_kept(f[c], nodes.inverse, h, half[c], u[c])
-        else:
-            power = _advance(f[c], nodes.inverse, h, half[c])
-        sums.works[INTERNAL] += h * power
-
-
-@inlined
-def balance_loads(nodes, motion, held, sums):
-    """The same with loads; increments are written."""
-    h, f, half, u, external = motion.h, motion.f, motion.half, motion.u, nodes.external
-    _begin_balance(held, half, sums)
-    for c in range(3):
-        power, given, sums.forces[LOADS, c] = _advance_loaded(f[c], external[c], nodes.inverse, h, half[c], u[c])
-        sums.works[INTERNAL] += h * power
-        sums.works[EXTERNAL] += h * given
-
-
-@inlined
-def balance_dampers(nodes, motion, held, sums):
-    """The same with dampers, and loads if there are any."""
-    h, f, half, u, external = motion.h, motion.f, motion.half, motion.u, nodes.external
-    _begin_balance(held, half, sums)
-    for c in range(3):
-        _forces(f[c], external[c], nodes.damping, half[c], u[c])
-        power, taken, total = _advance_damped(f[c], nodes.damping, nodes.inverse, h, half[c], u[c])
-        sums.forces[DRAGS, c] -= total
-        sums.works[INTERNAL] += h * power
-        sums.works[DAMPING] += h * taken
-        if external.shape[1] > 0:
-            sums.forces[LOADS, c], given = _load(external[c], h, half[c], u[c])
-            sums.works[EXTERNAL] += h * given
+    return balance
 
 
 @inlined
@@ -325,9 +312,10 @@ def displace(c, i, du, nodes, motion, sums):
         sums.forces[DRAGS, c] -= nodes.damping[i] * (v - before)
 
 
-@inlined
-def apply_supports(held, nodes, motion, sums):
+@addressed
+def apply_supports(s, step):
     """Give prescribed components their increments, by the velocities that :func:`balance` has kept."""
+    held, nodes, motion, sums = s.held, s.nodes, s.motion, s.sums
     h, loaded, damped = motion.h, nodes.external.shape[1] > 0, len(nodes.damping) > 0
     for k in range(len(held.nodes)):
         i, c = held.nodes[k], held.components[k]
@@ -343,9 +331,10 @@ def apply_supports(held, nodes, motion, sums):
         motion.half[c, i] = held.half[k] + held.u[k] / h  # exact at rest
 
 
-@inlined
-def react(held, nodes, motion, sums):
+@addressed
+def react(s, step):
     """Write the reactions of supports, when contact forces are known."""
+    held, nodes, motion, sums = s.held, s.nodes, s.motion, s.sums
     for k in range(len(held.nodes)):
         i, c = held.nodes[k], held.components[k]
         reaction = nodes.stiffness[i] * held.u[k] - held.load[k] - motion.contact[i, c]
@@ -390,9 +379,10 @@ def _scheme_rates(p, moving, held, motion):
     return i, c, motion.half[c, i] - 0.5 / motion.h * held.u[k], held.u[k] / (motion.h * motion.h)
 
 
-@inlined
-def correct_moving(moving, step, held, nodes, motion, sums):
+@addressed
+def correct_moving(s, step):
     """Correct the balance of a step for supports that move, and write ``jumps``."""
+    moving, held, nodes, motion, sums = s.moving, s.held, s.nodes, s.motion, s.sums
     h, damped = motion.h, len(nodes.damping) > 0
     works, forces, jumps = sums.works, sums.forces, sums.jumps
     clear_rows(jumps)
@@ -468,18 +458,20 @@ def accumulate(nodes, motion, touched, sums):
             ends[CONTACT] += motion.contact[i, c] * left
 
 
-@inlined
-def accumulate_loads(nodes, motion, sums):
+@addressed
+def accumulate_loads(s, step):
     """Write the work of loads over the last half of a step."""
+    motion = s.motion
     for c in range(3):
-        sums.ends[EXTERNAL] += _sum_left(nodes.external[c], motion.half[c], motion.u[c], motion.h)
+        s.sums.ends[EXTERNAL] += _sum_left(s.nodes.external[c], motion.half[c], motion.u[c], motion.h)
 
 
-@inlined
-def accumulate_drags(nodes, motion, sums):
+@addressed
+def accumulate_drags(s, step):
     """Write what dampers take over the last half of a step."""
+    motion = s.motion
     for c in range(3):
-        sums.ends[DAMPING] += _sum_drag_left(nodes.damping, motion.half[c], motion.u[c], motion.h)
+        s.sums.ends[DAMPING] += _sum_drag_left(s.nodes.damping, motion.half[c], motion.u[c], motion.h)
 
 
 @inlined

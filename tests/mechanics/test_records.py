@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,9 +23,7 @@ from pfem_petsc.stepping.phases import (
     accumulate_drags,
     accumulate_loads,
     apply_supports,
-    balance,
-    balance_dampers,
-    balance_loads,
+    balancing,
     new_sums,
     react,
     work_of_contact,
@@ -89,14 +88,9 @@ def test_a_balance_with_supports_and_contact_has_the_works_of_its_forces(damped,
     at, components = np.array([1, 1, 4]), np.array([0, 2, 1])
     x, before = here.x.copy(), here.half.copy()
     held = Prescribed(at, components, x[components, at] + 1e-3, *np.zeros((3, 3)), np.zeros((N, 3)))
-    if damped:
-        balance_dampers(nodes, here, held, sums)
-    elif loaded:
-        balance_loads(nodes, here, held, sums)
-    else:
-        balance(nodes, here, held, keep, sums)
-    apply_supports(held, nodes, here, sums)
-    react(held, nodes, here, sums)
+    s = SimpleNamespace(nodes=nodes, motion=here, held=held, sums=sums, course=SimpleNamespace(keeps=keep))
+    for phase in (balancing(loaded, damped), apply_supports, react):
+        getattr(phase, "py_func", phase)(s, 0)
     after = here.half
     v, a = 0.5 * (before + after), (after - before) / H
     force = (external if loaded else 0.0) - here.f - (damping * v if damped else 0.0)
@@ -120,10 +114,8 @@ def test_a_balance_with_supports_and_contact_has_the_works_of_its_forces(damped,
     here.contact[touched] = RNG.normal(size=(2, 3))
     work_of_contact(touched, here, sums)
     accumulate(nodes, here, touched, sums)
-    if damped:
-        accumulate_drags(nodes, here, sums)
-    if loaded:
-        accumulate_loads(nodes, here, sums)
+    for phase in (accumulate_loads, accumulate_drags)[0 if loaded else 1 : 2 if damped else 1]:
+        getattr(phase, "py_func", phase)(s, 0)
     push, left = here.contact.T, 0.5 * H * before
     np.testing.assert_allclose(sums.works[CONTACT], H * (push * v).sum(), rtol=1e-10)
     ends = sums.ends

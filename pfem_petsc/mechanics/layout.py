@@ -107,43 +107,23 @@ def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int
 
     Chunks end after ``chunk`` bars, at ``counted``, and where the lower end passes to another block of nodes.
     """
-    firsts = np.empty(_cut(bars, start, counted, stop, chunk, np.empty(0, dtype=np.uint32)) + 1, dtype=np.uint32)
-    _cut(bars, start, counted, stop, chunk, firsts)
-    firsts[-1] = stop
     low, high = np.sort(bars[start:stop], axis=1).T
-    follows = np.zeros(stop - start, dtype=np.bool_)  # both ends are the nodes after those of the bar before
-    follows[1:] = (np.diff(low) == 1) & (np.diff(high) == 1)
-    at = firsts[:-1].astype(np.int64) - start
-    follows[at] = False
-    sizes = np.diff(firsts.astype(np.int64))
+    begins = np.ones(stop - start, dtype=np.bool_)
+    begins[1:] = np.diff(low // NODE_BLOCK) != 0
+    begins[counted - start :][:1] = True
+    at = np.flatnonzero(begins)
+    since = np.arange(stop - start) - np.repeat(at, np.diff(at, append=stop - start))
+    at = np.flatnonzero(since % chunk == 0)
+    follows, alike = np.zeros((2, stop - start), dtype=np.bool_)
+    follows[1:] = (np.diff(low) == 1) & (np.diff(high) == 1)  # both ends are the nodes after those of the bar before
+    alike[1:] = np.diff(low) == 0
+    follows[at] = alike[at] = False
+    sizes = np.diff(at, append=stop - start)
     diagonal = sizes >= LEAST_RUN * np.add.reduceat(~follows, at, dtype=np.int64) if len(at) else sizes > 0
-    alike = np.zeros(stop - start, dtype=np.bool_)
-    alike[1:] = low[1:] == low[:-1]
-    alike[at] = False
     runs = np.flatnonzero(~np.where(np.repeat(diagonal, sizes), follows, alike))
-    chunks = np.searchsorted(runs, firsts.astype(np.int64) - start)
-    heads, fars, starts, chunks = (
-        values.astype(np.uint32) for values in (low[runs], high[runs], np.append(runs + start, stop), chunks)
-    )
-    chunks_counted = int(np.searchsorted(firsts[:-1], counted))
-    return Sweep(heads, fars, starts, chunks, diagonal, chunks_counted)
-
-
-@kernel
-def _cut(bars, start, counted, stop, chunk, firsts):
-    """Return the number of chunks; write their first bars unless ``firsts`` is empty."""
-    count = 0
-    first = start
-    block = -1
-    for k in range(start, stop):
-        here = min(bars[k, 0], bars[k, 1]) // NODE_BLOCK
-        if k in (start, counted) or here != block or k - first == chunk:
-            if len(firsts) > 0:
-                firsts[count] = k
-            count += 1
-            first = k
-            block = here
-    return count
+    chunks = np.searchsorted(runs, np.append(at, stop - start))
+    numbers = low[runs], high[runs], np.append(runs + start, stop), chunks
+    return Sweep(*(values.astype(np.uint32) for values in numbers), diagonal, int(np.searchsorted(at, counted - start)))
 
 
 NO_BAR = -1.0
@@ -249,10 +229,14 @@ def _make_groups(sweep: Sweep) -> _Groups:
     group_of = np.empty(n, dtype=np.int64)
     count = _group_runs(sweep.heads, sweep.fars, sweep.starts, fresh, star, group_of)
     runs = np.searchsorted(group_of, np.arange(count + 1))
-    heads, fars, starts = (np.empty(count + k, dtype=np.int64) for k in (0, 0, 1))
     stars = star[runs[:-1]]
-    _place_groups(sweep.heads, sweep.fars, sweep.starts, runs, stars, (heads, fars, starts))
-    return _Groups(stars, heads, fars, starts, runs)
+    first, last = runs[:-1], runs[1:] - 1
+    run_heads, run_starts = sweep.heads.astype(np.int64), sweep.starts.astype(np.int64)
+    lead = run_heads[first] % LANES
+    wide = run_heads[last] + run_starts[last + 1] - run_starts[last] - (run_heads[first] - lead)
+    counts = np.where(stars, run_starts[last + 1] - run_starts[first], -(-wide // LANES) * LANES)
+    heads, fars = (np.where(stars, 0, ends[first] - lead) for ends in (run_heads, sweep.fars.astype(np.int64)))
+    return _Groups(stars, heads, fars, np.append(0, np.cumsum(counts)), runs)
 
 
 @kernel
@@ -276,27 +260,6 @@ def _group_runs(heads, fars, starts, fresh, star, group_of):
         bars += count
         group_of[run] = groups - 1
     return groups
-
-
-@kernel
-def _place_groups(run_heads, run_fars, run_starts, runs, stars, places):
-    """Write the ends of the first column of each group, and the first column: ``places``, heads, fars and starts."""
-    heads, fars, starts = places
-    count = np.int64(0)
-    for g in range(len(heads)):
-        first, last = runs[g], runs[g + 1] - 1
-        starts[g] = count
-        if stars[g]:
-            heads[g] = fars[g] = 0
-            count += np.int64(run_starts[last + 1]) - np.int64(run_starts[first])
-            continue
-        lead = np.int64(run_heads[first]) % LANES
-        wide = np.int64(run_heads[last]) + np.int64(run_starts[last + 1]) - np.int64(run_starts[last])
-        wide -= np.int64(run_heads[first]) - lead
-        heads[g] = np.int64(run_heads[first]) - lead
-        fars[g] = np.int64(run_fars[first]) - lead
-        count += -(-wide // LANES) * LANES
-    starts[len(heads)] = count
 
 
 class Group(NamedTuple):

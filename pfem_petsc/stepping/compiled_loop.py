@@ -138,7 +138,7 @@ class Contacts(NamedTuple):
     changes : contacts that have closed or opened since the last row
     friction : energy that friction dissipates in the next step [J]
     near, others, pressing : nodes (m,) with contact forces of walls, of rows, and of both
-    rows, altered : (2,) numbers of rows with a force, and of those whose force begins or ends
+    rows, altered : numbers of rows with a force, and of those whose force begins or ends
     impact : energy that contacts lose in the step [J]
     """
 
@@ -275,32 +275,10 @@ def agree(s, step):
     s.course.holds = every[0] > 0
 
 
-@inlined
-def take_state(state, motion):
-    """Read positions and velocities at half steps by components."""
-    split_components(state.x, motion.x)
-    split_components(state.half, motion.half)
-
-
-@inlined
-def give_state(state, motion):
-    """Write the state at the end of a step, by the scheme alone."""
-    n, h = len(state.half), motion.h
-    join_components(motion.x, state.x)
-    join_components(motion.f, state.f)
-    join_components(motion.half, state.half)
-    join_components(motion.u, state.u)
-    for i in range(n):
-        rates_of(i, motion, state.v, state.a)
-        for c in range(3):
-            state.before[i, c] = state.x[i, c] - (h * state.half[i, c] - state.u[i, c])
-
-
 @addressed
 def set_loads(s, step):
     """Set loads and gravity that vary."""
-    if len(s.loads.gravity) > 0:
-        set_forces(step, s.loads, s.nodes.mass, s.nodes.external.T)
+    set_forces(step, s.loads, s.nodes.mass, s.nodes.external.T)
 
 
 @addressed
@@ -445,11 +423,19 @@ def record_row(s, step):
 
 @addressed
 def put_state(s, step):
-    """Write the state at the end of a step."""
-    if not (s.course.keeps):
-        restore_increments(s.nodes, s.motion, s.held)
-    give_state(s.state, s.motion)
-    put_rates(s.moving, step, s.held, s.state.v, s.state.a)
+    """Write the state at the end of a step: velocities and accelerations by the scheme alone, or of supports."""
+    state, motion, h = s.state, s.motion, s.motion.h
+    if not s.course.keeps:
+        restore_increments(s.nodes, motion, s.held)
+    join_components(motion.x, state.x)
+    join_components(motion.f, state.f)
+    join_components(motion.half, state.half)
+    join_components(motion.u, state.u)
+    for i in range(len(state.half)):
+        rates_of(i, motion, state.v, state.a)
+        for c in range(3):
+            state.before[i, c] = state.x[i, c] - (h * state.half[i, c] - state.u[i, c])
+    put_rates(s.moving, step, s.held, state.v, state.a)
 
 
 @kernel
@@ -468,7 +454,8 @@ def run_compiled(s, phases, starts, due, flags):
     keeps = flags.shape[1] > 0 or linked or calling or len(s.nodes.damping) > 0 or s.nodes.external.shape[1] > 0
     pressed.failure[0] = -1
     turned, done, passed, stops = np.int64(-1), 0, 0, False
-    take_state(s.state, motion)
+    split_components(s.state.x, motion.x)
+    split_components(s.state.half, motion.half)
     for step in range(count):
         if course.failed >= 0 or turned >= 0 or pressed.failure[0] >= 0:
             # the other ranks still need messages, until all know of the failure

@@ -192,12 +192,10 @@ class CompiledSteps:
 
     def _contacts(self, rows: FixedRows, called: CalledRows) -> Contacts:
         """Return the contacts before the first step."""
-        log, ledger = self.model.contact.log, self.ledger
-        held = called.held[: called.counts[0]]
-        others = np.concatenate([held, rows.nodes[rows.force[rows.of] > 0.0]])
-        pressing = np.concatenate([log.last, others])
-        friction = float(ledger.friction_ahead)
-        return Contacts(log.last, ledger.impacts.met, log.changes, friction, log.last, others, pressing, 0, 0, 0.0)
+        log, met, friction = self.model.contact.log, self.ledger.impacts.met, float(self.ledger.friction_ahead)
+        others = np.concatenate([called.held[: called.counts[0]], rows.nodes[rows.force[rows.of] > 0.0]])
+        nodes = log.last, others, np.concatenate([log.last, others])
+        return Contacts(log.last, met, log.changes, friction, *nodes, 0, 0, 0.0)
 
     def _make_phases(self, signature: Any, linked: bool) -> tuple[Any, np.ndarray]:
         """Return the phases of a step that this case needs, and where those of each time begin."""

@@ -138,26 +138,3 @@ def test_nodes_that_have_strayed_do_not_end_the_search(comm, shared_tmp_path):
     )
     with pytest.raises(SimulationFailure, match="not finite|zero length"):
         Simulation(case, comm, output=shared_tmp_path / "it", quiet=True).run()
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_bars_of_a_body_that_turns_and_is_stretched_a_little_are_not_searched_again(seed, comm, monkeypatch):
-    """What the search would find has not changed; it has once a bar has come through another."""
-    chance = np.random.default_rng(seed)
-    points = np.concatenate(
-        [chance.uniform(0.0, 1.0, (40, 3)), [[0.0, 0, 2.0], [1, 0, 2.0], [0, -1, 2.5], [0, 1, 2.5]]]
-    )
-    model = Model(rods(points, np.arange(44).reshape(-1, 2), 1e-3), comm)
-    search, here = CrossingBars(model), model.mesh.node_ids
-    shaken = points + 1e-3 * chance.standard_normal(points.shape)
-    search.find(shaken[here])
-    turn = np.linalg.qr(chance.standard_normal((3, 3)))[0]
-    searched = []
-    monkeypatch.setattr(search, "_search", lambda x: searched.append(x) or CrossingBars._search(search, x))
-    for stretch in (1.0, 1.0 + 1e-6):
-        assert search.find((stretch * shaken @ turn + [3.0, 4.0, 5.0])[here]) == CrossingBars(model).find(shaken[here])
-    assert not searched
-    shaken[40:] = points[40:]
-    shaken[42:] += [0.5, 0.0, -0.5]
-    assert search.find(shaken[here]) == CrossingBars(model).find(shaken[here])
-    assert search.find(shaken[here]).pairs > 0 and len(searched) == 1

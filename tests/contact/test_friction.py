@@ -35,23 +35,6 @@ def block(integrator, friction, *, velocity=0.0, end=0.1, static=None, step=2e-4
     )
 
 
-@pytest.mark.parallel
-@pytest.mark.parametrize("integrator", ["central_differences"])
-@pytest.mark.parametrize("friction", [0.0, 0.1, 0.3])
-def test_sliding_block(integrator, friction, comm, shared_tmp_path):
-    """All nodes slide downhill: the impulse of friction is mu times the pressing one, but for vibrations across."""
-    run = simulation(block(integrator, friction, velocity=0.5), comm, shared_tmp_path)
-    rows = [step.row for step in run]
-    impulse = rows[-1]["wall/floor/impulse"]
-    assert impulse[0] == pytest.approx(-friction * impulse[2], rel=2e-3, abs=1e-12)
-    mass, time = run.model.total_mass, rows[-1]["time"]
-    gained = rows[-1]["momentum"][0] / mass - 0.5
-    # the block rests on the floor on average: its weight is carried but for one bounce
-    assert impulse[2] == pytest.approx(mass * G * np.cos(ANGLE) * time, rel=0.1)
-    assert gained == pytest.approx(G * time * np.sin(ANGLE) - friction * impulse[2] / mass, rel=5e-3)
-    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-10 * rows[-1]["kinetic_energy"]
-
-
 @pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
 def test_sticking_block(integrator, comm, shared_tmp_path):
     """Where tan(angle) < mu the block stays: no node slips on the floor."""
@@ -64,24 +47,6 @@ def test_sticking_block(integrator, comm, shared_tmp_path):
     assert max(comm.allgather(float(slipped))) < 1e-4  # bounces of single nodes
     force = np.mean([row["wall/floor/force"] for row in rows[100:]], axis=0)
     assert force[0] / force[2] == pytest.approx(-np.tan(ANGLE), rel=0.1)
-
-
-def test_static_friction_holds_more(comm, shared_tmp_path):
-    """With mu below and mu_static above tan(angle), a block at rest stays and one that slides goes on."""
-    ratio = {}
-    for name, velocity in (("rest", 0.0), ("sliding", 0.5)):
-        case = block("central_differences", 0.3, static=0.8, velocity=velocity)
-        case["material"]["m"]["damping"] = 1e5  # ends the vibrations of a gravity that acts at once
-        run = simulation(case, comm, shared_tmp_path, name)
-        rows = [step.row for step in run]
-        force = np.sum([row["wall/floor/force"] for row in rows[50:60]], axis=0)
-        ratio[name] = -force[0] / force[2]
-        if name == "rest":
-            assert abs(rows[-1]["momentum"][0]) < 1e-3 * run.model.total_mass
-            assert -rows[-1]["wall/floor/force"][0] / rows[-1]["wall/floor/force"][2] == pytest.approx(
-                np.tan(ANGLE), 1e-3
-            )
-    assert ratio["sliding"] == pytest.approx(0.3, rel=0.01)
 
 
 def test_pulled_by_a_moving_floor(comm, shared_tmp_path):
@@ -107,45 +72,6 @@ def test_refused(comm, shared_tmp_path):
         simulation(block("central_differences", 0.5, static=0.2), comm, shared_tmp_path)
     with pytest.raises(InputError, match='friction needs contact.treatment = "scheme" or "stick"'):
         simulation(block("newmark", 0.5) | {"contact": {"treatment": "conserving"}}, comm, shared_tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("restitution", [0.0, 0.5, 0.8, 1.0])
-def test_bouncing(restitution, comm, shared_tmp_path):
-    """A bar dropped flat from 0.1 m: each bounce reaches e^2 of the height before, at the times of free fall."""
-    height, step = 0.1, 1e-4
-    floor = {
-        "type": "plane",
-        "name": "floor",
-        "point": [0, 0, -height],
-        "normal": [0, 0, 1.0],
-        "restitution": restitution,
-    }
-    case = {
-        "mesh": {"generator": "rod", "length": 0.2, "elements": 2},
-        "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
-        "section": {"s": {"area": 1e-5, "material": "m"}},
-        "gravity": {"acceleration": [0, 0, -G]},
-        "wall": [floor],
-        "time": {"integrator": "central_differences", "step": step, "end": 1.0},
-        "output": {"fields_every": 0},
-    }
-    run = simulation(case, comm, shared_tmp_path)
-    time, z = np.array([(s.row["time"], s.row["centre_of_mass"][2] + height) for s in run]).T
-    fall = np.sqrt(2.0 * height / G)
-    assert z.min() > -1e-12
-    hit = fall
-    for bounce in range(1, 4):
-        if restitution == 0.0 or hit + 2 * restitution**bounce * fall > 1.0:
-            break
-        flight = 2.0 * restitution**bounce * fall
-        inside = (time > hit) & (time < hit + flight)
-        assert z[inside].max() == pytest.approx(restitution ** (2 * bounce) * height, rel=0.02 * bounce)
-        top = time[inside][np.argmax(z[inside])]
-        assert top == pytest.approx(hit + 0.5 * flight, abs=0.01 * fall * bounce)
-        hit += flight
-    if restitution == 0.0:
-        assert z[time > fall + 0.01].max() < 1e-6
 
 
 def guided(integrator, friction, wall, speed=0.0):

@@ -115,19 +115,6 @@ def test_oblique_impact(integrator, comm, shared_tmp_path):
         assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-11
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["newmark", "houbolt"])
-def test_wall_with_mass(integrator, comm, shared_tmp_path):
-    """Momentum of truss and wall together stays, and the wall is dragged along."""
-    walls = planes([[0.3, -0.2, 1.0]], [-0.02], friction=0.4, mass=0.05, name="plate")
-    case = tumbling(walls, integrator, {}, step=5e-4, end=0.03)
-    del case["gravity"]
-    rows, _ = rows_of(case, comm, shared_tmp_path)
-    total = np.array([row["momentum"] + 0.05 * row["wall/plate/velocity"] for row in rows])
-    np.testing.assert_allclose(total, total[:1].repeat(len(rows), axis=0), atol=1e-11 * np.abs(total).max())
-    assert np.abs(np.cross(rows[-1]["wall/plate/velocity"], [0.3, -0.2, 1.0])).max() > 1e-3
-
-
 @pytest.mark.parametrize("friction", [0.2, 0.0])
 def test_wall_out_of_reach_changes_nothing(friction, comm, shared_tmp_path):
     """A plane 100 m above, oblique to the floor, is in no nodal frame: the steps are bitwise the same."""

@@ -98,21 +98,6 @@ def stacked(scheme, mass, folder, comm, floor=False):
     return Simulation(Case.from_dict(data, folder=folder), comm, output=folder / "it", quiet=True)
 
 
-@pytest.mark.parametrize(
-    "scheme, mass",
-    [*((scheme, "lumped") for scheme in SCHEMES), ("central_differences", "consistent"), ("newmark", "consistent")],
-)
-def test_rod_that_lies_on_another_stays_there(scheme, mass, comm, shared_tmp_path):
-    run = stacked(scheme, mass, shared_tmp_path, comm)
-    rows = [step.row for step in run]
-    weight = 0.1 * GRAVITY
-    for row in rows:
-        assert row["pair/p/force"] == pytest.approx([0.0, 0.0, weight], rel=1e-8)
-        assert row["support_force"] == pytest.approx([0.0, 0.0, 2.0 * weight], rel=1e-8)
-        assert row["active_contacts"] == 10
-    assert np.abs(run.state.v).max(initial=0.0) < 1e-12
-
-
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_rods_in_a_pile_stay_there(scheme, comm, shared_tmp_path):
     """The lower one on a floor that stops every node, the upper one on it."""

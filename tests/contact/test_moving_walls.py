@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from helpers.lattices import TRAPEZOID, rows_of
 from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
-from pages import DOCS
 
 from pfem_petsc import Case
 
@@ -86,20 +85,6 @@ def test_impact_seen_from_the_wall(scheme, treatment, restitution, wall, body):
     assert errors.frames < 1e-11
 
 
-def test_page_has_the_whole_scan():
-    """Every scheme and treatment is there, and errors are rounding, or what chatter makes of it."""
-    text = (DOCS / "contact.md").read_text(encoding="utf-8").split(table.START)[1].split(table.END)[0]
-    head, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in text.strip().splitlines())
-    assert head[1:] == [f"`{treatment}`" for treatment in table.TREATMENTS]
-    assert [row[0] for row in rows] == [table.label(*scheme) for scheme in table.SCHEMES]
-    for row in rows:
-        for cell in row[1:]:
-            number, _, errors = cell.partition(": ")
-            if number != "-":
-                work, balance, *others = map(float, errors.split(", "))
-                assert int(number) >= 2 and work < 1e-12 and balance < 1e-11 and max(others) < 1e-8, row
-
-
 @pytest.mark.parametrize(
     ("integrator", "treatment"),
     [("central_differences", "stick"), ("newmark", "stick"), ("houbolt", "stick"), ("energy_momentum", "stick")],
@@ -117,20 +102,6 @@ def test_bar_that_a_plate_carries(integrator, treatment, comm, shared_tmp_path):
         assert row["contact_work"] == pytest.approx(has, rel=0.02, abs=2e-4)
         assert abs(row["energy_imbalance"]) < 1e-14
     assert rows[-1]["contact_work"] > 0.05
-
-
-def test_work_of_a_wall_that_accelerates_in_batches_and_single_steps(comm, shared_tmp_path):
-    """A tied wall out of reach, with which steps are not made in batches, changes nothing."""
-    motion = [[0.0, 0.0, 0.0, 0.0], [0.01, 0.0, 0.0, 2e-3], [0.03, 0.0, 0.0, 1e-2]]
-    case = falling_bar("central_differences", "scheme", gap=0.0, motion=motion, friction=0.2)
-    case["initial"]["velocity"] = [0.4, 0.0, -1.0]
-    rows, _ = rows_of(case, comm, shared_tmp_path)
-    far = {"name": "far", "type": "plane", "point": [0.0, 0.0, -50.0], "normal": [0.0, 0.0, 1.0], "tied": True}
-    case["wall"].append(far)
-    others, _ = rows_of(case, comm, shared_tmp_path, "single")
-    assert rows[-1]["contact_work"] > 0.01
-    for name in ("contact_work", "friction_dissipation", "impact_dissipation", "numerical_dissipation"):
-        np.testing.assert_allclose([row[name] for row in rows], [row[name] for row in others], atol=1e-14)
 
 
 @pytest.mark.slow
@@ -153,16 +124,3 @@ def test_corner_that_moves_on_any_number_of_ranks(integrator, treatment, restitu
     assert np.abs(given).max(axis=(1, 2)).min() > 1e-3
     np.testing.assert_allclose(history["contact_work"], work, atol=1e-12 * np.abs(work).max())
     assert_as_on_one_rank(history, Case.from_dict(case), comm, shared_tmp_path, "contact_work", within=1e-8)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("scheme", "restitution", "told"),
-    [(("hulbert_chung", {"rho_b": 1.0}), 1.0, True), (("newmark", HALF), 0.0, True), (("chung_lee", {}), 0.5, False)],
-)
-def test_gains_are_told_wherever_they_are_seen_from(scheme, restitution, told, comm, shared_tmp_path, capfd):
-    """What contact produces is no matter of the velocity of the wall."""
-    for name, motion in (("moving", table.MOTION), ("seen", np.zeros(3))):
-        case = table.case_of(scheme, "scheme", restitution, "plane", "rod", motion)
-        rows_of(case.to_dict(), comm, shared_tmp_path, name)
-        assert capfd.readouterr().err.count("contact has produced") == told

@@ -5,8 +5,6 @@ import pytest
 from helpers.lattices import planes, rotation, simulation, two_lattices, two_rods
 
 from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.solvers.linear import LinearChoice
-from pfem_petsc.stepping.implicit import ImplicitStepper
 
 
 @pytest.mark.slow
@@ -51,63 +49,6 @@ def test_a_wall_while_pairs_are_apart(linear, comm, shared_tmp_path):
         assert max(row["newton_iterations"] for row in apart) <= 4
         found.append(run.gather(run.state.position))
     np.testing.assert_allclose(found[1], found[0], atol=1e-10)
-
-
-WALLS = {
-    "no walls": [],
-    "floor": planes([[0.0, 0.0, 1.0]], [-0.001]),
-    "oblique wall": planes([[0.1, -0.4, 1.0]], [-0.076]),
-    "wedge": planes([[0.0, 0.3, 1.0], [0.1, 1.0, -0.2]], [-0.002, -0.04]),
-    "wall across": [
-        {"type": "plane", "point": [0.09, 0, 0], "normal": [1.0, 0.1, 0.0], "node_set": "left", "velocity": [2.0, 0, 0]}
-    ],
-}
-
-
-@pytest.mark.parallel
-@pytest.mark.parametrize("crowded", [False, True], ids=["in one pair", "in several pairs"])
-@pytest.mark.parametrize("supported", [False, True], ids=["free", "supported"])
-@pytest.mark.parametrize("name", WALLS)
-def test_explicit_steps_solve_the_variational_inequality(name, supported, crowded, comm, shared_tmp_path):
-    """Also where walls stop the nodes of pairs: two methods that share nothing, one answer."""
-    supports = [{"node_set": "held", "fix": "y"}, {"node_set": "hinged", "fix": "xz"}] if supported else []
-    options = {"solver": {"rtol": 1e-13}, "supports": supports}
-    case = two_lattices(shared_tmp_path / "m.vtu", "central_differences", **options)
-    case["wall"] = WALLS[name]
-    if crowded:
-        case["contact_pair"].append({**case["contact_pair"][0], "name": "across", "direction": [1.0, -0.4, 0.3]})
-    run = simulation(case, comm, shared_tmp_path)
-    explicit, pairs = run.stepper, run.model.links
-    implicit = ImplicitStepper(run.model, explicit.scheme, explicit.h, LinearChoice("preonly", "lu", "test"))
-    implicit.state = run.model.contact.state = explicit.state
-    solve, worst, pressed, met = explicit.solve, [], [], []
-
-    def both(balance):
-        kept = explicit.state.contact
-        other = implicit.solve(balance)
-        forces, supported = pairs.force, explicit.state.support
-        explicit.state.contact = kept
-        solution = solve(balance)
-        scale = np.abs(pairs.force).max(initial=0.0)
-        worst.append(np.abs(solution.u - other.u).max(initial=0.0))
-        if scale:
-            assert np.abs(forces - pairs.force).max() < 1e-8 * scale
-            np.testing.assert_allclose(explicit.state.support, supported, atol=1e-8 * scale)
-        held = np.intersect1d(
-            pairs.two.pressed(pairs.force)[0], solution.walls.nodes[solution.walls.touching.any(axis=1)]
-        )
-        met.append(comm.allreduce(len(held)))
-        # a pair counts where its first node is owned
-        pressed.append(comm.allreduce(int(((pairs.force > 0.0) & (pairs.two.nodes[0] >= 0)).sum())))
-        return solution
-
-    explicit.solve = both
-    run.external_force(lambda time, state: np.zeros_like(run.state.v))  # without batches: each step is solved here
-    assert run.run() == 0
-    implicit.destroy()
-    assert max(pressed) > 8 and max(worst) < 1e-13
-    # nodes in several pairs do not come as far as the oblique wall
-    assert name == "no walls" or (name == "oblique wall" and crowded) or max(met) > 0
 
 
 def test_walls_stop_nodes_beside_pairs(tmp_path):

@@ -1,7 +1,6 @@
 """Models that run one after the other in a process do not affect each other."""
 
 import gc
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,24 +52,6 @@ def test_restrictions_to_inactive_unknowns_are_freed(comm, shared_tmp_path):
     run.stepper.destroy()
     run.stepper.destroy()
     assert restrictions() <= before
-
-
-@pytest.mark.thorough
-@pytest.mark.slow
-@pytest.mark.parametrize("linear, destroyed", [("mumps", True), ("mumps", False), ("gamg", True)])
-def test_one_simulation_after_the_other_takes_no_more_memory(linear, destroyed, comm, shared_tmp_path):
-    def resident():
-        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
-
-    for count in range(16):
-        run = simulation(resting(1, cells=(1, 1, 1), solver={"linear": linear}), comm, shared_tmp_path)
-        for _ in run:
-            pass
-        if destroyed:
-            run.stepper.destroy()
-        if count == 5:
-            before = resident()
-    assert resident() - before < 10 * 1e5  # bytes; what each leaves behind, if nothing is freed, is 2e5 to 4e5
 
 
 def test_consistent_mass_is_inverted_by_a_solver_with_options_and_a_check(comm, shared_tmp_path):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.lattices import lattice_case, planes, simulation, with_mesh_file
+from helpers.lattices import lattice_case, planes, simulation
 from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
 
 from pfem_petsc import Case
@@ -106,33 +106,6 @@ def drop(integrator, **keys):
         gravity=[20.0, 0.0, 30.0],
         solver={"rtol": 1e-13},
     )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee", "newmark", "houbolt"])
-def test_turned(integrator, comm, shared_tmp_path):
-    """The problem turned about is the same one."""
-    turn = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
-    turn *= np.linalg.det(turn)
-    found = {}
-    for name, by in (("as it is", None), ("turned", turn)):
-        case = with_mesh_file(drop(integrator), shared_tmp_path / f"{name}.vtu", by)
-        run = simulation(case, comm, shared_tmp_path, name)
-        rows = [step.row for step in run]
-        found[name] = run.gather(run.state.position), rows[-1], max(-r["wall/glue/force"] @ _normal(by) for r in rows)
-    assert found["turned"][1]["wall/glue/contacts"] >= 2
-    assert found["turned"][2] > 0.0  # it pulls at times
-    if comm.rank == 0:
-        assert np.abs(found["turned"][0] - found["as it is"][0] @ turn.T).max() < 1e-9 * 0.2
-    impulse = found["as it is"][1]["wall/glue/impulse"]
-    np.testing.assert_allclose(
-        found["turned"][1]["wall/glue/impulse"], turn @ impulse, atol=1e-8 * np.abs(impulse).max()
-    )
-
-
-def _normal(turn):
-    normal = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
-    return normal if turn is None else turn @ normal
 
 
 @pytest.mark.slow

@@ -53,9 +53,3 @@ def test_promised_energy(treatment, comm, shared_tmp_path):
     else:
         assert energy[-1] < 0.9
     assert sum(row["active_contacts"] > 0 for row in rows) > 10
-
-
-@pytest.mark.slow
-def test_dissipative_scheme_with_stick(comm, shared_tmp_path):
-    outside, energy, _ = tumble("newmark", "stick", 1000, comm, shared_tmp_path)
-    assert outside < 1e-12 * 0.2 and np.diff(energy).max() <= 0.0

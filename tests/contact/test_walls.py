@@ -102,30 +102,6 @@ def test_ball_stays_on_the_surface(integrator, parameters, comm, shared_tmp_path
     assert most >= 1
 
 
-@pytest.mark.few_sets
-@pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee", "newmark", "houbolt"])
-@pytest.mark.parametrize("kind", ["planes", "sphere", "motion"])
-def test_galilean_equivalence(kind, integrator, comm, shared_tmp_path):
-    """Moving walls and a resting truss are the same as resting walls and a moving truss, to 1e-10."""
-    speed = np.array([1.0, -0.5, -4.0])
-    walls = planes([[0.2, 0.1, 1.0], [1.0, 0.0, 0.4]], [-0.02, -0.015])
-    if kind == "sphere":
-        walls = [{"type": "sphere", "point": [0.1, 0.05, -0.32], "radius": 0.31, "name": "w"}]
-    moving = [dict(wall, velocity=(-speed).tolist()) for wall in walls]
-    if kind == "motion":
-        moving = [dict(wall, motion=[[0.0, 0, 0, 0], [0.1, *(-0.1 * speed)]], interpolation="linear") for wall in walls]
-    common = {"integrator": integrator, "step": 2e-4, "end": 0.02, "solver": {"rtol": 1e-13}}
-    rows, x, run = run_of(lattice_case(walls, velocity=speed.tolist(), **common), comm, shared_tmp_path, "a")
-    others, y, _ = run_of(lattice_case(moving, **common), comm, shared_tmp_path, "b")
-    assert [row["active_contacts"] for row in rows] == [row["active_contacts"] for row in others]
-    assert max(row["active_contacts"] for row in rows) >= 1
-    name = run.model.contact.names[0]
-    assert others[-1][f"wall/{name}/position"] == pytest.approx(np.array(moving[0]["point"]) - 0.02 * speed)
-    if comm.rank == 0:
-        assert np.abs(x - 0.02 * speed - y).max() < 1e-10 * 0.2
-
-
 @pytest.mark.parallel
 def test_adjust_moves_nodes_onto_the_wall(comm, shared_tmp_path):
     """Nodes that start beyond the wall start on it, and their bars without stress."""

@@ -15,7 +15,6 @@ from pfem_petsc.mechanics.chunk_laws import (
     STRESS,
     TEMPERATURE,
     densities_row,
-    evaluate,
     flatten,
     law_loops,
     work_rows,
@@ -103,11 +102,3 @@ def test_mean_stresses_times_strains_are_the_work(bars):
     gained = (last[densities] - first[densities]).sum(axis=0)[:CHUNK]
     done = (mean[STRESS] * (work[STRAIN] - start[STRAIN]))[:CHUNK]
     np.testing.assert_allclose(done, gained, rtol=1e-9, atol=1e-9 * np.abs(gained).max())
-
-
-def test_any_number_of_bars_is_evaluated():
-    law, numbers = LAWS["breakable"]
-    strain = np.linspace(-3e-3, 3e-3, 2 * CHUNK + 5)
-    found = evaluate(law, numbers, strain, 0.0, np.zeros((len(law.rows), len(strain))))
-    some = evaluate(law, numbers, strain[::100].copy(), 0.0, np.zeros((len(law.rows), len(strain[::100]))))
-    np.testing.assert_array_equal(found[:, ::100], some)

@@ -5,9 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
-from types import FunctionType
 from uuid import uuid4
 
 import numpy as np
@@ -17,7 +15,6 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.mechanics import compiled
 from pfem_petsc.mechanics.chunk_laws import law_loops
 from pfem_petsc.mechanics.compiled import Compilation, count_compiled, kernel
-from pfem_petsc.mechanics.materials import elastic, elastoplastic
 from pfem_petsc.mechanics.materials.base import LAWS, damped, softened
 from pfem_petsc.mechanics.rupture import breakable
 from pfem_petsc.registry import choices, lookup
@@ -88,40 +85,6 @@ def test_compiling_is_counted_and_loading_is_not(module):
     assert count_compiled() == before + 3
 
 
-def test_machine_code_from_disk_finds_what_it_refers_to(tmp_path):
-    """Hashes of texts need a number of the process, a system of equations LAPACK, a random number its generator."""
-    (tmp_path / "loops_of_others.py").write_text(
-        "import numpy as np\n"
-        "from pfem_petsc.mechanics.compiled import kernel\n"
-        "@kernel\n"
-        "def of_text(text):\n"
-        "    return hash(text)\n"
-        "@kernel\n"
-        "def solved(a, b):\n"
-        "    np.random.seed(1)\n"
-        "    return np.linalg.solve(a, b) + 0.0 * np.sort(np.random.rand(2))\n"
-        "@kernel\n"
-        "def refused(x):\n"
-        "    if x > 1.0:\n"
-        "        raise ValueError('too large')\n"
-        "    print('value', x)\n"
-    )
-    program = (
-        "import numpy as np\n"
-        "from loops_of_others import of_text, solved, refused\n"
-        "assert of_text('a long text') == hash('a long text')\n"
-        "print(solved(2.0 * np.eye(2), np.ones(2)))\n"
-        "refused(0.5)\n"
-        "try:\n"
-        "    refused(2.0)\n"
-        "except ValueError as error:\n"
-        "    print(error)\n"
-    )
-    for _ in range(2):  # compiled, then loaded
-        said, _ = run_python(program, folder=tmp_path)
-        assert " ".join(said) == "[0.5 0.5] value 0.5 too large"
-
-
 def test_short_compilations_are_not_reported():
     """They count together; a long one is told with the time of all so far, at intervals that grow up to a limit."""
     told, took = [], []
@@ -132,35 +95,6 @@ def test_short_compilations_are_not_reported():
     times = [2.0, 4.0, 8.0, 16.0, 31.0, 46.0, 61.0]
     assert told == [("second", time) for time in times]
     assert sum(took) == 62.0
-
-
-def test_a_loop_is_told_while_it_is_compiled(monkeypatch):
-    """One whose compilation has failed is not told as one that lasts."""
-    monkeypatch.setattr(compiled, "LOOK_EVERY", 0.005)
-
-    def compiled_for_a_while():
-        @kernel
-        def many(x):
-            return np.linalg.solve(np.eye(3), np.full(3, x)).sum() + np.sort(np.full(3, x))[0]
-
-        return many(1.0)
-
-    @kernel
-    def refused(x):
-        return x.no_such_attribute
-
-    told, took = [], []
-    monkeypatch.setattr(compiled, "_FOLDER", None)
-    with Compilation(lambda *what: told.append(what), took.append):
-        assert compiled_for_a_while() == pytest.approx(4.0)
-    assert {name for name, _ in told} == {"many"} and 0.0 < told[0][1] < 60.0
-    assert 0.0 < sum(took) < 60.0
-    with pytest.raises(Exception, match="no_such_attribute"):
-        refused(1.0)
-    told.clear()
-    with Compilation(lambda *what: told.append(what), took.append):
-        time.sleep(0.1)
-    assert told == []
 
 
 @pytest.mark.parametrize("patience", [0.0, 600.0])
@@ -282,57 +216,3 @@ def test_loops_of_all_laws_have_names_of_their_own():
         for variant in (law, damped(law), *((softened(law),) if law.softening is not None else ())):
             names += [loop.py_func.__qualname__ for one in (variant, breakable(variant)) for loop in loops_of(one)]
     assert len(names) > 100 and len(set(names)) == len(names)
-
-
-@pytest.mark.slow
-def test_every_process_finds_the_machine_code_of_another():
-    """Names and keys do not depend on the order of sets, nor on whether byte code is read or made."""
-    program = OF_ONE_LAW + "from pfem_petsc.mechanics.compiled import count_compiled\nprint(count_compiled())"
-    run_python(program, "elastic", "elastoplastic")
-    for seed in ("1", "2", "3"):
-        for prefix in ("", "/nonexistent"):
-            said, _ = run_python(
-                program,
-                "elastic",
-                "elastoplastic",
-                PYTHONHASHSEED=seed,
-                PYTHONPYCACHEPREFIX=prefix,
-            )
-            assert said[-1] == "0"
-
-
-@pytest.mark.slow
-def test_machine_code_of_two_processes_does_not_mix_laws(tmp_path):
-    """Each law is compiled by a process of its own, then a third one loads both."""
-
-    def run(*laws):
-        return [float(word) for word in run_python(OF_ONE_LAW, *laws, NUMBA_CACHE_DIR=str(tmp_path))[0]]
-
-    assert run("elastic") == [pytest.approx(0.25)]
-    # yields at 0.25, then 0.5 along the rest of the strain
-    assert run("elastoplastic") == [pytest.approx(0.0625 + 0.125)]
-    assert run("elastic", "elastoplastic") == [pytest.approx(0.25), pytest.approx(0.1875)]
-    assert run("elastoplastic", "elastic") == [pytest.approx(0.1875), pytest.approx(0.25)]
-
-
-def closures(function, found):
-    """Collect a function and all functions in its closure."""
-    function = getattr(function, "py_func", function)
-    if isinstance(function, FunctionType) and function not in found:
-        found.add(function)
-        for cell in function.__closure__ or ():
-            closures(cell.cell_contents, found)
-
-
-def test_closures_of_one_name_have_the_same_cells():
-    """Machine code of several processes is told apart by names of functions."""
-    found = set()
-    for law in (elastic.LAW, elastoplastic.LAW, softened(elastic.LAW), softened(elastoplastic.LAW)):
-        for loop in loops_of(law):
-            closures(loop, found)
-    known = {}
-    for function in found:
-        cells = [getattr(cell.cell_contents, "__qualname__", cell.cell_contents) for cell in function.__closure__ or ()]
-        name = function.__module__, function.__qualname__
-        assert known.setdefault(name, (cells, function.__code__)) == (cells, function.__code__), name
-    assert len(known) > 50

@@ -86,19 +86,6 @@ def test_energy_momentum_loses_nothing_but_plastic_work(law, measure, comm, shar
     assert (np.diff(history["plastic_heat"]) > -1e-9).all()
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("law", ["johnson_cook", "multilinear", "voce"])
-def test_laws_in_batches(law, tmp_path):
-    """Many steps in one call are the single steps to the last bit."""
-    case, found = Case.from_dict(one_bar(law, "central_differences", elements=3)), []
-    case.output.history_every = 7
-    for together in (False, True):
-        with Simulation(case, output=tmp_path / str(together), quiet=True) as simulation:
-            count = len(list(simulation.batches() if together else simulation))
-            found.append((count, simulation.state.x.tobytes(), simulation.model.bars.history().tobytes()))
-    assert found[0][0] == STEPS and found[0] == (STEPS, *found[1][1:]) and found[1][0] < STEPS
-
-
 @pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize(

@@ -26,17 +26,6 @@ def test_softened_elastic_bar_keeps_its_energy_while_heated(comm, shared_tmp_pat
 
 
 @pytest.mark.slow
-def test_heated_bar_with_a_rate_keeps_its_balance(tmp_path):
-    """While it flows and expands by heat, in the scheme that conserves energy."""
-    case = one_bar("perzyna", "energy_momentum", steps=60, elements=2, thermal_expansion=1.2e-5)
-    case["temperature"] = [{"table": [[0.0, 0.0], [6e-4, 400.0]]}]
-    history = run(Case.from_dict(case), tmp_path / "out")
-    start = history["kinetic_energy"][0]
-    assert history["plastic_heat"][-1] > 0.3 * start and abs(history["thermal_work"]).max() > 1e-2 * start
-    assert abs(history["numerical_dissipation"]).max() < 1e-11 * start
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("law, keys", [("elastic", {"softening": SOFTENING}), ("perzyna", {}), ("voce", {})])
 def test_halved_steps_keep_the_balance_of_heat(law, keys, comm, tmp_path):
     """Whole steps are refused: temperatures, also those of the failed solve, are taken at the ends of the halves."""
@@ -68,17 +57,3 @@ def test_restrained_bar_that_softens(tmp_path):
         stress = -0.75 * YOUNG * 1.2e-5 * 250.0
         stress = max(stress, -0.55 * 250e6) if keys else stress
         assert history["probe/tip/reaction"][-1, 0, 0] == pytest.approx(stress * AREA, rel=1e-9)
-
-
-@pytest.mark.thorough
-def test_thermal_work_of_laws_that_yield_while_heated(tmp_path):
-    """What is no heat, energy of the bars or thermal work vanishes with the square of the step."""
-    left = []
-    for parts in (1, 2, 4):
-        case = one_bar("voce", "newmark", steps=60 * parts, softening=SOFTENING, thermal_expansion=1.2e-5)
-        case["temperature"] = [{"table": [[0.0, 0.0], [6e-4, 300.0]]}]
-        case["time"] |= {"step": STEP / parts}
-        case["time"]["end"] = 6e-4
-        history = run(Case.from_dict(case), tmp_path / str(parts))
-        left.append(abs(history["numerical_dissipation"][-1]) / history["kinetic_energy"][0])
-    assert left[2] < 1e-3 and left[2] < 0.6 * left[0]

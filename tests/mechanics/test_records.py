@@ -1,14 +1,10 @@
 """Records of arrays that compiled loops take by reference, and the phases of a step beside formulas."""
 
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from pfem_petsc.mechanics.compiled import COMPILED, kernel
-from pfem_petsc.mechanics.records import References, by_reference
 from pfem_petsc.stepping.phases import (
     CONTACT,
     DAMPING,
@@ -33,46 +29,8 @@ RNG = np.random.default_rng(5)
 N, H = 7, 1e-2
 
 
-@kernel
-def scale(motion, factor):
-    total = 0.0
-    for c in range(3):
-        for i in range(motion.half.shape[1]):
-            motion.half[c, i] *= factor
-            total += motion.half[c, i]
-    return total
-
-
 def motion():
     return Motion(H, *RNG.normal(size=(4, 3, N)), np.zeros((N, 3)))
-
-
-def test_a_record_has_the_arrays_of_its_tuple():
-    given = motion()
-    sums = 2.0 * given.half.sum()
-    assert scale(by_reference(given), 2.0) == pytest.approx(sums)
-    assert scale(given, 1.0) == pytest.approx(sums) and given.half.sum() == pytest.approx(sums)
-
-
-@pytest.mark.skipif(not COMPILED, reason="tuples are passed as they are")
-def test_records_are_kept_as_long_as_their_fields_are_the_same():
-    given, references = motion(), References()
-    one = references.of(given)
-    assert references.of(Motion(*given)) is one and references.of(given._replace(u=given.u.copy())) is not one
-
-
-def test_a_second_process_compiles_no_record():
-    program = (
-        "import numpy as np\n"
-        "from pfem_petsc.mechanics.compiled import count_compiled\n"
-        "from pfem_petsc.mechanics.records import by_reference\n"
-        "from pfem_petsc.stepping.phases import Motion, move\n"
-        "made = by_reference(Motion(0.1, *np.ones((4, 3, 2)), np.zeros((2, 3))))\n"
-        "move(np.ones((3, 2)), 0.1, np.ones((3, 2)))\n"
-        "print(count_compiled())"
-    )
-    found = [subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True) for _ in "ab"]
-    assert found[1].stdout.strip() == "0"
 
 
 @pytest.mark.parametrize("damped", [False, True])

@@ -130,23 +130,6 @@ def test_free_octet_block(solver, mass, shared_tmp_path, comm):
     assert moved == pytest.approx(np.broadcast_to(np.eye(3)[:, None], moved.shape), abs=1e-8)
 
 
-def test_shapes_do_not_depend_on_solver_and_ranks(shared_tmp_path, comm):
-    """All the same, although the block has pairs of equal frequencies: dense matrices on one rank are the reference."""
-    from mpi4py import MPI
-
-    case = block("dense", count=12)
-    reference = None
-    if comm.rank == 0:
-        reference = modes_of(case, shared_tmp_path / "alone", MPI.COMM_SELF)
-    frequency, _, shape, _ = comm.bcast(reference)
-    for solver in SOLVERS:
-        if importlib.util.find_spec({"slepc": "slepc4py"}.get(solver, solver)) is None and solver != "dense":
-            continue
-        found = modes_of(block(solver, count=12), shared_tmp_path / solver, comm)
-        assert found[0] == pytest.approx(frequency, rel=1e-8)
-        assert found[2] == pytest.approx(shape, abs=1e-8 * np.abs(shape).max())
-
-
 def test_state_under_load(shared_tmp_path, comm):
     """Pressed to half its limit load, the arch has the stiffness of its path there."""
     case = arch_of(shared_tmp_path, comm, press(0.5), modes={"count": 1})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import configparser
 import os
 import re
 import shlex
@@ -109,20 +108,6 @@ def test_set_up_compiles_what_the_first_commands_need():
         _parse(shlex.split(command))
 
 
-@pytest.mark.parametrize(("limit", "kept"), [("numpy<2", True), ("numpy", False)])
-def test_later_installs_keep_numpy(tmp_path, limit, kept):
-    """The environment has a pip.conf that pip reads, where the bindings need an old NumPy; else none is left."""
-    text = (ROOT / "scripts" / "setup.sh").read_text()
-    (function,) = re.findall(r"^limit_numpy\(\) \{\n.*?^\}\n", text, re.MULTILINE | re.DOTALL)
-    (tmp_path / "pip.conf").write_text("old")
-    subprocess.run(["bash", "-euc", f'venv="{tmp_path}"\n{function}\nlimit_numpy "{limit}"'], check=True)
-    assert (tmp_path / "pip.conf").exists() == kept
-    if kept:
-        conf = configparser.ConfigParser()
-        conf.read(tmp_path / "pip.conf")
-        assert Path(conf["install"]["constraint"]).read_text() == "numpy<2\n"
-
-
 @pytest.mark.parametrize("linked", [False, True])
 def test_an_environment_of_another_checkout_is_left_alone(tmp_path, linked):
     """Also where this checkout has a link to it."""
@@ -183,28 +168,6 @@ def test_a_set_up_that_ends_early_names_the_environment(tmp_path, status, signal
     lines = ["setup: stopped by SIGTERM"] if signal else []
     lines += ["setup: the environment .venv is not finished: the same command goes on from there"] if status else []
     assert done.stderr.splitlines() == lines
-
-
-@pytest.mark.parametrize(
-    ("works", "made", "asked"),
-    [(0, True, []), (1, True, [""]), (2, True, ["", "--clear"]), (1, False, [""]), (2, False, [""])],
-)
-def test_a_half_made_environment_is_completed(tmp_path, works, made, asked):
-    """Pip works after ``works`` attempts; an environment that is not of this script is never cleared."""
-    venv = tmp_path / "venv"
-    venv.mkdir()
-    if made:
-        (venv / "made-from").write_text("here")
-    code = f'''root="{tmp_path}" venv="{venv}" python=true left={works}
-say() {{ :; }}
-foundation() {{ echo here; }}
-usable() {{ [[ $left == 0 ]]; }}
-run_venv() {{ echo "asked [$1]"; left=$((left - 1)); }}
-make_venv python3'''
-    done = of_setup("fail", "make_venv", code=code)
-    assert done.stdout.split("\n")[:-1] == [f"asked [{word}]" for word in asked]
-    assert done.returncode == (not made and works == 2)
-    assert (venv / "made-from").exists() == (done.returncode == 0)
 
 
 def test_scripts_are_valid_shell():

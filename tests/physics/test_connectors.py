@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from helpers.runs import run
 from helpers.small_models import case_of
-from helpers.stopped import assert_restart_is_bitwise
 
 from pfem_petsc import Case, Simulation, open_result, write_mesh
 from pfem_petsc.errors import InputError
@@ -168,22 +167,6 @@ def test_stable_step_counts_them(scheme, comm, shared_tmp_path):
         assert simulation.run() == 0
         kinetic = simulation.row["kinetic_energy"] if comm.rank == 0 else 0.0
         assert np.isfinite(kinetic) and kinetic < 1.1 * 2 * 0.5 * MASS * 0.2**2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["central_differences", "energy_momentum"])
-def test_stages_and_restart_are_bitwise(scheme, comm, tmp_path):
-    both = SPRING | {"dashpot": [{"between": ["one", "two"], "coefficient": C}]}
-    time = {"time": {"integrator": scheme, "step": 1e-4, "end": 2e-3}}
-    stage = [{"name": "rest", **time}, {"name": "pull", "load": [{"node_set": "far", "force": [9, 0, 1]}], **time}]
-    output = {"fields_every": 5, "probe": [{"name": n, "node_set": n} for n in ("a", "b")]}
-    case = two_bars(tmp_path, comm, both, stage=stage, output=output)
-    assert Case.from_dict(case.to_dict(), folder=tmp_path) == case
-    whole = assert_restart_is_bitwise(case, comm, tmp_path, 30)
-    # bars of the mesh, a spring, and a dashpot from the nearest of the first set to each node of the second
-    result = open_result(tmp_path / "whole")
-    assert result.mesh(0).n_cells == 2 + 1 + 2
-    assert result.field("axial_force", -1)[2] == pytest.approx(K * (gap(whole)[-1] - 1.0), rel=1e-2)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from helpers.runs import run
-from helpers.stopped import assert_restart_is_bitwise
 from mpi4py import MPI
 
 from pfem_petsc import Case
@@ -45,22 +44,6 @@ def test_decay(scheme, mass, tmp_path):
     np.testing.assert_allclose(history["damping_dissipation"], kinetic[0] - kinetic, atol=0.02 * kinetic[0])
     np.testing.assert_allclose(momentum - momentum[0], history["damping_impulse"], atol=1e-11)
     assert np.abs(history["energy_imbalance"]).max() < 1e-11 * kinetic[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-@pytest.mark.parametrize("scheme", ["central_differences", "wilson"])
-def test_restart_and_factor_one(scheme, comm, shared_tmp_path):
-    """Bitwise over a restart; a constant factor of one makes the motion without the table."""
-    held = {"support": [{"node_set": "start", "fix": "xyz"}], "gravity": {"acceleration": [0.0, 0.0, -9.81]}}
-    it = case(scheme, **held)
-    assert_restart_is_bitwise(it, comm, shared_tmp_path, 90)
-    one = run(case(scheme, table=((0.0, 1.0),), **held), shared_tmp_path / "one", comm)
-    data = it.to_dict()
-    del data["time"]["damping_table"]
-    none = run(Case.from_dict(data), shared_tmp_path / "none", comm)
-    for name in ("probe/end/position", "damping_dissipation", "energy_imbalance"):
-        np.testing.assert_allclose(one[name], none[name], rtol=1e-9, atol=1e-12)
 
 
 def test_refusals():

@@ -176,10 +176,3 @@ def test_reports_before_a_run(comm, shared_tmp_path):
     assert found[0][:4] == found[1][:4]
     np.testing.assert_allclose(found[0][4], found[1][4], rtol=1e-3)
     assert "17 free directions, 0 rigid motions" in found[0][0]
-
-
-@pytest.mark.parametrize("integrator", ["central_differences", "hulbert_chung", "houbolt", "generalized_alpha"])
-def test_restart_is_bitwise(integrator, comm, shared_tmp_path):
-    removal = [{"supports": "roller", "time": 1e-3, "duration": 1e-3}]
-    case = tower(shared_tmp_path, comm, True, **in_time(integrator, end=3e-3), remove=removal)
-    assert_restart_is_bitwise(case, comm, shared_tmp_path, 15)

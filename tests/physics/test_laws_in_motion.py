@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.kills import differences
 from helpers.runs import run
-from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
+from helpers.stopped import assert_restart_is_bitwise
 
-from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc import Case
 
 YOUNG = 1e7
 MATERIALS = {
@@ -95,21 +94,6 @@ def test_tower_of_all_laws(scheme, tower, comm, shared_tmp_path):
     assert history["damage_dissipation"][-1] == pytest.approx(reference["damage_dissipation"][-1], rel=0.1)
 
 
-@pytest.mark.slow
-@pytest.mark.parallel
-def test_ranks_agree(tower, comm, shared_tmp_path):
-    fields = ["stress", "status", "hinge_rotation", "damage"]
-    case = tower("chung_lee", output={"fields_every": 50, "fields": fields})
-    together = run(case, shared_tmp_path / "together", comm)
-    assert_as_on_one_rank(together, case, comm, shared_tmp_path, "slack_bars", "elastic_energy", "damage_dissipation")
-    if comm.rank == 0:
-        results = [open_result(shared_tmp_path / name) for name in ("alone", "together")]
-        for name in fields:
-            one, other = (result.field(name, -1) for result in results)
-            assert other == pytest.approx(one, rel=1e-8, abs=1e-8 * np.abs(one).max())
-            assert np.abs(one).max() > 0.0, name
-
-
 def row_of_bars(law, strain, velocity, steps=200, integrator="central_differences", elements=1):
     time = {"integrator": integrator, "step": 1e-3, "end": 1e-3 * steps, **PARAMETERS.get(integrator, {})}
     return Case.from_dict(
@@ -130,22 +114,6 @@ def row_of_bars(law, strain, velocity, steps=200, integrator="central_difference
 
 THROWN = {("cable", "engineering"): 3.0, ("strut", "green"): -3.0, ("damage", "logarithmic"): 3.0}
 THROWN |= {("compaction", "engineering"): -4.0}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("law", "strain"), THROWN)
-def test_batches_are_single_steps(law, strain, tmp_path):
-    found = []
-    for together in (False, True):
-        case = row_of_bars(law, strain, THROWN[law, strain])
-        with Simulation(case, output=tmp_path / str(together), quiet=True) as simulation:
-            for _ in simulation.batches() if together else simulation:
-                pass
-            assert simulation.state.step == 200
-            found.append((simulation.state.x.copy(), simulation.model.bars.history()))
-    assert np.array_equal(found[0][0], found[1][0]) and np.array_equal(found[0][1], found[1][1])
-    assert np.abs(found[0][1]).max() > 1e-3
-    assert differences(*(tmp_path / str(name) / "result.vtkhdf" for name in (False, True))) == {}
 
 
 @pytest.mark.slow

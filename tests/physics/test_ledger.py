@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.lattices import two_lattices
 from helpers.runs import GRAVITY, SCHEMES, case, floor, run, unexplained
 
-from pfem_petsc import Case
 from pfem_petsc.columns import LOST, STORED, SUPPLIED
 
 
@@ -43,26 +41,6 @@ def test_nothing_is_lost_before_the_first_row(integrator, shared_tmp_path):
     assert history["kinetic_energy"][0] == pytest.approx(2.0, rel=1e-14)
     assert history["impact_dissipation"][:2] == pytest.approx([0.0, 2.0], rel=1e-14)
     assert unexplained(history) < 1e-12
-
-
-@pytest.mark.parametrize("integrator", SCHEMES)
-def test_friction_takes_the_energy_of_sliding(integrator, shared_tmp_path):
-    """A rod that slides on a rough floor until it stands: friction has its kinetic energy, and impact nothing."""
-    history = run(
-        case(
-            integrator,
-            step=1e-3,
-            steps=40,
-            walls=[floor(friction=0.5)],
-            gravity={"acceleration": [0.0, 0.0, -GRAVITY]},
-            initial={"velocity": [0.0, 0.1, 0.0]},
-        ),
-        shared_tmp_path,
-    )
-    assert history["friction_dissipation"][-1] == pytest.approx(0.5 * 0.1**2, rel=0.06)  # the drag of whole steps
-    assert (np.diff(history["friction_dissipation"]) > -1e-15).all()
-    assert history["impact_dissipation"][-1] < 1e-12
-    assert unexplained(history) < 1e-9
 
 
 def test_a_belt_works_and_rubs(shared_tmp_path):
@@ -182,24 +160,3 @@ def test_damping_of_backward_differences_only_takes(shared_tmp_path):
     history = run(table, shared_tmp_path)
     assert (np.diff(history["damping_dissipation"]) > 0.0).all()
     assert np.abs(history["energy_imbalance"]).max() < 1e-10 * history["kinetic_energy"][0]
-
-
-@pytest.mark.slow
-def test_rows_at_some_steps_are_those_of_all(tmp_path):
-    """Works of bodies that collide, summed over the steps between rows."""
-    tables = two_lattices(
-        tmp_path / "mesh.vtu",
-        "central_differences",
-        gravity=(0.0, 0.0, -50.0),
-        load=[{"node_set": "second", "force": [-1.0, 0.0, 0.0]}],
-        wall=[{"name": "floor", "type": "plane", "point": [0.0, 0.0, -0.004], "normal": [0.0, 0.0, 1.0]}],
-    )
-    one, some = (
-        run(Case.from_dict(tables | {"output": {"fields_every": 0, "history_every": every}}), tmp_path / str(every))
-        for every in (1, 10)
-    )
-    assert one["pair/faces/force"].any() and one["wall/floor/force"].any() and one["impact_dissipation"][-1] > 0.0
-    assert np.abs(one["energy_imbalance"]).max() < 1e-11 * one["kinetic_energy"].max()
-    for column in one:
-        if column.endswith(("energy", "work", "dissipation", "imbalance", "momentum", "impulse", "force")):
-            np.testing.assert_array_equal(one[column][::10], some[column], err_msg=column)

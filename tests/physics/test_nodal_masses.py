@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from helpers.runs import run
-from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
@@ -96,37 +95,6 @@ def test_free_flight(scheme, mass, tmp_path):
     turning -= BAR / 6.0 * LENGTH**2 if mass == "consistent" else 0.0
     assert history["kinetic_energy"][0] == pytest.approx(0.5 * (TIP + BAR) + 2.0 * turning, rel=1e-12)
     np.testing.assert_allclose(history["angular_momentum"][-1, 2], 2.0 * turning, rtol=1e-7)
-
-
-@pytest.mark.parametrize("mass", ["lumped", "consistent"])
-def test_operators_agree(mass, tmp_path):
-    """Assembled and matrix-free Hessians, in large motion with damping."""
-    found = []
-    for operator in ("assembled", "matrix_free"):
-        it = case(
-            mesh={"generator": "rod", "length": LENGTH, "elements": 4},
-            material={"m": {"young_modulus": YOUNG, "density": DENSITY, "damping": 0.3 * DENSITY}},
-            gravity={"acceleration": [0.0, 0.0, -G]},
-            time={"integrator": "generalized_alpha", "step": 2e-3, "end": 0.1, "mass": mass},
-            solver={"linear": "cg", "operator": operator, "rtol": 1e-13},
-        )
-        found.append(run(it, tmp_path / operator, MPI.COMM_SELF)["probe/end/position"])
-    np.testing.assert_allclose(found[0], found[1], atol=1e-10)
-
-
-@pytest.mark.parallel
-@pytest.mark.parametrize("mass", ["lumped", "consistent"])
-def test_ranks_and_restart(mass, comm, shared_tmp_path):
-    """As on one rank; bitwise over a restart."""
-    tables = {
-        "mesh": {"generator": "rod", "length": LENGTH, "elements": 6},
-        "mass": [{"node_set": "all", "value": 0.2}, {"node_set": "end", "value": TIP}],
-        "gravity": {"acceleration": [0.0, 0.0, -G]},
-        "time": {"integrator": "chung_lee", "step": 2e-4, "end": 0.02, "mass": mass},
-    }
-    history = assert_restart_is_bitwise(case(**tables), comm, shared_tmp_path, 40)
-    assert history["kinetic_energy"][-1] > 0.0
-    assert_as_on_one_rank(history, case(**tables), comm, shared_tmp_path, "probe/end/position", within=1e-10)
 
 
 def test_refusals():

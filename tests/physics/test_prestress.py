@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from helpers.cables import AREA, DENSITY, LENGTH, YOUNG, cell, fan, rod
 from helpers.runs import run
-from helpers.stopped import assert_restart_is_bitwise
 
 from pfem_petsc import Simulation, open_result
 from pfem_petsc.mechanics.elements import MEASURES
@@ -48,19 +47,6 @@ def test_rest_length_is_that_of_a_mesh_with_this_length(strain, tmp_path):
         found = [open_result(tmp_path / folder).field(name, at) for folder, at in (("rest", 0), ("pulled", -1))]
         np.testing.assert_allclose(*found, rtol=1e-12, err_msg=name)
     assert pulled["elastic_energy"][-1] == pytest.approx(rest["elastic_energy"][0], rel=1e-12)
-
-
-@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
-def test_equals_a_thermal_strain(integrator, tmp_path):
-    """E (l/(f L) - 1) with f = 1 + a is (E/f) (l/L - 1 - a): the modulus of a heated bar refers to the mesh."""
-    change, time = -0.01, {"integrator": integrator, "step": 1e-4, "end": 4e-3}
-    heated = {"young_modulus": YOUNG / (1.0 + change), "thermal_expansion": 1e-4}
-    other = {"temperature": [{"value": change / 1e-4}], "time": time}
-    first = run(rod({"rest_length": 1.0 + change}, ends=("start",), time=time), tmp_path / "rest")
-    second = run(rod({}, heated, ends=("start",), **other), tmp_path / "heated")
-    x = [history["probe/all/position"][:, :, 0] for history in (first, second)]
-    assert np.ptp(x[0][:, 2]) > 0.01
-    np.testing.assert_allclose(*x, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
@@ -177,13 +163,3 @@ def test_balance_with_other_laws(law, tmp_path):
     held = run(rod({"pretension": RAMP, **section}, material, time={"end": 1e-3}), tmp_path / "held")
     np.testing.assert_allclose(held["prestress_work"], held["elastic_energy"], rtol=1e-10, atol=1e-12)
     assert open_result(tmp_path / "held").field("axial_force", -1) == pytest.approx([1500.0] * 2, rel=1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-@pytest.mark.parametrize("integrator", ["energy_momentum", "central_differences"])
-def test_restart_while_stressing_is_bitwise(integrator, shared_tmp_path, comm):
-    """The table comes back to the value of its start, and the rest lengths are those of the checkpoint."""
-    rows = [[0.0, 500.0], [1e-3, 1500.0], [2e-3, 500.0], [2.5e-3, 0.0]]
-    case = rod({"pretension": rows}, ends=("start",), time={"integrator": integrator, "end": 3e-3})
-    assert_restart_is_bitwise(case, comm, shared_tmp_path, 10, 20)

@@ -189,22 +189,3 @@ def test_what_is_gone_stays_away_in_later_stages(comm, shared_tmp_path):
 def test_removals_that_make_no_sense_are_refused(remove, told, comm, tmp_path):
     with pytest.raises(InputError, match=told):
         Simulation(tower(tmp_path, comm, static={"step": 0.3}, remove=[remove]), comm, tmp_path / "out", quiet=True)
-
-
-@pytest.mark.parametrize("scheme", ["central_differences", "generalized_alpha", "energy_momentum"])
-def test_restarts_while_heated_bars_are_removed_have_the_same_ledger(scheme, comm, tmp_path):
-    """A step begins with the energies and the stresses that a removal has left."""
-    step = PERIOD / 100.0
-    rows = [[k * step, 20.0 * np.sin(k)] for k in range(20)]
-    tables = {
-        "material": {"it": {**MATERIAL, "thermal_expansion": 1e-5}},
-        "temperature": [{"table": rows}],
-        "remove": [{"time": 2.3 * step, "duration": 9.1 * step, "bars": bars} for bars in ("leg", "second")],
-        "load": [{"node_set": "top", "force": [0.0, 0.0, -37.3 * WEIGHT]}],
-        "time": {"integrator": scheme, "step": step, "end": 14 * step},
-        "output": {"fields_every": 0},
-    }
-    case = tower(tmp_path, comm, **tables)
-    whole = assert_restart_is_bitwise(case, comm, tmp_path, 6)
-    assert whole["rupture_dissipation"][-1] > 0.0
-    assert np.abs(whole["energy_imbalance"]).max() < 1e-9 * np.abs(whole["thermal_work"]).max()

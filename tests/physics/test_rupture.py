@@ -6,7 +6,7 @@ from helpers.runs import run
 from helpers.small_models import AREA, DENSITY, MATERIAL, SPEED, YOUNG, chain
 from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
 
-from pfem_petsc import Simulation, open_result
+from pfem_petsc import Simulation
 from pfem_petsc.errors import InputError
 
 EXPLICIT = {"integrator": "central_differences"}
@@ -118,28 +118,6 @@ def pulled(folder, comm, **tables):
         **tables,
     )
     return case
-
-
-def test_batches_stop_where_bars_break(comm, tmp_path):
-    case = chain(
-        tmp_path,
-        comm,
-        10,
-        range(10),
-        {"strain": 2e-3, "steps": 2},
-        {**EXPLICIT, "step": 1e-5, "end": 3e-3},
-        section={"it": {"area": AREA, "material": "weak"}},
-        initial={"on": [{"node_set": "tip", "velocity": [12.0, 0.0, 0.0]}]},
-    )
-    case.output.history_every = 7
-    for name, together in (("one", False), ("many", True)):
-        simulation = Simulation(case, comm, output=tmp_path / name, quiet=True)
-        steps = len(list(simulation.batches() if together else simulation))
-        assert (steps < 100) == together
-    first, second = (open_result(tmp_path / name) for name in ("one", "many"))
-    assert first.history["broken_bars"][-1] > 0
-    for column in first.history:
-        np.testing.assert_array_equal(first.history[column], second.history[column], err_msg=column)
 
 
 @pytest.mark.parallel

@@ -127,14 +127,3 @@ def test_motions_of_shared_components_agree(guide_first, turn, comm, tmp_path):
     history = run(Case(case), tmp_path / "out", comm)
     place = history["probe/all/position"] @ (np.eye(3) if turn is None else turn)
     np.testing.assert_allclose(place[-1, :3], POINTS[:3] + [0.0, 0.0, 0.01], rtol=0.0, atol=1e-14)
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-def test_a_foot_stays_in_the_stages_after(comm, shared_tmp_path):
-    """A support that is gone in a stage stays so, and the foot remains where the other support holds it."""
-    remove = [{"supports": "guide", "time": 0.5}]
-    case = tripod({}, remove=[], stage=[{"static": {"step": 0.5}, "remove": remove}, {"static": {"step": 0.5}}])
-    place = run(case, shared_tmp_path / "out", comm)["probe/all/position"]
-    np.testing.assert_allclose(place[-1, :3], POINTS[:3], atol=1e-15)
-    assert abs(place[-1, 3, 0] - POINTS[3, 0]) > 1e-5

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from helpers.runs import run
-from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
@@ -35,55 +34,6 @@ def case(**tables):
 
 def time_of(scheme, step, end, mass="lumped"):
     return {"integrator": scheme, "step": step, "end": end, "mass": mass, **PARAMETERS.get(scheme, {})}
-
-
-@pytest.mark.parametrize("mass", ["lumped", "consistent"])
-@pytest.mark.parametrize("scheme", [*EXPLICIT, *IMPLICIT])
-def test_period(scheme, mass, tmp_path):
-    """Along each axis u = v/w sin(w t) with w^2 = k/m, of the whole bar; energies and momentum balance."""
-    omega = np.sqrt(K / BAR)
-    v = np.array([0.05, 0.1, -0.2])
-    it = case(time=time_of(scheme, 1e-3, 0.5, mass), initial={"velocity": v.tolist()})
-    history = run(it, tmp_path / "out", MPI.COMM_SELF)
-    t = history["time"][:, None]
-    u = history["centre_of_mass"] - history["centre_of_mass"][0]
-    exact = v / omega * np.sin(omega * t)
-    assert np.abs(u - exact).max() < (0.03 if scheme == "souza_moura" else 1e-3) * np.abs(exact).max()
-    scale = history["kinetic_energy"][0]
-    assert np.abs(history["energy_imbalance"]).max() < 1e-11 * scale
-    assert history["spring_energy"][-1] == pytest.approx(0.5 * (K * u[-1] ** 2).sum(), rel=1e-3)
-    gained = history["momentum"] - history["momentum"][0]
-    np.testing.assert_allclose(gained, history["support_impulse"], atol=1e-10 * np.abs(BAR * v).max())
-    if scheme == "energy_momentum":
-        assert np.abs(history["numerical_dissipation"]).max() < 1e-12 * scale
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
-def test_operators(operator, tmp_path):
-    """A chain on springs in large motion: both operators, and explicit steps, find the same motion."""
-    tables = {
-        "mesh": {"generator": "rod", "length": LENGTH, "elements": 4},
-        "spring": [
-            {"node_set": "start", "stiffness": [2e3, 1e3, 4e3]},
-            {"node_set": "end", "stiffness": [0.0, 90.0, 0.0]},
-        ],
-        "dashpot": [{"node_set": "end", "coefficient": 1.5}],
-        "gravity": {"acceleration": [0.0, 0.0, -G]},
-    }
-    implicit = case(
-        **tables,
-        time=time_of("generalized_alpha", 2.5e-4, 0.1, "consistent"),
-        solver={"linear": "cg", "operator": operator, "rtol": 1e-12},
-    )
-    first = run(implicit, tmp_path / "i", MPI.COMM_SELF)
-    second = run(
-        case(**tables, time=time_of("central_differences", 5e-5, 0.1, "consistent")), tmp_path / "e", MPI.COMM_SELF
-    )
-    np.testing.assert_allclose(first["probe/end/position"][-1], second["probe/end/position"][-1], atol=2e-5)
-    assert first["solver_iterations" if "solver_iterations" in first else "newton_iterations"].max() <= 6
-    for history in (first, second):
-        assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["external_work"].max()
 
 
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
@@ -290,23 +240,6 @@ def test_frame_in_statics_modes_and_critical_steps(operator, comm, shared_tmp_pa
     shaken = case(spring=springs, time={**time_of("central_differences", "auto", 0.1), "safety": 0.9})
     with Simulation(shaken, comm, output=shared_tmp_path / "auto", quiet=True) as simulation:
         assert simulation.plan.critical_step == pytest.approx(2.0 / np.sqrt(squares[-1]), rel=1e-5)
-
-
-@pytest.mark.parallel
-@pytest.mark.parametrize("scheme", ["central_differences", "energy_momentum"])
-def test_ranks_restart_and_stages(scheme, comm, shared_tmp_path):
-    """As on one rank; bitwise over a restart; springs keep their place in the next stage."""
-    data = case(time=time_of(scheme, 2e-4, 0.01)).to_dict()
-    time = data.pop("time")
-    data["mesh"] = {"generator": "rod", "length": LENGTH, "elements": 5}
-    data["dashpot"] = [{"node_set": "all", "coefficient": 0.3}]
-    data["spring"][1]["frame"] = FRAME
-    data["gravity"] = {"acceleration": [0.0, 3.0, -G]}
-    data["stage"] = [{"name": "one", "time": time}, {"name": "two", "time": time}]
-    data["initial"] = {"angular_velocity": [0.0, 0.0, 3.0]}
-    history = assert_restart_is_bitwise(Case.from_dict(data), comm, shared_tmp_path, 70)
-    assert np.abs(history["energy_imbalance"]).max() < 1e-10 * history["kinetic_energy"].max()
-    assert_as_on_one_rank(history, Case.from_dict(data), comm, shared_tmp_path, "probe/end/position")
 
 
 def test_refusals(tmp_path):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from helpers.meshes import every_node
 from helpers.runs import run
-from helpers.stopped import assert_restart_is_bitwise
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
@@ -54,16 +53,6 @@ def test_falling_bar(scheme, tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"].max()
     falling = case(scheme, wind={**wind, "velocity": [3.0, 4.0, 0.0], "drag_coefficient": 0.0}, end=0.05)
     assert run(falling, tmp_path / "no", MPI.COMM_SELF)["momentum"][-1, :2] == pytest.approx(0.0, abs=1e-15)
-
-
-@pytest.mark.parametrize("scheme", ["newmark", "energy_momentum", "central_differences"])
-def test_terminal_velocity_to_rounding(scheme, tmp_path):
-    """In the steady state predictions are exact."""
-    heavy = {"density": 50.0, "velocity": [2.0, 0.0, 0.0]}  # wind along the bar has no drag
-    history = run(case(scheme, 2e-4 if scheme[0] == "c" else 5e-3, 4.0, wind=heavy), tmp_path / "out", MPI.COMM_SELF)
-    terminal = np.sqrt(2.0 * DENSITY * AREA * G / (50.0 * 1.2 * DIAMETER))
-    assert history["probe/all/velocity"][-1, :, 2] == pytest.approx(-terminal, rel=1e-10)
-    assert history["probe/all/velocity"][-1, :, 0] == pytest.approx(0.0, abs=1e-10)
 
 
 @pytest.mark.parallel
@@ -150,23 +139,6 @@ def test_bars_that_have_left_have_no_drag(scheme, tmp_path):
     assert first[-1] > 1.5 * first[50]
     assert np.ptp(second[52:]) < 1e-12 * second[50]
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"].max()
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-@pytest.mark.parametrize("scheme", ["central_differences", "wilson"])
-def test_restart_and_stages(scheme, comm, shared_tmp_path):
-    """Bitwise, also from a stage that goes on with the wind of the stage before."""
-    data = case().to_dict()
-    del data["time"], data["wind"]
-    data["mesh"] = {"generator": "rod", "length": 2.0, "elements": 4}
-    data["support"] = [{"node_set": "start", "fix": "xyz"}]
-    parameters = {"theta": 1.5} if scheme == "wilson" else {}
-    time = {"integrator": scheme, "step": 1e-3, "end": 0.05, **parameters}
-    wind = {"velocity": [[0.0, 0.0, 0.0, 0.0], [0.04, 0.0, 30.0, 0.0]]}
-    data["stage"] = [{"name": "hang", "time": time, "wind": wind}, {"name": "sway", "time": time}]
-    history = assert_restart_is_bitwise(Case.from_dict(data), comm, shared_tmp_path, 20, 70)
-    assert history["external_work"][-1] != history["external_work"][51]  # in the second stage
 
 
 def test_refusals_and_warnings(tmp_path):

@@ -69,31 +69,6 @@ def test_nodes_on_bars_are_those_of_all_pairs(told):
     assert any(text.startswith(f"{expected} nodes lie on bars") for text in told(points, bars)[1])
 
 
-def test_first_ones_shown_are_the_lowest_of_all(told):
-    """Of 1,200 nodes on bars and as many pairs of coinciding nodes, from bars in no order."""
-    n, random = 1200, np.random.default_rng(5)
-    at = np.arange(n, dtype=float)[:, None] * [0.0, 1.0, 0.0]
-    points = np.concatenate([at, at + [1.0, 0, 0], at + [0.5, 0, 0], at + [1.0, 0, 0]])
-    chain = np.arange(n - 1)
-    ladder = [(2 * n + chain, 2 * n + chain + 1), (3 * n + chain, 3 * n + chain + 1)]
-    rungs = np.stack([np.arange(n), n + np.arange(n)], axis=1)[random.permutation(n)]
-    bars = np.concatenate([rungs, *(np.stack(pair, axis=1) for pair in ladder), [[0, 2 * n], [n - 1, 4 * n - 1]]])
-    entries, warnings = told(points, bars)
-    pairs = ", ".join(f"nodes {n + k} and {3 * n + k}" for k in range(5))
-    assert entries["same place"].startswith(f"2,400 nodes, {pairs}, ...: merge")
-    on = ", ".join(f"node {2 * n + a} on bar {k} (nodes {a} and {b})" for k, (a, b) in enumerate(rungs[:5].tolist()))
-    # the last bar passes a node as well
-    assert warnings[-1].startswith(f"1201 nodes lie on bars that they are not connected to: {on}, ...; ")
-
-
-def test_nodes_on_bars_of_a_graded_mesh(told):
-    """Most nodes are crowded into a corner."""
-    x = np.concatenate([[0.0], np.geomspace(1e-5, 1.0, 3000)])
-    points = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
-    _, warnings = told(points, [*((i, i + 1) for i in range(3000)), (2990, 2992)])
-    assert any("node 2991 on bar 3000" in text for text in warnings)
-
-
 def test_lengths_that_differ_too_much_for_a_search_are_told(told):
     x = np.append(1e-9 * np.arange(4000), 1.0)
     points = np.stack([x, 0.0 * x, 0.0 * x], axis=1)

@@ -88,28 +88,6 @@ def test_a_later_stage_that_cannot_run_is_found_before_the_first_step(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
-def test_paths_in_stages_and_restarts_in_them(tmp_path):
-    assert run(DOME, MPI.COMM_SELF, tmp_path / "whole") > 30
-    result = open_result(tmp_path / "whole")
-    history = result.history
-    check_balances({name: history[name] for name in history if not name.startswith("event/")})
-    load_factor, stage = history["load_factor"], history["stage"]
-    # what is at rest again has the same path again
-    ends = [int(np.flatnonzero(stage == k)[-1]) for k in range(4)]
-    assert load_factor[ends[3]] == pytest.approx(load_factor[ends[0]], rel=1e-6)
-    np.testing.assert_array_equal(load_factor[ends[0] : ends[1] + 1], load_factor[ends[0]])
-    assert history["elastic_energy"][ends[2]] < 1e-12 * history["elastic_energy"].max()
-    limits = history["event/load_factor"]
-    assert len(limits) == 2 and limits[1] == pytest.approx(limits[0], rel=1e-6)
-    assert list(history["event/step"] > ends[2]) == [False, True]
-    for step in (4, ends[0], ends[0] + 5, ends[2], ends[2] + 3):
-        assert run(DOME, MPI.COMM_SELF, tmp_path / "stopped", step, restart=step > 4) == step
-    run(DOME, MPI.COMM_SELF, tmp_path / "stopped", restart=True)
-    assert differences(*(tmp_path / name / "result.vtkhdf" for name in ("whole", "stopped"))) == {}
-
-
-@pytest.mark.slow
 def test_modes_are_those_of_the_end_of_the_last_stage(tmp_path):
     gravity = {"gravity": {"acceleration": [0.0, 0.0, -9.81]}, "modes": {"count": 2}}
     weight = {"name": "weight", "static": {"step": 0.5}}

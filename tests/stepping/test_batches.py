@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.lattices import planes, two_lattices
-from helpers.stopped import assert_restart_is_bitwise
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, columns, open_result
@@ -296,12 +295,6 @@ def test_batches_are_single_steps_and_move_as_the_general_stepper(name, comm, sh
         compare(one, general, exact=False, same_order=name != "sections" and not moves)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["sections", "loads over time", "gravity over time"])
-def test_restarts_between_batches_are_bitwise(name, comm, tmp_path):
-    assert_restart_is_bitwise(case(SMALL[name]), comm, tmp_path, 3, 50, 111)
-
-
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", PAIRS)
 def test_batches_with_pairs(name, comm, shared_tmp_path, monkeypatch):
@@ -350,24 +343,6 @@ def test_batches_with_pairs_and_walls(name, supported, comm, shared_tmp_path, mo
     assert np.abs(history["pair/faces/impulse"][-1]).max() > 0.01 and history["impact_dissipation"][-1] > 0.0
     assert np.abs(history["energy_imbalance"]).max() < 1e-11 * history["kinetic_energy"].max()
     compare(one, other, exact=False, same_order="moving" not in name)  # rounding of times
-
-
-def test_batches_with_pairs_of_several_tables(tmp_path):
-    tables = two_lattices(tmp_path / "mesh.vtu", "central_differences", cells=(1, 3, 3))
-    pair = tables["contact_pair"][0]
-    for k, part in enumerate(("left", "right")):
-        nodes = tables["node_set"][part]["indices"]
-        low, high = nodes[: len(nodes) // 2], nodes[len(nodes) // 2 :]
-        tables["node_set"] |= {f"low{k}": {"indices": low}, f"high{k}": {"indices": high}}
-    tables["contact_pair"] = [
-        pair | {"name": "high", "first": "high0", "second": "high1", "direction": [1.0, 0.0, 0.0]},
-        pair | {"name": "low", "first": "low0", "second": "low1", "gap": 0.002},
-    ]
-    tables["output"] = {"fields_every": 0, "history_every": 7}
-    given = Case.from_dict(tables)
-    history = compare(*(made(given, tmp_path, how, MPI.COMM_SELF)[0] for how in ("single", "batches")))
-    for name in ("low", "high"):
-        assert np.abs(history[f"pair/{name}/impulse"][-1]).max() > 0.01
 
 
 MOVED = {"restitution": 0.3, "friction": 0.2, "motion": [[0, 0, 0, 0], [8e-6, 0, 0, 1e-4], [3e-5, 1e-4, 0, -1e-4]]}
@@ -427,31 +402,6 @@ def test_all_columns_of_all_steps_are_those_of_single_steps(declared, comm, shar
 
 def sideways_energy(now):
     return 0.5 * now.model.inertia.mass @ now.state.v[:, 1] ** 2
-
-
-SQUEEZED = LATTICE | {
-    "mesh": block(1, 11, 4),  # whole planes of nodes for a rank
-    "node_set": {"left": {"group": "left"}, "right": {"group": "right"}, "held": {"nearest": [0.0, 0.0, 0.0]}},
-    "support": [{"node_set": "held", "fix": "xyz"}],
-    "initial": {
-        "velocity": [0.0, 1.0, 0.0],
-        "on": [{"node_set": "left", "velocity": [20.0, 0, 0]}, {"node_set": "right", "velocity": [-15.0, 2.0, 0]}],
-    },
-    "contact_pair": [{"name": "faces", "first": "left", "second": "right", "direction": [1, 0, 0], "gap": 0.00999}],
-    "time": LATTICE["time"] | {"end": 4e-5},
-    "output": {"fields_every": 0, "history_every": 3},
-}
-
-
-@pytest.mark.parallel
-def test_ranks_make_batches_with_pairs_of_their_own(comm, shared_tmp_path):
-    given = Case.from_dict(SQUEEZED)
-    one, count = made(given, shared_tmp_path, "single", comm)
-    many, fewer = made(given, shared_tmp_path, "batches", comm)
-    between = comm.allreduce(int((one.model.links.two.nodes < 0).sum()))
-    assert (between == 0 or comm.size > 2) and fewer < 0.4 * count
-    history = compare(one, many)
-    assert history["active_contacts"].max() > 8 and np.ptp(history["active_contacts"]) > 8
 
 
 @pytest.mark.parametrize("what", ["chung_lee", "newmark"])

@@ -60,13 +60,6 @@ def test_a_dome_is_not_turned_inside_out(step, comm, shared_tmp_path):
 
 
 @pytest.mark.slow
-def test_without_the_guard_the_dome_turns(comm, shared_tmp_path):
-    """What the guard is for: no message, and a state far from the exact one."""
-    row = last_of(dome(comm, shared_tmp_path, 10.0, 10.0, guard=False))
-    assert row["probe/apex/position"][0, 2] < 0.0
-
-
-@pytest.mark.slow
 def test_a_step_that_is_refused_leaves_the_state_as_it_was(comm, shared_tmp_path):
     """A blow throws the apex away in the smallest part of a step: status 3 with reason and way out, and nothing of the
     state has changed."""
@@ -282,12 +275,3 @@ def test_a_pushed_block_is_not_mirrored(comm, shared_tmp_path):
     assert all(row["kinetic_energy"] + row["elastic_energy"] < 1e-3 for row in rows)
     assert abs(rows[-1]["numerical_dissipation"]) < 1e-3
     assert comm.bcast(any("step 4" in text and "bisecting the step" in text for text in told))
-
-
-def test_without_the_guard_the_block_is_mirrored(comm, shared_tmp_path):
-    """What the guard is for: the energies of the step balance, and no message tells of it."""
-    rows, told, turn = pushed(comm, shared_tmp_path, False)
-    assert turn > 80.0
-    assert rows[-1]["kinetic_energy"] > 1000.0 * rows[-2]["kinetic_energy"]
-    assert abs(rows[-1]["energy_imbalance"]) < 1e-9
-    assert not any("step 4" in text for text in told)

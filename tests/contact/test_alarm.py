@@ -19,7 +19,6 @@ def run(comm, folder, *keys):
 
 
 @pytest.mark.slow
-@pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["central_differences", "chung_lee", "newmark", "wilson"])
 def test_a_node_beyond_a_wall_is_an_error(scheme, comm, shared_tmp_path):
     simulation = run(comm, shared_tmp_path, f"time.integrator={scheme}")
@@ -37,7 +36,6 @@ def test_a_node_beyond_a_wall_is_an_error(scheme, comm, shared_tmp_path):
     assert messages[0].startswith("step 70, t = 0.7") and "node 20 is 0.002 m beyond wall 'wall' (1 node" in messages[0]
 
 
-@pytest.mark.parallel
 def test_wilson_may_leave_x1_beyond(comm, shared_tmp_path):
     """x1 is beyond the wall by up to (theta - 1) h v; x_tau, which the step is solved for, is not."""
     case = Case.load("rod_impact", ["time.integrator=wilson", "output.fields_every=1", "time.end=0.2"])
@@ -58,7 +56,6 @@ def test_what_is_no_concern_of_a_wall_may_be_beyond_it(comm, shared_tmp_path):
     run(comm, shared_tmp_path, "initial.velocity=[0.5, 0, 0]", *keys)
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
 @pytest.mark.parametrize("tied", ["false", "true"])
 def test_supports_that_carry_a_node_through_a_wall_are_told(mass, tied, comm, shared_tmp_path):

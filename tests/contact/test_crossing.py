@@ -8,8 +8,6 @@ from pfem_petsc.contact.monitoring import CrossingBars
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.stepping.model import Model
 
-pytestmark = pytest.mark.parallel
-
 
 def rods(points, bars, radius, **tables):
     """Bars of a radius that cannot move, unless tables say so."""
@@ -39,6 +37,7 @@ def distance(a, b, c, d):
     return min(found)
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize(("seed", "longest"), [(1, 1.0), (2, 30.0)])
 def test_pairs_are_those_of_every_pair_compared(seed, longest, comm):
     generator, n, radius = np.random.default_rng(seed), 60, 0.02
@@ -109,6 +108,7 @@ def test_searches_of_many_bars_have_growing_intervals(comm, shared_tmp_path):
     assert (counts["seen"], counts["looks"], counts["most"], counts["first"]) == (1, 6, 1, "step 50, t = 0.5 s")
 
 
+@pytest.mark.parallel
 def test_first_crossing_is_told_once_and_counted_at_the_end(comm, shared_tmp_path, capfd):
     case = falling_onto(1)
     # at 1 m/s, the axes are closer than 0.12 m between 0.38 s and 0.62 s: snapshots at 0.4, 0.5 and 0.6 s

@@ -97,7 +97,6 @@ def test_point_mass_hits_a_wall_with_mass(comm, shared_tmp_path):
     assert last["wall/plate/velocity"][2] == pytest.approx(common - e * 1.2 * truss / (truss + mass), rel=0.02)
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
 @pytest.mark.parametrize(("friction", "mass"), [(5.0, 0.1), (5.0, 100.0), (0.3, 0.1), (0.3, 1.0)])
 def test_friction_moves_a_wall_with_mass(friction, mass, integrator, comm, shared_tmp_path):
@@ -175,7 +174,6 @@ def _rammed(normal, integrator, comm, folder):
     return [step.row for step in Simulation(case, comm, output=folder / "rod", quiet=True)]
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "chung_lee", "hulbert_chung"])
 def test_what_hits_a_truss_at_rest_brings_energy_into_it(integrator, comm, shared_tmp_path):
     """A truss without load has no energy but that of the wall with mass: the run is not taken for unstable.

@@ -9,8 +9,6 @@ from mpi4py import MPI
 from pfem_petsc import Case, Simulation
 from pfem_petsc.output.result import open_result
 
-pytestmark = pytest.mark.parallel
-
 CASE = """
 [mesh]
 generator = "rod"
@@ -50,6 +48,7 @@ def lie(scheme, mass, folder, velocity="[0.0, 0.0, 0.0]"):
     return MPI.COMM_WORLD.bcast(read)
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_weight_from_the_start(scheme, mass, shared_tmp_path):
@@ -98,6 +97,7 @@ def stacked(scheme, mass, folder, comm, floor=False):
     return Simulation(Case.from_dict(data, folder=folder), comm, output=folder / "it", quiet=True)
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_rods_in_a_pile_stay_there(scheme, comm, shared_tmp_path):
     """The lower one on a floor that stops every node, the upper one on it."""

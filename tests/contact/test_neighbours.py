@@ -5,8 +5,6 @@ import pytest
 
 from pfem_petsc.contact.neighbours import Points, Segments, find_pairs
 
-pytestmark = pytest.mark.parallel
-
 
 def segments(ends, ids, margin):
     """Segments without common ends."""
@@ -23,6 +21,7 @@ def test_segments_in_one_place_are_too_many(comm):
     assert find_pairs(comm, *segments(ends, rows, 0.1)) is None
 
 
+@pytest.mark.parallel
 def test_ranks_without_segments(comm):
     none = segments(np.empty((0, 2, 3)), np.empty(0, np.int64), 1.0)
     found = find_pairs(comm, *none, skin=0.1)
@@ -33,6 +32,7 @@ def test_ranks_without_segments(comm):
     assert sum(comm.allgather(len(found.ids))) == 1
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize(
     ("spread", "flat", "thick"),
     [(1.0, 1.0, 1.0), (40.0, 1.0, 1.0), (1.0, 0.0, 1.0), (3.0, 1.0, 30.0), (1e6, 1e-3, 1.0)],

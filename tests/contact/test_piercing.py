@@ -7,8 +7,6 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.contact.monitoring import distances
 from pfem_petsc.preflight.checks import warnings_before
 
-pytestmark = pytest.mark.parallel
-
 SHAPES = {
     "sphere": {"type": "sphere", "point": [1.0, 0.0, 0.6], "radius": 0.4},
     "cylinder": {"type": "cylinder", "point": [1.0, 5.0, 0.6], "axis": [0.0, 1.0, 0.0], "radius": 0.4},
@@ -39,6 +37,7 @@ def bar(shape, **keys):
     )
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("shape", SHAPES)
 def test_wall_that_flies_through_a_bar(shape, comm, shared_tmp_path, capfd):
     case = bar(shape)

@@ -11,8 +11,6 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.solvers import matrix_free as restricted
 
-pytestmark = pytest.mark.parallel
-
 
 def wall_force(comm, folder, name, *overrides):
     case = Case.load(name, ["time.integrator=wilson", "time.theta=1.5", "output.fields_every=0", *overrides])
@@ -35,6 +33,7 @@ def resting(steps, **tables):
     return lattice_case(planes([[0.0, 0.0, 1.0]], [0.0]), step=1e-3, end=1e-3 * steps, **tables)
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 def test_restrictions_to_inactive_unknowns_are_freed(comm, shared_tmp_path):
     """Every Newton iteration in contact makes a matrix of the inactive unknowns: PETSc keeps the last one alone."""

@@ -30,7 +30,6 @@ def rod(treatment, integrator, comm, folder, step=0.01, **parameters):
     return force, energy, rows
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("step", [0.005, 0.01, 0.02])
 def test_no_mass_no_spike_explicit(step, comm, shared_tmp_path):
     """The force spike no longer grows as 1/h, and impact takes no energy."""
@@ -40,7 +39,6 @@ def test_no_mass_no_spike_explicit(step, comm, shared_tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 @pytest.mark.parametrize("fix, normal", [("z", [-1.0, 0.0, 0.0]), ("yz", [-1.0, 0.0, 0.0]), ("z", [-0.8, 0.0, 0.6])])
 def test_no_mass_where_supports_hold_other_directions(integrator, fix, normal, comm, shared_tmp_path):
@@ -66,7 +64,6 @@ def test_no_mass_where_supports_hold_other_directions(integrator, fix, normal, c
     assert min(row["wall/wall/force"][0] for row in runs[1]) < -FORCE
 
 
-@pytest.mark.parallel
 def test_no_mass_where_supports_hold_the_normal(comm, shared_tmp_path):
     """A wall is no concern of a node that supports hold along its normal; the node keeps its mass."""
     keys = ['contact.treatment="mass_redistribution"', 'support=[{node_set="tip", fix="xyz"}]', "time.end=0.05"]

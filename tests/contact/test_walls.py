@@ -115,7 +115,6 @@ def test_adjust_moves_nodes_onto_the_wall(comm, shared_tmp_path):
     assert any("moved onto" in warning for warning in run.model.warnings)
 
 
-@pytest.mark.parallel
 def test_starting_beyond_a_wall_is_refused(comm, shared_tmp_path):
     with pytest.raises(InputError, match=r"wall 'wall1': node \d+ starts 0.01 m beyond the wall \(\d+ nodes in all\)"):
         simulation(lattice_case(planes([[0.0, 0.0, 1.0]], [0.01])), comm, shared_tmp_path)

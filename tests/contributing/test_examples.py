@@ -43,7 +43,6 @@ def test_they_are_listed(examples, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parallel
 def test_integrator_follows_its_recursion(examples, comm, shared_tmp_path):
     """One bar with a mass at its end is x'' + w^2 x = 0, whose backward differences are solved here by themselves."""
     h, steps, w2 = 0.05, 40, 2.0
@@ -168,7 +167,6 @@ def test_polygon_has_its_mass_and_spin(sides, examples, comm, shared_tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parallel
 def test_treatment_stops_the_chatter_of_the_trapezoidal_rule(examples, comm, shared_tmp_path):
     """With the scheme's own velocities the same rod gains energy tenfold (docs/contact.md)."""
     keys = ["time.integrator=newmark", "time.beta=0.25", "time.gamma=0.5", "contact.treatment=secant"]

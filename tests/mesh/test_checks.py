@@ -5,12 +5,11 @@ from helpers.meshes import slab_from
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.whole import check_mesh
 
-pytestmark = pytest.mark.parallel
-
 SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
 ROUND = [[0, 1], [1, 2], [2, 3], [3, 0]]
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize(
     ("points", "bars", "text"),
     [
@@ -48,6 +47,7 @@ def test_short_bars_are_a_warning(comm):
     assert "bar 4 (nodes 3 and 4), length 1e-08 m" in warning
 
 
+@pytest.mark.parallel
 def test_warnings_of_the_reader_are_kept_on_all_ranks(comm):
     slab = slab_from(SQUARE, ROUND, comm)
     slab.warnings = ["left out 3 elements"] if comm.rank == 0 else []

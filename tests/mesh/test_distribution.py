@@ -7,8 +7,6 @@ from pfem_petsc.mesh.distribution import distribute
 from pfem_petsc.mesh.generators import lattice
 from pfem_petsc.mesh.ordering import hilbert_keys, sweep_keys
 
-pytestmark = pytest.mark.parallel
-
 PARTITIONERS = ["coordinates", "ptscotch"]
 
 
@@ -44,6 +42,7 @@ def case(request, comm):
     mesh.close()
 
 
+@pytest.mark.parallel
 def test_parts_are_balanced(comm, case):
     original, _, mesh = case
     if mesh.partitioner == "coordinates":
@@ -54,6 +53,7 @@ def test_parts_are_balanced(comm, case):
         assert mesh.n_owned < 1.3 * original.n_nodes / comm.size + 2
 
 
+@pytest.mark.parallel
 def test_partitioner_is_chosen_by_the_mesh(comm):
     one_rank = "none (one rank)"
     for slab, used in ((cube(comm), "coordinates"), (irregular(comm), "ptscotch")):
@@ -124,6 +124,7 @@ def test_bars_lie_close_to_each_other_in_memory(comm):
     assert span.max() <= (n + 1) ** 2 + (n + 1)
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("structured", [False, True])
 def test_ranks_have_equal_work_where_nodes_have_different_numbers_of_bars(comm, structured):
     """A chain joined to a block: as many nodes, far fewer bars."""

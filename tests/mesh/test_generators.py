@@ -9,8 +9,6 @@ from pydantic import ValidationError
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice, mast, net, prism, ring, rod
 
-pytestmark = pytest.mark.parallel
-
 GENERATED = {
     "rod": (rod, {"length": 2.0, "elements": 7}),
     "ring": (ring, {"outer_radius": 3.0, "inner_radius": 2.5, "bays": 9}),
@@ -46,6 +44,7 @@ def reference_cubic(n):
     return np.concatenate([np.stack([k[one].ravel(), k[two].ravel()], 1) for one, two in pairs])
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("name", GENERATED)
 def test_every_rank_makes_its_part_of_the_same_sound_mesh(comm, name):
     module, keys = GENERATED[name]

@@ -12,8 +12,6 @@ from pfem_petsc.mesh import load_slab
 from pfem_petsc.mesh.generators import ring
 from pfem_petsc.mesh.slab import slab_range
 
-pytestmark = pytest.mark.parallel
-
 MESHES = Path(__file__).parents[2] / "meshes"
 
 
@@ -38,6 +36,7 @@ def check_sample(mesh, tops=("top",), legs=("legs",)):
         assert sorted(mesh.bar_groups[name].tolist()) == LEGS
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("kind", GMSH)
 def test_gmsh(comm, shared_tmp_path, kind):
     slab = read(written(comm, shared_tmp_path, "truss.msh", GMSH[kind]), comm)
@@ -47,6 +46,7 @@ def test_gmsh(comm, shared_tmp_path, kind):
     assert warning.endswith("left out 1 elements that are neither lines nor points")
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("kind", ["2.2 ascii", "4.1 ascii"])
 def test_gmsh_as_editors_of_windows_save_it(comm, shared_tmp_path, kind):
     """With a byte order mark, other line ends, and sections of other programs."""
@@ -55,6 +55,7 @@ def test_gmsh_as_editors_of_windows_save_it(comm, shared_tmp_path, kind):
     check_sample(whole(read(path, comm), comm))
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("version", ["gmsh22", "gmsh"])
 @pytest.mark.parametrize("binary", [False, True])
 def test_gmsh_written_by_meshio(comm, shared_tmp_path, version, binary):
@@ -67,6 +68,7 @@ def test_gmsh_written_by_meshio(comm, shared_tmp_path, version, binary):
     check_sample(whole(read(written(comm, shared_tmp_path, "truss.msh", write), comm), comm), (), ())
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("suffix", ["vtu", "vtkhdf"])
 def test_vtk(comm, shared_tmp_path, suffix):
     mesh = whole(read(written(comm, shared_tmp_path, f"truss.{suffix}", write_vtk), comm), comm)
@@ -74,6 +76,7 @@ def test_vtk(comm, shared_tmp_path, suffix):
     assert list(mesh.node_groups) == ["group_2"]
 
 
+@pytest.mark.parallel
 def test_vtk_with_other_cells_and_lines_of_several_points(comm, shared_tmp_path):
     """A line of n points is n - 1 bars, each with its group and number; vertices and triangles are left out."""
 
@@ -98,6 +101,7 @@ def test_vtk_with_other_cells_and_lines_of_several_points(comm, shared_tmp_path)
     assert np.concatenate(comm.allgather(slab.bar_fields["area"])).tolist() == [1.0, 1.0, 1.0, 1.0, 2.0, 3.0]
 
 
+@pytest.mark.parallel
 def test_hdf5_of_another_writer(comm, shared_tmp_path):
     check_sample(whole(read(written(comm, shared_tmp_path, "truss.h5", write_hdf5), comm), comm))
 

@@ -10,8 +10,6 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.output.result import open_result
 
-pytestmark = pytest.mark.parallel
-
 
 def buckled(case, folder, comm):
     """Factors, shapes and axial forces of a run, on all ranks. Collective."""
@@ -79,6 +77,7 @@ def mast(folder, comm, **tables):
     )
 
 
+@pytest.mark.parallel
 def test_guyed_column(shared_tmp_path, comm):
     """k x = lambda P/h (2 - 2 cos a) x with a = j pi/n: the sharpest zigzag buckles first."""
     factor, shape, force = buckled(mast(shared_tmp_path, comm), shared_tmp_path / "out", comm)
@@ -105,6 +104,7 @@ def test_vibration_ceases_at_the_buckling_load(shared_tmp_path, comm):
         assert np.sign(lowest) == sign
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("solver", ["dense", "scipy", "slepc"])
 def test_what_has_no_factor_is_told(solver, shared_tmp_path, comm):
     if solver != "dense":

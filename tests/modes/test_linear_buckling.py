@@ -10,8 +10,6 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.result import open_result
 
-pytestmark = pytest.mark.parallel
-
 MODES = {"kind": "buckling", "count": 1, "linear": True}
 STIFFNESS, HALF, YOUNG, AREA, DENSITY, EXPANSION = 1e4, 0.5, 1e9, 1e-4, 1000.0, 1e-5
 DIFFERS = "differ from those of a linear solve"
@@ -90,6 +88,7 @@ def test_load_beyond_one_that_acts_at_the_start(linear, shared_tmp_path, comm):
     assert found[0] == pytest.approx((0.5 * SUM - a) / (b - a), rel=1e-9)
 
 
+@pytest.mark.parallel
 def test_load_beyond_a_preload(shared_tmp_path, comm):
     """The last stage begins with the preload a and bars shorter by a/EA: 2 (a + lambda (b - a)) = k l."""
     a, b = 500.0, 700.0
@@ -100,6 +99,7 @@ def test_load_beyond_a_preload(shared_tmp_path, comm):
     assert found[0] == pytest.approx((0.5 * SUM * shorter - a) / (b - a), rel=1e-9)
 
 
+@pytest.mark.parallel
 def test_gravity_heat_and_prescribed_motion(shared_tmp_path, comm):
     """Each of them as the load; the first bar carries both masses, a clamped column E A (alpha T or d/L)."""
     mass, g = DENSITY * AREA * HALF, 9.81

@@ -9,8 +9,6 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.output.result import open_result
 
-pytestmark = pytest.mark.parallel
-
 YOUNG, DENSITY, AREA = 1e6, 1000.0, 1e-4
 STIFF, MASS = YOUNG * AREA, 2 * 0.5 * DENSITY * AREA  # of a bar of 1 m [N/m], of the node that has two [kg]
 
@@ -64,6 +62,7 @@ def test_a_wall_that_does_not_press_holds_nothing(shared_tmp_path, comm):
     assert values == pytest.approx([STIFF / MASS] * 2, rel=1e-12)
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize(("side", "sign"), [("outside", -1.0), ("inside", 1.0)])
 def test_sphere(side, sign, shared_tmp_path, comm):
     """On top of a ball the force of the wall pushes the node further off, F/R; in a bowl it brings it back."""
@@ -94,6 +93,7 @@ def test_at_the_end_of_a_motion(shared_tmp_path, comm):
     assert values == pytest.approx([STIFF / MASS], rel=1e-9)
 
 
+@pytest.mark.parallel
 def test_pairs_in_contact_are_refused(shared_tmp_path, comm):
     """Two rods pressed together: modes are refused with the reason, and the results are kept."""
     case = Case.from_dict(

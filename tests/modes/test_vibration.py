@@ -13,8 +13,6 @@ from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.modes import solvers
 from pfem_petsc.output.result import open_result
 
-pytestmark = pytest.mark.parallel
-
 LENGTH, AREA, YOUNG, DENSITY = 2.54, 1.979325e-6, 2.06842719e11, 7801.433  # VM53
 STRAIN, BARS = 0.00543228, 13
 TENSION = YOUNG * AREA * STRAIN
@@ -62,6 +60,7 @@ def chain(k, mass, bars=BARS):
     return np.sqrt(TENSION / l * (2.0 - 2.0 * np.cos(a)) / inertia) / (2.0 * np.pi)
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
 def test_ten_frequencies_of_a_taut_cable(solver, mass, shared_tmp_path, comm):
@@ -110,6 +109,7 @@ def dense(points, bars, young, area, density, mass):
     return stiff, inert
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
 def test_free_octet_block(solver, mass, shared_tmp_path, comm):
@@ -142,6 +142,7 @@ def test_state_under_load(shared_tmp_path, comm):
     assert frequency == pytest.approx([np.sqrt(stiffness / mass) / (2.0 * np.pi)], rel=1e-9)
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("held", [False, True])
 def test_multigrid_in_place_of_a_factorisation(held, shared_tmp_path, comm, monkeypatch):
     """As for models that are too large to be factorised; the numbers are those of dense matrices."""
@@ -239,6 +240,7 @@ def test_yielded_bars_vibrate_with_the_tangent_of_unloading(shared_tmp_path, com
     assert eigenvalue[2] == pytest.approx(2.0 * YOUNG / half / (DENSITY * half), rel=1e-6)
 
 
+@pytest.mark.parallel
 def test_nothing_can_move(shared_tmp_path, comm):
     data = string(count=1, bars=1)
     with pytest.raises(SimulationFailure, match="nothing can move"):

@@ -5,8 +5,6 @@ import pytest
 
 from pfem_petsc import Case, Simulation, Truss
 
-pytestmark = pytest.mark.parallel
-
 RADIUS, LENGTH, YOUNG = 0.01, 2.0, 2e11
 EULER = np.pi**3 * YOUNG * RADIUS**4 / 4.0 / LENGTH**2
 
@@ -41,6 +39,7 @@ def run(case, comm, folder, capfd, **how):
 STATIC = {"static": {"method": "newton", "step": 0.25, "min_step": 0.25, "max_step": 0.25, "end": 1.0}}
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("law", ["elastic", "elastoplastic"])
 def test_static_loads_beyond_eulers_load(law, comm, shared_tmp_path, capfd):
     material = {"law": law} if law == "elastic" else {"law": law, "yield_stress": 1e9, "isotropic_hardening": 0.0}
@@ -67,6 +66,7 @@ def test_unknown_section_is_not_compared(comm, shared_tmp_path, capfd):
     assert "Euler" not in error + log
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_motion_in_stages_and_after_a_restart(integrator, comm, shared_tmp_path, capfd):
     # a load that is suddenly applied gives twice its force, after half a period of several steps

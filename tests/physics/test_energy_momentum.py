@@ -6,9 +6,8 @@ from helpers.runs import energy, imbalance, run
 
 from pfem_petsc import Case
 
-pytestmark = pytest.mark.parallel
 
-
+@pytest.mark.parallel
 @pytest.mark.slow
 @pytest.mark.parametrize("strain", ["engineering", "green", "logarithmic"])
 def test_conservation(strain, shared_tmp_path, comm):

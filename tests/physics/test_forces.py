@@ -6,8 +6,6 @@ from helpers.runs import imbalance, run, unexplained
 
 from pfem_petsc import Case
 
-pytestmark = pytest.mark.parallel
-
 ROD = {
     "mesh": {"generator": "rod", "length": 1.0, "elements": 8},
     "node_set": {"start": {"group": "start"}, "end": {"group": "end"}, "all": {"all": True}},
@@ -37,6 +35,7 @@ PULLS = {
 }
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("pull", PULLS.values(), ids=PULLS)
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark", "chung_lee"])
 def test_moved_support(integrator, pull, shared_tmp_path, comm):
@@ -55,6 +54,7 @@ def test_moved_support(integrator, pull, shared_tmp_path, comm):
     assert np.mean(history["probe/end/reaction"][100:, 0, 0]) == pytest.approx(0.015, rel=0.1)
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["newmark", "houbolt"])
 def test_halving(integrator, shared_tmp_path, comm):
     """A step that Newton's method cannot make in the iterations allowed is made in parts, which grow back.

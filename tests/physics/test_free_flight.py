@@ -8,8 +8,6 @@ from helpers.runs import energy, imbalance, run
 
 from pfem_petsc import Case, Simulation
 
-pytestmark = pytest.mark.parallel
-
 MESHES = Path(__file__).parents[2] / "meshes"
 
 
@@ -39,6 +37,7 @@ def sizes(case, comm):
     return comm.allreduce(float(mass @ speed)), comm.allreduce(float(mass @ (speed * distance)))
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "linear", "angular"), [("central_differences", 1e-12, 1e-12), ("newmark", 1e-10, None)]
@@ -65,6 +64,7 @@ def test_momentum_over_a_thousand_steps(integrator, linear, angular, comm, share
     print(f"{integrator}: {drift / momentum:.1e} of sum m|v|, {turned / moment:.1e} of sum |x||m v|")
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["newmark", "houbolt", "generalized_alpha", "energy_momentum"])
 def test_a_coarse_solution_keeps_linear_momentum(integrator, comm, shared_tmp_path):

@@ -88,7 +88,6 @@ def test_relative_frame_is_absolute_frame_less_the_ground(scheme, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parallel
 @pytest.mark.parametrize("frame", ["absolute", "relative"])
 @pytest.mark.parametrize("scheme", ["trapezoid", "central_differences"])
 def test_reactions_are_mass_times_acceleration(scheme, frame, comm, shared_tmp_path):
@@ -103,7 +102,6 @@ def test_reactions_are_mass_times_acceleration(scheme, frame, comm, shared_tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.parallel
 def test_free_fall_under_a_table(comm, shared_tmp_path):
     """The velocity is the integral of the table, which is constant outside its rows; smooth ones of their spline."""
     for smooth, integral in ((False, 0.5 * 2.0 + 0.5 * 4.0), (True, 0.5 * 2.0 + 0.5 * 4.0)):

@@ -7,8 +7,6 @@ from helpers.runs import run
 
 from pfem_petsc import Case
 
-pytestmark = pytest.mark.parallel
-
 SECOND_ORDER = {
     "trapezoid": ("newmark", {"beta": 0.25, "gamma": 0.5}),
     "energy_momentum": ("energy_momentum", {}),
@@ -53,6 +51,7 @@ def relative(history):
     return history["probe/mass/position"][:, 0, 0] - history["probe/base/position"][:, 0, 0] - 1.0
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", SECOND_ORDER)
 def test_acceleration_record_against_exact_integration(scheme, comm, shared_tmp_path):
@@ -103,6 +102,7 @@ def test_nothing_rings_after_the_stop(scheme, interpolation, comm, shared_tmp_pa
     assert jagged < 2.0 * (OMEGA * STEP) ** 2 * np.abs(reaction).max()
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
 @pytest.mark.parametrize("scheme", ALL)
 def test_reactions_of_a_body_carried_along(scheme, mass, comm, shared_tmp_path):

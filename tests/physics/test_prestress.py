@@ -18,7 +18,6 @@ INTEGRATORS = [
 RAMP = [[0.0, 0.0], [1e-3, 1500.0]]
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("strain", STRAINS)
 @pytest.mark.parametrize("section", [{"pretension": 4e3}, {"pretension": -4e3}, {"prestress": 4e7}])
 def test_force_in_the_mesh(section, strain, shared_tmp_path, comm):

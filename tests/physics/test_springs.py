@@ -60,7 +60,6 @@ def test_dashpot(scheme, mass, tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-11 * kinetic[0]
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
 def test_static_deflection_and_modes(operator, comm, shared_tmp_path):
     """A chain of rods across its springs: nothing else holds it; reactions are those of the ground."""
@@ -213,7 +212,6 @@ def test_reactions_of_springs_in_statics(comm, shared_tmp_path):
     assert np.abs(history["probe/b/reaction"]).max() < 1e-8
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
 def test_frame_in_statics_modes_and_critical_steps(operator, comm, shared_tmp_path):
     """A weight that moves its bar aside; modes and the explicit limit of stiffness along the bar and across."""

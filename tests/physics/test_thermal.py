@@ -7,8 +7,6 @@ from helpers.runs import run
 from pfem_petsc import Case
 from pfem_petsc.output.result import open_result
 
-pytestmark = pytest.mark.parallel
-
 YOUNG, EXPANSION, LENGTH, AREA, DENSITY = 210e9, 1.2e-5, 2.0, 1e-4, 7850.0
 
 
@@ -65,6 +63,7 @@ def test_free_expansion(strain, shared_tmp_path, comm):
     assert history["elastic_energy"][-1] < 1e-20 * history["elastic_energy"][0]
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["newmark", "central_differences", "chung_lee", "wilson", "energy_momentum"])
 def test_heating_over_time(integrator, shared_tmp_path, comm):
     """A heated restrained bar: stress follows the table, and its elastic energy is the work of heating."""
@@ -105,6 +104,7 @@ def held_bar(folder, comm, law, **tables):
 SHORT = {"integrator": "newmark", "step": 1e-3, "end": 2e-3}
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "lost"),

@@ -9,8 +9,6 @@ from pfem_petsc import Case, Simulation, Truss
 from pfem_petsc.output.units import engineering
 from pfem_petsc.preflight import checks
 
-pytestmark = pytest.mark.parallel
-
 
 def test_two_free_bodies_have_no_mechanisms(comm, shared_tmp_path):
     """Two tetrahedra and a bar: 6, 6 and 5 rigid motions, of which 6 are those of the whole; one of them held: 11."""
@@ -33,6 +31,7 @@ def test_two_free_bodies_have_no_mechanisms(comm, shared_tmp_path):
     assert told["held"].startswith("21 free directions, 0 rigid motions, 11 of parts against each other, 0 mechanisms")
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("name", TRUSSES)
 def test_mechanisms_and_self_stress(comm, shared_tmp_path, name):
     points, bars, fixed, (unknowns, rigid, mechanisms, stresses, loose) = TRUSSES[name]
@@ -46,6 +45,7 @@ def test_mechanisms_and_self_stress(comm, shared_tmp_path, name):
     assert name != "square with a whip" or "the first is node 4. Was the mesh subdivided?" in free[0]
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize(
     ("override", "texts"),
     [
@@ -114,6 +114,7 @@ def test_a_run_needs_at_least_the_memory_that_is_used_before_it(comm, monkeypatc
     assert simulation.inspect()[0]["memory needed"] == f"about {used} by the end of the run, on all ranks"
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize(
     ("name", "overrides"),
     [
@@ -148,6 +149,7 @@ def test_a_mesh_in_millimetres_is_told(comm, shared_tmp_path, scale, area, told)
     assert not told or "a bar of 1.000 km is 100,000 times as long as it is thick (area = 0.0001 m2)" in texts[0]
 
 
+@pytest.mark.parallel
 def test_warnings_of_later_stages(comm):
     """What depends on the tables of a stage is reported for each, and what does not for the first alone."""
     time = {"integrator": "newmark", "step": 1e-4, "end": 1e-3, "beta": 0.25, "gamma": 0.5}

@@ -8,8 +8,6 @@ from helpers.small_models import TRUSSES, case_of
 from pfem_petsc import Case
 from pfem_petsc.registry import lookup
 
-pytestmark = pytest.mark.parallel
-
 
 @pytest.fixture
 def told(comm, shared_tmp_path):
@@ -34,6 +32,7 @@ def test_bars_that_meet_or_cross_at_an_angle_are_sound(told):
     assert not {"same place", "nodes on bars"} & set(entries)
 
 
+@pytest.mark.parallel
 def test_overlaps_without_a_common_node(told):
     """Bars 0-2 and 1-3 on a line, in any direction and far from the origin; and a node in the middle of another bar."""
     q, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
@@ -51,6 +50,7 @@ def test_nodes_that_were_not_merged(told):
     assert entries["same place"].startswith("2 nodes, nodes 3 and 4: merge them")
 
 
+@pytest.mark.parallel
 def test_nodes_on_bars_are_those_of_all_pairs(told):
     """Random bars of very different lengths through a grid of points, against a search of all pairs."""
     random = np.random.default_rng(8)
@@ -86,6 +86,7 @@ def test_generated_meshes_have_no_overlaps(comm, name, shared_tmp_path):
     assert not any("on bars" in text for text in warnings)
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize(("sizes", "seed"), [((60, 41, 7), 4), ((3, *(2,) * 70), 6)])
 def test_parts(told, sizes, seed):
     """Rings of bars, and loose bars, whose numbers wander."""
@@ -112,6 +113,7 @@ def divided(points, bars, parts):
     return points, divided_bars
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 @pytest.mark.parametrize("parts", [1, 2, 5])
 def test_subdivided_members_are_told(told, parts):

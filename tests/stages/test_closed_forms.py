@@ -76,7 +76,6 @@ def test_press_and_release_beyond_yield(run):
 
 
 @pytest.mark.slow
-@pytest.mark.parallel
 def test_loads_stay_or_are_replaced(run):
     stages = [
         {"name": "first", "static": {"step": 0.5, "end": 0.5}, "load": [pull(2.0)]},
@@ -99,7 +98,6 @@ def test_loads_stay_or_are_replaced(run):
 
 
 @pytest.mark.slow
-@pytest.mark.parallel
 def test_gravity_stays_and_a_bar_that_is_let_go_falls(run):
     weight, h = DENSITY * AREA * 10.0, 1e-4
     stages = [
@@ -177,7 +175,6 @@ def test_velocities_are_added_at_the_start_of_their_stage(run):
     np.testing.assert_allclose(history["external_work"][[200, 201, 601]], [0.0, 0.105, 0.3], atol=1e-12)
 
 
-@pytest.mark.parallel
 def test_a_wall_that_nodes_are_beyond_when_its_stage_begins_is_refused(run):
     stages = [
         {"name": "pull", "static": {"step": 0.5}, "load": [pull(100.0)]},

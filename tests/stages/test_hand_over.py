@@ -111,7 +111,6 @@ def test_data_of_bars_are_taken_by_name(comm, shared_tmp_path):
         np.testing.assert_array_equal(bars.history(), kept)
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("steps", [1, 2, 5])
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
 def test_statics_takes_over_while_a_bar_breaks(run, steps, damping):
@@ -127,7 +126,6 @@ def test_statics_takes_over_while_a_bar_breaks(run, steps, damping):
     np.testing.assert_allclose(supplied - found["elastic_energy"][-1], lost, rtol=1e-12)
 
 
-@pytest.mark.parallel
 def test_rest_length_of_a_broken_bar_changes_nothing(run):
     """It has dissipated what it had stored, whatever rest length a later stage gives it."""
     stages = [{"time": FLY, "load": pull(1.0)}, {"static": {"step": 0.25}, "load": pull(4.0)}]

@@ -13,13 +13,12 @@ from helpers.twins import Strut, solid
 from pfem_petsc import Case, Simulation, write_mesh
 from pfem_petsc.errors import InputError, SimulationFailure
 
-pytestmark = pytest.mark.parallel
-
 SQUARE = [[0, 0, 0], [0, 0, 1], [1, 0, 1], [1, 0, 0]]
 CABLE = {"law": "cable", "young_modulus": 2e11, "density": 7850.0}
 FEET = np.array([[0, 0, 0], [20, 0, -5.56], [30, 0, -5], [45, 0, 5.83], [60, 0, 20.0]])
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("method", [{"step": 0.5}, {"method": "relaxation"}])
 def test_slack_members(comm, shared_tmp_path, method):
     """SSNL105 of code_aster: a square of bars with two cables as diagonals, pushed sideways."""
@@ -103,6 +102,7 @@ def strut_case(bar, static, force=-1.0, **more):
     )
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("method", ["displacement", "arc_length"])
 @pytest.mark.parametrize("slenderness", [40.0, 200.0])
 def test_path_control_follows_the_softening_of_a_strut(comm, shared_tmp_path, method, slenderness):
@@ -132,6 +132,7 @@ def test_load_control_ends_at_the_peak(comm, shared_tmp_path):
         assert 0.6 < simulation.state.time < 1.0 / 1.5
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("law", ["cable", "strut", "damage"])
 def test_prestress(law, comm, shared_tmp_path):
     """Bars of two lengths between supports have the force that their section prescribes."""
@@ -177,6 +178,7 @@ def test_each_strut_buckles_at_the_load_of_its_own_area_and_length(comm, shared_
     assert fields["axial_force"] == pytest.approx(-euler, rel=1e-9)
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("linear", ["cg", "gamg"])
 def test_iterative_solvers_take_slack_cables_whose_nodes_are_held(linear, comm, shared_tmp_path):
     """A square of bars on two feet with two diagonals, one of which is slack."""

@@ -11,8 +11,6 @@ from mpi4py import MPI
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError, SimulationFailure
 
-pytestmark = pytest.mark.parallel
-
 WIRE = 5.7e10 * 2.2783e-4
 WEIGHT = 2844.23 * 2.2783e-4 * 9.81 * 325.0
 FOOT_POUNDS = np.array([[0, 0, 0], [20, 0, -5.56], [30, 0, -5], [45, 0, 5.83], [60, 0, 20.0]])
@@ -31,6 +29,7 @@ def test_straight_cable_hangs_as_the_chain_that_it_is(comm, shared_tmp_path, new
     assert row["kinetic_energy"] == 0.0 and not row["momentum"].any()
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 @pytest.mark.parametrize(("heat", "sag"), [(0.0, 6.352161), (39.26, 8.192650)])
 def test_heavy_cable(comm, shared_tmp_path, heat, sag):
@@ -94,6 +93,7 @@ def test_a_net_of_two_chains_is_two_chains(comm, shared_tmp_path):
     assert np.abs(x[:9, 1]).max() < 1e-8
 
 
+@pytest.mark.parallel
 def test_a_mechanism_swings_down(comm, shared_tmp_path):
     """Two bars that are hinged at one end alone, out along x; it hangs straight down, stretched by its weight."""
     case = chain(shared_tmp_path, comm, [[0, 0, 0], [1, 0, 0], [2, 0, 0]], fixed=[0], gravity=-9.81)
@@ -114,6 +114,7 @@ def test_a_free_mode_is_left_alone(comm, shared_tmp_path):
     assert np.linalg.norm(row["probe/ends/reaction"][0]) == pytest.approx(tension[0], rel=1e-8)
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 @pytest.mark.parametrize("sides", [3, 4, 5])
 def test_tensegrity_prism_turns_to_its_angle(comm, shared_tmp_path, sides):
@@ -226,6 +227,7 @@ def test_bars_that_yield_remember_equilibria_alone(comm, shared_tmp_path):
         np.testing.assert_allclose(relaxation[name], newton[name], rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 @pytest.mark.parametrize("newton", [True, False])
 def test_a_net_lies_down_on_a_floor(comm, shared_tmp_path, newton):
@@ -283,6 +285,7 @@ INCREMENTS = [
 FLOOR = "wall=[{name='floor', type='plane', point=[0.0, 0.0, -2.3], normal=[0.0, 0.0, 1.0]}]"
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("newton", [True, False])
 def test_ranks_agree(comm, shared_tmp_path, newton):
     keys = [*INCREMENTS, FLOOR, "material.rope.young_modulus=1e7", "static.step=0.5"]
@@ -307,6 +310,7 @@ def test_what_does_not_settle_ends_with_its_residual(comm, shared_tmp_path):
     assert list(open_result(shared_tmp_path / "out").history["load_factor"]) == [0.0]
 
 
+@pytest.mark.parallel
 def test_crushed_bars_end_the_run_on_all_ranks(comm, shared_tmp_path):
     case = chain(shared_tmp_path, comm, [[0, 0, 0], [1, 0, 0]], support=[
         {"node_set": "at0", "fix": "xyz"}, {"node_set": "at1", "fix": "yz"}],

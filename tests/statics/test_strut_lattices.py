@@ -10,8 +10,6 @@ from helpers.runs import run_with_fields
 
 from pfem_petsc import Case, Simulation, open_result
 
-pytestmark = pytest.mark.parallel
-
 
 def octet_strength(area, cells, comm, folder):
     """Largest force [N] on octet cells of round struts of an area, pressed by 1.2 % between frictionless plates."""
@@ -46,6 +44,7 @@ def octet_strength(area, cells, comm, folder):
     return -history["probe/top/reaction"][:, :, 2].sum(axis=1).min()
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 def test_strength_of_an_octet_cell_follows_yield_and_euler(comm, shared_tmp_path):
     """Areas over 16 to 1: with the area where struts yield, with its square where they buckle."""

@@ -452,7 +452,6 @@ def test_a_failure_is_that_of_single_steps(name, shared_tmp_path):
     np.testing.assert_array_equal(steps[0], steps[1])
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("name", ["turning", "squeezed", "jammed"])
 def test_a_failure_at_curved_walls_is_that_of_single_steps(name, shared_tmp_path):
     """A ball presses nodes against a floor, and against supports."""
@@ -500,7 +499,6 @@ JAMMED = {  # a wall pushes the end of a rod against a node that is held
 }
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("every", [1, 7])
 def test_rows_without_solution_fail_as_in_single_steps(every, comm, shared_tmp_path):
     given, texts = Case.from_dict(JAMMED | {"output": {"fields_every": 0, "history_every": every}}), []

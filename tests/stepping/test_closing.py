@@ -12,7 +12,6 @@ def simulate(comm, folder, *overrides, **options):
     return Simulation(case, comm, output=folder / "out", quiet=True, **options)
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_closed_simulation(comm, shared_tmp_path, integrator):
     with simulate(comm, shared_tmp_path, f"time.integrator={integrator}") as simulation:
@@ -43,7 +42,6 @@ def test_closed_before_its_end(comm, shared_tmp_path):
         assert again.run() == 0
 
 
-@pytest.mark.parallel
 def test_closed_without_a_step(comm, shared_tmp_path):
     with simulate(comm, shared_tmp_path):
         pass

@@ -8,8 +8,6 @@ from pfem_petsc.columns import ENERGIES
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.run.monitors import BlowUp
 
-pytestmark = pytest.mark.parallel
-
 
 def pendulum(comm, folder, integrator, degrees, modulus=1e8, steps=30, **keys):
     """A bar about its end, spinning by an angle a step at first, or falling by it where it is fastest."""
@@ -39,6 +37,7 @@ def row_of(number, **energies):
     }
 
 
+@pytest.mark.parallel
 def test_energy_created_is_compared_with_what_moves_the_truss_in_its_stage(comm, shared_tmp_path):
     """Works of earlier stages (1 MJ), what their quadrature lost, and prestress (0.5 MJ) do not hide that 20 J of
     motion become 400 J: the sixth row beyond twenty times the 20 J is the last, also after a restart between them."""
@@ -96,6 +95,7 @@ def test_gust_on_a_saddle_net_at_too_large_steps_is_stopped(comm, shared_tmp_pat
     assert simulation.row["kinetic_energy"] < 1e5
 
 
+@pytest.mark.parallel
 def test_failures_of_one_kind_are_told_once_and_counted(comm, shared_tmp_path):
     """A fall at 60 degrees a step is rejected again and again: the log has one message, and the number at the end."""
     gravity = {"acceleration": [0.0, 0.0, -9.81]}

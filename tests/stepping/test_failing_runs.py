@@ -9,8 +9,6 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.output.result import open_result
 
-pytestmark = pytest.mark.parallel
-
 COLLAPSE = r"step \d+, t = \S+ s: bar 19 between nodes 19 and 20 has gone through zero length, from 0\.05 m; .*use a"
 
 
@@ -26,6 +24,7 @@ def failing(comm, folder, *overrides):
     return messages[0], open_result(folder) if comm.rank == 0 else None
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["central_differences", "newmark", "chung_lee", "houbolt"])
 def test_bar_driven_through_zero_length(scheme, comm, shared_tmp_path):
     """At three times the wave speed the last bar jumps over zero length within a step."""
@@ -62,6 +61,7 @@ def test_strong_but_bearable_impact_runs_on(comm, shared_tmp_path):
         assert min(result.field("strain", i).min() for i in range(len(result.times))) < -0.5
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["energy_momentum", "central_differences"])
 def test_truss_crushed_between_walls(scheme, comm, shared_tmp_path):
     """Two walls close in on a tetrahedron until there is no room between them, or a bar has collapsed before."""
@@ -97,6 +97,7 @@ def test_truss_crushed_between_walls(scheme, comm, shared_tmp_path):
     assert comm.allgather(str(failure.value)) == [str(failure.value)] * comm.size
 
 
+@pytest.mark.parallel
 def test_no_convergence(comm, shared_tmp_path):
     """One Newton iteration for a nonlinear step and a tolerance below rounding."""
     keys = [

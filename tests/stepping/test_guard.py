@@ -8,8 +8,6 @@ from pfem_petsc import Case, Simulation, Truss
 from pfem_petsc.errors import NotConverged, SimulationFailure
 from pfem_petsc.stepping.guard import LARGEST, NOTICEABLE, StepGuard
 
-pytestmark = pytest.mark.parallel
-
 
 def star_dome():
     """The hexagonal star dome with 24 bars; nodes 7 to 12 are its feet."""
@@ -42,6 +40,7 @@ def last_of(simulation):
     return [step.row for step in simulation][-1]
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [0.1, 1.0, 10.0])
 def test_a_dome_is_not_turned_inside_out(step, comm, shared_tmp_path):
@@ -59,6 +58,7 @@ def test_a_dome_is_not_turned_inside_out(step, comm, shared_tmp_path):
     assert any("energy without a source" in text or "too far from the previous state" in text for text in told)
 
 
+@pytest.mark.parallel
 @pytest.mark.slow
 def test_a_step_that_is_refused_leaves_the_state_as_it_was(comm, shared_tmp_path):
     """A blow throws the apex away in the smallest part of a step: status 3 with reason and way out, and nothing of the
@@ -94,6 +94,7 @@ def lattice(comm, folder):
     return StepGuard(model), model.mesh.points.copy(), model.mesh.n_owned
 
 
+@pytest.mark.parallel
 def test_mirrored_cells_keep_their_lengths_and_are_found(comm, shared_tmp_path):
     guard, x, owned = lattice(comm, shared_tmp_path)
     mirrored = x.copy()
@@ -129,6 +130,7 @@ def guard_of(comm, folder, points, bars, feet, fix="xyz", modulus=1e8):
     return StepGuard(model), model.mesh.points.copy(), model.mesh
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize("degrees", [10.0, 30.0])
 def test_stiff_bars_that_turn_pass_whatever_their_stiffness(degrees, comm, shared_tmp_path):
     """Two bars of 10^8 N turn about their joints by an angle and twice that, with the noise of vibrating bars in the

@@ -48,30 +48,6 @@ def test_rank_that_leaves_a_collective_call_early_ends_the_run(outcome):
 
 
 @pytest.mark.slow
-def test_skip_on_one_rank_skips_everywhere(outcome):
-    status, output = outcome(
-        "@pytest.fixture",
-        "def there():",
-        "    if rank == 1:",
-        "        pytest.skip('not here')",
-        "@pytest.mark.parallel",
-        "def test_a(there):",
-        "    MPI.COMM_WORLD.Barrier()",
-    )
-    assert status == 0
-    assert "1 skipped in" in output
-
-
-@pytest.mark.slow
-def test_ranks_that_find_different_tests_end_the_run(outcome):
-    status, output = outcome(
-        "@pytest.mark.parallel", "@pytest.mark.parametrize('i', range(1 + rank))", "def test_a(i):", "    pass"
-    )
-    assert status != 0
-    assert "the ranks found different tests" in output
-
-
-@pytest.mark.slow
 def test_serial_tests_are_left_out_and_folders_agree_as_promised(outcome):
     status, output = outcome(
         "def test_serial():",

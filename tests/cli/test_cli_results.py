@@ -84,29 +84,6 @@ def test_info(short_run, capsys):
 
 
 @pytest.mark.slow
-def test_plot(short_run, tmp_path, capsys):
-    assert main(["plot", str(short_run), "-o", str(tmp_path)]) == 0
-    written = capsys.readouterr().out.split()
-    assert str(tmp_path / "energies.png") in written
-    assert sorted(map(str, tmp_path.iterdir())) == sorted(written)
-    assert main(["plot", str(short_run), "-o", str(tmp_path), "--curves", "wall/wall/force"]) == 0
-    assert capsys.readouterr().out.split() == [str(tmp_path / "curves.png")]
-    assert main(["plot", str(short_run), "--curves", "wall/wall/forse"]) == 2
-    assert "did you mean 'wall/wall/force'" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_render(short_run, tmp_path, capsys):
-    words = ["render", str(short_run), "-o", str(tmp_path), "--frames", "0,5", "--size", "320x240", "--video", "none"]
-    assert main([*words, "--field", "stress", "--clim", "-1e8", "1e8", "--no-poster"]) == 0
-    printed = capsys.readouterr().out
-    assert "2 frames" in printed
-    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["frame_0000.png", "frame_0001.png"]
-    assert main([*words, "--field", "stres"]) == 2
-    assert "did you mean 'stress'" in capsys.readouterr().err
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["info", "plot", "render"])
 def test_result_that_is_none(verb, tmp_path, capsys):
     assert main([verb, str(tmp_path)]) == 2

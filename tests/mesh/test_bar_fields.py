@@ -72,27 +72,6 @@ def test_field_is_a_section_for_each_bar(name, shared_tmp_path, comm):
         np.testing.assert_allclose(*(h[column] for h in histories), rtol=1e-9, atol=1e-9 * scale, err_msg=column)
 
 
-@pytest.mark.slow
-def test_batches_are_single_steps(tmp_path):
-    from mpi4py import MPI
-
-    file = written(tmp_path, MPI.COMM_SELF)
-    found = []
-    for together in (False, True):
-        case = graded(
-            file,
-            {"s": {"area_field": "thickness", "material": "m"}},
-            time={"integrator": "central_differences", "step": 2e-6, "end": 6e-4},
-        )
-        case.output.history_every = 7
-        with Simulation(case, MPI.COMM_SELF, output=tmp_path / f"{together}", quiet=True) as simulation:
-            count = len(list(simulation.batches() if together else simulation))
-        assert (count < 100) == together
-        found.append(open_result(tmp_path / f"{together}").history)
-    for column in found[0]:
-        np.testing.assert_array_equal(found[0][column], found[1][column], err_msg=column)
-
-
 @pytest.mark.parallel
 def test_pretension_of_bars_with_areas_of_their_own(shared_tmp_path, comm):
     """The force is the same in all bars, the stress is not."""

@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 from helpers.meshes import slab_from, whole
-from mpi4py import MPI
 
 from pfem_petsc.mesh.distribution import distribute
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.ordering import hilbert_keys, sweep_keys
+from pfem_petsc.mesh.ordering import hilbert_keys
 
 PARTITIONERS = ["coordinates", "ptscotch"]
 
@@ -68,46 +67,6 @@ def test_hilbert_curve_visits_neighbour_after_neighbour():
     order = np.argsort(hilbert_keys(points, np.zeros(3), float(n - 1)))
     steps = np.abs(np.diff(points[order], axis=0)).sum(axis=1)
     np.testing.assert_array_equal(steps, 1.0)
-
-
-@pytest.mark.parametrize("cells", [[5, 5, 5], [9, 4, 3]])
-def test_a_lattice_is_swept_in_its_own_order(cells):
-    mesh = lattice.generate(lattice.Parameters(kind="cubic", cells=cells, pitch=0.013), 0, 1)
-    np.testing.assert_array_equal(np.argsort(sweep_keys(mesh.points), kind="stable"), np.arange(mesh.n_nodes))
-
-
-def test_rows_of_a_thin_lattice_are_long():
-    mesh = lattice.generate(lattice.Parameters(kind="cubic", cells=[9, 8, 1], pitch=0.1), 0, 1)
-    order = np.argsort(sweep_keys(mesh.points), kind="stable")
-    np.testing.assert_allclose(np.diff(mesh.points[order][:9], axis=0), [[0.0, 0.1, 0.0]] * 8, atol=1e-15)
-
-
-@pytest.mark.parametrize("kind", ["octet", "bcc", "diamond"])
-def test_bars_of_lattices_repeat_from_cell_to_cell(kind, comm):
-    """Bars of one direction have the same difference of node numbers along a row of cells, in whatever numbering."""
-    n = 10
-    mesh = lattice.generate(lattice.Parameters(kind=kind, cells=[n, n, n], pitch=0.1), 0, 1)
-    shift = 1e-12 * np.random.default_rng(2).standard_normal(mesh.points.shape)  # rounding of a file
-    number = np.empty(mesh.n_nodes, dtype=np.int64)
-    number[np.argsort(sweep_keys(mesh.points + shift), kind="stable")] = np.arange(mesh.n_nodes)
-    ends = np.sort(number[mesh.bars], axis=1)
-    offset, low = ends[:, 1] - ends[:, 0], ends[:, 0]
-    order = np.lexsort((low, offset))
-    runs = 1 + np.count_nonzero((np.diff(low[order]) != 1) | (np.diff(offset[order]) != 0))
-    assert len(mesh.bars) > n * runs
-
-
-@pytest.mark.parametrize("more", [{}, {"missing": 0.1}])
-def test_nodes_of_a_disturbed_lattice_are_in_the_order_of_the_lattice(more):
-    """So its bars are in as long runs of constant offset."""
-    alone, keys = MPI.COMM_SELF, {"kind": "octet", "cells": (5, 4, 3), "pitch": 0.1, **more}
-    slabs = [
-        lattice.generate_on(lattice.Parameters(**keys, perturbation=share), alone, {}, None) for share in (None, 0.2)
-    ]
-    plain, disturbed = (distribute(slab, np.zeros(slab.n_bars, np.int32), alone) for slab in slabs)
-    np.testing.assert_array_equal(disturbed.node_ids, plain.node_ids)
-    np.testing.assert_array_equal(disturbed.bars, plain.bars)
-    assert 0.015 < np.abs(disturbed.points - plain.points).max() < 0.02 + 1e-12
 
 
 def test_bars_lie_close_to_each_other_in_memory(comm):

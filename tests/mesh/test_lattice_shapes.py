@@ -33,15 +33,6 @@ def test_own_cell_with_struts_to_the_next_cells():
     assert "is a mechanism" in mesh.warnings[0]
 
 
-def test_copies_of_a_strut_join_nodes_at_constant_offsets():
-    """What makes numbers regular: far from the faces, the difference of the ends depends on the strut alone."""
-    mesh = generated(kind="kelvin", cells=(6, 6, 6), pitch=1.0)
-    middle = 0.5 * mesh.points[mesh.bars].sum(axis=1)
-    inside = ((middle > 1.5) & (middle < 4.5)).all(axis=1)
-    assert np.count_nonzero(inside) > 500
-    assert len(np.unique(np.diff(mesh.bars[inside], axis=1))) <= 24  # struts of a cell
-
-
 def test_graded_pitch_follows_its_differential_equation():
     """dx/ds = p (1 + a x) from 0 is x = (exp(a p s) - 1)/a."""
     pitch, a = 0.1, 2.0

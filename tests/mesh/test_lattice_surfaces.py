@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from helpers.meshes import CORNERS, CUBE, assert_part_of, degrees, filled, lengths, write_stl
 from mpi4py import MPI
 
-from pfem_petsc import Case, Simulation
 from pfem_petsc.case.toml import FOLDER
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice
@@ -181,21 +178,6 @@ def test_gradings_that_do_not_fit_the_surface(tmp_path, factor, origin, told, mo
     monkeypatch.setattr("pfem_petsc.mesh.generators.lattice.block._STEPS", 1)
     with pytest.raises(InputError, match=told):
         filled(kind="cubic", pitch=0.25, surface={"file": str(path)}, grading=(1, 1, factor), origin=origin)
-
-
-def test_the_graded_bracket_of_the_page_runs(tmp_path, monkeypatch):
-    page = (Path(__file__).parents[2] / "docs/lattices.md").read_text()
-    (text,) = [block for block in page.split("```toml\n")[1:] if 'title = "Graded bracket"' in block]
-    monkeypatch.chdir(tmp_path)
-    Path("bracket.stl").write_bytes((FOLDER / "bracket.stl").read_bytes())
-    Path("graded.toml").write_text(text.split("```")[0])
-    case = Case.load("graded.toml", ["mesh.pitch=0.008"])
-    with Simulation(case, comm=MPI.COMM_SELF, quiet=True) as simulation:
-        simulation.run()
-        points, bars = simulation.mesh.points, simulation.mesh.n_bars
-        lowest = simulation.state.position[:, 2] - points[:, 2] if len(points) else np.zeros(1)
-    assert bars > 500
-    assert -1e-3 < lowest.min() < 0.0  # it sags under its weight
 
 
 @pytest.mark.parallel

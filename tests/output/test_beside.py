@@ -14,7 +14,6 @@ from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.output import hdf5, vtkhdf
 from pfem_petsc.output.integrity import damages
 from pfem_petsc.output.result import open_result
-from pfem_petsc.parallel.heap import SharedArrays, share_memory
 
 STEPS = range(0, 40, 5)
 
@@ -78,33 +77,6 @@ def test_file_of_snapshots_beside_the_steps_equals_that_of_one_rank(shared_tmp_p
 
 
 @pytest.mark.parallel
-def test_one_after_the_other_in_order(shared_tmp_path, monkeypatch):
-    """The next snapshot begins when the one before is in the file, so that memory holds one."""
-    seen, write_values, publish = [], vtkhdf._Snapshots.write, vtkhdf._Snapshots.publish
-
-    def begun(self, n, arrays):
-        seen.append(("begun", n))
-        return write_values(self, n, arrays)
-
-    def published(self, n, time):
-        publish(self, n, time)
-        seen.append(("published", n))
-
-    monkeypatch.setattr(vtkhdf._Snapshots, "write", begun)
-    monkeypatch.setattr(vtkhdf._Snapshots, "publish", published)
-    path, truss = shared_tmp_path / "result.vtkhdf", Truss(COMM)
-    with vtkhdf.ResultWriter(path, COMM, truss.mesh, **options()) as writer:
-        for step in STEPS:
-            begin(writer, truss, step)
-    if COMM.rank == 0:
-        assert seen == [(what, n) for n in range(len(STEPS)) for what in ("begun", "published")]
-        result = open_result(path)
-        np.testing.assert_array_equal(result.steps, STEPS)
-        for i, step in enumerate(STEPS):
-            assert_grid_is(result.mesh(i), truss, step)
-
-
-@pytest.mark.parallel
 @pytest.mark.parametrize("then", ["begin", "flush", "close"])
 def test_failure_beside_the_steps_is_raised_by_the_next_call_on_all_ranks(shared_tmp_path, monkeypatch, then):
     mark = vtkhdf._Snapshots.mark
@@ -159,23 +131,3 @@ def test_functions_and_loops_over_steps_see_the_snapshot_of_their_step(shared_tm
         assert len(seen) > 60
         assert seen == [(step, step - step % 10) for step, _ in seen]
     COMM.Barrier()
-
-
-@pytest.mark.parallel
-def test_arrays_that_ranks_share(monkeypatch):
-    arrays = SharedArrays(COMM, {"a": np.dtype((np.float64, (COMM.size, 3))), "b": np.dtype((np.int32, (0,)))}).arrays
-    arrays["a"][COMM.rank] = COMM.rank
-    COMM.Barrier()
-    np.testing.assert_array_equal(arrays["a"], np.repeat(np.arange(COMM.size), 3).reshape(-1, 3))
-    assert arrays["b"].size == 0
-    assert share_memory(COMM)
-    COMM.Barrier()
-
-    def refused(path, *given):
-        if str(path).startswith("/proc/"):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
-        return opened(path, *given)
-
-    opened = os.open
-    monkeypatch.setattr(os, "open", refused)
-    assert share_memory(COMM) == (COMM.size == 1)

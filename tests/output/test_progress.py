@@ -26,15 +26,6 @@ class Clock:
         return self.now
 
 
-class OtherRank:
-    """What a rank other than 0 of a communicator looks like to code that does not communicate after set-up."""
-
-    rank, size = 1, 2
-
-    def allreduce(self, value, op=None):
-        return self.size
-
-
 def run(steps: int, wall_per_step: float, **options) -> str:
     clock, stream = Clock(), io.StringIO()
     span = Span(options.pop("n_steps", steps), 1e-3 * steps)
@@ -132,33 +123,6 @@ def test_log_has_date_and_level_and_is_continued(tmp_path, capsys):
     assert captured.out == "" and captured.err.count("warning: node 3 is fast") == 2
 
 
-def test_nothing_is_said_when_nothing_is_due():
-    clock, stream = Clock(), io.StringIO()
-    progress = Progress(COMM, "Rod", Span(10**6, 1.0), stream=stream, clock=clock)
-    for step in range(1, 10001):
-        progress.update(step, 1e-6 * step, 1e-6, 1, 10, 0, 0.0)
-    assert stream.getvalue() == ""
-    clock.now += 2.0
-    progress.update(10001, 0.010001, 1e-6, 1, 10, 0, 0.0)
-    assert stream.getvalue().count("\n") == 1
-    assert "Newton 1.0/step" in stream.getvalue()  # the silent steps are counted
-    progress.close("stopped")
-    assert "stopped: 10,001 steps" in stream.getvalue() and "done" not in stream.getvalue()
-
-
-def test_other_ranks_say_nothing(tmp_path, capsys):
-    stream, clock = io.StringIO(), Clock()
-    progress = Progress(OtherRank(), "Rod", Span(10, 1.0), stream=stream, clock=clock, log_path=tmp_path / "log.txt")
-    progress.summary({"nodes": "21"})
-    clock.now += 60
-    progress.update(1, 0.1, 0.1)
-    progress.message("text")
-    progress.warning("text")
-    progress.close()
-    assert stream.getvalue() == "" and not (tmp_path / "log.txt").exists()
-    assert capsys.readouterr() == ("", "")
-
-
 @pytest.mark.parallel
 def test_unwritable_log_is_refused_on_all_ranks(tmp_path):
     (tmp_path / "file").write_text("")
@@ -177,20 +141,6 @@ def test_lost_log_is_said_once_and_the_run_goes_on(tmp_path, capsys):
     error = capsys.readouterr().err
     assert error.count("the log cannot be written any more") == 1
     assert "one" in stream.getvalue() and "two" in stream.getvalue() and "done" in stream.getvalue()
-
-
-class Gone(io.StringIO):
-    def write(self, text):
-        raise BrokenPipeError
-
-
-def test_reader_of_stdout_that_leaves_does_not_stop_the_run(tmp_path):
-    log = tmp_path / "log.txt"
-    progress = Progress(COMM, "Rod", Span(10, 1.0), log_path=log, stream=Gone())
-    progress.message("one")
-    progress.message("two")
-    progress.close()
-    assert "stdout is closed" in log.read_text() and "two" in log.read_text()
 
 
 class Terminal(io.StringIO):

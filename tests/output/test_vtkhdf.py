@@ -25,7 +25,6 @@ from pfem_petsc.columns import DECLARED, OF_MODES
 from pfem_petsc.errors import InputError
 from pfem_petsc.output import hdf5 as growing
 from pfem_petsc.output.integrity import damages
-from pfem_petsc.output.layout import complete_snapshots
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.units import unit_of
 from pfem_petsc.output.vtkhdf import ResultWriter
@@ -193,16 +192,6 @@ def test_compressed_snapshots(shared_tmp_path, monkeypatch, n_nodes, n_bars):
             assert_grid_is(read_with_vtk(paths[1], i)[0], truss, step)
 
 
-def test_compression_makes_files_smaller(tmp_path):
-    sizes = []
-    for compressed in (False, True):
-        truss = Truss(MPI.COMM_SELF, 3_000, 3_000)
-        with ResultWriter(tmp_path / "r", MPI.COMM_SELF, truss.mesh, **options(compressed=compressed)) as writer:
-            write(writer, truss, STEPS)
-        sizes.append((tmp_path / "r").stat().st_size)
-    assert sizes[1] < 0.8 * sizes[0]
-
-
 @pytest.mark.parallel
 def test_many_history_rows_come_in_blocks(shared_tmp_path):
     path = shared_tmp_path / "result.vtkhdf"
@@ -228,18 +217,6 @@ def test_no_fields_and_no_history(shared_tmp_path):
     if COMM.rank == 0:
         np.testing.assert_array_equal(read_with_vtk(path, 1)[0].points, truss.whole(5)[0])
         assert len(open_result(path).history) == 0
-
-
-def test_large_snapshots_do_not_share_chunks_where_sizes_allow(tmp_path):
-    truss = Truss(MPI.COMM_SELF, n_nodes=120_000, n_bars=120_000)
-    with ResultWriter(tmp_path / "result.vtkhdf", MPI.COMM_SELF, truss.mesh, **options()) as writer:
-        write(writer, truss, (0, 5))
-    with h5py.File(tmp_path / "result.vtkhdf") as file:
-        points = file["VTKHDF/Points"]
-        assert 120_000 % points.chunks[0] == 0
-        assert 100_000 < points.chunks[0] * 24 <= 1 << 20
-        assert complete_snapshots(file) == 2
-    assert_grid_is(read_with_vtk(tmp_path / "result.vtkhdf", 1)[0], truss, 5)
 
 
 @pytest.mark.slow

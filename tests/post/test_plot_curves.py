@@ -14,7 +14,6 @@ from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.errors import InputError
 from pfem_petsc.post import chart
 from pfem_petsc.post.chart import DASHES, REFERENCE, distinct
-from pfem_petsc.post.curves import draw_curves
 from pfem_petsc.post.filters import window_mean
 from pfem_petsc.post.plot import plot
 
@@ -46,12 +45,6 @@ def test_window_mean_keeps_the_impulse_of_uneven_steps():
     inner = slice(50, 350)
     # of the time before each point
     assert window_mean(time, line, 0.03)[inner] == pytest.approx(line[inner] - 3.0 * 0.015, rel=1e-9, abs=1e-12)
-
-
-def test_curves_of_an_earlier_call_stay(tmp_path, result):
-    (first,) = plot(result, tmp_path, curves=["kinetic_energy"])
-    (second,) = plot(result, tmp_path, curves=["momentum"])
-    assert [first.name, second.name] == ["curves.png", "curves_2.png"]
 
 
 def test_formats_and_tables(tmp_path, result):
@@ -135,17 +128,6 @@ def test_many_lines_and_areas_differ():
     areas = [chart.area(k) for k in range(16)]
     assert len({(s.get("color", s.get("facecolor")), s.get("hatch")) for s in areas}) == 16
     assert distinct(1, 1)["linestyle"] != distinct(0, 0)["linestyle"]
-
-
-def test_ten_results_keep_their_colours_in_all_panels(tmp_path):
-    """Also where a vector is zero in one of them, which has all components there; and all differ."""
-    results = [SyntheticResult(tmp_path / f"r{k}" / "result.vtkhdf", *ring()) for k in range(10)]
-    results[0].history["wall/wall/force"][:] = 0.0
-    drawn = draw_curves(results, ["wall/wall/force", "kinetic_energy"])
-    looks = [[(line.get_color(), str(line.get_linestyle())) for line in axes.lines] for axes in drawn.axes]
-    dashes = [[str(line._unscaled_dash_pattern) for line in axes.lines] for axes in drawn.axes]
-    assert looks[0] == looks[1] and dashes[0] == dashes[1] and len(looks[0]) == 10
-    assert len(set(zip(looks[0], dashes[0], strict=True))) == 10
 
 
 def test_displacements_are_compared_and_not_positions(tmp_path):

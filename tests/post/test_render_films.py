@@ -5,7 +5,7 @@ from __future__ import annotations
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from helpers.pictures import TINY, box, draw, drawing, near, pixels, projected
+from helpers.pictures import TINY, box, draw, drawing, pixels, projected
 from helpers.synthetic import SyntheticResult, ring
 from PIL import Image
 
@@ -38,20 +38,6 @@ def test_results_side_by_side(tmp_path, flying):
     other.axis = LOAD_FACTOR
     with pytest.raises(InputError, match="different axes \\(t, load factor\\)"):
         draw(tmp_path, [flying, other])
-
-
-def test_curves_of_results_side_by_side(tmp_path, flying):
-    """Each has its own curve, with one range for all: the curve of a tenth of the energy stays low."""
-    other = SyntheticResult(tmp_path / "y" / "result.vtkhdf", *ring(), walls=())
-    other.history["kinetic_energy"] = 0.1 * other.history["kinetic_energy"]
-    (file,) = draw(tmp_path, [flying, other], frames=[0], inset="kinetic_energy", size=(960, 400), cmap="Greys")
-    picture = drawing(file)
-    middle = picture.shape[1] // 2
-    heights = [near(half, (217, 72, 43), 25)[0] for half in (picture[:, :middle], picture[:, middle:])]
-    assert min(len(rows) for rows in heights) > 10
-    assert heights[1].mean() > heights[0].mean() + 40
-    with pytest.raises(InputError, match="inset needs tiles of 220 pixels or more, and these have 104"):
-        draw(tmp_path, [flying, other], inset="kinetic_energy", size=(240, 160))
 
 
 def test_slow_motion_is_between_snapshots(tmp_path, flying):
@@ -138,16 +124,6 @@ def test_ranks_divide_the_frames(shared_tmp_path, comm):
     if comm.rank == 0:
         own = render(alone, shared_tmp_path / "alone", video="none", **options)
         assert [path.read_bytes() for path in written[1:]] == [path.read_bytes() for path in own]
-
-
-def test_marker_moves_along_the_curve(tmp_path, flying):
-    files = draw(tmp_path, flying, frames=[1, 11], inset="kinetic_energy", size=(640, 360), cmap="Greys")
-    first, last = (near(drawing(file), (217, 72, 43), 25) for file in files)
-    assert last[1].mean() > first[1].mean() + 50
-    assert draw(tmp_path, flying, frames=[0], inset="centre_of_mass.x")
-    for name, text in (("kinetic_enrgy", "did you mean"), ("kinetic_energy.x", "is a number and has no components")):
-        with pytest.raises(InputError, match=text):
-            draw(tmp_path, flying, inset=name)
 
 
 def test_transparent_background(tmp_path, flying):

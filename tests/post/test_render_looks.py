@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.pictures import box, camera_of, draw, drawing, near, picture_of, pixels
+from helpers.pictures import box, camera_of, draw, drawing, near, picture_of
 from helpers.synthetic import SyntheticResult, lattice, ring
 
 from pfem_petsc import Case, Simulation, open_result
@@ -15,7 +15,6 @@ from pfem_petsc.errors import InputError
 from pfem_petsc.post.colours import GHOST, MARKS, TRAILS
 from pfem_petsc.post.motion import chosen_frames, drawn_radii, radii_of
 from pfem_petsc.post.options import frames_of
-from pfem_petsc.post.page import Page
 from pfem_petsc.post.scene import Layer, Style
 
 
@@ -151,21 +150,6 @@ def test_what_is_added_has_its_depth(view):
         picture = picture_of(points, [[0, 1]], [[255, 0, 0]], camera, (200, 200), style, layers)
         assert (picture[100, 100, 1] > picture[100, 100, 0]) == seen, (height, sign)
         assert picture[40, 100, 1] > picture[40, 100, 0]
-
-
-def test_bars_of_small_models_are_seen_in_tiles_too(tmp_path):
-    """A slender tower of some hundred bars: two pixels or more in the six instants of a page, too."""
-    level = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
-    points = np.concatenate([level + [0.0, 0.0, 1.4 * k] for k in range(20)])
-    i, four = np.arange(76), np.tile([1, 1, 1, -3], 19)
-    bars = np.concatenate([np.stack(ends, axis=1) for ends in ((i, i + 4), (i, i + 4 + four), (i + 4, i + 4 + four))])
-    tower = SyntheticResult(tmp_path / "x" / "result.vtkhdf", points, bars, walls=(), snapshots=7)
-    poster, frame = (pixels(file) for file in draw(tmp_path, tower, frames=[3], poster=True, size=(960, 540)))
-    for picture in (poster, frame):
-        left, top, width, height = Page.region_of((picture.shape[1], picture.shape[0]))
-        ink = picture[top + height // 10 : top + height, left : left + width, :3].min(axis=2) < 200
-        rows = ink[ink.any(axis=1)]
-        assert rows.sum() / len(rows) > 6.0  # four chords and a diagonal or more in each row
 
 
 def test_a_field_of_rounding_errors_has_no_colours(tmp_path, flying):

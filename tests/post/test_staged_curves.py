@@ -8,7 +8,6 @@ from helpers.pictures import table_columns
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.chart import Chart, Curve, Panel
 from pfem_petsc.post.filters import amplitude_spectrum, cfc, window_mean
 from pfem_petsc.post.plot import plot
 
@@ -84,16 +83,6 @@ def test_the_axis_says_that_load_factors_are_on_it(tmp_path, result):
         "load factor 0.5",
         "load factor 1",
     ]
-
-
-def test_stages_have_the_same_width(result):
-    """0.2 s of motion between load factors of 1 and 1."""
-    ends = result.stage_ends
-    assert ends == pytest.approx([0.0, 1.0, 1.0 + END, 2.0 + END])
-    values = result.history["kinetic_energy"]
-    chart = Chart([Panel("energy", "J", [Curve("k", values)])], "", result.history["time"], result.axis, ends=ends)
-    places = chart.axes[0].transData.transform(np.stack([ends, 0.0 * ends], axis=1))[:, 0]
-    assert np.diff(places) == pytest.approx(np.ptp(places) / 3.0)
 
 
 def test_walls_of_later_stages_stand_where_they_begin(result):

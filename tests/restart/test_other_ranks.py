@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from helpers.stopped import CASES, everywhere, request_stop, simulate
+from helpers.stopped import CASES, everywhere, simulate
 from mpi4py import MPI
 
-from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.errors import EarlyStop
+from pfem_petsc import open_result
 
 
 @pytest.mark.slow
@@ -49,47 +48,4 @@ def _far(one, other):
         for i in range(len(a.times)):
             if np.abs(a.positions(i) - b.positions(i)).max() > 1e-10 * np.abs(a.positions(i)).max():
                 found[f"positions {i}"] = i
-    return found
-
-
-@pytest.mark.parallel
-def test_state_comes_back_to_the_last_bit_with_nodes_elsewhere(comm, shared_tmp_path):
-    """One rank writes a yielding lattice, all read it: nodal arrays and plastic strains are the same numbers."""
-    case, overrides = CASES["plastic lattice"]
-    folder = shared_tmp_path / "lattice"
-    before = {}
-    if comm.rank == 0:
-        first = Simulation(Case.load(case, overrides), MPI.COMM_SELF, output=folder, quiet=True)
-        request_stop(first, 60)
-        with pytest.raises(EarlyStop):
-            first.run()
-        before = _by_number(first, MPI.COMM_SELF)
-        assert np.abs(before["plastic_strain"]).max() > 1e-6
-    before = comm.bcast(before)
-    again = Simulation(Case.load(case, overrides), comm, output=folder, quiet=True, restart=True)
-    again.start()
-    after = _by_number(again, comm)
-    again._finish("stopped")
-    assert before.keys() == after.keys()
-    for name in before:
-        assert before[name].tobytes() == after[name].tobytes(), name
-
-
-def _by_number(simulation, comm):
-    """Nodal arrays and plastic strains in mesh numbering, checked to be equal where a bar is on two ranks."""
-    mesh, state = simulation.mesh, simulation.state
-    owned = mesh.n_owned
-    found = {}
-    arrays = {"x": state.position, "v": state.v, "a": state.a, "f": state.f[:owned], "contact": state.contact}
-    for name, array in {**arrays, **state.memory}.items():
-        whole = np.zeros((mesh.n_nodes, 3))
-        whole[mesh.node_ids[:owned]] = array
-        found[name] = comm.allreduce(whole)
-    strain = simulation.model.bars.fields(state.x)["plastic_strain"]
-    low, high = np.full(mesh.n_bars, np.inf), np.full(mesh.n_bars, -np.inf)
-    low[mesh.bar_ids] = high[mesh.bar_ids] = strain
-    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-    np.testing.assert_array_equal(low, high)
-    found["plastic_strain"] = low
     return found

@@ -1,13 +1,9 @@
 """Killed, restarted and compared on 1, 2, 3, 5 and 8 ranks of five nodes: some own one, some nothing."""
 
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pytest
-from helpers.kills import command, differences
-from helpers.launch import environment
 
 from pfem_petsc.cli.main import main
 from pfem_petsc.output.result import open_result
@@ -51,22 +47,6 @@ name = "tip"
 node_set = "tip"
 """
 
-KILLED = """
-import os, signal, sys
-from mpi4py import MPI
-from pfem_petsc import Simulation
-from pfem_petsc.cli.main import main
-advance = Simulation._advance
-main([*sys.argv[1:], "-o", "whole"])
-
-def killed(self, most=1):
-    if self.state.step == 27 and MPI.COMM_WORLD.rank == MPI.COMM_WORLD.size - 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return advance(self, most)
-Simulation._advance = killed
-main([*sys.argv[1:], "-o", "killed"])
-"""
-
 
 def alone(folder, scheme):
     """A case file, and beside it the results on one rank."""
@@ -88,20 +68,6 @@ def assert_near(one, other):
             assert np.abs(a.positions(i) - b.positions(i)).max() < 1e-10
         for name in a.history:
             assert np.abs(np.asarray(a.history[name], float) - b.history[name]).max() < 1e-10, name
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(("ranks", "scheme"), [(5, "houbolt"), (8, "central_differences")])
-def test_killed_run_ends_as_if_undisturbed(tmp_path, ranks, scheme):
-    case = alone(tmp_path, scheme)
-    (tmp_path / "killed.py").write_text(KILLED)
-    options = {"env": environment(), "capture_output": True, "text": True, "timeout": 150.0, "cwd": tmp_path}
-    line = ["mpirun", "-n", str(ranks), sys.executable, "killed.py", case.name, "--quiet"]
-    assert subprocess.run(line, **options).returncode not in (0, 2, 3, 4)
-    done = subprocess.run(command(ranks, case.name, "--quiet", "-o", "killed", "--restart"), **options)
-    assert done.returncode == 0, done.stderr
-    assert differences(*(tmp_path / name / "result.vtkhdf" for name in ("whole", "killed"))) == {}
-    assert_near(tmp_path / "alone", tmp_path / "killed")
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ from petsc4py import PETSc
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.solvers.matrix_free import pass_less_often
-from pfem_petsc.solvers.node_loops import extend, extrapolate
 
 STEP = 4e-6  # twice the passage of a wave through a cell
 LATTICE = {
@@ -110,18 +109,3 @@ def test_options_for_the_accuracy_of_linear_solves_are_followed(comm, tmp_path):
         options.delValue("pfem_ksp_rtol")
     assert min(newton) > 1
     simulation.stepper.destroy()
-
-
-def test_guesses_follow_each_node_by_the_best_polynomial():
-    """A node with a constant acceleration that jumps, one with a linear and one with a quadratic one."""
-    times, steps = np.arange(8.0), np.zeros(8)
-    steps[::2] = 1.0
-    curves = np.stack([steps, 3.0 * times, times**2])
-    found, differences, orders = np.empty((3, 3)), np.zeros((3, 6)), np.zeros(3, dtype=np.uint8)
-    vectors = [curve[:, None] * np.ones(3) for curve in curves.T]
-    for before, after in zip(vectors[:-1], vectors[1:-1], strict=False):
-        extend(before, after, differences, orders)
-    extrapolate(vectors[-2], differences, orders, 2.0, found)
-    assert orders.tolist() == [0, 1, 2]
-    np.testing.assert_allclose(found[1:], 2.0 * vectors[-1][1:], rtol=1e-14)
-    np.testing.assert_allclose(found[0], 2.0 * vectors[-2][0], rtol=1e-14)

@@ -10,7 +10,6 @@ from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError, SimulationFailure
 
 HALF, HEIGHT, YOUNG, AREA = 1.0, 0.2, 1e9, 1e-4
-STEEL = {"steel": {"young_modulus": YOUNG, "density": 1000.0}}
 RESULTANT = {  # axial force times dl/dz over E A: (strain, derivative of the strain by the length) of l over l0
     "engineering": lambda s: s - 1.0,
     "green": lambda s: 0.5 * (s * s - 1.0) * s,
@@ -82,20 +81,6 @@ def test_stabilised_increments_snap_through(shared_tmp_path, comm, stabilise):
     assert (np.diff(history["damping_dissipation"]) >= 0.0).all()
     assert history["damping_dissipation"][-1] > history["elastic_energy"][-1]
     assert abs(history["energy_imbalance"]).max() < 1e-8 * history["external_work"][-1]
-
-
-def test_damping_of_materials_does_nothing_without_time(shared_tmp_path, comm):
-    damped = {"steel": {"young_modulus": YOUNG, "density": 1000.0, "damping": 1e5}}
-    history = history_of(truss(shared_tmp_path, comm, material=damped), comm, shared_tmp_path)
-    assert not history["damping_dissipation"].any()
-
-
-def test_increments_grow_up_to_the_largest(shared_tmp_path, comm):
-    case = truss(shared_tmp_path, comm, static={"step": 0.01, "max_step": 0.2})
-    steps = np.diff(history_of(case, comm, shared_tmp_path)["load_factor"])
-    assert steps[0] == pytest.approx(0.01)
-    np.testing.assert_allclose(steps[:5], 0.01 * 1.5 ** np.arange(5))
-    assert steps.max() == pytest.approx(0.2)
 
 
 def test_loads_and_gravity_grow_with_the_load_factor_and_tables_are_over_it(shared_tmp_path, comm):

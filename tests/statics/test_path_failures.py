@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from helpers.small_models import TRUSSES
 from mpi4py import MPI
-from petsc4py import PETSc
 
 import pfem_petsc.statics.stability
 from pfem_petsc import Case, Simulation, Truss, open_result
@@ -90,30 +89,6 @@ def test_displacement_that_turns_back(tmp_path):
     assert 0.143 < 0.1016 - history["probe/apex/position"][-1, 0, 2] < 0.16
 
 
-def test_a_factorisation_that_fails_within_a_solve_shortens_the_step(tmp_path, monkeypatch):
-    """As with PETSc 3.18 on several ranks; which matrices provoke it there depends on their order."""
-
-    class MumpsError(PETSc.Error):
-        def __str__(self):
-            return "error code 76\nError reported by MUMPS in solve phase: INFOG(1)=-3"
-
-    class FailsOnce:
-        def __init__(self, ksp):
-            self.destroy, self.setOperators = ksp.destroy, ksp.setOperators
-
-        def solve(self, b, x):
-            raise MumpsError(76)
-
-    case = von_mises({"method": "arc_length", "step": 0.05, "max_points": 4})
-    with Simulation(case, MPI.COMM_SELF, output=tmp_path / "a", quiet=True) as simulation:
-        for step in simulation:
-            if step.step == 1:
-                system = simulation.stepper.system
-                failing = system._ksp = FailsOnce(system._ksp)
-    assert system._ksp is not failing
-    assert open_result(tmp_path / "a").history["step"][-1] == 4
-
-
 class TestFreeMotions:
     @pytest.mark.parametrize("dense", [True, False])
     @pytest.mark.parametrize("method", ["newton", "arc_length"])
@@ -139,23 +114,6 @@ class TestFreeMotions:
         reached = float(text.split("beyond load factor ")[1].split()[0])
         assert 0.38 < reached < 0.3810873
         assert "free" not in text
-
-
-@pytest.mark.slow
-def test_factorised_inertia_finds_the_same(tmp_path, monkeypatch):
-    """Events of the dome by inertia and inverse iteration are those by all eigenvalues, branch included."""
-    case = Case.load(
-        "dome_16", ["static.branch_at=[2]", "static.step=0.05", "static.max_points=16", "output.fields_every=0"]
-    )
-    found = []
-    for name, dense in (("dense", 450), ("factorised", 0)):
-        monkeypatch.setattr(pfem_petsc.statics.stability, "DENSE", dense)
-        Simulation(case, MPI.COMM_SELF, output=tmp_path / name, quiet=True).run()
-        found.append(open_result(tmp_path / name).history)
-    for column in ("kind", "multiplicity", "step"):
-        assert found[0][f"event/{column}"].tolist() == found[1][f"event/{column}"].tolist()
-    np.testing.assert_allclose(found[0]["event/load_factor"], found[1]["event/load_factor"], rtol=1e-8)
-    np.testing.assert_allclose(found[0]["probe/ring/position"], found[1]["probe/ring/position"], atol=1e-8)
 
 
 @pytest.mark.slow

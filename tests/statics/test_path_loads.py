@@ -170,11 +170,3 @@ def test_gravity_as_the_load(tmp_path):
     history = run(case, tmp_path / "a", COMM)
     z = history["probe/n0/position"][:, 0, 2]
     np.testing.assert_allclose(100.0 * history["load_factor"], arch_force(z), atol=1e-7)
-
-
-def test_end_is_reached_exactly(tmp_path):
-    load = [{"node_set": "n0", "force": [0.0, 0.0, -100.0]}]
-    history = run(arch({"end": 0.3}, load=load), tmp_path / "a", COMM)
-    assert history["load_factor"][-1] == pytest.approx(0.3, abs=1e-14)
-    assert (np.diff(history["load_factor"]) > 0.0).all()
-    assert 100.0 * 0.3 == pytest.approx(arch_force(history["probe/n0/position"][-1, 0, 2]), rel=1e-8)

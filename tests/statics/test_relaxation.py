@@ -72,27 +72,6 @@ def test_hanging_cable_with_three_weights(comm, shared_tmp_path):
         assert open_result(shared_tmp_path / "out").field("axial_force", -1).max() == pytest.approx(24762.0, rel=3e-4)
 
 
-def test_a_net_of_two_chains_is_two_chains(comm, shared_tmp_path):
-    """Held along two edges; the bars across bear nothing, but hang with their weight."""
-    data = {
-        "mesh": {"generator": "net", "size": [8.0, 2.0], "cells": [8, 1]},
-        "node_set": {"ends": {"indices": [0, 8, 9, 17]}, "right": {"indices": [8, 17]}, "left": {"indices": [0, 9]}},
-        "material": {"m": {"young_modulus": 1e8, "density": 1000.0}},
-        "section": {"s": {"area": 1e-4, "material": "m"}},
-        "support": [
-            {"node_set": "left", "fix": "xyz"},
-            {"node_set": "right", "fix": "xyz", "motion": [[0.0, 0.0, 0.0, 0.0], [1.0, -2.5, 0.0, 0.5]]},
-        ],
-        "gravity": {"acceleration": [0.0, 0.0, -9.81]},
-        "static": {"method": "relaxation"},
-    }
-    _, x = run(data, comm, shared_tmp_path / "out")
-    _, places = funicular(5.5, 0.5, 1.0, 1e4, np.full(7, 0.2 * 9.81))
-    for edge in (x[:9], x[9:]):
-        assert np.abs(edge[:, [0, 2]] - places).max() < 1e-7
-    assert np.abs(x[:9, 1]).max() < 1e-8
-
-
 @pytest.mark.parallel
 def test_a_mechanism_swings_down(comm, shared_tmp_path):
     """Two bars that are hinged at one end alone, out along x; it hangs straight down, stretched by its weight."""
@@ -225,26 +204,6 @@ def test_bars_that_yield_remember_equilibria_alone(comm, shared_tmp_path):
     assert newton["plastic_dissipation"][-1] > 0.1
     for name in ("probe/all/position", "plastic_dissipation", "elastic_energy", "load_factor"):
         np.testing.assert_allclose(relaxation[name], newton[name], rtol=1e-7, atol=1e-9)
-
-
-@pytest.mark.parallel
-@pytest.mark.slow
-@pytest.mark.parametrize("newton", [True, False])
-def test_a_net_lies_down_on_a_floor(comm, shared_tmp_path, newton):
-    """The floor and the corners bear the weight; nodes are on the floor or above it."""
-    keys = ["mesh.cells=[4, 4]",
-            "wall=[{name='floor', type='plane', point=[0.0, 0.0, -2.0], normal=[0.0, 0.0, 1.0]}]",
-            "material.rope.young_modulus=1e7", f"static.newton={str(newton).lower()}"]  # fmt: skip
-    row, x = run(Case.load("hanging_net", keys), comm, shared_tmp_path / "out")
-    weight = 1000.0 * 1e-4 * 9.81 * 2 * 5 * 10.0
-    assert x[:, 2].min() > -2.0 - 1e-11
-    down = x[:, 2] < -2.0 + 1e-9
-    assert 1 <= down.sum() == row["active_contacts"] < 21
-    floor = row["wall/floor/force"]
-    # Newton's method begins with the nodes on the floor where the relaxed ones are, not with those at the start
-    assert (0 < row["newton_iterations"] < 10) == newton
-    assert 0.05 * weight < floor[2] == pytest.approx(weight - row["support_force"][2], rel=1e-7)
-    assert np.abs(floor[:2]).max() < 1e-9
 
 
 @pytest.mark.slow

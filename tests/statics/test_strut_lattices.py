@@ -88,18 +88,6 @@ def crush(comm, folder, viscosity, strain, **keys):
 
 
 @pytest.mark.slow
-def test_peak_of_a_crush_does_not_depend_on_stabilise(comm, shared_tmp_path):
-    """The peak is that of increments without viscosity, for viscosities over 100 to 1 and motions over 4 to 1."""
-    exact = crush(comm, shared_tmp_path / "0", 0.0, 0.05)[0]
-    for viscosity, strain, error in ((1e-4, 0.05, 1e-3), (1e-2, 0.05, 5e-3), (1e-3, 0.2, 5e-3)):
-        peak, history, remarks = crush(comm, shared_tmp_path / f"{viscosity}_{strain}", viscosity, strain)
-        assert peak == pytest.approx(exact, rel=error)
-        absorbed = history["elastic_energy"] + history["plastic_dissipation"] + history["damping_dissipation"]
-        assert 0.0 < history["damping_dissipation"][-1] < 0.05 * absorbed[-1]
-        assert "static.stabilise_share" not in remarks[0] and "% of the energy" in remarks[0]
-
-
-@pytest.mark.slow
 def test_share_of_stabilise_is_told_once(comm, shared_tmp_path):
     """A smaller largest share is exceeded: one warning, and its number again at the end."""
     _, history, remarks = crush(comm, shared_tmp_path / "it", 1e-2, 0.05, stabilise_share=1e-4)

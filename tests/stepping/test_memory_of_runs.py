@@ -7,11 +7,9 @@ import sys
 import tracemalloc
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.contact.monitoring import CrossingBars
 
 PITCH, YOUNG_MODULUS, DENSITY = 0.01, 110e9, 4500.0
 
@@ -53,29 +51,6 @@ def test_a_plain_explicit_run_holds_few_bytes_a_bar_after_its_set_up(tmp_path, f
     # ends 8, rest length 8 and again, in the order of loops, 9, far end 4, number 4; eight vectors and eight numbers a
     # node, 0.12 nodes a bar
     assert (large - small) / (many - few) < 33.0 + 0.122 * (8 * 24 + 8 * 8)
-
-
-def test_search_of_crossing_bars_needs_few_bytes_a_bar_and_none_in_the_mesh(tmp_path):
-    peaks, bars = [], []
-    for cells in (8, 16):
-        simulation = Simulation(lattice(cells), output=tmp_path / str(cells), quiet=True)
-        model, random = simulation.model, np.random.default_rng(1)
-        x = model.mesh.points + 2e-4 * random.random(model.mesh.points.shape)
-        CrossingBars(model).find(x)  # loops are loaded
-        search = CrossingBars(model)
-        tracemalloc.start()
-        try:
-            assert search.find(model.mesh.points).pairs == 0
-            in_the_mesh = tracemalloc.get_traced_memory()[1]
-            assert search.find(x).pairs == 0
-            peaks.append(tracemalloc.get_traced_memory()[1])
-        finally:
-            tracemalloc.stop()
-        bars.append(model.mesh.n_bars)
-        simulation.close()
-    assert in_the_mesh < 12.0 * bars[1]
-    # radii and what they are computed from, and 45 B for each of the bars of two planes of cells, of 13 here
-    assert (peaks[1] - peaks[0]) / (bars[1] - bars[0]) < 60.0
 
 
 def test_memory_of_large_arrays_goes_back_to_the_system_when_they_are_freed():

@@ -1,9 +1,7 @@
-"""Runs that are killed, files that are damaged or wrong, and runs in one folder at once, many times.
+"""Runs that are killed, and files with mistakes, many times.
 
     .venv/bin/python scripts/endurance.py kills 200 --ranks 1,2       # --cases 0:400: random cases
-    .venv/bin/python scripts/endurance.py damage 200
     .venv/bin/python scripts/endurance.py mutants 10000
-    .venv/bin/python scripts/endurance.py together 20
 
 kills     Explicit, implicit, plastic and multistep cases, with and without contact, run in turn on all numbers of
           ranks. With --cases A:B they are the cases that scripts/random_cases.py draws by these numbers, except those
@@ -11,13 +9,9 @@ kills     Explicit, implicit, plastic and multistep cases, with and without cont
           before its first checkpoint, and restarted, and often killed again, until it is done. After each kill the
           result file must open in VTK and in open_result; at the end all its values must be bitwise those of the
           uninterrupted run.
-damage    A bit, a byte or a page of a result file is changed. It may be refused (status 2) or have no effect: the
-          continued results are then those of the undamaged file.
 mutants   Case and mesh files with random mistakes are accepted, or refused with a message. Failures are a traceback, a
           status other than 0 and 2, a message without the file (or, for a case, without key or line), no answer
           within a minute, and a process that dies. --seed 1234 with one mutant and --folder DIR reproduces one.
-together  Three starts and two restarts into one folder at once: one run must succeed, the others must be refused with
-          status 2 and a message, and the results must be bitwise those of a single run.
 
 Status 0 if there are no failures.
 """
@@ -40,16 +34,13 @@ sys.path[:0] = [str(TESTS), str(TESTS / "random_cases")]
 
 from helpers.kills import (  # noqa: E402
     KINDS,
-    LATER,
     LEFT_OVER,
     Kind,
     VtkReader,
     assert_readable,
     differences,
     killed,
-    play,
     run,
-    shared_words,
 )
 
 EVERY = (7, 40, 1000)  # steps between checkpoints: many, some, none before the end
@@ -57,14 +48,13 @@ MOST = 4  # kills of a run before it may run to its end
 COUNTED = ("kills", "before 1st checkpoint", "runs", "launcher left", "unreadable", "different", "failed")
 BATCH = 250  # mutants of a process
 MEMORY = 6 << 30  # bytes that a check may use; files that request more must be refused
-SHORT = ["rod_impact", "--quiet", "--set", "time.end=0.6", "output.fields_every=2", "output.checkpoint_every=40"]
 
 
 def main() -> int:
     """Do what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("test", choices=("kills", "damage", "mutants", "together"))
-    parser.add_argument("number", type=int, help="of kills, damages, mutants or rounds")
+    parser.add_argument("test", choices=("kills", "mutants"))
+    parser.add_argument("number", type=int, help="of kills or mutants")
     parser.add_argument("--seed", type=int, help="of what is random; default: another one each time, 0 for mutants")
     parser.add_argument("--folder", type=Path, help="where to work; default: a temporary one, removed if all is well")
     parser.add_argument("--ranks", default="1,2", metavar="N,N", help="of kills, in turn (default: 1,2)")
@@ -82,10 +72,8 @@ def main() -> int:
     print(f"seed {seed}", flush=True)
     if arguments.test == "kills":
         bad = Kills(arguments, folder, random.Random(seed)).all(arguments.number)
-    elif arguments.test == "mutants":
-        bad = mutants(seed, arguments.number, folder)
     else:
-        bad = {"damage": damage, "together": together}[arguments.test](arguments.number, folder, random.Random(seed))
+        bad = mutants(seed, arguments.number, folder)
     if arguments.folder is None and not bad:
         shutil.rmtree(folder)
     return 1 if bad else 0
@@ -199,53 +187,6 @@ class Kills:
         return True
 
 
-def damage(number: int, folder: Path, chance: random.Random) -> int:
-    """Damage files, read and restart them, and count the outcomes; return the number of failures."""
-
-    def program(*words: str | Path) -> subprocess.CompletedProcess:
-        return subprocess.run([sys.executable, "-m", "pfem_petsc", *map(str, words)], capture_output=True, text=True)
-
-    counts, bad = Counter(), []
-    first, whole, tried = folder / "first", folder / "whole", folder / "tried"
-    program(*SHORT, "-o", first).check_returncode()
-    shutil.copytree(first, whole)
-    longer = [*SHORT, "time.end=0.8"]
-    program(*longer, "-o", whole, "--restart").check_returncode()
-    for _ in range(number):
-        shutil.rmtree(tried, ignore_errors=True)
-        shutil.copytree(first, tried)
-        what = damaged(tried / "result.vtkhdf", chance)
-        info, done = program("info", tried, "--verify"), program(*longer, "-o", tried, "--restart")
-        for process in (info, done):
-            if process.returncode not in (0, 2) or "internal error" in process.stderr:
-                bad.append(f"{what}: status {process.returncode}: {process.stderr.strip()[:300]}")
-        if done.returncode == 0 and differences(whole / "result.vtkhdf", tried / "result.vtkhdf"):
-            bad.append(f"{what}: went into continued results in silence")
-        outcome = f"{'refused' if done.returncode else 'does not matter'}, info --verify status {info.returncode}"
-        counts[f"{what.split()[0]}: {outcome}"] += 1
-        print(f"{what}: {outcome}", flush=True)
-    for outcome, times in sorted(counts.items()):
-        print(f"{times:5}  {outcome}")
-    print("\n".join(bad) or "none went into results in silence, none crashed")
-    return len(bad)
-
-
-def damaged(file: Path, chance: random.Random) -> str:
-    """Change a bit, a byte or a page of a file, and return a description of it."""
-    content = bytearray(file.read_bytes())
-    kind, at = chance.choice(["bit", "byte", "page"]), chance.randrange(len(content))
-    if kind == "bit":
-        content[at] ^= 1 << chance.randrange(8)
-    elif kind == "byte":
-        content[at] = (content[at] + chance.randrange(1, 256)) % 256
-    else:
-        at -= at % 4096
-        size = len(content[at : at + 4096])
-        content[at : at + 4096] = bytes(size) if chance.random() < 0.5 else chance.randbytes(size)
-    file.write_bytes(content)
-    return f"{kind} at {at}"
-
-
 def mutants(seed: int, number: int, folder: Path) -> int:
     """Try mutants in separate processes, count what became of them, and return the number of failures."""
     bad, at, kinds = 0, seed, Counter()
@@ -280,25 +221,6 @@ def try_mutants(seed: int, count: int, folder: Path) -> int:
             print(f"BAD {mutant}: {' | '.join(told.split(chr(10)))[:600]}", flush=True)
         print(f"tried {mutant} {'case' if mutant % 3 < 2 else 'mesh'}: {kind}", flush=True)
     return 0
-
-
-def together(number: int, folder: Path, chance: random.Random) -> int:
-    """Start runs into one folder at once, in rounds; return the number of rounds that fail."""
-    from pfem_petsc.cli.main import main as program
-
-    starts, restarts, failed = Counter(), Counter(), 0
-    program(shared_words(folder / "alone", LATER))
-    for each in range(number):
-        try:
-            found = play(folder / f"round{each}", folder / "alone" / "result.vtkhdf", chance)
-            starts.update(found[0])
-            restarts.update(found[1])
-            print(f"round {each}: starts {dict(found[0])}, restarts {dict(found[1])}", flush=True)
-        except AssertionError as error:
-            failed += 1
-            print(f"round {each}: {error}", flush=True)
-    print(f"{number} rounds: starts {dict(starts)}, restarts {dict(restarts)}, failed {failed}")
-    return failed
 
 
 if __name__ == "__main__":

@@ -16,6 +16,9 @@ bash "$(dirname "${BASH_SOURCE[0]}")/setup.sh" "${setup[@]}" || exit
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
 cd "$root" || exit
 
+# Byte code of the tests is made once for all stages.
+unset PYTHONDONTWRITEBYTECODE
+
 limit=${TEST_LIMIT:-10800}
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT

@@ -57,17 +57,6 @@ def test_python_of_pages_runs(tmp_path):
 
 
 @pytest.mark.slow
-def test_first_commands_run(tmp_path, monkeypatch):
-    """Those of README after the set-up and the activation, without the large one."""
-    monkeypatch.chdir(tmp_path)
-    asked = program_lines(ROOT / "README.md")[:4]
-    assert [words[0] for words in asked][0] == "rod_impact"
-    for words in asked:
-        assert main([*words, *(["--frames", "3"] if "render" in words else [])]) == 0, words
-    assert (tmp_path / "results" / "rod_impact" / "render.mp4").exists()
-
-
-@pytest.mark.slow
 def test_examples_of_modes_and_loads_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with Simulation(Case.load("taut_cable"), MPI.COMM_SELF, quiet=True) as simulation:
@@ -253,7 +242,7 @@ def told(tmp_path_factory) -> dict[str, str]:
             (folder / re.match(r"# (\S+)\n", text)[1]).write_text(text)
             continue
         script = folder / ("job.sh" if text.startswith("#!") else "commands.sh")
-        script.write_text(text)
+        script.write_text(re.sub(r"--frames \d+", "--frames 2", text))  # fewer than a reader draws
         command = ["bash", "-e", script.name]
         done = subprocess.run(command, cwd=folder, env=settings, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, f"{text}\n{done.stdout[-2000:]}\n{done.stderr[-3000:]}"

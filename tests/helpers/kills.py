@@ -300,3 +300,19 @@ def _assert_whole(folder: Path, steps: int) -> None:
     with open_result(folder) as result:
         np.testing.assert_array_equal(result.history["step"], range(steps + 1))
         np.testing.assert_array_equal(result.steps, range(0, steps + 1, 100))
+
+
+def damaged(file: Path, chance: random.Random) -> str:
+    """Change a bit, a byte or a page of a file, and return a description of it."""
+    content = bytearray(file.read_bytes())
+    kind, at = chance.choice(["bit", "byte", "page"]), chance.randrange(len(content))
+    if kind == "bit":
+        content[at] ^= 1 << chance.randrange(8)
+    elif kind == "byte":
+        content[at] = (content[at] + chance.randrange(1, 256)) % 256
+    else:
+        at -= at % 4096
+        size = len(content[at : at + 4096])
+        content[at : at + 4096] = bytes(size) if chance.random() < 0.5 else chance.randbytes(size)
+    file.write_bytes(content)
+    return f"{kind} at {at}"

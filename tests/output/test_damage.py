@@ -6,8 +6,7 @@ import shutil
 import h5py
 import numpy as np
 import pytest
-from endurance import damaged
-from helpers.kills import differences
+from helpers.kills import damaged, differences
 from helpers.synthetic import Truss, options, write
 from mpi4py import MPI
 

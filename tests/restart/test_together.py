@@ -1,11 +1,9 @@
 """Several runs in one folder at once."""
 
-import subprocess
-import sys
-from pathlib import Path
+import random
 
 import pytest
-from helpers.launch import environment
+from helpers.kills import LATER, play, shared_words
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.cli.main import main
@@ -15,12 +13,10 @@ from pfem_petsc.errors import InputError
 @pytest.mark.thorough
 @pytest.mark.slow
 def test_three_starts_and_two_restarts(tmp_path):
-    """Two rounds of the script; more by hand."""
-    script = Path(__file__).parents[2] / "scripts" / "endurance.py"
-    line = [sys.executable, script, "together", "2", "--seed", "1", "--folder", tmp_path]
-    done = subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=400)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "2 rounds: " in done.stdout
+    """One run of those that start at once succeeds, the others are refused; restarts change nothing of its results."""
+    assert main(shared_words(tmp_path / "alone", LATER)) == 0
+    for each in range(2):
+        play(tmp_path / f"round{each}", tmp_path / "alone" / "result.vtkhdf", random.Random(each))
 
 
 @pytest.mark.parametrize("more", [[], ["--restart"]])

@@ -163,8 +163,6 @@ def main() -> None:
     start = "<!-- table: scripts/contact_treatments.py -->\n"
     insert("contact.md", start, "<!-- end of table -->", table(results) + "\n")
     figure(results)
-    growth = {key: max(row["energy_imbalance"] for row in rows) / ENERGY for key, rows in results.items() if rows}
-    print(f"largest imbalance of the energy ledger over the start: {max(np.abs(list(growth.values()))):.1e}")
 
 
 if __name__ == "__main__":

@@ -1,14 +1,12 @@
 """Runs that are killed, and files with mistakes, many times.
 
-    .venv/bin/python scripts/endurance.py kills 200 --ranks 1,2       # --cases 0:400: random cases
+    .venv/bin/python scripts/endurance.py kills 200 --ranks 1,2
     .venv/bin/python scripts/endurance.py mutants 10000
 
 kills     Explicit, implicit, plastic and multistep cases, with and without contact, run in turn on all numbers of
-          ranks. With --cases A:B they are the cases that scripts/random_cases.py draws by these numbers, except those
-          that are refused or fail without a kill. A run is killed by SIGKILL, all ranks or one of them, possibly
-          before its first checkpoint, and restarted, and often killed again, until it is done. After each kill the
-          result file must open in VTK and in open_result; at the end all its values must be bitwise those of the
-          uninterrupted run.
+          ranks. A run is killed by SIGKILL, all ranks or one of them, possibly before its first checkpoint, and
+          restarted, and often killed again, until it is done. After each kill the result file must open in VTK and in
+          open_result; at the end all its values must be bitwise those of the uninterrupted run.
 mutants   Case and mesh files with random mistakes are accepted, or refused with a message. Failures are a traceback, a
           status other than 0 and 2, a message without the file (or, for a case, without key or line), no answer
           within a minute, and a process that dies. --seed 1234 with one mutant and --folder DIR reproduces one.
@@ -30,12 +28,11 @@ from collections import Counter
 from pathlib import Path
 
 TESTS = Path(__file__).resolve().parent.parent / "tests"
-sys.path[:0] = [str(TESTS), str(TESTS / "random_cases")]
+sys.path.insert(0, str(TESTS))
 
 from helpers.kills import (  # noqa: E402
     KINDS,
     LEFT_OVER,
-    Kind,
     VtkReader,
     assert_readable,
     differences,
@@ -59,7 +56,6 @@ def main() -> int:
     parser.add_argument("--folder", type=Path, help="where to work; default: a temporary one, removed if all is well")
     parser.add_argument("--ranks", default="1,2", metavar="N,N", help="of kills, in turn (default: 1,2)")
     parser.add_argument("--python", default=sys.executable, metavar="PATH", help="of killed runs; default: this one")
-    parser.add_argument("--cases", metavar="A:B", help="random cases with these numbers, to be killed")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     folder = arguments.folder or Path(tempfile.mkdtemp(prefix="endurance-"))
@@ -84,12 +80,7 @@ class Kills:
 
     def __init__(self, arguments: argparse.Namespace, folder: Path, chance: random.Random) -> None:
         self.folder, self.chance, self.python = folder, chance, arguments.python
-        self.drawn = arguments.cases is not None
-        ranks = [int(part) for part in arguments.ranks.split(",")]
-        self.kinds = self._random_kinds(arguments.cases) if self.drawn else KINDS
-        # a random case runs on one number of ranks, chosen in turn
-        several = [(name, count) for count in ranks for name in self.kinds]
-        self.turns = list(zip(self.kinds, ranks * len(self.kinds))) if self.drawn else several
+        self.turns = [(name, int(ranks)) for ranks in arguments.ranks.split(",") for name in KINDS]
         self.references: dict[tuple[str, int], tuple[Path, float]] = {}
 
     def all(self, number: int) -> int:
@@ -97,12 +88,10 @@ class Kills:
         begin, total = time.monotonic(), Counter()
         counts = {turn: Counter() for turn in self.turns}
         with VtkReader() as vtk:
-            while counts and total["kills"] < number:
-                # next is the case with the fewest kills, of random cases the one with the fewest runs
-                turn = min(counts, key=lambda each: counts[each]["runs" if self.drawn else "kills"])
-                if turn not in self.references and not self._reference(*turn):
-                    del counts[turn]
-                    continue
+            while total["kills"] < number:
+                turn = min(counts, key=lambda each: counts[each]["kills"])
+                if turn not in self.references:
+                    self._reference(*turn)
                 one = self._one_run(*turn, min(number - total["kills"], MOST), vtk)
                 counts[turn].update(one)
                 total.update(one)
@@ -115,30 +104,16 @@ class Kills:
         width = max(len(name) for name, _ in counts)
         print(f"\n{'case':{width}}  ranks  {'  '.join(COUNTED)}")
         for (name, ranks), count in [*counts.items(), (("all", ""), total)]:
-            if not self.drawn or name == "all" or count["unreadable"] + count["different"] + count["failed"]:
-                print(f"{name:{width}}  {ranks:5}  {'  '.join(f'{count[what]:{len(what)}}' for what in COUNTED)}")
+            print(f"{name:{width}}  {ranks:5}  {'  '.join(f'{count[what]:{len(what)}}' for what in COUNTED)}")
         bad = total["unreadable"] + total["different"] + total["failed"]
         took = f"{time.monotonic() - begin:.0f} s"
         print(f"{took}; restarts that failed, results that differ or cannot be read: {bad}")
         return bad
 
-    def _random_kinds(self, numbers: str) -> dict[str, Kind]:
-        """Write the cases that the generator draws by these numbers to files."""
-        from random_trusses.draw import draw_case
-        from random_trusses.running import case_text
-
-        first, _, end = numbers.partition(":")
-        kinds = {}
-        for seed in range(int(first), int(end)):
-            path = self.folder / f"random-{seed}.toml"
-            path.write_text(case_text(draw_case(seed)))
-            kinds[f"random {seed}"] = Kind(str(path), ())
-        return kinds
-
     def _one_run(self, name: str, ranks: int, most: int, vtk: VtkReader) -> Counter:
         """Kill a run up to ``most`` times, let it run to its end, and compare; return the counts."""
         whole, seconds = self.references[name, ranks]
-        kind, count, work = self.kinds[name], Counter(runs=1), self.folder / "killed"
+        kind, count, work = KINDS[name], Counter(runs=1), self.folder / "killed"
         every = self.chance.choice(EVERY)
         for old in self.folder.glob("killed*"):
             # a run that is killed between its end and the release of its folder leaves the lock
@@ -166,16 +141,13 @@ class Kills:
             print(f"DIFFERENT {name} on {ranks} (every {every}): {told}: {apart}", flush=True)
         return count
 
-    def _reference(self, name: str, ranks: int) -> bool:
-        """Run without kills, and keep the result file and the time of its steps [s]; False for a random case that does
-        not run."""
+    def _reference(self, name: str, ranks: int) -> None:
+        """Run without kills, and keep the result file and the time of its steps [s]."""
         place = self.folder / f"{name.replace(' ', '-').replace(',', '')}-{ranks}"
-        for _ in range(1 if self.drawn else 2):  # the first run compiles the loops
+        for _ in range(2):  # the first run compiles the loops
             shutil.rmtree(place, ignore_errors=True)
             begin = time.time()
-            done = run(self.kinds[name], ranks, place, 0, python=self.python)
-        if done.returncode in (2, 3) and self.drawn:
-            return False
+            done = run(KINDS[name], ranks, place, 0, python=self.python)
         if done.returncode != 0:
             raise SystemExit(f"{name} on {ranks} ranks fails undisturbed:\n{done.stderr}")
         # the log is opened just before the first step, after the model is set up
@@ -184,7 +156,6 @@ class Kills:
         seconds = max(0.3, time.time() - max(first, begin) - 0.3)
         print(f"{name} on {ranks}: {seconds:.1f} s of steps", flush=True)
         self.references[name, ranks] = place / "result.vtkhdf", seconds
-        return True
 
 
 def mutants(seed: int, number: int, folder: Path) -> int:

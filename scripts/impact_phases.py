@@ -1,14 +1,12 @@
 """The tables of impact phases: energy gain by contact for each phase of the impact within a step.
 
     python scripts/impact_phases.py            # rewrites those of docs/contact.md, in four minutes
-    python scripts/impact_phases.py --program  # prints them from runs of the program itself, in an hour
     python scripts/impact_phases.py --gains    # writes pfem_petsc/contact/impact_gains.npz, in twenty minutes
 
 Every integrator, treatment and mass matrix runs the rod of `rod_impact` against the wall in 14 phases: equal rods, each
 a fourteenth of v h further from the wall than the previous one; a second table has walls with restitution. Both tables
-are computed with small linear rods (impact_rods.py), and so are the gains that the program warns of before a run. With
---program all rods are one mesh, so that one run covers all phases, and the tests compare both. The exact energy ratios
-and releases are 1.
+are computed with small linear rods (impact_rods.py), and so are the gains that the program warns of before a run. Tests
+compare them with runs of the program, in which all rods are one mesh. The exact energy ratios and releases are 1.
 """
 
 from __future__ import annotations
@@ -312,10 +310,7 @@ def main() -> None:
         write_gains()
         return
     for columns, start, end in ((COLUMNS, START, END), (REBOUNDS, START_REBOUNDS, END_REBOUNDS)):
-        if "--program" in sys.argv[1:]:
-            print(table(impacts, columns), flush=True)
-        else:
-            insert("contact.md", start, end, table(judged, columns))
+        insert("contact.md", start, end, table(judged, columns))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ Each lattice is a result of one short step, drawn by ``render``; each group of s
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -110,6 +109,5 @@ def sheet(lattices: dict[str, dict[str, Any]], columns: int, path: Path) -> None
 
 
 if __name__ == "__main__":
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     sheet(KINDS, 5, ROOT / "docs" / "images" / "lattice_kinds.png")
     sheet(SHAPES, 3, ROOT / "docs" / "images" / "lattice_shapes.png")

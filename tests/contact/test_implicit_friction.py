@@ -171,20 +171,6 @@ def test_node_between_a_floor_and_a_sphere(steps, comm, shared_tmp_path):
     assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-12
 
 
-def test_ball_with_mass_on_a_lattice_that_lies_on_a_rough_floor(comm, shared_tmp_path):
-    """The floor's nodes are out of the ball's reach: they settle as if it was not there, through the whole impact."""
-    floor = {"type": "plane", "name": "floor", "point": [0, 0, 0], "normal": [0, 0, 1.0], "friction": 0.3}
-    ball = {"type": "sphere", "name": "ball", "point": [0.1, 0.1, 0.2505], "radius": 0.05, "mass": 0.05}
-    ball |= {"velocity": [0, 0, -1.0], "gravity": True}
-    case = lattice_case([floor, ball], cells=(2, 2, 2), integrator="newmark", end=0.02, step=1e-3)
-    case["gravity"] = {"acceleration": [0, 0, -G]}
-    rows, _ = rows_of(case, comm, shared_tmp_path)
-    assert sum(row["wall/ball/contacts"] > 0 for row in rows) > 5
-    assert rows[-1]["wall/ball/velocity"][2] > rows[1]["wall/ball/velocity"][2] + 0.1
-    assert min(row["wall/floor/contacts"] for row in rows[1:]) > 0
-    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-9
-
-
 @pytest.mark.parametrize(("theta", "friction"), [(1.4, 0.6), (1.6, 1.3)])
 def test_friction_of_nodes_that_stick_beyond_the_step_only_takes(theta, friction, comm, shared_tmp_path):
     """``wilson`` finds a node to stick at t + theta h; it slips at the end of the step, and a jump takes nothing back

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.lattices import SCHEMES, G, lattice_case, planes, rows_of, simulation, tumbling
+from helpers.lattices import SCHEMES, G, lattice_case, planes, simulation, tumbling
 from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
 
 from pfem_petsc import Case
@@ -99,23 +99,6 @@ def test_implicit_steps_tend_to_the_explicit_ones(keys, integrator, comm, shared
             apart.append(np.abs(x[integrator] - x["central_differences"]).max() / far)
     if comm.rank == 0:
         assert apart[1] < 0.7 * apart[0] and apart[1] < 0.001
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "solver",
-    [{"linear": "cg", "operator": "matrix_free"}, {"linear": "cg", "operator": "assembled"}, {"linear": "gamg"}],
-    ids=["matrix-free", "assembled", "gamg"],
-)
-def test_linear_solvers_agree(solver, comm, shared_tmp_path):
-    x = {}
-    for name, keys in (("mumps", {"linear": "mumps"}), ("other", solver)):
-        case = tumbling(WALLS["corner"], "newmark", {}, end=0.03, solver={"rtol": 1e-11, **keys})
-        rows, run = rows_of(case, comm, shared_tmp_path, name)
-        x[name] = run.gather(run.state.position)
-        assert max(row["active_contacts"] for row in rows) >= 2
-    if comm.rank == 0:
-        assert np.abs(x["mumps"] - x["other"]).max() < 1e-8 * 0.2
 
 
 @pytest.mark.slow

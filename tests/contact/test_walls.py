@@ -120,21 +120,6 @@ def test_starting_beyond_a_wall_is_refused(comm, shared_tmp_path):
         simulation(lattice_case(planes([[0.0, 0.0, 1.0]], [0.01])), comm, shared_tmp_path)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("integrator, parameters", [EXPLICIT, IMPLICIT])
-def test_starting_exactly_on_walls(integrator, parameters, comm, shared_tmp_path):
-    """Nodes on a wall at the start stay there under gravity, and the wall carries the weight."""
-    walls = planes([[0.0, 0.0, 1.0]], [0.0])
-    case = lattice_case(
-        walls, integrator=integrator, gravity=[0.0, 0.0, -9.81], step=2e-4, end=0.2, material={"damping": 2e5}
-    )
-    rows, x, run = run_of(case, comm, shared_tmp_path)
-    force = np.array([row["wall/wall1/force"] for row in rows])
-    assert force[-1] == pytest.approx([0, 0, 9.81 * run.model.total_mass], rel=1e-3, abs=1e-6)
-    if comm.rank == 0:
-        assert x[:, 2].min() >= -1e-13
-
-
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator, parameters", [EXPLICIT, IMPLICIT])
 def test_walls_that_leave_no_room(integrator, parameters, comm, shared_tmp_path):

@@ -1,4 +1,4 @@
-"""A dozen kills at random times; scripts/endurance.py makes hundreds."""
+"""Kills at random times; scripts/endurance.py makes hundreds."""
 
 import random
 
@@ -26,7 +26,7 @@ def test_killed_at_random_moments_the_run_ends_as_if_undisturbed(tmp_path, name,
     assert done.returncode == 0, done.stderr
     restart = []
     with VtkReader() as vtk:
-        for _ in range(3):
+        for _ in range(2):
             print(killed(kind, ranks, folder, chance.choice([5, 30]), 0.7, chance, *restart))
             restart = ["--restart"]
             if (folder / "result.vtkhdf").exists():

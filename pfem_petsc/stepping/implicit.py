@@ -282,7 +282,8 @@ class ImplicitStepper(Stepper):
 
     def _solve(self, balance: Balance, guess: np.ndarray) -> Solution:
         model, state = self.model, self.state
-        model.change_bars(balance.time)
+        if balance.weight:  # else the forces of the balance are those known at its start
+            model.change_bars(balance.time)
         if model.bars.viscous and balance.weight and self.scheme.inertial and not balance.discrete_gradient:
             self._set_rates(balance)
         scale = self._force_scale()

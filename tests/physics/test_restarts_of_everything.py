@@ -60,6 +60,7 @@ def case(integrator, mass):
     ("integrator", "mass"),
     [
         ("central_differences", "lumped"),
+        ("central_differences", "consistent"),
         ("energy_momentum", "lumped"),
         ("wilson", "consistent"),
         ("generalized_alpha", "consistent"),

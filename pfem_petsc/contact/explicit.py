@@ -6,19 +6,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..errors import SimulationFailure
-from ..mechanics.compiled import inlined, kernel
+from ..mechanics.compiled import NEEDED, inlined, kernel
 from ..mechanics.records import by_reference, record
 from ..mesh.ordering import NODE_BLOCK
 from ..tolerances import FIXED_POINT, PROJECTED, RANK
 from .friction import Rubbing, add_friction, jam
 from .node_walls import TURN, NodeWalls, WallForces
-from .projection import project, projection
+from .projection import project
 from .surfaces import OTHER, Surfaces, is_round, tangent
 from .tied import Ties
 
@@ -79,7 +78,7 @@ class Arrivals(NamedTuple):
     fixed : (m, 3) bool, components that supports prescribe
     applies : (m, w) bool, walls that can stop each
     touching : (m, w) bool, contacts of the last step
-    rebound, arrival : (m, w) memory of the last step of nodes that hit walls, in which :func:`presses` leaves that
+    rebound, arrival : (m, w) memory of the last step of nodes that hit walls, in which :func:`press_nodes` leaves that
         of this one, see :func:`impact_square`; (m, 0) without restitution
     normals, offsets : (m, w, 3), (m, w) tangent planes of walls of other shapes; (0, w, 3), (0, w) without such walls
     """
@@ -318,111 +317,104 @@ def _rub_on_round(j, x, free, drag, strengths, walls, given, planes):
     return False
 
 
-def kind_of(walls: PressedWalls) -> tuple[bool, bool, bool]:
-    """Return whether any walls are curved, whether any are rough, and whether there are several: see
-    :func:`presses`."""
+def kind_of(walls: PressedWalls) -> tuple[Any, Any, Any]:
+    """Return whether any walls are curved, whether any are rough, and whether there are several: ``NEEDED`` or None."""
     radii = walls.surfaces.radii
-    return bool(is_round(radii).any()), walls.friction.shape[1] > 0, len(radii) > 1
+    return tuple(
+        NEEDED if kind else None for kind in (is_round(radii).any(), walls.friction.shape[1] > 0, len(radii) > 1)
+    )
 
 
-@cache
-def presses(curved: bool, rough: bool, several: bool) -> Any:
-    """Make :func:`press_nodes` for walls of which some are ``curved`` or ``rough``, and for ``several`` ones."""
-    project_nodes = projection(several or curved)
+@kernel
+def press_nodes(places, given, walls, sums, curved, rough, several):
+    """Project nodes at ``places`` (m, 3) [m], in place, onto :class:`PressedWalls`, with friction and restitution,
+    and add the forces of the walls to ``sums``, see :class:`WallSums`; ``given``: :class:`Arrivals`;
+    ``curved``, ``rough``, ``several``: see :func:`kind_of`.
 
-    @kernel
-    def press_nodes(places, given, walls, sums):
-        """Project nodes at ``places`` (m, 3) [m], in place, onto :class:`PressedWalls`, with friction and restitution,
-        and add the forces of the walls to ``sums``, see :class:`WallSums`; ``given``: :class:`Arrivals`.
-
-        Each node is solved for by itself: its bits do not depend on the others. Returns the index of the first node
-        without a place, or -1, and why; the planes at the nodes, with offset -inf where a wall does not apply; the
-        total force (m, 3) [N]; walls that they touch (m, w); and the energy that friction dissipates [J].
-        """
-        way, unpushed, tolerance, restitution = walls.way, walls.unpushed, walls.tolerance, walls.restitution
-        force, contacts, moment = sums.force, sums.contacts, sums.moment
-        start, stiffness, fixed = given.start, given.stiffness, given.fixed
-        m, w = given.applies.shape
-        bounces = len(restitution) > 0
-        free = places.copy()
-        directions = np.empty((0, w, 3))
-        if curved:  # noqa: SIM102 - what is not needed is not compiled
-            if walls.part < 1.0:
-                directions = _directions(free, walls, given)
-        planes = _Planes(np.empty((m, w, 3)), np.empty((m, w)), directions, np.empty((m if bounces else 0, w)))
-        normals, pull = planes.normals, planes.pull
+    Each node is solved for by itself: its bits do not depend on the others. Returns the index of the first node
+    without a place, or -1, and why; the planes at the nodes, with offset -inf where a wall does not apply; the
+    total force (m, 3) [N]; walls that they touch (m, w); and the energy that friction dissipates [J].
+    """
+    way, unpushed, tolerance, restitution = walls.way, walls.unpushed, walls.tolerance, walls.restitution
+    force, contacts, moment = sums.force, sums.contacts, sums.moment
+    start, stiffness, fixed = given.start, given.stiffness, given.fixed
+    m, w = given.applies.shape
+    bounces = len(restitution) > 0
+    free = places.copy()
+    directions = np.empty((0, w, 3))
+    if curved is not None:  # noqa: SIM102 - what is not needed is not compiled
+        if walls.part < 1.0:
+            directions = _directions(free, walls, given)
+    planes = _Planes(np.empty((m, w, 3)), np.empty((m, w)), directions, np.empty((m if bounces else 0, w)))
+    normals, pull = planes.normals, planes.pull
+    for j in range(m):
+        _set_planes(j, free, free, walls, given, planes)
+    strengths = np.zeros((m, w))
+    failed, why = project(places, fixed, normals, planes.offsets, tolerance, strengths, several), 0
+    if failed >= 0:
+        why = INFEASIBLE
+    if curved is not None:
         for j in range(m):
-            _set_planes(j, free, free, walls, given, planes)
-        strengths = np.zeros((m, w))
-        failed, why = project_nodes(places, fixed, normals, planes.offsets, tolerance, strengths), 0
-        if failed >= 0:
-            why = INFEASIBLE
-        if curved:
-            for j in range(m):
-                wrong = _settle_on_round(j, places, free, strengths, walls, given, planes)
-                if wrong > 0 and (failed < 0 or wrong < why or (wrong == why and j < failed)):
-                    failed, why = j, wrong
-        smooth, pushed = np.empty((m if bounces else 0, 3)), np.empty((m if bounces else 0, w), dtype=np.bool_)
-        for j in range(len(pushed)):
+            wrong = _settle_on_round(j, places, free, strengths, walls, given, planes)
+            if wrong > 0 and (failed < 0 or wrong < why or (wrong == why and j < failed)):
+                failed, why = j, wrong
+    smooth, pushed = np.empty((m if bounces else 0, 3)), np.empty((m if bounces else 0, w), dtype=np.bool_)
+    for j in range(len(pushed)):
+        for c in range(3):
+            smooth[j, c] = places[j, c]
+        for k in range(w):
+            pushed[j, k] = strengths[j, k] > 0.0
+    for j in range(m):
+        for k in range(w):
+            strengths[j, k] *= stiffness[j]
+    drag = np.zeros((m, w, 3))
+    if rough is not None:
+        rubbing = Rubbing(start, way, fixed, normals, planes.offsets, walls.friction[0], walls.friction[1], stiffness)
+        unsettled = add_friction(rubbing, places, strengths, drag)
+        if curved is not None:
+            for j in range(m if failed < 0 else 0):
+                if not _rub_on_round(j, places, free, drag, strengths, walls, given, planes):
+                    unsettled = min(unsettled, j) if unsettled >= 0 else j
+        if unsettled >= 0 and failed < 0:
+            failed, why = unsettled, JAMMED
+    for j in range(m if bounces else 0):
+        for k in range(w):
+            fresh = pushed[j, k] and not given.touching[j, k] and restitution[k] > 0.0
+            approach = arrived = 0.0
             for c in range(3):
-                smooth[j, c] = places[j, c]
-            for k in range(w):
-                pushed[j, k] = strengths[j, k] > 0.0
-        for j in range(m):
-            for k in range(w):
-                strengths[j, k] *= stiffness[j]
-        drag = np.zeros((m, w, 3))
-        if rough:
-            rubbing = Rubbing(
-                start, way, fixed, normals, planes.offsets, walls.friction[0], walls.friction[1], stiffness
-            )
-            unsettled = add_friction(rubbing, places, strengths, drag)
-            if curved:
-                for j in range(m if failed < 0 else 0):
-                    if not _rub_on_round(j, places, free, drag, strengths, walls, given, planes):
-                        unsettled = min(unsettled, j) if unsettled >= 0 else j
-            if unsettled >= 0 and failed < 0:
-                failed, why = unsettled, JAMMED
-        for j in range(m if bounces else 0):
-            for k in range(w):
-                fresh = pushed[j, k] and not given.touching[j, k] and restitution[k] > 0.0
-                approach = arrived = 0.0
+                approach -= normals[j, k, c] * (free[j, c] - start[j, c] - unpushed[k, c])
+                arrived -= normals[j, k, c] * (smooth[j, c] - start[j, c] - way[k, c])
+            square = max(approach * approach - pull[j, k] * (approach - arrived), 0.0)
+            given.rebound[j, k] = square if fresh and approach > 0.0 else 0.0
+            given.arrival[j, k] = arrived if fresh else 0.0
+    total = np.zeros((m, 3))
+    touching = np.zeros((m, w), dtype=np.bool_)
+    dissipated = 0.0
+    for j in range(m):
+        x, y, z = places[j, 0], places[j, 1], places[j, 2]
+        for k in range(w):
+            strength = strengths[j, k]
+            if strength == 0.0:
+                continue
+            fx, fy, fz = strength * normals[j, k, 0], strength * normals[j, k, 1], strength * normals[j, k, 2]
+            if rough is not None:
+                fx += drag[j, k, 0]
+                fy += drag[j, k, 1]
+                fz += drag[j, k, 2]
                 for c in range(3):
-                    approach -= normals[j, k, c] * (free[j, c] - start[j, c] - unpushed[k, c])
-                    arrived -= normals[j, k, c] * (smooth[j, c] - start[j, c] - way[k, c])
-                square = max(approach * approach - pull[j, k] * (approach - arrived), 0.0)
-                given.rebound[j, k] = square if fresh and approach > 0.0 else 0.0
-                given.arrival[j, k] = arrived if fresh else 0.0
-        total = np.zeros((m, 3))
-        touching = np.zeros((m, w), dtype=np.bool_)
-        dissipated = 0.0
-        for j in range(m):
-            x, y, z = places[j, 0], places[j, 1], places[j, 2]
-            for k in range(w):
-                strength = strengths[j, k]
-                if strength == 0.0:
-                    continue
-                fx, fy, fz = strength * normals[j, k, 0], strength * normals[j, k, 1], strength * normals[j, k, 2]
-                if rough:
-                    fx += drag[j, k, 0]
-                    fy += drag[j, k, 1]
-                    fz += drag[j, k, 2]
-                    for c in range(3):
-                        dissipated -= drag[j, k, c] * (places[j, c] - start[j, c] - way[k, c])
-                total[j, 0] += fx
-                total[j, 1] += fy
-                total[j, 2] += fz
-                force[k, 0] += fx
-                force[k, 1] += fy
-                force[k, 2] += fz
-                moment[k, 0] += y * fz - z * fy
-                moment[k, 1] += z * fx - x * fz
-                moment[k, 2] += x * fy - y * fx
-                touching[j, k] = True
-                contacts[k] += 1
-        return failed, why, planes, total, touching, dissipated
-
-    return press_nodes
+                    dissipated -= drag[j, k, c] * (places[j, c] - start[j, c] - way[k, c])
+            total[j, 0] += fx
+            total[j, 1] += fy
+            total[j, 2] += fz
+            force[k, 0] += fx
+            force[k, 1] += fy
+            force[k, 2] += fz
+            moment[k, 0] += y * fz - z * fy
+            moment[k, 1] += z * fx - x * fz
+            moment[k, 2] += x * fy - y * fx
+            touching[j, k] = True
+            contacts[k] += 1
+    return failed, why, planes, total, touching, dissipated
 
 
 def impact_square(approach: np.ndarray, arrival: np.ndarray, pull: np.ndarray) -> np.ndarray:
@@ -510,7 +502,7 @@ class ExplicitContact(NodeWalls):
         return nodes, force, walls
 
     def placeless(self, node: int, why: int, normals: np.ndarray, offsets: np.ndarray) -> str:
-        """Return the message about an owned node whose place :func:`presses` did not find; its planes (w, 3),
+        """Return the message about an owned node whose place :func:`press_nodes` did not find; its planes (w, 3),
         (w,)."""
         if why == INFEASIBLE:
             return self.infeasible_message(node, offsets)
@@ -658,7 +650,7 @@ class ExplicitContact(NodeWalls):
         bounces = len(walls.restitution) > 0
         others = (walls.surfaces.radii == OTHER).any()
         marked = np.full(len(x) // NODE_BLOCK + 1, bounces)
-        reference, press_nodes = by_reference(walls), presses(*kind_of(walls))
+        reference = by_reference(walls)
         nodes = walls.room[: find_penetrating(np.ascontiguousarray(x.T), reference, marked)].copy()
         if others:
             nodes = np.union1d(nodes, np.flatnonzero(self.near(x, displacements)))
@@ -682,7 +674,7 @@ class ExplicitContact(NodeWalls):
             ]
             sums, places = WallSums(np.zeros((w, 3)), np.zeros(w, int), np.zeros((w, 3))), free.copy()
             given = Arrivals(start, drift, *of_nodes, *memory, *planes)
-            failed, why, found, force, touching, friction = press_nodes(places, given, reference, sums)
+            failed, why, found, force, touching, friction = press_nodes(places, given, reference, sums, *kind_of(walls))
             if failed >= 0 or not others or np.abs(places - at).max() <= tolerance:
                 break
             at = places

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..integrators.base import Balance, State
-from ..mechanics.compiled import inlined, kernel
+from ..mechanics.compiled import NEEDED, inlined, kernel
 from ..tolerances import FREE_PART, ON_BOUND, PROJECTED
 from .frames import NodalFrames, Sliding
 from .node_walls import free_squares
-from .projection import projection
+from .projection import project
 
 if TYPE_CHECKING:
     from ..mechanics.mass import Inertia
@@ -282,7 +282,7 @@ def solve_locally(
     fixed, normals, offsets, stiffness = rubbing.fixed, rubbing.normals, rubbing.offsets, rubbing.stiffness
     moved = x - np.where(fixed, 0.0, reaction) / stiffness[:, None]
     normal_forces, drag = np.zeros(offsets.shape), np.zeros(normals.shape)
-    projection(normals.shape[1] > 1)(moved, fixed, normals, offsets, PROJECTED * size, normal_forces)
+    project(moved, fixed, normals, offsets, PROJECTED * size, normal_forces, NEEDED if normals.shape[1] > 1 else None)
     normal_forces *= stiffness[:, None]
     for group, static in ((slipping, rubbing.dynamic), (~slipping, rubbing.static)):
         rubbing.apply(np.flatnonzero(group), static, moved, normal_forces, drag)

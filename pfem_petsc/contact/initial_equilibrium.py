@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..mechanics.compiled import NEEDED
 from ..tolerances import ON_BOUND
 from .friction import Rubbing
 from .node_walls import WallForces
-from .projection import projection
+from .projection import project
 
 if TYPE_CHECKING:
     from ..integrators.base import State
@@ -96,7 +97,7 @@ def start_at_rest(
         between = links.rest(apart, share * mass, closed, held)
         free = apart[nodes] + between[nodes] / weight[:, None]
         moved = free.copy()
-        projection(normals.shape[1] > 1)(moved, fixed, normals, planes, 0.0, strengths)
+        project(moved, fixed, normals, planes, 0.0, strengths, NEEDED if normals.shape[1] > 1 else None)
         if contact.has_friction:
             strengths *= weight[:, None]
             rough = contact.friction, contact.static_friction

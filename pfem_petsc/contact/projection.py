@@ -5,12 +5,11 @@ share nodes, both by one solver of complementarity problems.
 from __future__ import annotations
 
 import math
-from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import NEEDED, kernel
 from ..tolerances import FREE_PART, SINGULAR_ROW
 
 
@@ -123,93 +122,83 @@ def find_multipliers(matrix, values, tolerance, z):
     return False
 
 
-@cache
-def projection(several: bool) -> Any:
-    """Make the loop that projects nodes onto ``several`` planes, or one; see :func:`project`."""
+@kernel
+def project(x, fixed, normals, offsets, tolerance, multipliers, several=NEEDED):
+    """Move nodes to the nearest position that satisfies all planes.
 
-    @kernel
-    def project(x, fixed, normals, offsets, tolerance, multipliers):
-        """Move nodes to the nearest position that satisfies all planes.
+    Parameters
+    ----------
+    x : (m, 3) free positions [m], changed in place
+    fixed : (m, 3) bool, prescribed components, which do not move
+    normals : (m, w, 3) unit normals; offsets : (m, w) [m], -inf for a plane that does not apply
+    tolerance : a plane violated by at most this counts as satisfied [m]
+    multipliers : (m, w) output [m]: the node moves by the sum of multipliers times normals (free components)
+    several : ``NEEDED``, or None if w is 1
 
-        Parameters
-        ----------
-        x : (m, 3) free positions [m], changed in place
-        fixed : (m, 3) bool, prescribed components, which do not move
-        normals : (m, w, 3) unit normals; offsets : (m, w) [m], -inf for a plane that does not apply
-        tolerance : a plane violated by at most this counts as satisfied [m]
-        multipliers : (m, w) output [m]: the node moves by the sum of multipliers times normals (free components)
-
-        Returns
-        -------
-        int
-            First node with infeasible planes, or -1.
-        """
-        m, w = offsets.shape
-        free = np.zeros((w, 3))
-        gap = np.zeros(w)
-        usable = np.zeros(w, dtype=np.bool_)
-        move = np.zeros(3)
-        infeasible = -1
-        for i in range(m):
-            count, first, n = 0, 0, 0
-            for k in range(w):
-                multipliers[i, k] = 0.0
-                g = -offsets[i, k]
-                length = 0.0
-                for c in range(3):
-                    g += normals[i, k, c] * x[i, c]
-                    free[k, c] = 0.0 if fixed[i, c] else normals[i, k, c]
-                    length += free[k, c] * free[k, c]
-                gap[k] = g
-                usable[k] = length > FREE_PART and g < math.inf
-                n += usable[k]
-                if usable[k] and g < 0.0:
-                    first = k
-                    count += 1
-            if count == 0:
-                continue
-            alone = False
-            if count == 1:  # the common case: a single violated plane whose projection satisfies all others
-                square = (
-                    free[first, 0] * free[first, 0] + free[first, 1] * free[first, 1] + free[first, 2] * free[first, 2]
-                )
-                multipliers[i, first] = -gap[first] / square
-                alone = True
-                for c in range(3):
-                    move[c] = multipliers[i, first] * free[first, c]
-                for k in range(w):
-                    g = gap[k] + free[k, 0] * move[0] + free[k, 1] * move[1] + free[k, 2] * move[2]
-                    alone = alone and (k == first or not usable[k] or g >= -tolerance)
-            if several:  # noqa: SIM102 - what is not needed is not compiled
-                if not alone:
-                    planes, values, z = np.flatnonzero(usable), np.empty(n), np.zeros(n)
-                    gram = np.empty((n, n))
-                    for a in range(n):
-                        values[a] = gap[planes[a]]
-                        for b in range(n):
-                            gram[a, b] = 0.0
-                            for c in range(3):
-                                gram[a, b] += free[planes[a], c] * free[planes[b], c]
-                    # planes through one point may lie beyond each other by rounding for ever, unless that is tolerated
-                    if not find_multipliers(gram, values, 0.0, z) and not find_multipliers(gram, values, tolerance, z):
-                        multipliers[i, first] = 0.0
-                        if infeasible < 0:
-                            infeasible = i
-                        continue
-                    move[:] = 0.0
-                    multipliers[i, first] = 0.0
-                    for a in range(n):
-                        multipliers[i, planes[a]] = z[a]
-                        for c in range(3):
-                            move[c] += z[a] * free[planes[a], c]
+    Returns
+    -------
+    int
+        First node with infeasible planes, or -1.
+    """
+    m, w = offsets.shape
+    free = np.zeros((w, 3))
+    gap = np.zeros(w)
+    usable = np.zeros(w, dtype=np.bool_)
+    move = np.zeros(3)
+    infeasible = -1
+    for i in range(m):
+        count, first, n = 0, 0, 0
+        for k in range(w):
+            multipliers[i, k] = 0.0
+            g = -offsets[i, k]
+            length = 0.0
             for c in range(3):
-                x[i, c] += move[c]
-        return infeasible
-
-    return project
-
-
-project = projection(True)
+                g += normals[i, k, c] * x[i, c]
+                free[k, c] = 0.0 if fixed[i, c] else normals[i, k, c]
+                length += free[k, c] * free[k, c]
+            gap[k] = g
+            usable[k] = length > FREE_PART and g < math.inf
+            n += usable[k]
+            if usable[k] and g < 0.0:
+                first = k
+                count += 1
+        if count == 0:
+            continue
+        alone = False
+        if count == 1:  # the common case: a single violated plane whose projection satisfies all others
+            square = free[first, 0] * free[first, 0] + free[first, 1] * free[first, 1] + free[first, 2] * free[first, 2]
+            multipliers[i, first] = -gap[first] / square
+            alone = True
+            for c in range(3):
+                move[c] = multipliers[i, first] * free[first, c]
+            for k in range(w):
+                g = gap[k] + free[k, 0] * move[0] + free[k, 1] * move[1] + free[k, 2] * move[2]
+                alone = alone and (k == first or not usable[k] or g >= -tolerance)
+        if several is not None:  # noqa: SIM102 - what is not needed is not compiled
+            if not alone:
+                planes, values, z = np.flatnonzero(usable), np.empty(n), np.zeros(n)
+                gram = np.empty((n, n))
+                for a in range(n):
+                    values[a] = gap[planes[a]]
+                    for b in range(n):
+                        gram[a, b] = 0.0
+                        for c in range(3):
+                            gram[a, b] += free[planes[a], c] * free[planes[b], c]
+                # planes through one point may lie beyond each other by rounding for ever, unless that is tolerated
+                if not find_multipliers(gram, values, 0.0, z) and not find_multipliers(gram, values, tolerance, z):
+                    multipliers[i, first] = 0.0
+                    if infeasible < 0:
+                        infeasible = i
+                    continue
+                move[:] = 0.0
+                multipliers[i, first] = 0.0
+                for a in range(n):
+                    multipliers[i, planes[a]] = z[a]
+                    for c in range(3):
+                        move[c] += z[a] * free[planes[a], c]
+        for c in range(3):
+            x[i, c] += move[c]
+    return infeasible
 
 
 class Groups(NamedTuple):

@@ -43,6 +43,8 @@ LOOP = types.void(_VALUES, types.float64, _VALUES, types.int64)
 _STRAIN, _TEMPERATURE, _STRESS, _MODULUS = (np.uint64(row * ROW) for row in (STRAIN, TEMPERATURE, STRESS, MODULUS))
 _STRAIN0, _TEMPERATURE0 = _STRESS, _MODULUS
 
+_LAW = types.FunctionType(LOOP)
+
 # functions as arguments are marked so; this module and the loops that take its lists are all that uses them
 warnings.filterwarnings("ignore", category=numba.NumbaExperimentalFeatureWarning)
 
@@ -232,29 +234,43 @@ def first_class(loops: Sequence[Callable[..., Any]], signature: Any = LOOP) -> A
     whichever and however many they are. The loops must be kept as long as it is used."""
     if not COMPILED:
         return list(loops)
-    empty, append = _list_of(types.FunctionType(signature))
-    found = empty()
+    if not loops:
+        return _none()
+    one, append = _list_loops(types.FunctionType(signature))
     for loop in loops:
         loop.compile(signature.args)
+    found = one(loops[0])
+    for loop in loops[1:]:
         append(found, loop)
     return found
 
 
 @cache
-def _list_of(kind: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Make the loops that return an empty list of functions of a kind, and that append one to it."""
+def _list_loops(kind: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return loops that begin a list of functions of a kind, and that append to it."""
+    one, append = kernel(_one), kernel(_append)
+    for loop, arguments in ((one, (kind,)), (append, (types.ListType(kind), kind))):
+        loop.compile(arguments)
+        loop.disable_compile()  # a function is otherwise an argument of a type of its own
+    return one, append
 
-    @kernel
-    def empty():
-        return List.empty_list(kind)
 
-    @kernel
-    def append(loops, loop):
-        loops.append(loop)
+@kernel
+def _none():
+    """Return an empty list of loops of laws."""
+    return List.empty_list(_LAW)
 
-    append.compile((types.ListType(kind), kind))
-    append.disable_compile()  # a loop is otherwise an argument of a type of its own
-    return empty, append
+
+def _one(loop: Any) -> Any:
+    """Return a list of one loop."""
+    loops = List()
+    loops.append(loop)
+    return loops
+
+
+def _append(loops: Any, loop: Any) -> None:
+    """Append a loop to a list."""
+    loops.append(loop)
 
 
 def evaluate(law: Law, numbers: tuple[Any, ...], strain: Any, temperature: Any, history: np.ndarray) -> np.ndarray:

@@ -25,6 +25,10 @@ COMPILED = not numba.config.DISABLE_JIT
 KERNELS: list[Any] = []
 """All compiled loops of this process."""
 
+NEEDED = ()
+"""Argument of a loop for a part of it that is needed; None for one that is not, which is not compiled. Closures would
+not do: Numba does not find their machine code on disk if they contain other loops."""
+
 _PACKAGE = Path(__file__).parents[1]
 
 _KEPT = 6

@@ -122,8 +122,11 @@ def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int
     diagonal = sizes >= LEAST_RUN * np.add.reduceat(~follows, at, dtype=np.int64) if len(at) else sizes > 0
     runs = np.flatnonzero(~np.where(np.repeat(diagonal, sizes), follows, alike))
     chunks = np.searchsorted(runs, np.append(at, stop - start))
-    numbers = low[runs], high[runs], np.append(runs + start, stop), chunks
-    return Sweep(*(values.astype(np.uint32) for values in numbers), diagonal, int(np.searchsorted(at, counted - start)))
+    return Sweep(
+        *(values.astype(np.uint32) for values in (low[runs], high[runs], np.append(runs + start, stop), chunks)),
+        diagonal,
+        int(np.searchsorted(at, counted - start)),
+    )
 
 
 NO_BAR = -1.0

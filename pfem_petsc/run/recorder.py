@@ -262,9 +262,13 @@ class Recorder:
         head[_BARS] += stepper.energy.energies
         head[HEAD.first("alarm")] = alarm
         fill_at_state(self._at_state, stepper, head)
-        of_walls = walls.force.copy(), walls.moment.copy(), walls.contacts.copy()  # those of no contact are read-only
         changes, contact.log.changes = contact.log.changes, 0
-        sums = ContactSums(*of_walls, contact.log.releases, self.model.links.totals())
+        sums = ContactSums(
+            # those of no contact are read-only
+            *(getattr(walls, name).copy() for name in ("force", "moment", "contacts")),
+            contact.log.releases,
+            self.model.links.totals(),
+        )
         record_forces(impulses.state.v, sums, changes, share.numbers)
         held = self.model.supports.any or self.model.bars.springs is not None
         reacts = held and not stepper.scheme.balance_at_endpoints

@@ -524,8 +524,7 @@ def run_compiled(s, phases, starts, due, flags):
         if stops or (wrong and not several):
             break
     found = done, passed, course.recorded, course.lost, course.changed, course.failed, turned, course.unsolved
-    outcome = s.outcome
     for k in range(len(found)):
-        outcome[k] = found[k]
-    outcome[NEAR], outcome[PRESSING] = len(contacts.near), len(contacts.pressing)
+        s.outcome[k] = found[k]
+    s.outcome[NEAR], s.outcome[PRESSING] = len(contacts.near), len(contacts.pressing)
     return contacts.touched, contacts.met, contacts.changes, contacts.friction

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..columns import HEAD
-from ..contact.explicit import Arrivals, PressedWalls, WallSums, find_penetrating, presses
+from ..contact.explicit import Arrivals, PressedWalls, WallSums, find_penetrating, press_nodes
 from ..contact.fixed_rows import close_rows, pressed_nodes
 from ..contact.node_walls import compare_contacts
 from ..contact.surfaces import Surfaces, wall_gaps
@@ -43,7 +43,7 @@ class WallArrays(NamedTuple):
 
 @record
 class ContactNodes(NamedTuple):
-    """Results of :func:`~pfem_petsc.contact.explicit.presses` in a step: room for ``nodes`` (n,), the walls that
+    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the walls that
     they are ``touching`` (n, w), their ``places`` (n, 3); ``failure`` (2,): the first of them without a place, or -1,
     and why, and its planes, ``normals`` (w, 3) and ``offsets`` (w,); and the sums of each wall, ``force`` (w, 3),
     ``contacts`` (w,) and ``moment`` (w, 3)."""
@@ -129,10 +129,9 @@ def _mark(marked, nodes, value):
 
 
 @cache
-def press_walls(curved: bool, rough: bool, several: bool) -> Any:
+def press_walls(curved: Any, rough: Any, several: Any) -> Any:
     """Make the phase that moves nodes beyond walls onto them, for walls of a kind, see
-    :func:`~pfem_petsc.contact.explicit.presses`."""
-    press_nodes = presses(curved, rough, several)
+    :func:`~pfem_petsc.contact.explicit.kind_of`."""
 
     @addressed
     def press(s, step):
@@ -160,7 +159,9 @@ def press_walls(curved: bool, rough: bool, several: bool) -> Any:
                 for c in range(3):
                     places[j, c] = free[c, found[j]]
             sums = WallSums(out.force, out.contacts, out.moment)
-            failed, why, planes, total, touching, contacts.friction = press_nodes(places, given, pressed, sums)
+            failed, why, planes, total, touching, contacts.friction = press_nodes(
+                places, given, pressed, sums, curved, rough, several
+            )
             for j in range(m):
                 i = found[j]
                 out.nodes[j] = i

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.contact.explicit import Arrivals, PressedWalls, WallSums, kind_of, presses
+from pfem_petsc.contact.explicit import Arrivals, PressedWalls, WallSums, kind_of, press_nodes
 from pfem_petsc.contact.node_walls import TURN
 from pfem_petsc.contact.surfaces import Surfaces
 from pfem_petsc.errors import SimulationFailure
@@ -169,7 +169,7 @@ def test_friction_on_a_sphere_in_large_steps(side, friction):
         *(np.empty((m, 0)), np.empty((m, 0)), np.empty((0, 1, 3)), np.empty((0, 1))),
     )
     x, sums = free.copy(), WallSums(np.zeros((1, 3)), np.zeros(1, dtype=np.int64), np.zeros((1, 3)))
-    failed, _, _, force, _, dissipated = presses(*kind_of(walls))(x, given, walls, sums)
+    failed, _, _, force, _, dissipated = press_nodes(x, given, walls, sums, *kind_of(walls))
     assert m > 60 and turned.sum() > 20 and failed < 0
     np.testing.assert_allclose(np.linalg.norm(x, axis=1), 1.0, atol=1e-12)
     np.testing.assert_allclose(force, stiffness * (x - free), atol=1e-12)

@@ -73,8 +73,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in words[:cut]
     # overflows are reported by their consequences
     warnings.filterwarnings("default" if debug else "ignore", category=RuntimeWarning)
-    warnings.filterwarnings("once", category=UserWarning)
-    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
+    told: set[str] = set()
+
+    def once(message: Warning | str, *_: object, **__: object) -> str:
+        """Python's filter "once" forgets what it has told whenever a library changes filters."""
+        text = f"warning: {message}\n"
+        new = text not in told
+        told.add(text)
+        return text if new else ""
+
+    warnings.formatwarning = once
     try:
         arguments, verb = _parse(words[:cut], words[cut + 1 :])
     except InputError as error:

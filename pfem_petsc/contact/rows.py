@@ -107,8 +107,7 @@ def gather_rows(at, array, vectors):
 
 @kernel
 def pair_values(ends, normals, least, x, values):
-    """Compute rows n . (x_2 - x_1) - least (r,) at positions (n, 3) of their nodes ``ends`` (2, r), with the bits of
-    :func:`~pfem_petsc.contact.fixed_rows.solve_rows`."""
+    """Compute rows n . (x_2 - x_1) - least (r,) at positions (n, 3) of their nodes ``ends`` (2, r)."""
     for r in range(len(values)):
         i, j = ends[0, r], ends[1, r]
         apart = normals[r, 0] * (x[j, 0] - x[i, 0]) + normals[r, 2] * (x[j, 2] - x[i, 2])

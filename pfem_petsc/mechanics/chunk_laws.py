@@ -163,9 +163,9 @@ def _put(first: int, count: int) -> Callable[..., Any]:
 
 @cache
 def law_loops(law: Law, form: tuple[Any, ...]) -> SimpleNamespace:
-    """Make the loops of a law whose numbers have a form: ``brief`` writes stresses and history, ``full`` moduli and
-    energy densities too; ``mean`` writes the mean stresses of steps and their derivatives, and no history (None
-    without mean stresses)."""
+    """Make the loops of a law whose numbers have a form: ``brief`` writes stresses and the new history to the
+    workspace, ``full`` moduli and energy densities too; ``mean`` writes the mean stresses of steps and their
+    derivatives, and no history (None without mean stresses)."""
     response, mean_stress, by_rate, can_break = law.response, law.mean_stress, law.rate, law.rupture >= 0
     count, n_data, gone = len(law.internal), len(law.bar_data), _place(HISTORY + max(law.rupture, 0))
     last, last_stress = _place(HISTORY + count), _place(HISTORY + count + 1)

@@ -34,9 +34,9 @@ _PACKAGE = Path(__file__).parents[1]
 _KEPT = 6
 """Folders of machine code, of several versions, processors or installations of Numba, that are kept."""
 
-# Neither contraction to fused multiply-add nor reassociation: the result of a loop must not depend on how it was
-# compiled, for one bar or for eight at once. Then a bar evaluated on two ranks has the same bits on both, and a
-# restarted run is bitwise identical to an uninterrupted one (contraction would save 5 %).
+# Neither contraction to fused multiply-add nor reassociation, but for the sums of add_freely: the result of a loop must
+# not depend on how it was compiled, for one bar or for eight at once. Then a bar evaluated on two ranks has the same
+# bits on both, and a restarted run is bitwise identical to an uninterrupted one (contraction would save 5 %).
 # Assuming "no NaN" would hide divergence.
 _OPTIONS = {"fastmath": {"nsz"}, "error_model": "numpy"}
 

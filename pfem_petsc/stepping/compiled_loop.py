@@ -56,7 +56,7 @@ FAILED, LOST = -1, -2
 """Results of calls: a failure of the simulation, any other error."""
 
 
-record(Messages)
+record(Messages)  # which stands below the compiled loops
 
 
 @record
@@ -137,7 +137,8 @@ class Contacts(NamedTuple):
     touched, met : nodes (m,) that touch walls; that have touched walls and not left them
     changes : contacts that have closed or opened since the last row
     friction : energy that friction dissipates in the next step [J]
-    near, others, pressing : nodes (m,) with contact forces of walls, of rows, and of both
+    near : nodes (m,) beyond walls, or that rebound
+    others, pressing : nodes (m,) with contact forces of rows; these and ``near``
     rows, altered : numbers of rows with a force, and of those whose force begins or ends
     impact : energy that contacts lose in the step [J]
     """
@@ -170,6 +171,11 @@ class Course(NamedTuple):
     holds: bool
     lost: int
     unsolved: int
+
+
+def new_course() -> Course:
+    """Return that of steps of which none is made."""
+    return Course(False, False, failed=-1, shortened=False, changed=0, recorded=0, holds=False, lost=0, unsolved=0)
 
 
 @record
@@ -212,14 +218,14 @@ DONE, PASSED, RECORDED, LOST_BY_MPI, CHANGED, COLLAPSED, TURNED, UNSOLVED, NEAR,
 """Numbers of the outcome of some steps: of steps made; of those that other ranks make too, of which this one only sends
 messages after a failure; of shares of rows; the error code of MPI. In the last step: the number of bars that changed
 their state of rupture; the first bar that collapsed, and that went through zero length, or -1; whether a call for rows
-failed; the number of nodes near walls, in ContactNodes; and of nodes with contact forces."""
+failed; the number of nodes beyond walls or that rebound, in ContactNodes; and of nodes with contact forces."""
 
 
 _RUBBED, _IMPACT = map(HEAD.first, ("friction_dissipation", "impact_dissipation"))
 _EXTERNAL_WORK, _DAMPED, _NUMERICAL, _KINETIC = map(
     HEAD.first, ("external_work", "damping_dissipation", "numerical_dissipation", "kinetic_energy")
 )
-_MOMENTA, _SUPPORT, _PRESSING = map(
+_MOMENTA, _SUPPORT, _ACTIVE = map(
     HEAD.first,
     (
         "momentum",  # followed by angular momentum and centre of mass
@@ -233,7 +239,8 @@ _ENERGIES, _SPRINGS = len(BAR_ENERGIES), BAR_ENERGIES.index("spring_energy")
 
 BEGIN, SEND, TAKE, FORCES, PRESS, IMPACTS, BOOK, AGREE, END, RECORD = range(10)
 """When phases of a step are made: at its start; messages between ranks; forces and balance; contact and reactions;
-contacts that close; the books of the step; agreement of ranks; where the state is needed; in a step with a row."""
+contacts that close; the books of the step; agreement of ranks; where the state is needed; in a step with a row, at the
+end of a call, and where something is wrong."""
 
 
 @inlined
@@ -329,7 +336,7 @@ def close_called(s, step):
         for i in called.changing[: called.counts[1]]:
             rates_of(i, s.motion, s.state.v, s.state.a)
         put_rates(s.moving, step, s.held, s.state.v, s.state.a)
-        if s.calls.python(step, CLOSE) != 0:
+        if s.calls.python(step, CLOSE) != 0:  # the rows have been solved, so this is an error
             s.course.unsolved = LOST
         s.contacts.impact += called.loss[0]
 
@@ -352,8 +359,10 @@ def push_particles(s, step):
                 load = forces[k, c]
             elif k < first:
                 load = walls[k - WALLS, c]
-            else:  # the last rows are those of jumps, which need Python
-                load = links[k - first, c] if k < first + len(links) else 0.0
+            elif k < first + len(links):
+                load = links[k - first, c]
+            else:  # jumps, which need Python
+                load = 0.0
             u[k, c] = h * h * load
             s.impulses.half[k, c] += h * load
 
@@ -415,7 +424,7 @@ def record_row(s, step):
         row[_SUPPORT + c] = sums.forces[SUPPORTS, c]
         for k in range(3):
             row[_MOMENTA + 3 * k + c] = sums.momenta[k, c]
-    row[_PRESSING] = len(s.contacts.pressing)
+    row[_ACTIVE] = len(s.contacts.pressing)
     pressed = s.pressed
     contact = ContactSums(pressed.force, pressed.moment, pressed.contacts, s.walls.releases, s.rows.totals)
     record_forces(s.impulses.v, contact, s.contacts.changes, row)
@@ -481,10 +490,10 @@ def run_compiled(s, phases, starts, due, flags):
         course.needs_energies = ending or s.bars.can_break  # a bar that breaks ends the steps
         _perform(FORCES, phases, starts, s, step)
         _perform(PRESS, phases, starts, s, step)
-        if course.unsolved < FAILED:
+        if course.unsolved == LOST:
             break
         _perform(IMPACTS, phases, starts, s, step)
-        if course.unsolved < FAILED:
+        if course.unsolved == LOST:
             break
         s.ledger[_IMPACT] += contacts.impact
         _perform(BOOK, phases, starts, s, step)
@@ -496,7 +505,7 @@ def run_compiled(s, phases, starts, due, flags):
         wrong = stops or course.failed >= 0 or pressed.failure[0] >= 0 or course.unsolved != 0
         wrong = wrong or not np.isfinite(sums.works[INTERNAL])
         looks = course.holds = wrong or course.shortened
-        if agrees:
+        if agrees:  # whether any rank has to look at its state
             _perform(AGREE, phases, starts, s, step)
             looks = course.holds
             if course.lost != 0:
@@ -506,7 +515,7 @@ def run_compiled(s, phases, starts, due, flags):
             if course.failed < 0 and course.shortened:
                 turned = np.int64(first_inverted(s.state.x, s.state.before, s.bars.ends, s.bars.watched))
             wrong = wrong or turned >= 0
-        if agrees and looks:
+        if agrees and looks:  # whether any rank found something wrong
             course.holds = wrong
             _perform(AGREE, phases, starts, s, step)
             stops = course.holds

@@ -53,7 +53,6 @@ from .compiled_loop import (
     CalledRows,
     Calls,
     Contacts,
-    Course,
     ImpulseArrays,
     StateArrays,
     StepArrays,
@@ -63,6 +62,7 @@ from .compiled_loop import (
     close_called,
     evaluate_forces,
     join_pressing,
+    new_course,
     push_particles,
     put_state,
     record_row,
@@ -203,10 +203,14 @@ class CompiledSteps:
         damped, loaded, held = model.inertia.damped, model.external.active, len(self._held.nodes) > 0
         called, walls = self._called.record.any, len(model.contact.walls) > 0
         several, springs, moves = model.comm.size > 1, len(self._springs.nodes) > 0, model.supports.moves
-        touch, sent = walls or linked or called, model.contact.moving.any()
+        touch, walls_move = walls or linked or called, model.contact.moving.any()
         press = press_walls(*kind_of(self._walls.pressed)) if walls else None
         chosen = {
-            BEGIN: ((place_supports, moves), (place_walls, sent), (set_loads, loaded and not model.external.steady)),
+            BEGIN: (
+                (place_supports, moves),
+                (place_walls, walls_move),
+                (set_loads, loaded and not model.external.steady),
+            ),
             SEND: ((send_positions, several),),
             TAKE: ((take_positions, several),),
             FORCES: (
@@ -220,9 +224,9 @@ class CompiledSteps:
             IMPACTS: ((close_on_walls, walls), (close_on_rows, linked), (close_called, called)),
             BOOK: (
                 *((book_springs, springs), (correct_moving, moves), (sum_rows, linked), (push_particles, True)),
-                *((work_of_walls, sent),),
+                *((work_of_walls, walls_move),),
             ),
-            AGREE: ((agree, several),),
+            AGREE: ((agree, several and (model.bars.can_break or called)),),
             END: ((put_state, True),),
             RECORD: (
                 *((sum_ends, True), (accumulate_loads, loaded), (accumulate_drags, damped), (sum_moving, moves)),
@@ -284,7 +288,7 @@ class CompiledSteps:
             walls = walls._replace(motions=self._wall_motions(begin, count))
         arrays = StepArrays(
             by_reference(contacts),
-            by_reference(Course(False, False, -1, False, 0, 0, False, 0, 0)),
+            by_reference(new_course()),
             self._nodes,
             self._motion,
             self._held,
@@ -390,6 +394,7 @@ class CompiledSteps:
 
 
 _CALL = types.int64(types.int64, types.int64)
+_HELD, _CHANGING = range(2)  # nodes of CalledRows, and the places of their numbers
 
 
 class RowCaller:
@@ -417,13 +422,13 @@ class RowCaller:
         n = 0 if self.links.separate else len(u)
         nodes, counts, loss = np.empty((2, n), dtype=np.int64), np.zeros(2, dtype=np.int64), np.zeros(1)
         self.record = CalledRows(not self.links.separate, np.empty((n, 3)), u[:n], *nodes, counts, loss)
-        self._keep(0, self.links.pressed())
+        self._keep(_HELD, self.links.pressed())
         if self.record.any:
             stepper.balance = stepper.scheme.balance(stepper.state, stepper.h)
 
     def _keep(self, which: int, nodes: np.ndarray) -> None:
         if self.record.any:
-            room = self.record.changing if which else self.record.held
+            room = self.record.held if which == _HELD else self.record.changing
             self.record.counts[which] = len(nodes)
             room[: len(nodes)] = nodes
 
@@ -447,7 +452,7 @@ class RowCaller:
             else:
                 self._close()
         except BaseException as error:  # noqa: BLE001  # an exception cannot pass the compiled loop: end raises it
-            if isinstance(error, SimulationFailure) and not is_alone():
+            if what == SOLVE and isinstance(error, SimulationFailure) and not is_alone():
                 self.failure = error
                 return FAILED
             self._error = error
@@ -457,8 +462,8 @@ class RowCaller:
     def _solve(self, time: float) -> None:
         """Solve the rows of the balance for the positions at a time [s]; if that fails, they have no forces."""
         links, record = self.links, self.record
-        self._keep(0, np.empty(0, dtype=np.int64))
-        self._keep(1, np.empty(0, dtype=np.int64))
+        self._keep(_HELD, np.empty(0, dtype=np.int64))
+        self._keep(_CHANGING, np.empty(0, dtype=np.int64))
         self._totals[:] = 0.0
         stepper = self.stepper
         stepper.balance = replace(stepper.balance, predictor=record.predictor, time=time)
@@ -466,12 +471,12 @@ class RowCaller:
         if load is not None:
             links.push(load, self._stiffness, self._u, self._contact)
         self._totals[:] = links.totals()
-        self._keep(0, links.pressed())
+        self._keep(_HELD, links.pressed())
         two = links.two
         changed = (links.force[two.at] > 0.0) != two.record.closed
         if changed.any():
             nodes = two.nodes[:, changed]
-            self._keep(1, np.unique(nodes[nodes >= 0]))
+            self._keep(_CHANGING, np.unique(nodes[nodes >= 0]))
 
     def _close(self) -> None:
         """Find the energy that rows lose, from velocities and accelerations of the state at their nodes."""

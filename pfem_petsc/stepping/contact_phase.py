@@ -27,7 +27,8 @@ class WallArrays(NamedTuple):
     """Walls ``pressed`` and their log, see :mod:`~pfem_petsc.contact.explicit` and
     :mod:`~pfem_petsc.contact.node_walls`; their surfaces ``at_rest``, without displacement, and at the end of the step,
     ``level``; and for walls that move ``motions`` (t, 2, w, 3), displacements and velocities at the start of the first
-    step, at the end of each, and of one more, else (0, 2, w, 3); ``free`` (3, n) and ``marked`` (blocks,), workspace.
+    step, at the end of each, and of one more, else (0, 2, w, 3); ``free`` (3, n), positions without walls, ``marked``
+    (blocks,) and ``present``, workspace; ``releases`` (w,) since the start.
     """
 
     pressed: PressedWalls

@@ -1,5 +1,5 @@
-"""The phases of a step of central differences, each over all nodes of a rank: move, balance, supports, finish, and the
-sums that the energy balance needs.
+"""The phases of a step of central differences, each over all nodes of a rank: move, springs, balance, supports,
+reactions, and the sums that the energy balance needs.
 
 Positions, velocities at half steps, increments and forces lie by components, (3, n) or longer rows, so that loops are
 vectorised. With velocities at half steps, x1 = x0 + h half, the balance (m/h^2 + c/(2h)) u = f_ext - f_int - c half
@@ -314,7 +314,7 @@ def displace(c, i, du, nodes, motion, sums):
 
 @addressed
 def apply_supports(s, step):
-    """Give prescribed components their increments, by the velocities that :func:`balance` has kept."""
+    """Give prescribed components their increments, by the velocities that :func:`balancing` has kept."""
     held, nodes, motion, sums = s.held, s.nodes, s.motion, s.sums
     h, loaded, damped = motion.h, nodes.external.shape[1] > 0, len(nodes.damping) > 0
     for k in range(len(held.nodes)):

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-COMPILED = {"addressed", "kernel", "inlined", "intrinsic", "njit", "overload", "register_jitable"}
+COMPILED = {"addressed", "kernel", "law_kernel", "inlined", "intrinsic", "njit", "overload", "register_jitable"}
 """Decorators of functions whose types Numba infers."""
 
 

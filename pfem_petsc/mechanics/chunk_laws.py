@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from numba import types
 from numba.typed import List
 
-from .compiled import COMPILED, inlined, kernel
+from .compiled import COMPILED, inlined, kernel, law_kernel
 from .materials.base import Law
 
 CHUNK = 512
@@ -190,14 +190,14 @@ def law_loops(law: Law, form: tuple[Any, ...]) -> SimpleNamespace:
         work[_STRESS + i] = stress
         return modulus, densities
 
-    @partial(kernel, first_class=True)
+    @law_kernel
     def brief(p, step, work, n):
         numbers = numbers_of(p)
         for k in range(n):
             i = np.uint64(k)
             respond(numbers, step, work, i)
 
-    @partial(kernel, first_class=True)
+    @law_kernel
     def full(p, step, work, n):
         numbers = numbers_of(p)
         for k in range(n):
@@ -209,7 +209,7 @@ def law_loops(law: Law, form: tuple[Any, ...]) -> SimpleNamespace:
     if mean_stress is None:
         return SimpleNamespace(brief=brief, full=full, mean=None)
 
-    @partial(kernel, first_class=True)
+    @law_kernel
     def mean(p, step, work, n):
         numbers = numbers_of(p)
         for k in range(n):

@@ -134,6 +134,11 @@ def kernel(function: Callable[..., Any], first_class: bool = False, called: bool
     return made
 
 
+def law_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a loop that Python calls, and other loops by its address."""
+    return kernel(function, first_class=True)
+
+
 def addressed(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a loop that only other loops call, by its address."""
     return kernel(function, first_class=True, called=False)

@@ -261,7 +261,6 @@ class Recorder:
         head[:] = stepper.ledger.sums
         head[_BARS] += stepper.energy.energies
         head[HEAD.first("alarm")] = alarm
-        fill_at_state(self._at_state, stepper, head)
         changes, contact.log.changes = contact.log.changes, 0
         sums = ContactSums(
             # those of no contact are read-only
@@ -270,6 +269,7 @@ class Recorder:
             self.model.links.totals(),
         )
         record_forces(impulses.state.v, sums, changes, share.numbers)
+        fill_at_state(self._at_state, stepper, head)
         held = self.model.supports.any or self.model.bars.springs is not None
         reacts = held and not stepper.scheme.balance_at_endpoints
         if self.probe_nodes or reacts:

@@ -262,9 +262,13 @@ class BarBlock:
         return values
 
     def put_row(self, number: int, values: Any) -> None:
-        """Set a row of these data to values (stop - start,) or a number."""
+        """Set a row of these data to values (stop - start,) or a number.
+
+        Columns without a bar have the ``bar_data`` of the first one, as laws need not have a stress for zeros.
+        """
         values = np.ascontiguousarray(np.broadcast_to(values, self.stop - self.start), dtype=float)
-        spread_values(self.layout, self.index, values, 0.0, self.columns[number])
+        none = values[0] if number >= len(self.law.rows) and len(values) else 0.0
+        spread_values(self.layout, self.index, values, float(none), self.columns[number])
 
     @property
     def history(self) -> np.ndarray:

@@ -266,3 +266,30 @@ def test_bars_of_these_laws_break(law, integrator, keys, tmp_path):
     if integrator == "energy_momentum":
         assert abs(history["numerical_dissipation"]).max() < 1e-11 * start
     assert np.ptp(history["probe/tip/velocity"][-10:, 0, 0]) < 1e-9  # flies on
+
+
+def test_data_of_bars_have_values_where_a_run_has_no_bar(tmp_path):
+    """Between two rods the columns of a run have no bar: a strut of no slenderness has no stress there."""
+    law = {"law": "strut", "strain": "green"}
+    case = Case.from_dict(
+        {
+            "mesh": {"generator": "two_rods", "length": 0.6, "elements": 9, "gap": 0.002},
+            "node_set": {"tip": {"group": "first_end"}},
+            "material": {
+                "it": {
+                    "law": "strut",
+                    "young_modulus": 2.8e6,
+                    "density": 8700.0,
+                    "yield_stress": 5.3e3,
+                    "strain": "green",
+                }
+            },
+            "section": {"it": {"area": 1e-4, "material": "it", "shape": "round", "effective_length": 0.5}},
+            "initial": {"on": [{"node_set": "tip", "velocity": [0.01, 0.0, 0.0]}]},
+            "time": {"integrator": "central_differences", "step": "auto", "end": 2e-2},
+        }
+    )
+    Simulation(case, output=tmp_path / "out", quiet=True).run()
+    history = open_result(tmp_path / "out").history
+    assert history["elastic_energy"][-1] > 0.01 * history["kinetic_energy"][0]
+    assert np.abs(history["energy_imbalance"]).max() < 1e-12 * history["kinetic_energy"][0]

@@ -270,7 +270,6 @@ def test_bars_of_these_laws_break(law, integrator, keys, tmp_path):
 
 def test_data_of_bars_have_values_where_a_run_has_no_bar(tmp_path):
     """Between two rods the columns of a run have no bar: a strut of no slenderness has no stress there."""
-    law = {"law": "strut", "strain": "green"}
     case = Case.from_dict(
         {
             "mesh": {"generator": "two_rods", "length": 0.6, "elements": 9, "gap": 0.002},

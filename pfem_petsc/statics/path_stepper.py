@@ -85,7 +85,7 @@ class PathStepper(StaticStepper):
         self.keys = keys
         self.scheme = PathEquilibrium()
         self.end = float(keys.max_points)  # of the clock
-        self.metric = Metric(model.comm, getattr(keys, "constraint", "cylindrical") == "spherical")
+        self.metric = Metric(model.comm, keys.spherical)
         self.direction = None
         if keys.node_set is not None:
             self.direction = Direction(model, keys.node_set, keys.direction)

@@ -20,6 +20,11 @@ class Parameters(PathKeys):
     constraint: Literal["cylindrical", "spherical"] = "cylindrical"
     """whether lengths are of displacements alone, or of displacements and load factor"""
 
+    @property
+    def spherical(self) -> bool:
+        """Whether the load factor counts in lengths."""
+        return self.constraint == "spherical"
+
 
 def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> PathStepper:
     """The stepper of a case. Collective."""

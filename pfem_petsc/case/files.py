@@ -8,10 +8,11 @@ Files of forces: NPZ files have the arrays ``time`` (n,) [s], ``nodes`` (m,) wit
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import re
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -419,3 +420,47 @@ def _checked_times(times: np.ndarray, where: Callable[[int], str]) -> np.ndarray
             f"{where(k + 1)}: times must increase, but {times[k + 1].item()!r} follows {times[k].item()!r}"
         )
     return times
+
+
+def profile_of(path: Path, profile: str, keys: Sequence[str]) -> dict[str, float | str]:
+    """Return the values of a profile in a catalogue, by key.
+
+    The CSV file has a heading with ``profile`` and ``keys`` in SI units, and a line for each profile; cells may be
+    empty, and lines that begin with ``#`` are skipped. Columns are separated by commas, semicolons or tabs.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or has another column, or not this profile, or twice.
+    """
+    try:
+        text = readable_whole(path).read_text("utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise InputError(f"this file cannot be read: {error}") from error
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    separator = max(",;\t", key=lines[0].count) if lines else ","
+    rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator)]
+    if not rows or "profile" not in rows[0]:
+        raise InputError("expected a heading with the column profile, and columns named by keys of sections")
+    heading = rows[0]
+    for column in heading:
+        if column != "profile" and column not in keys:
+            raise InputError(f"column {column!r} is no key of a section{nearest(column, list(keys))}")
+    named = [row for row in rows[1:] if len(row) == len(heading) and row[heading.index("profile")] == profile]
+    uneven = next((row for row in rows[1:] if len(row) != len(heading)), None)
+    if uneven is not None:
+        raise InputError(f"the line {separator.join(uneven)!r} has {len(uneven)} cells, the heading {len(heading)}")
+    if len(named) != 1:
+        known = [row[heading.index("profile")] for row in rows[1:]]
+        hint = f"{len(named)} profiles are called {profile!r}" if named else f"no profile is called {profile!r}"
+        raise InputError(hint + ("" if named else nearest(profile, known)))
+    return {
+        key: _number_or_text(cell) for key, cell in zip(heading, named[0], strict=True) if cell and key != "profile"
+    }
+
+
+def _number_or_text(cell: str) -> float | str:
+    try:
+        return float(cell)
+    except ValueError:
+        return cell

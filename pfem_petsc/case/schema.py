@@ -425,7 +425,7 @@ def _check_sections(model: CaseModel, stages: list[CaseModel], problems: Problem
     """Refuse keys of sections that would have no effect."""
     wind = any(each.wind is not None for each in (model, *stages))
     for name, section in model.section.items():
-        for key in ("diameter", "drag_coefficient"):
+        for key in ("drag_coefficient",) if section.shape is not None else ("diameter", "drag_coefficient"):
             if getattr(section, key) is not None and not wind:
                 text = "has an effect in wind alone: remove the key, or give [wind]"
                 problems.add(("section", name, key), text, getattr(section, key))
@@ -437,8 +437,11 @@ def _check_sections(model: CaseModel, stages: list[CaseModel], problems: Problem
             text = "has no effect: bars of this material and section are not checked for buckling; remove the key"
             problems.add(("section", name, "effective_length"), text, section.effective_length)
         path = ("section", name, "thickness")
-        if path in problems.overridden and not (wind and section.diameter is None):
-            text = "changes no result: stiffness and mass follow from area, and the law does not buckle; change area"
+        if path in problems.overridden and section.diameter is None and not wind:
+            text = (
+                "changes no result: stiffness and mass follow from area, and the law does not buckle; change area, or "
+                "give diameter instead of it"
+            )
             problems.add(path, text, section.thickness)
 
 

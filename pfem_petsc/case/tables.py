@@ -19,6 +19,7 @@ from pydantic import (
 )
 
 from ..errors import InputError
+from ..mechanics.section_shapes import SHAPES, SIZES, CrossSection, cross_section
 from .base import (
     FileName,
     Finite,
@@ -41,7 +42,7 @@ from .base import (
     refers,
     refusal,
 )
-from .files import digest_of
+from .files import digest_of, profile_of
 
 Indices = Annotated[tuple[NonNegativeInt, ...], listed]
 
@@ -211,11 +212,10 @@ class Rupture(StrictModel):
 class Section(StrictModel):
     """Cross-section and material of bars."""
 
-    exactly_one = (("area", "area_field"),)
-    at_most_one = (PRESTRESSES,)
+    at_most_one = (("area", "area_field"), ("shape", "second_moment"), PRESTRESSES)
 
     area: PositiveFloat | None = None
-    """cross-section area [m2]"""
+    """cross-section area [m2]; default: that of the sizes of the shape"""
     area_field: Annotated[str, Field(min_length=1)] | None = None
     """cell field of the mesh file with the area of each bar [m2], instead of ``area``"""
     material: Annotated[str, refers("material", "material")]
@@ -223,16 +223,28 @@ class Section(StrictModel):
     bars: BarGroup | None = None
     """bar group of the mesh, or the bars with a value of a field: { field = "NAME", value = 2 }; default: all bars that
     no other section names"""
-    shape: Literal["round", "tube"] | None = None
-    """shape of the cross-section: a solid circle or a tube of this area"""
+    shape: Literal[SHAPES] | None = None  # type: ignore[valid-type]
+    """shape of the cross-section, by sizes; an area may stand for the diameter of a solid circle, for the diameter or
+    the thickness of a tube, and for the thickness of the others"""
+    diameter: PositiveFloat | None = None
+    """outer diameter of a solid circle or a tube [m]; without a shape, the diameter in wind alone, by default that of a
+    solid circle of this area"""
+    width: PositiveFloat | None = None
+    """width of an angle, box, I section or channel, over all [m]"""
+    height: PositiveFloat | None = None
+    """height of the same, over all [m]; default: width"""
     thickness: PositiveFloat | None = None
-    """wall thickness of a tube [m]"""
+    """thickness of the walls of a tube or box, of the legs of an angle, of the flanges of the others [m]"""
+    web_thickness: PositiveFloat | None = None
+    """thickness of the web of an I section or channel [m]; default: thickness"""
     second_moment: PositiveFloat | None = None
     """second moment of area about the axis of buckling [m4], instead of a shape"""
+    catalogue: FileName | None = None
+    """CSV file with a line for each profile: its name in the column ``profile``, and keys of this table in others"""
+    profile: Annotated[str, Field(min_length=1)] | None = None
+    """name of a profile in the catalogue, whose values the section has"""
     effective_length: PositiveFloat = 1.0
     """effective length factor K: a bar buckles over K times its length"""
-    diameter: PositiveFloat | None = None
-    """diameter in wind [m]; default: that of the shape, or of a round bar of this area"""
     drag_coefficient: NonNegativeFloat | None = None
     """drag coefficient in wind; default: that of [wind]"""
     pretension: NumberOrRows | None = None
@@ -241,6 +253,24 @@ class Section(StrictModel):
     """stress in the mesh [Pa], or rows [t, stress] [s, Pa]"""
     rest_length: NumberOrRows | None = None
     """rest length over the length in the mesh, or rows [t, factor] [s, -]"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_catalogue(cls, data: Any, info: ValidationInfo) -> Any:
+        """Put the values of a profile in the place of its name, so that a case does not depend on the file any more."""
+        if not isinstance(data, Mapping) or info.context is None or not {"catalogue", "profile"} & set(data):
+            return data
+        for key in ("catalogue", "profile"):
+            if not isinstance(data.get(key), str) or not data[key]:
+                raise ValueError("catalogue (a CSV file) and profile (a name in it) need each other")
+        try:
+            values = profile_of(Path(info.context.folder, data["catalogue"]), data["profile"], list(cls.model_fields))
+        except InputError as error:
+            raise refusal((("catalogue",), str(error), data["catalogue"])) from error
+        taken = [key for key in values if key in data]
+        if taken:
+            raise refusal(((taken[0],), f"the profile {data['profile']!r} has this value too", data[taken[0]]))
+        return {key: value for key, value in data.items() if key not in ("catalogue", "profile")} | values
 
     @field_validator("rest_length")
     @classmethod
@@ -255,17 +285,31 @@ class Section(StrictModel):
         """The key that prescribes rest lengths, None without one."""
         return next((key for key in PRESTRESSES if getattr(self, key) is not None), None)
 
+    @property
+    def sizes(self) -> dict[str, float]:
+        """The sizes that are given [m]."""
+        return {key: getattr(self, key) for key in SIZES if getattr(self, key) is not None}
+
+    @property
+    def uniform_area(self) -> float | None:
+        """The area of each bar [m2], given or that of the sizes; None with a field of areas."""
+        return float(self.cross_section().area) if self.area_field is None else None
+
+    def cross_section(self, area: np.ndarray | None = None) -> CrossSection:
+        """Return the cross-sections of the bars, with the areas (b,) [m2] of the field if the section has one."""
+        return cross_section(self.shape, self.sizes, self.area if self.area_field is None else area, self.second_moment)
+
     @model_validator(mode="after")
-    def _one_shape(self) -> Section:
-        if (self.shape == "tube") != (self.thickness is not None):
-            raise ValueError('shape = "tube" and thickness [m] need each other')
-        if self.shape is not None and self.second_moment is not None:
-            raise ValueError("second_moment follows from the shape: give one of the two")
-        if self.thickness is not None and self.area is not None and self.thickness > math.sqrt(self.area / math.pi):
-            raise ValueError(
-                f"thickness = {self.thickness!r} m is too much for a tube of area = {self.area!r} m2: a solid bar of "
-                f"this area has a radius of {math.sqrt(self.area / math.pi):.6g} m"
-            )
+    def _has_sizes(self) -> Section:
+        # areas of a field are checked with the mesh; these suit any size
+        thickness, diameter = self.thickness or 0.0, self.diameter or 0.0
+        trial = max(2.0 * math.pi * thickness * thickness, 0.125 * math.pi * diameter * diameter) or 1.0
+        try:
+            found = self.cross_section(np.array([trial]))
+        except OverflowError:
+            found = CrossSection(0.0, 0.0, 0.0, 0.0, 0.0)
+        if not np.all(np.isfinite(np.hstack(found))) or not np.all(np.asarray(found.area) > 0.0):
+            raise ValueError(f"sizes are out of range, in square metres: {self.sizes}")
         return self
 
 

@@ -68,23 +68,9 @@ if TYPE_CHECKING:
 
 def bar_shapes(section: Section, length: np.ndarray, area: np.ndarray) -> BarShapes:
     """Return the shapes of bars of a section from their lengths [m] and areas [m2], both (b,)."""
-    nothing = np.zeros_like(length)
-    outer, inner, moment, modulus = np.sqrt(area / np.pi), nothing, nothing, nothing
-    if section.thickness is not None:
-        outer = area / (2.0 * np.pi * section.thickness) + 0.5 * section.thickness
-        inner = np.maximum(outer - section.thickness, 0.0)
-    if section.second_moment is not None:
-        moment = np.full_like(length, section.second_moment)
-        squares, difference = 4.0 * moment / area, area / np.pi
-        hollow = squares >= difference
-        outer = np.where(hollow, np.sqrt(0.5 * (squares + difference)), outer)
-        inner = np.where(hollow, np.sqrt(0.5 * np.maximum(squares - difference, 0.0)), 0.0)
-        flat = 0.25 * area * np.sqrt(3.0 * squares)
-        modulus = np.where(hollow, 4.0 / 3.0 * (outer**3 - inner**3), flat)
-    elif section.shape is not None:
-        moment = 0.25 * np.pi * (outer**4 - inner**4)
-        modulus = 4.0 / 3.0 * (outer**3 - inner**3)
-    return BarShapes(length, area, moment, modulus, outer, section.effective_length * length)
+    found = section.cross_section(area)
+    each = [np.broadcast_to(np.asarray(value, dtype=float), length.shape) for value in found[:4]]
+    return BarShapes(length, *each, section.effective_length * length)
 
 
 _SHOWN = 12
@@ -180,13 +166,17 @@ def check_areas(case: Case, slab: MeshSlab, sections: np.ndarray) -> None:
                 f"{key}: bar {wrong[0] + slab.first_bar} of {slab.source} (and {len(wrong) - 1} more here) has "
                 f"{values[wrong[0]]:g} m2; give each bar of the section an area > 0"
             )
-        least = 0.0 if section.thickness is None else np.pi * section.thickness**2
-        thin = np.flatnonzero((sections == index) & (values < least))
-        if len(thin):
-            raise InputError(
-                f"{case.source}: section.{name}.thickness = {section.thickness!r} m is too much for the tube of bar "
-                f"{thin[0] + slab.first_bar}, whose area is {values[thin[0]]:g} m2"
-            )
+        thickness, diameter = section.thickness or 0.0, section.diameter or np.inf
+        for size, unsuitable in (
+            (f"thickness = {thickness!r} m is too much", values < np.pi * thickness**2),
+            (f"diameter = {diameter!r} m is too little", values > 0.25 * np.pi * diameter**2),
+        ):
+            bars = np.flatnonzero(unsuitable & (sections == index)) if section.shape is not None else ()
+            if len(bars):
+                raise InputError(
+                    f"{case.source}: section.{name}.{size} for the tube of bar {bars[0] + slab.first_bar}, whose area "
+                    f"is {values[bars[0]]:g} m2"
+                )
 
 
 def section_of_bars(case: Case, slab: MeshSlab) -> np.ndarray:
@@ -312,14 +302,14 @@ def make_blocks(mesh: DistributedMesh, case: Case) -> tuple[list[BarBlock], BarL
         section = case.section[names[block.section]]
         material = case.material[section.material]
         law, measure = laws[section.material], MEASURES[material.strain]
-        area = section.area if section.area_field is None else mesh.bar_fields[section.area_field]
+        area = None if section.area_field is None else mesh.bar_fields[section.area_field]
         blocks.append(
             BarBlock(
                 section=names[block.section],
                 start=block.start,
                 counted=block.counted,
                 stop=block.stop,
-                area=float(area) if section.area_field is None else area[block.start : block.stop].copy(),
+                area=section.uniform_area if area is None else area[block.start : block.stop].copy(),
                 density=material.density,
                 damping=material.damping,
                 thermal_expansion=material.thermal_expansion,
@@ -726,8 +716,7 @@ class Bars:
         def radius(block: BarBlock) -> np.ndarray | float:
             if not isinstance(block.area, float):
                 return self._shapes(block).radius
-            one = bar_shapes(self.case.section[block.section], np.ones(1), np.array([block.area]))
-            return float(one.radius[0])  # that of each of them
+            return float(self.case.section[block.section].cross_section().radius)  # that of each of them
 
         return self.of_blocks(radius)
 

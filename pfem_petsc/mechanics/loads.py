@@ -14,7 +14,6 @@ from ..case.tables import LoadFile
 from ..errors import InputError, raised
 from ..parallel.agreement import on_root, outcome
 from ..registry import nearest
-from .bars import bar_shapes
 from .compiled import kernel
 from .motion import Group, Table, TimeTables, grouped
 from .records import record
@@ -269,12 +268,9 @@ class Wind:
             if block.section not in case.section:  # springs and dashpots
                 continue
             section, part = case.section[block.section], slice(block.start, block.stop)
-            rest = bars.rest[part]
-            diameter = section.diameter
-            if diameter is None:
-                diameter = 2.0 * bar_shapes(section, rest, np.full_like(rest, block.area)).radius
+            width = section.cross_section(block.area).width
             coefficient = wind.drag_coefficient if section.drag_coefficient is None else section.drag_coefficient
-            self._factor[part] = 0.25 * wind.density * coefficient * diameter
+            self._factor[part] = 0.25 * wind.density * coefficient * width
             # dF/dw over the mass of the bar, for w = 1 m/s
             most = float(np.max(4.0 * self._factor[part] / (block.density * block.area), initial=0.0))
             self._rate = max(self._rate, most)

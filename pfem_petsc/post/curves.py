@@ -68,7 +68,7 @@ def rod_on_wall(result: Any) -> ClosedForm | None:
         or not _keys(wall) <= {"name", "type", "point", "normal", "node_set"}
         or wall.type != "plane"
         or len(case.section) != 1
-        or section.area is None
+        or section.uniform_area is None
         or section.prestressed
         or start.node_set is not None
         or any(start.angular_velocity)
@@ -98,10 +98,10 @@ def rod_on_wall(result: Any) -> ClosedForm | None:
     if limit is not None and speed > limit / (density * c):
         hardening = material.isotropic_hardening + material.kinematic_hardening
         slow = math.sqrt(modulus * hardening / (modulus + hardening) / density)
-        plateau = section.area * (limit + density * slow * (speed - limit / (density * c)))
+        plateau = section.uniform_area * (limit + density * slow * (speed - limit / (density * c)))
         known = np.where(touching, plateau, np.where(since < 0.0, 0.0, np.nan))
         return ClosedForm("plastic wave of linear hardening", {force: known[:, None] * normal})
-    mass, way = density * section.area * length, np.array([axis, 0.0, 0.0])
+    mass, way = density * section.uniform_area * length, np.array([axis, 0.0, 0.0])
     mean = speed * np.clip(1.0 - np.maximum(since, 0.0) / travel, -1.0, 1.0)
     inside = np.clip(since, 0.0, 2.0 * travel)
     centre = speed * (
@@ -109,7 +109,7 @@ def rod_on_wall(result: Any) -> ClosedForm | None:
     )
     kinetic = 0.5 * mass * speed**2 * np.abs(mean) / speed
     columns = {
-        force: (density * c * section.area * speed * touching)[:, None] * normal,
+        force: (density * c * section.uniform_area * speed * touching)[:, None] * normal,
         "kinetic_energy": kinetic,
         "elastic_energy": 0.5 * mass * speed**2 - kinetic,
         "momentum": mass * mean[:, None] * way,
@@ -138,7 +138,7 @@ def von_mises(result: Any) -> ClosedForm | None:
         or case.wall
         or not _keys(load) <= {"node_set", "force"}
         or any(load.force[:2])
-        or section.area is None
+        or section.uniform_area is None
         or section.prestressed
         or not _keys(case.material[section.material]) <= {"law", "young_modulus", "density"}
     ):
@@ -151,7 +151,7 @@ def von_mises(result: Any) -> ClosedForm | None:
     base, rise = 0.5 * float(np.ptp(feet[:, 0])), float(points[apex, 2])
     heights = [np.asarray(result.positions(i))[apex, 2] for i in range(len(result.times))]
     height = np.linspace(rise, min([*heights, rise]), 400)
-    stiff = 2.0 * case.material[section.material].young_modulus * section.area
+    stiff = 2.0 * case.material[section.material].young_modulus * section.uniform_area
     load_z = -stiff * height * (1.0 / np.hypot(base, height) - 1.0 / math.hypot(base, rise))
     return ClosedForm("closed form of two bars", path=(rise - height, load_z / load.force[2]))
 

@@ -370,9 +370,9 @@ def radii_of(result: Any) -> np.ndarray | None:
             raise InputError(f"the mesh of {case.source} has {mesh.n_bars} bars now, the result {len(length)}")
         numbers[: mesh.n_bars], areas[: mesh.n_bars] = section_areas(case, mesh)
     except (InputError, OSError):
-        if len(sections) > 1 or sections[0].area is None:
+        if len(sections) > 1 or sections[0].uniform_area is None:
             return None
-        numbers, areas = np.zeros(len(length), dtype=int), np.full(len(length), sections[0].area)
+        numbers, areas = np.zeros(len(length), dtype=int), np.full(len(length), sections[0].uniform_area)
     radius = np.full(len(length), np.inf)
     for number, section in enumerate(sections):
         own = numbers == number
@@ -391,7 +391,8 @@ def section_areas(case: Any, mesh: Any) -> tuple[np.ndarray, np.ndarray]:
     numbers, areas = section_of_bars(case, mesh), np.ones(mesh.n_bars)
     for number, section in enumerate(case.section.values()):
         own = np.flatnonzero(numbers == number)
-        areas[own] = section.area if section.area_field is None else mesh.bar_fields[section.area_field][own]
+        area = section.uniform_area
+        areas[own] = mesh.bar_fields[section.area_field][own] if area is None else area
     return numbers, areas
 
 

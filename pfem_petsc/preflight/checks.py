@@ -172,10 +172,11 @@ def _materials(case: Case) -> Iterator[str]:
 
 def _sections(case: Case) -> Iterator[str]:
     for name, section in case.section.items():
-        if section.area is not None and not 1e-18 <= section.area <= _LARGEST_AREA:
-            yield f"section.{name}.area = {section.area:g} m2: no bar has that; 1 mm2 is 1e-6 m2"
+        area = section.uniform_area
+        if area is not None and not 1e-18 <= area <= _LARGEST_AREA:
+            yield f"section.{name}: area = {area:g} m2: no bar has that; 1 mm2 is 1e-6 m2"
         young = case.material[section.material].young_modulus
-        stiffness = None if section.area is None else young * section.area
+        stiffness = None if area is None else young * area
         for key, unit, hard in (("prestress", "Pa", young), ("pretension", "N", stiffness)):
             given = getattr(section, key)
             if given is None or hard is None:

@@ -40,13 +40,8 @@ def case(section, overrides=(), **more):
             {},
             r"thickness = 0.002 \(given by --set\): changes no result: .* change area",
         ),
-        (
-            TUBE | {"diameter": 0.1},
-            ["section.a.thickness=2e-3"],
-            WIND,
-            "section.a.thickness = 0.002 .*changes no result",
-        ),
-        ({"thickness": 1e-3}, (), {}, r'shape = "tube" and thickness \[m\] need each other'),
+        (TUBE | {"diameter": 0.1}, (), {}, 'shape = "tube" needs two of area, diameter, thickness, got diameter and'),
+        ({"thickness": 1e-3}, (), {}, "thickness needs a shape: round, tube, angle, box, I, channel"),
     ],
 )
 def test_refused(section, overrides, more, text):
@@ -56,6 +51,7 @@ def test_refused(section, overrides, more, text):
 
 def test_accepted():
     case({"diameter": 0.1, "drag_coefficient": 1.0}, **WIND)
+    case({"area": None, "shape": "tube", "diameter": 0.1, "thickness": 1e-3}, ["section.a.thickness=2e-3"])
     case(TUBE)  # compared with Euler's load
     case(TUBE | {"effective_length": 0.5})
     case(TUBE, ["section.a.thickness=2e-3"], **WIND)

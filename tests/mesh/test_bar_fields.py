@@ -115,7 +115,7 @@ def test_areas_too_small_for_a_tube(tmp_path):
         (
             {"area_field": "a", "area": 1.0},
             {"generator": "rod", "length": 1.0, "elements": 1},
-            "exactly one of the keys",
+            "at most one of the keys area, area_field",
         ),
         ({}, {"generator": "rod", "length": 1.0, "elements": 1}, "exactly one of the keys area, area_field"),
         (

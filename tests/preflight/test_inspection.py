@@ -53,7 +53,7 @@ def test_mechanisms_and_self_stress(comm, shared_tmp_path, name):
         ("material.steel.density=7.85e-9 time.step=auto", ["material.steel.density = 7.85e-09 kg/m3"]),
         ("material.steel.yield_stress=1e12", ["material.steel.yield_stress = 1e+12 Pa"]),
         ("material.steel.kinematic_hardening=0.0", ["material.steel yields without hardening", "depend on the mesh"]),
-        ("section.default.area=100.0", ["section.default.area = 100 m2"]),
+        ("section.default.area=100.0", ["section.default: area = 100 m2"]),
         ("initial.velocity=[6000,0,0]", ["node ", "starts at 6.000 km/s, faster than waves"]),
         ("wall.0.normal=[1,0,0] wall.0.point=[-30,0,0]", ["no node moves towards wall 'wall'"]),
     ],

@@ -40,7 +40,14 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
 HOMES = {"run": "cases", "list": "cases", "check": "cases", "mesh": "mesh", "render": "results", "plot": "results"}
-HOMES |= {"report": "results", "info": "results", "sweep": "cases", "bench": "bench", "completion": "cases"}
+HOMES |= {
+    "report": "results",
+    "members": "results",
+    "info": "results",
+    "sweep": "cases",
+    "bench": "bench",
+    "completion": "cases",
+}
 """Verbs, and the modules of this package whose ``VERBS`` have them."""
 
 EXAMPLES = f"""\

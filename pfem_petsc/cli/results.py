@@ -8,12 +8,14 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..errors import InputError, printable
+from ..post.members import PER
 from ..post.options import Options, PlotOptions
 from .parser import PROGRAM, Verb, argument, options_of, surviving
 
 if TYPE_CHECKING:
-    import numpy as np
     from mpi4py import MPI
 
     from ..output.result import Modes, Result
@@ -155,6 +157,51 @@ def report(arguments: argparse.Namespace) -> int:
     return 0
 
 
+MEMBERS = f"""\
+examples:
+  {PROGRAM} members results/tower
+  {PROGRAM} members results/tower --csv members.csv --picture members.png
+  {PROGRAM} members results/tower --each-case --limit 100
+  {PROGRAM} members results/tower --case wind --per bar
+  {PROGRAM} members results/dome_earthquake --time 4.2"""
+
+OF_MEMBERS = (
+    argument("result", metavar="RESULT", help="result file, or its folder"),
+    argument("--per", choices=PER, default=PER[0], help="what a row is: a chain of bars on one line, or a bar"),
+    argument("--time", metavar="T", type=float, help="state nearest to this time or load factor; default: all"),
+    argument("--case", metavar="NAME", help="one load case, combination or stage; default: all"),
+    argument("--each-case", action="store_true", help="rows for each of them, instead of for the one that governs"),
+    argument("--limit", metavar="N", type=int, default=20, help="rows printed; default: %(default)s; 0: all"),
+    argument("--csv", metavar="FILE", type=Path, help="write all rows as CSV"),
+    argument("--parquet", metavar="FILE", type=Path, help="write all rows as Parquet, which needs pyarrow"),
+    argument("--markdown", metavar="FILE", type=Path, help="write all rows as a table of Markdown"),
+    argument("--picture", metavar="FILE", type=Path, help="draw the truss in colours of utilisation, as PNG"),
+)
+
+
+def print_members(arguments: argparse.Namespace) -> int:
+    """Print the table of members, and the names of files that are written."""
+    from ..post.members import draw_members, members
+
+    if arguments.limit < 0:
+        raise InputError(f"members: --limit {arguments.limit}: give a number of rows, or 0 for all")
+    path = surviving(arguments.result)
+    table = members(path, per=arguments.per, time=arguments.time, case=arguments.case, each_case=arguments.each_case)
+    limit = arguments.limit or table.n_rows
+    print(printable(table.where(np.arange(min(limit, table.n_rows))).text()))
+    print("in m, N and Pa; tension is positive; governing states are those of the snapshots")
+    if table.n_rows > limit:
+        print(f"{table.n_rows - limit:,} more rows: --limit 0 prints all, --csv writes them")
+    for name in ("csv", "parquet", "markdown"):
+        file = getattr(arguments, name)
+        if file is not None:
+            getattr(table, f"to_{name}")(file)
+            print(file)
+    if arguments.picture is not None:
+        print(draw_members(path, table, arguments.picture))
+    return 0
+
+
 RENDER = f"""\
 examples:
   {PROGRAM} render results/rod_impact
@@ -277,6 +324,14 @@ VERBS = (
         "one",
         OF_REPORT,
         report,
+    ),
+    Verb(
+        "members",
+        "List the members: axial forces, stresses, utilisation of strength and of Euler's load, by load case.",
+        MEMBERS,
+        "one",
+        OF_MEMBERS,
+        print_members,
     ),
     Verb(
         "render",

@@ -94,6 +94,39 @@ class Table(Mapping[str, np.ndarray]):
             writer.writerows(zip(*lists, strict=True))
         return path
 
+    def to_parquet(self, path: Path | str) -> Path:
+        """Write the table as a Parquet file.
+
+        Raises
+        ------
+        InputError
+            If pyarrow is not installed, or the file cannot be written.
+        """
+        try:
+            from pyarrow import parquet, table
+        except ImportError as error:
+            raise InputError(f"to_parquet needs pyarrow: pip install pyarrow ({error}); to_csv does not") from error
+        path = Path(path)
+        with written(path, "the table"):
+            parquet.write_table(table(dict(self)), path)
+        return path
+
+    def to_markdown(self, path: Path | str | None = None) -> str:
+        """Return the table as text of Markdown, and write it to a file if one is given; an earlier file is replaced.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be written.
+        """
+        lines = [list(self), ["---"] * len(self)]
+        lines += [[_text(value) for value in row] for row in zip(*self.values(), strict=True)]
+        text = "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
+        if path is not None:
+            with written(Path(path), "the table"):
+                Path(path).write_text(text, encoding="utf-8")
+        return text
+
     def _texts(self) -> list[list[str]]:
         """The heading and the shown rows as texts."""
         shown = list(range(self.n_rows))
@@ -104,7 +137,13 @@ class Table(Mapping[str, np.ndarray]):
         return lines
 
     def __str__(self) -> str:
-        lines = self._texts()
+        return self._aligned(self._texts())
+
+    def text(self) -> str:
+        """Return all rows as text in columns."""
+        return self._aligned([list(self), *([_text(value) for value in row] for row in zip(*self.values()))])
+
+    def _aligned(self, lines: Sequence[Sequence[str]]) -> str:
         widths = [max(len(line[k]) for line in lines) for k in range(len(self))]
         return "\n".join("  ".join(f"{text:>{w}}" for text, w in zip(line, widths, strict=True)) for line in lines)
 
@@ -220,4 +259,5 @@ def _plain(value: Any) -> Any:
 
 def _text(value: Any) -> str:
     text = f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
+    text = "" if text == "nan" else text
     return text if len(text) <= 60 else f"{text[:57]}..."

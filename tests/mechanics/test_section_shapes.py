@@ -117,7 +117,8 @@ def test_sizes_give_the_area_and_can_be_changed():
 
 def test_profiles_of_a_catalogue(tmp_path):
     (tmp_path / "profiles.csv").write_text(
-        "# hot rolled\nprofile;area;second_moment;shape;width;thickness\nIPE200;28.5e-4;142e-8;;;\nL60x6;;;angle;0.06;0.006\n"
+        "# hot rolled\nprofile;area;second_moment;shape;width;thickness\n"
+        "IPE200;28.5e-4;142e-8;;;\nL60x6;;;angle;0.06;0.006\n"
     )
 
     def read(profile, **keys):

@@ -226,6 +226,8 @@ class MaterialKeys(StrictModel):
                 raise ValueError(f"row {k}: the temperature must increase from row to row")
         return rows
 
+    design_strength: PositiveFloat | None = None
+    """stress to which tables of members compare that of a bar [Pa]; no result depends on it; default: yield_stress"""
     rupture: Rupture | None = None
     """limits beyond which a bar breaks"""
 

@@ -1,0 +1,421 @@
+"""Members: axial forces and stresses of bars and chains of bars, and their utilisation of strength and Euler's load.
+
+A member is a chain of bars of one section that lie on one line in the mesh: they are joined at nodes with no other bar,
+no support, spring or dashpot. Utilisations are
+
+- of strength: |N|/(A f), the largest of its bars, with the axial force N, the area A in the mesh, and the
+  ``design_strength`` f of its material, by default its ``yield_stress``;
+- of Euler's load: -N (K L)^2/(pi^2 E I) where N is compression, with the length L of the member in the mesh, Young's
+  modulus E, and the smallest second moment I and the effective length factor K of its section.
+
+They do not exist without a strength, or without a shape or second moment of the section.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import InputError, written
+from ..output.table import Table
+from ..registry import nearest
+
+PER = ("member", "bar")
+"""What a row of the table may be."""
+
+_COLLINEAR = 1e-4
+"""Largest sine of the angle between bars of a member."""
+
+_FORCE = "axial_force"
+
+
+class Bars(NamedTuple):
+    """The bars of a case, by their numbers in the mesh: arrays (bars,), in SI units.
+
+    Attributes
+    ----------
+    section : number of the section, -1 of connectors between nodes
+    area, length : in the mesh
+    strength : of the material, NaN without
+    rigidity : E I, NaN without shape and second moment
+    factor : effective length factor
+    """
+
+    section: np.ndarray
+    area: np.ndarray
+    length: np.ndarray
+    strength: np.ndarray
+    rigidity: np.ndarray
+    factor: np.ndarray
+
+
+class Members(NamedTuple):
+    """Members of a truss.
+
+    Attributes
+    ----------
+    bars : (bars,) numbers of bars, member after member
+    first : (members,) where each begins in ``bars``
+    """
+
+    bars: np.ndarray
+    first: np.ndarray
+
+    def least(self, values: np.ndarray) -> np.ndarray:
+        """The smallest value (members,) of each member, of values (bars,) in the order of the mesh."""
+        return np.minimum.reduceat(values[self.bars], self.first)
+
+    def most(self, values: np.ndarray) -> np.ndarray:
+        """The largest value (members,) of each member; NaN where one is."""
+        return np.maximum.reduceat(values[self.bars], self.first)
+
+    def total(self, values: np.ndarray) -> np.ndarray:
+        """The sum (members,) over the bars of each member."""
+        return np.add.reduceat(values[self.bars], self.first)
+
+    def spread(self, values: np.ndarray) -> np.ndarray:
+        """Values (members,) for each bar (bars,), in the order of the mesh."""
+        counts = np.diff([*self.first, len(self.bars)])
+        out = np.empty(len(self.bars), dtype=values.dtype)
+        out[self.bars] = np.repeat(values, counts)
+        return out
+
+
+class Truss(NamedTuple):
+    """What members need of the model of a result: its bars, and nodes at which members end."""
+
+    bars: Bars
+    held: np.ndarray
+    sections: list[str]
+
+
+def truss_of(result: Any) -> Truss:
+    """Return the bars of the case of an open result, whose mesh is made or read again.
+
+    Raises
+    ------
+    InputError
+        If the mesh is not there any more, or has other bars.
+    """
+    from mpi4py import MPI
+
+    from ..mechanics.bars import bar_shapes
+    from ..stepping.model import Model
+
+    stages = result.case.stages
+    model = Model(stages[0], MPI.COMM_SELF, later=stages[1:])
+    mesh, case, n = model.mesh, model.case, len(result.bars)
+    if mesh.n_bars > n:
+        raise InputError(f"the mesh of {case.source} has {mesh.n_bars} bars now, the result {n}")
+    sections = list(case.section)
+    values = {name: np.full(n, np.nan) for name in Bars._fields}
+    values["section"] = np.full(n, -1)
+    for block in model.bars.blocks:
+        if block.section not in case.section:
+            continue
+        section = case.section[block.section]
+        material = case.material[section.material]
+        own = mesh.bar_ids[block.start : block.stop]
+        lengths = model.bars.mesh_lengths[block.start : block.stop]
+        shapes = bar_shapes(section, lengths, np.broadcast_to(block.area, lengths.shape))
+        strength = material.design_strength or getattr(material, "yield_stress", None)
+        values["section"][own] = sections.index(block.section)
+        values["area"][own], values["length"][own] = shapes.area, lengths
+        values["strength"][own] = np.nan if strength is None else strength
+        known = shapes.second_moment > 0.0
+        values["rigidity"][own] = np.where(known, material.young_modulus * shapes.second_moment, np.nan)
+        values["factor"][own] = section.effective_length
+    held = [model.nodes[table.node_set] for stage in stages for table in stage.support]
+    for table in (*case.spring, *case.dashpot):
+        held += [model.nodes[name] for name in (table.between or (table.node_set,))]
+    nodes = np.unique(np.concatenate([np.empty(0, dtype=np.int64), *held]))
+    return Truss(Bars(**values), mesh.node_ids[nodes], sections)
+
+
+def find_members(points: np.ndarray, ends: np.ndarray, section: np.ndarray, held: np.ndarray) -> Members:
+    """Return the members of a truss, in the order of their first bars; connectors are in none.
+
+    Parameters
+    ----------
+    points : (nodes, 3) positions in the mesh [m]
+    ends : (bars, 2) nodes of bars, connectors among them
+    section : (bars,) numbers of sections, -1 of connectors
+    held : nodes at which a member ends
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n, inner = len(ends), np.bincount(ends.ravel(), minlength=len(points)) == 2
+    inner[held] = False
+    # both bars of each node with two: sorted by node, they follow each other
+    order = np.argsort(ends.ravel(), kind="stable")
+    sides = order[inner[ends.ravel()[order]]].reshape(-1, 2)
+    first, second = sides.T // 2
+    away = points[ends.ravel()[sides ^ 1]] - points[ends.ravel()[sides[:, 0]]][:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        one, other = np.moveaxis(away / np.linalg.norm(away, axis=2, keepdims=True), 1, 0)
+    straight = (np.linalg.norm(np.cross(one, other), axis=1) <= _COLLINEAR) & ((one * other).sum(axis=1) < 0.0)
+    straight &= (section[first] == section[second]) & (section[first] >= 0)
+    joined = coo_array((np.ones(straight.sum()), (first[straight], second[straight])), shape=(n, n))
+    _, label = connected_components(joined, directed=False)
+    # in the order of the first bars
+    _, begins = np.unique(label, return_index=True)
+    rank = np.empty(len(begins), dtype=np.int64)
+    rank[np.argsort(begins)] = np.arange(len(begins))
+    bars = np.flatnonzero(section >= 0)
+    bars = bars[np.argsort(rank[label[bars]], kind="stable")]
+    changes = np.diff(rank[label[bars]], prepend=-1) != 0
+    return Members(bars, np.flatnonzero(changes))
+
+
+class Instant(NamedTuple):
+    """A snapshot that the table covers.
+
+    Attributes
+    ----------
+    case : name of the load case, combination or stage, empty without
+    snapshot : its number
+    """
+
+    case: str
+    snapshot: int
+
+
+def instants_of(result: Any, time: float | None, case: str | None) -> list[Instant]:
+    """Return the snapshots of a table: of all or one of the cases, at a time or over the run.
+
+    Raises
+    ------
+    InputError
+        If there is no such case or time.
+    """
+    times = np.asarray(result.times)
+    names = [stage.name for stage in result.case.stage]
+    if case is not None and case not in names:
+        raise InputError(f"{result.path}: there is no load case, combination or stage {case!r}{nearest(case, names)}")
+    found = [Instant(names[stage] if names else "", i) for i, stage in _snapshots(result)]
+    found = [each for each in found if case is None or each.case == case]
+    if time is not None:
+        if not times[0] <= time <= times[-1] * (1.0 + 1e-12):
+            raise InputError(f"{result.path}: --time {time:g}: snapshots are from {times[0]:g} to {times[-1]:g}")
+        found = [min(found, key=lambda each: abs(times[each.snapshot] - time))]
+    return found
+
+
+def _snapshots(result: Any) -> Iterator[tuple[int, int]]:
+    """Yield the numbers of snapshots and their stages; of load cases, the snapshot with all of the load."""
+    stages = result.case.stage
+    numbers = np.zeros(len(result.times), dtype=int)
+    if stages:
+        ends = np.asarray(result.stage_ends)[1:]
+        numbers = np.minimum(np.searchsorted(ends, np.asarray(result.times) * (1.0 - 1e-12)), len(stages) - 1)
+    yield from enumerate(numbers.tolist())
+
+
+class _Table:
+    """Rows under construction: the governing state of each member, and its extremes."""
+
+    def __init__(self, truss: Truss, members: Members) -> None:
+        self.bars, self.members = truss.bars, members
+        count = len(members.first)
+        self.measure = np.full(count, -1.0)
+        self.values = {name: np.full(count, np.nan) for name in (_FORCE, "stress", *UTILISATIONS)}
+        self.instant = np.zeros(count, dtype=np.int64)
+        self.tension, self.compression = np.zeros(count), np.zeros(count)
+
+    def add(self, number: int, force: np.ndarray) -> None:
+        """Take the axial forces (bars,) [N] of the instant of a number."""
+        bars, members = self.bars, self.members
+        stress = force / bars.area
+        least, most = members.least(force), members.most(force)
+        self.tension, self.compression = np.maximum(self.tension, most), np.minimum(self.compression, least)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            strength = members.most(np.abs(stress) / bars.strength)
+            length = members.total(bars.length) * members.most(bars.factor)
+            buckling = np.maximum(-least, 0.0) * length**2 / (np.pi**2 * members.least(bars.rigidity))
+        force = np.where(-least > most, least, most)
+        extreme, smallest = members.most(stress), members.least(stress)
+        stress = np.where(-least > most, smallest, extreme)
+        measure = np.fmax(strength, buckling)
+        measure = np.where(np.isnan(measure), np.abs(force), measure)
+        # where compression governs by buckling, its force is the one to show
+        shown = np.where(np.nan_to_num(buckling, nan=-1.0) > np.nan_to_num(strength, nan=-1.0), least, force)
+        taken = measure > self.measure
+        self.measure[taken], self.instant[taken] = measure[taken], number
+        new = dict(zip(self.values, (shown, stress, strength, buckling), strict=True))
+        for name, values in self.values.items():
+            values[taken] = new[name][taken]
+
+
+UTILISATIONS = ("yield_utilisation", "buckling_utilisation")
+"""Columns that may be empty."""
+
+
+def members(
+    result_path: Path | str | Any,
+    *,
+    per: str = "member",
+    time: float | None = None,
+    case: str | None = None,
+    each_case: bool = False,
+) -> Table:
+    """Return the table of the members of a result, those with the highest utilisation first.
+
+    A row has the state that governs its member: of the largest utilisation of strength or of Euler's load; without
+    either, of the largest axial force, and rows are sorted by that. States are those of the snapshots.
+
+    Parameters
+    ----------
+    result_path : result file or its folder, or an open result
+    per : ``member``, or ``bar``: each bar is a row, and buckles over its own length
+    time : of the snapshot nearest to it, in the unit of the result; None: the whole run
+    case : name of a load case, a combination or a stage; None: all of them
+    each_case : whether each of them has rows of its own, instead of one row for the one that governs
+
+    Returns
+    -------
+    Columns ``member`` (number), ``bars`` (numbers, from 0), ``section``, ``length`` [m], ``axial_force`` [N], tension
+    positive, ``stress`` [Pa], ``yield_utilisation``, ``buckling_utilisation`` (NaN where there is none), ``case``,
+    ``time`` of the snapshot, and over all states ``tension``, ``compression`` [N], the largest and the smallest axial
+    force, 0 without any.
+
+    Raises
+    ------
+    InputError
+        If the result has no axial forces or no such case, or its mesh is not there any more.
+    """
+    from .chart import opened
+
+    with opened(result_path) as result:
+        return _members(result, per, instants_of(result, time, case), each_case)
+
+
+def _members(result: Any, per: str, instants: Sequence[Instant], each_case: bool) -> Table:
+    if per not in PER:
+        raise InputError(f"members: per = {per!r}: expected one of {', '.join(PER)}")
+    if _FORCE not in result.cell_fields:
+        raise InputError(
+            f"{result.path}: has no field {_FORCE}; name it in output.fields of the case, and run it again"
+        )
+    truss = truss_of(result)
+    found = _found(result, truss, per)
+    groups = [[k] for k in range(len(instants))]
+    names = [instant.case for instant in instants]
+    groups = [[k for k, each in enumerate(names) if each == name] for name in dict.fromkeys(names)]
+    groups = groups if each_case else [list(range(len(instants)))]
+    tables = []
+    for group in groups:
+        table = _Table(truss, found)
+        for k in group:
+            table.add(k, np.asarray(result.field(_FORCE, instants[k].snapshot), dtype=float))
+        tables.append(_columns(table, truss, result, instants))
+    columns = {name: np.concatenate([each[name] for each in tables]) for name in tables[0]}
+    order = np.argsort(-columns.pop("measure"), kind="stable")
+    return Table({name: values[order] for name, values in columns.items()})
+
+
+def _found(result: Any, truss: Truss, per: str) -> Members:
+    bars = truss.bars
+    if per == "bar":
+        own = np.flatnonzero(bars.section >= 0)
+        return Members(own, np.arange(len(own)))
+    return find_members(np.asarray(result.positions(0), dtype=float), result.bars, bars.section, truss.held)
+
+
+def _columns(table: _Table, truss: Truss, result: Any, instants: Sequence[Instant]) -> dict[str, np.ndarray]:
+    found, bars = table.members, truss.bars
+    section = np.array(truss.sections)[bars.section[found.bars[found.first]]]
+    governing = table.instant
+    return {
+        "member": np.arange(len(found.first)),
+        "bars": np.array([_numbers(part) for part in np.split(found.bars, found.first[1:])]),
+        "section": section,
+        "length": found.total(bars.length),
+        **table.values,
+        "case": np.array([instant.case for instant in instants])[governing],
+        "time": np.asarray(result.times)[[instant.snapshot for instant in instants]][governing],
+        "tension": table.tension,
+        "compression": table.compression,
+        "measure": table.measure,
+    }
+
+
+def _numbers(bars: np.ndarray) -> str:
+    """Return numbers as text: ``3``, ``3-7`` for those in a row, ``3 8 12``."""
+    ordered = np.sort(bars)
+    if len(ordered) > 2 and ordered[-1] - ordered[0] == len(ordered) - 1:
+        return f"{ordered[0]}-{ordered[-1]}"
+    return " ".join(map(str, ordered.tolist()))
+
+
+class _Picture:
+    """A snapshot of a result whose bars have their largest utilisation as the field ``utilisation``."""
+
+    point_fields: Sequence[str] = ()
+    cell_fields: Sequence[str] = ("utilisation",)
+
+    def __init__(self, result: Any, utilisation: np.ndarray) -> None:
+        self._result, self._values = result, utilisation
+        self.path, self.case, self.bars, self.axis, self.history = (
+            result.path,
+            result.case,
+            result.bars,
+            result.axis,
+            result.history,
+        )
+        self.times = result.times[:1]
+
+    def positions(self, i: int) -> np.ndarray:
+        """Positions (nodes, 3) [m] of the first snapshot."""
+        return self._result.positions(0)
+
+    def field(self, name: str, i: int) -> np.ndarray:
+        """The utilisations (bars,)."""
+        return self._values
+
+    def caption(self, i: int) -> str:
+        """What the picture shows."""
+        return "largest utilisation of strength and Euler's load"
+
+
+def draw_members(result_path: Path | str | Any, table: Table, file: Path | str, **options: Any) -> Path:
+    """Draw the truss with each bar in the colour of the utilisation of its member; return the file.
+
+    Parameters
+    ----------
+    result_path : result file or its folder, or an open result
+    table : of :func:`members`, of the same result
+    file : PNG file
+    options : of :func:`~pfem_petsc.post.render.render`
+
+    Raises
+    ------
+    InputError
+        If no member has a utilisation, or the picture cannot be made.
+    """
+    from .chart import opened
+    from .render import render
+
+    values = np.fmax(table["yield_utilisation"], table["buckling_utilisation"])
+    if not np.any(np.isfinite(values)):
+        raise InputError(
+            "members: nothing to draw: utilisations need a yield_stress or design_strength of the material, or a "
+            "shape or second_moment of the section"
+        )
+    file = Path(file)
+    with opened(result_path) as result, tempfile.TemporaryDirectory() as folder:
+        each = np.zeros(len(result.bars))
+        for bars, value in zip(table["bars"], values, strict=True):
+            first, _, last = str(bars).partition("-")
+            chosen = list(range(int(first), int(last) + 1) if last else map(int, first.split()))
+            each[chosen] = np.fmax(each[chosen], value)
+        defaults = {"field": "utilisation", "clim": (0.0, max(1.0, float(np.nanmax(each)))), "note": lambda _: None}
+        made = render(_Picture(result, np.nan_to_num(each)), folder, frames=[0], video="none", **(defaults | options))
+        with written(file, "the picture"):
+            shutil.copyfile(next(path for path in made if path.name.startswith("frame_")), file)
+    return file

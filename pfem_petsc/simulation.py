@@ -148,7 +148,7 @@ class Simulation(WithEquations):
             self._finish("stopped")
         finally:
             self._free_equations()
-            self.stepper.destroy()
+            self._stages.destroy()
 
     def _usable(self) -> None:
         if self._closed:

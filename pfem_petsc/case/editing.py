@@ -229,8 +229,9 @@ def tables_of(case: CaseModel, given: bool = False) -> dict[str, Any]:
     Tables over time from files have rows instead.
     """
     data = {"title": case.title, **({"plugins": list(case.plugins)} if case.plugins else {}), **_tables(case, given)}
-    if case.stage:
-        data["stage"] = [_stage(case, stage, given) for stage in case.stage]
+    stages = [stage for stage in case.stage if not stage.derived]
+    if stages:
+        data["stage"] = [_stage(case, stage, given) for stage in stages]
     return data
 
 
@@ -352,7 +353,8 @@ def settle(case: CaseModel, attached: bool = True) -> None:
     """Give all tables of a case their places in it, or take these away."""
     owner = case if attached else None
     for k, stage in enumerate(case.stage):
-        _settle(stage, owner, lambda key, k=k: _of_stage(case, k, key))
+        _settle(stage, None if stage.derived else owner, lambda key, k=k: _of_stage(case, k, key))
+        stage.__dict__["editor"] = (case if attached else stage), stage.__dict__["editor"][1]
     _settle(case, owner, lambda key: (key,))
 
 

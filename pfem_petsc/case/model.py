@@ -29,8 +29,20 @@ from ..errors import InputError
 from ..fields import cell_fields, point_fields
 from ..mechanics.materials.base import LAWS, MaterialKeys, internal_variables, law_name
 from ..registry import added_file, choices, lookup, modules, nearest
+from . import load_cases
 from . import tables as t
-from .base import ConstraintKeys, FilePath, Name, NonNegativeInt, PositiveInt, StrictModel, listed, refusal
+from .base import (
+    ConstraintKeys,
+    FilePath,
+    Finite,
+    Name,
+    NonNegativeInt,
+    PositiveInt,
+    StrictModel,
+    listed,
+    refers,
+    refusal,
+)
 from .files import Columns, TableFile, file_columns, rows_of
 
 GENERATORS = "pfem_petsc.mesh.generators"
@@ -52,7 +64,7 @@ class Reading:
     def __init__(self, data: Mapping[str, Any], folder: Path, lenient: bool = False) -> None:
         self.folder, self.lenient = folder, lenient
         self.missing: list[str] = []
-        self.names = {key: _names(data.get(key)) for key in ("node_set", "material", "section", "support")}
+        self.names = {key: _names(data.get(key)) for key in ("node_set", "material", "section", "support", "load_case")}
         self._columns: dict[str, Columns] = {}
 
     def rows(self, given: Any, columns: tuple[str, ...]) -> list[list[float]]:
@@ -422,6 +434,38 @@ Load = Annotated[
 ]
 
 
+class LoadCase(StrictModel):
+    """Loads that act together, beside what the case has outside of load cases."""
+
+    name: Name
+    """name of the load case in results, tables and messages; unique, also among combinations and stages"""
+    load: Annotated[list[Load], listed] = []
+    """forces on nodes, under ``[[load_case.load]]``"""
+    gravity: t.Gravity | None = None
+    """acceleration of every mass"""
+    wind: t.Wind | None = None
+    """wind that drags the bars"""
+    temperature: list[t.Temperature] = []
+    """temperatures of bars, under ``[[load_case.temperature]]``"""
+    support: list[t.Support] = []
+    """supports that move, in the place of those of the same name or node set, under ``[[load_case.support]]``"""
+
+    @model_validator(mode="after")
+    def _loads(self) -> LoadCase:
+        if not any(getattr(self, key) for key in load_cases.TABLES):
+            raise ValueError(f"has no loads: expected at least one of the tables {', '.join(load_cases.TABLES)}")
+        return self
+
+
+class Combination(StrictModel):
+    """Load cases that act together, each with a factor."""
+
+    name: Name
+    """name of the combination in results, tables and messages; unique, also among load cases and stages"""
+    factors: Annotated[dict[Annotated[str, refers("load_case", "load case")], Finite], Field(min_length=1)]
+    """factors by the names of load cases: { dead = 1.35, wind = 1.5 }"""
+
+
 STAGED = Field(json_schema_extra={"staged": True})
 """Annotation of a table that a stage may give."""
 
@@ -452,6 +496,8 @@ class CaseModel(StrictModel):
     time: Time | None = None
     static: Static | None = None
     stage: list[Any] = []
+    load_case: list[LoadCase] = []
+    combination: list[Combination] = []
     modes: t.Modes | None = None
     output: Annotated[t.Output, STAGED] = Field(default_factory=t.Output)
     solver: Annotated[t.Solver, STAGED] = Field(default_factory=t.Solver)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pickle
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from ..errors import InputError
 from ..mechanics.materials.base import law_of
 from ..registry import add_plugin, has_plugin, nearest
+from . import load_cases
 from .editing import (
     TABLES,
     apply_overrides,
@@ -25,10 +26,19 @@ from .editing import (
 from .model import ANALYSES, KEYS, ONE_STAGE, STAGE_TABLES, CaseModel, Reading, StageName, StageOutput
 from .problems import Problems
 from .tables import PRESTRESSES
-from .toml import KeyPath, built_in_path, parse_toml, plain, read_text, table_text
+from .toml import KeyPath, built_in_path, key_text, parse_toml, plain, read_text, table_text
 
 NAMED = ("node_set", "material", "section")
 """Keys that have tables by name."""
+
+_WITHOUT_STAGES = {
+    **dict.fromkeys(("stage", "given", "stressed"), ()),
+    "number": 0,
+    "fixed": False,
+    "derived": False,
+    "starts_from": None,
+}
+"""Attributes of a case that is no stage."""
 
 _ARGUMENTS = {
     "name": "the name of a case is that of its file, or an argument: Case(..., name=...), case.copy(name=...)",
@@ -76,6 +86,8 @@ class Case(_Tables):
     number : of a stage among those of its case, from 0
     given : tables that a stage gives itself, and does not have from the stages before
     stressed : names of the sections whose prestress a stage gives itself
+    derived : whether a stage follows from load cases, and is not one of ``[[stage]]``
+    starts_from : number of the stage from whose end a load case or combination starts; None: the one before
     fixed : whether it cannot be changed, as the case of a simulation
     editor : the case that is changed with this one, which is another for those of stages; and the key path of a table
 
@@ -116,7 +128,7 @@ class Case(_Tables):
     def _of(cls, model: CaseModel, **attributes: Any) -> Case:
         case = cls.__new__(cls)
         case.__dict__.update({attribute_of(key): value for key, value in model.__dict__.items()})
-        case.__dict__.update({"stage": (), "number": 0, "given": (), "stressed": (), "fixed": False, **attributes})
+        case.__dict__.update(_WITHOUT_STAGES | attributes)
         return case
 
     def __eq__(self, other: object) -> bool:
@@ -257,6 +269,12 @@ class Case(_Tables):
         models = [
             _validated(stage.data, each, problems, stage.place) for stage, each in zip(stages, reading[1:], strict=True)
         ]
+        if model is not None and None not in models and (model.load_case or model.combination):
+            derived = load_case_stages(data, model, stages, problems)
+            reading += (more := [Reading(stage.data, folder, lenient) for stage in derived])
+            pairs = zip(derived, more, strict=True)
+            models += [_validated(stage.data, each, problems, stage.place) for stage, each in pairs]
+            stages += derived
         if model is not None and None not in models and not lenient:
             _check_sections(model, models, problems)
         problems.raise_if_any()
@@ -275,10 +293,12 @@ class Case(_Tables):
             cls._of(
                 tables,
                 name=stage.name,
-                source=f"{source}: stage[{k}]",
+                source=": ".join(filter(None, (source, key_text(stage.of if stage.derived else ("stage", k))))),
                 number=k,
                 given=stage.given,
                 stressed=stage.stressed,
+                derived=stage.derived,
+                starts_from=stage.starts_from,
                 **common,
             )
             for k, (stage, tables) in enumerate(zip(stages, models, strict=True))
@@ -483,6 +503,8 @@ class StageTables(NamedTuple):
     data : the tables of the case that are in force
     given : the tables that the stage gives itself; stressed : names of the sections whose prestress it gives
     owner : the number of the stage that gave each table that is not the case's own
+    of : of a stage that follows from load cases: the key path of its table
+    starts_from : the number of the stage that it starts from, if that is not the one before
     """
 
     name: str
@@ -490,9 +512,18 @@ class StageTables(NamedTuple):
     given: tuple[str, ...]
     stressed: tuple[str, ...]
     owner: Mapping[str, int]
+    of: KeyPath | None = None
+    starts_from: int | None = None
+
+    @property
+    def derived(self) -> bool:
+        """Whether it follows from load cases."""
+        return self.of is not None
 
     def place(self, path: KeyPath) -> KeyPath:
         """Return the path in the case of a key of the tables in force: ``stage[1].static.step``."""
+        if self.of is not None:
+            return (*self.of, *path)
         return ("stage", self.owner[str(path[0])], *path) if path and path[0] in self.owner else path
 
 
@@ -508,7 +539,8 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
             there = f"; this case has {', '.join(having)}" if having else ""
             problems.add((), f"[{key}] and [[stage]] exclude each other: give [stage.{key}]{there}")
     last = len(rows) - 1
-    common = {key: value for key, value in data.items() if key not in ("stage", "modes", *ANALYSES)}
+    not_common = ("stage", "load_case", "combination", "modes", *ANALYSES)
+    common = {key: value for key, value in data.items() if key not in not_common}
     owner: dict[str, int] = {}
     found: list[StageTables] = []
     for k, row in enumerate(rows):
@@ -576,3 +608,45 @@ def _output(given: Any, common: Any, k: int, problems: Problems) -> Any:
     if read is None or not isinstance(common, Mapping):
         return common
     return {**common, **read.model_dump(exclude_none=True)}
+
+
+def load_case_stages(
+    data: Mapping[str, Any], model: CaseModel, stages: Sequence[StageTables], problems: Problems
+) -> list[StageTables]:
+    """The stages that follow from the load cases and combinations of a case, with one before them if it has none."""
+    made: list[StageTables] = []
+    if model.modes is not None:
+        problems.add(("modes",), "modes are those of one state, and not of load cases: give a case without them")
+        return []
+    if not stages:
+        if model.static is None:
+            problems.add((), "[[load_case]] needs [static], by which each of them is solved, or static stages before")
+            return []
+        common = {key: value for key, value in data.items() if key not in ("load_case", "combination", "modes")}
+        made.append(StageTables(load_cases.PERMANENT, common, (), (), {}, of=()))
+    last = [*stages, *made][-1]
+    if "static" not in last.data:
+        problems.add((), f"load cases start from a static state, and the last stage {last.name!r} is none")
+        return []
+    method = last.data["static"].get("method", "newton") if isinstance(last.data["static"], Mapping) else None
+    if method not in load_cases.METHODS:
+        known = ", ".join(load_cases.METHODS)
+        problems.add((), f"load cases are solved by the method of the state before them, one of {known}; got {method}")
+        return []
+    names = [stage.name for stage in (*stages, *made)]
+    keys = [("load_case", k) for k in range(len(model.load_case))]
+    keys += [("combination", k) for k in range(len(model.combination))]
+    common = {key: value for key, value in last.data.items() if key not in ("modes", *ONE_STAGE)}
+    try:
+        rows = load_cases.stage_rows(model.load_case, model.combination, common)
+    except load_cases.UnsuitableError as error:
+        problems.add((error.key,), str(error))
+        return []
+    base = len(stages) + len(made) - 1
+    for of, row in zip(keys, rows, strict=True):
+        name = row.pop("name")
+        if name in names:
+            problems.add((*of, "name"), "another load case, combination or stage has this name", name)
+        names.append(name)
+        made.append(StageTables(name, {**common, **row}, tuple(row), (), {}, of=of, starts_from=base))
+    return made

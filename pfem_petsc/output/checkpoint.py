@@ -38,6 +38,8 @@ from .hdf5 import (
 from .integrity import checksum
 
 NAME, PREVIOUS = "checkpoint.h5", "checkpoint-previous.h5"
+ORIGIN = "checkpoint-origin.h5"
+"""The state that load cases start from."""
 
 _FORMAT, _VERSION = "pfem_petsc checkpoint", 1
 _LARGEST_SEAL = 1 << 20

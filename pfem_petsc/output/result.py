@@ -197,8 +197,11 @@ class Result:
         self.point_fields, self.cell_fields = sorted(vtk["PointData"]), sorted(vtk["CellData"])
         self.case_text: str = file["case/text"][()].decode()
         # a mesh of arrays makes a long text, which is not parsed without need
-        stages = tomllib.loads(self.case_text).get("stage", ()) if "[[stage]]" in self.case_text else ()
-        self._static_stages = ["static" in stage for stage in stages]
+        staged = any(f"[[{key}]]" in self.case_text for key in ("stage", "load_case"))
+        tables = tomllib.loads(self.case_text) if staged else {}
+        derived = len(tables.get("load_case", ())) + len(tables.get("combination", ()))
+        stages = tables.get("stage", [{"static": True}] if derived else [])
+        self._static_stages = ["static" in stage for stage in stages] + [True] * derived
         self.attributes: dict[str, Any] = read_attributes(file["case"])
         self._n_rows = complete_rows(file)
         self._columns = dataset_names(file["history"])

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -194,27 +194,28 @@ def instants_of(result: Any, time: float | None, case: str | None) -> list[Insta
     InputError
         If there is no such case or time.
     """
-    times = np.asarray(result.times)
-    names = [stage.name for stage in result.case.stage]
+    times, stages = np.asarray(result.times), result.case.stage
+    names = [stage.name for stage in stages]
     if case is not None and case not in names:
         raise InputError(f"{result.path}: there is no load case, combination or stage {case!r}{nearest(case, names)}")
-    found = [Instant(names[stage] if names else "", i) for i, stage in _snapshots(result)]
+    number = np.zeros(len(times), dtype=int)
+    if stages:
+        ends = np.asarray(result.stage_ends)[1:]
+        number = np.minimum(np.searchsorted(ends, times * (1.0 - 1e-12)), len(stages) - 1)
+    found = [Instant(names[k] if names else "", i) for i, k in enumerate(number.tolist())]
+    if any(stage.starts_from is not None for stage in stages) and time is None:
+        # of each load case, the snapshot with all of its load
+        asked = [s.name for s in stages if s.name == case or (case is None and s.starts_from is not None)]
+        last = {each.case: each for each in found}
+        found = [last[name] for name in asked if name in last]
     found = [each for each in found if case is None or each.case == case]
+    if not found:
+        raise InputError(f"{result.path}: has no snapshots of {case or 'load cases'} yet")
     if time is not None:
         if not times[0] <= time <= times[-1] * (1.0 + 1e-12):
             raise InputError(f"{result.path}: --time {time:g}: snapshots are from {times[0]:g} to {times[-1]:g}")
         found = [min(found, key=lambda each: abs(times[each.snapshot] - time))]
     return found
-
-
-def _snapshots(result: Any) -> Iterator[tuple[int, int]]:
-    """Yield the numbers of snapshots and their stages; of load cases, the snapshot with all of the load."""
-    stages = result.case.stage
-    numbers = np.zeros(len(result.times), dtype=int)
-    if stages:
-        ends = np.asarray(result.stage_ends)[1:]
-        numbers = np.minimum(np.searchsorted(ends, np.asarray(result.times) * (1.0 - 1e-12)), len(stages) - 1)
-    yield from enumerate(numbers.tolist())
 
 
 class _Table:

@@ -206,6 +206,7 @@ class History(Observer):
     stages : Stages
     synchroniser : Synchroniser
     warn : receives a warning
+    stepper : of the stage; None: of the present one
 
     Attributes
     ----------
@@ -213,8 +214,15 @@ class History(Observer):
     writer : of the result file
     """
 
-    def __init__(self, stages: Stages, synchroniser: Synchroniser, warn: Callable[[str], None]) -> None:
-        stepper, model = stages.stepper, stages.model
+    def __init__(
+        self,
+        stages: Stages,
+        synchroniser: Synchroniser,
+        warn: Callable[[str], None],
+        stepper: Stepper | None = None,
+    ) -> None:
+        stepper = stages.stepper if stepper is None else stepper
+        model = stepper.model
         self.every, self._staged = model.case.output.history_every, bool(stages.case.stage)
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
         self.ledger = stepper.ledger = Ledger(stepper)
@@ -224,15 +232,16 @@ class History(Observer):
         inertial = stepper.scheme.inertial
         self.blow_up = BlowUp(model, inertial)
         # works over the increments of equilibria are quadratures, whose error is no energy that something has made
-        self._contact_watch = ContactWatch(model, warn, stages.stepper.plan) if inertial else None
+        self._contact_watch = ContactWatch(model, warn, stepper.plan) if inertial else None
         self._watched = self.recorder.layout.indices(WATCHED)
         self.row: Mapping[str, Any] | None = None
         self.writer: ResultWriter | None = None
 
-    def begin_stage(self, earlier: History, last: Row, handed: Handover) -> None:
-        """Go on with the rows of the stage that has ended, with ``last``, the row of its end. Collective."""
+    def begin_stage(self, earlier: History, source: History, last: Row, handed: Handover) -> None:
+        """Go on with the rows of the stage that has ended, in the state at the end of the stage of ``source``, which
+        is the same unless a load case begins, with ``last``, the row of that end. Collective."""
         self.row, self.writer = last, earlier.writer
-        first = self.recorder.begin_stage(earlier.recorder, last, handed)
+        first = self.recorder.begin_stage(source.recorder, last, handed)
         self.blow_up.check(first, self._stepper.state)
         if self._contact_watch is not None:
             self._contact_watch.check(first)
@@ -465,6 +474,16 @@ class Checkpointing(Observer):
         SimulationFailure
             On all ranks; earlier checkpoints are kept.
         """
+        if self._state.stepper.number != self.last_step:
+            self._write(self._path)
+            self.last_step = self._state.stepper.number
+        self._synchroniser.checkpoint_written()
+
+    def write_origin(self, path: Path) -> None:
+        """Write the state that load cases start from, which a restart in one of them needs for those after it."""
+        self._write(path)
+
+    def _write(self, path: Path) -> None:
         history, state, case = self._history, self._state, self._stages.case
         history.writer.flush_history()
         scalars = state.scalars(history.ledger.kept(), history.kept(), self._snapshots.kept())
@@ -473,21 +492,18 @@ class Checkpointing(Observer):
             start = self._stages.model.start
             numbers = None if start is None else start.scalars()
             scalars["stage"] = {"number": self._stages.number, "history": history.stage(), "start": numbers}
-        if scalars["step"] != self.last_step:
-            attributes = {
-                "state_version": STATE_VERSION,
-                "pfem_petsc": __version__,
-                "name": case.name,
-                "overrides": list(case.overrides),
-                "plugins": list(case.added),
-                "case": case.to_dict(),
-                "plan": self._stages.plan.record,
-                "mesh_mark": state.mesh_mark,
-                "external_functions": self._stages.model.external.functions,
-            }
-            write_checkpoint(self._path, self._stages.comm, state.arrays(), scalars, attributes)
-            self.last_step = scalars["step"]
-        self._synchroniser.checkpoint_written()
+        attributes = {
+            "state_version": STATE_VERSION,
+            "pfem_petsc": __version__,
+            "name": case.name,
+            "overrides": list(case.overrides),
+            "plugins": list(case.added),
+            "case": case.to_dict(),
+            "plan": self._stages.plan.record,
+            "mesh_mark": state.mesh_mark,
+            "external_functions": self._stages.model.external.functions,
+        }
+        write_checkpoint(path, self._stages.comm, state.arrays(), scalars, attributes)
 
     def complete(self) -> None:
         """Write the checkpoint of the last step, if the case requests checkpoints."""

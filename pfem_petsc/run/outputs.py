@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,11 +11,12 @@ import numpy as np
 from mpi4py import MPI
 
 from ..case.schema import Case
-from ..columns import declared
+from ..columns import Row, declared
 from ..errors import EarlyStop, SimulationFailure, printable
 from ..fields import Fields
 from ..mechanics.compiled import Compilation
 from ..output.checkpoint import NAME as CHECKPOINT
+from ..output.checkpoint import ORIGIN, Checkpoint
 from ..output.layout import MODE_VALUES, Contents, Kept
 from ..output.progress import Progress, Span
 from ..output.result import RESULT_NAME
@@ -22,7 +24,7 @@ from ..output.units import MODE, TIME, duration
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import agreed_call, on_root
 from ..preflight.checks import summarise, warnings_before
-from ..restart import Restart, RunState, prepare_folder
+from ..restart import Restart, RunState, changed_keys, prepare_folder
 from ..signals import early
 from ..stepping.model import Model
 from ..stepping.stepper import Step, Stepper
@@ -212,6 +214,8 @@ class Outputs:
         self._callbacks: list[tuple[Callable[[Step], object], int]] = []
         self._writer: ResultWriter | None = None
         self._continues = self._recorded = False
+        # of the stage that load cases start from: its history, and the row of its end
+        self._origin: tuple[History, Row] | None = None
 
     @property
     def _stepper(self) -> Stepper:
@@ -250,6 +254,7 @@ class Outputs:
             self.history.ledger.load_state(state.share(restart.file.scalars["ranks"])["ledger"])
             self.history.load_state(restart.file.scalars)
             self.snapshots.load_state(restart.file.scalars)
+            self._restore_origin(restart)
             self._tell_restart(restart)
             # the file of modes does not belong to the new end
             on_root(model.comm, (folder / MODES_FILE).unlink, True)
@@ -258,6 +263,24 @@ class Outputs:
             self.checkpointing.last_step = restart.step
             kept = Kept(stepper.number, *restart.last)
         self._write_to(ResultWriter(folder / RESULT_NAME, model.comm, model.mesh, self._contents(), kept))
+
+    def _restore_origin(self, restart: Restart) -> None:
+        """Restore the stage that further load cases start from, from its own checkpoint. Collective."""
+        stages, path = self._stages, restart.path.with_name(ORIGIN)
+        if stages.next_starts_from is None or stages.model.case.starts_from is None:
+            return
+        file = Checkpoint(path, stages.comm)
+        changed_keys(path, file.attributes["case"], stages.case.to_dict(), stages.case.source)
+        scalars, stepper = file.scalars, stages.make_origin()
+        state = RunState(stepper)
+        state.restore(file, stages.case.source)
+        history = History(stages, self._synchroniser, self.progress.warning, stepper)
+        history.ledger.load_state(state.share(scalars["ranks"])["ledger"])
+        history.load_state(scalars)
+        self._origin = history, history.recorder.row()
+        stepper.settle()
+        if not self._continues:
+            on_root(stages.comm, shutil.copyfile, path, self._folder / ORIGIN)
 
     def _open_progress(self, notes: Iterable[str]) -> Progress:
         """Open the progress report and write summary, warnings and notes. Collective."""
@@ -351,7 +374,10 @@ class Outputs:
         stages, history, snapshots, last_step = self._stages, self.history, self.snapshots, self.checkpointing.last_step
         self._complete_stage()
         self.tell_remarks()
-        row = history.recorder.row()
+        source, row = self._origin or (history, history.recorder.row())
+        if self._origin is None and stages.next_starts_from is not None:
+            self._origin = source, row
+            self.checkpointing.write_origin(self._folder / ORIGIN)
         ended = f"step {self._stepper.number}, {self._stepper.axis.place(self._stepper.place)}"
         handed = stages.advance()
         stepper = stages.stepper
@@ -362,7 +388,7 @@ class Outputs:
         self.fields = Fields(stages.model, stages.fields)
         self._observe(RunState(stepper))
         self.checkpointing.last_step = last_step
-        self.history.begin_stage(history, row, handed)
+        self.history.begin_stage(history, source, row, handed)
         self._write_to(self._writer)
         self.snapshots.load_state(snapshots.kept())
         stepper.leave()  # with the ledger, as equilibria after bars have gone take work

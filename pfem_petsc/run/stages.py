@@ -85,6 +85,7 @@ class Stages:
     Attributes
     ----------
     stepper : of the present stage
+    origin : stepper of the stage from whose end load cases start, once it has ended; None before and without
     plan : of the whole run
     functions : that give forces in the present stage and in those after it, see :meth:`call`
     columns : of the history, name to type with the shape of a value, None for a case without stages
@@ -104,6 +105,7 @@ class Stages:
         self._cases = case.stages
         self.functions: list[Callable[..., Any]] = []
         self.stepper: Stepper
+        self.origin: Stepper | None = None
         self.columns: dict[str, np.dtype] | None = None
         self.fields: list[str] | None = None
         self.wall_positions: dict[str, np.ndarray] = {}
@@ -161,6 +163,18 @@ class Stages:
         """Whether no stage comes after the present one."""
         return self.number == len(self._cases) - 1
 
+    @property
+    def next_starts_from(self) -> int | None:
+        """Number of the stage from whose end the next one starts, if that is the origin of load cases."""
+        return None if self.at_last else self._cases[self.number + 1].starts_from
+
+    def make_origin(self) -> Stepper:
+        """Create the stepper of the stage from whose end load cases start, to restore its state. Collective."""
+        number = self._cases[self.number].starts_from
+        model = Model(self._cases[number], self.comm, self.model.mesh)
+        self.origin = _make_stepper(model, self.plan.record["stages"][number])
+        return self.origin
+
     def call(self, function: Callable[..., Any]) -> None:
         """Add the forces that a function returns in stages that compute motion.
 
@@ -192,13 +206,16 @@ class Stages:
         SimulationFailure
             On all ranks, where the stage cannot begin there.
         """
-        old, number = self.stepper, self.number + 1
+        ended, number = self.stepper, self.number + 1
         stage = self._cases[number]
-        where = f"stage {stage.name!r}, begun after step {old.number}, {old.axis.exact(old.place)}"
-        old.settle()
+        where = f"stage {stage.name!r}, begun after step {ended.number}, {ended.axis.exact(ended.place)}"
+        if self.origin is None:
+            ended.settle()
+            self.origin = ended if stage.starts_from is not None else None
+        old = self.origin or ended
         try:
             model = Model(stage, self.comm, old.model.mesh)
-            model.begin_stage(_end_of_stage(old))
+            model.begin_stage(_end_of_stage(old, ended))
             for function in self.functions if stage.time is not None else ():
                 model.external.call(function)
             check_start(model.contact, old.state.position, model.size, adjusts=False)
@@ -207,10 +224,16 @@ class Stages:
             raise SimulationFailure(f"{where}: {error}") from error
         _hand_over(old, stepper)
         handed = _changes(old, stepper)
-        old.destroy()
+        if ended is not self.origin:
+            ended.destroy()
         self.stepper = stepper
         stepper.start()
         return handed
+
+    def destroy(self) -> None:
+        """Free PETSc objects of the steppers. Collective; may be called again."""
+        for stepper in (self.stepper, *([self.origin] if self.origin is not None else [])):
+            stepper.destroy()
 
 
 def _changes(old: Stepper, new: Stepper) -> Handover:
@@ -226,13 +249,13 @@ def _changes(old: Stepper, new: Stepper) -> Handover:
     return Handover(float(sums[0]), sums[1:4], sums[4:])
 
 
-def _end_of_stage(stepper: Stepper) -> StageStart:
-    """What the next stage starts from, at the end of a stage."""
-    model, state = stepper.model, stepper.state
+def _end_of_stage(old: Stepper, ended: Stepper) -> StageStart:
+    """What the next stage starts from, at the end of a stage, and where: after the stage that has ended."""
+    model, state = old.model, old.state
     external, time = model.external, state.time
     return StageStart(
-        step=stepper.number,
-        time=stepper.place,
+        step=ended.number,
+        time=ended.place,
         position=state.position.copy(),
         force=external.loads_at(time),
         gravity=np.array(external.gravity_at(time)),

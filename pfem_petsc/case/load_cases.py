@@ -1,0 +1,140 @@
+"""Load cases and their combinations, as stages that all start from the same state.
+
+Each load case is solved by itself, nonlinearly, from the state at the end of the last stage, or, in a case without
+stages, from the equilibrium under what the case has outside of load cases: its pretension, gravity, loads. These remain
+in force, with the factor 1. A combination is solved in the same way, with the loads of its load cases times factors;
+nothing is superposed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from .base import has_rows
+
+PERMANENT = "permanent"
+"""Name of the stage before the load cases of a case that gives no stages."""
+
+METHODS = ("newton", "relaxation")
+"""Methods of static analyses that end at a load factor."""
+
+TABLES = ("load", "gravity", "wind", "temperature", "support")
+"""Tables of a load case."""
+
+
+class UnsuitableError(ValueError):
+    """Load cases that cannot be combined: the key in the table, and why."""
+
+    def __init__(self, key: str, reason: str) -> None:
+        super().__init__(reason)
+        self.key = key
+
+
+def stage_rows(cases: Sequence[Any], combinations: Sequence[Any], common: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the tables of a stage for each load case and each combination.
+
+    Parameters
+    ----------
+    cases, combinations : the validated tables ``[[load_case]]`` and ``[[combination]]``
+    common : the tables in force in the stage that they start from
+
+    Raises
+    ------
+    UnsuitableError
+        If a combination has no meaning, such as of two winds.
+    """
+    own = {case.name: _tables(case) for case in cases}
+    rows = [{"name": name, **_joined(common, [tables], name)} for name, tables in own.items()]
+    for combination in combinations:
+        scaled = [_scaled(own[name], factor, name) for name, factor in combination.factors.items() if factor]
+        rows.append({"name": combination.name, **_joined(common, scaled, combination.name)})
+    return rows
+
+
+def _tables(case: Any) -> dict[str, Any]:
+    tables = {key: getattr(case, key) for key in TABLES}
+    lists = {key: [row.as_table(given=True) for row in value] for key, value in tables.items() if type(value) is list}
+    single = {key: value.as_table() for key, value in tables.items() if type(value) is not list and value is not None}
+    return {key: value for key, value in {**lists, **single}.items() if value}
+
+
+def _scaled(tables: Mapping[str, Any], factor: float, name: str) -> dict[str, Any]:
+    """Return the tables of a load case times a factor."""
+    made: dict[str, Any] = {}
+    for key, value in tables.items():
+        if key == "wind":  # its drag is proportional to the density
+            if factor < 0.0:
+                raise UnsuitableError(name, f"a wind cannot have the factor {factor:g} < 0: turn its velocity")
+            made[key] = {**value, "density": factor * value["density"]}
+        elif key == "gravity":
+            made[key] = {**value, "acceleration": _times(value["acceleration"], factor)}
+        else:
+            made[key] = [_scaled_row(key, row, factor, name) for row in value]
+    return made
+
+
+def _scaled_row(key: str, row: Mapping[str, Any], factor: float, name: str) -> dict[str, Any]:
+    scaled = dict(row)
+    for of in {"load": ("force",), "temperature": ("value", "table"), "support": ("motion", "velocity")}[key]:
+        if row.get(of) is not None:
+            scaled[of] = _times(row[of], factor)
+    if key == "load" and "file" in row:
+        scaled["scale"] = factor * row.get("scale", 1.0)
+    if key == "support" and row.get("acceleration") is not None:
+        raise UnsuitableError(name, "a support with acceleration cannot be combined: give its motion")
+    return scaled
+
+
+def _times(value: Any, factor: float) -> Any:
+    """Return a number, a vector, or rows over time times a factor, which the times do not get."""
+    if has_rows(value):
+        return [[row[0], *(factor * each for each in row[1:])] for row in value]
+    return [factor * each for each in value] if isinstance(value, list | tuple) else factor * value
+
+
+def _joined(common: Mapping[str, Any], parts: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
+    """Return the tables of what is in force and of load cases together."""
+    made: dict[str, Any] = {}
+    for key in TABLES:
+        given = [part[key] for part in parts if key in part]
+        if not given:
+            continue
+        if key == "load":
+            made[key] = [row for rows in (common.get(key, []), *given) for row in rows]
+        elif key == "support":
+            made[key] = _supports(common.get(key, []), given, name)
+        elif key == "gravity":
+            made[key] = _gravity([*([common[key]] if common.get(key) else []), *given], name)
+        elif len(given) > 1 or (key == "wind" and common.get(key)):
+            raise UnsuitableError(name, f"has more than one {key}, which cannot be added: combine the others")
+        else:
+            made[key] = given[0] if key == "wind" else [*common.get(key, []), *given[0]]
+    return made
+
+
+def _gravity(tables: Sequence[Any], name: str) -> dict[str, Any]:
+    accelerations = [table["acceleration"] if isinstance(table, Mapping) else table.acceleration for table in tables]
+    if len(accelerations) > 1 and any(map(has_rows, accelerations)):
+        raise UnsuitableError(name, "adds a gravity with rows to another gravity: give constant accelerations")
+    if len(accelerations) == 1:
+        return {"acceleration": accelerations[0]}
+    return {"acceleration": [sum(each) for each in zip(*accelerations, strict=True)]}
+
+
+def _supports(common: Sequence[Mapping[str, Any]], given: Sequence[Sequence[Any]], name: str) -> list[dict[str, Any]]:
+    """Return the supports in force, with those of load cases in the place of those of the same name or node set."""
+    rows = [dict(row) for row in common]
+    taken: dict[str, dict[str, Any]] = {}
+    for row in [row for each in given for row in each]:
+        key = f"name {row['name']}" if row.get("name") else f"node set {row['node_set']}"
+        if key in taken:
+            raise UnsuitableError(name, f"moves the support of {key} in two load cases: give one that moves it")
+        same = "name" if row.get("name") else "node_set"
+        found = next((k for k, other in enumerate(rows) if other.get(same) == row[same]), None)
+        taken[key] = dict(row)
+        if found is None:
+            rows.append(taken[key])
+        else:
+            rows[found] = taken[key]
+    return rows

@@ -102,6 +102,8 @@ def _document(result: Any, curves: Sequence[Path], drawn: Path | None, reason: s
         "Summary": _table(_summary(result)),
         "Warnings": "".join(f'<div class="warning">{html.escape(text)}</div>' for text in log["warnings"])
         or "<p>None.</p>",
+        "Load cases": _load_cases(result),
+        "Members": _members(result),
         "Truss": truss,
         "Curves": "".join(_figure(path, path.stem.replace("_", " ").capitalize()) for path in curves),
         "Energies": _energies(result.history),
@@ -112,8 +114,9 @@ def _document(result: Any, curves: Sequence[Path], drawn: Path | None, reason: s
         "Versions": _table({key: str(value) for key, value in result.attributes.items() if value not in ("", {}, [])}),
     }
     shown = {name: body for name, body in sections.items() if body}
-    links = "".join(f'<a href="#{name.lower()}">{name}</a>' for name in shown)
-    body = "".join(f'<h2 id="{name.lower()}">{name}</h2>{content}' for name, content in shown.items())
+    marks = {name: name.lower().replace(" ", "-") for name in shown}
+    links = "".join(f'<a href="#{marks[name]}">{name}</a>' for name in shown)
+    body = "".join(f'<h2 id="{marks[name]}">{name}</h2>{content}' for name, content in shown.items())
     lead = f"{result.n_nodes:,} nodes, {result.n_bars:,} bars · {_span(result)}"
     return (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
@@ -186,6 +189,59 @@ def _energies(history: Mapping[str, np.ndarray]) -> str:
     share = f" ({worst / largest:.1e} of the largest energy)" if largest > 0.0 else ""
     text = f"<p>Largest imbalance of stored + lost − supplied: {engineering(worst, 'J')}{share}."
     return f"{text} Terms that are zero are left out.</p>" + _grid(["energy", "", "start", "largest", "end"], lines)
+
+
+def _load_cases(result: Any) -> str:
+    """The reaction, the largest displacement and the governing member of each load case and combination."""
+    cases = [stage for stage in result.case.stages if stage.starts_from is not None]
+    if not cases or not len(result.times):
+        return ""
+    from .members import instants_of
+
+    start, history, lines = np.asarray(result.positions(0), dtype=float), result.history, []
+    steps = np.asarray(history["step"])
+    for instant in instants_of(result, None, None):
+        moved = np.linalg.norm(result.positions(instant.snapshot) - start, axis=1)
+        row = np.flatnonzero(steps == result.steps[instant.snapshot])
+        force = np.asarray(history["support_force"])[row[-1]] if len(row) and "support_force" in history else ()
+        least = 1e-9 * max(map(abs, force), default=0.0)  # below is rounding
+        reaction = ", ".join(engineering(float(value) if abs(value) > least else 0.0, "N") for value in force)
+        lines.append([instant.case, engineering(float(moved.max()), "m"), f"node {moved.argmax()}", reaction])
+    head = ["load case or combination", "largest displacement", "", "force of the supports (x, y, z)"]
+    return _grid(head, lines)
+
+
+_MOST_MEMBERS = 20
+
+
+def _members(result: Any) -> str:
+    """The members with the highest utilisation, if any has one."""
+    from .members import members
+
+    try:
+        table = members(result)
+    except (InputError, OSError) as error:
+        return f"<p>No table of members: {html.escape(str(error))}</p>"
+    known = np.isfinite(table["yield_utilisation"]) | np.isfinite(table["buckling_utilisation"])
+    if not known.any():
+        return ""
+    head = ["bars", "section", "length", "axial force", "stress", "of strength", "of Euler's load", "case", ""]
+    lines = [
+        [
+            str(row["bars"]),
+            str(row["section"]),
+            engineering(float(row["length"]), "m"),
+            engineering(float(row["axial_force"]), "N"),
+            engineering(float(row["stress"]), "Pa"),
+            *("" if np.isnan(row[name]) else f"{100.0 * row[name]:.1f} %" for name in table if "utilisation" in name),
+            str(row["case"]),
+            _place(result, float(row["time"])),
+        ]
+        for row in table.where(np.arange(min(_MOST_MEMBERS, table.n_rows))).rows
+    ]
+    more = table.n_rows - len(lines)
+    rest = f"<p>The command members lists the other {more:,}.</p>" if more else ""
+    return _grid(head, lines) + rest
 
 
 def _events(result: Any) -> str:

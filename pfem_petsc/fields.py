@@ -48,6 +48,7 @@ FIELDS = [
     Field("stress", "bars", "Pa", lambda now: now.bars["stress"]),
     Field("axial_force", "bars", "N", lambda now: now.bars["axial_force"]),
     Field("plastic_strain", "bars", "", lambda now: now.bars["plastic_strain"]),
+    Field("rest_length", "bars", "m", lambda now: now.model.bars.rest.copy(), lambda model: model.rest_lengths.found),
     Field("temperature", "bars", "K", lambda now: now.temperature(), lambda model: model.temperatures.any),
     Field("status", "bars", "", lambda now: now.model.bars.status(), lambda model: model.bars.has_status),
 ]

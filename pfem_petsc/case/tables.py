@@ -60,8 +60,12 @@ def distinct(what: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-PRESTRESSES = ("pretension", "prestress", "rest_length")
+BY_BAR = ("pretension", "rest_length", "force_density")
+"""Keys of a section whose values may also be those of a field of the mesh, ``pretension_field`` and so on."""
+PRESTRESSES = ("pretension", "prestress", "rest_length", "force_density", *(f"{key}_field" for key in BY_BAR))
 """Keys of a section that prescribe rest lengths."""
+FIELD_KEYS = ("area_field", *(f"{key}_field" for key in BY_BAR))
+"""Keys of a section that name fields of the mesh with a value for each bar."""
 
 
 def _has_direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -252,7 +256,15 @@ class Section(StrictModel):
     prestress: NumberOrRows | None = None
     """stress in the mesh [Pa], or rows [t, stress] [s, Pa]"""
     rest_length: NumberOrRows | None = None
-    """rest length over the length in the mesh, or rows [t, factor] [s, -]"""
+    """rest length over the length in the mesh, or rows [t, factor] [s, -]; if constant, mass is that of this length"""
+    force_density: NumberOrRows | None = None
+    """axial force over length in the mesh [N/m], or rows [t, q] [s, N/m]"""
+    pretension_field: Annotated[str, Field(min_length=1)] | None = None
+    """cell field of the mesh file with the ``pretension`` of each bar [N]"""
+    rest_length_field: Annotated[str, Field(min_length=1)] | None = None
+    """cell field of the mesh file with the ``rest_length`` of each bar over its length in the mesh"""
+    force_density_field: Annotated[str, Field(min_length=1)] | None = None
+    """cell field of the mesh file with the ``force_density`` of each bar [N/m]"""
 
     @model_validator(mode="before")
     @classmethod

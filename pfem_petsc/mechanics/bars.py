@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from ..case.tables import FieldValue
+from ..case.tables import FIELD_KEYS, FieldValue
 from ..columns import BAR_ENERGIES, STORED
 from ..errors import InputError
 from ..fields import STATUS
@@ -77,10 +77,10 @@ _SHOWN = 12
 """Number of values of a field that messages list."""
 
 
-def area_fields(case: Case) -> dict[str, str]:
-    """Return the cell fields of the mesh that sections take their areas from, each with the key that names it."""
-    named = [(s.area_field, f"{case.source}: section.{name}.area_field") for name, s in case.section.items()]
-    return {field: key for field, key in reversed(named) if field is not None}
+def bar_fields(case: Case) -> dict[str, str]:
+    """Return the cell fields of the mesh whose values sections take, each with the key that names it."""
+    named = [(s, key, f"{case.source}: section.{name}.{key}") for name, s in case.section.items() for key in FIELD_KEYS]
+    return {getattr(section, key): text for section, key, text in reversed(named) if getattr(section, key) is not None}
 
 
 def _bar_groups(case: Case) -> Iterator[tuple[str, str | FieldValue]]:
@@ -105,14 +105,14 @@ def mesh_of_cases(cases: Sequence[Case], comm: MPI.Comm) -> MeshSlab:
     case = cases[0]
     groups = {name for each in cases for _, name in _bar_groups(each) if isinstance(name, str)}
     groups |= {node_set.group for node_set in case.node_set.values() if node_set.group is not None}
-    areas = area_fields(case)
-    fields = {chosen.field: key for key, chosen, _ in reversed(selections(cases))} | areas
+    values = {field: key for each in reversed(cases) for field, key in bar_fields(each).items()}
+    fields = {chosen.field: key for key, chosen, _ in reversed(selections(cases))} | values
     slab = load_slab(case.mesh, comm, fields, groups)
-    for name, key in areas.items():
+    for name, key in values.items():
         if name not in slab.bar_fields:
             raise InputError(f"{key} = {name!r}: {slab.source} has this field for nodes, not for bars")
     select(slab, cases, comm)
-    slab.bar_fields, slab.node_fields = {name: slab.bar_fields[name] for name in areas}, {}
+    slab.bar_fields, slab.node_fields = {name: slab.bar_fields[name] for name in values}, {}
     return slab
 
 
@@ -359,7 +359,8 @@ class Bars:
     Attributes
     ----------
     ends : (b, 2) int32, local node indices of each bar
-    mesh_lengths : (b,) float64, lengths in the mesh [m], which determine mass and damping
+    mesh_lengths : (b,) float64, lengths in the mesh [m]
+    mass_lengths : (b,) the same, or rest lengths that sections give, which determine mass and damping
     rest_at_start : (b,) the same at the start of the step, or (0,) if they are constant
     heat_at_start : :attr:`heat` at the start of the step, if it varies
     arrays : what compiled loops read
@@ -389,7 +390,7 @@ class Bars:
         self._reference = self._referred = None
         self.components = new_components(len(mesh.points)), new_components(len(mesh.points), FORCES)
         self.arrays = self._make_arrays(layout, history)
-        self.rest = self.mesh_lengths
+        self.rest = self.mass_lengths = self.mesh_lengths
         self.heat_at_start = self.heat
         for block in self.blocks:
             if block.law.bar_data:
@@ -626,7 +627,7 @@ class Bars:
         rows = MatrixRows(pattern.ptr, pattern.slots, values)
         mass = np.zeros(len(self.ends))
         for block, m in zip(self.blocks, inertia, strict=True):
-            mass[block.start : block.stop] = m * self.mesh_lengths[block.start : block.stop]
+            mass[block.start : block.stop] = m * self.mass_lengths[block.start : block.stop]
         stored = np.zeros((2, len(self.ends)))
         if start is None:
             if weight:

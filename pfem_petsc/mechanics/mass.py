@@ -97,7 +97,7 @@ class Inertia:
         mass = np.zeros(mesh.n_local)
         damping = np.zeros(mesh.n_local)
         for block in bars.blocks:
-            ends, lengths = bars.ends[block.start : block.stop], bars.mesh_lengths[block.start : block.stop]
+            ends, lengths = bars.ends[block.start : block.stop], bars.mass_lengths[block.start : block.stop]
             add_at_ends(ends, 0.5 * (block.density * block.area) * lengths, mass)
             if block.damping:
                 add_at_ends(ends, 0.5 * (block.damping * block.area) * lengths, damping)
@@ -175,7 +175,7 @@ class Inertia:
         for block in self.bars.blocks:
             coefficient = np.atleast_1d(density(block) * block.area)
             consistent_product(
-                self.bars.ends, self.bars.mesh_lengths, block.start, block.stop, coefficient, self._u, self._out
+                self.bars.ends, self.bars.mass_lengths, block.start, block.stop, coefficient, self._u, self._out
             )
         out[:] = self._out[:owned]
         return out

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..case.base import has_rows
 from ..errors import InputError
 from ..mesh.distribution import bars_of_group
 from .elements import COLLAPSED_STRETCH, MEASURES, virgin
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from ..case.schema import Case
+    from ..case.tables import Section
     from ..mesh.distribution import DistributedMesh
     from .bars import BarBlock, Bars
     from .materials.base import Law
@@ -38,9 +40,12 @@ class RestLengths:
     ----------
     any : whether a section prescribes them
     varying : whether any of them changes over time
+    found : whether the analysis finds them
     """
 
     def __init__(self, case: Case, bars: Bars) -> None:
+        stages = case.editor[0].stages
+        self.found = any(each.static is not None and each.static.method == "force_density" for each in stages)
         given = {name: section.prestressed for name, section in case.section.items()}
         self.any, self.varying = any(key is not None for key in given.values()), False
         # in later stages they stay as they are, unless the stage gives those of a section
@@ -55,22 +60,19 @@ class RestLengths:
             if key is None:
                 continue
             section = case.section[name]
-            material = case.material[section.material]
             where = f"{case.source}: section.{name}.{key}"
-            value = getattr(section, key)
-            rows = ((0.0, value),) if isinstance(value, float) else value
-            blocks = [block for block in bars.blocks if block.section == name]
-            law = law_of(material)  # of intact bars, also of those that can break
-            bar = law, material.numbers(), MEASURES[material.strain]
-            for _, each in rows:
-                for block in blocks:  # refuses what the law cannot bear
-                    _stretches(block, bar, key, each, where)
-            entries = [_Entry(block, bar, key, rows, where) for block in blocks]
+            entries = [
+                _Entry(block, bar_of(case, section), *_prescribed(bars, block, section, key, where), where)
+                for block in bars.blocks
+                if block.section == name
+            ]
+            for entry in entries:
+                entry.largest()  # refuses what the law cannot bear
             if name in held:
                 for entry in entries:
                     entry.apply(bars, math.inf)
                 continue
-            self.varying |= len(rows) > 1
+            self.varying |= has_rows(getattr(section, key)) and len(getattr(section, key)) > 1
             self._entries += entries
         self.apply(0.0)
         if self.varying:
@@ -89,6 +91,11 @@ class RestLengths:
         for entry in self._entries:
             entry.apply(self._bars, time)
 
+    def take(self, part: slice, rest: np.ndarray) -> None:
+        """Give the bars of a block the rest lengths [m] of a form that is found, instead of those of the case."""
+        self._bars.set_rest(part, rest)
+        self._entries = [entry for entry in self._entries if entry.block.start != part.start]
+
     def shorten(self) -> None:
         """Give all bars the smallest rest lengths that they have at any time, which make them stiffest."""
         for entry in self._entries:
@@ -99,15 +106,23 @@ class RestLengths:
 class _Entry:
     """The bars of a block, with the values that they have over time."""
 
-    def __init__(self, block: BarBlock, bar: Bar, key: str, rows: Sequence[tuple[float, float]], where: str) -> None:
-        self.block, self.bar, self.key, self.where = block, bar, key, where
+    def __init__(
+        self,
+        block: BarBlock,
+        bar: Bar,
+        key: str,
+        rows: Sequence[tuple[float, float]],
+        factor: np.ndarray | float,
+        where: str,
+    ) -> None:
+        self.block, self.bar, self.key, self.factor, self.where = block, bar, key, factor, where
         self.values = [value for _, value in rows]
         self._table = Table(rows)
         self._found: tuple[float, np.ndarray | float] | None = None  # the last value and its stretch
 
     def _stretch(self, value: float) -> np.ndarray | float:
         if self._found is None or self._found[0] != value:
-            self._found = value, _stretches(self.block, self.bar, self.key, value, self.where)
+            self._found = value, stretches(self.block, self.bar, self.key, self.factor * value, self.where)
         return self._found[1]
 
     def apply(self, bars: Bars, time: float) -> None:
@@ -121,8 +136,61 @@ class _Entry:
         return functools.reduce(np.maximum, map(self._stretch, self.values))
 
 
-def _stretches(block: BarBlock, bar: Bar, key: str, value: float, where: str) -> np.ndarray | float:
-    """Return the stretch in the mesh of the bars of a block."""
+def unstressed_lengths(case: Case, bars: Bars) -> np.ndarray:
+    """Return the lengths (b,) [m] that bars are made with, which have their mass: those in the mesh, or constant rest
+    lengths that sections of the case give."""
+    lengths = bars.mesh_lengths
+    for block in bars.blocks:
+        section = case.section.get(block.section)
+        factor = getattr(section, "rest_length", None)
+        field = getattr(section, "rest_length_field", None)
+        part = slice(block.start, block.stop)
+        if field is not None:
+            factor = bars.mesh.bar_fields[field][part]
+        if factor is not None and not has_rows(factor):
+            lengths = lengths.copy() if lengths is bars.mesh_lengths else lengths
+            lengths[part] *= factor
+    return lengths
+
+
+def bar_of(case: Case, section: Section) -> Bar:
+    """Return what :func:`stretches` needs of the material of a section."""
+    material = case.material[section.material]
+    return law_of(material), material.numbers(), MEASURES[material.strain]  # intact, also if it can break
+
+
+def _prescribed(
+    bars: Bars, block: BarBlock, section: Section, key: str, where: str
+) -> tuple[str, Sequence[tuple[float, float]], np.ndarray | float]:
+    """Return what a section prescribes of the bars of a block: the kind, rows over time, and a factor of their values.
+
+    Raises
+    ------
+    InputError
+        If a value of a field is not finite, or no factor on a length.
+    """
+    part, factor, value = slice(block.start, block.stop), 1.0, getattr(section, key)
+    kind = key.removesuffix("_field")
+    if kind != key:
+        factor, value = bars.mesh.bar_fields[value][part], 1.0
+        sound = np.isfinite(factor)
+        if kind == "rest_length":
+            sound &= (factor > 1e-3) & (factor < 1e3)
+        wrong = np.flatnonzero(~sound)
+        if len(wrong):
+            expected = "a factor on its length in the mesh, like 0.99" if kind == "rest_length" else "a finite number"
+            bar = bars.mesh.bar_ids[block.start + wrong[0]]
+            raise InputError(
+                f"{where}: bar {bar} (and {len(wrong) - 1} more here) has {factor[wrong[0]]:g}; expected {expected}"
+            )
+    if kind == "force_density":
+        kind, factor = "pretension", factor * bars.mesh_lengths[part]
+    return kind, value if has_rows(value) else ((0.0, value),), factor
+
+
+def stretches(block: BarBlock, bar: Bar, key: str, value: np.ndarray | float, where: str) -> np.ndarray | float:
+    """Return the stretch in the mesh of the bars of a block, with a value of ``pretension``, ``prestress`` or
+    ``rest_length``, one or one of each bar (b,)."""
     if key == "rest_length":
         return 1.0 / value
     law, parameters, measure = bar
@@ -132,13 +200,14 @@ def _stretches(block: BarBlock, bar: Bar, key: str, value: float, where: str) ->
         if not law.bar_data and np.ndim(target) == 0:
             return stretch_of(law, measure, parameters, target, as_force)
         data = block.history[len(block.law.rows) :]
-        rows = np.vstack([np.broadcast_to(target, data.shape[1:]), data])
+        rows = np.vstack([np.broadcast_to(target, block.stop - block.start), data])
         kinds, which = np.unique(rows, axis=1, return_inverse=True)
         each = [(force, (*parameters, *given)) for force, *given in kinds.T.tolist()]
         return np.array([stretch_of(law, measure, p, force, as_force) for force, p in each])[np.ravel(which)]
     except ValueError as error:
         unit = "N" if key == "pretension" else "Pa"
-        raise InputError(f"{where} = {value:g} {unit}: {error}") from error
+        given = f" = {value:g} {unit}" if np.ndim(value) == 0 else ""
+        raise InputError(f"{where}{given}: {error}") from error
 
 
 def stretch_of(law: Law, measure: Callable, parameters: tuple[float, ...], target: float, as_force: bool) -> float:

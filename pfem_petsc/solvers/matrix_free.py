@@ -292,7 +292,7 @@ class MatrixFreeHessian:
             coefficients = inertia.coefficients(alpha, eta)
             for block, coefficient in zip(bars.blocks, coefficients, strict=True):
                 density = np.atleast_1d(6.0 * coefficient)
-                consistent_product(bars.ends, bars.mesh_lengths, block.start, block.stop, density, u, out)
+                consistent_product(bars.ends, bars.mass_lengths, block.start, block.stop, density, u, out)
             if inertia.points.any:
                 out[:owned] += inertia.points.nodal(alpha, eta)[:, None] * u[:owned]
         elif inertia.redistribution is not None:

@@ -457,8 +457,13 @@ class StaticStepper(ImplicitStepper):
             setattr(self.scheme, how, False)
 
     def remarks(self) -> list[str]:
-        """Return what the viscosity has dissipated, and how many solves failed. Collective."""
-        failures = super().remarks()
+        """Return how many bars are slack, what the viscosity has dissipated, and how many solves failed. Collective."""
+        failures, bars = super().remarks(), self.model.bars
+        slack = self.model.comm.allreduce(bars.slack_count()) if bars.slackens else 0
+        if slack:
+            failures.insert(
+                0, f"load factor {self.state.time:.6g}: {slack:,} of {self.model.mesh.n_bars:,} bars are slack"
+            )
         if not self.stabilise:
             return failures
         share = 100.0 * self._share()

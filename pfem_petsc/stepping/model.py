@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..mechanics.bars import Bars, check_areas, mesh_of_cases, section_of_bars
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia, PointInertia, add_at_ends
-from ..mechanics.rest_lengths import RestLengths, Temperatures
+from ..mechanics.rest_lengths import RestLengths, Temperatures, unstressed_lengths
 from ..mechanics.springs import add_connectors, connected, make_springs, with_connectors
 from ..mechanics.supports import Supports
 from ..mesh.distribution import distribute, resolve_node_sets
@@ -129,6 +129,7 @@ class Model:
         springs = make_springs(case, self.nodes, mesh)
         if springs is not None:
             self.bars.families.append(springs)
+        self.bars.mass_lengths = unstressed_lengths(case.editor[0].stages[0], self.bars)
         self.inertia = Inertia(mesh, self.bars, case.mass == "consistent", PointInertia(case, self.nodes, mesh))
         if case.time is not None:
             self.inertia.vary(case.time.damping_table)

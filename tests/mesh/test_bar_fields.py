@@ -117,7 +117,7 @@ def test_areas_too_small_for_a_tube(tmp_path):
             {"generator": "rod", "length": 1.0, "elements": 1},
             "at most one of the keys area, area_field",
         ),
-        ({}, {"generator": "rod", "length": 1.0, "elements": 1}, "exactly one of the keys area, area_field"),
+        ({}, {"generator": "rod", "length": 1.0, "elements": 1}, "expected area, area_field, or a shape"),
         (
             {"area_field": "a"},
             {"generator": "rod", "length": 1.0, "elements": 1},

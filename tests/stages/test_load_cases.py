@@ -24,7 +24,13 @@ FRAME = {
     "mesh": {"generator": "lattice", "kind": "octet", "cells": [1, 1, 2], "pitch": 0.2},
     "node_set": {"bottom": {"box": [[-1, -1, -1e-6], [1, 1, 1e-6]]}, "top": {"box": [[-1, -1, 0.4 - 1e-6], [1, 1, 1]]}},
     "material": {
-        "m": {"young_modulus": 2e9, "density": 1e3, "yield_stress": 5.6e6, "isotropic_hardening": 1e8, "strain": "green"}
+        "m": {
+            "young_modulus": 2e9,
+            "density": 1e3,
+            "yield_stress": 5.6e6,
+            "isotropic_hardening": 1e8,
+            "strain": "green",
+        }
     },
     "section": {"s": {"material": "m", "shape": "tube", "diameter": 6e-3, "thickness": 1e-3}},
     "support": [{"node_set": "bottom", "fix": "xyz"}],

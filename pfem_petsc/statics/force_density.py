@@ -1,0 +1,312 @@
+"""The linear problem of force densities, and its stepper: see :mod:`~pfem_petsc.statics.methods.force_density`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import coo_array
+
+from ..columns import HEAD
+from ..errors import InputError, SimulationFailure
+from ..mechanics.elements import bar_lengths
+from ..mechanics.motion import Table
+from ..mechanics.rest_lengths import bar_of, stretches
+from ..stepping.stepper import Solution
+from .stepper import StaticStepper
+
+if TYPE_CHECKING:
+    from ..integrators.base import Balance
+    from ..solvers.linear import LinearChoice
+    from ..stepping.model import Model
+    from .methods.force_density import Parameters
+
+_DIRECT_UP_TO = 200_000
+"""Nodes up to which a factorisation is used; beyond, conjugate gradients with multigrid, if no density is negative."""
+
+
+_DISSIPATED, _STRESSING = HEAD.first("numerical_dissipation"), HEAD.first("prestress_work")
+
+
+class Prescribed:
+    """What the bars of this rank are given.
+
+    Attributes
+    ----------
+    density : (b,) force over length [N/m], NaN of bars that are given forces
+    force : (b,) force [N], NaN of the others
+    """
+
+    def __init__(self, model: Model, time: float) -> None:
+        case, bars = model.case, model.bars
+        self.density, self.force = np.full(len(bars.ends), np.nan), np.full(len(bars.ends), np.nan)
+        for block in bars.blocks:
+            section, part = case.section[block.section], slice(block.start, block.stop)
+            key = section.prestressed
+            where = f"{case.source}: section.{block.section}"
+            if key is None or key.startswith("rest_length"):
+                raise InputError(
+                    f'{where}: static.method = "force_density" needs a force_density [N/m], pretension [N] or '
+                    "prestress [Pa] of each section, or a field of them"
+                )
+            value = getattr(section, key)
+            if key.endswith("_field"):
+                value = bars.mesh.bar_fields[value][part]
+            elif not isinstance(value, float):
+                value = float(Table(value)(time)[0])
+            out = self.density if key.startswith("force_density") else self.force
+            out[part] = value * block.area if key == "prestress" else value
+
+
+class ForceDensityStepper(StaticStepper):
+    """Finds the form in one increment, and gives the bars the rest lengths with which they have their forces there.
+
+    Attributes
+    ----------
+    solves : linear solves of the form
+    """
+
+    kept_numbers = (*StaticStepper.kept_numbers, "solves")
+    finds_jumps = False
+
+    def __init__(self, model: Model, choice: LinearChoice, parameters: Parameters) -> None:
+        _check(model)
+        super().__init__(model, choice, parameters)
+        Prescribed(model, 0.0)  # refuses what is missing before the run
+        self.parameters, self.guard, self.solves, self._found = parameters, None, 0, ""
+        model.rest_lengths.varying = True  # the form changes them, which does work
+
+    def obstacle(self) -> str:
+        """See :class:`StaticStepper`: what moves freely is found by the solve. Collective."""
+        return ""
+
+    def settle(self) -> None:
+        """See :class:`StaticStepper`; the form is in equilibrium to rounding."""
+
+    def resume(self) -> None:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
+        super().resume()
+        if self.state.step:
+            self._keep_rest(self.model.bars.rest)
+
+    def solve(self, balance: Balance) -> Solution:
+        """Return the form as the solution of a balance. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, if there is no form, or given forces are not reached.
+        """
+        model, state, owned = self.model, self.state, self.model.mesh.n_owned
+        given = Prescribed(model, balance.time)
+        x = state.x.copy()
+        model.supports.place(x[:owned], model.supports.positions(balance.time))
+        form = Form(model, state.external, x)
+        self.solves = form.find(given, self.parameters.tolerance, self.parameters.max_iterations)
+        self._stress(form.x, given)
+        f = np.empty_like(form.x)
+        model.bars.forces(form.x, f, commit=False)
+        state.support = model.supports.part(f[:owned] - state.external)
+        self._found = self._lengths()
+        return Solution(form.x[:owned] - balance.predictor, f, model.contact.nothing, linear=self.solves)
+
+    def _stress(self, x: np.ndarray, given: Prescribed) -> None:
+        """Give the bars the rest lengths with which they have their forces at positions."""
+        model, case = self.model, self.model.case
+        length = np.empty(len(model.bars.ends))
+        bar_lengths(x, model.bars.ends, length)
+        force = np.where(np.isnan(given.force), given.density * length, given.force)
+        rest = length.copy()
+        try:
+            for block in model.bars.blocks:
+                part, section = slice(block.start, block.stop), case.section[block.section]
+                most, least = force[part].max(), force[part].min()
+                where = f"{case.source}: section.{block.section}: forces of {least:g} to {most:g} N"
+                rest[part] /= stretches(block, bar_of(case, section), "pretension", force[part], where)
+        except InputError as error:
+            raise SimulationFailure(str(error)) from error
+        self._keep_rest(rest)
+
+    def _keep_rest(self, rest: np.ndarray) -> None:
+        for block in self.model.bars.blocks:
+            part = slice(block.start, block.stop)
+            self.model.rest_lengths.take(part, rest[part].copy())
+
+    def _account(self, end: float) -> None:
+        """Update the ledger: what the bars have gained is the work of their prestress, whatever the way there."""
+        ledger = self.ledger
+        before = None if ledger is None else ledger.sums[_DISSIPATED]
+        super()._account(end)
+        if ledger is not None:
+            ledger.sums[_STRESSING] -= ledger.sums[_DISSIPATED] - before
+            ledger.sums[_DISSIPATED] = before
+
+    def remarks(self) -> list[str]:
+        """See :class:`StaticStepper`. Collective."""
+        return [*([self._found] if self._found else []), *super().remarks()]
+
+    def _lengths(self) -> str:
+        """Return what to tell of unstressed lengths, and of the mass of the mesh if it is not theirs. Collective."""
+        model = self.model
+        counted = model.mesh.counted
+        rest, made = model.bars.rest[counted], model.bars.mass_lengths[counted]
+        total, mass = model.comm.allreduce(np.array([rest.sum(), made.sum()]))
+        lows, highs = model.comm.allgather(rest.min(initial=np.inf)), model.comm.allgather(rest.max(initial=0.0))
+        solves = f"{self.solves} linear solve{'s' * (self.solves > 1)}"
+        return (
+            f"form found by {solves}: unstressed lengths (field rest_length) "
+            f"from {min(lows):.6g} to {max(highs):.6g} m, {total:.6g} m in all"
+            + (f"; bars keep the mass of {mass:.6g} m in the mesh" if abs(mass - total) > 0.01 * total else "")
+        )
+
+
+class Form:
+    """Positions of equilibrium for force densities. Construction is collective.
+
+    Attributes
+    ----------
+    x : (local, 3) positions with ghosts [m]
+    """
+
+    def __init__(self, model: Model, external: np.ndarray, x: np.ndarray) -> None:
+        self.model, self.external, self.x = model, external, x
+        mesh = model.mesh
+        numbers = np.concatenate([mesh.first_node + np.arange(mesh.n_owned), mesh.ghost_numbers])
+        self._ends = numbers[mesh.bars]
+
+    def find(self, given: Prescribed, tolerance: float, most: int) -> int:
+        """Find the form, and return the number of solves. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks.
+        """
+        mesh, comm = self.model.mesh, self.model.comm
+        length, forced = np.empty(len(mesh.bars)), ~np.isnan(given.force)
+        any_forced = comm.allreduce(bool(forced.any()), op=MPI.LOR)
+        largest = comm.allreduce(float(np.abs(given.force[forced]).max(initial=0.0)), op=MPI.MAX)
+        mesh.update_ghosts(self.x)
+        for count in range(1, most + 1):
+            bar_lengths(self.x, mesh.bars, length)
+            density = np.where(forced, given.force / np.maximum(length, np.finfo(float).tiny), given.density)
+            self._solve(density)
+            bar_lengths(self.x, mesh.bars, length)
+            lack = np.abs(density[forced] * length[forced] - given.force[forced]).max(initial=0.0)
+            lack = comm.allreduce(float(lack), op=MPI.MAX)
+            if not any_forced or lack <= tolerance * largest:
+                return count
+        raise SimulationFailure(
+            f"form finding: forces of {lack:.3g} N are lacking after {most} solves, {tolerance * largest:.3g} N are "
+            "allowed: with these forces there may be no form (a bar shrinks to a point); give force densities, or "
+            "increase static.max_iterations or static.tolerance"
+        )
+
+    def _solve(self, density: np.ndarray) -> None:
+        """Move to the form of force densities (b,) [N/m]. Collective."""
+        mesh, comm, fixed = self.model.mesh, self.model.comm, self.model.supports.fixed
+        owned, held = mesh.n_owned, np.zeros((mesh.n_local, 3))
+        held[:owned] = fixed
+        mesh.update_ghosts(held)
+        # bars to prescribed nodes pull with their positions
+        right, pull = np.empty((owned, 3)), np.zeros((mesh.n_local, 3))
+        for near, far in (mesh.bars.T, mesh.bars.T[::-1]):
+            np.add.at(pull, near, density[:, None] * held[far] * self.x[far])
+        right[:] = np.where(fixed, self.x[:owned], self.external + pull[:owned])
+        alike = comm.allreduce(bool((fixed == fixed[:, :1]).all()), op=MPI.LAND)
+        for axes in ((0, 1, 2),) if alike else ((0,), (1,), (2,)):
+            solver = self._factorised(density, held[:, axes[0]])
+            try:
+                for axis in axes:
+                    self.x[:owned, axis] = self._solved(solver, right[:, axis])
+            finally:
+                solver.destroy()
+        mesh.update_ghosts(self.x)
+
+    def _solved(self, solver: PETSc.KSP, right: np.ndarray) -> np.ndarray:
+        """Return the solution (owned,) for a right side. Collective."""
+        b = PETSc.Vec().createWithArray(right.copy(), comm=self.model.comm)
+        x = b.duplicate()
+        try:
+            solver.solve(b, x)
+            if solver.getConvergedReason() < 0 or not np.isfinite(x.norm()):
+                raise SimulationFailure(_SINGULAR)
+            return x.getArray().copy()
+        except PETSc.Error as error:
+            raise SimulationFailure(_SINGULAR) from error
+        finally:
+            b.destroy()
+            x.destroy()
+
+    def _factorised(self, density: np.ndarray, held: np.ndarray) -> PETSc.KSP:
+        """Return the solver of a component that is prescribed at some nodes, 1 in ``held`` (local,). Collective."""
+        mesh, comm = self.model.mesh, self.model.comm
+        owned, first, free = mesh.n_owned, mesh.first_node, held == 0.0
+        rows, columns = [np.arange(owned)], [first + np.arange(owned)]
+        diagonal, values = held[:owned].copy(), []
+        for one, other in ((0, 1), (1, 0)):
+            near, far = mesh.bars[:, one], mesh.bars[:, other]
+            own = (near < owned) & free[near]
+            np.add.at(diagonal, near[own], density[own])
+            both = own & free[far]
+            rows.append(near[both])
+            columns.append(self._ends[both, other])
+            values.append(-density[both])
+        places = np.concatenate(rows), np.concatenate(columns)
+        local = coo_array((np.concatenate([diagonal, *values]), places), shape=(owned, mesh.n_nodes)).tocsr()
+        matrix = PETSc.Mat().createAIJ(
+            ((owned, mesh.n_nodes), (owned, mesh.n_nodes)),
+            csr=(local.indptr.astype(PETSc.IntType), local.indices.astype(PETSc.IntType), local.data),
+            comm=comm,
+        )
+        solver = PETSc.KSP().create(comm)
+        solver.setOperators(matrix)
+        positive = comm.allreduce(float(density.min(initial=np.inf)), op=MPI.MIN) > 0.0
+        if mesh.n_nodes > _DIRECT_UP_TO and positive:
+            solver.setType("cg")
+            solver.getPC().setType("gamg")
+            solver.setTolerances(rtol=1e-12, max_it=1000)
+        else:
+            solver.setType("preonly")
+            solver.getPC().setType("lu")
+            solver.getPC().setFactorSolverType("mumps")
+        matrix.destroy()
+        return solver
+
+
+_SINGULAR = (
+    "form finding: these force densities have no form: bars connect some nodes with no support, or tension and "
+    "compression cancel; add supports or correct the force densities"
+)
+
+
+def _check(model: Model) -> None:
+    """Refuse what form finding does not have.
+
+    Raises
+    ------
+    InputError
+        On all ranks.
+    """
+    case = model.case
+    given = {
+        "wall": bool(case.wall),
+        "contact_pair": bool(case.contact_pair),
+        "constraint": bool(case.constraint),
+        "spring": bool(case.spring),
+        "dashpot": bool(case.dashpot),
+        "temperature": bool(case.temperature),
+        "remove": bool(case.remove),
+    }
+    there = [key for key, has in given.items() if has]
+    if there:
+        raise InputError(
+            f'{case.source}: static.method = "force_density" finds forms of bars with supports and loads, and takes no '
+            f"[[{there[0]}]]: give it in a later stage"
+        )
+    if model.supports.inclined is not None:
+        raise InputError(
+            f'{case.source}: support: static.method = "force_density" takes supports along the axes of the model alone'
+        )

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..mechanics.materials.base import law_of
 from ..registry import add_plugin, has_plugin, nearest
 from . import load_cases
+from .base import is_finite_number
 from .editing import (
     TABLES,
     apply_overrides,
@@ -25,7 +26,7 @@ from .editing import (
 )
 from .model import ANALYSES, KEYS, ONE_STAGE, STAGE_TABLES, CaseModel, Reading, StageName, StageOutput
 from .problems import Problems
-from .tables import PRESTRESSES
+from .tables import PRESTRESSES, Damping
 from .toml import KeyPath, built_in_path, key_text, parse_toml, plain, read_text, table_text
 
 NAMED = ("node_set", "material", "section")
@@ -261,6 +262,7 @@ class Case(_Tables):
         if added:
             own = data.get("plugins", [])
             data["plugins"] = [*(own if isinstance(own, list) else [own]), *added]
+        _spread_damping(data, problems)
         stages = stages_of(data, problems) if "stage" in data else []
         if not lenient:
             _add_plugins(data.get("plugins"), folder, problems)
@@ -420,6 +422,30 @@ def _unpickled(cls: type[Case], plugins: Iterable[str], state: bytes) -> Case:
     case.__dict__.update(pickle.loads(state))
     settle(case)
     return case
+
+
+def _spread_damping(data: dict[str, Any], problems: Problems) -> None:
+    """Give each material and nodal mass its part of the table [damping], in the place of that table."""
+    if "damping" not in data:
+        return
+    table = problems.validated(Damping, data.pop("damping"), None, lambda path: ("damping", *path))
+    materials = data.get("material")
+    if table is None or not isinstance(materials, Mapping):
+        return
+    of_mass, of_stiffness = table.factors
+    for name, material in materials.items():
+        if not isinstance(material, dict):
+            continue
+        for key in ("damping", "stiffness_damping"):
+            if material.get(key):
+                text = "[damping] gives each material its damping: remove this key, or that table"
+                problems.add(("material", name, key), text, material[key])
+        density = material.get("density")
+        if is_finite_number(density):  # else it is refused
+            material |= {"damping": of_mass * density, "stiffness_damping": of_stiffness}
+    for row in data["mass"] if isinstance(data.get("mass"), list) else ():
+        if isinstance(row, dict):
+            row.setdefault("damping", of_mass)
 
 
 def _validated(

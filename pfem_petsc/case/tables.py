@@ -344,9 +344,8 @@ class Initial(StrictModel):
         return self
 
 
-def _moves_along(normal: tuple, rows: tuple, velocity: tuple | None) -> None:
-    """Refuse a motion that is all across the one direction in which a support prescribes it."""
-    given = np.array([row[1:] for row in rows] + ([velocity] if velocity is not None else []))
+def _moves_along(normal: tuple, given: np.ndarray) -> None:
+    """Refuse vectors of a motion (n, 3) that are all across the one direction in which a support prescribes it."""
     unit = np.array(normal) / np.linalg.norm(normal)
     if given.any() and np.abs(given @ unit).max() <= _PARALLEL * np.abs(given).max():
         raise ValueError("the motion has no component along normal, so it would have no effect")
@@ -355,7 +354,6 @@ def _moves_along(normal: tuple, rows: tuple, velocity: tuple | None) -> None:
 class Support(WithFiles):
     """Fixed or prescribed position components of a node set."""
 
-    alternatives = ("velocity",)
     exactly_one = (("fix", "normal"),)
     at_most_one = (("motion", "velocity", "acceleration"),)
 
@@ -373,12 +371,15 @@ class Support(WithFiles):
     on which a roller moves"""
     motion: Table4 | None = None
     """rows [t, dx, dy, dz]: displacement from the mesh [s, m], at rest before the first and after the last row"""
-    velocity: Vector3 | None = None
-    """constant velocity of the fixed components [m/s]"""
+    velocity: VectorOrRows | None = None
+    """constant velocity of the fixed components [m/s]; or rows [t, vx, vy, vz] [s, m/s]: linear between rows, zero
+    outside"""
     acceleration: Table4 | None = None
     """rows [t, ax, ay, az] [s, m/s2]: linear between rows, zero outside; the fixed components start from rest"""
     motion_file: FileName | None = None
     """the rows of ``motion`` from the columns of a CSV or NPZ file: its name, or a table of :class:`TableFile`"""
+    velocity_file: FileName | None = None
+    """the rows of ``velocity`` from a file in the same way"""
     acceleration_file: FileName | None = None
     """the rows of ``acceleration`` from a file in the same way"""
     interpolation: Literal["smooth", "linear"] = "smooth"
@@ -402,15 +403,20 @@ class Support(WithFiles):
                 raise ValueError("frame defines the axes of fix; expected the key fix")
             check_frame(self.frame)
         if self.normal is not None:
-            _moves_along(self.normal, self.motion or self.acceleration or (), self.velocity)
+            _moves_along(self.normal, self._vectors)
         if self.fix is None or self.frame is not None:
             return self
-        for k, axis in enumerate("xyz"):
-            rows = self.motion or self.acceleration or ()
-            moves = any(row[1 + k] != 0.0 for row in rows) or (self.velocity is not None and self.velocity[k] != 0.0)
+        for axis, moves in zip("xyz", self._vectors.any(axis=0), strict=True):
             if moves and axis not in self.fix:
                 raise ValueError(f'{axis} is given a motion, but fix = "{self.fix}" leaves it free')
         return self
+
+    @property
+    def _vectors(self) -> np.ndarray:
+        """The vectors (n, 3) that describe its motion."""
+        rows = self.motion or self.acceleration or (self.velocity if has_rows(self.velocity) else ())
+        constant = self.velocity is not None and not has_rows(self.velocity)
+        return np.array([row[1:] for row in rows] + ([self.velocity] if constant else [])).reshape(-1, 3)
 
 
 class NodalMass(StrictModel):
@@ -420,6 +426,24 @@ class NodalMass(StrictModel):
     """name of a node set"""
     value: NonNegativeFloat
     """mass of each node of the set [kg]"""
+    damping: NonNegativeFloat = 0.0
+    """damping of this mass over it [1/s], as ``damping`` of a material over its density"""
+
+
+class Damping(StrictModel):
+    """Rayleigh damping of the whole truss, C = a M + b K: each material and nodal mass gets its part."""
+
+    ratio: Annotated[float, Field(gt=0.0, lt=1.0)]
+    """damping ratio, of critical damping, at the frequencies"""
+    frequencies: Annotated[tuple[PositiveFloat, ...], listed, Field(min_length=1, max_length=2)]
+    """one or two natural frequencies [Hz]"""
+
+    @property
+    def factors(self) -> tuple[float, float]:
+        """The factors a of the mass [1/s] and b of the stiffness [s]: with two circular frequencies v and w,
+        a = 2 z v w/(v + w) and b = 2 z/(v + w), so that z = (a/w + b w)/2 at both; with one, where z is smallest."""
+        first, last = 2.0 * math.pi * self.frequencies[0], 2.0 * math.pi * self.frequencies[-1]
+        return 2.0 * self.ratio * first * last / (first + last), 2.0 * self.ratio / (first + last)
 
 
 class _GroundOrNodes(StrictModel):

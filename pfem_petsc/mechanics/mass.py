@@ -57,6 +57,7 @@ class PointInertia:
         self.mass, self.damping = np.zeros((2, mesh.n_owned))
         for entry in case.point_mass:
             self.mass[nodes[entry.node_set]] += entry.value
+            self.damping[nodes[entry.node_set]] += entry.damping * entry.value
         grounded = [entry for entry in case.dashpot if entry.node_set is not None]
         for entry in grounded:
             self.damping[nodes[entry.node_set]] += entry.coefficient

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ..case.base import has_rows
 from .compiled import kernel
 
 if TYPE_CHECKING:
@@ -88,6 +89,8 @@ def motion_of(entry: Support | WallKeys) -> Motion | None:
         rows = np.array(entry.motion, dtype=np.float64)
         smooth = getattr(entry, "interpolation", "smooth") == "smooth"
         return Motion(rows[:, 0], pieces(rows[:, 0], rows[:, 1:], smooth), jumps=not smooth)
+    if entry.velocity is not None and has_rows(entry.velocity):
+        return _moving(np.array(entry.velocity, dtype=np.float64))
     if entry.velocity is not None and any(entry.velocity):
         coefficients = np.zeros((1, 4, 3))
         coefficients[0, 1] = entry.velocity
@@ -148,6 +151,17 @@ def _rests(width: np.ndarray, rate: np.ndarray) -> np.ndarray:
         onward = before * rate[k - 2] > 0.0 and after * rate[k + 2] > 0.0
         rests[k] = not (turns and fades and even and onward)
     return rests
+
+
+def _moving(rows: np.ndarray) -> Motion:
+    """Return the motion with velocities by rows [t, vx, vy, vz], which are zero outside and may jump at both ends."""
+    times, values = rows[:, 0], rows[:, 1:]
+    width = np.diff(times)[:, None]
+    coefficients = np.zeros((len(times), 4, 3))
+    coefficients[:-1, 1] = values[:-1]
+    coefficients[:-1, 2] = np.diff(values, axis=0) / (2.0 * width)
+    coefficients[1:, 0] = np.cumsum(0.5 * width * (values[:-1] + values[1:]), axis=0)
+    return Motion(times, coefficients, jumps=bool(values[[0, -1]].any()))
 
 
 def _accelerated(rows: np.ndarray) -> Motion:

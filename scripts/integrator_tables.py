@@ -44,6 +44,8 @@ ROWS = (
     Row("`wilson`, θ = 1.5", "wilson", {"theta": 1.5}),
     Row("`generalized_alpha`, ρ∞ = 0.8", "generalized_alpha", {"rho_inf": 0.8}),
     Row("`generalized_alpha`, ρ∞ = 0", "generalized_alpha", {"rho_inf": 0.0}),
+    Row("`hht_alpha`, α = −0.05", "hht_alpha", {"alpha": -0.05}),
+    Row("`hht_alpha`, α = −1/3", "hht_alpha", {"alpha": -1.0 / 3.0}),
     Row("`energy_momentum`", "energy_momentum", {}),
 )
 

@@ -36,7 +36,11 @@ class Scheme(Base):
 
     def __init__(self, parameters: StrictModel) -> None:
         super().__init__(parameters)
-        rho = parameters.rho_inf
+        self.set_coefficients()
+
+    def set_coefficients(self) -> None:
+        """Set alpha_m, alpha_f, beta, gamma from the parameters."""
+        rho = self.parameters.rho_inf
         self.alpha_m = (2.0 * rho - 1.0) / (rho + 1.0)
         self.alpha_f = rho / (rho + 1.0)
         self.gamma = 0.5 - self.alpha_m + self.alpha_f
@@ -49,7 +53,7 @@ class Scheme(Base):
             eta=kept * self.gamma / (self.beta * h),
             predictor=state.position + h * state.v + (h * h * (0.5 - self.beta)) * state.a,
             v_hat=state.v + (kept * h * (1.0 - self.gamma)) * state.a,
-            a_hat=self.alpha_m * state.a,
+            a_hat=self.alpha_m * state.a if self.alpha_m else None,
             time=state.time + h,
             loads=((kept, state.time + h), (self.alpha_f, state.time)),
             weight=kept,

@@ -106,6 +106,10 @@ def implicit_alpha(rho):
     return newmark_family((1 - a_m + a_f) ** 2 / 4, 0.5 - a_m + a_f, a_m, a_f)
 
 
+def hht_alpha(alpha):
+    return newmark_family((1 - alpha) ** 2 / 4, 0.5 - alpha, 0.0, -alpha)
+
+
 def chung_lee(beta):
     return newmark_family(beta, 1.5, 0.0, 1.0, lagged_velocity=True)
 
@@ -154,6 +158,8 @@ SCHEMES = {
     "wilson 2": ("wilson", {"theta": 2.0}, 3, wilson(2.0)),
     "generalized_alpha 0.8": ("generalized_alpha", {}, 3, implicit_alpha(0.8)),
     "generalized_alpha 0": ("generalized_alpha", {"rho_inf": 0.0}, 3, implicit_alpha(0.0)),
+    "hht_alpha -0.05": ("hht_alpha", {}, 3, hht_alpha(-0.05)),
+    "hht_alpha -1/3": ("hht_alpha", {"alpha": -1.0 / 3.0}, 3, hht_alpha(-1.0 / 3.0)),
 }
 
 

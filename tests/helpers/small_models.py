@@ -39,6 +39,7 @@ SCHEMES = {
     "wilson": {},
     "houbolt": {},
     "generalized_alpha": {"rho_inf": 0.6},
+    "hht_alpha": {},
     "energy_momentum": {},
 }
 

@@ -679,7 +679,7 @@ def _time(chance: random.Random, body: Body) -> dict[str, Any]:
     return time
 
 
-def _parameters(chance: random.Random, name: str) -> dict[str, float]:
+def _parameters(chance: random.Random, name: str) -> dict[str, Any]:
     if chance.random() < 0.4:
         return {}
     if name == "newmark":
@@ -690,7 +690,8 @@ def _parameters(chance: random.Random, name: str) -> dict[str, float]:
     if name == "wilson":
         return {"theta": chance.choice((1.5, 1.6, 2.0, chance.uniform(1.37, 2.2)))}
     if name == "generalized_alpha":
-        return {"rho_inf": chance.uniform(0.0, 1.0)}
+        rho = chance.uniform(0.0, 1.0)
+        return {"integrator": "hht_alpha", "alpha": (rho - 1.0) / (rho + 1.0)} if rho > 0.6 else {"rho_inf": rho}
     if name == "chung_lee":
         return {"beta": chance.uniform(1.0, 28.0 / 27.0)}
     if name == "hulbert_chung":

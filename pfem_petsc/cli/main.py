@@ -43,6 +43,7 @@ HOMES = {"run": "cases", "list": "cases", "check": "cases", "mesh": "mesh", "ren
 HOMES |= {
     "report": "results",
     "members": "results",
+    "crush": "results",
     "info": "results",
     "sweep": "cases",
     "bench": "bench",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError, printable
+from ..post.crush import WINDOW
 from ..post.members import PER
 from ..post.options import Options, PlotOptions
 from .parser import PROGRAM, Verb, argument, options_of, surviving
@@ -202,6 +203,46 @@ def print_members(arguments: argparse.Namespace) -> int:
     return 0
 
 
+CRUSH = f"""\
+examples:
+  {PROGRAM} crush results/octet_compression --wall plate
+  {PROGRAM} crush results/octet_compression --wall plate --area 9e-4 --height 0.03 --csv crush.csv --picture crush.png
+  {PROGRAM} crush results/drop --wall floor --displacement probe/top/position.z --window 0.02"""
+
+OF_CRUSH = (
+    argument("result", metavar="RESULT", help="result file, or its folder"),
+    argument("--wall", metavar="NAME", required=True, help="the wall that compresses the block"),
+    argument("--area", metavar="A", type=float, help="of the block across its way [m2]; default: of the box around it"),
+    argument("--height", metavar="H", type=float, help="of the block along its way [m]; default: of the box around it"),
+    argument(
+        "--displacement",
+        metavar="NAME",
+        help="component of the history whose change compresses the block, where the wall does not move",
+    ),
+    argument("--window", metavar="STRAIN", type=float, default=WINDOW, help="of means; default: %(default)s; 0: none"),
+    argument("--csv", metavar="FILE", type=Path, help="write the curves over strain as CSV"),
+    argument("--picture", metavar="FILE", type=Path, help="draw the curves: PNG, SVG or PDF"),
+)
+
+
+def print_crush(arguments: argparse.Namespace) -> int:
+    """Print the figures of a crush test, and the names of files that are written."""
+    from ..output.units import engineering
+    from ..post.crush import crush, draw_crush
+
+    options = {name: getattr(arguments, name) for name in ("area", "height", "displacement", "window")}
+    test = crush(surviving(arguments.result), arguments.wall, **options)
+    for row in test.figures().rows:
+        value, unit = row["value"], row["unit"]
+        text = engineering(value, unit) if unit in ("Pa", "J", "J/m³", "J/kg") else f"{value:.6g} {unit}".rstrip()
+        print(f"{row['figure']:34}  {text if np.isfinite(value) else 'not reached'}")
+    if arguments.csv is not None:
+        print(test.table().to_csv(arguments.csv))
+    if arguments.picture is not None:
+        print(draw_crush(test, arguments.picture))
+    return 0
+
+
 RENDER = f"""\
 examples:
   {PROGRAM} render results/rod_impact
@@ -332,6 +373,14 @@ VERBS = (
         "one",
         OF_MEMBERS,
         print_members,
+    ),
+    Verb(
+        "crush",
+        "Figures of a crush test: stress-strain, first peak, plateau, energy by volume and mass, densification.",
+        CRUSH,
+        "one",
+        OF_CRUSH,
+        print_crush,
     ),
     Verb(
         "render",

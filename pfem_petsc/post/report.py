@@ -107,6 +107,7 @@ def _document(result: Any, curves: Sequence[Path], drawn: Path | None, reason: s
         "Truss": truss,
         "Curves": "".join(_figure(path, path.stem.replace("_", " ").capitalize()) for path in curves),
         "Energies": _energies(result.history),
+        "Crush tests": _crush(result),
         "Events": _events(result),
         "Modes": _modes(result),
         "Cost": _table(_cost(result, log)),
@@ -242,6 +243,35 @@ def _members(result: Any) -> str:
     more = table.n_rows - len(lines)
     rest = f"<p>The command members lists the other {more:,}.</p>" if more else ""
     return _grid(head, lines) + rest
+
+
+_CRUSHED = 0.05
+"""Least strain of a block that a wall compresses, from which its figures are in the report."""
+
+
+def _crush(result: Any) -> str:
+    """The figures of what moving walls compress, with the box around the mesh for area and height."""
+    from .crush import crush, draw_crush
+
+    found = ""
+    for wall in result.case.every_wall:
+        if f"wall/{wall.name}/position" not in result.history:
+            continue
+        try:
+            test = crush(result, wall.name)
+        except (InputError, OSError):
+            continue  # it touches nothing, or the mesh is not there any more
+        if test.strain[-1] < _CRUSHED:
+            continue
+        rows = [
+            [row["figure"], f"{row['value']:.6g}" if np.isfinite(row["value"]) else "not reached", row["unit"]]
+            for row in test.figures().rows
+        ]
+        with tempfile.TemporaryDirectory() as folder:
+            picture = _figure(draw_crush(test, Path(folder) / "crush.png"), f"Wall {wall.name}: stress and strain")
+        found += f"<p>Wall {html.escape(wall.name)}, area and height of the box around the mesh:</p>"
+        found += _grid(["", "", ""], rows) + picture
+    return found
 
 
 def _events(result: Any) -> str:

@@ -110,3 +110,17 @@ class RelaxationKeys(Increments):
         return self.step
 
     largest = smallest
+
+
+class ForceDensityKeys(Increments):
+    """Repeated solves for given forces; the form is found in one increment."""
+
+    tolerance: PositiveFloat = 1e-9
+    """of given forces, relative to the largest"""
+    max_iterations: PositiveInt = 500
+    """number of linear solves after which a form with given forces is given up"""
+
+    step: ClassVar[float] = 1.0
+    end: ClassVar[float] = 1.0
+    smallest: ClassVar[float] = 1.0
+    largest: ClassVar[float] = 1.0

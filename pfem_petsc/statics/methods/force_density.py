@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ...case.base import PositiveFloat, PositiveInt
-from ..keys import Increments
+from ..keys import ForceDensityKeys
 
 if TYPE_CHECKING:
     from ...solvers.linear import LinearChoice
@@ -20,36 +19,10 @@ if TYPE_CHECKING:
 __all__ = ["Parameters", "make_stepper"]
 
 
-class Parameters(Increments):
-    """Repeated solves for given forces."""
-
-    tolerance: PositiveFloat = 1e-9
-    """of given forces, relative to the largest"""
-    max_iterations: PositiveInt = 500
-    """number of linear solves after which a form with given forces is given up"""
-
-    @property
-    def step(self) -> float:
-        """The form is found in one increment of the load factor."""
-        return 1.0
-
-    @property
-    def end(self) -> float:
-        """The last load factor."""
-        return 1.0
-
-    @property
-    def smallest(self) -> float:
-        """The smallest increment."""
-        return 1.0
-
-    @property
-    def largest(self) -> float:
-        """The largest increment."""
-        return 1.0
+Parameters = ForceDensityKeys
 
 
-def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> ForceDensityStepper:
+def make_stepper(model: Model, parameters: ForceDensityKeys, choice: LinearChoice) -> ForceDensityStepper:
     """Create the stepper of a case. Collective."""
     from ..force_density import ForceDensityStepper
 

@@ -14,9 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
+from ..case.model import INTEGRATORS
+from ..case.tables import Modes
 from ..contact.monitoring import small_walls
+from ..errors import PfemError
 from ..files import memory_of_machine
 from ..output.units import duration, engineering
+from ..registry import lookup
 from ..tolerances import ON_BOUND
 from .geometry import Geometry
 
@@ -75,6 +79,8 @@ def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
     rigidity = geometry.rigidity()
     entries |= {"rigidity": rigidity} if rigidity else {}
     entries |= {f"wall {name}": text for name, text in wall_gaps(model)[0].items()}
+    period, advice = _period(model)
+    entries, warnings = entries | period, warnings + advice
     if not _is_own(case):
         return entries, warnings
     found = geometry.nodes_on_bars()
@@ -89,8 +95,50 @@ def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
         many = "nodes lie on bars that they are not connected to"
         what = many if between > 1 else "node lies on a bar that it is not connected to"
         shown = _list(between, on_bars)
-        warnings = [f"{between} {what}: {shown}; if they are intended to be connected, divide the bar there"]
+        warnings.append(f"{between} {what}: {shown}; if they are intended to be connected, divide the bar there")
     return entries, warnings
+
+
+_MODES_UP_TO = 3000
+"""Components up to which the lowest natural frequency of the initial state is computed by ``check``."""
+_STEPS = (40, 100)
+"""Steps of a period that are advised: for damped motion, and for resonance with little damping."""
+
+
+def _period(model: Model) -> tuple[dict[str, str], list[str]]:
+    """Return the lowest natural frequency and the steps in its period as an entry, and what is advised. Collective.
+
+    Of implicit steps alone: explicit ones are far smaller. Without an entry for large models, and where there is no
+    such frequency: mechanisms, initial velocities, contact that modes do not support.
+    """
+    case = model.case
+    times = [stage.time for stage in case.editor[0].stages if stage.time is not None]
+    implicit = [t for t in times if not lookup(INTEGRATORS, t.integrator, "time.integrator").Scheme.explicit]
+    if not implicit or 3 * model.mesh.n_nodes > _MODES_UP_TO:
+        return {}, []
+    step = max(time.step for time in implicit)
+    from ..modes.find import InitialState, find_modes
+
+    try:
+        stepper = InitialState(model)
+        stepper.start()
+        found = find_modes(model, stepper.state, Modes(count=1), case.mass == "consistent")
+    except PfemError:
+        return {}, []
+    frequency = float(found.values[0]) if len(found.values) else 0.0
+    if not frequency > 0.0:
+        return {}, []
+    steps = 1.0 / (frequency * step)
+    entry = f"{engineering(frequency, 'Hz')} in the initial state, {steps:.3g} steps a period"
+    few, many = _STEPS
+    if steps >= few:
+        return {"lowest frequency": entry}, []
+    fine = engineering(1.0 / (many * frequency), "s")
+    return {"lowest frequency": entry}, [
+        f"time.step = {engineering(step, 's')}: {steps:.3g} steps in the period of the lowest frequency, "
+        f"{engineering(frequency, 'Hz')}: take {few} for damped motion and {many}, {fine}, for resonance with little "
+        f"damping, whose amplitude is some 5 % too small at {few}"
+    ]
 
 
 def _is_own(case: Case) -> bool:

@@ -46,6 +46,8 @@ ROWS = (
     Row("`generalized_alpha`, ρ∞ = 0", "generalized_alpha", {"rho_inf": 0.0}),
     Row("`hht_alpha`, α = −0.05", "hht_alpha", {"alpha": -0.05}),
     Row("`hht_alpha`, α = −1/3", "hht_alpha", {"alpha": -1.0 / 3.0}),
+    Row("`bathe`, ρ∞ = 0.8 (two balances a step)", "bathe", {"rho_inf": 0.8}),
+    Row("`bathe`, ρ∞ = 0 (two balances a step)", "bathe", {"rho_inf": 0.0}),
     Row("`energy_momentum`", "energy_momentum", {}),
 )
 
@@ -61,6 +63,12 @@ def advance(scheme: Scheme, state: State, h: float, held: bool) -> None:
 
     The balance is solved as in the program: M a + (1 - w) f(x0) + w f(x) = 0, or x = 0.
     """
+    for share, _ in scheme.substeps:
+        _advance(scheme, state, share * h, held)
+
+
+def _advance(scheme: Scheme, state: State, h: float, held: bool) -> None:
+    """Make a substep."""
     if scheme.solves_next_position:
         scheme.advance(state, h)
     balance = scheme.balance(state, h)

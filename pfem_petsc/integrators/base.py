@@ -107,6 +107,7 @@ class Scheme(ABC):
     remembers : names of the scheme's nodal arrays in the state's memory, which are linear in the motion
     turns_held : x1 - x0 = h (v0 + v1)/2 and nothing else relates velocity to position, so the velocity of a node that
         is fixed from one step to the next is reversed
+    substeps : of a step that solves several balances: of each the share of the step, and where it ends in the step
     notice : message to users who choose the scheme; empty for none
     inertial : whether its balance has inertia; without it there are no velocities, impulses and impacts
     """
@@ -122,6 +123,7 @@ class Scheme(ABC):
     symmetric = True
     remembers: tuple[str, ...] = ()
     turns_held = False
+    substeps: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
     notice = ""
 
     def __init__(self, parameters: StrictModel) -> None:

@@ -143,13 +143,14 @@ class ImplicitStepper(Stepper):
         state, ticks = self.state, 2**_HALVINGS
         start, done = state.time, 0
         end = (state.step + 1) * self.h
-        size = ticks >> self.level
+        size, between = ticks >> self.level, False
         self.smallest = self.h
         while done < ticks:
-            self._set_part(self.h * (size / ticks))
-            external = state.external
+            place = end if done + size == ticks else start + self.h * ((done + size) / ticks)
+            self._set_part(place - state.time if between else self.h * (size / ticks))
+            external, begun = state.external, state.time
             try:
-                self._make_part(end if done + size == ticks else start + self.h * ((done + size) / ticks))
+                self._make_substeps(place)
             except NotConverged as failure:
                 state.external = external
                 if size == 1:
@@ -159,11 +160,25 @@ class ImplicitStepper(Stepper):
                 size //= 2
                 self.level += 1
                 self.tell_failure(failure, f"bisecting the step, to {self.h * size / ticks:.4g} s")
+                if state.time > begun:  # a first substep has been made: on to the next of the smaller parts
+                    between = True
+                    while start + self.h * ((done + size) / ticks) <= state.time:
+                        done += size
                 continue
-            done += size
+            done, between = done + size, False
         self.level = max(self.level - 1, 0)
         self.leave()
         state.step += 1
+
+    def _make_substeps(self, end: float) -> None:
+        """Advance by ``part`` to a time [s], balance by balance of the scheme."""
+        begun, part = self.state.time, self.part
+        try:
+            for share, place in self.scheme.substeps:
+                self.part = share * part
+                self._make_part(end if place == 1.0 else begun + place * part)
+        finally:
+            self.part = part
 
     def _set_part(self, part: float) -> None:
         if part != self.part:

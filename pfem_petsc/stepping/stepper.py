@@ -123,6 +123,7 @@ class PrescribedMotion:
             supports.put(state.memory["half_velocity"], way / self.stepper.part)
         ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
         made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
+        self.change = {}  # the scheme may have no memory at the end of this balance
         for name, array in made.items():
             change = np.zeros_like(state.v)
             supports.put(change, supports.get(given[name]) - array[:, 0])

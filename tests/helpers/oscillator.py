@@ -110,6 +110,26 @@ def hht_alpha(alpha):
     return newmark_family((1 - alpha) ** 2 / 4, 0.5 - alpha, 0.0, -alpha)
 
 
+def bathe(rho):
+    """Two substeps of matrices on (x, h v, h^2 a), with the whole step h."""
+
+    def eigenvalues(omega_h, damping_ratio=0.0):
+        g = 0.5 if rho == 1.0 else (2.0 - np.sqrt(2.0 + 2.0 * rho)) / (1.0 - rho)
+        q1 = (rho + 1.0) / (2.0 * g * (rho - 1.0) + 4.0)
+        q2 = 0.5 - g * q1
+        q0 = 1.0 - q1 - q2
+        c, k, one = 2.0 * damping_ratio * omega_h, omega_h**2, np.eye(3)
+        # unknown (x, v, a) of each substep: two formulas and the balance
+        left = np.array([[1.0, -0.5 * g, 0.0], [0.0, 1.0, -0.5 * g], [k, c, 1.0]])
+        middle = np.linalg.solve(left, [[1.0, 0.5 * g, 0.0], [0.0, 1.0, 0.5 * g], [0.0, 0.0, 0.0]])
+        left = np.array([[1.0, -q2, 0.0], [0.0, 1.0, -q2], [k, c, 1.0]])
+        start = np.array([[0.0, q0, 0.0], [0.0, 0.0, q0], [0.0, 0.0, 0.0]]) + np.diag([1.0, 1.0, 0.0])
+        between = np.array([[0.0, q1, 0.0], [0.0, 0.0, q1], [0.0, 0.0, 0.0]])
+        return np.linalg.eigvals(np.linalg.solve(left, start @ one + between @ middle))
+
+    return eigenvalues
+
+
 def chung_lee(beta):
     return newmark_family(beta, 1.5, 0.0, 1.0, lagged_velocity=True)
 
@@ -158,6 +178,9 @@ SCHEMES = {
     "wilson 2": ("wilson", {"theta": 2.0}, 3, wilson(2.0)),
     "generalized_alpha 0.8": ("generalized_alpha", {}, 3, implicit_alpha(0.8)),
     "generalized_alpha 0": ("generalized_alpha", {"rho_inf": 0.0}, 3, implicit_alpha(0.0)),
+    "bathe 0": ("bathe", {}, 2, bathe(0.0)),
+    "bathe 0.8": ("bathe", {"rho_inf": 0.8}, 2, bathe(0.8)),
+    "bathe 1": ("bathe", {"rho_inf": 1.0}, 2, bathe(1.0)),
     "hht_alpha -0.05": ("hht_alpha", {}, 3, hht_alpha(-0.05)),
     "hht_alpha -1/3": ("hht_alpha", {"alpha": -1.0 / 3.0}, 3, hht_alpha(-1.0 / 3.0)),
 }

@@ -40,6 +40,7 @@ SCHEMES = {
     "houbolt": {},
     "generalized_alpha": {"rho_inf": 0.6},
     "hht_alpha": {},
+    "bathe": {"rho_inf": 0.5},
     "energy_momentum": {},
 }
 

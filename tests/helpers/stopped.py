@@ -34,6 +34,7 @@ CASES = {
     "hulbert_chung": ("rod_impact", (*SHORT, "time.integrator=hulbert_chung")),
     "souza_moura": ("rod_impact", (*SHORT, "time.integrator=souza_moura")),
     "generalized_alpha": ("rod_impact", (*SHORT, "time.integrator=generalized_alpha")),
+    "bathe": ("rod_impact", (*SHORT, "time.integrator=bathe")),
     "hht_alpha": ("rod_impact", (*SHORT, "time.integrator=hht_alpha", "time.alpha=-0.2", "contact.treatment=stick")),
     "lagged multigrid": (
         "lattice_drop",

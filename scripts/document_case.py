@@ -18,6 +18,7 @@ from pydantic.fields import FieldInfo
 from pfem_petsc.case.base import StrictModel
 from pfem_petsc.case.files import TableFile
 from pfem_petsc.case.model import KEYS, STAGE_TABLES, CaseModel, Family, StageName, StageOutput, shape_of
+from pfem_petsc.case.tables import Damping
 from pfem_petsc.registry import choices, lookup
 
 
@@ -28,7 +29,7 @@ def _tables() -> dict[str, tuple[type[StrictModel] | Family, ...]]:
         shape = shape_of(field)
         heading = {list: f"[[{key}]]", dict: f"[{key}.NAME]"}.get(shape.many, f"[{key}]")
         found[heading] = shape.models if shape.family is None else (*shape.models, shape.family)
-    found["[[stage]]"] = (StageName, StageOutput)
+    found |= {"[[stage]]": (StageName, StageOutput), "[damping]": (Damping,)}
     return {**{heading: models for heading, models in found.items() if models}, "Columns of files": (TableFile,)}
 
 

@@ -2,6 +2,7 @@
 
     python scripts/impact_phases.py            # rewrites those of docs/contact.md, in four minutes
     python scripts/impact_phases.py --gains    # writes pfem_petsc/contact/impact_gains.npz, in twenty minutes
+    python scripts/impact_phases.py --gains bathe    # the part of an integrator
 
 Every integrator, treatment and mass matrix runs the rod of `rod_impact` against the wall in 14 phases: equal rods, each
 a fourteenth of v h further from the wall than the previous one; a second table has walls with restitution. Both tables
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -268,15 +269,20 @@ GAINS = {
     "houbolt": [{}],
     "wilson": [{"theta": theta} for theta in (1.0, 1.4, 1.5, 1.6, 1.8, 2.0, 3.0)],
     "generalized_alpha": [{"rho_inf": rho} for rho in (0.0, 0.5, 0.8, 0.9, 1.0)],
+    "hht_alpha": [{"alpha": alpha} for alpha in (-1.0 / 3.0, -0.2, -0.1, -0.05, 0.0)],
+    "bathe": [{"rho_inf": rho} for rho in (0.0, 0.5, 0.8, 1.0)],
     "energy_momentum": [{}],
 }
 """Integrators of the table of gains, and their parameters."""
 
 
-def write_gains() -> None:
-    """Write the table of gains that the program reads."""
-    arrays = {}
+def write_gains(integrators: Sequence[str]) -> None:
+    """Write the table of gains that the program reads, or the part of some integrators."""
+    with np.load(TABLE) as table:
+        arrays = dict(table)
     for integrator, every in GAINS.items():
+        if integrators and integrator not in integrators:
+            continue
         module = lookup("pfem_petsc.integrators", integrator, "")
         gains = np.zeros((len(every), len(CASES), len(RESTITUTIONS), len(BARS), len(GAIN_STEPS)), dtype=np.float16)
         for of_parameters, parameters in zip(gains, every, strict=True):
@@ -307,7 +313,7 @@ def _fill_gains(gains: np.ndarray, module: ModuleType, parameters: Any, treatmen
 def main() -> None:
     """Run everything, and insert the tables between their marks in the document."""
     if "--gains" in sys.argv[1:]:
-        write_gains()
+        write_gains([word for word in sys.argv[1:] if word != "--gains"])
         return
     for columns, start, end in ((COLUMNS, START, END), (REBOUNDS, START_REBOUNDS, END_REBOUNDS)):
         insert("contact.md", start, end, table(judged, columns))

@@ -103,7 +103,15 @@ class _Rods:
         return 0.5 * (np.einsum("pi,ij,pj->p", v, self.m, v) + np.einsum("pi,ij,pj->p", x, self.k, x))
 
     def step(self) -> None:
-        """Advance all rods by a step, with the treatment of impact."""
+        """Advance all rods by a step."""
+        whole = self.h
+        for share, _ in self.scheme.substeps:
+            self.h = share * whole
+            self._balance_step()
+        self.h = whole
+
+    def _balance_step(self) -> None:
+        """Advance all rods by a balance of the step, with the treatment of impact."""
         state = self.state
         start = state.x[self.tips, 0].copy()
         before, touched = self.strength + self.change, self.touching

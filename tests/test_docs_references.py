@@ -329,7 +329,7 @@ def test_types_of_keys():
     """What the models say is what the page says: limits, vectors, rows, choices."""
     lines = {row[0]: row for row in document_case.rows(tables.Section)[0]}
     assert lines["`area`"][1:4] == ["number > 0", "m2", ""]
-    assert lines["`shape`"][1] == '`"round"`, `"tube"`'
+    assert lines["`shape`"][1] == '`"round"`, `"tube"`, `"angle"`, `"box"`, `"I"`, `"channel"`'
     assert lines["`material`"][3] == "*required*"
     lines = {row[0]: row for row in document_case.rows(tables.TimeKeys)[0]}
     assert lines["`safety`"][1:4] == ["number > 0, ≤ 1", "", "0.9"]

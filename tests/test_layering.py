@@ -20,7 +20,7 @@ FLOORS = (
     ("registry",),
     ("parallel",),
     ("cases",),
-    ("case.base", "case.toml"),
+    ("case.base", "case.section_shapes", "case.toml"),
     ("case.files",),
     ("case.tables",),
     ("mesh",),

@@ -47,7 +47,7 @@ def stage_rows(cases: Sequence[Any], combinations: Sequence[Any], common: Mappin
     own = {case.name: _tables(case) for case in cases}
     rows = [{"name": name, **_joined(common, [tables], name)} for name, tables in own.items()]
     for combination in combinations:
-        scaled = [_scaled(own[name], factor, name) for name, factor in combination.factors.items() if factor]
+        scaled = [_scaled(own[n], factor, combination.name) for n, factor in combination.factors.items() if factor]
         rows.append({"name": combination.name, **_joined(common, scaled, combination.name)})
     return rows
 

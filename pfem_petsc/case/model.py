@@ -454,6 +454,8 @@ class LoadCase(StrictModel):
     def _loads(self) -> LoadCase:
         if not any(getattr(self, key) for key in load_cases.TABLES):
             raise ValueError(f"has no loads: expected at least one of the tables {', '.join(load_cases.TABLES)}")
+        if self.wind is not None and self.wind.varies:
+            raise refusal((("wind", "velocity"), "a load case takes a constant wind [vx, vy, vz]", None))
         return self
 
 

@@ -453,7 +453,7 @@ def _validated(
 ) -> Any:
     """Return the model of nested tables; if they are rejected, add the problems and return None."""
     for key in [key for key in data if key not in KEYS]:
-        problems.add((key,), f"unknown key{_hint(key, KEYS)}")
+        problems.add((key,), f"unknown key{_hint(key, [*KEYS, 'damping'])}")
     for key in ("material", "section"):
         if data.get(key, {}) == {}:
             problems.add((), f"no [{key}.NAME] is given: a case needs at least one {key}")
@@ -654,7 +654,10 @@ def load_case_stages(
     if "static" not in last.data:
         problems.add((), f"load cases start from a static state, and the last stage {last.name!r} is none")
         return []
-    method = last.data["static"].get("method", "newton") if isinstance(last.data["static"], Mapping) else None
+    static = last.data["static"] if isinstance(last.data["static"], Mapping) else {}
+    method = static.get("method", "newton")
+    if method == "force_density":  # the net as built
+        static, method = {"method": "newton"}, "newton"
     if method not in load_cases.METHODS:
         known = ", ".join(load_cases.METHODS)
         problems.add((), f"load cases are solved by the method of the state before them, one of {known}; got {method}")
@@ -662,7 +665,7 @@ def load_case_stages(
     names = [stage.name for stage in (*stages, *made)]
     keys = [("load_case", k) for k in range(len(model.load_case))]
     keys += [("combination", k) for k in range(len(model.combination))]
-    common = {key: value for key, value in last.data.items() if key not in ("modes", *ONE_STAGE)}
+    common = {key: value for key, value in last.data.items() if key not in ("modes", *ONE_STAGE)} | {"static": static}
     try:
         rows = load_cases.stage_rows(model.load_case, model.combination, common)
     except load_cases.UnsuitableError as error:

@@ -19,7 +19,6 @@ from pydantic import (
 )
 
 from ..errors import InputError
-from ..mechanics.section_shapes import SHAPES, SIZES, CrossSection, cross_section
 from .base import (
     FileName,
     Finite,
@@ -43,6 +42,7 @@ from .base import (
     refusal,
 )
 from .files import digest_of, profile_of
+from .section_shapes import SHAPES, SIZES, CrossSection, cross_section
 
 Indices = Annotated[tuple[NonNegativeInt, ...], listed]
 

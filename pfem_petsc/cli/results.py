@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ..errors import InputError, printable
-from ..post.crush import WINDOW
-from ..post.members import PER
-from ..post.options import Options, PlotOptions
+from ..post.options import PER, WINDOW, Options, PlotOptions
 from .parser import PROGRAM, Verb, argument, options_of, surviving
 
 if TYPE_CHECKING:
+    import numpy as np
     from mpi4py import MPI
 
     from ..output.result import Modes, Result
@@ -182,15 +180,20 @@ OF_MEMBERS = (
 
 def print_members(arguments: argparse.Namespace) -> int:
     """Print the table of members, and the names of files that are written."""
-    from ..post.members import draw_members, members
+    from ..output.result import open_result
+    from ..post.members import draw_members, members, unfinished
 
     if arguments.limit < 0:
         raise InputError(f"members: --limit {arguments.limit}: give a number of rows, or 0 for all")
     path = surviving(arguments.result)
     table = members(path, per=arguments.per, time=arguments.time, case=arguments.case, each_case=arguments.each_case)
     limit = arguments.limit or table.n_rows
-    print(printable(table.where(np.arange(min(limit, table.n_rows))).text()))
+    print(printable(table.text(limit)))
     print("in m, N and Pa; tension is positive; governing states are those of the snapshots")
+    with open_result(path) as result:
+        left = unfinished(result)
+    if left:
+        print(f"not computed to their ends, and left out: {', '.join(map(printable, left))}")
     if table.n_rows > limit:
         print(f"{table.n_rows - limit:,} more rows: --limit 0 prints all, --csv writes them")
     for name in ("csv", "parquet", "markdown"):
@@ -235,7 +238,7 @@ def print_crush(arguments: argparse.Namespace) -> int:
     for row in test.figures().rows:
         value, unit = row["value"], row["unit"]
         text = engineering(value, unit) if unit in ("Pa", "J", "J/m³", "J/kg") else f"{value:.6g} {unit}".rstrip()
-        print(f"{row['figure']:34}  {text if np.isfinite(value) else 'not reached'}")
+        print(f"{row['figure']:34}  {text if math.isfinite(value) else 'not reached'}")
     if arguments.csv is not None:
         print(test.table().to_csv(arguments.csv))
     if arguments.picture is not None:

@@ -325,6 +325,7 @@ class ExternalForce:
         self.wind = Wind(case, inertia.bars) if case.wind is not None else None
         if self.wind is not None and case.time is not None:
             self.state_forces.append(self.wind)
+        self._drag: np.ndarray | None = None  # of the wind of a load case, on the truss as it is at its start
         self._keeps = case.holds("load"), case.holds("gravity")
         self._loads = None if self._keeps[0] else NodalLoads(case, nodes, inertia.mesh)
         varies = case.gravity is not None and case.gravity.varies
@@ -396,7 +397,18 @@ class ExternalForce:
         self._add_loads(time, out)
         for force in self.state_forces:
             force.add(time, self._state, out)
+        if self._drag is not None:
+            out += time * self._drag
         return out
+
+    def take_drag(self, position: np.ndarray) -> None:
+        """Take the drag of the wind at positions (owned, 3) [m] at rest as a load, which grows with the load factor.
+        Collective."""
+        mesh = self.inertia.mesh
+        at_rest = ForceState(position, np.zeros_like(position), mesh.node_ids[: mesh.n_owned], self._nodes)
+        self._drag = np.zeros_like(position)
+        self.wind.add(0.0, at_rest, self._drag)
+        self.active = True
 
     def constant(self) -> np.ndarray | None:
         """(owned, 3) [N], which must not be changed, if the forces are the same at all times, else None."""

@@ -207,7 +207,9 @@ def stretches(block: BarBlock, bar: Bar, key: str, value: np.ndarray | float, wh
     except ValueError as error:
         unit = "N" if key == "pretension" else "Pa"
         given = f" = {value:g} {unit}" if np.ndim(value) == 0 else ""
-        raise InputError(f"{where}{given}: {error}") from error
+        slack = any(name == "slack" for name, _ in law.internal) and np.min(target) < 0.0
+        text = "bars of this law take no compression" if slack else str(error)
+        raise InputError(f"{where}{given}: {text}") from error
 
 
 def stretch_of(law: Law, measure: Callable, parameters: tuple[float, ...], target: float, as_force: bool) -> float:

@@ -139,9 +139,10 @@ class Table(Mapping[str, np.ndarray]):
     def __str__(self) -> str:
         return self._aligned(self._texts())
 
-    def text(self) -> str:
-        """Return all rows as text in columns."""
-        return self._aligned([list(self), *([_text(value) for value in row] for row in zip(*self.values()))])
+    def text(self, most: int | None = None) -> str:
+        """Return all rows, or the first ones, as text in columns."""
+        rows = itertools.islice(zip(*self.values(), strict=True), most)
+        return self._aligned([list(self), *([_text(value) for value in row] for row in rows)])
 
     def _aligned(self, lines: Sequence[Sequence[str]]) -> str:
         widths = [max(len(line[k]) for line in lines) for k in range(len(self))]

@@ -23,9 +23,7 @@ import numpy as np
 from ..errors import InputError
 from ..output.table import Table, selected
 from ..registry import nearest
-
-WINDOW = 0.01
-"""Width of the window of strain, unless given."""
+from .options import WINDOW
 
 _PLATEAU = (0.2, 0.4)
 _PLATEAU_END = 1.3
@@ -170,7 +168,10 @@ def _test(
     height = float(box[axis]) if height is None else height
     if not area > 0.0 or not height > 0.0:
         raise InputError("crush: the box around the mesh has no volume: give the area and the height of the block")
-    way, force = way[start:end], force[start:end]
+    way, force = way[start:end].copy(), force[start:end]
+    if force[0] == 0.0 and force[2] > force[1]:  # between two rows: where the line through the next two has no force
+        touch = way[1] - force[1] * (way[2] - way[1]) / (force[2] - force[1])
+        way[0] = min(max(touch, way[0]), way[1])
     # loading only: where the wall goes back, the way so far is kept
     strain = np.maximum.accumulate((way - way[0]) / height)
     kept = np.concatenate([[True], np.diff(strain) > 0.0])

@@ -24,12 +24,13 @@ import numpy as np
 from ..errors import InputError, written
 from ..output.table import Table
 from ..registry import nearest
-
-PER = ("member", "bar")
-"""What a row of the table may be."""
+from .options import PER
 
 _COLLINEAR = 1e-4
 """Largest sine of the angle between bars of a member."""
+
+_ROUNDING = 1e-9
+"""Relative difference of times that are equal."""
 
 _FORCE = "axial_force"
 
@@ -110,8 +111,7 @@ def truss_of(result: Any) -> Truss:
     stages = result.case.stages
     model = Model(stages[0], MPI.COMM_SELF, later=stages[1:])
     mesh, case, n = model.mesh, model.case, len(result.bars)
-    if mesh.n_bars > n:
-        raise InputError(f"the mesh of {case.source} has {mesh.n_bars} bars now, the result {n}")
+    _check_mesh(result, mesh)
     sections = list(case.section)
     values = {name: np.full(n, np.nan) for name in Bars._fields}
     values["section"] = np.full(n, -1)
@@ -133,8 +133,31 @@ def truss_of(result: Any) -> Truss:
     held = [model.nodes[table.node_set] for stage in stages for table in stage.support]
     for table in (*case.spring, *case.dashpot):
         held += [model.nodes[name] for name in (table.between or (table.node_set,))]
+    held += [model.nodes[name] for pair in case.contact_pair for name in (pair.first, pair.second)]
     nodes = np.unique(np.concatenate([np.empty(0, dtype=np.int64), *held]))
     return Truss(Bars(**values), mesh.node_ids[nodes], sections)
+
+
+def _check_mesh(result: Any, mesh: Any) -> None:
+    """Refuse a mesh that is not the one of a result.
+
+    Raises
+    ------
+    InputError
+        If nodes or bars differ.
+    """
+    ends, numbers = np.asarray(result.bars), mesh.node_ids[mesh.bars]
+    counts = (result.n_nodes, len(ends)), (mesh.n_nodes, mesh.n_bars)
+    same = counts[0] == counts[1] and bool((ends[mesh.bar_ids] == numbers).all())
+    if same and "displacement" in result.point_fields:
+        points = np.asarray(result.positions(0), dtype=float) - np.asarray(result.field("displacement", 0), dtype=float)
+        size = float(np.ptp(mesh.points, axis=0).max())
+        same = bool(np.abs(points[mesh.node_ids] - mesh.points).max() <= 1e-5 * size)
+    if not same:
+        raise InputError(
+            f"{result.path}: the mesh of its case is another one now (it had {counts[0][0]:,} nodes and "
+            f"{counts[0][1]:,} bars): the table of members reads it again; put it back, or run the case again"
+        )
 
 
 def find_members(points: np.ndarray, ends: np.ndarray, section: np.ndarray, held: np.ndarray) -> Members:
@@ -198,24 +221,48 @@ def instants_of(result: Any, time: float | None, case: str | None) -> list[Insta
     names = [stage.name for stage in stages]
     if case is not None and case not in names:
         raise InputError(f"{result.path}: there is no load case, combination or stage {case!r}{nearest(case, names)}")
-    number = np.zeros(len(times), dtype=int)
-    if stages:
-        ends = np.asarray(result.stage_ends)[1:]
-        number = np.minimum(np.searchsorted(ends, times * (1.0 - 1e-12)), len(stages) - 1)
+    if time is not None and not times[0] <= time <= times[-1] * (1.0 + _ROUNDING):
+        raise InputError(f"{result.path}: --time {time:g}: snapshots are from {times[0]:g} to {times[-1]:g}")
+    number, complete = _stage_of(result)
     found = [Instant(names[k] if names else "", i) for i, k in enumerate(number.tolist())]
-    if any(stage.starts_from is not None for stage in stages) and time is None:
-        # of each load case, the snapshot with all of its load
-        asked = [s.name for s in stages if s.name == case or (case is None and s.starts_from is not None)]
-        last = {each.case: each for each in found}
-        found = [last[name] for name in asked if name in last]
+    if stages:
+        # of a load case or a form, only the end is a state of the truss; before load cases is none, unless it is asked
+        of_cases = any(stage.starts_from is not None for stage in stages)
+        ends = [stage.starts_from is not None or _finds_form(stage) for stage in stages]
+        wanted = [stage.starts_from is not None or not of_cases or stage.name == case for stage in stages]
+        kept = [wanted[k] and (complete[i] or not ends[k]) for i, k in enumerate(number.tolist())]
+        found = [each for each, keep in zip(found, kept, strict=True) if keep]
+    elif _finds_form(result.case):
+        found = found[-1:]
     found = [each for each in found if case is None or each.case == case]
     if not found:
-        raise InputError(f"{result.path}: has no snapshots of {case or 'load cases'} yet")
-    if time is not None:
-        if not times[0] <= time <= times[-1] * (1.0 + 1e-12):
-            raise InputError(f"{result.path}: --time {time:g}: snapshots are from {times[0]:g} to {times[-1]:g}")
-        found = [min(found, key=lambda each: abs(times[each.snapshot] - time))]
-    return found
+        raise InputError(f"{result.path}: {case or 'no load case'} has not been computed to its end")
+    return found if time is None else [min(found, key=lambda each: abs(times[each.snapshot] - time))]
+
+
+def unfinished(result: Any) -> list[str]:
+    """Return the names of load cases and combinations that have not been computed to their ends."""
+    number, complete = _stage_of(result)
+    done = set(number[complete].tolist())
+    return [s.name for k, s in enumerate(result.case.stage) if s.starts_from is not None and k not in done]
+
+
+def _stage_of(result: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of the stage of each snapshot, and whether it is that of the end of the stage."""
+    times, stages = np.asarray(result.times), result.case.stage
+    if not stages:
+        return np.zeros(len(times), dtype=int), np.ones(len(times), dtype=bool)
+    begins = np.asarray(result.stage_ends)
+    number = np.clip(np.searchsorted(begins[1:], times * (1.0 - _ROUNDING)), 0, len(stages) - 1)
+    # a path ends where it ends; other analyses where the case says
+    planned = np.array([np.nan if stage.end is None else stage.end for stage in stages])[number]
+    made = times - begins[np.minimum(number, len(begins) - 1)]
+    return number, ~(made < planned * (1.0 - _ROUNDING)) & (made > 0.0)
+
+
+def _finds_form(stage: Any) -> bool:
+    """Whether an analysis finds a form, so that its start is no state of the truss."""
+    return stage.static is not None and stage.static.method == "force_density"
 
 
 class _Table:
@@ -239,13 +286,13 @@ class _Table:
             strength = members.most(np.abs(stress) / bars.strength)
             length = members.total(bars.length) * members.most(bars.factor)
             buckling = np.maximum(-least, 0.0) * length**2 / (np.pi**2 * members.least(bars.rigidity))
-        force = np.where(-least > most, least, most)
-        extreme, smallest = members.most(stress), members.least(stress)
-        stress = np.where(-least > most, smallest, extreme)
-        measure = np.fmax(strength, buckling)
-        measure = np.where(np.isnan(measure), np.abs(force), measure)
         # where compression governs by buckling, its force is the one to show
-        shown = np.where(np.nan_to_num(buckling, nan=-1.0) > np.nan_to_num(strength, nan=-1.0), least, force)
+        governs = np.nan_to_num(buckling, nan=-1.0) > np.nan_to_num(strength, nan=-1.0)
+        pushed = (-least > most) | governs
+        shown = np.where(pushed, least, most)
+        stress = np.where(pushed, members.least(stress), members.most(stress))
+        measure = np.fmax(strength, buckling)
+        measure = np.where(np.isnan(measure), np.abs(shown), measure)
         taken = measure > self.measure
         self.measure[taken], self.instant[taken] = measure[taken], number
         new = dict(zip(self.values, (shown, stress, strength, buckling), strict=True))
@@ -316,7 +363,8 @@ def _members(result: Any, per: str, instants: Sequence[Instant], each_case: bool
             table.add(k, np.asarray(result.field(_FORCE, instants[k].snapshot), dtype=float))
         tables.append(_columns(table, truss, result, instants))
     columns = {name: np.concatenate([each[name] for each in tables]) for name in tables[0]}
-    order = np.argsort(-columns.pop("measure"), kind="stable")
+    utilised = ~np.isnan(np.fmax(*(columns[name] for name in UTILISATIONS)))
+    order = np.lexsort([-columns.pop("measure"), ~utilised])
     return Table({name: values[order] for name, values in columns.items()})
 
 

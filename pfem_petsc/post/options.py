@@ -10,6 +10,11 @@ from typing import Any
 
 from ..errors import InputError
 
+PER = ("member", "bar")
+"""What a row of a table of members may be."""
+WINDOW = 0.01
+"""Window of strain of a crush test, unless one is given."""
+
 STYLES = ("auto", "tubes", "lines")
 VIDEOS = {
     "mp4": ("mp4",),

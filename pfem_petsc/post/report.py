@@ -197,11 +197,13 @@ def _load_cases(result: Any) -> str:
     cases = [stage for stage in result.case.stages if stage.starts_from is not None]
     if not cases or not len(result.times):
         return ""
-    from .members import instants_of
+    from .members import instants_of, unfinished
 
     start, history, lines = np.asarray(result.positions(0), dtype=float), result.history, []
     steps = np.asarray(history["step"])
-    for instant in instants_of(result, None, None):
+    left = unfinished(result)
+    missing = f"<p>Not computed to their ends: {html.escape(', '.join(left))}</p>" if left else ""
+    for instant in instants_of(result, None, None) if len(left) < len(cases) else ():
         moved = np.linalg.norm(result.positions(instant.snapshot) - start, axis=1)
         row = np.flatnonzero(steps == result.steps[instant.snapshot])
         force = np.asarray(history["support_force"])[row[-1]] if len(row) and "support_force" in history else ()
@@ -209,7 +211,7 @@ def _load_cases(result: Any) -> str:
         reaction = ", ".join(engineering(float(value) if abs(value) > least else 0.0, "N") for value in force)
         lines.append([instant.case, engineering(float(moved.max()), "m"), f"node {moved.argmax()}", reaction])
     head = ["load case or combination", "largest displacement", "", "force of the supports (x, y, z)"]
-    return _grid(head, lines)
+    return missing + (_grid(head, lines) if lines else "")
 
 
 _MOST_MEMBERS = 20

@@ -216,13 +216,22 @@ class Form:
             np.add.at(pull, near, density[:, None] * held[far] * self.x[far])
         right[:] = np.where(fixed, self.x[:owned], self.external + pull[:owned])
         alike = comm.allreduce(bool((fixed == fixed[:, :1]).all()), op=MPI.LAND)
+        # prescribed nodes at one hold all nodes at one, unless some hang on none
+        ones, to_held = held.copy(), np.zeros((mesh.n_local, 3))
+        for near, far in (mesh.bars.T, mesh.bars.T[::-1]):
+            np.add.at(to_held, near, density[:, None] * held[far])
+        ones[:owned] = np.where(fixed, 1.0, to_held[:owned])
+        hung = True
         for axes in ((0, 1, 2),) if alike else ((0,), (1,), (2,)):
             solver = self._factorised(density, held[:, axes[0]])
             try:
+                hung &= bool(np.all(np.abs(self._solved(solver, ones[:owned, axes[0]]) - 1.0) < _SOLVED))
                 for axis in axes:
                     self.x[:owned, axis] = self._solved(solver, right[:, axis])
             finally:
                 solver.destroy()
+        if not comm.allreduce(hung, op=MPI.LAND):
+            raise SimulationFailure(_SINGULAR)
         mesh.update_ghosts(self.x)
 
     def _solved(self, solver: PETSc.KSP, right: np.ndarray) -> np.ndarray:
@@ -276,9 +285,12 @@ class Form:
         return solver
 
 
+_SOLVED = 1e-4
+"""Error of a known solution beyond which the matrix of force densities is taken for singular."""
+
 _SINGULAR = (
-    "form finding: these force densities have no form: bars connect some nodes with no support, or tension and "
-    "compression cancel; add supports or correct the force densities"
+    "form finding: these force densities have no form: bars connect some nodes with no support along an axis, tension "
+    "and compression cancel, or bars with given forces shrink to points; add supports, or correct forces and densities"
 )
 
 

@@ -506,9 +506,10 @@ class StaticStepper(ImplicitStepper):
                 cause += ", or the friction of walls does not hold it"
         # smaller increments have been tried
         attempt = re.sub(rf"[.;] {re.escape(self.remedy)}", "", str(failure), flags=re.IGNORECASE)
+        of = f"load case {model.case.name!r}: " if model.case.starts_from is not None else ""
         return SimulationFailure(
-            f"no equilibrium found beyond load factor {self.state.time:.6g} with increments down to {smallest:.3g}: "
-            f"{cause}; {others}. The last attempt: {attempt}{free}"
+            f"{of}no equilibrium found beyond load factor {self.state.time:.6g} with increments down to "
+            f"{smallest:.3g}: {cause}; {others}. The last attempt: {attempt}{free}"
         )
 
     def _limit_point(self, size: float) -> str:
@@ -642,7 +643,7 @@ def _check(model: Model) -> None:
             f'{source}: spring: static.method = "{case.static.method}" does not support springs to the ground; '
             'use "newton", or bars to supported nodes as springs'
         )
-    if model.external.wind is not None and model.external.wind.fastest():
+    if model.external.wind is not None and case.starts_from is None and model.external.wind.fastest():
         raise InputError(
             f"{source}: wind: drag turns with the bars, which a static analysis does not follow; use [time] with "
             "damping, or the forces as [[load]]; a stage may have [stage.wind]"

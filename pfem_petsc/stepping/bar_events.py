@@ -53,6 +53,8 @@ def collapse_message(model: Model, found: Collapse, where: str, remedies: tuple[
         return f"{where}: the positions of {name} are not finite: the motion diverged; {remedies[0]}"
     how = f"collapsed to {length:.3g} m" if found.shortened else "gone through zero length"
     past = found.before[b] - found.before[a]
+    if not found.h or not rest:  # of equilibria, at one load factor
+        return f"{where}: {name} has {how}, from {rest:.3g} m: the load crushes it, or bars pass through each other"
     speed = float(np.linalg.norm(way - past)) / found.h
     block = next(block for block in model.bars.blocks if block.start <= bar < block.stop)
     wave = float(np.sqrt(block.modulus / block.density)) if block.density else model.wave_speed

@@ -197,6 +197,8 @@ class Model:
         self.supports.hold(start.position)
         active = self.comm.allreduce(bool(start.force.any()) or bool(start.gravity.any()), op=MPI.LOR)
         self.external.hold(start.force, start.gravity, start.wind, active)
+        if self.case.starts_from is not None and self.case.wind is not None:
+            self.external.take_drag(start.position)
         if self.case.holds("wall"):
             self.contact.motion.held = np.array(start.walls).reshape(-1, 3)
 

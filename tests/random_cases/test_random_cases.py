@@ -125,8 +125,9 @@ def test_generator_draws_all_of_what_is_documented():
     assert keys >= {"velocity", "motion", "mass", "gravity", "adjust", "tied"}
     assert keys >= {"friction", "static_friction", "restitution"}
     times = [table["time"] for table in tables]
-    assert len({time["integrator"] for time in times}) == 9
-    assert {key for time in times for key in time} >= {"mass", "beta", "gamma", "theta", "rho_b", "rho_inf", "safety"}
+    assert len({time["integrator"] for time in times}) == 11
+    keys = {key for time in times for key in time}
+    assert keys >= {"mass", "beta", "gamma", "theta", "rho_b", "rho_inf", "alpha", "safety"}
     assert {table.get("contact", {}).get("treatment") for table in tables} >= {
         "scheme", "stick", "conserving", "mass_redistribution",
     }  # fmt: skip

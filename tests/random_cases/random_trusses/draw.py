@@ -691,7 +691,9 @@ def _parameters(chance: random.Random, name: str) -> dict[str, Any]:
         return {"theta": chance.choice((1.5, 1.6, 2.0, chance.uniform(1.37, 2.2)))}
     if name == "generalized_alpha":
         rho = chance.uniform(0.0, 1.0)
-        return {"integrator": "hht_alpha", "alpha": (rho - 1.0) / (rho + 1.0)} if rho > 0.6 else {"rho_inf": rho}
+        if rho > 0.6:
+            return {"integrator": "hht_alpha", "alpha": (rho - 1.0) / (rho + 1.0)}
+        return {"rho_inf": rho} if rho > 0.2 else {"integrator": "bathe", "rho_inf": 5.0 * rho}
     if name == "chung_lee":
         return {"beta": chance.uniform(1.0, 28.0 / 27.0)}
     if name == "hulbert_chung":

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case
+from pfem_petsc.case.section_shapes import cross_section
 from pfem_petsc.errors import InputError
-from pfem_petsc.mechanics.section_shapes import cross_section
 
 
 def test_circles():

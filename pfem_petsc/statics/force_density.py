@@ -278,9 +278,9 @@ class Form:
             solver.getPC().setType("gamg")
             solver.setTolerances(rtol=1e-12, max_it=1000)
         else:
+            # on every rank the whole, as MUMPS repeats to rounding only
             solver.setType("preonly")
-            solver.getPC().setType("lu")
-            solver.getPC().setFactorSolverType("mumps")
+            solver.getPC().setType("lu" if comm.size == 1 else "redundant")
         matrix.destroy()
         return solver
 

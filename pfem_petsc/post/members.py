@@ -236,7 +236,8 @@ def instants_of(result: Any, time: float | None, case: str | None) -> list[Insta
         found = found[-1:]
     found = [each for each in found if case is None or each.case == case]
     if not found:
-        raise InputError(f"{result.path}: {case or 'no load case'} has not been computed to its end")
+        what = "no load case has" if case is None else f"{case!r} has not"
+        raise InputError(f"{result.path}: {what} been computed to its end")
     return found if time is None else [min(found, key=lambda each: abs(times[each.snapshot] - time))]
 
 
@@ -352,10 +353,10 @@ def _members(result: Any, per: str, instants: Sequence[Instant], each_case: bool
         )
     truss = truss_of(result)
     found = _found(result, truss, per)
-    groups = [[k] for k in range(len(instants))]
-    names = [instant.case for instant in instants]
-    groups = [[k for k, each in enumerate(names) if each == name] for name in dict.fromkeys(names)]
-    groups = groups if each_case else [list(range(len(instants)))]
+    groups = [list(range(len(instants)))]
+    if each_case:
+        names = [instant.case for instant in instants]
+        groups = [[k for k, each in enumerate(names) if each == name] for name in dict.fromkeys(names)]
     tables = []
     for group in groups:
         table = _Table(truss, found)

@@ -14,6 +14,7 @@ from ..errors import InputError, SimulationFailure
 from ..mechanics.elements import bar_lengths
 from ..mechanics.motion import Table
 from ..mechanics.rest_lengths import bar_of, stretches
+from ..parallel.agreement import agreed
 from ..stepping.stepper import Solution
 from .stepper import StaticStepper
 
@@ -74,7 +75,8 @@ class ForceDensityStepper(StaticStepper):
     def __init__(self, model: Model, choice: LinearChoice, parameters: ForceDensityKeys) -> None:
         _check(model)
         super().__init__(model, choice, parameters)
-        Prescribed(model, 0.0)  # refuses what is missing before the run
+        with agreed(model.comm):
+            Prescribed(model, 0.0)  # refuses what is missing before the run
         self.parameters, self.guard, self.solves, self._found = parameters, None, 0, ""
         model.rest_lengths.varying = True  # the form changes them, which does work
 
@@ -119,14 +121,15 @@ class ForceDensityStepper(StaticStepper):
         bar_lengths(x, model.bars.ends, length)
         force = np.where(np.isnan(given.force), given.density * length, given.force)
         rest = length.copy()
-        try:
-            for block in model.bars.blocks:
-                part, section = slice(block.start, block.stop), case.section[block.section]
-                most, least = force[part].max(), force[part].min()
-                where = f"{case.source}: section.{block.section}: forces of {least:g} to {most:g} N"
-                rest[part] /= stretches(block, bar_of(case, section), "pretension", force[part], where)
-        except InputError as error:
-            raise SimulationFailure(str(error)) from error
+        with agreed(model.comm):
+            try:
+                for block in model.bars.blocks:
+                    part, section = slice(block.start, block.stop), case.section[block.section]
+                    most, least = force[part].max(), force[part].min()
+                    where = f"{case.source}: section.{block.section}: forces of {least:g} to {most:g} N"
+                    rest[part] /= stretches(block, bar_of(case, section), "pretension", force[part], where)
+            except InputError as error:
+                raise SimulationFailure(str(error)) from error
         self._keep_rest(rest)
 
     def _keep_rest(self, rest: np.ndarray) -> None:

@@ -185,13 +185,12 @@ def print_members(arguments: argparse.Namespace) -> int:
 
     if arguments.limit < 0:
         raise InputError(f"members: --limit {arguments.limit}: give a number of rows, or 0 for all")
-    path = surviving(arguments.result)
-    table = members(path, per=arguments.per, time=arguments.time, case=arguments.case, each_case=arguments.each_case)
+    options = {name: getattr(arguments, name) for name in ("per", "time", "case", "each_case")}
+    with open_result(surviving(arguments.result)) as result:
+        table, left = members(result, **options), unfinished(result)
     limit = arguments.limit or table.n_rows
     print(printable(table.text(limit)))
     print("in m, N and Pa; tension is positive; governing states are those of the snapshots")
-    with open_result(path) as result:
-        left = unfinished(result)
     if left:
         print(f"not computed to their ends, and left out: {', '.join(map(printable, left))}")
     if table.n_rows > limit:
@@ -202,7 +201,7 @@ def print_members(arguments: argparse.Namespace) -> int:
             getattr(table, f"to_{name}")(file)
             print(file)
     if arguments.picture is not None:
-        print(draw_members(path, table, arguments.picture))
+        print(draw_members(result, table, arguments.picture))
     return 0
 
 

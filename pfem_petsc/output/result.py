@@ -388,7 +388,7 @@ class Result:
         )
 
 
-def _impulse(history: Any, column: str) -> np.ndarray | None:
+def impulse_of(history: Any, column: str) -> np.ndarray | None:
     """Return the impulse (rows, 3) [N s] of a column of forces, None where the result has none."""
     names = [f"{column.removesuffix('force')}{kind}" for kind in ("impulse", "jump_impulse")]
     if "load_factor" in history or names[0] not in history:
@@ -406,7 +406,7 @@ def peak_force(result: Any, column: str) -> tuple[float, float, float]:
     """
     history = result.history
     time, force = history["time"], history[column]
-    impulse = _impulse(history, column)
+    impulse = impulse_of(history, column)
     window = 2.0 * float(result.attributes.get(f"wave_time/{column}", 0.0))
     if impulse is None or not 0.0 < window < np.inf or len(time) < 2:
         size = np.linalg.norm(force, axis=1)
@@ -429,7 +429,7 @@ def touch_impulse(result: Any, wall: str) -> tuple[float, float]:
     the impulse that stops nodes, which no mean force of a row shows.
     """
     history = result.history
-    impulse = _impulse(history, f"wall/{wall}/force")
+    impulse = impulse_of(history, f"wall/{wall}/force")
     if impulse is None or len(impulse) < 2:
         return 0.0, 0.0
     changes = np.diff(impulse, axis=0)

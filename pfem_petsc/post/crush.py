@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import InputError
+from ..output.result import impulse_of
 from ..output.table import Table, selected
 from ..registry import nearest
 from .options import WINDOW
@@ -215,10 +216,9 @@ def _way(result: Any, wall: str, displacement: str | None) -> tuple[np.ndarray, 
 def _mean_forces(history: Any, wall: str) -> np.ndarray:
     """Return the force (rows, 3) [N] of a wall: its impulse over the time of a row where there is one."""
     force = np.asarray(history[f"wall/{wall}/force"], dtype=float)
-    names = [f"wall/{wall}/{kind}" for kind in ("impulse", "jump_impulse")]
-    if "load_factor" in history or names[0] not in history or len(force) < 2:
+    impulse = impulse_of(history, f"wall/{wall}/force")
+    if impulse is None or len(force) < 2:
         return force
-    impulse = sum(np.asarray(history[name], dtype=float) for name in names if name in history)
     time = np.asarray(history["time"], dtype=float)
     mean = np.diff(impulse, axis=0) / np.diff(time)[:, None]
     # at a row, the mean of the intervals beside it

@@ -79,13 +79,6 @@ class Members(NamedTuple):
         """The sum (members,) over the bars of each member."""
         return np.add.reduceat(values[self.bars], self.first)
 
-    def spread(self, values: np.ndarray) -> np.ndarray:
-        """Values (members,) for each bar (bars,), in the order of the mesh."""
-        counts = np.diff([*self.first, len(self.bars)])
-        out = np.empty(len(self.bars), dtype=values.dtype)
-        out[self.bars] = np.repeat(values, counts)
-        return out
-
 
 class Truss(NamedTuple):
     """What members need of the model of a result: its bars, and nodes at which members end."""

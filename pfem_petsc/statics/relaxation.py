@@ -448,10 +448,8 @@ class RelaxationStepper(StaticStepper):
         motion, most = self.motion, self.parameters.max_iterations
         size, node = largest_at_node(self.model.mesh, motion.residual)
         where = self.at(self.state.step + 1, motion.time)
-        case = self.model.case
-        of = f"load case {case.name!r}: " if case.starts_from is not None else ""
         return SimulationFailure(
-            f"{of}{where}: relaxation has not converged in {most} pseudo-steps: residual "
+            f"{self.of_case}{where}: relaxation has not converged in {most} pseudo-steps: residual "
             f"{motion.norm:.3g} N, required {self.parameters.tolerance * motion.load:.3g} N; worst at node {node} "
             f"({size:.3g} N). Increase static.max_iterations or static.tolerance; if the residual does not fall, "
             "nothing balances the load there"

@@ -113,6 +113,12 @@ class StaticStepper(ImplicitStepper):
         return self.state.time
 
     @property
+    def of_case(self) -> str:
+        """Beginning of a message about a load case, which names it; empty for others."""
+        case = self.model.case
+        return f"load case {case.name!r}: " if case.starts_from is not None else ""
+
+    @property
     def done(self) -> bool:
         """Whether the last load factor is reached."""
         return self.state.time >= self.end * (1.0 - TIME)
@@ -506,9 +512,8 @@ class StaticStepper(ImplicitStepper):
                 cause += ", or the friction of walls does not hold it"
         # smaller increments have been tried
         attempt = re.sub(rf"[.;] {re.escape(self.remedy)}", "", str(failure), flags=re.IGNORECASE)
-        of = f"load case {model.case.name!r}: " if model.case.starts_from is not None else ""
         return SimulationFailure(
-            f"{of}no equilibrium found beyond load factor {self.state.time:.6g} with increments down to "
+            f"{self.of_case}no equilibrium found beyond load factor {self.state.time:.6g} with increments down to "
             f"{smallest:.3g}: {cause}; {others}. The last attempt: {attempt}{free}"
         )
 

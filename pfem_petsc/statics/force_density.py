@@ -214,21 +214,15 @@ class Form:
         held[:owned] = fixed
         mesh.update_ghosts(held)
         # bars to prescribed nodes pull with their positions
-        right, pull = np.empty((owned, 3)), np.zeros((mesh.n_local, 3))
-        for near, far in (mesh.bars.T, mesh.bars.T[::-1]):
-            np.add.at(pull, near, density[:, None] * held[far] * self.x[far])
-        right[:] = np.where(fixed, self.x[:owned], self.external + pull[:owned])
+        right = np.where(fixed, self.x[:owned], self.external + self._pull(density, held * self.x))
         alike = comm.allreduce(bool((fixed == fixed[:, :1]).all()), op=MPI.LAND)
         # prescribed nodes at one hold all nodes at one, unless some hang on none
-        ones, to_held = held.copy(), np.zeros((mesh.n_local, 3))
-        for near, far in (mesh.bars.T, mesh.bars.T[::-1]):
-            np.add.at(to_held, near, density[:, None] * held[far])
-        ones[:owned] = np.where(fixed, 1.0, to_held[:owned])
+        ones = np.where(fixed, 1.0, self._pull(density, held))
         hung = True
         for axes in ((0, 1, 2),) if alike else ((0,), (1,), (2,)):
             solver = self._factorised(density, held[:, axes[0]])
             try:
-                hung &= bool(np.all(np.abs(self._solved(solver, ones[:owned, axes[0]]) - 1.0) < _SOLVED))
+                hung &= bool(np.all(np.abs(self._solved(solver, ones[:, axes[0]]) - 1.0) < _SOLVED))
                 for axis in axes:
                     self.x[:owned, axis] = self._solved(solver, right[:, axis])
             finally:
@@ -236,6 +230,15 @@ class Form:
         if not comm.allreduce(hung, op=MPI.LAND):
             raise SimulationFailure(_SINGULAR)
         mesh.update_ghosts(self.x)
+
+    def _pull(self, density: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the sums (owned, 3) over the bars of a node of their densities (b,) times values (local, 3) at their
+        other ends."""
+        mesh = self.model.mesh
+        out = np.zeros((mesh.n_local, 3))
+        for near, far in (mesh.bars.T, mesh.bars.T[::-1]):
+            np.add.at(out, near, density[:, None] * values[far])
+        return out[: mesh.n_owned]
 
     def _solved(self, solver: PETSc.KSP, right: np.ndarray) -> np.ndarray:
         """Return the solution (owned,) for a right side. Collective."""

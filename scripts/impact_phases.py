@@ -61,7 +61,7 @@ COLUMNS = {
     )
 }
 REBOUNDS = {f"e = {e:g}": ("scheme", "lumped", e) for e in (0.2, 0.5, 0.8, 0.9, 1.0)}
-EXPLICIT = "central_differences", "chung_lee", "hulbert_chung", "souza_moura"
+EXPLICIT = "central_differences", "chung_lee", "hulbert_chung", "souza_moura", "noh_bathe"
 STEPS = 0.2, 1.0, 5.0, 20.0
 """Steps relative to the explicit limit of the lumped rod; explicit schemes use 0.2 and 0.9 of their own limit."""
 SCHEMES = (
@@ -72,12 +72,15 @@ SCHEMES = (
     ("hulbert_chung", {"rho_b": 0.8}),
     ("hulbert_chung", {"rho_b": 1.0}),
     ("souza_moura", {}),
+    ("noh_bathe", {"p": 0.54}),
     ("newmark", {"beta": 1.0, "gamma": 1.5}),
     ("newmark", {"beta": 0.25, "gamma": 0.5}),
     ("newmark", {"beta": 0.3025, "gamma": 0.6}),
     ("houbolt", {}),
     *(("wilson", {"theta": theta}) for theta in (1.4, 1.5, 1.6, 1.8, 2.0)),
     *(("generalized_alpha", {"rho_inf": rho}) for rho in (0.0, 0.5, 0.8, 1.0)),
+    *(("hht_alpha", {"alpha": alpha}) for alpha in (-0.05, -1.0 / 3.0)),
+    *(("bathe", {"rho_inf": rho}) for rho in (0.0, 0.8)),
     ("energy_momentum", {}),
 )
 
@@ -218,10 +221,10 @@ def cell(found: Impacts | None) -> str:
     return f"{found.largest.max():.3f}, {found.last.max():.3f}, {max(releases, 0)}, {found.force.max():.2f}{star}"
 
 
-def refused(scheme: Scheme, treatment: str) -> bool:
-    """Return whether a treatment refuses a scheme."""
+def refused(scheme: Scheme, treatment: str, restitution: float = 0.0) -> bool:
+    """Return whether a scheme cannot have a treatment or restitution."""
     if treatment == "scheme":
-        return False
+        return bool(restitution) and scheme.solves_next_position and not scheme.leapfrog
     return lookup("pfem_petsc.contact.treatments", treatment, "").Treatment.refuses(scheme) is not None
 
 
@@ -232,7 +235,7 @@ def judged(
     module = lookup("pfem_petsc.integrators", integrator, "")
     known = module.Parameters(**parameters)
     scheme = module.Scheme(known)
-    if refused(scheme, treatment):
+    if refused(scheme, treatment, restitution):
         return None
     impact = RodImpact(treatment, mass == "consistent", step, restitution)
     found = scan_impacts(scheme, impact)
@@ -259,6 +262,7 @@ GAINS = {
     "chung_lee": [{"beta": beta} for beta in (1.0, 1.02, 28.0 / 27.0)],
     "hulbert_chung": [{"rho_b": rho} for rho in (0.0, 0.5, 0.8, 1.0)],
     "souza_moura": [{}],
+    "noh_bathe": [{"p": p} for p in (0.54, 0.7)],
     "newmark": [
         {"beta": beta, "gamma": gamma}
         for beta, gamma in (
@@ -302,6 +306,8 @@ def _fill_gains(gains: np.ndarray, module: ModuleType, parameters: Any, treatmen
     for of_bars, restitution in zip(gains, RESTITUTIONS if bounces else RESTITUTIONS[:1], strict=False):
         for of_steps, bars in zip(of_bars, BARS, strict=True):
             for k, step in enumerate(GAIN_STEPS):
+                if refused(module.Scheme(parameters), treatment, restitution):
+                    break
                 impact = RodImpact(treatment, consistent, step, restitution, bars)
                 gain = scan_impacts(module.Scheme(parameters), impact).gain
                 of_steps[k] = gain if gain < 6e4 else np.inf

@@ -86,9 +86,11 @@ class _Rods:
         # for rods that hit the wall in the last step, if restitution bounds the next position; see rebound_way
         self.square, self.arrival = np.zeros(phases), np.zeros(phases)
         self._inverse: tuple[float, np.ndarray] | None = None
-        scheme.start(self.state, step)
+        self.h = scheme.substeps[-1][0] * step  # the start is the end of a step
+        scheme.start(self.state, self.h)
         if scheme.solves_next_position:
             self._solve()
+        self.h = step
 
     def rods(self, values: np.ndarray) -> np.ndarray:
         """Return a (phases, nodes) view of an array of the state."""

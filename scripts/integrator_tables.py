@@ -19,7 +19,11 @@ from pfem_petsc.registry import lookup
 
 DOCUMENT = DOCS / "integrators.md"
 SHARES = (0.05, 0.1, 0.2)  # h/T
-MEMORY = {"central_differences": ("half_velocity",), "houbolt": ("d0", "d1")}
+MEMORY = {
+    "central_differences": ("half_velocity",),
+    "houbolt": ("d0", "d1"),
+    "noh_bathe": ("half_velocity", "first_known"),
+}
 
 
 class Row(NamedTuple):
@@ -37,6 +41,8 @@ ROWS = (
     Row("`hulbert_chung`, ρ_b = 0", "hulbert_chung", {"rho_b": 0.0}),
     Row("`souza_moura` (stand-in: `hulbert_chung`, ρ_b = 0.3)", "souza_moura", {}),
     Row("`hulbert_chung`, ρ_b = 0.8", "hulbert_chung", {"rho_b": 0.8}),
+    Row("`noh_bathe`, p = 0.54 (two balances a step)", "noh_bathe", {"p": 0.54}),
+    Row("`noh_bathe`, p = 0.7 (two balances a step)", "noh_bathe", {"p": 0.7}),
     Row("`newmark`, β = 1, γ = 3/2 (Hu)", "newmark", {"beta": 1.0, "gamma": 1.5}),
     Row("`newmark`, β = 1/4, γ = 1/2", "newmark", {"beta": 0.25, "gamma": 0.5}),
     Row("`houbolt`", "houbolt", {}),

@@ -25,9 +25,10 @@ from pfem_petsc.errors import InputError
 
 START, END = "<!-- table: scripts/moving_walls.py -->\n", "<!-- end of moving walls -->"
 SCHEMES = (
-    *(("central_differences", {}), ("chung_lee", {}), ("hulbert_chung", {}), ("souza_moura", {})),
+    *(("central_differences", {}), ("chung_lee", {}), ("hulbert_chung", {}), ("souza_moura", {}), ("noh_bathe", {})),
     *(("newmark", {}), ("newmark", {"beta": 0.25, "gamma": 0.5}), ("houbolt", {})),
-    *(("wilson", {"theta": 1.4}), ("wilson", {"theta": 2.0}), ("generalized_alpha", {}), ("energy_momentum", {})),
+    *(("wilson", {"theta": 1.4}), ("wilson", {"theta": 2.0}), ("generalized_alpha", {})),
+    *(("hht_alpha", {}), ("bathe", {}), ("energy_momentum", {})),
 )
 TREATMENTS = "scheme", "stick", "conserving", "mass_redistribution"
 RESTITUTIONS = 0.0, 0.5, 1.0

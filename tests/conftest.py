@@ -5,8 +5,8 @@ tear-down), so a failure on one rank is a failure on all, with that rank's repor
 others, for example because an exception ended a collective call on one of them, reports this and ends the run. Only
 rank 0 prints.
 
-Of tests that take long or have many sets of parameters a part is run, and those marked ``thorough`` are left out;
-``--all-sets`` runs everything.
+Of the slow tests a part is run, another one after each commit (``--part``), of tests with many sets of parameters some,
+and those marked ``thorough`` are left out; ``--all-sets`` runs everything.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.launch import OF_A_LAUNCH, environment, refuse_repeated_names, thinned
+from helpers.launch import OF_A_LAUNCH, PARTS, environment, part_of_commit, refuse_repeated_names, thinned
 from hypothesis import settings
 
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -54,13 +54,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--all-sets",
         action="store_true",
-        help="all sets of parameters of each test, and the tests marked thorough",
+        help="all sets of parameters of each test, all slow tests, and the tests marked thorough",
+    )
+    parser.addoption(
+        "--part",
+        type=int,
+        choices=range(PARTS),
+        help="part of the slow tests that is run; by default another one after each commit",
     )
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_configure(config: pytest.Config) -> None:
     refuse_repeated_names(Path(__file__).parent)
+    if config.option.part is None:
+        config.option.part = part_of_commit(Path(__file__).parent)
     if AGREEMENT is not None:
         # A folder of its own for each rank: pytest's numbered ones are claimed by several at once.
         config.option.basetemp = tempfile.mkdtemp(prefix=f"pytest-rank{WORLD.rank}-")
@@ -75,8 +83,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         terminal._tw._file = open(os.devnull, "w")  # noqa: SIM115 - open for as long as the process lives
 
 
-def pytest_report_header() -> str:
-    return f"ranks: {WORLD.size}"
+def pytest_report_header(config: pytest.Config) -> str:
+    which = "all tests" if config.option.all_sets else f"slow tests: those of --part {config.option.part}"
+    return f"ranks: {WORLD.size}, {which}"
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
@@ -91,7 +100,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         kept = [item for item in items if item.get_closest_marker("parallel") is not None]
     # tests that are asked for by name are run, all of them
     if not config.option.all_sets and not any("::" in word for word in config.args):
-        kept = thinned(kept, WORLD.size)
+        kept = thinned(kept, WORLD.size, config.option.part)
     chosen = set(kept)
     config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
     items[:] = kept

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from helpers.launch import refuse_repeated_names, thinned
+from helpers.launch import PARTS, refuse_repeated_names, thinned
 
 
 def test_files_of_one_name_are_refused(tmp_path):
@@ -33,7 +33,7 @@ class Item:
         return name if name in self.marks else None
 
 
-def test_marking_tests_slow_does_not_change_which_sets_run():
+def test_sets_and_parts_that_run():
     for marks, ranks, kept in (
         ((), 1, [0, 10, 20, 30, 40]),
         (("slow",), 1, [0, 10, 20, 30, 40]),
@@ -43,4 +43,6 @@ def test_marking_tests_slow_does_not_change_which_sets_run():
         (("thorough",), 1, []),
     ):
         items = [Item(number, *marks) for number in range(42)]
-        assert [item.number for item in thinned(items, ranks)] == kept
+        parts = [[item.number for item in thinned(items, ranks, part)] for part in range(PARTS)]
+        # a slow test is in one of the parts, others are in all
+        assert sorted(parts) == (PARTS * [kept] if "slow" not in marks else [*(PARTS - 1) * [[]], kept])

@@ -124,6 +124,7 @@ def climbing(package: Path) -> list[str]:
     return wrong
 
 
+@pytest.mark.slow
 def test_no_import_climbs():
     assert climbing(PACKAGE) == []
 

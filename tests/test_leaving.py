@@ -20,6 +20,7 @@ def generate(parameters):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "status"), [("rod_impact", 0), ("nothing", 2)])
 def test_all_that_is_due_at_exit_is_done(case, status, tmp_path):
     """What others have registered, then the log of PETSc; into a pipe, which is written when the program ends."""
@@ -31,6 +32,7 @@ def test_all_that_is_due_at_exit_is_done(case, status, tmp_path):
         assert done.stdout.index("the last words") < done.stdout.index("PETSc Performance Summary")
 
 
+@pytest.mark.slow
 def test_process_does_not_leave_early_after_a_failure_or_with_open_files(tmp_path, monkeypatch):
     left = []
     monkeypatch.setattr(os, "_exit", left.append)

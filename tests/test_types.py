@@ -37,6 +37,7 @@ def untyped(node: ast.AST) -> Iterator[str]:
         yield from untyped(child)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", ["pfem_petsc", "scripts"])
 def test_functions_are_typed(folder):
     files = sorted((ROOT / folder).rglob("*.py"))

@@ -568,6 +568,13 @@ class Bars:
             if self.step > 0.0:
                 self.put_parameters(block, (*block.parameters[:-1], eta * self.step))
 
+    def extrapolate_rates(self, ratio: float) -> None:
+        """Extrapolate the strain rates of viscous bars from the last two steps, whose sizes have this ratio, and those
+        of the steps before the inverse one."""
+        for block in self.viscous_blocks:
+            self.put_parameters(block, (*block.parameters[:-1], 1.0 + ratio / (1.0 + ratio)))
+            block.put_row(block.law.known_rate, ratio * block.row(block.law.known_rate))
+
     @contextmanager
     def at_step(self, step: float, eta: float) -> Iterator[None]:
         """Evaluate bars with another ``step``, viscous ones with ``eta`` as in :meth:`set_rates`."""

@@ -170,16 +170,6 @@ class ImplicitStepper(Stepper):
         self.leave()
         state.step += 1
 
-    def _make_substeps(self, end: float) -> None:
-        """Advance by ``part`` to a time [s], balance by balance of the scheme."""
-        begun, part = self.state.time, self.part
-        try:
-            for share, place in self.scheme.substeps:
-                self.part = share * part
-                self._make_part(end if place == 1.0 else begun + place * part)
-        finally:
-            self.part = part
-
     def _set_part(self, part: float) -> None:
         if part != self.part:
             self.scheme.step_changed(self.state)

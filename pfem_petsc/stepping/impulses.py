@@ -122,7 +122,7 @@ class Impulses:
 
     def start(self, totals: np.ndarray) -> None:
         """Initialise from this rank's sums (3, 3) of support, external and damping force at the start [N]."""
-        scheme, h = self.stepper.scheme, self.stepper.part
+        scheme, h = self.stepper.scheme, self.stepper.part_before_start
         self.state.a = self.forces(totals, self.stepper.walls_at_start, self.stepper.links_at_start).copy()
         scheme.start(self.state, h)
 
@@ -133,17 +133,18 @@ class Impulses:
         self.force[WALLS + self.n_walls : self.jumps] = links
         return self.force
 
-    def step(self, totals: np.ndarray) -> None:
-        """Add the forces of the last balance; ``totals`` (3, 3) are support, external and damping force [N]."""
+    def step(self, totals: np.ndarray, part: float) -> None:
+        """Add the forces of the last balance, after a substep of size ``part`` [s]; ``totals`` (3, 3) are support,
+        external and damping force [N]."""
         stepper, state = self.stepper, self.state
         walls = stepper.solution.walls.force
         self._before = self._of_walls()
         if stepper.step_changed:
             stepper.scheme.step_changed(state)
-        balance = stepper.scheme.balance(state, stepper.part)
+        balance = stepper.scheme.balance(state, part)
         load = self.forces(totals, walls, self.links.totals())
         u = (load if balance.a_hat is None else load - balance.a_hat) / balance.alpha
-        stepper.scheme.finish(state, balance, u, stepper.part)
+        stepper.scheme.finish(state, balance, u, part)
         for name, change in stepper.prescribed.change.items():
             particles = getattr(state, name) if name in ("v", "a") else state.memory[name]
             particles[SUPPORT] += change
@@ -209,7 +210,7 @@ class NoImpulses(Impulses):
     def start(self, totals: np.ndarray) -> None:
         """Nothing."""
 
-    def step(self, totals: np.ndarray) -> None:
+    def step(self, totals: np.ndarray, part: float) -> None:
         """Take the forces of walls before and after the step."""
         before, self._last = self._last, self.stepper.solution.walls.force.copy()
         self._mean = 0.5 * (before + self._last)

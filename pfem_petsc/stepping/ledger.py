@@ -250,7 +250,7 @@ class Ledger:
         if stepper.totals_at_start is not None:
             self.impulses.start(stepper.totals_at_start)
             if stepper.scheme.solves_next_position:
-                self.impulses.step(stepper.totals_solved)
+                self.impulses.step(stepper.totals_solved, stepper.part_before_start)
                 self.impulses.state.v[:] = 0.0  # like the nodal velocities, which have not jumped yet
                 self._pending = [self._impact(self._before, started=True), stepper.solution.walls.friction]
                 # damping treats nodes that walls stop at the start as already stopped
@@ -268,7 +268,7 @@ class Ledger:
             after, jumped = self._before_jump(after)
         first, second = (before, after) if stepper.scheme.balance_at_endpoints else 2 * (balanced(stepper, before),)
         works = self._works(0.5 * (stepper.state.position - stepper.before[:owned]), first, second)
-        self.impulses.step(self._sum_state(present, second))
+        self.impulses.step(self._sum_state(present, second), stepper.part)
         if jump is not None:
             self.impulses.jump()
         stepper.step_changed = False

@@ -18,7 +18,6 @@ from ..contact.node_walls import WallForces
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy, release
-from ..mechanics.materials.base import EXTRAPOLATED
 from ..output.units import LOAD_FACTOR, Axis
 from ..output.units import TIME as AXIS
 from ..tolerances import BEYOND, ON_BOUND, TIME
@@ -119,8 +118,9 @@ class PrescribedMotion:
             supports.put(array, values)
         self._restart()
         if self.stepper.scheme.solves_next_position:
-            way = supports.positions(self.stepper.balance.time) - supports.positions(time)
-            supports.put(state.memory["half_velocity"], way / self.stepper.part)
+            end = self.stepper.balance.time
+            way = supports.positions(end) - supports.positions(time)
+            supports.put(state.memory["half_velocity"], way / (end - time))
         ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
         made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
         self.change = {}  # the scheme may have no memory at the end of this balance
@@ -333,12 +333,14 @@ class Stepper(ABC):
         self.totals_at_start = self.totals()
         self.walls_at_start = self.solution.walls.force
         self.links_at_start = model.links.totals()
-        self.scheme.start(state, self.h)
+        self.part = self.part_before_start
+        self.scheme.start(state, self.part)
         if model.bars.viscous and self.scheme.solves_next_position:  # the rate half a step before, to extrapolate from
             half = self.on_all(state.memory["half_velocity"])
-            model.bars.set_rates(state.x, state.x - (0.5 * self.h) * half, (1.0 - EXTRAPOLATED) * half, 0.0)
+            before = self.part / (self.part + self.scheme.substeps[0][0] * self.h)
+            model.bars.set_rates(state.x, state.x - (0.5 * self.part) * half, -before * half, 0.0)
         bodies = model.contact.motion.bodies
-        bodies.start(self.h)
+        bodies.start(self.part)
         if self.scheme.solves_next_position:
             v, speeds = state.v, bodies.state.v
             for phase in (self._set_balance, self._solve_balance, self._finish):
@@ -349,6 +351,12 @@ class Stepper(ABC):
             # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
             state.v = v
             bodies.state.v = speeds
+        self.part = self.h
+
+    @property
+    def part_before_start(self) -> float:
+        """Size of a substep that ends where the first step starts [s]."""
+        return self.scheme.substeps[-1][0] * self.h
 
     def start_without_motion(self) -> None:
         """Initialise positions, internal forces and loads at time zero, where nothing moves. Collective."""
@@ -484,9 +492,23 @@ class Stepper(ABC):
 
     def step(self) -> None:
         """Advance from t_n to t_{n+1}; the state is complete at both. Collective if the solve is."""
-        self._make_part((self.state.step + 1) * self.h)
+        self._make_substeps((self.state.step + 1) * self.h)
         self.leave()
         self.state.step += 1
+
+    def _make_substeps(self, end: float) -> None:
+        """Advance by ``part`` to a time [s], balance by balance of the scheme."""
+        begun, part = self.state.time, self.part
+        try:
+            before = self.part_before_start
+            for share, place in self.scheme.substeps:
+                self.part = share * part
+                if self.model.bars.viscous and self.part != before and self.scheme.solves_next_position:
+                    self.model.bars.extrapolate_rates(self.part / before)
+                before = self.part
+                self._make_part(end if place == 1.0 else begun + place * part)
+        finally:
+            self.part = part
 
     def leave(self) -> None:
         """Remove the bars and supports that are to go at the time reached. Collective."""
@@ -698,8 +720,8 @@ class Stepper(ABC):
     def when(self, balance: Balance) -> str:
         """Return the step of a balance and the time at which it holds, for messages."""
         step = self.state.step + 1
-        if self.scheme.solves_next_position and self.state.time > 0.0:
-            step += 1  # the position solved for belongs to the next step
+        if self.scheme.solves_next_position:  # the position solved for may belong to the next step
+            step += balance.time > (step + TIME) * self.h
         return self.at(step, balance.time)
 
     def evaluate(self, commit: bool) -> None:

@@ -43,12 +43,15 @@ SCHEMES: dict[str, Integrator] = {
     "wilson_1.6": Integrator("Wilson, θ = 1.6", _set("wilson", "theta=1.6")),
     "chung_lee_1": Integrator("Chung & Lee, β = 1", _set("chung_lee", "beta=1.0")),
     "hulbert_chung": Integrator("Hulbert & Chung, ρ_b = 0", _set("hulbert_chung", "rho_b=0.0")),
+    "noh_bathe": Integrator("Noh & Bathe, p = 0.54", _set("noh_bathe")),
     "generalized_alpha": Integrator("Generalised-α, ρ∞ = 0.8", _set("generalized_alpha")),
+    "hht_alpha": Integrator("HHT-α, α = −0.05", _set("hht_alpha")),
+    "bathe": Integrator("Bathe, ρ∞ = 0", _set("bathe")),
     "energy_momentum": Integrator("Energy-momentum", _set("energy_momentum")),
 }
 PAPER = ("central_differences", "newmark", "chung_lee", "souza_moura", "houbolt", "wilson")
 IN_TABLES = (*PAPER, *(scheme for scheme in SCHEMES if scheme not in PAPER))
-EXPLICIT = ("central_differences", "chung_lee", "souza_moura", "chung_lee_1", "hulbert_chung")
+EXPLICIT = ("central_differences", "chung_lee", "souza_moura", "chung_lee_1", "hulbert_chung", "noh_bathe")
 
 
 class Reading(NamedTuple):

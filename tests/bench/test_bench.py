@@ -39,6 +39,7 @@ def test_memory_sees_what_was_used_and_freed():
     assert 0.49 * size <= memory.growth() < 0.6 * size
 
 
+@pytest.mark.slow
 def test_contact_jobs_touch_the_floor_in_every_step(tmp_path):
     job = Job("contact", "central_differences", contact=True, plastic=True, step=0.02 * CROSSING)
     simulation = Simulation(make_case(job, "cubic", 3, 100), output=tmp_path, quiet=True)

@@ -29,6 +29,7 @@ def mesh(tmp_path, monkeypatch, capfd):
     return call
 
 
+@pytest.mark.slow
 def test_a_file_in_millimetres_becomes_a_case_that_runs(mesh, tmp_path):
     status, out, err = mesh("clean", MESHES / "tower.inp", "tower.vtu", "--scale", "0.001", "--case", "tower.toml")
     assert (status, err) == (0, "")
@@ -76,6 +77,7 @@ def test_generated_meshes(mesh):
     assert read_whole("l.vtu").bar_fields["w"].max() == 2.0
 
 
+@pytest.mark.slow
 def test_convert_info_refine_merge_picture(mesh):
     assert mesh("convert", MESHES / "mast.vtu", "mast.msh")[0] == 0
     assert mesh("refine", "mast.msh", "fine.h5", "--parts", "3")[0] == 0

@@ -121,6 +121,7 @@ def test_every_step_is_optimal(name, supported, comm, shared_tmp_path):
         np.testing.assert_allclose(momentum, np.tile(momentum[0], (len(rows), 1)), atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("heavy", [False, True], ids=["alone", "beside a wall with mass"])
 def test_no_room(heavy, comm, shared_tmp_path):

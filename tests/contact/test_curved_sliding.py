@@ -143,6 +143,7 @@ def test_slides_far_from_the_origin(wall, integrator, tmp_path):
         assert gap > -1e2 * rounding
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.1, 0.6, 2.0])
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_friction_on_a_sphere_in_large_steps(side, friction):
@@ -187,6 +188,7 @@ def test_friction_on_a_sphere_in_large_steps(side, friction):
     assert dissipated == pytest.approx((friction * push * size).sum(), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_friction_that_is_not_found_is_told(tmp_path):
     """A node that a step throws far into the edge of a rough bowl and a rough floor: which node, step and time."""
     start, free = np.array([-0.89323743, 0.29823369, -0.29926374]), np.array([-1.14142704, 0.23835193, -0.37258924])

@@ -60,6 +60,7 @@ def test_rows_that_come_and_go_hold_and_conserve_momentum(scheme, row, comm, sha
     assert np.abs(found["energy_imbalance"]).max() <= 1e-6 * found["kinetic_energy"][0]
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_restart_among_rows_that_come_and_go_is_bitwise(scheme, comm, shared_tmp_path):

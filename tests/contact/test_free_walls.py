@@ -67,6 +67,7 @@ def test_wall_with_weight(integrator, parameters, comm, shared_tmp_path):
         np.testing.assert_array_equal(row["wall/light/velocity"], 0.0)
 
 
+@pytest.mark.slow
 def test_point_mass_hits_a_wall_with_mass(comm, shared_tmp_path):
     """A bar hits flat: with restitution e the relative velocity is turned round and multiplied by e."""
     step, e, mass = 1e-4, 0.6, 4e-3

@@ -35,6 +35,7 @@ def block(integrator, friction, *, velocity=0.0, end=0.1, static=None, step=2e-4
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
 def test_sticking_block(integrator, comm, shared_tmp_path):
     """Where tan(angle) < mu the block stays: no node slips on the floor."""

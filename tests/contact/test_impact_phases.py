@@ -148,7 +148,7 @@ def test_no_combination_gains_without_a_warning(integrator, parameters):
         steps = (0.5, 2.0, 8.0, 30.0)
         if explicit:
             steps = [round(part * table.own_limit(integrator, parameters, mass), 2) for part in (0.3, 0.6, 0.9)]
-        if table.judged(integrator, parameters, treatment, mass, 0.1) is None:  # refused
+        if table.judged(integrator, parameters, treatment, mass, 0.1, restitution) is None:  # refused
             continue
         for step in steps:
             for elements in (5, 40):

@@ -37,6 +37,7 @@ def bar(shape, **keys):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("shape", SHAPES)
 def test_wall_that_flies_through_a_bar(shape, comm, shared_tmp_path, capfd):

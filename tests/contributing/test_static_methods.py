@@ -33,6 +33,7 @@ def test_load_factors_are_those_listed_and_each_is_an_equilibrium(examples, comm
     assert load == pytest.approx(0.9 * LIMIT * np.array([0.0, *FACTORS]), abs=1e-6 * LIMIT)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_restart_is_bitwise(examples, comm, shared_tmp_path):
     assert_restart_is_bitwise(arch(shared_tmp_path, comm, FACTORS), comm, shared_tmp_path, 2)

@@ -151,6 +151,7 @@ def test_failure_of_all_ranks_is_told_without_delay(on_ranks, tmp_path):
     assert done.stderr.count("ValueError: surprise") == 2 and "MPI_ABORT" not in done.stderr + done.stdout
 
 
+@pytest.mark.slow
 def test_failure_on_a_single_rank(tmp_path):
     """Without a launcher: as Python tells it."""
     (tmp_path / "program.py").write_text(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import zlib
 from collections import defaultdict
 from pathlib import Path
 
@@ -31,6 +33,21 @@ FEWER = 4
 """Factor on the stride for tests marked ``few_sets``."""
 
 
+PARTS = 4
+"""Of the slow tests; one part runs without ``--all-sets``."""
+
+
+def part_of_commit(folder: Path) -> int:
+    """Return the part of the slow tests that is due at the present commit, the next one after the next commit; the
+    first where there is no repository."""
+    git = ["git", "-C", str(folder), "rev-list", "--count", "HEAD"]
+    try:
+        count = subprocess.run(git, capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return 0
+    return int(count) % PARTS
+
+
 def refuse_repeated_names(folder: Path) -> None:
     """Raise ``pytest.UsageError`` if two test files in the folders below have the same name."""
     found: dict[str, list[str]] = defaultdict(list)
@@ -45,17 +62,18 @@ def refuse_repeated_names(folder: Path) -> None:
         )
 
 
-def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
-    """Return all tests except the thorough ones, with some of their sets of parameters.
+def thinned(items: list[pytest.Item], ranks: int, part: int) -> list[pytest.Item]:
+    """Return a part of the slow tests and all others except the thorough ones, with some of their sets of parameters.
 
     Tests with several sets run with every tenth of them (eighth on two ranks, twelfth on three), tests marked
-    ``few_sets`` with a quarter of these. Of the parallel tests one half runs on two ranks, the other on three. Being
-    ``slow`` makes no difference.
+    ``few_sets`` with a quarter of these. Of the parallel tests one half runs on two ranks, the other on three.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
-        if item.get_closest_marker("thorough") is None:
-            sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
+        function = getattr(item, "originalname", item.name)
+        other = zlib.crc32(f"{item.path.name} {function}".encode()) % PARTS != part
+        if item.get_closest_marker("thorough") is None and not (other and item.get_closest_marker("slow") is not None):
+            sets.setdefault((item.path, function), []).append(item)
     chosen: set[pytest.Item] = set()
     for group in list(sets.values())[ranks % 2 :: 2] if ranks > 1 else list(sets.values()):
         if len(group) > 1:

@@ -130,6 +130,27 @@ def bathe(rho):
     return eigenvalues
 
 
+def noh_bathe(p):
+    """Two explicit substeps of rows on (x, h v, h^2 a), with the whole step h and velocities in the balances."""
+
+    def eigenvalues(omega_h, damping_ratio=0.0):
+        s, c, k = 1.0 - p, 2.0 * damping_ratio * omega_h, omega_h**2
+        q1 = (1.0 - 2.0 * p) / (2.0 * p * s)
+        q2 = 0.5 - p * q1
+        q0 = 0.5 - q1 - q2
+        x, v, a = np.eye(3)
+        middle = x + p * v + 0.5 * p * p * a
+        known = v + 0.5 * p * a
+        a_middle = -(k * middle + c * known) / (1.0 + 0.5 * p * c)
+        v_middle = known + 0.5 * p * a_middle
+        x1 = middle + s * v_middle + 0.5 * s * s * a_middle
+        known = v_middle + s * (q0 * a + (0.5 + q1) * a_middle)
+        a1 = -(k * x1 + c * known) / (1.0 + s * q2 * c)
+        return np.linalg.eigvals(np.array([x1, known + s * q2 * a1, a1]))
+
+    return eigenvalues
+
+
 def chung_lee(beta):
     return newmark_family(beta, 1.5, 0.0, 1.0, lagged_velocity=True)
 
@@ -170,6 +191,8 @@ SCHEMES = {
     "hulbert_chung 0.8": ("hulbert_chung", {}, 3, explicit_alpha(0.8)),
     "hulbert_chung 1": ("hulbert_chung", {"rho_b": 1.0}, 3, explicit_alpha(1.0)),
     "souza_moura": ("souza_moura", {}, 3, explicit_alpha(0.3)),
+    "noh_bathe 0.54": ("noh_bathe", {}, 2, noh_bathe(0.54)),
+    "noh_bathe 0.7": ("noh_bathe", {"p": 0.7}, 2, noh_bathe(0.7)),
     "newmark": ("newmark", {}, 2, newmark_family(1.0, 1.5)),
     "trapezoid": ("newmark", {"beta": 0.25, "gamma": 0.5}, 2, newmark_family(0.25, 0.5)),
     "houbolt": ("houbolt", {}, 3, houbolt),

@@ -72,6 +72,7 @@ SCHEMES = [
     "central_differences",
     "chung_lee",
     "hulbert_chung",
+    "noh_bathe",
     "newmark",
     "houbolt",
     "wilson",

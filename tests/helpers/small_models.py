@@ -35,6 +35,7 @@ SCHEMES = {
     "chung_lee": {},
     "souza_moura": {},
     "hulbert_chung": {"rho_b": 0.8},
+    "noh_bathe": {},
     "newmark": {"beta": 0.25, "gamma": 0.5},
     "wilson": {},
     "houbolt": {},

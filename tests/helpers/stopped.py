@@ -33,6 +33,7 @@ CASES = {
     "chung_lee": ("rod_impact", (*SHORT, "time.integrator=chung_lee")),
     "hulbert_chung": ("rod_impact", (*SHORT, "time.integrator=hulbert_chung")),
     "souza_moura": ("rod_impact", (*SHORT, "time.integrator=souza_moura")),
+    "noh_bathe": ("rod_impact", (*SHORT, "time.integrator=noh_bathe")),
     "generalized_alpha": ("rod_impact", (*SHORT, "time.integrator=generalized_alpha")),
     "bathe": ("rod_impact", (*SHORT, "time.integrator=bathe")),
     "hht_alpha": ("rod_impact", (*SHORT, "time.integrator=hht_alpha", "time.alpha=-0.2", "contact.treatment=stick")),

@@ -116,6 +116,7 @@ def test_run_says_what_it_compiles(tmp_path, monkeypatch, capsys, patience):
     assert "minute" not in said
 
 
+@pytest.mark.slow
 def test_the_folder_depends_on_all_sources(tmp_path):
     """A changed file of the package leads to another folder, so that no loop inlines what a function was."""
     copy = tmp_path / "pfem_petsc"
@@ -144,6 +145,7 @@ def test_the_folder_depends_on_all_sources(tmp_path):
     assert {first, second, third} <= left and len(left) == compiled._KEPT
 
 
+@pytest.mark.slow
 def test_machine_code_is_kept_where_it_can_be(tmp_path):
     """In the package, in the folder for it of the user, or nowhere, which is told once; a folder that the user gives
     comes first, and Numba's own choice for other programs is not changed."""
@@ -183,6 +185,7 @@ print(evaluate(law, (2.0,), 0.5, 0.0, np.zeros((0, 1)))[STRESS, 0], count_compil
 """
 
 
+@pytest.mark.slow
 def test_a_law_of_a_user_is_compiled_anew_when_its_file_changes(tmp_path):
     path, unique = tmp_path / "of_a_user.py", uuid4()  # no earlier run has compiled this file
 

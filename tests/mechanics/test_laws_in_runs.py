@@ -208,6 +208,7 @@ def test_case_with_tables_is_written_and_read(tmp_path):
         assert json.loads(json.dumps(case.to_dict()))["material"]["it"]["softening"] == SOFTENING
 
 
+@pytest.mark.slow
 def test_critical_step_is_that_of_the_largest_modulus(tmp_path):
     """A bar that becomes four times as stiff while it cools takes half the step from the start."""
     rows = [[-50.0, 4.0, 1.0], [0.0, 1.0, 1.0]]
@@ -269,6 +270,7 @@ def test_bars_of_these_laws_break(law, integrator, keys, tmp_path):
     assert np.ptp(history["probe/tip/velocity"][-10:, 0, 0]) < 1e-9  # flies on
 
 
+@pytest.mark.slow
 def test_data_of_bars_have_values_where_a_run_has_no_bar(tmp_path):
     """Between two rods the columns of a run have no bar: a strut of no slenderness has no stress there."""
     case = Case.from_dict(

@@ -47,6 +47,7 @@ def whole():
     return mesh
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_sections_by_the_field_of_a_converter(comm, shared_tmp_path):
     file = shared_tmp_path / "integer.vtu"

@@ -195,6 +195,7 @@ def test_vtu_on_which_vtk_aborts_is_refused(tmp_path):
     refusal(path)
 
 
+@pytest.mark.slow
 def test_vtk_with_other_cells(tmp_path):
     import pyvista
 
@@ -206,6 +207,7 @@ def test_vtk_with_other_cells(tmp_path):
     assert "FILE" in refusal(path)
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(st.data())
 def test_changed_words_of_gmsh_text_are_read_or_refused(tmp_path_factory, data):
@@ -233,6 +235,7 @@ NAMES = [f"{kind.replace(' ', '-')}.msh" for kind in GMSH]
 NAMES += ["mesh.h5", "mesh.inp", "parts.inp", "mesh.3mf", "mesh_bars.csv", "mesh_nodes.csv", "mesh.stl"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_changed_files_are_read_or_refused(tmp_path, name):
     sound_meshes(tmp_path)

@@ -38,6 +38,7 @@ def history(case, comm, folder):
     return {name: column for name, column in open_result(folder).history.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_same_results_as_from_a_file(comm, shared_tmp_path, monkeypatch):
     path = write_mesh(shared_tmp_path / "tripod.h5", POINTS, BARS, **GROUPS, **AREAS, comm=comm)
@@ -159,6 +160,7 @@ def test_missing_fields_and_groups_are_told():
         Simulation(Case(grouped, mesh=tripod()), MPI.COMM_SELF, check_only=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("most", [5, 10_000])
 def test_restart_with_the_same_truss_only(comm, shared_tmp_path, monkeypatch, most):

@@ -99,6 +99,7 @@ def test_load_beyond_a_preload(shared_tmp_path, comm):
     assert found[0] == pytest.approx((0.5 * SUM * shorter - a) / (b - a), rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_gravity_heat_and_prescribed_motion(shared_tmp_path, comm):
     """Each of them as the load; the first bar carries both masses, a clamped column E A (alpha T or d/L)."""

@@ -107,6 +107,7 @@ def test_failure_beside_the_steps_is_raised_by_the_next_call_on_all_ranks(shared
     COMM.Barrier()
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_functions_and_loops_over_steps_see_the_snapshot_of_their_step(shared_tmp_path):
     case = Case.load("lattice_drop")

@@ -26,6 +26,7 @@ def written(path):
     return truss
 
 
+@pytest.mark.slow
 def test_a_sound_file_is_sound(tmp_path):
     written(tmp_path / "result.vtkhdf")
     assert examine(tmp_path / "result.vtkhdf", deep=True) == []
@@ -66,6 +67,7 @@ def test_a_changed_value_is_named_and_not_continued(tmp_path, name):
             ResultWriter(path, MPI.COMM_SELF, truss.mesh, **options(append_after_step=9))
 
 
+@pytest.mark.slow
 def test_what_follows_a_restart_has_its_checksums_too(tmp_path):
     path = tmp_path / "result.vtkhdf"
     truss = written(path)

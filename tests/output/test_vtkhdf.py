@@ -139,6 +139,7 @@ def test_single_precision_is_for_fields(shared_tmp_path):
         assert vtk_to_numpy(grid.GetCellData().GetArray("stress")).dtype == np.float32
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("after", [-1, 0, 7, 12, 20])
 def test_going_on_after_a_step_gives_the_same_file(shared_tmp_path, after):
@@ -157,6 +158,7 @@ def test_going_on_after_a_step_gives_the_same_file(shared_tmp_path, after):
         assert_grid_is(grid, truss, 20)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize(("n_nodes", "n_bars"), [(24, 40), (23, 41)])
 def test_compressed_snapshots(shared_tmp_path, monkeypatch, n_nodes, n_bars):

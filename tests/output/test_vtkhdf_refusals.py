@@ -10,6 +10,7 @@ from pfem_petsc.output.result import open_result
 from pfem_petsc.output.vtkhdf import ResultWriter
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_going_on_with_another_case_is_refused(shared_tmp_path):
     path = shared_tmp_path / "result.vtkhdf"

@@ -65,6 +65,7 @@ def test_vibration_of_two_masses(scheme, mass, comm, shared_tmp_path):
     assert np.abs(centres(history) - [1.0, 0.0, 0.0]).max() < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
 @pytest.mark.parametrize("scheme", [*EXPLICIT, *IMPLICIT])
 def test_dashpot_between_two_masses(scheme, mass, comm, shared_tmp_path):
@@ -204,6 +205,7 @@ def test_nodes_at_the_same_place_are_refused(comm, tmp_path):
         Simulation(case, comm, check_only=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["central_differences", "energy_momentum"])
 def test_beside_heat_wind_yield_and_removals(scheme, comm, tmp_path):
     """All bars of such cases can leave the model and are heated, but not springs and dashpots; energies balance."""
@@ -234,6 +236,7 @@ def test_beside_heat_wind_yield_and_removals(scheme, comm, tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * scale
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_they_are_no_overlapping_bars(comm, shared_tmp_path):
     """A spring with a dashpot beside it, both along a bar and over a node, is what it should be; they join parts."""

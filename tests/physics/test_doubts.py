@@ -66,6 +66,7 @@ def test_unknown_section_is_not_compared(comm, shared_tmp_path, capfd):
     assert "Euler" not in error + log
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_motion_in_stages_and_after_a_restart(integrator, comm, shared_tmp_path, capfd):
@@ -95,6 +96,7 @@ def test_motion_in_stages_and_after_a_restart(integrator, comm, shared_tmp_path,
     assert told.split("bars were")[1] == log.split("bars were")[1].splitlines()[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "analysis", [STATIC, {"time": {"integrator": "central_differences", "step": 1e-5, "end": 1e-4}}]
 )

@@ -43,6 +43,7 @@ def test_nothing_is_lost_before_the_first_row(integrator, shared_tmp_path):
     assert unexplained(history) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_belt_works_and_rubs(shared_tmp_path):
     """A belt of velocity V under a rod at rest does the work F V t; friction takes what the rod does not get of it."""
     belt = floor(friction=0.2, velocity=[0.0, 5.0, 0.0])
@@ -95,6 +96,7 @@ def test_walls_with_mass_are_in_the_balance(integrator, shared_tmp_path):
     assert np.abs(momentum - momentum[0] - weight).max() < 1e-8 * heavy * speed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("treatment", ["scheme", "stick", "conserving"])
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark", "houbolt", "energy_momentum"])
 def test_pairs_meet(integrator, treatment, shared_tmp_path):

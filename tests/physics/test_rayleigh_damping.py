@@ -40,6 +40,7 @@ def run(data, folder):
     return open_result(folder).history
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["newmark", "central_differences"])
 def test_ratios_of_three_oscillators(integrator, tmp_path):
     """At both frequencies the ratio is the given one, between them it is smaller; nodal masses are damped too."""

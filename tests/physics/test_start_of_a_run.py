@@ -70,11 +70,12 @@ def test_damped_nodes_that_start_on_a_wall(integrator, shared_tmp_path):
         ),
         shared_tmp_path,
     )
-    assert history["active_contacts"][1] == 1
+    # the acceleration of an impact acts once more in the next step of noh_bathe, away from the wall
+    assert history["active_contacts"][1] == (integrator != "noh_bathe")
     start = history["kinetic_energy"][0]
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * start
     stopped = start / 8.0  # the kinetic energy of the node; schemes that let go of it strike it again
-    chatters = integrator in ("chung_lee", "houbolt", "generalized_alpha", "energy_momentum")
+    chatters = integrator in ("chung_lee", "noh_bathe", "houbolt", "generalized_alpha", "energy_momentum")
     assert history["impact_dissipation"][1] == pytest.approx(stopped, rel=1e-9)
     assert chatters or history["impact_dissipation"][-1] == pytest.approx(stopped, rel=1e-9)
     assert (np.diff(history["damping_dissipation"]) >= 0.0).all()

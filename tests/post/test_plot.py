@@ -74,6 +74,7 @@ def test_empty_history_is_refused(tmp_path, result):
         plot(result, tmp_path)
 
 
+@pytest.mark.slow
 def test_one_row_is_enough(tmp_path, result):
     """Its numbers are points, which are seen."""
     result.history = {name: values[:1] for name, values in result.history.items()}
@@ -169,6 +170,7 @@ def texts(file) -> str:
     return " ".join(re.findall(r"<text[^>]*>([^<]*)</text>", file.read_text()))
 
 
+@pytest.mark.slow
 def test_what_does_not_change_is_named_instead_of_drawn(tmp_path, result):
     """A fixed probe, and one that flies at a constant velocity, take no panels but for its displacement."""
     time = result.history["time"]

@@ -96,6 +96,7 @@ def test_closed_form_of_the_rod(tmp_path):
         assert closed_form(moved) is None
 
 
+@pytest.mark.slow
 def test_forces_of_a_picture_have_one_unit(tmp_path, result):
     """1.6 kN as computed, less than 1 kN filtered, and a second wall with 40 N."""
     result.history["wall/wall/force"] = result.history["wall/wall/force"] * (1600.0 / 54e3)

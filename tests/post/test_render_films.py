@@ -40,6 +40,7 @@ def test_results_side_by_side(tmp_path, flying):
         draw(tmp_path, [flying, other])
 
 
+@pytest.mark.slow
 def test_slow_motion_is_between_snapshots(tmp_path, flying):
     """0.05 s at 1000 frames a second from 13 snapshots: the middle of two of them is the mean of their positions."""
     told = []

@@ -39,6 +39,7 @@ def result(tmp_path_factory):
     return open_result(folder)
 
 
+@pytest.mark.slow
 def test_rows_of_motion_are_told_from_those_of_static_stages(result):
     (rows,) = result.stretches
     assert set(result.history["stage"][rows]) == {1}
@@ -71,6 +72,7 @@ def test_spectra_are_of_rows_of_motion(tmp_path, result):
     assert frequency == pytest.approx(expected[0]) and amplitude == pytest.approx(expected[1])
 
 
+@pytest.mark.slow
 def test_the_axis_says_that_load_factors_are_on_it(tmp_path, result):
     plot(result, tmp_path, formats=["csv", "svg"])
     assert "time [s], in static stages load factor" in (tmp_path / "walls.svg").read_text()
@@ -93,6 +95,7 @@ def test_walls_of_later_stages_stand_where_they_begin(result):
     np.testing.assert_array_equal(position[rows.stop :], position[[rows.stop - 1] * 2])
 
 
+@pytest.mark.slow
 def test_static_stages_alone_have_no_filter(tmp_path, result):
     case = result.case.to_dict()
     case["stage"] = [stage for stage in case["stage"] if "static" in stage][:1]

@@ -117,6 +117,7 @@ def test_generator_draws_stages_with_all_that_they_may_have():
     assert {table["material"]["m1"]["rupture"]["steps"] for table in tables} == {1, 2, 4, 6}
 
 
+@pytest.mark.slow
 def test_generator_draws_all_of_what_is_documented():
     tables = [draw_case(seed) for seed in range(400)]
     walls = [wall for table in tables for wall in table.get("wall", ())]

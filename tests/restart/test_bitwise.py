@@ -150,6 +150,7 @@ VISCOUS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_preconditioner_is_set_up_again_with_the_step_of_its_set_up(tmp_path):
     """The step of rate-dependent bars, t + theta h less t, differs in its last bits from step to step."""
     history = assert_restart_is_bitwise(Case.from_dict(VISCOUS), MPI.COMM_SELF, tmp_path, 3, 6)
@@ -169,6 +170,7 @@ TUMBLING = {
 }
 
 
+@pytest.mark.slow
 def test_sums_at_the_end_of_a_batch_of_steps_are_put_back(tmp_path):
     """What supports of the next stage take is the difference from them; a batch adds nodes in another order."""
     history = assert_restart_is_bitwise(Case.from_dict(TUMBLING), MPI.COMM_SELF, tmp_path, 5, 10)

@@ -36,6 +36,7 @@ def test_nothing_to_restart_from(tmp_path, capsys):
     assert len(steps(tmp_path / "new")[0]) == 51
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [0, 20])
 def test_finished_run(tmp_path, capsys, every):
     words = rod(tmp_path / "done", f"--set=output.checkpoint_every={every}")
@@ -54,6 +55,7 @@ def test_finished_run(tmp_path, capsys, every):
     assert [path.name for path in tmp_path.iterdir()] == ["done"]
 
 
+@pytest.mark.slow
 def test_finished_run_of_another_case_is_moved_aside(tmp_path):
     folder = tmp_path / "done"
     assert main(rod(folder, "--set=output.checkpoint_every=0")) == 0
@@ -61,6 +63,7 @@ def test_finished_run_of_another_case_is_moved_aside(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["done", "done.1"]
 
 
+@pytest.mark.slow
 def test_longer_end_goes_on_without_gap_or_duplicate(copy, capsys):
     words = rod(copy, "--restart", "--set", "output.history_every=2", "solver.rtol=1e-8", end=0.9)
     words.remove("--quiet")
@@ -97,6 +100,7 @@ def test_other_case_is_refused(copy, change, text, capsys):
     assert {name: (copy / name).read_bytes() for name in before} == before
 
 
+@pytest.mark.slow
 def test_missing_and_damaged_files(copy, capsys):
     assert main(rod(copy, "--restart", str(copy / "no.h5"), end=0.9)) == 2
     assert "no.h5: there is no such checkpoint" in capsys.readouterr().err
@@ -190,6 +194,7 @@ def test_values_of_another_case_are_not_kept(copy):
     assert kept_arguments("pendulum", copy, True) == ([], [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fields_every", [10, 0])
 def test_results_beyond_an_earlier_end_are_never_cut(tmp_path, capsys, fields_every):
     folder = tmp_path / "rod"
@@ -210,6 +215,7 @@ def test_results_beyond_an_earlier_end_are_never_cut(tmp_path, capsys, fields_ev
     assert [path.name for path in tmp_path.iterdir()] == ["rod"]
 
 
+@pytest.mark.slow
 def test_earlier_end_of_a_finished_run_says_what_there_is(copy, capsys):
     words = rod(copy, "--restart", end=0.3)
     words.remove("--quiet")
@@ -240,6 +246,7 @@ def test_checkpoint_says_what_it_was_written_by(copy):
     assert state["scalars"]["step"] == 50
 
 
+@pytest.mark.slow
 def test_folder_of_checkpoints_stands_for_its_newest(copy, tmp_path, capsys):
     new = tmp_path / "new"
     assert main(rod(new, "--restart", str(copy), end=0.6)) == 0

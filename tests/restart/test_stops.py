@@ -19,6 +19,7 @@ from pfem_petsc.cli.main import main
 from pfem_petsc.output.result import open_result
 
 
+@pytest.mark.slow
 def test_wall_time(tmp_path, capsys):
     folder = tmp_path / "slow"
     words = ["rod_impact", "-o", str(folder), "--quiet", "--set", "time.end=1000"]
@@ -35,6 +36,7 @@ def test_wall_time(tmp_path, capsys):
     np.testing.assert_array_equal(rows, range(rows[-1] + 1))
 
 
+@pytest.mark.slow
 def test_message_has_the_command_that_continues(tmp_path, capsys):
     """Run as it stands, but for the wall time; a value with blanks and quotes comes back whole."""
     folder = tmp_path / "a folder"

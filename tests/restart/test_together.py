@@ -53,6 +53,7 @@ def test_all_ranks_are_refused(comm, shared_tmp_path):
         assert third.run() == 0
 
 
+@pytest.mark.slow
 def test_checkpoint_that_is_replaced_while_it_is_read(tmp_path):
     """Header and arrays are those of one file, whatever has its name by then."""
     from mpi4py import MPI

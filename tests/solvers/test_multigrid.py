@@ -70,6 +70,7 @@ def made(simulation):
     return multigrid
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("kind", ["held", "irregular"])
 def test_coarse_matrix_is_that_of_the_interpolated_displacements(comm, shared_tmp_path, kind):

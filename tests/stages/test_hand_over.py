@@ -79,6 +79,7 @@ def run(comm, shared_tmp_path):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("earlier", [{"static": {"step": 0.5}}, {"time": FLY}])
 def test_bars_that_a_later_stage_removes_keep_their_data_beside_springs_and_dashpots(run, earlier):
@@ -126,6 +127,7 @@ def test_statics_takes_over_while_a_bar_breaks(run, steps, damping):
     np.testing.assert_allclose(supplied - found["elastic_energy"][-1], lost, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_rest_length_of_a_broken_bar_changes_nothing(run):
     """It has dissipated what it had stored, whatever rest length a later stage gives it."""
     stages = [{"time": FLY, "load": pull(1.0)}, {"static": {"step": 0.25}, "load": pull(4.0)}]
@@ -159,6 +161,7 @@ def rest(value):
     return {"section": {"s": {"rest_length": value}}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole", [False, True])
 def test_heat_of_a_bar_that_is_shortened_and_released(run, whole):
     """In one table or in three stages: heat is the integral of s_Y A r da over the rest length r, and nothing else."""

@@ -108,6 +108,7 @@ def test_paths_with_corners_and_strong_curvature_have_no_jump(tmp_path, capfd):
         assert JUMPS not in text and not failed
 
 
+@pytest.mark.slow
 def test_a_stage_that_begins_out_of_equilibrium_is_no_jump(tmp_path, capfd):
     """A bar that hardens as a root of its plastic strain, stopped in flight and suddenly longer: no path is left."""
     law = {"law": "johnson_cook", "yield_stress": 1e3, "strength_coefficient": 1e4, "hardening_exponent": 0.5}
@@ -126,6 +127,7 @@ def test_a_stage_that_begins_out_of_equilibrium_is_no_jump(tmp_path, capfd):
     assert "jumps" not in told(Case.from_dict(data), tmp_path, capfd)
 
 
+@pytest.mark.slow
 def test_displacement_that_turns_back_is_no_jump_in_silence(tmp_path, capfd):
     """An arch pressed through a soft bar snaps back under the displacement of that bar's end."""
     rise = 0.2

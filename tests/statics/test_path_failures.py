@@ -77,6 +77,7 @@ def test_path_that_cannot_go_on_keeps_its_points(tmp_path):
     assert len(history["load_factor"]) > 3
 
 
+@pytest.mark.slow
 def test_displacement_that_turns_back(tmp_path):
     """The dome of 16 bars goes up again after the third limit point: displacement control says so and stops."""
     data = Case.load("dome_16").to_dict()

@@ -143,6 +143,7 @@ def test_feet_that_move_apart_pull_the_apex_down(method, tmp_path):
     assert z[-1] == pytest.approx(0.04, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_temperature_as_the_load(tmp_path):
     """Cooled bars under a constant load: the load factor is a temperature, and has a limit point."""
     load = [{"node_set": "n0", "force": [0.0, 0.0, -1.0], "table": [[0.0, 10.0], [1.0, 10.0]]}]

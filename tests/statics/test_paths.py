@@ -97,6 +97,7 @@ class TestDomeOf16:
     LIMITS = [0.09566, -0.09612, 0.3209, -0.0938, 0.0938, -0.3209, 0.09612, -0.09566]
     READ_OFF = [(24.1, 0.0966), (75.9, -0.0941), (142.2, 0.3203), (136.3, -0.0901), (66.1, 0.0950), (61.3, -0.3183)]
 
+    @pytest.mark.slow
     def test_limit_points(self, history):
         """The seven of Hrinda 2010 (read off figures) and one more, which the symmetry of the shape asks for."""
         limits = [(1e3 * way, factor) for kind, factor, way in events(history) if kind == "limit"]
@@ -225,6 +226,7 @@ def test_pyramid_of_eight_bars(tmp_path):
 
 
 class TestStarDome:
+    @pytest.mark.slow
     def test_limit_points(self, tmp_path):
         """P/(E A) = 3.1565e-4, then -265 N at 30.2 mm."""
         history = run(Case.load("star_dome", ["output.fields_every=0"]), tmp_path / "results", MPI.COMM_SELF)

@@ -244,6 +244,7 @@ INCREMENTS = [
 FLOOR = "wall=[{name='floor', type='plane', point=[0.0, 0.0, -2.3], normal=[0.0, 0.0, 1.0]}]"
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("newton", [True, False])
 def test_ranks_agree(comm, shared_tmp_path, newton):

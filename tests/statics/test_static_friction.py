@@ -122,6 +122,7 @@ def test_slip_spreads_along_a_chain_of_sliders(shared_tmp_path, comm):
     assert abs(history["energy_imbalance"]).max() < 1e-9 * history["friction_dissipation"][-1]
 
 
+@pytest.mark.slow
 def test_a_static_coefficient_holds_until_it_breaks(shared_tmp_path, comm):
     """Pulled steadily, a slider with mu_s > mu jerks: it holds to mu_s N and slips until the spring has mu N."""
     motion = [[0.0, 0.0], [1.0, 0.006]]
@@ -164,6 +165,7 @@ def pushed(force):
     return {"load": [{"node_set": "all", "force": [0.0, 0.0, -1.0], "table": STEADY}, load]}
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_a_block_that_friction_alone_holds_sticks(shared_tmp_path, comm):
     """No support holds it: the stiffness is singular until nodes press on the floor."""

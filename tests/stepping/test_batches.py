@@ -277,6 +277,7 @@ def compare_histories(first, second, exact=True):
             np.testing.assert_allclose(first[column], second[column], rtol=1e-9, atol=rounding, err_msg=column)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", NAMES)
 def test_batches_are_single_steps_and_move_as_the_general_stepper(name, comm, shared_tmp_path):
@@ -295,6 +296,7 @@ def test_batches_are_single_steps_and_move_as_the_general_stepper(name, comm, sh
         compare(one, general, exact=False, same_order=name != "sections" and not moves)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", PAIRS)
 def test_batches_with_pairs(name, comm, shared_tmp_path, monkeypatch):
@@ -316,6 +318,7 @@ def test_batches_with_pairs(name, comm, shared_tmp_path, monkeypatch):
     compare(one, other, exact=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("supported", [False, True], ids=["free", "supported"])
 @pytest.mark.parametrize("name", WALLED)
@@ -361,6 +364,7 @@ CROWDED = SECTIONS | {  # something of each kind
 CROWDED["node_set"]["every"] = {"all": True}
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("declared", [False, True], ids=["own", "declared"])
 def test_all_columns_of_all_steps_are_those_of_single_steps(declared, comm, shared_tmp_path, monkeypatch):
@@ -414,6 +418,7 @@ def test_what_batches_do_not_serve_takes_single_steps(what, tmp_path):
     assert count == 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pairs", [False, True])
 def test_a_stopped_run_of_batches_goes_on_to_the_same_end(pairs, tmp_path):
     given = case(SMALL["yielding"])
@@ -436,6 +441,7 @@ def test_a_stopped_run_of_batches_goes_on_to_the_same_end(pairs, tmp_path):
 CRUSHED = {"initial": {"velocity": [0.0, 0.0, -2e4]}, "wall": [FLOOR]}
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", ["on a wall", "by a load"])
 def test_a_failure_is_that_of_single_steps(name, shared_tmp_path):
@@ -452,6 +458,7 @@ def test_a_failure_is_that_of_single_steps(name, shared_tmp_path):
     np.testing.assert_array_equal(steps[0], steps[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["turning", "squeezed", "jammed"])
 def test_a_failure_at_curved_walls_is_that_of_single_steps(name, shared_tmp_path):
     """A ball presses nodes against a floor, and against supports."""
@@ -499,6 +506,7 @@ JAMMED = {  # a wall pushes the end of a rod against a node that is held
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 7])
 def test_rows_without_solution_fail_as_in_single_steps(every, comm, shared_tmp_path):
     given, texts = Case.from_dict(JAMMED | {"output": {"fields_every": 0, "history_every": every}}), []

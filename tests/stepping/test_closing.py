@@ -50,6 +50,7 @@ def test_closed_without_a_step(comm, shared_tmp_path):
     assert not (shared_tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_state_of_a_restart(comm, shared_tmp_path):
     """It is there before the first step."""

@@ -131,6 +131,7 @@ def test_leaving_ends_the_runs(rod, tmp_path):
     runs.close()  # ends the long run, of 10^6 steps
 
 
+@pytest.mark.slow
 def test_a_killed_sweep_leaves_no_run_behind(tmp_path):
     command = ["sweep", "rod_impact", "--vary", "time.end=1e4", "-o", str(tmp_path / "out"), "--quiet"]
     variables = environment()
@@ -195,6 +196,7 @@ def test_values_of_a_command_line(text, values):
     assert verb._values(f"key={text}") == ("key", values)
 
 
+@pytest.mark.slow
 def test_a_run_with_warnings_says_so(rod, tmp_path):
     """Where its row is otherwise that of a run without: runs are compared by the table."""
     changes = {"time.integrator": ["newmark", "generalized_alpha"]}
@@ -204,6 +206,7 @@ def test_a_run_with_warnings_says_so(rod, tmp_path):
     assert re.match(r"\d+ warnings?: contact: generalized_alpha .* gains energy in impacts", table["message"][1])
 
 
+@pytest.mark.slow
 def test_comparisons_name_what_varies(rod, tmp_path):
     """In the place of the folders of the runs, where that is known and distinct."""
     changes = [{"time.step": step, "time.end": end} for step, end in ((0.01, 0.1), (0.02, 0.1), (0.01, 0.2))]
@@ -217,6 +220,7 @@ def test_comparisons_name_what_varies(rod, tmp_path):
     assert labels_of(runs[:2]) == ["0000", "0001"]
 
 
+@pytest.mark.slow
 def test_vectors_are_columns_of_their_components(rod, tmp_path):
     asked = ["wall/wall/force", "probe/tip/position[0].x", "kinetic_energy"]
     of_plots = {"peak": "peak_wall/wall/force", "last": "probe/tip/position.x", "moved": "probe/tip/displacement.norm"}

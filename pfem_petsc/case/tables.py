@@ -60,9 +60,9 @@ def distinct(what: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-BY_BAR = ("pretension", "rest_length", "force_density")
+BY_BAR = ("pretension", "rest_length", "force_density", "target_length")
 """Keys of a section whose values may also be those of a field of the mesh, ``pretension_field`` and so on."""
-PRESTRESSES = ("pretension", "prestress", "rest_length", "force_density", *(f"{key}_field" for key in BY_BAR))
+PRESTRESSES = ("prestress", *BY_BAR, *(f"{key}_field" for key in BY_BAR))
 """Keys of a section that prescribe rest lengths."""
 FIELD_KEYS = ("area_field", *(f"{key}_field" for key in BY_BAR))
 """Keys of a section that name fields of the mesh with a value for each bar."""
@@ -259,12 +259,17 @@ class Section(StrictModel):
     """rest length over the length in the mesh, or rows [t, factor] [s, -]; if constant, mass is that of this length"""
     force_density: NumberOrRows | None = None
     """axial force over length in the mesh [N/m], or rows [t, q] [s, N/m]"""
+    target_length: PositiveFloat | None = None
+    """length in a form that is found [m]"""
     pretension_field: Annotated[str, Field(min_length=1)] | None = None
     """cell field of the mesh file with the ``pretension`` of each bar [N]"""
     rest_length_field: Annotated[str, Field(min_length=1)] | None = None
     """cell field of the mesh file with the ``rest_length`` of each bar over its length in the mesh"""
     force_density_field: Annotated[str, Field(min_length=1)] | None = None
     """cell field of the mesh file with the ``force_density`` of each bar [N/m]"""
+
+    target_length_field: Annotated[str, Field(min_length=1)] | None = None
+    """cell field of the mesh file with the ``target_length`` of each bar [m]"""
 
     @model_validator(mode="before")
     @classmethod

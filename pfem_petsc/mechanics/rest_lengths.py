@@ -62,7 +62,7 @@ class RestLengths:
             section = case.section[name]
             where = f"{case.source}: section.{name}.{key}"
             entries = [
-                _Entry(block, bar_of(case, section), *_prescribed(bars, block, section, key, where), where)
+                _Entry(block, bar_of(case, section), *self._in_mesh(block, section, key, where), where)
                 for block in bars.blocks
                 if block.section == name
             ]
@@ -77,6 +77,28 @@ class RestLengths:
         self.apply(0.0)
         if self.varying:
             bars.rest_at_start = bars.rest.copy()
+
+    def _in_mesh(
+        self, block: BarBlock, section: Section, key: str, where: str
+    ) -> tuple[str, Sequence[tuple[float, float]], np.ndarray | float]:
+        """Return what a section prescribes in the mesh, as :func:`prescribed`.
+
+        Raises
+        ------
+        InputError
+            If no form is found in which bars could have given lengths.
+        """
+        kind, rows, factor = prescribed(self._bars, block, section, key, where)
+        if kind == "target_length":
+            if not self.found:
+                raise InputError(
+                    f'{where}: lengths are found in a form, by a stage with static.method = "force_density"; in the '
+                    "mesh give rest_length, a factor on the length there"
+                )
+            return "rest_length", ((0.0, 1.0),), 1.0
+        if kind == "force_density":
+            return "pretension", rows, factor * self._bars.mesh_lengths[block.start : block.stop]
+        return kind, rows, factor
 
     def hold(self, rest: np.ndarray) -> None:
         """Take over the rest lengths (b,) [m] of the previous stage if they remain in force."""
@@ -159,7 +181,7 @@ def bar_of(case: Case, section: Section) -> Bar:
     return law_of(material), material.numbers(), MEASURES[material.strain]  # intact, also if it can break
 
 
-def _prescribed(
+def prescribed(
     bars: Bars, block: BarBlock, section: Section, key: str, where: str
 ) -> tuple[str, Sequence[tuple[float, float]], np.ndarray | float]:
     """Return what a section prescribes of the bars of a block: the kind, rows over time, and a factor of their values.
@@ -167,7 +189,7 @@ def _prescribed(
     Raises
     ------
     InputError
-        If a value of a field is not finite, or no factor on a length.
+        If a value of a field is not finite, or no factor on a length, or no length.
     """
     part, factor, value = slice(block.start, block.stop), 1.0, getattr(section, key)
     kind = key.removesuffix("_field")
@@ -176,15 +198,16 @@ def _prescribed(
         sound = np.isfinite(factor)
         if kind == "rest_length":
             sound &= (factor > 1e-3) & (factor < 1e3)
+        elif kind == "target_length":
+            sound &= factor > 0.0
         wrong = np.flatnonzero(~sound)
         if len(wrong):
-            expected = "a factor on its length in the mesh, like 0.99" if kind == "rest_length" else "a finite number"
+            known = {"rest_length": "a factor on its length in the mesh, like 0.99", "target_length": "a length [m]"}
+            expected = known.get(kind, "a finite number")
             bar = bars.mesh.bar_ids[block.start + wrong[0]]
             raise InputError(
                 f"{where}: bar {bar} (and {len(wrong) - 1} more here) has {factor[wrong[0]]:g}; expected {expected}"
             )
-    if kind == "force_density":
-        kind, factor = "pretension", factor * bars.mesh_lengths[part]
     return kind, value if has_rows(value) else ((0.0, value),), factor
 
 

@@ -13,7 +13,7 @@ from ..columns import HEAD
 from ..errors import InputError, SimulationFailure
 from ..mechanics.elements import bar_lengths
 from ..mechanics.motion import Table
-from ..mechanics.rest_lengths import bar_of, stretches
+from ..mechanics.rest_lengths import bar_of, prescribed, stretches
 from ..parallel.agreement import agreed
 from ..stepping.stepper import Solution
 from .stepper import StaticStepper
@@ -36,29 +36,46 @@ class Prescribed:
 
     Attributes
     ----------
-    density : (b,) force over length [N/m], NaN of bars that are given forces
-    force : (b,) force [N], NaN of the others
+    density : (b,) force over length [N/m]; of other bars that of the last solve, from the mean of the given ones on
+    force, length : (b,) force [N] and length [m], NaN of the others
     """
 
     def __init__(self, model: Model, time: float) -> None:
         case, bars = model.case, model.bars
-        self.density, self.force = np.full(len(bars.ends), np.nan), np.full(len(bars.ends), np.nan)
+        self.density, self.force, self.length = np.full((3, len(bars.ends)), np.nan)
+        self.comm = model.comm
+        outs = {"force_density": self.density, "target_length": self.length}
         for block in bars.blocks:
             section, part = case.section[block.section], slice(block.start, block.stop)
-            key = section.prestressed
-            where = f"{case.source}: section.{block.section}"
+            key, where = section.prestressed, f"{case.source}: section.{block.section}"
             if key is None or key.startswith("rest_length"):
                 raise InputError(
-                    f'{where}: static.method = "force_density" needs a force_density [N/m], pretension [N] or '
-                    "prestress [Pa] of each section, or a field of them"
+                    f'{where}: static.method = "force_density" needs a force_density [N/m], pretension [N], '
+                    "prestress [Pa] or target_length [m] of each section, or a field of them"
                 )
-            value = getattr(section, key)
-            if key.endswith("_field"):
-                value = bars.mesh.bar_fields[value][part]
-            elif not isinstance(value, float):
-                value = float(Table(value)(time)[0])
-            out = self.density if key.startswith("force_density") else self.force
-            out[part] = value * block.area if key == "prestress" else value
+            kind, rows, factor = prescribed(bars, block, section, key, f"{where}.{key}")
+            value = factor * float(Table(rows)(time)[0])
+            outs.get(kind, self.force)[part] = value * block.area if kind == "prestress" else value
+
+    def begin(self, lengths: np.ndarray) -> None:
+        """Set the densities of bars with given forces or lengths (b,) [m]. Collective."""
+        forced = ~np.isnan(self.force)
+        self.density[forced] = self.force[forced] / np.maximum(lengths[forced], np.finfo(float).tiny)
+        free, given = np.isnan(self.density), ~np.isnan(self.density)
+        count, total = self.comm.allreduce(np.array([given.sum(), np.abs(self.density[given]).sum()]))
+        self.density[free] = total / count if total else 1.0
+
+    def follow(self, lengths: np.ndarray) -> float:
+        """Change the densities for the lengths (b,) [m] of a form; return what lacks in it, relative to the largest
+        given force, or to a given length. Collective."""
+        forced, sized = ~np.isnan(self.force), ~np.isnan(self.length)
+        force, ratio = self.force[forced], lengths[sized] / self.length[sized]
+        lack = np.abs(self.density[forced] * lengths[forced] - force).max(initial=0.0)
+        numbers = np.array([lack, np.abs(force).max(initial=0.0), np.abs(ratio - 1.0).max(initial=0.0)])
+        self.comm.Allreduce(MPI.IN_PLACE, numbers, op=MPI.MAX)
+        self.density[forced] = force / np.maximum(lengths[forced], np.finfo(float).tiny)
+        self.density[sized] *= ratio
+        return float(max(numbers[0] / numbers[1] if numbers[1] else 0.0, numbers[2]))
 
 
 class ForceDensityStepper(StaticStepper):
@@ -187,24 +204,22 @@ class Form:
         SimulationFailure
             On all ranks.
         """
-        mesh, comm = self.model.mesh, self.model.comm
-        length, forced = np.empty(len(mesh.bars)), ~np.isnan(given.force)
-        any_forced = comm.allreduce(bool(forced.any()), op=MPI.LOR)
-        largest = comm.allreduce(float(np.abs(given.force[forced]).max(initial=0.0)), op=MPI.MAX)
+        mesh, lengths = self.model.mesh, np.empty(len(self.model.mesh.bars))
         mesh.update_ghosts(self.x)
+        bar_lengths(self.x, mesh.bars, lengths)
+        given.begin(lengths)
         for count in range(1, most + 1):
-            bar_lengths(self.x, mesh.bars, length)
-            density = np.where(forced, given.force / np.maximum(length, np.finfo(float).tiny), given.density)
-            self._solve(density)
-            bar_lengths(self.x, mesh.bars, length)
-            lack = np.abs(density[forced] * length[forced] - given.force[forced]).max(initial=0.0)
-            lack = comm.allreduce(float(lack), op=MPI.MAX)
-            if not any_forced or lack <= tolerance * largest:
+            self._solve(given.density)
+            bar_lengths(self.x, mesh.bars, lengths)
+            used = given.density.copy()
+            lack = given.follow(lengths)
+            if lack <= tolerance:
+                given.density = used
                 return count
         raise SimulationFailure(
-            f"form finding: forces of {lack:.3g} N are lacking after {most} solves, {tolerance * largest:.3g} N are "
-            "allowed: with these forces there may be no form (a bar shrinks to a point); give force densities, or "
-            "increase static.max_iterations or static.tolerance"
+            f"form finding: given forces or lengths are missed by {lack:.3g} of them after {most} solves, {tolerance:g} "
+            "is allowed: with these there may be no form (a bar shrinks to a point; a chain is too short for its "
+            "supports); give force densities, or increase static.max_iterations or static.tolerance"
         )
 
     def _solve(self, density: np.ndarray) -> None:

@@ -113,12 +113,12 @@ class RelaxationKeys(Increments):
 
 
 class ForceDensityKeys(Increments):
-    """Repeated solves for given forces; the form is found in one increment."""
+    """Repeated solves for given forces or lengths; the form is found in one increment."""
 
     tolerance: PositiveFloat = 1e-9
-    """of given forces, relative to the largest"""
+    """of given forces, relative to the largest, and of given lengths"""
     max_iterations: PositiveInt = 500
-    """number of linear solves after which a form with given forces is given up"""
+    """number of linear solves after which a form with given forces or lengths is given up"""
 
     step: ClassVar[float] = 1.0
     end: ClassVar[float] = 1.0

@@ -131,6 +131,49 @@ def test_given_forces_are_those_of_fermat_and_of_a_triangle(tmp_path):
             assert one @ two == pytest.approx(0.0, abs=1e-8)
 
 
+def test_given_lengths_are_those_of_a_tripod_and_of_a_chain(tmp_path):
+    """A weight on three cables hangs where spheres around their ends meet; two pairs of equal bars by Pythagoras."""
+    corners, hung = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [1.0, 4.0, 0.0]]), np.array([1.8, 1.5, -2.5])
+    points = np.vstack([corners, [[2.0, 1.0, 0.0]]])
+    given = np.linalg.norm(corners - hung, axis=1)
+    common = {
+        "material": {"m": CABLE},
+        "stage": [{**BUILT[0], "static": {"method": "force_density", "tolerance": 1e-12}}, BUILT[1]],
+    }
+    tripod = common | {
+        "mesh": Truss(points, [(3, 0), (3, 1), (3, 2)], bar_fields={"cut": given}),
+        "section": {"s": {"area": 1e-4, "material": "m", "target_length_field": "cut"}},
+        "node_set": {"corners": {"indices": [0, 1, 2]}, "weight": {"indices": [3]}},
+        "support": [{"node_set": "corners", "fix": "xyz"}],
+        "load": [{"node_set": "weight", "force": [0.0, 0.0, -900.0]}],
+    }
+    result = run(tripod, MPI.COMM_SELF, tmp_path / "tripod")
+    for snapshot in (1, 2):
+        np.testing.assert_allclose(result.positions(snapshot)[3], hung, atol=1e-9)
+    # the forces that balance the weight, and the cut lengths
+    force = np.linalg.solve(((corners - hung) / given[:, None]).T, [0.0, 0.0, 900.0])
+    np.testing.assert_allclose(result.field("axial_force", 1), force, rtol=1e-8)
+    np.testing.assert_allclose(result.field("rest_length", 1), given / (1.0 + force / E_A), rtol=1e-9)
+
+    ends = common | {
+        "mesh": Truss([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [3.0, 0.0, 0.0]], [(0, 1), (1, 2), (2, 3)]),
+        "section": {"s": {"area": 1e-4, "material": "m", "target_length": 1.3}},
+        "node_set": {"ends": {"indices": [0, 3]}, "inside": {"indices": [1, 2]}},
+        "support": [{"node_set": "ends", "fix": "xyz"}],
+        "load": [{"node_set": "inside", "force": [0.0, 0.0, -50.0]}],
+    }
+    found = run(ends, MPI.COMM_SELF, tmp_path / "chain").positions(1)
+    x, deep = 0.5 * (3.0 - 1.3), -np.sqrt(1.3**2 - 0.25 * 1.7**2)
+    np.testing.assert_allclose(found, [[0, 0, 0], [x, 0, deep], [x + 1.3, 0, deep], [3, 0, 0]], atol=1e-9)
+
+    ends["section"]["s"]["target_length"] = 0.9  # shorter than the way between the supports
+    with pytest.raises(SimulationFailure, match="a chain is too short for its supports"):
+        run(ends, MPI.COMM_SELF, tmp_path / "short")
+    ends["stage"] = [BUILT[1]]
+    with pytest.raises(InputError, match="target_length: lengths are found in a form"):
+        Simulation(Case.from_dict(ends), check_only=True)
+
+
 @pytest.mark.parallel
 @pytest.mark.parametrize("key", ["pretension_field", "rest_length_field", "force_density_field"])
 def test_values_of_bars_are_those_of_sections_of_one_bar_each(key, comm, shared_tmp_path):
@@ -174,10 +217,11 @@ def test_mass_is_that_of_given_rest_lengths():
 @pytest.mark.parametrize(
     ("section", "more", "text"),
     [
-        ({}, {}, "needs a force_density .* pretension .* or prestress"),
+        ({}, {}, "needs a force_density .* pretension .*, prestress .* or target_length"),
         ({"rest_length": 0.99}, {}, "needs a force_density"),
-        ({"force_density": 1.0, "pretension": 1.0}, {}, "at most one of the keys pretension, prestress, rest_length"),
+        ({"force_density": 1.0, "pretension": 1.0}, {}, "at most one of the keys prestress, pretension, rest_length"),
         ({"force_density_field": "q"}, {}, "has no field of this name"),
+        ({"target_length": -1.0}, {}, "target_length = -1.0: expected a value > 0"),
         (
             {"force_density": 1.0},
             {"wall": [{"type": "plane", "point": [0.0, 0.0, -9.0], "normal": [0.0, 0.0, 1.0]}]},

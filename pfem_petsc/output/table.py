@@ -186,12 +186,14 @@ def varied(folder: Path) -> dict[str, str]:
 
 
 _DISPLACEMENT = "/displacement"
+MINUS = " - "
+"""Between two names, of which the difference is selected."""
 _SELECTION = re.compile(r"(?P<whole>.+?)(\[(?P<node>\d+)\])?(\.(?P<part>x|y|z|norm))?")
 
 
 def source_of(name: str) -> str:
-    """Return the column of the history that a name of :func:`selected` is computed from."""
-    whole = _SELECTION.fullmatch(name)["whole"]
+    """Return the column of the history that a name of :func:`selected` is computed from, of a difference the first."""
+    whole = _SELECTION.fullmatch(name.partition(MINUS)[0])["whole"]
     if not whole.endswith(_DISPLACEMENT):
         return whole
     return whole.removesuffix(_DISPLACEMENT) + ("/position" if whole.startswith("probe/") else "")
@@ -202,7 +204,8 @@ def selected(history: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 
     ``NAME[0]`` is the value of the first node, and ``.x``, ``.y``, ``.z``, ``.norm`` are components; of all nodes, that
     of their mean, of reactions that of the sum. ``probe/NAME/displacement`` is the position relative to that of the
-    first row, and ``centre_of_mass/displacement`` that of the centre of mass.
+    first row, and ``centre_of_mass/displacement`` that of the centre of mass. ``A - B`` is the difference of two such
+    names, as of a probe and the ground.
 
     Raises
     ------
@@ -212,6 +215,12 @@ def selected(history: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     known = [column for column in history if not column.startswith("event/")]
     if name in known:
         return np.asarray(history[name])
+    if MINUS in name:
+        both = {each: selected(history, each) for each in name.split(MINUS, 1)}
+        one, other = (over_nodes(each, values) if values.ndim == 3 else values for each, values in both.items())
+        if one.shape != other.shape:
+            raise InputError(f"{name}: one is a vector and the other is not; select a component, like .x")
+        return one - other
     whole, node, part = _SELECTION.fullmatch(name).group("whole", "node", "part")
     source = whole if whole in known else source_of(whole)
     if source not in known:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.table import over_nodes, selected, source_of, varied
+from ..output.table import MINUS, over_nodes, selected, source_of, varied
 from ..output.units import TIME, unit_of
 from .chart import COLOURS, DASHES, REFERENCE, Chart, Curve, Panel, distinct, largest
 from .filters import AS_COMPUTED, Filter, amplitude_spectrum
@@ -241,7 +241,7 @@ def exact_curves(exact: ClosedForm | None, names: Sequence[str], place: np.ndarr
     curves: list[Curve] = []
     for name in names:
         whole = name if exact is None or name in exact.columns else name.rpartition(".")[0] or name
-        if exact is not None and source_of(whole) in exact.columns:
+        if exact is not None and MINUS not in name and source_of(whole) in exact.columns:
             values = column(exact.columns, name)[name]
             curves.append(Curve("" if curves else exact.name, values, REFERENCE, name + CLOSED_FORM, place))
     return curves

@@ -185,8 +185,11 @@ def _polygon(shape: str, sizes: Mapping[str, float], area: np.ndarray | float | 
     if web is not None and web > webs:
         raise ValueError(f"web_thickness = {web!r} m is too much: at most {webs:g} m")
 
-    def properties(thickness: float) -> tuple[float, float, float]:
-        return weak_axis(outline(width, height, thickness, thickness if web is None else web))
+    def made(thickness: float) -> Outline:
+        return outline(width, height, thickness, thickness if web is None else web)
+
+    def area_of(thickness: float) -> float:
+        return _first(_edges(made(thickness)))[0]
 
     if area is None:
         thickness = sizes["thickness"]
@@ -195,13 +198,13 @@ def _polygon(shape: str, sizes: Mapping[str, float], area: np.ndarray | float | 
     else:
         most = min(flanges, webs if web is None else math.inf)
         least = 1e-12 * most
-        if not properties(least)[0] < area < properties(most)[0]:
+        if not area_of(least) < area < area_of(most):
             raise ValueError(
                 f'area = {area!r} m2 cannot be that of shape = "{shape}" with these sizes: a thickness up to '
-                f"{most:g} m gives {properties(least)[0]:.6g} to {properties(most)[0]:.6g} m2"
+                f"{most:g} m gives {area_of(least):.6g} to {area_of(most):.6g} m2"
             )
-        thickness = brentq(lambda value: properties(value)[0] - area, least, most, xtol=1e-15 * most, rtol=1e-14)
-    found, moment, modulus = properties(thickness)
+        thickness = brentq(lambda value: area_of(value) - area, least, most, xtol=1e-15 * most, rtol=1e-14)
+    found, moment, modulus = weak_axis(made(thickness))
     return CrossSection(found, moment, modulus, math.sqrt(found / math.pi), max(width, height))
 
 
@@ -211,11 +214,7 @@ def weak_axis(outline: Outline) -> tuple[float, float, float]:
     Moments are integrals along the edges (Green's theorem): of x^2, y^2 and x y over the area; the smallest is the
     smaller eigenvalue of their tensor about the centroid. The plastic modulus is that of the two halves of equal area.
     """
-    edges = np.array(
-        [(*a, *b) for polygon in outline for a, b in zip(polygon, [*polygon[1:], polygon[0]], strict=True)]
-    )
-    edges[:, 0::2] -= edges[:, 0].mean()
-    edges[:, 1::2] -= edges[:, 1].mean()
+    edges = _edges(outline)
     area, centre = _first(edges)
     edges[:, 0::2] -= centre[0]
     edges[:, 1::2] -= centre[1]
@@ -235,6 +234,16 @@ def weak_axis(outline: Outline) -> tuple[float, float, float]:
     level = brentq(excess, distance.min(), distance.max(), xtol=1e-15 * np.ptp(distance), rtol=1e-14)
     # distances from the level of the half beyond it, and of the other, as those from the centroid have no integral
     return area, float(values[0]), 2.0 * _beyond(distance, along, level, 2) + area * level
+
+
+def _edges(outline: Outline) -> np.ndarray:
+    """Return the edges (e, 4), from one point to another."""
+    edges = np.array(
+        [(*a, *b) for polygon in outline for a, b in zip(polygon, [*polygon[1:], polygon[0]], strict=True)]
+    )
+    edges[:, 0::2] -= edges[:, 0].mean()
+    edges[:, 1::2] -= edges[:, 1].mean()
+    return edges
 
 
 def _first(edges: np.ndarray) -> tuple[float, np.ndarray]:

@@ -10,6 +10,7 @@ import importlib
 import math
 import random
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -248,6 +249,130 @@ def draw_connectors(chance: random.Random, case: dict[str, Any], body: Body, mot
     if chance.random() < 0.6:
         coefficient = 10 ** chance.uniform(-3, -1) * math.sqrt(stiffness * bar)
         case.setdefault("dashpot", []).append({"between": between, "coefficient": coefficient})
+
+
+FILES = Path(__file__).resolve().parent
+PROFILES, RECORD = str(FILES / "profiles.csv"), str(FILES / "record.csv")
+NAMES = [line.split(",")[0] for line in Path(PROFILES).read_text().splitlines()[1:]]
+SHAPES = ("round", "tube", "angle", "box", "I", "channel")
+STRESSING = ("pretension", "prestress", "rest_length", "force_density")
+
+
+def closed_area(shape: str, sizes: dict[str, float]) -> float:
+    """Area of a shape by its sizes."""
+    d, b, t = (sizes.get(key, 0.0) for key in ("diameter", "width", "thickness"))
+    h, w = sizes.get("height", b), sizes.get("web_thickness", t)
+    solid = {"round": 0.25 * math.pi * d * d, "tube": math.pi * t * (d - t), "angle": t * (b + h - t)}
+    return (solid | {"box": 2.0 * t * (b + h - 2.0 * t)}).get(shape, 2.0 * b * t + (h - 2.0 * t) * w)
+
+
+def draw_sections(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Give sections a shape by sizes of about the same area, or a profile of a catalogue."""
+    for section in case["section"].values():
+        if chance.random() < 0.2 or {"shape", "second_moment", "area_field"} & set(section):
+            continue
+        area, shape = section.pop("area"), chance.choice(SHAPES)
+        alike = "stage" in case or "static" in case or len(case["section"]) == 1
+        if chance.random() < 0.25 and alike and not {"pretension", "force_density"} & set(section):
+            section |= {"catalogue": PROFILES, "profile": chance.choice(NAMES)}
+            continue
+        sizes = {"diameter" if shape in ("round", "tube") else "width": 1.0}
+        sizes |= {"thickness": chance.uniform(0.04, 0.3)} if shape != "round" else {}
+        if "width" in sizes and chance.random() < 0.5:
+            sizes["height"] = chance.uniform(0.7, 1.5)
+        if shape in ("I", "channel") and chance.random() < 0.5:
+            sizes["web_thickness"] = chance.uniform(0.04, 0.3)
+        scale = math.sqrt(area / closed_area(shape, sizes))
+        section |= {"shape": shape, **{key: scale * size for key, size in sizes.items()}}
+        if chance.random() < 0.3:  # the area in the place of a size
+            found = [key for key in ("diameter", "thickness") if key in section]
+            del section[chance.choice(found)]
+            section["area"] = area
+        if chance.random() < 0.3 and case["material"][section["material"]].get("law") != "cable":
+            section["effective_length"] = 0.8
+
+
+def draw_fields(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Give the bars of a section an area and a prestress each."""
+    if any(key.removesuffix("_field") in STRESSING for section in case["section"].values() for key in section):
+        return
+    section = case["section"][chance.choice(sorted(case["section"]))]
+    steps = case.get("time", {"step": "auto"})
+    fits = steps["step"] == "auto" or steps["integrator"] not in EXPLICIT
+    fields = {"sizes": [section["area"] * chance.uniform(0.7, 1.4) for _ in body.bars]}
+    if section.get("shape", "round") != "round" or "second_moment" in section or not fits or chance.random() < 0.5:
+        fields["sizes"] = [section["area"] for _ in body.bars]
+    else:
+        section["area_field"] = "sizes"
+        del section["area"]
+    if "area" in section or chance.random() < 0.7:
+        material = case["material"][section["material"]]
+        strains, key = _strains(chance, material, len(body.bars)), chance.choice((*STRESSING[::2], "force_density"))
+        lengths = np.linalg.norm(body.points[body.bars[:, 1]] - body.points[body.bars[:, 0]], axis=1)
+        force = material["young_modulus"] * np.array(fields["sizes"]) * strains
+        fields["given"] = {"pretension": force, "rest_length": 1.0 - strains, "force_density": force / lengths}[key]
+        section[f"{key}_field"] = "given"
+    if case["mesh"]["generator"] != "arrays":
+        groups = {"node_groups": body.node_groups, "bar_groups": body.bar_groups}
+        case["mesh"] = {"generator": "arrays", "points": body.points, "bars": body.bars, **groups}
+        if case.get("solver", {}).get("linear") == "multigrid":  # of generated lattices
+            case["solver"]["linear"] = "auto"
+    case["mesh"]["bar_fields"] = fields
+
+
+def _strains(chance: random.Random, material: dict[str, Any], count: int) -> np.ndarray:
+    """Strains that a material bears."""
+    young = material["young_modulus"]
+    strong = [material.get(key, young) for key in ("yield_stress", "tensile_strength", "proof_stress")]
+    most = min(3e-3, 0.9 * min(strong) / young, 0.9 * material.get("curve", [[1.0]])[0][0])
+    least = 0.0 if material.get("law") == "cable" else -1.0
+    return np.array([most * chance.uniform(least, 1.0) for _ in range(count)])
+
+
+def draw_density(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Give force densities in the place of pretensions; forces become smaller."""
+    for section in case["section"].values():
+        given = section.pop("pretension", None)
+        if given is not None:
+            rows = [[t, value / body.size] for t, value in given] if isinstance(given, list) else given / body.size
+            section["force_density"] = rows
+
+
+def draw_damping(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Damp the whole truss by a ratio at one or two frequencies, or nodal masses alone."""
+    highest, ratio = 1.0 / (math.pi * body.limit), 10 ** chance.uniform(-3, -1)
+    frequencies = sorted(highest * 10 ** chance.uniform(-2, -0.3) for _ in range(chance.randint(1, 2)))
+    if case.get("mass") and chance.random() < 0.5:
+        case["mass"][0]["damping"] = 2.0 * math.pi * ratio * frequencies[0]
+        if chance.random() < 0.4:
+            return
+    for material in case["material"].values():
+        for key in ("damping", "stiffness_damping"):
+            material.pop(key, None)
+    if case.get("time", {"step": "auto"})["step"] != "auto":  # the critical step stays about the same
+        ratio = min(ratio, 0.02 * math.pi * body.limit * (frequencies[0] + frequencies[-1]))
+    case["damping"] = {"ratio": ratio, "frequencies": frequencies}
+
+
+def draw_velocities(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Move supports by records of velocity."""
+    for support in case.get("support", ()):
+        by_velocity(chance, support, motion.speed * chance.uniform(-0.4, 0.4), motion.end)
+
+
+def by_velocity(chance: random.Random, support: dict[str, Any], speed: float, end: float) -> None:
+    """Move a support by rows of velocity, or by a file with them."""
+    for key in ("motion", "velocity", "interpolation"):
+        support.pop(key, None)
+    turned = "fix" not in support or "frame" in support
+    moves = [turned or axis in support["fix"] for axis in "xyz"]
+    if chance.random() < 0.4:
+        columns = ["t", *(name if moved else "" for name, moved in zip(("vx", "vy", "vz"), moves, strict=True))]
+        table = {"file": RECORD, "columns": columns, "scale": speed, "time_scale": end}
+        support["velocity_file"] = table
+        return
+    times = sorted(chance.uniform(0.0, 1.0) for _ in range(chance.randint(1, 4)))
+    support["velocity"] = [[t * end, *(speed * chance.uniform(-1.0, 1.0) * moved for moved in moves)] for t in times]
 
 
 CELLS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (1, 1, 2), (2, 2, 1), (2, 1, 2), (1, 2, 2), (3, 1, 1))
@@ -650,6 +775,11 @@ CHANGES = (
     ("points", None, draw_points),
     ("inclined", 0.1, draw_inclined),
     ("connectors", 0.08, draw_connectors),
+    ("density", 0.4, draw_density),
+    ("velocities", 0.3, draw_velocities),
+    ("damping", 0.1, draw_damping),
+    ("fields", 0.12, draw_fields),
+    ("sections", 0.2, draw_sections),
 )
 """What some cases have besides, with its share of them, drawn on its own so that other cases stay as they are."""
 

@@ -37,7 +37,7 @@ def stage_rows(cases: Sequence[Any], combinations: Sequence[Any], common: Mappin
     Parameters
     ----------
     cases, combinations : the validated tables ``[[load_case]]`` and ``[[combination]]``
-    common : the tables in force in the stage that they start from
+    common : the tables in force at the end of the stage that they start from, by :func:`at_end`
 
     Raises
     ------
@@ -50,6 +50,31 @@ def stage_rows(cases: Sequence[Any], combinations: Sequence[Any], common: Mappin
         scaled = [_scaled(own[n], factor, combination.name) for n, factor in combination.factors.items() if factor]
         rows.append({"name": combination.name, **_joined(common, scaled, combination.name)})
     return rows
+
+
+def at_end(stage: Any) -> dict[str, Any]:
+    """Return the tables in force at the end of a static stage, a validated one: what varies has its value there, and
+    supports are at rest."""
+    last = getattr(stage.static.parameters, "end", 1.0)
+    tables = _tables(stage)
+    for key, of in (("load", "force"), ("temperature", "value")):
+        tables[key] = [_constant(row, "table", of, last) for row in tables.get(key, [])]
+    if "gravity" in tables:
+        tables["gravity"] = _constant(tables["gravity"], "acceleration", "acceleration", last)
+    motion = ("motion", "velocity", "acceleration", "interpolation")
+    still = [{key: value for key, value in row.items() if key not in motion} for row in tables.get("support", [])]
+    return {**tables, "support": still}
+
+
+def _constant(row: Mapping[str, Any], key: str, of: str, time: float) -> dict[str, Any]:
+    """Return a row whose ``key`` has rows over time as it is at one, with the value of ``of`` then."""
+    if not has_rows(row.get(key)):
+        return dict(row)
+    from ..mechanics.motion import Table
+
+    values = Table(row[key], row.get("interpolation") == "smooth")(time).tolist()
+    kept = {name: value for name, value in row.items() if name not in (key, "interpolation")}
+    return {**kept, of: values if key == of else _times(row[of], values[0]) if of in row else values[0]}
 
 
 def _tables(case: Any) -> dict[str, Any]:

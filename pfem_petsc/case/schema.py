@@ -272,7 +272,7 @@ class Case(_Tables):
             _validated(stage.data, each, problems, stage.place) for stage, each in zip(stages, reading[1:], strict=True)
         ]
         if model is not None and None not in models and (model.load_case or model.combination):
-            derived = load_case_stages(data, model, stages, problems)
+            derived = load_case_stages(data, model, stages, [model, *models][-1], problems)
             reading += (more := [Reading(stage.data, folder, lenient) for stage in derived])
             pairs = zip(derived, more, strict=True)
             models += [_validated(stage.data, each, problems, stage.place) for stage, each in pairs]
@@ -637,9 +637,11 @@ def _output(given: Any, common: Any, k: int, problems: Problems) -> Any:
 
 
 def load_case_stages(
-    data: Mapping[str, Any], model: CaseModel, stages: Sequence[StageTables], problems: Problems
+    data: Mapping[str, Any], model: CaseModel, stages: Sequence[StageTables], start: CaseModel, problems: Problems
 ) -> list[StageTables]:
-    """The stages that follow from the load cases and combinations of a case, with one before them if it has none."""
+    """The stages that follow from the load cases and combinations of a case, with one before them if it has none.
+
+    ``start`` is the validated last stage, or the case without stages."""
     made: list[StageTables] = []
     if model.modes is not None:
         problems.add(("modes",), "modes are those of one state, and not of load cases: give a case without them")
@@ -667,7 +669,7 @@ def load_case_stages(
     keys += [("combination", k) for k in range(len(model.combination))]
     common = {key: value for key, value in last.data.items() if key not in ("modes", *ONE_STAGE)} | {"static": static}
     try:
-        rows = load_cases.stage_rows(model.load_case, model.combination, common)
+        rows = load_cases.stage_rows(model.load_case, model.combination, load_cases.at_end(start))
     except load_cases.UnsuitableError as error:
         problems.add((error.key,), str(error))
         return []

@@ -39,6 +39,15 @@ def test_box_and_i_section_by_rectangles():
     assert beam.plastic_modulus == pytest.approx((2 * t * b**2 + (h - 2 * t) * w**2) / 4.0, rel=1e-13)
 
 
+def test_thickness_from_an_area():
+    """The smallest thickness that is tried has no axis of equal halves to rounding."""
+    sizes = {"width": 0.03957047351167371, "height": 0.03883870351542023}
+    found = cross_section("channel", sizes, 1e-3)
+    t = max(np.roots([-2.0, 2.0 * 0.03957047351167371 + 0.03883870351542023, -1e-3]).min(), 0.0)
+    assert found.area == pytest.approx(1e-3, rel=1e-12)
+    assert found.second_moment == pytest.approx(cross_section("channel", {**sizes, "thickness": t}).second_moment)
+
+
 @pytest.mark.parametrize(
     ("shape", "sizes", "inside", "least"),
     [

@@ -102,6 +102,32 @@ def test_each_is_a_run_of_its_own(comm, shared_tmp_path):
                 assert history[column][row] == pytest.approx(one.history[column][-1], rel=1e-7, abs=1e-9)
 
 
+def test_what_varied_before_stays():
+    """Loads, gravity, temperatures and supports over the load factor are in load cases as they were at the end."""
+    ramp = [[0.0, 0.2], [0.5, 2.0], [1.5, 1.0]]
+    moved = {"node_set": "bottom", "fix": "xyz", "motion": [[0.0, 0.0, 0.0, 0.0], [0.8, 1e-3, 0.0, 0.0]]}
+    before = {
+        "load": [{**TOP, "force": [0.0, 20.0, 0.0], "table": ramp}],
+        "gravity": {"acceleration": [[0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, -30.0]]},
+        "temperature": [{"table": [[0.0, 60.0], [1.0, 20.0]]}],
+        "support": [moved, {"name": "lid", "node_set": "top", "fix": "z"}],
+    }
+    own = {
+        "load": PUSH,
+        "gravity": {"acceleration": [0.0, 3.0, 0.0]},
+        "temperature": [{"value": 5.0}],
+        "support": [
+            {"name": "lid", "node_set": "top", "fix": "z", "motion": [[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -1e-3]]}
+        ],
+    }
+    case = Case.from_dict(FRAME | before | {"load_case": [{"name": "one", **own}]})
+    stage = case.stage[1]
+    assert [load.force for load in stage.load] == [(0.0, 30.0, 0.0), (12.0, 0.0, 0.0)]
+    assert stage.gravity.acceleration == (0.0, 3.0, -15.0)
+    assert [(heat.value, heat.table) for heat in stage.temperature] == [(20.0, None), (5.0, None)]
+    assert [support.motion is None for support in stage.support] == [True, False]
+
+
 @pytest.mark.slow
 @pytest.mark.parallel
 def test_restart_in_any_is_bitwise(comm, shared_tmp_path):

@@ -24,11 +24,14 @@ from mpi4py import MPI
 
 from pfem_petsc import open_result
 from pfem_petsc.case.schema import Case
+from pfem_petsc.case.tables import Section
 from pfem_petsc.contact.walls.base import WallKeys
+from pfem_petsc.output.result import Result
+from pfem_petsc.post.members import members
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
 
-from .draw import generated, members_of
+from .draw import closed_area, generated, members_of
 
 Faults = list[tuple[str, str]]
 _ENDS = ("_energy", "_dissipation", "_work")
@@ -84,8 +87,10 @@ def check_result(folder: Path, warned: list[str]) -> Faults:
     faults = _finite(result)
     if faults:
         return faults
+    faults += _sections(case) + _members_table(folder, result)
     if case.stage:
-        return _stages(result, case, history) + _momentum(case, history)
+        return faults + _stages(result, case, history) + _momentum(case, history) + _states(folder, result)
+    faults += _mass(case, history)
     faults += _walls(result, case, history)
     faults += _energy(case, history, warned, result.size)
     faults += _momentum(case, history)
@@ -98,14 +103,21 @@ def _stages(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Fault
     # below: supports that move a mechanism, with forces that are rounding errors of the stiffness
     if not scale > 1e-13 * _strongest(case) * float(np.ptp(result.positions, axis=0).max(initial=0.0)):
         return []
-    faults = _open(history)
+    faults, stages = _open(history), history["stage"].astype(int)
+    # load cases begin with what there was at the end of the stage that they start from
+    ends = {k: np.flatnonzero(stages == k).max(initial=-1) for k in range(len(case.stage))}
+    before = np.arange(len(stages)) - 1
+    for k, stage in enumerate(case.stage):
+        if stage.starts_from is not None:
+            before[np.flatnonzero(stages == k)[:1]] = ends[stage.starts_from]
+    before = before[1:]
     may_fall = [stage.time is not None and stage.time.integrator in BY_END_VELOCITIES for stage in case.stage]
     for name in NEVER_FALL:
-        falls = np.diff(history[name])
+        falls = history[name][1:] - history[name][before]
         if name == "damping_dissipation":
-            falls[np.array(may_fall)[history["stage"][1:].astype(int)]] = 0.0
+            falls[np.array(may_fall)[stages[1:]]] = 0.0
         if falls.min(initial=0.0) < -1e-11 * scale:
-            stage = int(history["stage"][falls.argmin() + 1])
+            stage = stages[falls.argmin() + 1]
             faults.append((f"{name} falls", f"{falls.min() / scale:.3g} of the largest energy, in stage {stage}"))
     return faults
 
@@ -240,7 +252,93 @@ def _energy(case: Case, history: dict[str, np.ndarray], warned: list[str], size:
 
 def _strongest(case: Case) -> float:
     """E A of the stiffest bar [N]."""
-    return max(m.young_modulus for m in case.material.values()) * max(s.area for s in case.section.values())
+    return max(m.young_modulus for m in case.material.values()) * max(
+        _areas(case, s).max() for s in case.section.values()
+    )
+
+
+def _areas(case: Case, section: Section) -> np.ndarray:
+    """Area of the bars of a section [m2], one or one of each bar of the mesh."""
+    if section.area_field is not None:
+        return np.array(case.to_dict()["mesh"]["bar_fields"][section.area_field])
+    return np.array([section.uniform_area])
+
+
+def _sections(case: Case) -> Faults:
+    """Check that areas are those of closed forms."""
+    faults: Faults = []
+    for name, section in case.section.items():
+        if section.shape is None or section.area is not None or section.area_field is not None:
+            continue
+        expected = closed_area(section.shape, section.sizes)
+        if not abs(section.uniform_area - expected) <= 1e-12 * expected:
+            faults.append(("area is not that of the sizes", f"{name}: {section.uniform_area} and {expected} m2"))
+    return faults
+
+
+def _mass(case: Case, history: dict[str, np.ndarray]) -> Faults:
+    """Check the momentum of a body that begins in translation: areas, densities, unstressed lengths, nodal masses."""
+    start = case.initial[0] if len(case.initial) == 1 else None
+    if start is None or start.node_set is not None or any(start.angular_velocity) or case.support:
+        return []
+    table = case.to_dict()["mesh"]
+    slab, fields = generated(table), table.get("bar_fields", {})
+    ends = slab.points[np.asarray(slab.bars)]
+    lengths, lines = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), np.zeros(len(slab.bars))
+    for section in sorted(case.section.values(), key=lambda section: section.bars is not None):
+        rows = slice(None) if section.bars is None else slab.bar_groups[str(section.bars)]
+        rest = section.rest_length if isinstance(section.rest_length, float) else 1.0
+        rest = np.array(fields.get(section.rest_length_field, np.full(len(lines), rest)))
+        made = np.broadcast_to(_areas(case, section), lines.shape) * rest * case.material[section.material].density
+        lines[rows] = made[rows]
+    nodal = sum(mass.value * len(_members(case, mass.node_set)) for mass in case.point_mass)
+    expected = (lines @ lengths + nodal) * np.array(start.velocity)
+    if not np.abs(history["momentum"][0] - expected).max() <= 1e-9 * np.abs(expected).max():
+        return [("momentum at the start is not that of the mass", f"{history['momentum'][0]} and {expected}")]
+    return []
+
+
+def _members_table(folder: Path, result: Loaded) -> Faults:
+    """Check the table of members against the axial forces of the snapshots."""
+    forces = result.fields.get("axial_force")
+    if forces is None or not len(result.steps):
+        return []
+    opened = open_result(folder)
+    whole, times = members(opened, per="bar"), np.asarray(opened.times)
+    bars = whole["bars"].astype(int)
+    shown = forces[np.abs(times[:, None] - whole["time"]).argmin(axis=0), bars]
+    scale = np.abs(forces).max()
+    if not np.abs(shown - whole["axial_force"]).max(initial=0.0) <= 1e-12 * scale:
+        return [("members: axial_force is not that of the snapshot", f"{np.abs(shown - whole['axial_force']).max()}")]
+    each = members(opened, per="bar", each_case=True) if result.case.stage else None
+    for column, extreme in (("tension", np.maximum), ("compression", np.minimum)):
+        expected = np.zeros(len(result.fields["axial_force"][0]))
+        if each is None:
+            expected = extreme(expected, extreme.reduce(forces))
+        else:
+            extreme.at(expected, each["bars"].astype(int), each[column])
+        if not np.abs(whole[column] - expected[bars]).max(initial=0.0) <= 1e-12 * scale:
+            return [(f"members: {column} is not the extreme of the rows", f"{whole[column]}, {expected[bars]}")]
+    return []
+
+
+def stage_end(opened: Result, name: str) -> int:
+    """Number of the snapshot at the end of a stage, a load case or a combination."""
+    k = [stage.name for stage in opened.case.stages].index(name)
+    return int(np.abs(np.asarray(opened.times) - np.asarray(opened.stage_ends)[k + 1]).argmin())
+
+
+def _states(folder: Path, result: Loaded) -> Faults:
+    """Check that a form stays where it is, and that a combination of one load case with the factor 1 is this case."""
+    opened, names = open_result(folder), [stage.name for stage in result.case.stages]
+    pairs = [("form", "built")] if "built" in names else []
+    pairs += [(next(iter(row.factors)), row.name) for row in result.case.combination if row.name == "same"]
+    faults: Faults = []
+    for one, other in pairs:
+        a, b = (result.positions[stage_end(opened, name)] for name in (one, other))
+        if not np.abs(a - b).max() <= 1e-9 * result.size:
+            faults.append((f"{other} is not {one.rstrip('0123456789')}", f"{np.abs(a - b).max() / result.size:.3g}"))
+    return faults
 
 
 def _gains(case: Case, history: dict[str, np.ndarray], warned: list[str], scale: float) -> Faults:

@@ -24,11 +24,12 @@ from helpers.kills import differences
 from mpi4py import MPI
 
 from pfem_petsc import Case, open_result
+from pfem_petsc.case.editing import tables_of
 from pfem_petsc.errors import InputError
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
 
-from .checks import Loaded, check_result, distance, energy_scale
+from .checks import Loaded, check_result, distance, energy_scale, stage_end
 from .draw import draw_case, generated, members_of
 from .draw_stages import draw_staged
 from .running import case_text, clear, run_case, run_in_two_parts, steps_of
@@ -56,6 +57,9 @@ UNITS: dict[str, tuple[int, int, int]] = {
     "fluidity": (0, 0, -1),
     "specific_heat": (2, 0, -2),
     "area": (2, 0, 0),
+    **dict.fromkeys(("width", "height", "web_thickness"), (1, 0, 0)),
+    "force_density": (0, 1, -2),
+    "frequencies": (0, 0, -1),
     "second_moment": (4, 0, 0),
     "pretension": (1, 1, -2),
     "force": (1, 1, -2),
@@ -70,7 +74,17 @@ UNITS: dict[str, tuple[int, int, int]] = {
     "time": (0, 0, 1),
     "duration": (0, 0, 1),
 }
-ROWS = ("pretension", "prestress", "rest_length", "table", "motion", "velocity", "acceleration", "damping_table")
+ROWS = (
+    "pretension",
+    "prestress",
+    "rest_length",
+    "force_density",
+    "table",
+    "motion",
+    "velocity",
+    "acceleration",
+    "damping_table",
+)
 """Keys that may have rows whose first number is a time."""
 VECTORS = ("velocity", "angular_velocity", "acceleration", "force", "normal", "axis", "along", "direction")
 
@@ -111,6 +125,10 @@ def _as_arrays(table: dict[str, Any]) -> dict[str, Any]:
         "bars": np.asarray(slab.bars).tolist(),
         "bar_groups": groups,
     }
+    if "bar_fields" in table["mesh"]:
+        plain["mesh"]["bar_fields"] = copy.deepcopy(table["mesh"]["bar_fields"])
+    if any({"catalogue", "velocity_file"} & set(each) for each in (*_supports(plain), *plain["section"].values())):
+        plain = tables_of(Case.from_dict(plain), given=True)  # which has the numbers of the files
     if plain.get("solver", {}).get("linear") == "multigrid":  # of generated lattices only
         plain["solver"]["linear"] = "auto"
     return plain
@@ -197,7 +215,8 @@ def _turned(chance: random.Random, table: dict[str, Any]) -> Copy:
 
 def _supports(table: dict[str, Any]) -> list[dict[str, Any]]:
     """Those of the case and of its stages."""
-    return [support for part in (table, *table.get("stage", ())) for support in part.get("support", ())]
+    parts = (table, *table.get("stage", ()), *table.get("load_case", ()))
+    return [support for part in parts for support in part.get("support", ())]
 
 
 def _renumbered(chance: random.Random, table: dict[str, Any]) -> Copy:
@@ -292,7 +311,7 @@ def judge_copies(
     """
     faults: list[tuple[str, str]] = []
     explicit = "solver" not in table and table["time"].get("mass") != "consistent"
-    kinds = {kind: make for kind, make in KINDS.items() if "stage" not in table or kind in OF_STAGES}
+    kinds = {kind: make for kind, make in KINDS.items() if "time" in table or kind in OF_STAGES}
     tight = explicit or table.get("solver", {}).get("rtol", 1.0) < 1e-10
     moved: float | None = None
     for kind, make in kinds.items():
@@ -457,6 +476,8 @@ def check_case(text: str, comm: MPI.Comm, folder: Path, source: str, restart: bo
     if outcome.status == 0 and comm.rank == 0:
         told["faults"] += check_result(folder / "whole", outcome.warnings)
         told["touched"] = _touched(folder / "whole")
+        if comm.size == 1:
+            told["faults"] += judge_load_case(_table(text), folder, source)
     steps = comm.bcast(steps_of(folder / "whole") if outcome.status == 0 and comm.rank == 0 else 0)
     if restart and outcome.status == 0 and steps > 4:
         files = (folder / "whole" / "result.vtkhdf", folder / "parts" / "result.vtkhdf")
@@ -471,6 +492,105 @@ def check_case(text: str, comm: MPI.Comm, folder: Path, source: str, restart: bo
             told["faults"].append((cause, f"stopped at step {second.stopped}: {len(apart)} datasets: {first}"))
     clear(comm, folder / "parts")
     return told
+
+
+def judge_load_case(table: dict[str, Any], folder: Path, source: str) -> list[tuple[str, str]]:
+    """Check the damping of the case, and one of its load cases or combinations against stages by hand, on one rank."""
+    whole = open_result(folder / "whole")
+    faults = _damping(whole.case, table.get("damping"))
+    names = [row["name"] for key in ("load_case", "combination") for row in table.get(key, ())]
+    if not names:
+        return faults
+    name, place = random.Random(table["title"]).choice(names), folder / "hand"
+    outcome = run_case(case_text(by_hand(table, name)), MPI.COMM_SELF, place, source=source)
+    if outcome.status:
+        return [*faults, (f"{name} by hand fails", f"status {outcome.status}: {outcome.message[:300]}")]
+    one, other = Loaded(folder / "whole"), Loaded(place)
+    ends = stage_end(whole, name), -1
+    for what, a, b in [("positions", one.positions, other.positions), *_both(one.fields, other.fields)]:
+        scale = one.size if what == "positions" else max(float(np.abs(b).max()), 1e-300)
+        apart = float(np.abs(a[ends[0]] - b[ends[1]]).max()) / scale
+        if not apart <= 1e-7:
+            faults.append((f"load case is not that by hand: {what}", f"{name}: {apart:.3g}"))
+    clear(MPI.COMM_SELF, place)
+    return faults
+
+
+def _both(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    return [(name, one[name], other[name]) for name in ("axial_force", "plastic_strain") if name in one]
+
+
+def _damping(case: Case, given: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """Check that materials have the damping of a ratio at its frequencies, none of it negative."""
+    for material in case.material.values() if given else ():
+        a, b = material.damping / material.density, material.stiffness_damping
+        rates = 2.0 * np.pi * np.array(given["frequencies"])
+        if min(a, b) < 0.0 or not np.allclose(0.5 * (a / rates + b * rates), given["ratio"], rtol=1e-12):
+            return [("damping is not that of the ratio", f"{a}, {b} of {given}")]
+    return []
+
+
+def by_hand(table: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return a case with a load case or combination as its last stage, whose tables are written out."""
+    made = copy.deepcopy({key: value for key, value in table.items() if key not in ("load_case", "combination")})
+    stages = made.setdefault("stage", [])
+    if not stages:
+        stages.append({"name": "permanent", "static": made.pop("static")})
+    keys = ("load", "gravity", "temperature", "support")
+    common = {key: next((part[key] for part in (*stages[::-1], made) if key in part), []) for key in keys}
+    factors = {row["name"]: row["factors"] for row in table.get("combination", ())}.get(name, {name: 1.0})
+    cases = {row["name"]: row for row in table["load_case"]}
+    static = stages[-1]["static"]
+    stage = {"name": name, "static": {"method": "newton"} if static["method"] == "force_density" else static}
+    own: dict[str, list] = {key: [] for key in (*keys, "wind")}
+    for case, factor in factors.items():
+        for key in own if factor else ():
+            rows = cases[case].get(key, [])
+            own[key] += [_times(row, factor) for row in (rows if isinstance(rows, list) else [rows])]
+    for key, last in (("load", "force"), ("temperature", "value")):
+        if own[key]:
+            stage[key] = [_at_end(row, last) for row in common[key]] + own[key]
+    if own["gravity"]:
+        rows = [*([common["gravity"]] if common["gravity"] else []), *own["gravity"]]
+        stage["gravity"] = {"acceleration": np.sum([row["acceleration"] for row in rows], axis=0).tolist()}
+    if own["support"]:
+        moved = own["support"][0]
+        same = "name" if "name" in moved else "node_set"
+        motions = ("motion", "velocity", "velocity_file", "interpolation")
+        still = [{key: value for key, value in row.items() if key not in motions} for row in common["support"]]
+        stage["support"] = [moved if row.get(same) == moved[same] else row for row in still]
+    if own["wind"]:  # of load cases alone
+        single = {"wind": own["wind"][0]}
+        if own["gravity"]:
+            single["gravity"] = {
+                "acceleration": np.sum([row["acceleration"] for row in own["gravity"]], axis=0).tolist()
+            }
+        lists = {key: own[key] for key in ("load", "temperature", "support") if own[key]}
+        made["load_case"] = [{"name": name, **lists, **single}]
+    else:
+        stages.append(stage)
+    return made
+
+
+def _at_end(row: dict[str, Any], key: str) -> dict[str, Any]:
+    """Return a row over time as it is after the last of its rows."""
+    last = row["table"][-1][1] if "table" in row else None
+    kept = {name: value for name, value in row.items() if name not in ("table", "interpolation")}
+    if last is None:
+        return kept
+    return kept | {key: last if key == "value" else [last * each for each in row[key]]}
+
+
+def _times(row: dict[str, Any], factor: float) -> dict[str, Any]:
+    """Return a table of a load case times a factor."""
+    scaled = copy.deepcopy(row)
+    for key in {"force", "acceleration", "value", "density"} & set(row):
+        scaled[key] = (factor * np.array(row[key])).tolist()
+    if "table" in row and "force" not in row:
+        scaled["table"] = [[t, factor * value] for t, value in row["table"]]
+    if "motion" in row:
+        scaled["motion"] = [[t, *(factor * value for value in values)] for t, *values in row["motion"]]
+    return scaled
 
 
 def judge_ranks(text: str, table: dict, one: Path, other: Path, folder: Path, source: str) -> list[tuple[str, str]]:

@@ -13,10 +13,11 @@ from random_trusses.comparisons import (
     KINDS,
     check_case,
     judge_copies,
+    judge_load_case,
     judge_ranks,
     judge_schemes,
 )
-from random_trusses.draw import LAWS, draw_case
+from random_trusses.draw import LAWS, SHAPES, draw_case
 from random_trusses.draw_stages import draw_staged
 from random_trusses.running import case_text, run_case
 
@@ -102,9 +103,10 @@ def test_generator_draws_stages_with_all_that_they_may_have():
     for table in tables[:60]:
         assert tomllib.loads(case_text(table)) == table
         Case.from_toml(case_text(table))
-    stages = [stage for table in tables for stage in table["stage"]]
+    stages = [stage for table in tables for stage in table.get("stage", ())]
     methods = {stage["static"]["method"] for stage in stages if "static" in stage}
-    assert methods == {"newton", "relaxation"} and {len(table["stage"]) for table in tables} == {2, 3, 4}
+    assert methods == {"newton", "relaxation", "force_density"}
+    assert {len(table.get("stage", ())) for table in tables} >= {0, 2, 3, 4}
     assert len({stage["time"]["integrator"] for stage in stages if "time" in stage}) == 9
     given = {key for stage in stages for key in stage}
     assert given >= {"support", "load", "gravity", "temperature", "wall", "remove", "section", "initial"}
@@ -114,6 +116,11 @@ def test_generator_draws_stages_with_all_that_they_may_have():
     sections = [keys for each in (*tables, *stages) for keys in each.get("section", {}).values()]
     rests = [keys[key] for keys in sections for key in ("pretension", "prestress", "rest_length") if key in keys]
     assert {type(value) for value in rests} == {float, list}
+    assert {key for keys in sections for key in keys} >= {"force_density", "force_density_field", "shape", "catalogue"}
+    cases = [row for table in tables for row in table.get("load_case", ())]
+    assert {key for row in cases for key in row} == {"name", "load", "gravity", "wind", "temperature", "support"}
+    factors = {factor for table in tables for row in table.get("combination", ()) for factor in row["factors"].values()}
+    assert factors == {1.0, 1.35, 1.5, 0.5, 0.0, -1.0}
     assert {table["material"]["m1"]["rupture"]["steps"] for table in tables} == {1, 2, 4, 6}
 
 
@@ -140,6 +147,16 @@ def test_generator_draws_all_of_what_is_documented():
         "support", "load", "gravity", "temperature", "contact_pair", "initial", "solver", "output",
     }  # fmt: skip
     assert {key for table in tables for key in table["mesh"]} >= {"generator", "bracing", "kind", "gap"}
+    sections = [section for table in tables for section in table["section"].values()]
+    assert {section.get("shape") for section in sections} == {None, *SHAPES}
+    keys = {key for section in sections for key in section}
+    assert keys >= {"pretension_field", "rest_length_field", "force_density_field", "force_density", "area_field"}
+    assert keys >= {"width", "height", "thickness", "web_thickness", "diameter", "catalogue", "profile"}
+    supports = [support for table in tables for support in table.get("support", ())]
+    assert "velocity_file" in {key for support in supports for key in support}
+    assert any(type(support.get("velocity", [0.0])[0]) is list for support in supports)
+    assert {len(table["damping"]["frequencies"]) for table in tables if "damping" in table} == {1, 2}
+    assert any("damping" in mass for table in tables for mass in table.get("mass", ()))
 
 
 FALLING = """
@@ -186,6 +203,7 @@ def sound(tmp_path):
         ("history/plastic_heat", lambda x: x - np.arange(len(x)), "plastic heat falls"),
         ("history/damping_dissipation", lambda x: x - 1e-3, "damping_dissipation negative"),
         ("history/momentum", lambda x: x * np.nan, "not finite"),
+        ("history/momentum", lambda x: 1.001 * x, "momentum at the start is not that of the mass"),
     ],
 )
 def test_the_checks_see_what_they_are_there_for(sound, name, change, cause):
@@ -195,6 +213,16 @@ def test_the_checks_see_what_they_are_there_for(sound, name, change, cause):
     with h5py.File(sound / "result.vtkhdf", "a", locking=False) as file:
         file[name][...] = change(file[name][...])
     assert cause in [found for found, _ in check_result(sound, [])]
+
+
+def test_load_cases_by_hand_see_another_load(tmp_path):
+    table = next(table for table in map(draw_staged, range(200)) if "load" in table.get("load_case", [{}])[0])
+    table["load_case"] = table["load_case"][:1]
+    table.pop("combination", None)
+    assert check_case(case_text(table), MPI.COMM_SELF, tmp_path, "random-0.toml", False)["faults"] == []
+    table["load_case"][0]["load"][0]["force"][1] += 0.01
+    found = {cause for cause, _ in judge_load_case(table, tmp_path, "random-0.toml")}
+    assert found == {"load case is not that by hand: positions", "load case is not that by hand: axial_force"}
 
 
 @pytest.mark.slow

@@ -87,14 +87,15 @@ def check_result(folder: Path, warned: list[str]) -> Faults:
     faults = _finite(result)
     if faults:
         return faults
-    faults += _sections(case) + _members_table(folder, result)
+    faults += _sections(case)
     if case.stage:
-        return faults + _stages(result, case, history) + _momentum(case, history) + _states(folder, result)
+        faults += _stages(result, case, history) + _momentum(case, history) + _states(folder, result)
+        return faults or _members_table(folder, result)
     faults += _mass(case, history)
     faults += _walls(result, case, history)
     faults += _energy(case, history, warned, result.size)
     faults += _momentum(case, history)
-    return faults
+    return faults or _members_table(folder, result)
 
 
 def _stages(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults:

@@ -138,12 +138,12 @@ def _joined(common: Mapping[str, Any], parts: Sequence[Mapping[str, Any]], name:
     return made
 
 
-def _gravity(tables: Sequence[Any], name: str) -> dict[str, Any]:
-    accelerations = [table["acceleration"] if isinstance(table, Mapping) else table.acceleration for table in tables]
-    if len(accelerations) > 1 and any(map(has_rows, accelerations)):
+def _gravity(tables: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
+    accelerations = [table["acceleration"] for table in tables]
+    if len(tables) > 1 and any(map(has_rows, accelerations)):
         raise UnsuitableError(name, "adds a gravity with rows to another gravity: give constant accelerations")
-    if len(accelerations) == 1:
-        return {"acceleration": accelerations[0]}
+    if len(tables) == 1:
+        return dict(tables[0])
     return {"acceleration": [sum(each) for each in zip(*accelerations, strict=True)]}
 
 

@@ -128,6 +128,14 @@ def test_what_varied_before_stays():
     assert [support.motion is None for support in stage.support] == [True, False]
 
 
+def test_gravity_with_rows_keeps_its_interpolation():
+    rows = [[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -9.81]]
+    weight = {"name": "dead", "gravity": {"acceleration": rows, "interpolation": "smooth"}}
+    case = Case.from_dict(FRAME | {"load_case": [weight], "combination": [{"name": "c", "factors": {"dead": 2.0}}]})
+    assert [stage.gravity.interpolation for stage in case.stage[1:]] == ["smooth", "smooth"]
+    assert case.stage[2].gravity.acceleration[1] == (1.0, 0.0, 0.0, -19.62)
+
+
 @pytest.mark.slow
 @pytest.mark.parallel
 def test_restart_in_any_is_bitwise(comm, shared_tmp_path):

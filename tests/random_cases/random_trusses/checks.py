@@ -280,7 +280,8 @@ def _sections(case: Case) -> Faults:
 def _mass(case: Case, history: dict[str, np.ndarray]) -> Faults:
     """Check the momentum of a body that begins in translation: areas, densities, unstressed lengths, nodal masses."""
     start = case.initial[0] if len(case.initial) == 1 else None
-    if start is None or start.node_set is not None or any(start.angular_velocity) or case.support:
+    adjusted = any(wall.adjust for wall in case.wall)  # which changes lengths in the mesh
+    if start is None or start.node_set is not None or any(start.angular_velocity) or case.support or adjusted:
         return []
     table = case.to_dict()["mesh"]
     slab, fields = generated(table), table.get("bar_fields", {})

@@ -563,7 +563,10 @@ class StaticStepper(ImplicitStepper):
         state, rest = self.state, np.zeros_like(self.state.position)
         system.linearise(rest)
         response = system.response(rest, state.time)
-        metric = Metric(self.model.comm, False, 1.0 / dot(self.model.comm, response, response))
+        square = dot(self.model.comm, response, response)
+        if not square:  # nothing changes with the load factor
+            return ""
+        metric = Metric(self.model.comm, False, 1.0 / square)
         points, softest = PointSolver(state, system, metric, False), 1.0
         for length in size * _LENGTHS:
             try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.small_models import case_of
+from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError, SimulationFailure
@@ -187,3 +188,19 @@ def test_a_viscous_bar_that_yields_under_its_load_does_not_lack_supports(shared_
     with pytest.raises(SimulationFailure, match="Bars yield there, and without hardening nothing resists") as error:
         history_of(case, comm, shared_tmp_path)
     assert "upports" not in str(error.value)
+
+
+def test_the_cause_of_a_failure_is_told_where_nothing_changes_with_the_load_factor(tmp_path):
+    """Bars that yield, in a stage that only lets what moved come to rest: there is no response to look along."""
+    yields = {"m": {"young_modulus": 1e6, "density": 1e3, "yield_stress": 1e3, "isotropic_hardening": 1e4}}
+    data = {
+        "mesh": {"generator": "rod", "length": 1.0, "elements": 1},
+        "node_set": {"start": {"group": "start"}, "all": {"all": True}},
+        "material": yields,
+        "section": {"s": {"area": 1e-3, "material": "m"}},
+        "support": [{"node_set": "start", "fix": "x"}, {"node_set": "all", "fix": "yz"}],
+        "static": {"step": 0.5},
+    }
+    with Simulation(Case.from_dict(data), MPI.COMM_SELF, tmp_path, quiet=True) as simulation:
+        simulation.run()
+        assert "no limit point" in simulation.stepper._limit_point(0.5)

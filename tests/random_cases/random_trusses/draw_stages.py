@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .draw import EXPLICIT, IMPLICIT, plain, vector
-from .draw_load_cases import Scale, draw_changes
+from .draw_load_cases import draw_changes
 
 YOUNG, DENSITY, AREA, PITCH = 1e6, 1000.0, 1e-3, 0.5
 STEP = 0.5 * PITCH / (YOUNG / DENSITY) ** 0.5
@@ -89,7 +89,7 @@ def draw_staged(seed: int) -> dict[str, Any]:
     case["output"] = {"fields_every": chance.choice((1, 4)), "history_every": chance.choice((1, 1, 3))}
     case["output"]["probe"] = [{"name": "pr", "node_set": "one"}]
     case["solver"] = {"linear": chance.choice(("auto", "auto", "gamg", "cg", "mumps")), "rtol": 1e-12}
-    draw_changes(seed, case, Scale(FORCE, STRAIN, PITCH, SPEED, STEP), [stage.end for stage in kinds])
+    draw_changes(seed, case, FORCE, STEP, [stage.end for stage in kinds])
     return plain(case)
 
 

@@ -31,15 +31,12 @@ def vector(chance: random.Random, length: float) -> np.ndarray:
 def draw_prestress(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
     """Prescribe rest lengths of a section."""
     section = case["section"][chance.choice(sorted(case["section"]))]
-    material = case["material"][section["material"]]
-    young = material["young_modulus"]
-    most = min(3e-3, 0.9 * material.get("yield_stress", young) / young)
-    least = 0.0 if material.get("law") == "cable" else -1.0  # cables are not pressed
-    key = chance.choice(("pretension", "prestress", "rest_length"))
+    material, key = case["material"][section["material"]], chance.choice(STRESSING)
+    unit = {"pretension": section["area"], "prestress": 1.0, "force_density": section["area"] / body.size}
 
     def value() -> float:
-        strain = most * chance.uniform(least, 1.0)
-        return {"pretension": young * strain * section["area"], "prestress": young * strain}.get(key, 1.0 - strain)
+        strain = _strains(chance, material, 1)[0]
+        return material["young_modulus"] * strain * unit[key] if key in unit else 1.0 - strain
 
     rows = sorted(chance.random() for _ in range(chance.randint(1, 4)))
     section[key] = value() if chance.random() < 0.4 else [[row * motion.end, value()] for row in rows]
@@ -251,8 +248,7 @@ def draw_connectors(chance: random.Random, case: dict[str, Any], body: Body, mot
         case.setdefault("dashpot", []).append({"between": between, "coefficient": coefficient})
 
 
-FILES = Path(__file__).resolve().parent
-PROFILES, RECORD = str(FILES / "profiles.csv"), str(FILES / "record.csv")
+PROFILES, RECORD = (str(Path(__file__).resolve().parent / name) for name in ("profiles.csv", "record.csv"))
 NAMES = [line.split(",")[0] for line in Path(PROFILES).read_text().splitlines()[1:]]
 SHAPES = ("round", "tube", "angle", "box", "I", "channel")
 STRESSING = ("pretension", "prestress", "rest_length", "force_density")
@@ -272,22 +268,20 @@ def draw_sections(chance: random.Random, case: dict[str, Any], body: Body, motio
         if chance.random() < 0.2 or {"shape", "second_moment", "area_field"} & set(section):
             continue
         area, shape = section.pop("area"), chance.choice(SHAPES)
-        alike = "stage" in case or "static" in case or len(case["section"]) == 1
+        alike = "time" not in case or len(case["section"]) == 1
         if chance.random() < 0.25 and alike and not {"pretension", "force_density"} & set(section):
             section |= {"catalogue": PROFILES, "profile": chance.choice(NAMES)}
             continue
-        sizes = {"diameter" if shape in ("round", "tube") else "width": 1.0}
-        sizes |= {"thickness": chance.uniform(0.04, 0.3)} if shape != "round" else {}
-        if "width" in sizes and chance.random() < 0.5:
-            sizes["height"] = chance.uniform(0.7, 1.5)
-        if shape in ("I", "channel") and chance.random() < 0.5:
-            sizes["web_thickness"] = chance.uniform(0.04, 0.3)
+        more = {"thickness": 1.0, "height": 0.5, "web_thickness": 0.5}
+        allowed = {"round": 0, "tube": 1, "angle": 2, "box": 2}.get(shape, 3)
+        sizes = {"diameter" if allowed < 2 else "width": 1.0}
+        for key in [key for key in list(more)[:allowed] if chance.random() < more[key]]:
+            sizes[key] = chance.uniform(0.7, 1.5) if key == "height" else chance.uniform(0.04, 0.3)
         scale = math.sqrt(area / closed_area(shape, sizes))
         section |= {"shape": shape, **{key: scale * size for key, size in sizes.items()}}
         if chance.random() < 0.3:  # the area in the place of a size
-            found = [key for key in ("diameter", "thickness") if key in section]
-            del section[chance.choice(found)]
             section["area"] = area
+            del section[chance.choice([key for key in ("diameter", "thickness") if key in section])]
         if chance.random() < 0.3 and case["material"][section["material"]].get("law") != "cable":
             section["effective_length"] = 0.8
 
@@ -296,22 +290,20 @@ def draw_fields(chance: random.Random, case: dict[str, Any], body: Body, motion:
     """Give the bars of a section an area and a prestress each."""
     if any(key.removesuffix("_field") in STRESSING for section in case["section"].values() for key in section):
         return
-    section = case["section"][chance.choice(sorted(case["section"]))]
-    steps = case.get("time", {"step": "auto"})
-    fits = steps["step"] == "auto" or steps["integrator"] not in EXPLICIT
-    fields = {"sizes": [section["area"] * chance.uniform(0.7, 1.4) for _ in body.bars]}
-    if section.get("shape", "round") != "round" or "second_moment" in section or not fits or chance.random() < 0.5:
-        fields["sizes"] = [section["area"] for _ in body.bars]
-    else:
-        section["area_field"] = "sizes"
+    section, count = case["section"][chance.choice(sorted(case["section"]))], len(body.bars)
+    material, steps = case["material"][section["material"]], case.get("time", {"step": "auto"})
+    fields: dict[str, Any] = {}
+    sizes, fits = np.full(count, section["area"]), steps["step"] == "auto" or steps["integrator"] not in EXPLICIT
+    if section.get("shape", "round") == "round" and "second_moment" not in section and fits and chance.random() < 0.5:
+        sizes *= [chance.uniform(0.7, 1.4) for _ in body.bars]
+        section["area_field"], fields["sizes"] = "sizes", sizes
         del section["area"]
     if "area" in section or chance.random() < 0.7:
-        material = case["material"][section["material"]]
-        strains, key = _strains(chance, material, len(body.bars)), chance.choice((*STRESSING[::2], "force_density"))
+        key, strains = chance.choice(("pretension", "rest_length", "force_density")), _strains(chance, material, count)
         lengths = np.linalg.norm(body.points[body.bars[:, 1]] - body.points[body.bars[:, 0]], axis=1)
-        force = material["young_modulus"] * np.array(fields["sizes"]) * strains
-        fields["given"] = {"pretension": force, "rest_length": 1.0 - strains, "force_density": force / lengths}[key]
-        section[f"{key}_field"] = "given"
+        force = material["young_modulus"] * sizes * strains
+        fields[key] = {"pretension": force, "rest_length": 1.0 - strains, "force_density": force / lengths}[key]
+        section[f"{key}_field"] = key
     if case["mesh"]["generator"] != "arrays":
         groups = {"node_groups": body.node_groups, "bar_groups": body.bar_groups}
         case["mesh"] = {"generator": "arrays", "points": body.points, "bars": body.bars, **groups}
@@ -325,17 +317,8 @@ def _strains(chance: random.Random, material: dict[str, Any], count: int) -> np.
     young = material["young_modulus"]
     strong = [material.get(key, young) for key in ("yield_stress", "tensile_strength", "proof_stress")]
     most = min(3e-3, 0.9 * min(strong) / young, 0.9 * material.get("curve", [[1.0]])[0][0])
-    least = 0.0 if material.get("law") == "cable" else -1.0
+    least = 0.0 if material.get("law") == "cable" else -1.0  # cables are not pressed
     return np.array([most * chance.uniform(least, 1.0) for _ in range(count)])
-
-
-def draw_density(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
-    """Give force densities in the place of pretensions; forces become smaller."""
-    for section in case["section"].values():
-        given = section.pop("pretension", None)
-        if given is not None:
-            rows = [[t, value / body.size] for t, value in given] if isinstance(given, list) else given / body.size
-            section["force_density"] = rows
 
 
 def draw_damping(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
@@ -346,9 +329,8 @@ def draw_damping(chance: random.Random, case: dict[str, Any], body: Body, motion
         case["mass"][0]["damping"] = 2.0 * math.pi * ratio * frequencies[0]
         if chance.random() < 0.4:
             return
-    for material in case["material"].values():
-        for key in ("damping", "stiffness_damping"):
-            material.pop(key, None)
+    for name, material in case["material"].items():
+        case["material"][name] = {key: value for key, value in material.items() if not key.endswith("damping")}
     if case.get("time", {"step": "auto"})["step"] != "auto":  # the critical step stays about the same
         ratio = min(ratio, 0.02 * math.pi * body.limit * (frequencies[0] + frequencies[-1]))
     case["damping"] = {"ratio": ratio, "frequencies": frequencies}
@@ -357,22 +339,19 @@ def draw_damping(chance: random.Random, case: dict[str, Any], body: Body, motion
 def draw_velocities(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
     """Move supports by records of velocity."""
     for support in case.get("support", ()):
-        by_velocity(chance, support, motion.speed * chance.uniform(-0.4, 0.4), motion.end)
+        by_velocity(chance, support, motion.end * motion.speed * chance.uniform(-0.4, 0.4), motion.end)
 
 
-def by_velocity(chance: random.Random, support: dict[str, Any], speed: float, end: float) -> None:
-    """Move a support by rows of velocity, or by a file with them."""
+def by_velocity(chance: random.Random, support: dict[str, Any], way: float, end: float) -> None:
+    """Move a support by some way, with rows of velocity or a file that has them."""
     for key in ("motion", "velocity", "interpolation"):
         support.pop(key, None)
-    turned = "fix" not in support or "frame" in support
-    moves = [turned or axis in support["fix"] for axis in "xyz"]
-    if chance.random() < 0.4:
-        columns = ["t", *(name if moved else "" for name, moved in zip(("vx", "vy", "vz"), moves, strict=True))]
-        table = {"file": RECORD, "columns": columns, "scale": speed, "time_scale": end}
-        support["velocity_file"] = table
-        return
+    moves = ["frame" in support or axis in support.get("fix", "xyz") for axis in "xyz"]
+    columns = ["t", *(name if moved else "" for name, moved in zip(("vx", "vy", "vz"), moves, strict=True))]
     times = sorted(chance.uniform(0.0, 1.0) for _ in range(chance.randint(1, 4)))
-    support["velocity"] = [[t * end, *(speed * chance.uniform(-1.0, 1.0) * moved for moved in moves)] for t in times]
+    rows = [[t * end, *(way / end * chance.uniform(-1.0, 1.0) * moved for moved in moves)] for t in times]
+    file = {"file": RECORD, "columns": columns, "scale": way / end, "time_scale": end}
+    support |= {"velocity_file": file} if chance.random() < 0.4 else {"velocity": rows}
 
 
 CELLS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (1, 1, 2), (2, 2, 1), (2, 1, 2), (1, 2, 2), (3, 1, 1))
@@ -775,7 +754,6 @@ CHANGES = (
     ("points", None, draw_points),
     ("inclined", 0.1, draw_inclined),
     ("connectors", 0.08, draw_connectors),
-    ("density", 0.4, draw_density),
     ("velocities", 0.3, draw_velocities),
     ("damping", 0.1, draw_damping),
     ("fields", 0.12, draw_fields),

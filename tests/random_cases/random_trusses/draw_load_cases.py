@@ -5,29 +5,29 @@ from __future__ import annotations
 import random
 from typing import Any
 
-import numpy as np
-
 from .draw import ODD, STRESSING, Body, Motion, by_velocity, draw_damping, draw_fields, draw_sections, vector
 
-NOT_OF_FORMS = ("initial", "wall", "temperature", "remove", "contact")
-"""Tables that belong to stages after a form."""
-ALONE = ("wind", "temperature", "support")
-"""Tables of load cases that are not added."""
 
-
-def draw_form(chance: random.Random, case: dict[str, Any], force: float) -> None:
+def draw_form(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
     """Find the form of the net first, with nodes that hold it; what forms cannot have comes after it."""
     mesh, stages = case["mesh"], case["stage"]
     mesh["node_groups"]["pegs"] = [6, 7, 8, 9] if len(mesh["points"]) > 8 else [6, 7]
     case["node_set"]["pegs"] = {"group": "pegs"}
     held = any(support["name"] == "base2" and support["fix"] == "x" for support in case["support"])
     case["support"].append({"name": "pegs", "node_set": "pegs", "fix": "yz" if held else "xyz"})
-    stages[0] |= {key: case.pop(key) for key in NOT_OF_FORMS if key in case}
+    stages[0] |= {key: case.pop(key) for key in ("initial", "wall", "temperature", "remove") if key in case}
     for key in ("spring", "dashpot", "contact_pair"):
         case.pop(key, None)
     for name, section in case["section"].items():
         key = chance.choice(("force_density",) * 4 + ("force_density_field", "pretension", "pretension_field"))
-        size = force * section["area"] / 1e-3 * chance.uniform(0.2, 0.8) / (0.9 if key.startswith("force") else 1.0)
+        size = (
+            body.stiffness
+            * 1e-3
+            * section["area"]
+            / 1e-3
+            * chance.uniform(0.2, 0.8)
+            / (0.9 if key.startswith("force") else 1.0)
+        )
         if key.endswith("_field"):
             mesh.setdefault("bar_fields", {})[name] = [size * chance.uniform(0.6, 1.0) for _ in mesh["bars"]]
         kept = {of: value for of, value in section.items() if of not in STRESSING}
@@ -37,7 +37,7 @@ def draw_form(chance: random.Random, case: dict[str, Any], force: float) -> None
     case["stage"] = [{"name": "form", "static": {"method": "force_density"}}, *built, *later]
 
 
-def draw_load_cases(chance: random.Random, case: dict[str, Any], force: float) -> None:
+def draw_load_cases(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
     """Load cases and combinations, from the last stage or from what is permanent in a case without stages."""
     rest = {"method": "newton", "step": chance.choice((0.5, 1.0)), "min_step": 0.01}
     if chance.random() < 0.3 and case["stage"][0]["name"] != "form":
@@ -48,13 +48,13 @@ def draw_load_cases(chance: random.Random, case: dict[str, Any], force: float) -
         case["stage"].append({"name": "rest", "static": rest})
     for table in (case, *case.get("stage", ())):
         table.pop("wind", None)
-    case["load_case"] = [_load_case(chance, case, force, f"lc{k}") for k in range(chance.randint(1, 3))]
+    case["load_case"] = [_load_case(chance, case, 1e-3 * body.stiffness, f"lc{k}") for k in range(chance.randint(1, 3))]
     names = [row["name"] for row in case["load_case"]]
     combined = [{"name": "same", "factors": {chance.choice(names): 1.0}}] if chance.random() < 0.6 else []
     for k in range(chance.randint(0, 2)):
         taken = {name: row for name, row in zip(names, case["load_case"], strict=True) if chance.random() < 0.8}
         if chance.random() > ODD:  # at most one of what is not added
-            for key in ALONE:
+            for key in ("wind", "temperature", "support"):
                 others = [name for name, row in taken.items() if key in row][1:]
                 taken = {name: row for name, row in taken.items() if name not in others}
         signs = {name: (1.0,) if "wind" in row else (1.0, 1.0, 1.0, -1.0) for name, row in taken.items()}
@@ -71,13 +71,12 @@ def _load_case(chance: random.Random, case: dict[str, Any], size: float, name: s
         vector(chance, 2e-3),
         chance.uniform(-20.0, 30.0),
     )
+    over = {"table": [[0.2, 0.3], [0.6, chance.uniform(-1.0, 1.5)]], "interpolation": "smooth"}
     load = {"node_set": chance.choice(("one", "top")), "force": force}
-    if chance.random() < 0.3:
-        load |= {"table": [[0.2, 0.3], [0.6, chance.uniform(-1.0, 1.5)]], "interpolation": "smooth"}
     support = {"node_set": "left", "fix": "xyz", "motion": [[0.0, 0.0, 0.0, 0.0], [chance.uniform(0.3, 1.0), *way]]}
     hot_bars = {"value": heat} if chance.random() < 0.6 else {"table": [[0.1, 0.3 * heat], [0.7, heat]]}
     tables = {
-        "load": [load],
+        "load": [load | (over if chance.random() < 0.3 else {})],
         "gravity": {"acceleration": vector(chance, 1.0)},
         "support": [support | ({"name": "base"} if chance.random() < 0.7 else {})],
         "temperature": [hot_bars | ({"bars": "some"} if chance.random() < 0.3 else {})],
@@ -86,22 +85,19 @@ def _load_case(chance: random.Random, case: dict[str, Any], size: float, name: s
     return {"name": name, **{kind: tables[kind] for kind in chance.sample(kinds, chance.randint(1, 3))}}
 
 
-def draw_changes(seed: int, case: dict[str, Any], force: float, step: float, ends: list[float]) -> None:
-    """Change a case of stages, each kind of change by a chance of its own."""
-    chances = {name: random.Random(f"{name} {seed}") for name in SHARES}
-    drawn = {name for name, share in SHARES.items() if chances[name].random() <= share}
-    for table, end in zip((case, *case["stage"][1:]), ends, strict=True) if "velocity" in drawn else ():
-        for support in table.get("support", ()):
-            by_velocity(chances["velocity"], support, 1e-3 / end, end)
-    for name, change in (("form", draw_form), ("load cases", draw_load_cases)):
-        if name in drawn:
-            change(chances[name], case, force)
-    mesh = case["mesh"]
-    body = Body(case, np.array(mesh["points"]), np.array(mesh["bars"]), mesh["node_groups"], limit=2.0 * step)
-    for name, change in (("damping", draw_damping), ("fields", draw_fields), ("sections", draw_sections)):
-        if name in drawn:
-            change(chances[name], case, body, Motion(np.zeros(3), 1.0, 1, step, ends[0]))
+def draw_records(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Move supports of stages by records of velocity."""
+    for k, stage in enumerate(case["stage"]):
+        for support in (stage if k else case).get("support", ()):
+            by_velocity(chance, support, 1e-3, stage.get("time", {"end": 1.0})["end"])
 
 
-SHARES = {"velocity": 0.2, "form": 0.2, "load cases": 0.45, "damping": 0.2, "fields": 0.2, "sections": 0.4}
-"""Shares of the cases of stages with each kind of change."""
+CHANGES = (
+    ("records", 0.15, draw_records),
+    ("form", 0.2, draw_form),
+    ("load cases", 0.45, draw_load_cases),
+    ("damping", 0.2, draw_damping),
+    ("fields", 0.2, draw_fields),
+    ("sections", 0.4, draw_sections),
+)
+"""What some cases of stages have besides, as in ``draw.CHANGES``."""

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from .draw import EXPLICIT, IMPLICIT, plain, vector
-from .draw_load_cases import draw_changes
+from .draw import EXPLICIT, IMPLICIT, Body, Motion, plain, vector
+from .draw_load_cases import CHANGES
 
 YOUNG, DENSITY, AREA, PITCH = 1e6, 1000.0, 1e-3, 0.5
 STEP = 0.5 * PITCH / (YOUNG / DENSITY) ** 0.5
@@ -89,7 +89,13 @@ def draw_staged(seed: int) -> dict[str, Any]:
     case["output"] = {"fields_every": chance.choice((1, 4)), "history_every": chance.choice((1, 1, 3))}
     case["output"]["probe"] = [{"name": "pr", "node_set": "one"}]
     case["solver"] = {"linear": chance.choice(("auto", "auto", "gamg", "cg", "mumps")), "rtol": 1e-12}
-    draw_changes(seed, case, FORCE, STEP, [stage.end for stage in kinds])
+    body = Body(
+        {}, *(np.array(case["mesh"][key]) for key in ("points", "bars")), {}, 2.0 * STEP, stiffness=YOUNG * AREA
+    )
+    for name, share, change in CHANGES:
+        own = random.Random(f"{name} of stages {seed}")
+        if own.random() <= share:
+            change(own, case, body, Motion(np.zeros(3), SPEED, 1, STEP, 1.0))
     return plain(case)
 
 

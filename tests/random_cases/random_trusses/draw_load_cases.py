@@ -19,7 +19,10 @@ def draw_form(chance: random.Random, case: dict[str, Any], body: Body, motion: M
     for key in ("spring", "dashpot", "contact_pair"):
         case.pop(key, None)
     for name, section in case["section"].items():
-        key = chance.choice(("force_density",) * 4 + ("force_density_field", "pretension", "pretension_field"))
+        forces = (
+            ("pretension", "pretension_field") if "bars" in section else ()
+        )  # where most bars have one, some shrink
+        key = chance.choice(("force_density", "force_density", "force_density_field", *forces))
         size = (
             body.stiffness
             * 1e-3

@@ -85,11 +85,11 @@ class Scheme(ExplicitScheme):
         state.memory["half_velocity"] = state.v - (0.5 * h) * state.a
 
     def restart(self, state: State, nodes: np.ndarray | tuple[np.ndarray, np.ndarray], h: float) -> None:
+        """See :class:`Scheme`; the next position stays where it was solved to be."""
         first, following = self._substeps(state.memory, h, made=True)
         v, a = state.v[nodes], state.a[nodes]
         name, share = ("first_known", 0.5) if first else ("second_known", sum(self.weights))
         state.memory[name][nodes] = v + (share * following) * a
-        state.memory["half_velocity"][nodes] = v + (0.5 * following) * a
 
     def advance(self, state: State, h: float) -> None:
         """Move to the next position, which the last balance has determined."""

@@ -154,7 +154,7 @@ class Treatment(Base):
     def refuses(cls, scheme: Scheme) -> str | None:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         if scheme.explicit and not scheme.solves_next_position:
-            return "of the explicit schemes only central_differences can have nodes without mass"
+            return "of the explicit schemes only central_differences and noh_bathe can have nodes without mass"
         return None
 
     @classmethod

@@ -40,7 +40,7 @@ NEVER_FALL = (
     "plastic_heat",
     *(f"{kind}_dissipation" for kind in ("damage", "rupture", "viscous", "friction", "damping")),
 )
-BY_END_VELOCITIES = ("central_differences", "chung_lee", "souza_moura")
+BY_END_VELOCITIES = ("central_differences", "chung_lee", "souza_moura", "noh_bathe")
 """Integrators whose damping works by the velocities at both ends of a step: it gives energy where these point back."""
 
 

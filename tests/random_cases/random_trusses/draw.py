@@ -678,7 +678,7 @@ def _law(chance: random.Random, wall: dict[str, Any], treatment: str, time: dict
         if chance.random() < 0.4:
             wall["static_friction"] = wall["friction"] * chance.uniform(1.0, 1.6)
     solves_next_position = time["integrator"] == "central_differences"
-    fits = "mass" not in time and (treatment == "scheme" or treatment == "stick" and not solves_next_position)
+    fits = "mass" not in time and time["integrator"] != "noh_bathe" and (treatment == "scheme" or treatment == "stick" and not solves_next_position)
     if kind == "restitution" and (odd or fits and (solves_next_position or "mass" not in wall)):
         wall["restitution"] = chance.choice((0.3, 0.7, 1.0, chance.random()))
         if solves_next_position and chance.random() < 0.2:
@@ -692,7 +692,7 @@ def _tilted(chance: random.Random, way: np.ndarray, amount: float) -> np.ndarray
     return tilted / np.linalg.norm(tilted)
 
 
-EXPLICIT = {"central_differences": 2.0, "chung_lee": 1.85, "hulbert_chung": 1.5, "souza_moura": 1.7}
+EXPLICIT = {"central_differences": 2.0, "chung_lee": 1.85, "hulbert_chung": 1.5, "souza_moura": 1.7, "noh_bathe": 3.4}
 """Explicit integrators, with a limit of Omega that is safe for all their parameters without damping."""
 IMPLICIT = ("newmark", "houbolt", "wilson", "generalized_alpha", "energy_momentum")
 CONSERVING = ("newmark", "houbolt", "energy_momentum")
@@ -764,7 +764,7 @@ CHANGES = (
 
 def _time(chance: random.Random, body: Body) -> dict[str, Any]:
     explicit = chance.random() < 0.45
-    name = chance.choices(tuple(EXPLICIT), (5, 2, 2, 1))[0] if explicit else chance.choice(IMPLICIT)
+    name = chance.choices(tuple(EXPLICIT), (5, 2, 2, 1, 2))[0] if explicit else chance.choice(IMPLICIT)
     time: dict[str, Any] = {"integrator": name}
     if chance.random() < 0.15:
         time["mass"] = "consistent"
@@ -804,6 +804,8 @@ def _parameters(chance: random.Random, name: str) -> dict[str, Any]:
         return {"rho_inf": rho} if rho > 0.2 else {"integrator": "bathe", "rho_inf": 5.0 * rho}
     if name == "chung_lee":
         return {"beta": chance.uniform(1.0, 28.0 / 27.0)}
+    if name == "noh_bathe":
+        return {"p": chance.uniform(0.51, 0.7)}
     if name == "hulbert_chung":
         return {"rho_b": chance.uniform(0.0, 1.0)}
     return {}
@@ -867,7 +869,7 @@ def _treatment(chance: random.Random, time: dict[str, Any]) -> str:
     known = ["scheme", "scheme", "scheme", "stick"]
     if odd or time["integrator"] in CONSERVING:
         known.append("conserving")
-    if odd or time["integrator"] not in EXPLICIT or time["integrator"] == "central_differences":
+    if odd or time["integrator"] not in EXPLICIT or time["integrator"] in ("central_differences", "noh_bathe"):
         known.append("mass_redistribution")
     return "scheme" if "mass" in time and not odd else chance.choice(known)
 

@@ -128,6 +128,11 @@ class ColourScale:
     cmap : a matplotlib colour map or its name; None: chosen by the sign of the lower limit
     unit : unit of the values
 
+    Attributes
+    ----------
+    factor, unit : of the numbers beside the colours, and their unit with a prefix
+    shown : maps values in that unit
+
     Raises
     ------
     InputError
@@ -136,25 +141,27 @@ class ColourScale:
 
     def __init__(self, limits: tuple[float, float], cmap: Any = None, unit: str = "") -> None:
         import matplotlib
-        from matplotlib.colors import LinearSegmentedColormap
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import LinearSegmentedColormap, Normalize
 
         low, high = limits
         if not (np.isfinite(low) and np.isfinite(high) and low < high):
             raise InputError(f"render: colour limits {low:g}, {high:g} must be two finite, increasing numbers")
         if cmap is None:
-            colours = DIVERGING if low < 0 < high else SEQUENTIAL
-            cmap = LinearSegmentedColormap.from_list("bars", colours)
+            cmap = LinearSegmentedColormap.from_list("bars", DIVERGING if low < 0 < high else SEQUENTIAL)
         elif isinstance(cmap, str):
             if cmap not in matplotlib.colormaps:
                 raise InputError(f"render: unknown colour map '{cmap}'{nearest(cmap, list(matplotlib.colormaps))}")
             cmap = matplotlib.colormaps[cmap]
-        self.low, self.high, self.cmap = float(low), float(high), cmap
         self.factor, self.unit = prefix_for(max(abs(low), abs(high)), unit)
+        self.shown = ScalarMappable(Normalize(low * self.factor, high * self.factor, clip=True), cmap)
 
     def colours(self, values: np.ndarray) -> np.ndarray:
         """Return colours (n, 3) uint8 of values (n,), clipped at the limits; NaN has the lowest colour."""
-        place = np.nan_to_num((values - self.low) / (self.high - self.low), nan=0.0)
-        return self.cmap(np.clip(place, 0.0, 1.0), bytes=True)[:, :3]
+        low, high = self.shown.get_clim()
+        return self.shown.to_rgba(np.nan_to_num(self.factor * values, nan=low, posinf=high, neginf=low), bytes=True)[
+            :, :3
+        ]
 
 
 def limits_of(

@@ -222,32 +222,22 @@ class Film:
 
     def start(self, size: tuple[int, int]) -> None:
         """Prepare frames of a size."""
-        left, top, width, height = Page.region_of(size)
-        self._columns, tile = 1, (width, height)
-        several = len(self.motions) > 1
+        several, columns = len(self.motions) > 1, 1
         if several:
             aspect = np.mean([self._aspect(motion) for motion in self.motions])
-            self._columns, rows = grid(len(self.motions), float(aspect), (width, height))
-            tile = (width // self._columns, height // rows - Page.strip_of(size))
-        self._prepare(size, tile)
+            columns, _ = grid(len(self.motions), float(aspect), Page.region_of(size)[2:])
+        self._prepare(size, self._labels if several else [""], columns)
         if self.options.inset is not None:
             frames = {0, self.count // 2, self.count - 1}
             shown = [self._draw(k, number) for k in range(len(self.motions)) for number in frames]
-            wide, (x, y) = inset_room(shown, several)
-            results, strip = [motion.result for motion in self.motions], Page.strip_of(size) if several else 0
-            for k in range(len(results)):
-                row, column = divmod(k, self._columns)
-                corner = left + column * tile[0] + x, top + row * (tile[1] + strip) + strip + y
-                self._page.add_inset(results, k, self.options.inset, corner, wide)
+            results = [motion.result for motion in self.motions]
+            self._page.add_insets(results, self.options.inset, inset_room(shown, several))
 
     def frame(self, number: int) -> np.ndarray:
         """Return a page (height, width, 3 or 4) uint8."""
         drawings = [self._draw(k, number) for k in range(len(self.motions))]
-        motion, camera = self.motions[0], self._cameras[0][number]
-        captions = list(self._labels) if len(drawings) > 1 else []
-        moments = [float(motion.times[number]) for motion in self.motions]
-        time = motion.time(motion.frames[number])
-        return self._page.compose(drawings, camera, time, captions, self._columns, moments)
+        motion, moments = self.motions[0], [motion.times[number] for motion in self.motions]
+        return self._page.draw(drawings, self._cameras[0][number], motion.time(motion.frames[number]), moments)
 
     def poster(self) -> np.ndarray:
         """Return six instants on one page, in a grid that suits the shape of the motion."""
@@ -255,16 +245,13 @@ class Film:
         own = getattr(motion.result, "instants", None)
         wanted = max(2, _TILES // len(self.motions))
         chosen = instants(motion.result, motion.frames, wanted) if own is None else own(wanted)
-        _, _, width, height = Page.region_of(_POSTER)
-        columns, rows = grid(len(chosen), self._aspect(motion), (width, height))
-        if several:
-            columns, rows = len(chosen), len(self.motions)
-        self._prepare(_POSTER, (width // columns, height // rows - Page.strip_of(_POSTER)))
-        numbers = range(len(self.motions))
-        drawings = [self._draw(k, motion.frames.index(frame)) for k in numbers for frame in chosen]
         heads = [f"{label}, " if several else "" for label in self._labels]
         captions = [head + motion.time(frame) for head in heads for frame in chosen]
-        return self._page.compose(drawings, self._cameras[0][0], "", captions, columns)
+        columns, _ = grid(len(chosen), self._aspect(motion), Page.region_of(_POSTER)[2:])
+        self._prepare(_POSTER, captions, len(chosen) if several else columns)
+        numbers = [motion.frames.index(frame) for frame in chosen]
+        drawings = [self._draw(k, number) for k in range(len(self.motions)) for number in numbers]
+        return self._page.draw(drawings, self._cameras[0][0])
 
     def close(self) -> None:
         """Give the windows back."""
@@ -272,16 +259,19 @@ class Film:
             scene.close()
         self._scenes = []
 
-    def _prepare(self, size: tuple[int, int], tile: tuple[int, int]) -> None:
-        """Make cameras, page and scenes for tiles of a page, in pixels."""
+    def _prepare(self, size: tuple[int, int], captions: Sequence[str], columns: int) -> None:
+        """Make page, cameras and scenes for a size in pixels and drawings with captions in columns."""
         self.close()
         options = self.options
+        marks = [MARKS[mark] for mark in options.marks]
+        heading = Heading(self.title, self.colours[0].title, self.scale, marks, options.transparent)
+        self._page = Page(size, heading, captions, columns)
+        tile = self._page.tile
         self._cameras = [cameras(options, motion, tile[0] / tile[1]) for motion in self.motions]
         if len(self.motions) > 1:
             self._cameras = at_one_scale(self._cameras)
-        marks = [MARKS[mark] for mark in options.marks]
-        heading = Heading(self.title, self.colours[0].title, self.scale, marks, options.transparent)
-        self._page = Page(size, heading, self._cameras[0][0], tile[1])
+        if self._cameras[0][0].parallel:
+            self._page.add_length_scale(self._cameras[0][0])
         _, _, width, height = Page.region_of(size)
         for motion, style, colour, film in zip(self.motions, self.styles, self.colours, self._cameras, strict=True):
             # lines of a small model stay visible in a tile; those of a large one would merge
@@ -474,6 +464,7 @@ def _figure(film: Film) -> Any:
         import plotly.graph_objects as plotly
     except ImportError as error:
         raise InputError("render: --html needs plotly, which is not installed: pip install plotly") from error
+    from matplotlib.colors import to_hex
 
     motion, colour, scale = film.motions[0], film.colours[0], film.scale
     frame, camera = motion.frames[0], cameras(film.options, motion, 1.6)[0]
@@ -490,11 +481,11 @@ def _figure(film: Film) -> Any:
         bars.move(start + step * (now - start), radius if gone is None else np.where(gone, -1.0, radius))
         places.append(np.asarray(bars.mesh.points).T.copy())
     label = colour.title + (f" [{scale.unit}]" if scale.unit else "")
-    stops = [[k / 15, "rgb({:.0f},{:.0f},{:.0f})".format(*(255 * np.array(scale.cmap(k / 15)[:3])))] for k in range(16)]
+    low, high = scale.shown.get_clim()
     shades: dict[str, Any] = {
-        "colorscale": stops,
-        "cmin": scale.factor * scale.low,
-        "cmax": scale.factor * scale.high,
+        "colorscale": [to_hex(colour) for colour in scale.shown.cmap(np.linspace(0.0, 1.0, 16))],
+        "cmin": low,
+        "cmax": high,
         "colorbar": {"title": {"text": label.replace(" ", "<br>", 1)}, "len": 0.7, "thickness": 20},
     }
     values = scale.factor * colour.values(frame)[bars.rows].astype(np.float32)

@@ -144,9 +144,7 @@ def distinct(k: int, dash: int | None = None) -> dict[str, Any]:
 def area(k: int) -> dict[str, Any]:
     """Return the style of the ``k``-th area of a panel: of the first ones plain, of others hatched."""
     colour = COLOURS[k % len(COLOURS)]
-    if k < len(COLOURS):
-        return {"color": colour, "alpha": 0.85}
-    hatch = ("///", "\\\\\\", "...", "xxx")[(k // len(COLOURS) - 1) % 4]
+    hatch = (None, "///", "\\\\\\", "...", "xxx")[k // len(COLOURS) % 5]
     return {"facecolor": colour, "edgecolor": "white", "hatch": hatch, "alpha": 0.85}
 
 
@@ -238,6 +236,11 @@ class Chart:
     note : text below the panels
     ends : start of the first stage and ends of all, which get the same width where load factors and times are on one
         axis
+
+    Attributes
+    ----------
+    figure, axes : of matplotlib; axes of each panel
+    scales : factor and prefixed unit of all numbers of a unit
     """
 
     def __init__(
@@ -250,7 +253,6 @@ class Chart:
         note: str = "",
         ends: Sequence[float] = (),
     ) -> None:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         drawn = [panel for panel in panels if panel]
@@ -260,7 +262,6 @@ class Chart:
         wider = max(0.0, _LETTER * (max(map(len, names), default=0) - _LETTERS))
         size = (_WIDTHS.get(columns, 4.4 * columns) + columns * wider, 0.9 + 2.5 * sum(heights))
         self.figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasAgg(self.figure)
         own = any(panel.over for panel in drawn)
         grid = self.figure.subplots(
             len(heights), columns, sharex=False if own else "col", squeeze=False, height_ratios=heights
@@ -272,13 +273,9 @@ class Chart:
             self.figure.supxlabel(literal(lines), x=0.01, ha="left", fontsize=9, color="#5b6472")
         self.time, self._axis, self._ends = np.asarray(time, dtype=float), axis, ends
         self._columns: list[tuple[str, np.ndarray, str, np.ndarray]] = []
-        sizes: dict[str, list[float]] = {}
-        for panel in drawn:
-            if panel.scale is None:
-                sizes.setdefault(panel.unit, []).append(panel.size)
-            for curve in panel.curves if panel.over else ():
-                sizes.setdefault(panel.over[1], []).append(largest(curve.place))
-        self._scales = {unit: common_prefix(found, unit) for unit, found in sizes.items()}
+        sizes = [(panel.unit, panel.size) for panel in drawn if panel.scale is None]
+        sizes += [(panel.over[1], largest(curve.place)) for panel in drawn if panel.over for curve in panel.curves]
+        self.scales = {unit: common_prefix([size for other, size in sizes if other == unit], unit) for unit, _ in sizes}
         for number, (axes, panel) in enumerate(zip(grid.flat, panels, strict=True)):
             if panel is None:
                 axes.remove()
@@ -292,33 +289,31 @@ class Chart:
             label = self._axis.label(along[1])
         else:
             name, unit = panel.over
-            along, places = self._scales[unit], f"{name} [{unit}]" if unit else name
+            along, places = self.scales[unit], f"{name} [{unit}]" if unit else name
             label = f"{name.replace('_', ' ')} [{along[1]}]" if unit else name.replace("_", " ")
-        factor, shown = panel.scale or self._scales[panel.unit]
+        factor, shown = panel.scale or self.scales[panel.unit]
         above = below = 0.0
         for number, curve in enumerate(panel.curves):
             place = self.time if curve.place is None else np.asarray(curve.place, dtype=float)
             values = np.asarray(curve.values, dtype=float)
-            usual = {} if curve.kind in ("area", "band") else distinct(number)
-            style = {**usual, "label": literal(curve.name), **curve.style}
+            style = {"label": literal(curve.name), **curve.style}
             if curve.kind in ("area", "band"):
                 every = max(1, len(place) // _POINTS)
                 x, y = place[::every] * along[0], values[::every] * factor
-                style = {"linewidth": 0, **style}
                 if curve.kind == "band":
-                    axes.fill_between(x, y[:, 0], y[:, 1], **style)
+                    axes.fill_between(x, y[:, 0], y[:, 1], linewidth=0, **style)
                     continue
-                axes.fill_between(x, above, above := above + np.maximum(y, 0.0), **style)
+                axes.fill_between(x, above, above := above + np.maximum(y, 0.0), linewidth=0, **style)
                 if (y < 0.0).any():
-                    style["label"] = None
-                    axes.fill_between(x, below, below := below + np.minimum(y, 0.0), **style)
+                    axes.fill_between(
+                        x, below, below := below + np.minimum(y, 0.0), linewidth=0, **style | {"label": None}
+                    )
+            elif curve.kind.startswith("steps"):
+                side = "pre" if curve.kind == "steps before" else "post"
+                _fill_steps(axes, place * along[0], values, side, {**distinct(number), **style})
             else:
-                style |= {"marker": "o"} if len(place) == 1 else {}  # a line needs two points
-                if curve.kind.startswith("steps"):
-                    side = "pre" if curve.kind == "steps before" else "post"
-                    _fill_steps(axes, place * along[0], values, side, style)
-                else:
-                    axes.plot(place * along[0], values * factor, **style)
+                marker = "o" if len(place) == 1 else None  # a line needs two points
+                axes.plot(place * along[0], values * factor, **{"marker": marker, **distinct(number), **style})
             heading = f"{curve.key or curve.name} [{panel.unit}]" if panel.unit else curve.key or curve.name
             over = f"{places}: {curve.source}" if curve.source else places
             if not any(heading == other and over == before for before, _, other, _ in self._columns):
@@ -336,10 +331,6 @@ class Chart:
             axes.set_xlabel(label)
         if panel.legend and axes.get_legend_handles_labels()[0]:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, handlelength=1.8)
-
-    def scale(self, unit: str) -> tuple[float, str]:
-        """Return the factor and the prefixed unit of all numbers of a unit."""
-        return self._scales[unit]
 
     def save(self, file: Path, formats: Iterable[str] = ("png",)) -> list[Path]:
         """Write the picture, or its table, in formats of :data:`FORMATS`; return the files.

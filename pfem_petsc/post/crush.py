@@ -136,32 +136,28 @@ def crush(
     InputError
         If there is no such wall or component, or the wall is not touched, or does not move.
     """
+    from scipy.integrate import cumulative_trapezoid
+
     from .chart import opened
 
-    with opened(result_path) as result:
-        return _test(result, wall, area, height, displacement, window)
-
-
-def _test(
-    result: Any, wall: str, area: float | None, height: float | None, displacement: str | None, window: float
-) -> CrushTest:
-    history, names = result.history, [each.name for each in result.case.every_wall]
     for name, value in (("area", area), ("height", height)):
         if value is not None and not (value > 0.0 and np.isfinite(value)):
             raise InputError(f"crush: {name} = {value:g}: expected a number > 0")
     if not 0.0 <= window < 0.2:
         raise InputError(f"crush: window = {window:g}: expected a strain from 0 to 0.2")
-    if wall not in names or f"wall/{wall}/force" not in history:
-        raise InputError(f"{result.path}: there is no wall {wall!r}{nearest(wall, names)}")
-    way, along = _way(result, wall, displacement)
-    force = np.abs(_mean_forces(history, wall) @ along)
+    with opened(result_path) as result:
+        case, names = result.case, [each.name for each in result.case.every_wall]
+        if wall not in names or f"wall/{wall}/force" not in result.history:
+            raise InputError(f"{result.path}: there is no wall {wall!r}{nearest(wall, names)}")
+        way, along = _way(result, wall, displacement)
+        force = np.abs(_mean_forces(result.history, wall) @ along)
+        box = np.ptp(np.asarray(result.positions(0), dtype=float), axis=0)
     touched = np.flatnonzero(force > 0.0)
     if not len(touched):
         raise InputError(f"{result.path}: wall {wall!r} is not touched")
     start, end = max(int(touched[0]) - 1, 0), int(np.argmax(way)) + 1
     if end - start < 3:
         raise InputError(f"{result.path}: wall {wall!r} compresses nothing: its force begins where its way ends")
-    box = np.ptp(np.asarray(result.positions(0), dtype=float), axis=0)
     axis = int(np.argmax(np.abs(along)))
     if (area is None or height is None) and abs(along[axis]) < 1.0 - 1e-9:
         raise InputError(f"crush: wall {wall!r} moves along no axis: give the area and the height of the block")
@@ -175,15 +171,15 @@ def _test(
         way[0] = min(max(touch, way[0]), way[1])
     # loading only: where the wall goes back, the way so far is kept
     strain = np.maximum.accumulate((way - way[0]) / height)
-    kept = np.concatenate([[True], np.diff(strain) > 0.0])
-    work = np.concatenate([[0.0], np.cumsum(0.5 * (force[1:] + force[:-1]) * np.diff(strain))]) / area
+    kept = np.diff(strain, prepend=-1.0) > 0.0
+    work = cumulative_trapezoid(force, strain, initial=0.0) / area
     strain, energy, stress = strain[kept], work[kept], force[kept] / area
     if window > 0.0:
         low, high = np.maximum(strain - 0.5 * window, 0.0), np.minimum(strain + 0.5 * window, strain[-1])
         stress = (np.interp(high, strain, energy) - np.interp(low, strain, energy)) / (high - low)
     largest = np.maximum.accumulate(stress)
     efficiency = np.divide(energy, largest, out=np.zeros_like(energy), where=largest > 0.0)
-    return CrushTest(strain, stress, energy, efficiency, area, height, _mass(result), window)
+    return CrushTest(strain, stress, energy, efficiency, area, height, _mass(case), window)
 
 
 def _way(result: Any, wall: str, displacement: str | None) -> tuple[np.ndarray, np.ndarray]:
@@ -225,13 +221,13 @@ def _mean_forces(history: Any, wall: str) -> np.ndarray:
     return np.vstack([mean[:1], 0.5 * (mean[1:] + mean[:-1]), mean[-1:]])
 
 
-def _mass(result: Any) -> float:
-    """Return the mass of the truss [kg]."""
+def _mass(case: Any) -> float:
+    """Return the mass of the truss of a case [kg]."""
     from mpi4py import MPI
 
     from ..stepping.model import Model
 
-    stages = result.case.stages
+    stages = case.stages
     return Model(stages[0], MPI.COMM_SELF, later=stages[1:]).total_mass
 
 

@@ -269,46 +269,25 @@ def usual_curves(results: Sequence[Any]) -> list[str]:
     return chosen
 
 
-def draw_comparison(results: Sequence[Any], forces: Filter, closed_forms: bool = True) -> Chart:
-    """Draw what is compared of results; forces as computed and, in a panel below, after a filter."""
-    panels: list[tuple[str, Filter | None]] = []
-    for name in usual_curves(results):
-        panels.append((name, None))
-        if name.endswith("/force") and forces.name != AS_COMPUTED:
-            panels.append((name, forces))
-    return _draw(results, panels, None, None, closed_forms)
-
-
 def draw_curves(
     results: Sequence[Any],
-    names: Sequence[str],
+    panels: Sequence[tuple[str, Filter | None]],
     against: str | None = None,
     chosen: Filter | None = None,
     closed_forms: bool = True,
 ) -> Chart:
-    """Draw a panel for each named column, with the curves of all results, over time or another column.
+    """Draw panels of columns, with the curves of all results, over time or another column.
 
     Parameters
     ----------
     results : open results
-    names : columns, or components of them
+    panels : columns, or components of them, and the filter of each; energies are never filtered
     against : a column of numbers, or a component; None: time
-    chosen : filter of the curves, and of the column that they are drawn over; energies are never filtered
+    chosen : filter of the column that they are drawn over
     closed_forms : whether to draw the closed form of the first result
     """
-    if not names:
+    if not panels:
         raise InputError("plot: no curves named; columns: " + ", ".join(results[0].history))
-    return _draw(results, [(name, chosen) for name in names], against, chosen, closed_forms)
-
-
-def _draw(
-    results: Sequence[Any],
-    panels: Sequence[tuple[str, Filter | None]],
-    against: str | None,
-    chosen: Filter | None,
-    closed_forms: bool,
-) -> Chart:
-    """Draw panels of columns, each with its filter, over time or another column with a filter."""
     first, labels = results[0], labels_of(results)
     if len({result.axis.symbol for result in results}) > 1 and against is None:
         raise InputError("plot: the results are over different axes: " + ", ".join({r.axis.symbol for r in results}))
@@ -431,7 +410,7 @@ def draw_spectra(
         panels.append(Panel(label, unit, curves, title, 1.1, ("frequency", "Hz"), (1.0, unit), legend, log=True))
     title = first.case.title or first.case.name
     chart = Chart(panels, title, np.zeros(1))
-    factor, shown = chart.scale("Hz")
+    factor, shown = chart.scales["Hz"]
     for axes, panel in zip(chart.axes, panels, strict=True):
         end = highest or max(curve.place[-1] for curve in panel.curves)
         inside = [(curve.place > 0.0) & (curve.place <= end) for curve in panel.curves]

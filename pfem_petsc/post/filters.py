@@ -50,24 +50,23 @@ def make_filter(text: str) -> Filter:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = [math.nan]
+    if kind == "butterworth" and len(numbers) == 1:
+        numbers.append(2.0)
     good = all(math.isfinite(number) and number > 0.0 for number in numbers)
-    if kind == "none" and not words:
-        return Filter(AS_COMPUTED, lambda time, values, zero=False: np.array(values, dtype=float))
-    if kind == "mean" and len(numbers) == 1 and good:
-        (width,) = numbers
-        corner = f"{0.4429 / width:.3g} Hz"
-        name = f"mean of the {engineering(width, 's', 3)} before (−3 dB at {corner})"
-        return Filter(name, lambda time, values, zero=False: _chosen_mean(time, values, width, zero))
-    if kind == "cfc" and len(numbers) == 1 and good:
-        (size,) = numbers
-        corner = f"{CFC_CORNER * size * (math.sqrt(2.0) - 1.0) ** 0.25:.3g} Hz"
-        name = f"CFC {size:g} of SAE J211-1 (two passes, −3 dB at {corner})"
-        return Filter(name, lambda time, values, zero=False: cfc(time, values, size, zero))
-    if kind == "butterworth" and len(numbers) in (1, 2) and good:
-        cutoff, order = numbers[0], int(numbers[1]) if len(numbers) == 2 else 2
-        if order == (numbers + [2.0])[1] and order <= 10:
-            name = f"Butterworth of order {order} (two passes, −3 dB at {cutoff:g} Hz)"
-            return Filter(name, lambda time, values, zero=False: butterworth(time, values, cutoff, order, zero))
+    match kind, numbers:
+        case "none", []:
+            return Filter(AS_COMPUTED, lambda time, values, zero=False: np.array(values, dtype=float))
+        case "mean", [width] if good:
+            corner = f"{0.4429 / width:.3g} Hz"
+            name = f"mean of the {engineering(width, 's', 3)} before (−3 dB at {corner})"
+            return Filter(name, lambda time, values, zero=False: _chosen_mean(time, values, width, zero))
+        case "cfc", [size] if good:
+            corner = f"{CFC_CORNER * size * (math.sqrt(2.0) - 1.0) ** 0.25:.3g} Hz"
+            name = f"CFC {size:g} of SAE J211-1 (two passes, −3 dB at {corner})"
+            return Filter(name, lambda time, values, zero=False: cfc(time, values, size, zero))
+        case "butterworth", [cutoff, order] if good and order == int(order) <= 10:
+            name = f"Butterworth of order {order:g} (two passes, −3 dB at {cutoff:g} Hz)"
+            return Filter(name, lambda time, values, zero=False: butterworth(time, values, cutoff, int(order), zero))
     raise InputError(
         f"filter = {text!r} is not known; give cfc:CLASS, butterworth:FREQUENCY[:ORDER] [Hz, up to order 10], "
         "mean:SECONDS or none, like cfc:180"

@@ -13,15 +13,14 @@ They do not exist without a strength, or without a shape or second moment of the
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, written
+from ..errors import InputError
 from ..output.table import Table
 from ..registry import nearest
 from .options import PER
@@ -259,41 +258,6 @@ def _finds_form(stage: Any) -> bool:
     return stage.static is not None and stage.static.method == "force_density"
 
 
-class _Table:
-    """Rows under construction: the governing state of each member, and its extremes."""
-
-    def __init__(self, truss: Truss, members: Members) -> None:
-        self.bars, self.members = truss.bars, members
-        count = len(members.first)
-        self.measure = np.full(count, -1.0)
-        self.values = {name: np.full(count, np.nan) for name in (_FORCE, "stress", *UTILISATIONS)}
-        self.instant = np.zeros(count, dtype=np.int64)
-        self.tension, self.compression = np.zeros(count), np.zeros(count)
-
-    def add(self, number: int, force: np.ndarray) -> None:
-        """Take the axial forces (bars,) [N] of the instant of a number."""
-        bars, members = self.bars, self.members
-        stress = force / bars.area
-        least, most = members.least(force), members.most(force)
-        self.tension, self.compression = np.maximum(self.tension, most), np.minimum(self.compression, least)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            strength = members.most(np.abs(stress) / bars.strength)
-            length = members.total(bars.length) * members.most(bars.factor)
-            buckling = np.maximum(-least, 0.0) * length**2 / (np.pi**2 * members.least(bars.rigidity))
-        # where compression governs by buckling, its force is the one to show
-        governs = np.nan_to_num(buckling, nan=-1.0) > np.nan_to_num(strength, nan=-1.0)
-        pushed = (-least > most) | governs
-        shown = np.where(pushed, least, most)
-        stress = np.where(pushed, members.least(stress), members.most(stress))
-        measure = np.fmax(strength, buckling)
-        measure = np.where(np.isnan(measure), np.abs(shown), measure)
-        taken = measure > self.measure
-        self.measure[taken], self.instant[taken] = measure[taken], number
-        new = dict(zip(self.values, (shown, stress, strength, buckling), strict=True))
-        for name, values in self.values.items():
-            values[taken] = new[name][taken]
-
-
 UTILISATIONS = ("yield_utilisation", "buckling_utilisation")
 """Columns that may be empty."""
 
@@ -333,58 +297,75 @@ def members(
     """
     from .chart import opened
 
-    with opened(result_path) as result:
-        return _members(result, per, instants_of(result, time, case), each_case)
-
-
-def _members(result: Any, per: str, instants: Sequence[Instant], each_case: bool) -> Table:
     if per not in PER:
         raise InputError(f"members: per = {per!r}: expected one of {', '.join(PER)}")
-    if _FORCE not in result.cell_fields:
-        raise InputError(
-            f"{result.path}: has no field {_FORCE}; name it in output.fields of the case, and run it again"
-        )
-    truss = truss_of(result)
-    found = _found(result, truss, per)
-    groups = [list(range(len(instants)))]
-    if each_case:
-        names = [instant.case for instant in instants]
-        groups = [[k for k, each in enumerate(names) if each == name] for name in dict.fromkeys(names)]
-    tables = []
-    for group in groups:
-        table = _Table(truss, found)
-        for k in group:
-            table.add(k, np.asarray(result.field(_FORCE, instants[k].snapshot), dtype=float))
-        tables.append(_columns(table, truss, result, instants))
+    with opened(result_path) as result:
+        instants = instants_of(result, time, case)
+        if _FORCE not in result.cell_fields:
+            raise InputError(
+                f"{result.path}: has no field {_FORCE}; name it in output.fields of the case, and run it again"
+            )
+        truss = truss_of(result)
+        if per == "bar":
+            own = np.flatnonzero(truss.bars.section >= 0)
+            found = Members(own, np.arange(len(own)))
+        else:
+            points = np.asarray(result.positions(0), dtype=float)
+            found = find_members(points, result.bars, truss.bars.section, truss.held)
+        groups: dict[str, list[Instant]] = {}
+        for instant in instants:
+            groups.setdefault(instant.case if each_case else "", []).append(instant)
+        tables = [_governing(result, truss, found, group) for group in groups.values()]
     columns = {name: np.concatenate([each[name] for each in tables]) for name in tables[0]}
     utilised = ~np.isnan(np.fmax(*(columns[name] for name in UTILISATIONS)))
     order = np.lexsort([-columns.pop("measure"), ~utilised])
     return Table({name: values[order] for name, values in columns.items()})
 
 
-def _found(result: Any, truss: Truss, per: str) -> Members:
-    bars = truss.bars
-    if per == "bar":
-        own = np.flatnonzero(bars.section >= 0)
-        return Members(own, np.arange(len(own)))
-    return find_members(np.asarray(result.positions(0), dtype=float), result.bars, bars.section, truss.held)
-
-
-def _columns(table: _Table, truss: Truss, result: Any, instants: Sequence[Instant]) -> dict[str, np.ndarray]:
-    found, bars = table.members, truss.bars
-    section = np.array(truss.sections)[bars.section[found.bars[found.first]]]
-    governing = table.instant
+def _governing(result: Any, truss: Truss, found: Members, instants: Sequence[Instant]) -> dict[str, np.ndarray]:
+    """Return the columns (members,) of the table, with the state of the largest ``measure`` of each member."""
+    count = len(found.first)
+    governing, number = {"measure": np.full(count, -1.0)}, np.zeros(count, dtype=int)
+    tension, compression = np.zeros(count), np.zeros(count)
+    for k, instant in enumerate(instants):
+        force = np.asarray(result.field(_FORCE, instant.snapshot), dtype=float)
+        state = _state(truss.bars, found, force)
+        tension, compression = np.maximum(tension, found.most(force)), np.minimum(compression, found.least(force))
+        taken = state["measure"] > governing["measure"]
+        number[taken] = k
+        governing = {name: np.where(taken, values, governing.get(name, values)) for name, values in state.items()}
     return {
-        "member": np.arange(len(found.first)),
+        "member": np.arange(count),
         "bars": np.array([_numbers(part) for part in np.split(found.bars, found.first[1:])]),
-        "section": section,
-        "length": found.total(bars.length),
-        **table.values,
-        "case": np.array([instant.case for instant in instants])[governing],
-        "time": np.asarray(result.times)[[instant.snapshot for instant in instants]][governing],
-        "tension": table.tension,
-        "compression": table.compression,
-        "measure": table.measure,
+        "section": np.array(truss.sections)[truss.bars.section[found.bars[found.first]]],
+        "length": found.total(truss.bars.length),
+        **governing,
+        "case": np.array([instant.case for instant in instants])[number],
+        "time": np.asarray(result.times)[[instant.snapshot for instant in instants]][number],
+        "tension": tension,
+        "compression": compression,
+    }
+
+
+def _state(bars: Bars, members: Members, force: np.ndarray) -> dict[str, np.ndarray]:
+    """Return columns (members,) of a state, from axial forces (bars,) [N], and the ``measure`` by which it governs."""
+    stress = force / bars.area
+    least, most = members.least(force), members.most(force)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        strength = members.most(np.abs(stress) / bars.strength)
+        length = members.total(bars.length) * members.most(bars.factor)
+        buckling = np.maximum(-least, 0.0) * length**2 / (np.pi**2 * members.least(bars.rigidity))
+    # where compression governs by buckling, its force is the one to show
+    governs = np.nan_to_num(buckling, nan=-1.0) > np.nan_to_num(strength, nan=-1.0)
+    pushed = (-least > most) | governs
+    shown = np.where(pushed, least, most)
+    largest = np.fmax(strength, buckling)
+    return {
+        _FORCE: shown,
+        "stress": np.where(pushed, members.least(stress), members.most(stress)),
+        "yield_utilisation": strength,
+        "buckling_utilisation": buckling,
+        "measure": np.where(np.isnan(largest), np.abs(shown), largest),
     }
 
 
@@ -396,36 +377,6 @@ def _numbers(bars: np.ndarray) -> str:
     return " ".join(map(str, ordered.tolist()))
 
 
-class _Picture:
-    """A snapshot of a result whose bars have their largest utilisation as the field ``utilisation``."""
-
-    point_fields: Sequence[str] = ()
-    cell_fields: Sequence[str] = ("utilisation",)
-
-    def __init__(self, result: Any, utilisation: np.ndarray) -> None:
-        self._result, self._values = result, utilisation
-        self.path, self.case, self.bars, self.axis, self.history = (
-            result.path,
-            result.case,
-            result.bars,
-            result.axis,
-            result.history,
-        )
-        self.times = result.times[:1]
-
-    def positions(self, i: int) -> np.ndarray:
-        """Positions (nodes, 3) [m] of the first snapshot."""
-        return self._result.positions(0)
-
-    def field(self, name: str, i: int) -> np.ndarray:
-        """The utilisations (bars,)."""
-        return self._values
-
-    def caption(self, i: int) -> str:
-        """What the picture shows."""
-        return "largest utilisation of strength and Euler's load"
-
-
 def draw_members(result_path: Path | str | Any, table: Table, file: Path | str, **options: Any) -> Path:
     """Draw the truss with each bar in the colour of the utilisation of its member; return the file.
 
@@ -434,7 +385,7 @@ def draw_members(result_path: Path | str | Any, table: Table, file: Path | str, 
     result_path : result file or its folder, or an open result
     table : of :func:`members`, of the same result
     file : PNG file
-    options : of :func:`~pfem_petsc.post.render.render`
+    options : see :class:`~pfem_petsc.post.options.Options`
 
     Raises
     ------
@@ -442,7 +393,8 @@ def draw_members(result_path: Path | str | Any, table: Table, file: Path | str, 
         If no member has a utilisation, or the picture cannot be made.
     """
     from .chart import opened
-    from .render import render
+    from .options import Options
+    from .render import Film, save
 
     values = np.fmax(table["yield_utilisation"], table["buckling_utilisation"])
     if not np.any(np.isfinite(values)):
@@ -450,15 +402,29 @@ def draw_members(result_path: Path | str | Any, table: Table, file: Path | str, 
             "members: nothing to draw: utilisations need a yield_stress or design_strength of the material, or a "
             "shape or second_moment of the section"
         )
-    file = Path(file)
-    with opened(result_path) as result, tempfile.TemporaryDirectory() as folder:
+    with opened(result_path) as result:
         each = np.zeros(len(result.bars))
         for bars, value in zip(table["bars"], values, strict=True):
             first, _, last = str(bars).partition("-")
             chosen = list(range(int(first), int(last) + 1) if last else map(int, first.split()))
             each[chosen] = np.fmax(each[chosen], value)
-        defaults = {"field": "utilisation", "clim": (0.0, max(1.0, float(np.nanmax(each)))), "note": lambda _: None}
-        made = render(_Picture(result, np.nan_to_num(each)), folder, frames=[0], video="none", **(defaults | options))
-        with written(file, "the picture"):
-            shutil.copyfile(next(path for path in made if path.name.startswith("frame_")), file)
+        # the first snapshot, with the utilisations as its field
+        drawn = SimpleNamespace(
+            path=result.path,
+            case=result.case,
+            bars=result.bars,
+            axis=result.axis,
+            history=result.history,
+            times=result.times[:1],
+            positions=result.positions,
+            point_fields=(),
+            cell_fields=("utilisation",),
+            field=lambda name, snapshot: each,
+            caption=lambda snapshot: "largest utilisation of strength and Euler's load",
+        )
+        defaults = {"field": "utilisation", "clim": (0.0, max(1.0, float(each.max())))}
+        film = Film([drawn], Options(frames=[0], **(defaults | options)), lambda _: None)
+        film.start(film.options.size)
+        file = save(film.frame(0), Path(file))
+        film.close()
     return file

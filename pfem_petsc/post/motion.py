@@ -240,32 +240,29 @@ def chosen_frames(
     """
     if len(times) == 0:
         raise InputError("render: the result holds no snapshots; set [output] fields_every and run again")
+    within = np.arange(len(times))
     if span is not None:
         first, last = _checked(span, times)
-        within = [int(k) for k in np.flatnonzero((times >= first) & (times <= last))]
-        if not within:
+        within = within[(times >= first) & (times <= last)]
+        if not len(within):
             raise InputError(f"render: span = {first:g} {last:g} holds no snapshot; give a longer one, or rate")
-    else:
-        within = list(range(len(times)))
+    if isinstance(frames, Iterable):
+        chosen = [int(k) for k in frames]
+        for k in chosen:
+            if not -len(times) <= k < len(times):
+                raise InputError(f"render: frame {k} does not exist; the result holds snapshots 0 to {len(times) - 1}")
+        if not chosen:
+            raise InputError("render: frames is an empty list")
+        return [k % len(times) for k in chosen]
     count = len(within)
     if frames is None and count > MOST_FRAMES:
         note(f"{MOST_FRAMES} of {count} snapshots are drawn; ask for more with frames = {count}")
-        frames = MOST_FRAMES
-    if frames is None:
-        return within
-    if isinstance(frames, (int, np.integer)):
-        if frames < 1:
-            raise InputError(f"render: frames = {frames} must be positive; a list of numbers may count from the end")
-        if frames == 1:
-            return within[-1:]  # at the first one, most structures are at rest and look like their mesh
-        return [within[int(k)] for k in np.unique(np.linspace(0, count - 1, min(int(frames), count)).round())]
-    chosen = [int(k) for k in frames]
-    for k in chosen:
-        if not -len(times) <= k < len(times):
-            raise InputError(f"render: frame {k} does not exist; the result holds snapshots 0 to {len(times) - 1}")
-    if not chosen:
-        raise InputError("render: frames is an empty list")
-    return [k % len(times) for k in chosen]
+    wanted = MOST_FRAMES if frames is None else frames
+    if wanted < 1:
+        raise InputError(f"render: frames = {frames} must be positive; a list of numbers may count from the end")
+    if wanted == 1:
+        return within[-1:].tolist()  # at the first one, most structures are at rest and look like their mesh
+    return within[np.linspace(0, count - 1, min(wanted, count)).round().astype(int)].tolist()
 
 
 def even_times(times: np.ndarray, rate: float, span: Sequence[float] | None) -> np.ndarray:
@@ -363,19 +360,18 @@ def radii_of(result: Any) -> np.ndarray | None:
     if not sections:
         return None
     length = _lengths(result)
-    numbers, areas = np.full(len(length), -1), np.ones(len(length))
     try:
         mesh = mesh_of_cases([case], MPI.COMM_SELF)
         if mesh.n_bars > len(length):
             raise InputError(f"the mesh of {case.source} has {mesh.n_bars} bars now, the result {len(length)}")
-        numbers[: mesh.n_bars], areas[: mesh.n_bars] = section_areas(case, mesh)
+        numbers, areas = section_areas(case, mesh)
     except (InputError, OSError):
         if len(sections) > 1 or sections[0].uniform_area is None:
             return None
         numbers, areas = np.zeros(len(length), dtype=int), np.full(len(length), sections[0].uniform_area)
     radius = np.full(len(length), np.inf)
     for number, section in enumerate(sections):
-        own = numbers == number
+        own = np.flatnonzero(numbers == number)
         radius[own] = bar_shapes(section, length[own], areas[own]).radius
     return np.where(np.isfinite(radius), radius, radius.min())
 
@@ -514,14 +510,15 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
     shifts, present = np.zeros((len(times), len(walls), 3)), np.zeros((len(times), len(walls)), dtype=bool)
     when = np.asarray(history["time"], dtype=float)
     numbers = np.asarray(history["stage"]) if "stage" in history else np.zeros(len(when), dtype=int)
-    for row, time in enumerate(times):
-        for number, stage in enumerate(result.case.stages):
-            if number and (number not in numbers or when[numbers < number].max(initial=0.0) >= time):
-                break
-            present[row] = np.isin(names, [wall.name for wall in stage.wall])
-            for wall in stage.wall:
-                k = names.index(wall.name)
-                shifts[row, k] = _place(wall) - _place(walls[k]) if number else 0.0
+    stages = result.case.stages
+    begins = [when[numbers < k].max(initial=0.0) if k in numbers else np.inf for k in range(1, len(stages))]
+    current = np.searchsorted(begins, times)
+    for number, stage in enumerate(stages):
+        reached = current >= number
+        present[reached] = np.isin(names, [wall.name for wall in stage.wall])
+        for wall in stage.wall if number else ():
+            k = names.index(wall.name)
+            shifts[reached, k] = _place(wall) - _place(walls[k])
     for k, name in enumerate(names):
         if f"wall/{name}/position" in history:
             places = np.asarray(history[f"wall/{name}/position"], dtype=float)

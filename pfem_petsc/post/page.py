@@ -68,14 +68,6 @@ class Heading(NamedTuple):
     transparent: bool = False
 
 
-class _Inset(NamedTuple):
-    """The marker on a curve: (rows,) times [s], and (rows, 2) where the marker is then."""
-
-    marker: Line2D
-    times: np.ndarray
-    curve: np.ndarray
-
-
 class Page:
     """Frame of a picture: drawings in tiles of a figure of matplotlib, with texts, axes and curves around them.
 
@@ -99,7 +91,8 @@ class Page:
     ) -> None:
         self._figure = figure = _figure(size, 0.0 if heading.transparent else 1.0)
         self._inches, self._channels = figure.dpi_scale_trans, 4 if heading.transparent else 3
-        self._insets: list[_Inset] = []
+        # the marker on a curve, (rows,) times [s], and (rows, 2) where the marker is then
+        self._insets: list[tuple[Line2D, np.ndarray, np.ndarray]] = []
         wide, high = figure.get_size_inches()
         left, top, width, height = self.region_of(size)
         strip, rows = self.strip_of(size) if len(captions) > 1 else 0, -(-len(captions) // columns)
@@ -166,9 +159,9 @@ class Page:
             if length > 0.05:
                 label = {"color": PALE, "fontsize": 11, "ha": "center", "va": "center"}
                 self._triad.annotate(name, (0.0, 0.0), tip * (1.0 + 0.33 / length), arrowprops=arrow, **label)
-        for inset, moment in zip(self._insets, moments, strict=False):
-            places = [np.interp(moment, inset.times, values) for values in inset.curve.T] if len(inset.times) else []
-            inset.marker.set_data(*([place] for place in places or ((), ())))
+        for (marker, times, curve), moment in zip(self._insets, moments, strict=False):
+            if len(times):
+                marker.set_data(*([np.interp(moment, times, values)] for values in curve.T))
         canvas = self._figure.canvas
         with boxes_allowed():
             canvas.draw()
@@ -219,7 +212,7 @@ class Page:
                 axes.margins(y=0.08)
                 axes.set_title(literal(label + (f" [{unit}]" if unit else "")))
                 (marker,) = axes.plot([], [], "o", color=_MARKER, markersize=6 * pixel)
-                self._insets.append(_Inset(marker, times, curve))
+                self._insets.append((marker, times, curve))
 
 
 def history_curve(history: Any, name: str) -> np.ndarray:

@@ -19,12 +19,12 @@ from .curves import (
     History,
     closed_form,
     column,
-    draw_comparison,
     draw_curves,
     draw_spectra,
     exact_curves,
     read,
     smoothed,
+    usual_curves,
     words,
 )
 from .filters import AS_COMPUTED, Filter, make_filter, window_mean
@@ -34,6 +34,8 @@ WINDOW = 0.02  # width of the moving average of forces, relative to the run
 
 _ROUNDING = 1e-9
 """Change of a curve below which it is constant, relative to the largest number of its unit in the picture."""
+
+_MOMENTA = ("momentum", "angular_momentum")
 
 _QUANTITIES = ("displacement", "velocity", "reaction")
 """Of probes that have panels; accelerations in impacts are mostly noise."""
@@ -85,12 +87,16 @@ def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | Non
             chart = draw_spectra(results, list(given.spectrum), given.window, given.highest)
             return chart.save(_free(folder / "spectra", suffixes), suffixes)
         if given.curves is not None:
-            chart = draw_curves(results, list(given.curves), given.against, chosen, given.closed_forms)
+            panels = [(name, chosen) for name in given.curves]
+            chart = draw_curves(results, panels, given.against, chosen, given.closed_forms)
             return chart.save(_free(folder / "curves", suffixes), suffixes)
         if len(results) > 1:
             forces = chosen or _usual_filter(results[0])
-            chart = draw_comparison(results, forces, given.closed_forms)
-            return chart.save(folder / "comparison", suffixes)
+            panels = []
+            for name in usual_curves(results):  # forces as computed and, in a panel below, filtered
+                smoothed_too = name.endswith("/force") and forces.name != AS_COMPUTED
+                panels += [(name, None), (name, forces)] if smoothed_too else [(name, None)]
+            return draw_curves(results, panels, closed_forms=given.closed_forms).save(folder / "comparison", suffixes)
         (result,) = results
         return _usual(result, folder, suffixes, chosen, given.closed_forms)
 
@@ -104,17 +110,16 @@ def _usual(
     forces = chosen or _usual_filter(result)
     drawn = {
         "energies": energies(history, exact),
-        "momentum": momentum(history, exact) if result.stretches else [],
+        "momentum": momentum(history, exact) if result.stretches else ([], "", 1),
         "probes": probes(history, exact),
         "walls": force_panels(result, "wall", forces, exact),
         "pairs": force_panels(result, "pair", forces),
         "constraints": force_panels(result, "constraint", forces),
-        "force_displacement": force_displacement(result, forces, exact),
-        "solver": solver(history),
+        "force_displacement": (force_displacement(result, forces, exact), "", 1),
+        "solver": (solver(history), "", 1),
     }
     written = []
-    for name, picture in drawn.items():
-        panels, note, columns = picture if isinstance(picture, tuple) else (picture, "", 1)
+    for name, (panels, note, columns) in drawn.items():
         if panels:
             ends = result.stage_ends if result.axis.staged else ()
             chart = Chart(panels, title, read(history, "time"), result.axis, columns, note, ends)
@@ -184,13 +189,10 @@ def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Pa
 
 def momentum(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
     """Momentum, angular momentum and the displacement of the centre of mass, without those that do not change."""
-    names = {"momentum": "momentum", "angular_momentum": "angular_momentum"}
-    names["centre_of_mass"] = "centre_of_mass/displacement"
-    panels = {}
-    for source, name in names.items():
-        if source in history:
-            label = "centre of mass,\nmoved by" if name != source else words(name)
-            panels[label] = _vector(history, name, label, exact)
+    panels = {words(name): _vector(history, name, words(name), exact) for name in _MOMENTA if name in history}
+    if "centre_of_mass" in history:
+        label = "centre of mass,\nmoved by"
+        panels[label] = _vector(history, "centre_of_mass/displacement", label, exact)
     scales = {}
     if len(panels) == 3:
         arm = np.linalg.norm(read(history, "centre_of_mass"), axis=1)
@@ -348,9 +350,9 @@ def _load_paths(history: History, exact: ClosedForm | None) -> list[Panel]:
         if name.startswith("probe/") and name.endswith("/position"):
             moved = read(history, name).mean(axis=1)
             moved = moved - moved[0]
-            k = int(np.argmax(np.abs(moved).max(axis=0)))
-            sign = -1.0 if moved[np.argmax(np.abs(moved[:, k])), k] < 0.0 else 1.0
-            if not np.any(moved[:, k]):
+            row, k = np.unravel_index(np.argmax(np.abs(moved)), moved.shape)
+            sign = np.sign(moved[row, k])
+            if sign == 0.0:
                 continue
             curves = [Curve(AS_COMPUTED, read(history, "load_factor"), place=sign * moved[:, k])]
             if exact is not None and exact.path is not None:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,7 +85,10 @@ def render(
     InputError
         For options that do not fit the result, or a folder that cannot be written.
     """
-    first = comm is None or comm.rank == 0
+    from mpi4py import MPI
+
+    comm = comm or MPI.COMM_SELF
+    first = comm.rank == 0
     tell = note if first else _nothing
     chosen = Options(**options)
     paths = list(result_path) if isinstance(result_path, (list, tuple)) else [result_path]
@@ -99,10 +102,10 @@ def render(
         folder = Path(output)
         film = Film(results, chosen, tell)
         film.tell_length(tell)
-        with agreed(comm) if comm is not None else nullcontext():
+        with agreed(comm):
             if first:
                 _emptied(folder / "frames")
-        if comm is None or comm.size == 1:
+        if comm.size == 1:
             helpers = _helpers(paths, folder, chosen, film.count)
             shares = [slice(k, None, len(helpers) + 1) for k in range(len(helpers) + 1)]
         else:
@@ -112,18 +115,15 @@ def render(
         for helper, share in zip(helpers, shares[1:], strict=True):
             if helper.wait() != 0:  # it may not know a law of the user's, for example
                 film.write(folder / "frames", share, tell)
-        if comm is not None:
-            comm.Barrier()
+        comm.Barrier()
         made = []
         if first and chosen.poster:
-            made.append(_save(film.poster(), folder / "render.png"))
+            made.append(save(film.poster(), folder / "render.png"))
         film.close()
         if first:
             pattern = folder / "frames" / "frame_%04d.png"
             made += [encode(pattern, folder / f"render.{kind}", chosen.fps) for kind in chosen.kinds]
-    if comm is not None:
-        made = comm.bcast(made)
-    return made + [folder / "frames" / f"frame_{number:04d}.png" for number in range(film.count)]
+    return comm.bcast(made) + [folder / "frames" / f"frame_{number:04d}.png" for number in range(film.count)]
 
 
 def render_modes(
@@ -218,7 +218,7 @@ class Film:
                 told = time.monotonic()
                 # by all processes together
                 note(f"{sum(1 for _ in folder.glob('frame_*.png'))} of {self.count} frames are drawn")
-            _save(self.frame(number), folder / f"frame_{number:04d}.png")
+            save(self.frame(number), folder / f"frame_{number:04d}.png")
 
     def start(self, size: tuple[int, int]) -> None:
         """Prepare frames of a size."""
@@ -379,12 +379,19 @@ def _emptied(folder: Path) -> None:
             old.unlink()
 
 
-def _save(picture: np.ndarray, file: Path) -> Path:
+def save(picture: np.ndarray, file: Path) -> Path:
+    """Write a picture (height, width, 3 or 4) uint8 as PNG; return the file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
     from PIL import Image
 
     with written(file, "the picture"):
         # fast compression, because a film has hundreds of frames
-        Image.fromarray(picture).save(file, compress_level=1)
+        Image.fromarray(picture).save(file, format="PNG", compress_level=1)
     return file
 
 

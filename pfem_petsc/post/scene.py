@@ -25,7 +25,7 @@ WALL_COLOUR, EDGE_COLOUR, NODE_COLOUR = (116, 125, 138), (75, 85, 99), (31, 36, 
 VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 
 _LIGHT = np.array([-0.4, 0.7, 1.0]) / np.linalg.norm([-0.4, 0.7, 1.0])  # right, up, to the eye
-_AMBIENT, _DIFFUSE, _SPECULAR = 0.42, 0.66, 0.35
+_AMBIENT, _DIFFUSE, _SPECULAR = 0.42, 0.58, 0.35  # the first two make 1: colours without lighting are as given
 _ANYWHERE = np.array([0.36, 0.48, 0.8])
 _ROUND = 2.5  # pixels: radius from which a bar has a round surface; thinner ones are flat, with a shade across
 _MOST_PIXELS = (1.5e6, 1e7)  # up to which 3 x 3 (small models) and 2 x 2 pixels are averaged to one
@@ -153,14 +153,13 @@ class Segments:
         places, self._solid = np.zeros((count * len(form), 3), dtype=np.float32), kind not in ("line", "strip")
         self.mesh = pyvista.PolyData(places, lines=kept) if kind == "line" else pyvista.PolyData(places, faces=kept)
         self.mesh.point_data["colour"] = np.zeros(places.shape, dtype=np.uint8)
-        if self._solid:
-            self.mesh.point_data.active_normals = places.copy()
+        self.mesh.point_data.active_normals = places.copy()
         if plotter is None:
             return
-        shine = {"ambient": _AMBIENT, "diffuse": _DIFFUSE, "specular": _SPECULAR} if self._solid else {}
         options: dict[str, Any] = {"scalars": "colour", "rgb": True, "preference": "point", "line_width": width}
+        shine = {"ambient": _AMBIENT, "diffuse": _DIFFUSE, "specular": _SPECULAR if self._solid else 0.0}
         self.actor = plotter.add_mesh(
-            self.mesh, lighting=self._solid, reset_camera=False, render=False, specular_power=10.0, **options, **shine
+            self.mesh, lighting=True, reset_camera=False, render=False, specular_power=10.0, **options, **shine
         )
         self.actor.prop.interpolation = "Phong" if kind == "round" else "Gouraud"
 
@@ -171,7 +170,6 @@ class Segments:
         colours: np.ndarray | None = None,
         ahead: np.ndarray = _ANYWHERE,
         pale: np.ndarray | None = None,
-        light: np.ndarray | None = None,
     ) -> None:
         """Draw bars between points.
 
@@ -182,7 +180,6 @@ class Segments:
         colours : (n or b, 3) uint8
         ahead : (3,), or (n, 3) at each node: the direction to the eye
         pale : (n,), the share of white at each node
-        light : (3,), the direction to the light, by which flat bars have a shade
         """
         # single precision, component by component: passes over a million bars
         first, last = ends = np.stack([x.astype(np.float32)[self.ends] for x in points.T], axis=1)
@@ -197,25 +194,18 @@ class Segments:
         wide = np.broadcast_to(radius, self.ends.shape).astype(np.float32)
         if (hidden := wide[0] < 0.0).any():
             wide[:, hidden], last[:, hidden] = 0.0, first[:, hidden]
-        places = self.mesh.points.reshape(shape)
-        if self._form.any():
-            normals = self._form @ np.stack([axis, side, facing], axis=1)
-            for k in range(3):
-                places[..., k] = ends[self._end, k] + wide[self._end] * normals[k]
-            if self._solid:
-                self.mesh.point_data["Normals"].reshape(shape)[:] = np.moveaxis(normals, 0, 2)
-        else:
-            places[:] = np.moveaxis(ends, 1, 2)
+        places, normals = self.mesh.points.reshape(shape), self.mesh.point_data["Normals"].reshape(shape)
+        away = self._form @ np.stack([axis, side, facing], axis=1)
+        for k in range(3):
+            places[..., k] = ends[self._end, k] + wide[self._end] * away[k]
+            normals[..., k] = away[k] if self._solid else facing[k]
         if colours is None:
             return
         white = 0.0 if pale is None else pale.astype(np.float32)[self.ends]
-        share = np.float32(1.0)
-        if light is not None and not self._solid:
-            share = np.minimum(1.0, _AMBIENT + _DIFFUSE * np.maximum(0.0, light.astype(np.float32) @ facing))
         shades = self.mesh.point_data["colour"].reshape(shape)
         for k in range(3):
             ink = colours[:, k].astype(np.float32)[self._colour_rows]
-            shades[..., k] = (share * (ink + white * (255.0 - ink)) + 0.5).astype(np.uint8)[self._end]
+            shades[..., k] = (ink + white * (255.0 - ink) + 0.5).astype(np.uint8)[self._end]
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -312,7 +302,7 @@ class Scene:
         self._plotter.renderer.SetUseOIT(False)  # walls are drawn in their order
         self._plotter.background_color = "black" if transparent else "white"
         self._plotter.screenshot(return_img=True)  # the first one draws by itself, and chooses a camera
-        self._transparent, self._shaded = transparent, style.shaded
+        self._transparent = transparent
         thick = max(self.width, 2.0 * pixels * float(np.quantile(self._radius, 0.9)) if count else 0.0)
         solid = style.shaded and (count <= FEW or (thick >= 2.0 * _ROUND * unit and count <= TUBE_LIMIT))
         if solid:
@@ -320,6 +310,7 @@ class Scene:
         else:
             kind = "line" if count > TUBE_LIMIT and not style.tubes else "strip"
         self.segments = Segments(self._plotter, self._bars, kind, on_nodes, self.width * self._factor)
+        self.segments.actor.prop.lighting = style.shaded
         nodes = count <= 400 and shortest > 3.0 * self.width if style.nodes is None else style.nodes
         self._nodes = self._balls() if nodes else None
         self._extra: list[Any] = []
@@ -328,7 +319,9 @@ class Scene:
         """Return nodes as bars without length, and their radii."""
         used, radius = np.unique(self._bars), np.zeros(int(self._bars.max(initial=-1)) + 1)
         np.maximum.at(radius, self._bars, self._radius[:, None])
-        return Segments(self._plotter, np.stack([used, used], axis=1), "rough", False), 1.2 * radius[used]
+        balls = Segments(self._plotter, np.stack([used, used], axis=1), "rough", False)
+        balls.mesh.point_data["colour"][:] = NODE_COLOUR
+        return balls, 1.2 * radius[used]
 
     def close(self) -> None:
         """Give the window back."""
@@ -365,18 +358,14 @@ class Scene:
         radius = np.maximum(self._radius, 0.5 * self.width * pixel[self.segments.ends])
         if gone is not None:
             radius[:, gone] = -1.0
-        pale = light = None
+        pale = None
         if not camera.parallel:  # what is far away is paler, to show thousands of bars in space
             depths = self._corners @ camera.towards
             pale = 0.5 * np.clip((depths.max() - points @ camera.towards) / max(np.ptp(depths), 1e-300), 0.0, 1.0)
-        if self._shaded:
-            light = _LIGHT @ np.stack([camera.right, camera.up, camera.towards])
-        self.segments.move(points, radius, colours, camera.ahead(points), pale, light)
+        self.segments.move(points, radius, colours, camera.ahead(points), pale)
         if self._nodes is not None:
             balls, sizes = self._nodes
-            used = np.unique(self._bars)
-            ink = np.tile(np.array(NODE_COLOUR, dtype=np.uint8), (len(used), 1))
-            balls.move(points, np.maximum(sizes, 0.7 * self.width * pixel[used]), ink)
+            balls.move(points, np.maximum(sizes, 0.7 * self.width * pixel[balls.ends[0]]))
         self._extra = [self._add(layer, camera) for layer in layers if len(layer.lines)]
         self._extra += self._add_walls(surfaces, camera)
         eye = camera.centre + camera.distance * camera.towards
@@ -406,8 +395,9 @@ class Scene:
         made = Segments(self._plotter, layer.lines, "strip", False)
         least = max(0.5 * layer.width * self.unit, 0.4) * camera.metres(points)[made.ends] / self.size[1]
         radius = layer.radius + 2.0 * pixel if np.any(layer.radius) else 0.0
-        colours = np.tile(np.array(layer.colour, dtype=np.uint8), (len(layer.lines), 1))
-        made.move(points, np.maximum(radius, least), colours, camera.ahead(points))
+        made.actor.prop.lighting = False
+        made.mesh.point_data["colour"][:] = layer.colour
+        made.move(points, np.maximum(radius, least), ahead=camera.ahead(points))
         return made.actor
 
     def _add_walls(self, surfaces: Sequence[Surface], camera: Camera) -> list[Any]:

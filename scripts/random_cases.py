@@ -5,10 +5,11 @@
     .venv/bin/python scripts/random_cases.py --cases failing/*.toml
 
 Cases are drawn over all documented keys and their combinations, one per seed; with `--staged` they have two to four
-stages. Each is run on one rank and on three, in
+stages, forms before and load cases after them. Each is run on one rank and on three, in
 one process for many cases; every third one is also stopped in the middle and continued. Checks: status 0, 2 or 3, with
 a message unless it is 0; no node beyond a wall; finite results; energy balance and growth; dissipations; momentum;
-agreement between numbers of ranks to 1e-9; bitwise identical continued runs; with `--schemes-every` also convergence of
+tables of members; a load case or combination as stages by hand; agreement between numbers of ranks to 1e-9; bitwise
+identical continued runs; with `--schemes-every` also convergence of
 an explicit and an implicit scheme to the same motion; with `--copies-every` that copies of a case which are moved by 1
 and 1000 km, turned, renumbered, and in other units give the same results. Cases that crash or hang are reported and
 skipped. Status 0 if there are no faults.

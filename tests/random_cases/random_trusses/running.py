@@ -29,7 +29,7 @@ _cleared = 0
 GRACE = 20.0
 """Seconds in which all ranks must reach the end of a case."""
 STATUS = {InputError: 2, SimulationFailure: 3}
-_PLACE = re.compile(r"\bstep \d|\bt = |^form finding: ")  # a form is found in one step
+_PLACE = re.compile(r"\bstep \d|\bt = |^form finding: | at the start")  # a form is found in one step
 
 
 @dataclass

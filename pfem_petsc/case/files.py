@@ -83,7 +83,7 @@ def file_columns(path: Path) -> Columns:
     try:
         data = readable_whole(path).read_bytes()
     except (OSError, ValueError) as error:
-        raise InputError(f"this file cannot be read: {error}") from error
+        raise _unreadable(path, error) from error
     if data[:4] == b"PK\x03\x04" or data[:6] == b"\x93NUMPY":
         return _array_columns(path)
     try:
@@ -276,6 +276,14 @@ class Forces(NamedTuple):
     forces: np.ndarray
 
 
+def _unreadable(path: Path, error: Exception) -> InputError:
+    """Return the refusal of a file, in which a file that is missing is named with its folder."""
+    if isinstance(error, FileNotFoundError):
+        folder = path.resolve().parent
+        return InputError(f"there is no file {path.name} in {folder}; names of files are relative to the case file")
+    return InputError(f"this file cannot be read: {error}")
+
+
 def digest_of(path: Path) -> str:
     """Return a digest of the content of a file.
 
@@ -288,7 +296,7 @@ def digest_of(path: Path) -> str:
         with readable_whole(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except (OSError, ValueError) as error:
-        raise InputError(f"this file cannot be read: {error}") from error
+        raise _unreadable(path, error) from error
 
 
 def read_forces(path: Path, digest: str) -> Forces:
@@ -436,7 +444,7 @@ def profile_of(path: Path, profile: str, keys: Sequence[str]) -> dict[str, float
     try:
         text = readable_whole(path).read_text("utf-8-sig")
     except (OSError, ValueError) as error:
-        raise InputError(f"this file cannot be read: {error}") from error
+        raise _unreadable(path, error) from error
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     separator = max(",;\t", key=lines[0].count) if lines else ","
     rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator)]

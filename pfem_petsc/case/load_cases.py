@@ -45,9 +45,9 @@ def stage_rows(cases: Sequence[Any], combinations: Sequence[Any], common: Mappin
         If a combination has no meaning, such as of two winds.
     """
     own = {case.name: _tables(case) for case in cases}
-    rows = [{"name": name, **_joined(common, [tables], name)} for name, tables in own.items()]
+    rows = [{"name": case.name, **_joined(common, {case.name: _tables(case)}, case.name)} for case in cases]
     for combination in combinations:
-        scaled = [_scaled(own[n], factor, combination.name) for n, factor in combination.factors.items() if factor]
+        scaled = {n: _scaled(own[n], factor, combination.name) for n, factor in combination.factors.items() if factor}
         rows.append({"name": combination.name, **_joined(common, scaled, combination.name)})
     return rows
 
@@ -118,11 +118,11 @@ def _times(value: Any, factor: float) -> Any:
     return [factor * each for each in value] if isinstance(value, list | tuple) else factor * value
 
 
-def _joined(common: Mapping[str, Any], parts: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
-    """Return the tables of what is in force and of load cases together."""
+def _joined(common: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]], name: str) -> dict[str, Any]:
+    """Return the tables of what is in force and of load cases, by their names, together."""
     made: dict[str, Any] = {}
     for key in TABLES:
-        given = [part[key] for part in parts if key in part]
+        given = [part[key] for part in parts.values() if key in part]
         if not given:
             continue
         if key == "load":
@@ -132,7 +132,11 @@ def _joined(common: Mapping[str, Any], parts: Sequence[Mapping[str, Any]], name:
         elif key == "gravity":
             made[key] = _gravity([*([common[key]] if common.get(key) else []), *given], name)
         elif len(given) > 1 or (key == "wind" and common.get(key)):
-            raise UnsuitableError(name, f"has more than one {key}, which cannot be added: combine the others")
+            of = [repr(each) for each, part in parts.items() if key in part]
+            of += ["what acts in all load cases"] if common.get(key) else []
+            raise UnsuitableError(
+                name, f"adds the {key} of {' and '.join(of)}, of which one can act: leave out the others"
+            )
         else:
             made[key] = given[0] if key == "wind" else [*common.get(key, []), *given[0]]
     return made

@@ -76,7 +76,12 @@ class Problems:
         try:
             return model.model_validate(data, context=context)
         except ValidationError as error:
-            for item in error.errors(include_url=False):
+            found = error.errors(include_url=False)
+            for item in found:
+                # a list is counted without its wrong items
+                counted = item["type"] in ("too_short", "too_long")
+                if counted and any(other["loc"][: len(item["loc"])] == item["loc"] != other["loc"] for other in found):
+                    continue
                 self._describe(_owner(model, item["loc"], data), item, place)
         return None
 
@@ -95,8 +100,12 @@ class Problems:
             self.add(where, f"this key is missing{about}")
         elif kind in ("missing", "too_long", "too_short") and isinstance(value, list | tuple):
             whole = where[:-1] if kind == "missing" else where
+            bound = {"too_short": ("min_length", "at least"), "too_long": ("max_length", "at most")}.get(kind)
+            size = f", {bound[1]} {context[bound[0]]}" if bound and _list_text(field)[-1:].isalpha() else ""
             self.add(
-                whole, f"expected {_list_text(field)}, got {len(value)} value{'s' * (len(value) != 1)}{about}", value
+                whole,
+                f"expected {_list_text(field)}{size}, got {len(value)} value{'s' * (len(value) != 1)}{about}",
+                value,
             )
         elif kind == "refused":
             self.add(where, context["text"], value)
@@ -142,7 +151,7 @@ class Owner(NamedTuple):
 
 def _owner(model: type[StrictModel], loc: KeyPath, data: Any) -> Owner:
     """Follow the path of an error through the models and the data to the table that it is about."""
-    owner, rest = Owner(model, None, ()), list(loc)
+    owner, rest = Owner(model, None, ()), [part for part in loc if part != "[key]"]  # which marks names of a table
     while rest:
         part = rest.pop(0)
         field = owner.model.model_fields.get(str(part))
@@ -198,6 +207,7 @@ def _list_text(field: FieldInfo | None) -> str:
 
 
 _SIMPLE = {
+    "too_short": "expected at least one entry",
     "float_type": "expected a number",
     "int_type": "expected an integer",
     "string_type": "expected a text in quotes",

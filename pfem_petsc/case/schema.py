@@ -671,13 +671,18 @@ def load_case_stages(
     try:
         rows = load_cases.stage_rows(model.load_case, model.combination, load_cases.at_end(start))
     except load_cases.UnsuitableError as error:
-        problems.add((error.key,), str(error))
+        named = [row.name for row in (*model.load_case, *model.combination)]
+        problems.add(keys[named.index(error.key)], f"{error.key!r} {error}")
         return []
     base = len(stages) + len(made) - 1
     for of, row in zip(keys, rows, strict=True):
         name = row.pop("name")
         if name in names:
-            problems.add((*of, "name"), "another load case, combination or stage has this name", name)
+            own = "the state before the load cases has this name: give another"
+            taken = (
+                own if not stages and name == load_cases.PERMANENT else "another load case, combination or stage has it"
+            )
+            problems.add((*of, "name"), taken, name)
         names.append(name)
         made.append(StageTables(name, {**common, **row}, tuple(row), (), {}, of=of, starts_from=base))
     return made

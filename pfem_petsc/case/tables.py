@@ -286,7 +286,8 @@ class Section(StrictModel):
             raise refusal((("catalogue",), str(error), data["catalogue"])) from error
         taken = [key for key in values if key in data]
         if taken:
-            raise refusal(((taken[0],), f"the profile {data['profile']!r} has this value too", data[taken[0]]))
+            text = f"the profile {data['profile']!r} has this value too: remove it here, or from the catalogue"
+            raise refusal(((taken[0],), text, data[taken[0]]))
         return {key: value for key, value in data.items() if key not in ("catalogue", "profile")} | values
 
     @field_validator("rest_length")

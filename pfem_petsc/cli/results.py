@@ -237,7 +237,9 @@ def print_crush(arguments: argparse.Namespace) -> int:
     for row in test.figures().rows:
         value, unit = row["value"], row["unit"]
         text = engineering(value, unit) if unit in ("Pa", "J", "J/m³", "J/kg") else f"{value:.6g} {unit}".rstrip()
-        print(f"{row['figure']:34}  {text if math.isfinite(value) else 'not reached'}")
+        print(f"{row['figure']:34}  {text if math.isfinite(value) else 'none'}")
+    for remark in test.remarks():
+        print(remark)
     if arguments.csv is not None:
         print(test.table().to_csv(arguments.csv))
     if arguments.picture is not None:

@@ -244,7 +244,8 @@ class Result:
             stage = stages[min(int(np.searchsorted(times, time)), self._n_rows - 1)]
             if static[stage]:
                 rows = stages == stage
-                return LOAD_FACTOR.place(float(np.interp(time, times[rows], history["load_factor"][rows])))
+                text = LOAD_FACTOR.place(float(np.interp(time, times[rows], history["load_factor"][rows])))
+                return f"{self.case.stage[int(stage)].name}, {text}" if sum(static) > 1 else text
         return self.axis.place(time)
 
     @property

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..errors import InputError, written
 from ..registry import nearest
+from .units import unit_of
 
 if TYPE_CHECKING:
     import pandas
@@ -220,11 +221,17 @@ def selected(history: Mapping[str, np.ndarray], name: str) -> np.ndarray:
         one, other = (over_nodes(each, values) if values.ndim == 3 else values for each, values in both.items())
         if one.shape != other.shape:
             raise InputError(f"{name}: one is a vector and the other is not; select a component, like .x")
+        units = [unit_of(source_of(each)) for each in both]
+        if units[0] != units[1]:
+            raise InputError(f"{name}: the units {units[0] or '1'} and {units[1] or '1'} differ")
         return one - other
     whole, node, part = _SELECTION.fullmatch(name).group("whole", "node", "part")
     source = whole if whole in known else source_of(whole)
     if source not in known:
-        raise InputError(f"the history has no column '{whole}'{nearest(whole, known)}")
+        moved = [column.replace("/position", _DISPLACEMENT) for column in known if column.startswith("probe/")]
+        hint = nearest(whole, list(dict.fromkeys([*known, *moved])))
+        blanks = f", or a difference, which is written with blanks, 'A{MINUS}B'" if "-" in whole else ""
+        raise InputError(f"the history has no column '{whole}'{blanks}{hint}")
     values = np.asarray(history[source])
     if values.ndim == 1:
         raise InputError(f"{name}: column '{whole}' is a number and has no components")

@@ -3,7 +3,8 @@
 With the force F of a wall along its way d, the area A and the height h of the block before the test, stress is F/A and
 strain d/h from the first contact on. Definitions are those of ISO 13314:2011 for porous metals:
 
-- first peak: the first maximum of the stress that is followed by a drop;
+- first peak: the first maximum of the stress that is followed by a drop; none where it is within half a window of the
+  first contact, as the mean has no full window there;
 - plateau stress: mean stress between 20 and 40 % of strain;
 - end of the plateau: the strain at which the stress reaches 1.3 times the plateau stress;
 - energy by volume: integral of the stress over the strain, up to 50 %, and up to densification;
@@ -74,7 +75,8 @@ class CrushTest(NamedTuple):
         first, last = _PLATEAU
         plateau = (self.energy_to(last) - self.energy_to(first)) / (last - first)
         peak, at = self._first_peak()
-        beyond = np.flatnonzero((self.strain > first) & (self.stress >= _PLATEAU_END * plateau))
+        at = at if np.isfinite(peak) else np.nan
+        ends = self._reaches(first, _PLATEAU_END * plateau)
         best = int(np.argmax(self.efficiency))
         dense = float(self.strain[best]) if best < len(self.strain) - 1 else np.nan
         volume = self.area * self.height
@@ -88,7 +90,7 @@ class CrushTest(NamedTuple):
             ("first peak", peak, "Pa"),
             ("strain at the first peak", at, ""),
             ("plateau stress (20 to 40 %)", plateau, "Pa"),
-            ("strain at the end of the plateau", float(self.strain[beyond[0]]) if len(beyond) else np.nan, ""),
+            ("strain at the end of the plateau", ends, ""),
             ("densification strain", dense, ""),
             ("largest efficiency", float(self.efficiency[best]), ""),
             ("energy by volume to 50 %", half, "J/m³"),
@@ -101,13 +103,34 @@ class CrushTest(NamedTuple):
         names, values, units = zip(*rows, strict=True)
         return Table({"figure": list(names), "value": np.array(values), "unit": list(units)})
 
+    def _reaches(self, first: float, stress: float) -> float:
+        """Return the strain beyond ``first`` at which the stress [Pa] is reached, NaN without."""
+        beyond = np.flatnonzero((self.strain > first) & (self.stress >= stress))
+        if not len(beyond):
+            return np.nan
+        beside = slice(max(int(beyond[0]) - 1, 0), int(beyond[0]) + 1)
+        return float(np.interp(stress, self.stress[beside], self.strain[beside]))
+
+    def remarks(self) -> list[str]:
+        """Return what users should know of the figures."""
+        peak, at = self._first_peak()
+        if not np.isnan(peak) or np.isnan(at):
+            return []
+        return [
+            f"the first peak is within half a window of strain ({self.window:g}) of the first contact and has no mean "
+            "over one: give a smaller window, 0 for the rows as they are"
+        ]
+
     def _first_peak(self) -> tuple[float, float]:
-        """Return the stress [Pa] and the strain of the first maximum that a drop follows, NaN without."""
+        """Return the stress [Pa] and the strain of the first maximum that a drop follows, NaN without; the stress alone
+        is NaN if no full window fits before it."""
         largest = np.maximum.accumulate(self.stress)
         dropped = np.flatnonzero(self.stress < (1.0 - _DROP) * largest)
         if not len(dropped):
             return np.nan, np.nan
         at = int(np.argmax(self.stress[: dropped[0]]))
+        if self.strain[at] < 0.5 * self.window:
+            return np.nan, float(self.strain[at])
         return float(self.stress[at]), float(self.strain[at])
 
 

@@ -217,9 +217,9 @@ def instants_of(result: Any, time: float | None, case: str | None) -> list[Insta
         raise InputError(f"{result.path}: --time {time:g}: snapshots are from {times[0]:g} to {times[-1]:g}")
     number, complete = _stage_of(result)
     found = [Instant(names[k] if names else "", i) for i, k in enumerate(number.tolist())]
+    of_cases = any(stage.starts_from is not None for stage in stages)
     if stages:
         # of a load case or a form, only the end is a state of the truss; before load cases is none, unless it is asked
-        of_cases = any(stage.starts_from is not None for stage in stages)
         ends = [stage.starts_from is not None or _finds_form(stage) for stage in stages]
         wanted = [stage.starts_from is not None or not of_cases or stage.name == case for stage in stages]
         kept = [wanted[k] and (complete[i] or not ends[k]) for i, k in enumerate(number.tolist())]
@@ -228,7 +228,7 @@ def instants_of(result: Any, time: float | None, case: str | None) -> list[Insta
         found = found[-1:]
     found = [each for each in found if case is None or each.case == case]
     if not found:
-        what = "no load case has" if case is None else f"{case!r} has not"
+        what = f"no {'load case' if of_cases else 'stage'} has" if case is None else f"{case!r} has not"
         raise InputError(f"{result.path}: {what} been computed to its end")
     return found if time is None else [min(found, key=lambda each: abs(times[each.snapshot] - time))]
 

@@ -146,7 +146,7 @@ def _summary(result: Any) -> dict[str, str]:
     if len(result.times):
         points = np.asarray(result.positions(0), dtype=float)
         rows["extent"] = " × ".join(engineering(float(length), "m") for length in np.ptp(points, axis=0))
-    analysis = [_analysis(stage) for stage in case.stages]
+    analysis = [f"{stage.name}: {_analysis(stage)}" if case.stage else _analysis(stage) for stage in case.stages]
     rows["analysis"] = "; ".join(analysis)
     rows["history"] = f"{len(history['time']):,} rows, {_span(result)}"
     rows["snapshots"] = f"{len(result.times):,}"
@@ -228,7 +228,7 @@ def _members(result: Any) -> str:
     known = np.isfinite(table["yield_utilisation"]) | np.isfinite(table["buckling_utilisation"])
     if not known.any():
         return ""
-    head = ["bars", "section", "length", "axial force", "stress", "of strength", "of Euler's load", "case", ""]
+    head = ["bars", "section", "length", "axial force", "stress", "of strength", "of Euler's load", "case", "at"]
     lines = [
         [
             str(row["bars"]),

@@ -45,6 +45,9 @@ _LARGEST_AREA = 10.0
 
 _STRENGTHS = ("yield_stress", "proof_stress", "tensile_strength")
 
+_INSTANTS = 201
+"""Of a run at which the motion of the ground is looked at."""
+
 _OPENING = math.sqrt(2.0)
 """Widest body that passes between the nodes of a square mesh of bars, over the length of these."""
 
@@ -61,6 +64,7 @@ def warnings_before(case: Case, model: Model, plan: Plan, first: bool = True) ->
     texts = [f"{source}{text}" for text in odd_numbers(case, model)]
     texts += memory_warning(model, plan, source) + idle_walls(model) + narrow_walls(model)
     texts += wall_gaps(model)[1] if first else []
+    texts += _braked_ground(case, model, plan)
     if first:
         count, nodes, lowest = geometry.parts()
         if count > 1 and not model.links:  # links connect bodies
@@ -69,6 +73,32 @@ def warnings_before(case: Case, model: Model, plan: Plan, first: bool = True) ->
                 "among them"
             )
     return texts + _loose_nodes(case, model, geometry)
+
+
+def _braked_ground(case: Case, model: Model, plan: Plan) -> list[str]:
+    """Return a warning if the ground moves as a whole and damping acts on its velocity noticeably. Collective."""
+    supports, inertia = model.supports, model.inertia
+    if case.time is None or not supports.moves or supports.inclined is not None or not inertia.damped:
+        return []
+    times = np.linspace(0.0, plan.end, _INSTANTS)
+    v, a = (np.array(each).reshape(_INSTANTS, -1) for each in zip(*(supports.rates(t, plan.step) for t in times)))
+    most = np.full((3, _INSTANTS, 3), -np.inf)  # largest v, -v and |a| of each component over all supports
+    for axis in range(3):
+        of_axis = supports.components == axis
+        for out, values in zip(most, (v, -v, np.abs(a)), strict=True):
+            out[:, axis] = values[:, of_axis].max(axis=1, initial=-np.inf)
+    share = np.divide(inertia.damping, inertia.mass, out=np.zeros_like(inertia.mass), where=inertia.mass > 0.0)
+    rate = model.comm.allreduce(float(share.max(initial=0.0)), op=MPI.MAX)
+    model.comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
+    together = np.abs(most[0] + most[1])[np.isfinite(most[0])].max(initial=0.0) == 0.0
+    speed, pull = np.abs(most[0][np.isfinite(most[0])]).max(initial=0.0), most[2].max(initial=0.0)
+    if not together or rate * speed <= 0.1 * pull:
+        return []
+    return [
+        f"damping acts on absolute velocities, and the ground moves with up to {speed:.3g} m/s: it loads masses by up "
+        f"to {rate * speed:.3g} m/s2, beside accelerations of the ground up to {pull:.3g} m/s2; damping relative to "
+        "the ground needs stiffness_damping alone"
+    ]
 
 
 def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:

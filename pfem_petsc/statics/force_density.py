@@ -217,9 +217,9 @@ class Form:
                 given.density = used
                 return count
         raise SimulationFailure(
-            f"form finding: given forces or lengths are missed by {lack:.3g} of them after {most} solves, {tolerance:g} "
-            "is allowed: with these there may be no form (a bar shrinks to a point; a chain is too short for its "
-            "supports); give force densities, or increase static.max_iterations or static.tolerance"
+            f"form finding: given forces or lengths are missed by {lack:.3g} of them after {most} solves, "
+            f"{tolerance:g} is allowed: increase static.max_iterations or static.tolerance if it is small; else no form"
+            " may have them (a bar shrinks to a point; a chain is too short for its supports): give force densities"
         )
 
     def _solve(self, density: np.ndarray) -> None:

@@ -117,7 +117,7 @@ class ForceDensityKeys(Increments):
 
     tolerance: PositiveFloat = 1e-9
     """of given forces, relative to the largest, and of given lengths"""
-    max_iterations: PositiveInt = 500
+    max_iterations: PositiveInt = 5000
     """number of linear solves after which a form with given forces or lengths is given up"""
 
     step: ClassVar[float] = 1.0

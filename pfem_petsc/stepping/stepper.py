@@ -500,13 +500,25 @@ class Stepper(ABC):
         """Advance by ``part`` to a time [s], balance by balance of the scheme."""
         begun, part = self.state.time, self.part
         try:
-            before = self.part_before_start
+            before, made = self.part_before_start, []
             for share, place in self.scheme.substeps:
                 self.part = share * part
                 if self.model.bars.viscous and self.part != before and self.scheme.solves_next_position:
                     self.model.bars.extrapolate_rates(self.part / before)
                 before = self.part
                 self._make_part(end if place == 1.0 else begun + place * part)
+                made.append((share, self.solution))
+            if len(made) > 1:  # rows have the mean forces of walls in the step
+                walls = [each.walls for _, each in made]
+                force, moment = (
+                    sum(share * getattr(each.walls, name) for share, each in made) for name in ("force", "moment")
+                )
+                contacts = np.maximum.reduce([each.contacts for each in walls])
+                self.solution = replace(
+                    self.solution,
+                    walls=replace(walls[-1], force=force, moment=moment, contacts=contacts),
+                    contacts=max(each.contacts for _, each in made),
+                )
         finally:
             self.part = part
 

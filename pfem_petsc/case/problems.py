@@ -101,7 +101,7 @@ class Problems:
         elif kind in ("missing", "too_long", "too_short") and isinstance(value, list | tuple):
             whole = where[:-1] if kind == "missing" else where
             bound = {"too_short": ("min_length", "at least"), "too_long": ("max_length", "at most")}.get(kind)
-            size = f", {bound[1]} {context[bound[0]]}" if bound and _list_text(field)[-1:].isalpha() else ""
+            size = f", {bound[1]} {context[bound[0]]}" if bound and not re.search(r"\d", _list_text(field)) else ""
             self.add(
                 whole,
                 f"expected {_list_text(field)}{size}, got {len(value)} value{'s' * (len(value) != 1)}{about}",

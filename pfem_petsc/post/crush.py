@@ -129,7 +129,7 @@ class CrushTest(NamedTuple):
         if not len(dropped):
             return np.nan, np.nan
         at = int(np.argmax(self.stress[: dropped[0]]))
-        if self.strain[at] < 0.5 * self.window:
+        if self.window > 0.0 and (at == 0 or self.strain[at - 1] < 0.5 * self.window):
             return np.nan, float(self.strain[at])
         return float(self.stress[at]), float(self.strain[at])
 

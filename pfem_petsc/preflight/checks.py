@@ -92,7 +92,7 @@ def _braked_ground(case: Case, model: Model, plan: Plan) -> list[str]:
     model.comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
     together = np.abs(most[0] + most[1])[np.isfinite(most[0])].max(initial=0.0) == 0.0
     speed, pull = np.abs(most[0][np.isfinite(most[0])]).max(initial=0.0), most[2].max(initial=0.0)
-    if not together or rate * speed <= 0.1 * pull:
+    if not together or rate * speed <= 0.5 * pull:
         return []
     return [
         f"damping acts on absolute velocities, and the ground moves with up to {speed:.3g} m/s: it loads masses by up "

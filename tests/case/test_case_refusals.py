@@ -153,7 +153,7 @@ REFUSED = {
     ),
     "record that is not there": (
         ["support.0.acceleration_file=none.csv"],
-        ['support[0].acceleration_file = "none.csv"', "cannot be read"],
+        ['support[0].acceleration_file = "none.csv"', "there is no file none.csv in"],
     ),
     "unknown interpolation": (["support.0.interpolation=smoth"], ["support[0].interpolation", "'smooth'?"]),
     "lines of accelerations": (

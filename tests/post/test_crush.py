@@ -65,6 +65,26 @@ def test_first_peak_is_the_mean_over_the_window(monkeypatch):
     assert figures(block(strain, stress), monkeypatch, window=0.0)["first peak"] == pytest.approx(8e6, rel=1e-9)
 
 
+def test_a_peak_within_the_window_is_told_and_not_guessed(monkeypatch):
+    """A strut that buckles at a strain of 0.1 %: 8 MPa, of which a mean over 1 % knows nothing."""
+    strain = np.linspace(0.0, 0.3, 30001)
+    result = block(strain, np.interp(strain, [0.0, 0.001, 0.004, 0.3], [0.0, 8e6, 2e6, 2e6]))
+    found = figures(result, monkeypatch)
+    assert np.isnan(found["first peak"]) and np.isnan(found["strain at the first peak"])
+    assert "give a smaller window, 0 for the rows" in crush(result, "w").remarks()[0]
+    rows = crush(result, "w", window=0.0)
+    assert figures(result, monkeypatch, window=0.0)["first peak"] == pytest.approx(8e6, rel=1e-9)
+    assert rows.remarks() == []
+
+
+def test_end_of_the_plateau_is_between_rows(monkeypatch):
+    """Rows at every 3 % of strain: 10 MPa to 42 %, then 100 MPa more over 10 %, 13 MPa at 42.3 %."""
+    strain = np.arange(0.0, 0.6, 0.03)
+    stress = np.interp(strain, [0.0, 1e-6, 0.42, 0.52, 0.6], [0.0, 10e6, 10e6, 110e6, 190e6])
+    found = figures(block(strain, stress), monkeypatch, window=0.0)
+    assert found["strain at the end of the plateau"] == pytest.approx(0.423, abs=1e-9)
+
+
 @pytest.mark.parametrize(
     ("wall", "options", "text"),
     [

@@ -63,6 +63,23 @@ def test_odd_values_are_told(comm, override, texts):
     assert all(text in told[0] for text in texts)
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_damping_on_ground_that_moves_on(comm, told):
+    """a V of a ground that moves at a constant velocity is all that acts; beside an acceleration of 8 m/s2 it is not."""
+    rows = [1.0, 0.0, 0.0] if told else [[0.0, 0.0, 0.0, 0.0], [0.1, 0.8, 0.0, 0.0], [0.2, 0.0, 0.0, 0.0]]
+    case = {
+        "mesh": {"generator": "rod", "length": 1.0, "elements": 4},
+        "node_set": {"ground": {"group": "start"}},
+        "material": {"m": {"young_modulus": 1e9, "density": 1e3}},
+        "damping": {"ratio": 0.02, "frequencies": [1.0]},
+        "section": {"s": {"area": 1e-4, "material": "m"}},
+        "support": [{"node_set": "ground", "fix": "xyz", "velocity": rows}],
+        "time": {"integrator": "newmark", "step": 1e-3, "end": 0.2},
+    }
+    _, warnings = inspected(Case.from_dict(case), comm)
+    assert any("damping acts on absolute velocities" in text for text in warnings) == told
+
+
 def test_far_from_the_origin(comm, shared_tmp_path):
     points, bars, _, _ = TRUSSES["tetrahedron"]
     _, (text,) = inspected(case_of(shared_tmp_path, comm, np.add(points, 1e7), bars), comm)

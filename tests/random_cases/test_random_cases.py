@@ -107,7 +107,7 @@ def test_generator_draws_stages_with_all_that_they_may_have():
     methods = {stage["static"]["method"] for stage in stages if "static" in stage}
     assert methods == {"newton", "relaxation", "force_density"}
     assert {len(table.get("stage", ())) for table in tables} >= {0, 2, 3, 4}
-    assert len({stage["time"]["integrator"] for stage in stages if "time" in stage}) == 9
+    assert len({stage["time"]["integrator"] for stage in stages if "time" in stage}) == 10
     given = {key for stage in stages for key in stage}
     assert given >= {"support", "load", "gravity", "temperature", "wall", "remove", "section", "initial"}
     assert {key for table in tables for key in table} >= {"spring", "dashpot", "mass", "contact_pair", "wind"}
@@ -133,7 +133,7 @@ def test_generator_draws_all_of_what_is_documented():
     assert keys >= {"velocity", "motion", "mass", "gravity", "adjust", "tied"}
     assert keys >= {"friction", "static_friction", "restitution"}
     times = [table["time"] for table in tables]
-    assert len({time["integrator"] for time in times}) == 11
+    assert len({time["integrator"] for time in times}) == 12
     keys = {key for time in times for key in time}
     assert keys >= {"mass", "beta", "gamma", "theta", "rho_b", "rho_inf", "alpha", "safety"}
     assert {table.get("contact", {}).get("treatment") for table in tables} >= {
@@ -216,13 +216,14 @@ def test_the_checks_see_what_they_are_there_for(sound, name, change, cause):
 
 
 def test_load_cases_by_hand_see_another_load(tmp_path):
-    table = next(table for table in map(draw_staged, range(200)) if "load" in table.get("load_case", [{}])[0])
+    table = draw_staged(19)  # one that finds its equilibria
     table["load_case"] = table["load_case"][:1]
     table.pop("combination", None)
-    assert check_case(case_text(table), MPI.COMM_SELF, tmp_path, "random-0.toml", False)["faults"] == []
+    told = check_case(case_text(table), MPI.COMM_SELF, tmp_path, "random-0.toml", False)
+    assert told["status"] == 0 and told["faults"] == []
     table["load_case"][0]["load"][0]["force"][1] += 0.01
     found = {cause for cause, _ in judge_load_case(table, tmp_path, "random-0.toml")}
-    assert found == {"load case is not that by hand: positions", "load case is not that by hand: axial_force"}
+    assert found >= {"load case is not that by hand: positions", "load case is not that by hand: axial_force"}
 
 
 @pytest.mark.slow

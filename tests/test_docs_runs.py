@@ -225,10 +225,8 @@ STAND_INS = {
 """Commands of a cluster that this machine may not have."""
 
 
-@pytest.fixture(scope="module")
-def told(tmp_path_factory) -> dict[str, str]:
+def run_tutorial(folder: Path) -> dict[str, str]:
     """What each block printed, by its text, and the folder under ``""``."""
-    folder = tmp_path_factory.mktemp("tutorial")
     (folder / "bin").mkdir()
     (folder / ".venv" / "bin").mkdir(parents=True)
     (folder / ".venv" / "bin" / "activate").touch()
@@ -255,8 +253,7 @@ def output(told: dict[str, str], command: str) -> str:
     return next(printed for text, printed in told.items() if command in text)
 
 
-@pytest.mark.slow
-def test_numbers_of_the_page(told):
+def _numbers_are_those_of_the_page(told):
     text = TUTORIAL.read_text()
     quoted = re.search(r"It prints `(force: .*?)`", text)[1]
     assert quoted == output(told, "python force.py").strip()
@@ -278,8 +275,7 @@ def energy_left(folder: Path) -> float:
     return float(energy[-1] / energy[0])
 
 
-@pytest.mark.slow
-def test_mistakes_that_check_finds(told, capsys, monkeypatch):
+def _mistakes_are_found_by_check(told, capsys, monkeypatch):
     monkeypatch.chdir(told[""])
     assert main(["check", "rod.toml", "--set", "section.rod.area=100.0"]) == 0
     assert "no bar has that; 1 mm2 is 1e-6 m2" in "".join(capsys.readouterr())
@@ -287,8 +283,7 @@ def test_mistakes_that_check_finds(told, capsys, monkeypatch):
     assert "beyond the wall" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_lattice_and_job(told):
+def _lattice_and_job_are_those_of_the_page(told):
     assert re.search(r"bars +7,440\n", output(told, "mpirun -n 2 python -m pfem_petsc drop.toml\n"))
     again = output(told, "--restart --set time.end=1e-4")
     assert "changed: time.end: 6e-05 -> 0.0001" in again and re.search(r"done: 4\d steps in .* t = 100\.\d µs", again)
@@ -298,14 +293,23 @@ def test_lattice_and_job(told):
     assert "done:" in job and "submitted" not in job
 
 
-@pytest.mark.slow
-def test_files_of_the_page_are_written(told):
+def _files_of_the_page_are_written(told):
     results = Path(told[""]) / "results"
     for name in ("energies.png", "momentum.png", "walls.png", "render.mp4", "render.png"):
         assert (results / "rod_impact" / name).stat().st_size > 1000, name
     assert (results / "rod-sweep" / "sweep.csv").read_text().count("\n") == 3
     newmark = (results / "newmark" / "curves.png").stat().st_size
     assert newmark > 1000
+
+
+@pytest.mark.slow
+def test_tutorial(tmp_path, capsys, monkeypatch):
+    """One test, as the blocks of the page need those before them and take longer than all that is asserted of them."""
+    told = run_tutorial(tmp_path)
+    _numbers_are_those_of_the_page(told)
+    _lattice_and_job_are_those_of_the_page(told)
+    _files_of_the_page_are_written(told)
+    _mistakes_are_found_by_check(told, capsys, monkeypatch)
 
 
 @pytest.mark.slow

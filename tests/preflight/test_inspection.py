@@ -65,7 +65,7 @@ def test_odd_values_are_told(comm, override, texts):
 
 @pytest.mark.parametrize("told", [True, False])
 def test_damping_on_ground_that_moves_on(comm, told):
-    """a V of a ground that moves at a constant velocity is all that acts; beside an acceleration of 8 m/s2 it is not."""
+    """A ground at a constant velocity V loads by a V alone; beside an acceleration of 8 m/s2 that is little."""
     rows = [1.0, 0.0, 0.0] if told else [[0.0, 0.0, 0.0, 0.0], [0.1, 0.8, 0.0, 0.0], [0.2, 0.0, 0.0, 0.0]]
     case = {
         "mesh": {"generator": "rod", "length": 1.0, "elements": 4},

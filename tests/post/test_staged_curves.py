@@ -79,11 +79,11 @@ def test_the_axis_says_that_load_factors_are_on_it(tmp_path, result):
     assert table_columns(tmp_path / "walls.csv")[0][0] == "time [s], in static stages load factor"
     assert result.axis.span(0.0, 2.0) == "0 to 2 (time [s], in static stages load factor)"
     assert [result.place(time) for time in (0.125, 1.0, 1.05, 1.7, 2.2)] == [
-        "load factor 0.125",
-        "load factor 1",
+        "press, load factor 0.125",
+        "press, load factor 1",
         "t = 1.050 s",
-        "load factor 0.5",
-        "load factor 1",
+        "again, load factor 0.5",
+        "again, load factor 1",
     ]
 
 

@@ -108,12 +108,14 @@ class Scheme(ABC):
     turns_held : x1 - x0 = h (v0 + v1)/2 and nothing else relates velocity to position, so the velocity of a node that
         is fixed from one step to the next is reversed
     substeps : of a step that solves several balances: of each the share of the step, and where it ends in the step
+    allows_restitution : whether walls may have restitution
     notice : message to users who choose the scheme; empty for none
     inertial : whether its balance has inertia; without it there are no velocities, impulses and impacts
     """
 
     explicit = False
     inertial = True
+    allows_restitution = True
     solves_next_position = False
     balance_at_endpoints = True
     solves_end = True
@@ -174,6 +176,11 @@ class ExplicitScheme(Scheme):
     """Base class of schemes whose Hessian contains no stiffness."""
 
     explicit = True
+
+    def advance(self, state: State, h: float) -> None:
+        """Move to the next position, which the last balance of a scheme that :attr:`solves_next_position` has
+        determined by the mean velocity until then, its memory ``half_velocity``."""
+        state.position[:] += h * state.memory["half_velocity"]
 
 
 def lagged_limit(alpha_m: float, beta: float, gamma: float, damping_ratio: float) -> float:

@@ -34,10 +34,6 @@ class Scheme(ExplicitScheme):
     def start(self, state: State, h: float) -> None:
         state.memory["half_velocity"] = state.v - (0.5 * h) * state.a
 
-    def advance(self, state: State, h: float) -> None:
-        """Move to x_{n+1}, which the last balance has determined."""
-        state.position[:] += h * state.memory["half_velocity"]
-
     def balance(self, state: State, h: float) -> Balance:
         half = state.memory["half_velocity"]
         return Balance(

@@ -38,6 +38,7 @@ class Scheme(ExplicitScheme):
     """
 
     solves_next_position = True
+    allows_restitution = False  # which of the two velocities jumps, and when, is not known
     remembers = ("half_velocity", "first_known", "second_known")
 
     def __init__(self, parameters: StrictModel) -> None:
@@ -90,10 +91,6 @@ class Scheme(ExplicitScheme):
         v, a = state.v[nodes], state.a[nodes]
         name, share = ("first_known", 0.5) if first else ("second_known", sum(self.weights))
         state.memory[name][nodes] = v + (share * following) * a
-
-    def advance(self, state: State, h: float) -> None:
-        """Move to the next position, which the last balance has determined."""
-        state.position[:] += h * state.memory["half_velocity"]
 
     def _substeps(self, memory: dict[str, np.ndarray], h: float, made: bool = False) -> tuple[bool, float]:
         """Return whether the balance, or after one that is ``made`` the next, is at tp, and the size [s] of the substep

@@ -74,8 +74,8 @@ class CrushTest(NamedTuple):
         """Names, values and units of the figures; values are NaN where the test does not reach them."""
         first, last = _PLATEAU
         plateau = (self.energy_to(last) - self.energy_to(first)) / (last - first)
-        peak, at = self._first_peak()
-        at = at if np.isfinite(peak) else np.nan
+        at = self._first_peak()
+        peak = at is not None and self._has_window(at)
         ends = self._reaches(first, _PLATEAU_END * plateau)
         best = int(np.argmax(self.efficiency))
         dense = float(self.strain[best]) if best < len(self.strain) - 1 else np.nan
@@ -87,8 +87,8 @@ class CrushTest(NamedTuple):
             ("mass", self.mass, "kg"),
             ("largest strain", float(self.strain[-1]), ""),
             ("largest stress", float(self.stress.max()), "Pa"),
-            ("first peak", peak, "Pa"),
-            ("strain at the first peak", at, ""),
+            ("first peak", float(self.stress[at]) if peak else np.nan, "Pa"),
+            ("strain at the first peak", float(self.strain[at]) if peak else np.nan, ""),
             ("plateau stress (20 to 40 %)", plateau, "Pa"),
             ("strain at the end of the plateau", ends, ""),
             ("densification strain", dense, ""),
@@ -113,25 +113,23 @@ class CrushTest(NamedTuple):
 
     def remarks(self) -> list[str]:
         """Return what users should know of the figures."""
-        peak, at = self._first_peak()
-        if not np.isnan(peak) or np.isnan(at):
+        at = self._first_peak()
+        if at is None or self._has_window(at):
             return []
         return [
             f"the first peak is within half a window of strain ({self.window:g}) of the first contact and has no mean "
             "over one: give a smaller window, 0 for the rows as they are"
         ]
 
-    def _first_peak(self) -> tuple[float, float]:
-        """Return the stress [Pa] and the strain of the first maximum that a drop follows, NaN without; the stress alone
-        is NaN if no full window fits before it."""
+    def _first_peak(self) -> int | None:
+        """Return the number of the first maximum of stress that a drop follows, None without."""
         largest = np.maximum.accumulate(self.stress)
         dropped = np.flatnonzero(self.stress < (1.0 - _DROP) * largest)
-        if not len(dropped):
-            return np.nan, np.nan
-        at = int(np.argmax(self.stress[: dropped[0]]))
-        if self.window > 0.0 and (at == 0 or self.strain[at - 1] < 0.5 * self.window):
-            return np.nan, float(self.strain[at])
-        return float(self.stress[at]), float(self.strain[at])
+        return int(np.argmax(self.stress[: dropped[0]])) if len(dropped) else None
+
+    def _has_window(self, at: int) -> bool:
+        """Return whether a full window of strain fits before and after a maximum."""
+        return self.window == 0.0 or at > 0 and bool(self.strain[at - 1] >= 0.5 * self.window)
 
 
 def crush(

@@ -377,6 +377,12 @@ def _numbers(bars: np.ndarray) -> str:
     return " ".join(map(str, ordered.tolist()))
 
 
+def _bars_of(text: str) -> list[int]:
+    """Return the numbers that :func:`_numbers` has written."""
+    first, _, last = text.partition("-")
+    return list(range(int(first), int(last) + 1) if last else map(int, first.split()))
+
+
 def draw_members(result_path: Path | str | Any, table: Table, file: Path | str, **options: Any) -> Path:
     """Draw the truss with each bar in the colour of the utilisation of its member; return the file.
 
@@ -405,8 +411,7 @@ def draw_members(result_path: Path | str | Any, table: Table, file: Path | str, 
     with opened(result_path) as result:
         each = np.zeros(len(result.bars))
         for bars, value in zip(table["bars"], values, strict=True):
-            first, _, last = str(bars).partition("-")
-            chosen = list(range(int(first), int(last) + 1) if last else map(int, first.split()))
+            chosen = _bars_of(str(bars))
             each[chosen] = np.fmax(each[chosen], value)
         # the first snapshot, with the utilisations as its field
         drawn = SimpleNamespace(

@@ -473,12 +473,12 @@ def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> Non
 def _check_restitution(model: Model, plan: Plan, treatment: type[Treatment] | None, k: int, key: str) -> None:
     if model.inertia.consistent:
         raise InputError(f'{key}: restitution needs time.mass = "lumped": one node\'s velocity jumps')
+    if not plan.scheme.allows_restitution:
+        raise InputError(
+            f"{key}: restitution with {model.case.time.integrator}, whose substeps differ, is not known; use "
+            "another integrator"
+        )
     if plan.scheme.solves_next_position:
-        if not plan.scheme.leapfrog:
-            raise InputError(
-                f"{key}: restitution with {model.case.time.integrator}, whose substeps differ, is not known; use "
-                "another integrator"
-            )
         model.contact.rebounds = True
         if treatment is not None:
             raise InputError(f'{key}: with {model.case.time.integrator} restitution needs contact.treatment = "scheme"')

@@ -4,7 +4,7 @@
 # usage: scripts/docs.sh [FOLDER]      default: build/docs
 set -euo pipefail
 
-bash "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
+bash "$(dirname "${BASH_SOURCE[0]}")/setup.sh" --dev
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
 cd "$root"
 folder=${1:-build/docs}

@@ -2,7 +2,9 @@
 # Brings a machine to a working virtual environment in the checkout. Does nothing where that is done already; where it was
 # stopped, or something is missing, it goes on with that.
 #
-# usage: scripts/setup.sh [--build-petsc]
+# usage: scripts/setup.sh [--build-petsc] [--dev]
+#
+# --dev: also what tests, the site of the documentation and optional features need; an environment that has it keeps it
 #
 # Where PETSc comes from:
 #   - PETSC_DIR is set, or the active Python imports petsc4py: that PETSc, with that Python; nothing is installed outside
@@ -13,10 +15,11 @@
 # PFEM_VENV   the environment; default .venv, with --build-petsc .venv-petsc
 set -euo pipefail
 
-build=no
+build=no dev=no
 for argument in "$@"; do
     case $argument in
         --build-petsc) build=yes ;;
+        --dev) dev=yes ;;
         *) sed -n '2,/^set/{/^set/d;s/^# \{0,1\}//;p}' "$0"; exit "$([[ $argument == --help ]] && echo 0 || echo 2)" ;;
     esac
 done
@@ -86,6 +89,7 @@ PYTHON
 stamp() {
     cat pyproject.toml scripts/setup.sh scripts/build_petsc.sh
     foundation
+    echo "dev: $dev"
 }
 
 # Whether everything that pyproject.toml lists is installed; a package whose installation was interrupted is not. Those of
@@ -188,18 +192,23 @@ usable() { [[ -f $venv/bin/activate ]] && "$python" -m pip --version > /dev/null
 
 site_packages() { "$python" -c "import sysconfig; print(sysconfig.get_path('purelib'))"; }
 
-# What pyproject.toml lists, but for the packages named: those come with MPI and PETSc.
+# What pyproject.toml lists, but for the packages named: those come with MPI and PETSc. Of the extras, users get those
+# for meshes, and --dev all.
 requirements() {
-    "$python" - "$@" <<'PYTHON'
+    "$python" - "$dev" "$@" <<'PYTHON'
 import re, sys, tomllib
 project = tomllib.load(open("pyproject.toml", "rb"))["project"]
-wanted = [*project["dependencies"], *(r for extra in project["optional-dependencies"].values() for r in extra)]
-print(*(r for r in wanted if re.match(r"[\w-]+", r)[0] not in sys.argv[1:]), sep="\n")
+extras = project["optional-dependencies"]
+chosen = extras if sys.argv[1] == "yes" else ["mesh"]
+wanted = [*project["dependencies"], *(r for name in chosen for r in extras[name])]
+print(*(r for r in wanted if re.match(r"[\w-]+", r)[0] not in sys.argv[2:]), sep="\n")
 PYTHON
 }
 
 pip_install() {
-    "$python" -m pip install --disable-pip-version-check "$@" > "$log" 2>&1 || failed "$log" "pip install $*"
+    # Byte code is written where it is imported: that of all packages takes as much room as the largest of them.
+    "$python" -m pip install --disable-pip-version-check --no-compile "$@" > "$log" 2>&1 ||
+        failed "$log" "pip install $*"
 }
 
 # Packages that a user installs later must not bring a NumPy with which petsc4py does not work.
@@ -341,6 +350,7 @@ elif base=$(foreign_python); then
 else
     mode=distribution base=/usr/bin/python3
 fi
+[[ ! -f $venv/for-development ]] || dev=yes
 if [[ -x $python && -f $venv/setup-done ]] && stamp | cmp -s - "$venv/setup-done" && complete; then
     exit 0
 fi
@@ -369,5 +379,6 @@ compile_loops() {
 what_is_compiled() { sed -n '/^compiling/p'; }
 say "compiling loops for this machine, which runs load then; what takes long is told"
 compile_loops || say "not all loops are compiled, for the reason above: the first runs compile what they need"
+[[ $dev == no ]] || touch "$venv/for-development"
 stamp > "$venv/setup-done"
 say "done in $((SECONDS - start)) s: ${venv#"$root"/}"

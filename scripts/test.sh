@@ -6,7 +6,7 @@
 # that hangs: 10800 unless set, many times what a slow machine takes.
 set -uo pipefail
 
-setup=()
+setup=(--dev)
 if [[ ${1:-} == --build-petsc ]]; then
     setup+=("$1")
     shift

@@ -205,11 +205,10 @@ print(*(r for r in wanted if re.match(r"[\w-]+", r)[0] not in sys.argv[2:]), sep
 PYTHON
 }
 
-pip_install() {
-    # Byte code is written where it is imported: that of all packages takes as much room as the largest of them.
-    "$python" -m pip install --disable-pip-version-check --no-compile "$@" > "$log" 2>&1 ||
-        failed "$log" "pip install $*"
-}
+pip_run() { "$python" -m pip --disable-pip-version-check "$@" > "$log" 2>&1 || failed "$log" "pip $*"; }
+
+# Byte code is written where it is imported: that of all packages takes as much room as the largest of them.
+pip_install() { pip_run install --no-compile "$@"; }
 
 # Packages that a user installs later must not bring a NumPy with which petsc4py does not work.
 limit_numpy() {
@@ -227,6 +226,8 @@ install_rest() {
     say "installing Python packages"
     pip_install "$@" "${list[@]}"
     pip_install --no-deps --editable .
+    # venv brings it for builds, which have their own
+    [[ ! -d $(site_packages)/setuptools ]] || pip_run uninstall --yes setuptools
 }
 
 # Compiled against NumPy 1, a package does not work with NumPy 2; the other way round it does.

@@ -207,7 +207,9 @@ PYTHON
 
 pip_run() { "$python" -m pip --disable-pip-version-check "$@" > "$log" 2>&1 || failed "$log" "pip $*"; }
 
-# Byte code is written where it is imported: that of all packages takes as much room as the largest of them.
+# Byte code is written where a package is imported, by the check and the first runs: that of all modules takes as much
+# room as the largest of them.
+unset PYTHONDONTWRITEBYTECODE
 pip_install() { pip_run install --no-compile "$@"; }
 
 # Packages that a user installs later must not bring a NumPy with which petsc4py does not work.

@@ -101,7 +101,7 @@ def lookup(package: str, name: str, where: str) -> ModuleType:
                 f"{where}: {_installed(package)[name].value} cannot be imported: {type(error).__name__}: {error}"
             ) from error
     known = choices(package)
-    hint = nearest(name, known) if known else "; none is built in, CONTRIBUTING.md says how to add one"
+    hint = nearest(name, known) if known else "; none is built in, docs/extending.md says how to add one"
     raise InputError(f"{where}: unknown value {name!r}{hint}")
 
 
@@ -149,7 +149,7 @@ def add_plugin(path: Path | str) -> None:
     if package is None or not name.isidentifier():
         known = ", ".join(kind.defines for kind in KINDS.values())
         raise InputError(
-            f"this is no plugin: expected a file NAME.py that defines one of {known} (CONTRIBUTING.md has examples)"
+            f"this is no plugin: expected a file NAME.py that defines one of {known} (docs/extending.md has examples)"
         )
     if name in _own(package):
         raise InputError(f"{package} has a module {name} of its own: give the plugin another name")

@@ -1,4 +1,4 @@
-"""The table and the figure of docs/contact.md: treatments of impact times integrators, on the rod against a wall.
+"""A table and the figure of docs/contact_tables.md: treatments of impact times integrators, on a rod and a wall.
 
     python scripts/contact_treatments.py            # rewrites both, in about a minute
     python scripts/contact_treatments.py --sliding  # rewrites the table of slides on a curved wall, in about a minute
@@ -156,7 +156,7 @@ def main() -> None:
     parser.add_argument("--sliding", action="store_true", help="the table of slides only")
     if parser.parse_args().sliding:
         start = "<!-- table: scripts/contact_treatments.py --sliding -->\n"
-        insert("contact.md", start, "<!-- end of slides -->", sliding() + "\n")
+        insert("contact_tables.md", start, "<!-- end of slides -->", sliding() + "\n")
         return
     results = {
         (label(integrator, parameters), treatment): run(treatment, integrator, parameters)
@@ -164,7 +164,7 @@ def main() -> None:
         for treatment in TREATMENTS
     }
     start = "<!-- table: scripts/contact_treatments.py -->\n"
-    insert("contact.md", start, "<!-- end of table -->", table(results) + "\n")
+    insert("contact_tables.md", start, "<!-- end of table -->", table(results) + "\n")
     figure(results)
 
 

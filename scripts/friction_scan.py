@@ -1,4 +1,4 @@
-"""The table of friction in an impact in docs/contact.md: errors of the velocity that particles keep along the wall.
+"""The table of friction in docs/contact_tables.md: errors of the velocity that particles keep along a wall.
 
     python scripts/friction_scan.py  # rewrites it, in about two minutes
 
@@ -138,7 +138,7 @@ def lines(schemes: tuple = SCHEMES) -> list[str]:
 
 def main() -> None:
     """Run everything, and insert the table between its marks in the document."""
-    insert("contact.md", START, END, "\n".join(lines()) + "\n")
+    insert("contact_tables.md", START, END, "\n".join(lines()) + "\n")
 
 
 if __name__ == "__main__":

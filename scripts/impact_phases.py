@@ -1,6 +1,6 @@
 """The tables of impact phases: energy gain by contact for each phase of the impact within a step.
 
-    python scripts/impact_phases.py            # rewrites those of docs/contact.md, in four minutes
+    python scripts/impact_phases.py            # rewrites those of docs/contact_tables.md, in four minutes
     python scripts/impact_phases.py --gains    # writes pfem_petsc/contact/impact_gains.npz, in twenty minutes
     python scripts/impact_phases.py --gains bathe    # the part of an integrator
 
@@ -322,7 +322,7 @@ def main() -> None:
         write_gains([word for word in sys.argv[1:] if word != "--gains"])
         return
     for columns, start, end in ((COLUMNS, START, END), (REBOUNDS, START_REBOUNDS, END_REBOUNDS)):
-        insert("contact.md", start, end, table(judged, columns))
+        insert("contact_tables.md", start, end, table(judged, columns))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The table of moving walls in docs/contact.md: their work, the energy balance, and impacts seen from the wall.
+"""The table of moving walls in docs/contact_tables.md: their work, the energy balance, and impacts seen from the wall.
 
     python scripts/moving_walls.py  # rewrites it, in a quarter of an hour
 
@@ -152,7 +152,7 @@ def table() -> str:
 
 def main() -> None:
     """Run everything, and insert the table between its marks in the document."""
-    insert("contact.md", START, END, table() + "\n")
+    insert("contact_tables.md", START, END, table() + "\n")
 
 
 if __name__ == "__main__":

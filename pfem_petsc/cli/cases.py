@@ -296,7 +296,7 @@ def list_all(arguments: argparse.Namespace) -> int:
     for kind, lines in sections.items():
         print(f"{kind}:")
         if not lines:
-            print("  none is built in; CONTRIBUTING.md has an example and says how to add one")
+            print("  none is built in; docs/extending.md has an example and says how to add one")
         for name, text in lines.items():
             print(f"  {name:{width}}  {text}")
     return 0

@@ -9,8 +9,8 @@ With tau = theta h the unknown is x_tau at t0 + tau:
 Walls bound x_tau, not x1. A node in contact then moves as at infinite frequency, at theta = 1.4 by a factor of -0.778
 per step, so its reaction alternates, the wall releases it, and contact chatters and gains energy. The decay of a node
 in contact (0.533 per step at theta = 1.5) does not make contact safe: false releases depend on the phase of the impact
-and gain energy below theta = 1.8 at small steps (see the table in docs/contact.md). Plastic strains are stored from x1,
-not from x_tau.
+and gain energy below theta = 1.8 at small steps (see the table in docs/contact_tables.md). Plastic strains are stored
+from x1, not from x_tau.
 """
 
 from __future__ import annotations

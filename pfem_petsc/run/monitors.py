@@ -309,7 +309,7 @@ class ContactWatch:
             self.tell(
                 f"{at}: contact has produced {made}: {self.what} gains "
                 "energy in impacts; use another contact.treatment or time.integrator, or a smaller time.step "
-                "(docs/contact.md, phases of an impact)"
+                "(docs/contact_tables.md, phases of an impact)"
             )
         else:
             self.tell(

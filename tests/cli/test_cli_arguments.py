@@ -78,7 +78,7 @@ def test_list_names_everything_on_offer(capsys):
     for kind in KINDS:  # also where nothing is built in
         assert f"{kind}:" in lines
     assert lines[lines.index("constraints:") + 1] == (
-        "  none is built in; CONTRIBUTING.md has an example and says how to add one"
+        "  none is built in; docs/extending.md has an example and says how to add one"
     )
     assert all(text for text in shown.values())
     assert "Elastic rod against a rigid wall" in "\n".join(lines)

@@ -175,7 +175,7 @@ def test_page_has_what_the_rods_do(integrator, parameters, step):
     for columns in (table.COLUMNS, table.REBOUNDS):
         found = [table.judged(integrator, parameters, *column[:2], step, column[2]) for column in columns.values()]
         line = f"| {table.label(integrator, parameters)} | {step:.3g} | {' | '.join(map(table.cell, found))} |"
-        assert line in pages.DOCS.joinpath("contact.md").read_text()
+        assert line in pages.DOCS.joinpath("contact_tables.md").read_text()
 
 
 def test_gain_is_told_while_it_runs(tmp_path, capfd):

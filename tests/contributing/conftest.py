@@ -1,4 +1,4 @@
-"""The examples of CONTRIBUTING.md as plugins: nothing is put into the package."""
+"""The files of the folder examples as plugins: nothing is put into the package."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import shutil
 import sys
 
 import pytest
-from helpers.pages import EXAMPLES
+from helpers.pages import PLUGINS, SPIN
 
 from pfem_petsc import registry
 from pfem_petsc.case import toml
@@ -18,8 +18,8 @@ def plugin_files(comm, shared_tmp_path):
     folder = shared_tmp_path / "added"
     if comm.rank == 0:
         folder.mkdir()
-        for path, code in EXAMPLES.items():
-            (folder / path.rpartition("/")[2]).write_text(code)
+        for name, code in {**PLUGINS, "polygon_spin.toml": SPIN}.items():
+            (folder / name).write_text(code)
     comm.Barrier()
     return folder
 

@@ -1,4 +1,4 @@
-"""The constraint of CONTRIBUTING.md: tethers and struts."""
+"""The constraint of the folder examples: tethers and struts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The examples of CONTRIBUTING.md: each is added to the package as one file, found by its name, and run."""
+"""The folder examples: each file is a plugin, found by its name, and run."""
 
 from __future__ import annotations
 
@@ -11,18 +11,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.pages import EXAMPLES, PACKAGES, TEXT, run
+from helpers.pages import EXAMPLES, PLUGINS, TEXT, run
 from helpers.stopped import assert_restart_is_bitwise
 
-from pfem_petsc import Case, Simulation, fields, open_result
+from pfem_petsc import Case, Simulation, fields, open_result, registry
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.motion import wall_surfaces
 
 
-def test_one_example_of_each_kind():
-    folders = [path.rpartition("/")[0].replace("/", ".") for path in EXAMPLES]
-    assert sorted(folders) == sorted([*PACKAGES, "cases"])
+def test_one_example_of_each_kind(examples):
+    found = {package: sorted(modules) for package, modules in registry._plugins.items()}
+    assert all(len(names) == 1 for names in found.values()), found
+    assert sorted(f"{name}.py" for (name,) in found.values()) == list(PLUGINS)
+    assert all(f"examples/{name}" in TEXT for name in PLUGINS)
+
+
+@pytest.mark.slow
+def test_case_of_the_folder_runs_where_it_is(own_registry, tmp_path):
+    """Corners of the polygon hit the funnel after they fell 0.6 - 0.5 m at 1 m/s."""
+    command = ["run", str(EXAMPLES / "polygon_spin.toml"), "-o", str(tmp_path / "out"), "--quiet"]
+    assert main(command) == 0
+    history = open_result(tmp_path / "out").history
+    first = history["time"][np.flatnonzero(history["wall/funnel/contacts"])[0]]
+    assert first == pytest.approx(0.1, abs=2e-3)
 
 
 def test_they_are_listed(examples, capsys):
@@ -34,7 +46,7 @@ def test_they_are_listed(examples, capsys):
         ("viscoplastic", "Viscoplastic bar with kinematic hardening"),
         ("polygon", "A regular polygon"),
         ("tether", "A bound on the distance of two nodes"),
-        ("obj", "Wavefront OBJ files"),
+        ("wire", "Wire files, text of our own"),
         ("listed", "Equilibria at listed load factors"),
         ("secant", "Held nodes have the mean normal velocity"),
         ("polygon_spin", "A polygon that spins inside a funnel"),
@@ -168,7 +180,7 @@ def test_polygon_has_its_mass_and_spin(sides, examples, comm, shared_tmp_path):
 
 @pytest.mark.slow
 def test_treatment_stops_the_chatter_of_the_trapezoidal_rule(examples, comm, shared_tmp_path):
-    """With the scheme's own velocities the same rod gains energy tenfold (docs/contact.md)."""
+    """With the scheme's own velocities the same rod gains energy tenfold (docs/contact_tables.md)."""
     keys = ["time.integrator=newmark", "time.beta=0.25", "time.gamma=0.5", "contact.treatment=secant"]
     keys += ["initial.velocity=[0.1, 0, 0]", "time.end=4.0", "output.fields_every=0"]
     run(Case.load("rod_impact", keys), comm, shared_tmp_path / "rod")
@@ -191,16 +203,17 @@ def test_treatment_states_what_it_goes_with(examples, comm, tmp_path):
 def test_reader_of_a_mesh_format(examples, tmp_path):
     from pfem_petsc.formats import read_whole
 
-    text = "# a square\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\no frame\nl 1 2 3 4 1\no brace\nl -4/1 -2/1\nf 1 2 3\n"
-    (tmp_path / "square.obj").write_text(text)
-    mesh = read_whole(tmp_path / "square.obj")
+    text = "# a square\nnode 0 0 0\nnode 1 0 0\nnode 1 1 0\nnode 0 1 0\ngroup frame\n"
+    text += "bar 1 2\nbar 2 3\nbar 3 4\nbar 4 1\ngroup brace  # one\nbar 1 3\n"
+    (tmp_path / "square.wire").write_text(text)
+    mesh = read_whole(tmp_path / "square.wire")
     assert mesh.bars.tolist() == [[0, 1], [1, 2], [2, 3], [3, 0], [0, 2]]
     assert {name: members.tolist() for name, members in mesh.bar_groups.items()} == {
         "frame": [0, 1, 2, 3],
         "brace": [4],
     }
-    assert main(["mesh", "convert", str(tmp_path / "square.obj"), str(tmp_path / "square.msh")]) == 0
-    for wrong, line in (("v 0 0", 2), ("v 0 0 z", 2)):
-        (tmp_path / "square.obj").write_text(text.replace("v 0 0 0", wrong))
-        with pytest.raises(InputError, match=f"square.obj: line {line}: "):
-            read_whole(tmp_path / "square.obj")
+    assert main(["mesh", "convert", str(tmp_path / "square.wire"), str(tmp_path / "square.msh")]) == 0
+    for wrong in ("node 0 0", "node 0 0 z", "nodes 0 0 0"):
+        (tmp_path / "square.wire").write_text(text.replace("node 0 0 0", wrong))
+        with pytest.raises(InputError, match="square.wire: line 2: .* expected node X Y Z, bar I J or group NAME"):
+            read_whole(tmp_path / "square.wire")

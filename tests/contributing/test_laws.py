@@ -1,4 +1,4 @@
-"""The material law of CONTRIBUTING.md."""
+"""The material law of the folder examples."""
 
 from __future__ import annotations
 

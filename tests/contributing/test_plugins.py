@@ -8,19 +8,13 @@ import sys
 
 import pytest
 from helpers.launch import environment
-from helpers.pages import EXAMPLES
+from helpers.pages import PLUGINS, SPIN
 from mpi4py import MPI
 
 from pfem_petsc import Case, InputError, Simulation, registry
 from pfem_petsc.cli.main import main
 
-FILES = sorted(path.rpartition("/")[2] for path in EXAMPLES if path.endswith(".py"))
-CASE = next(code for path, code in EXAMPLES.items() if path.endswith(".toml"))
-
-
-def code_of(name):
-    """Return an example of CONTRIBUTING.md by the name of its file."""
-    return next(code for path, code in EXAMPLES.items() if path.endswith(name))
+FILES = list(PLUGINS)
 
 
 @pytest.fixture
@@ -40,7 +34,7 @@ def test_results_open_without_the_plugins_of_their_case(
 ):
     """Nothing is installed: the case names the files, relative to it; then the files are gone."""
     monkeypatch.chdir(plugin_files)
-    (plugin_files / "spin.toml").write_text(f"plugins = {FILES}\n{CASE}")
+    (plugin_files / "spin.toml").write_text(f"plugins = {FILES}\n{SPIN}")
     forgotten()
     assert main(["spin.toml", "-o", "out", "--set", "time.end=0.01"]) == 0
     assert main(["check", "polygon_spin.toml", "--plugin", *FILES]) == 0
@@ -104,8 +98,8 @@ def test_every_verb_takes_plugins(plugin_files, forgotten, monkeypatch, capfd):
 def test_a_case_names_its_plugins(plugin_files, examples, forgotten):
     forgotten()
     with pytest.raises(InputError, match="unknown value"):
-        Case.from_toml(CASE, plugin_files)
-    case = Case.from_toml(f"plugins = {FILES}\n{CASE}", plugin_files)
+        Case.from_toml(SPIN, plugin_files)
+    case = Case.from_toml(f"plugins = {FILES}\n{SPIN}", plugin_files)
     assert case.plugins == tuple(str(plugin_files / name) for name in FILES)
     assert Case.from_toml(case.to_toml(), "/elsewhere") == case == case.copy()
     assert case.wall[0].half_angle == 45.0
@@ -133,7 +127,7 @@ def test_what_is_no_plugin_is_refused(tmp_path, name, text, told):
         Case.from_dict({"plugins": ["none.py"], **data}, folder=tmp_path)
 
 
-LAW = code_of("viscoplastic.py")
+LAW = PLUGINS["viscoplastic.py"]
 RETURNED = "return stress, tangent, (plastic, back, heat), (elastic, heat, 0.5 * back * back / hardening)"
 
 
@@ -180,7 +174,7 @@ def test_wrong_laws_are_refused(plugin_files, forgotten, old, new, told):
 )
 def test_wrong_walls_are_refused(plugin_files, tmp_path, forgotten, old, new, told):
     forgotten()
-    code = code_of("funnel.py")
+    code = PLUGINS["funnel.py"]
     assert code.count(old) >= 1
     (plugin_files / "funnel.py").write_text(code.replace(old, new, 1))
     case = Case.load(plugin_files / "polygon_spin.toml", plugins=[plugin_files / name for name in FILES])
@@ -218,21 +212,18 @@ def test_other_failures_name_the_plugin(plugin_files, forgotten, monkeypatch, ca
         ),
     ):
         forgotten()
-        code = code_of(name)
+        code = PLUGINS[name]
         for old, new in changes.items():
             code = code.replace(old, new, 1)
         (plugin_files / name).write_text(code)
         assert main(words) == status
         error = capsys.readouterr().err
         assert error.startswith(f"error: the plugin {plugin_files / name}, line ") and told in error
-        (plugin_files / name).write_text(code_of(name))
+        (plugin_files / name).write_text(PLUGINS[name])
 
 
 def test_installed_packages_add_modules_by_entry_points(tmp_path, monkeypatch):
-    absolute = LAW.replace("...case", "pfem_petsc.case").replace(
-        "from .base", "from pfem_petsc.mechanics.materials.base"
-    )
-    (tmp_path / "soft_laws.py").write_text(absolute)
+    (tmp_path / "soft_laws.py").write_text(LAW)
     info = tmp_path / "soft_laws-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: soft_laws\nVersion: 1.0\n")

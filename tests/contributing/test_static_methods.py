@@ -1,4 +1,4 @@
-"""The method of a static analysis of CONTRIBUTING.md: equilibria at listed load factors."""
+"""The method of a static analysis of the folder examples: equilibria at listed load factors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pages of the documentation: their prose, blocks and commands, and the examples of CONTRIBUTING.md."""
+"""Pages of the documentation: their prose, blocks and commands; the plugins of the folder examples."""
 
 from __future__ import annotations
 
@@ -11,17 +11,12 @@ from pfem_petsc import Simulation
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.glob("*.md")])
-TEXT = (ROOT / "CONTRIBUTING.md").read_text()
-PACKAGES = (
-    *("integrators", "contact.walls", "contact.constraints", "mesh.generators", "mechanics.materials"),
-    *("contact.treatments", "formats", "statics.methods"),
-)
-EXAMPLES = {
-    path: code
-    for code, path in re.findall(
-        r"^```(?:python|toml)\n(# pfem_petsc/(\S+)\n.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL
-    )
-}
+TEXT = (DOCS / "extending.md").read_text()
+EXAMPLES = ROOT / "examples"
+PLUGINS = {path.name: path.read_text() for path in sorted(EXAMPLES.glob("*.py"))}
+SPIN = (EXAMPLES / "polygon_spin.toml").read_text().partition("\ntitle")
+SPIN = "".join(SPIN[1:]).lstrip()
+"""The case of the examples, without the key that names the plugins."""
 
 
 def blocks(page: Path, *languages: str) -> list[str]:

@@ -12,6 +12,7 @@ from ..mesh.whole import PLANE, WholeMesh
 from ._abaqus_keywords import Block
 from ._abaqus_model import AtNodes, Deck, listed
 from ._numbers import number_of
+from ._tables import alike, name_of
 
 MADE = "_section_"
 """Beginning of the names of element sets that the writer makes for areas."""
@@ -28,24 +29,6 @@ def value_of(words: list[str], at: int) -> float:
 def short(value: float) -> float:
     """Return a number as people write it."""
     return float(f"{value:.12g}")
-
-
-def _name_of(groups: dict[str, np.ndarray], members: np.ndarray, wanted: str) -> str:
-    """Return the name of the group with these members, which may be a new one."""
-    for name in (wanted, *groups):
-        if name in groups and np.array_equal(groups[name], members):
-            return name
-    while wanted in groups:
-        wanted += "_"
-    groups[wanted] = members
-    return wanted
-
-
-def _alike(groups: dict[str, np.ndarray], values: np.ndarray, wanted: str) -> Iterator[tuple[list[float], str]]:
-    """Yield the rows of values (n, k) that differ and are not zero, each with the name of the group that has it."""
-    rows, which = np.unique(values, axis=0, return_inverse=True)
-    for i in np.flatnonzero(rows.any(axis=1)):
-        yield rows[i].tolist(), _name_of(groups, np.flatnonzero(which.ravel() == i), wanted)
 
 
 # ---- materials
@@ -284,7 +267,7 @@ def add_initial_stress(mesh: WholeMesh, deck: Deck) -> list[str]:
         if len(values) == 1 and values[0] != 0.0:
             keys["prestress"] = float(values[0])
         for k, value in enumerate(values.tolist() if len(values) > 1 else [], 1):
-            group = _name_of(mesh.bar_groups, members[stress[members] == value], f"{name}_{k}")
+            group = name_of(mesh.bar_groups, members[stress[members] == value], f"{name}_{k}")
             sections.pop(name, None)
             sections[group] = {**keys, "bars": group, **({"prestress": value} if value else {})}
     return told
@@ -500,7 +483,7 @@ class Conditions:
         for (name, axis, motion), members in self._supports.items():
             left = members[self._held[members, axis] == self._motions[motion]]
             if len(left):  # of which later lines have given no other motion
-                name = name if len(left) == len(members) else _name_of(self._mesh.node_groups, left, name)
+                name = name if len(left) == len(members) else name_of(self._mesh.node_groups, left, name)
                 times = tuple(time for time, _ in motion[1])
                 found.setdefault((name, motion[0], times), {})[axis] = [value for _, value in motion[1]]
         tables: dict[str, dict[str, Any]] = {}
@@ -526,7 +509,7 @@ class Conditions:
             return {}
         bent = ", which is not the same for all" if np.ptp(self._mesh.points[members, 2]) else ""
         self._told.append(f"{self._deck.path}: the case holds {len(free)} nodes of plane elements along z{bent}")
-        return {PLANE: {"node_set": _name_of(self._mesh.node_groups, free, "plane"), "fix": "z"}}
+        return {PLANE: {"node_set": name_of(self._mesh.node_groups, free, "plane"), "fix": "z"}}
 
     def _load_tables(self) -> dict[str, dict[str, Any]]:
         tables: dict[str, dict[str, Any]] = {}
@@ -565,7 +548,7 @@ class Conditions:
             above[members] = factors * value - start if rows else factors * (value - start)
         tables: dict[str, dict[str, Any]] = {}
         if len(times):
-            for values, group in _alike(mesh.bar_groups, above[mesh.bars].mean(axis=1), "temperature"):
+            for values, group in alike(mesh.bar_groups, above[mesh.bars].mean(axis=1), "temperature"):
                 same = len(set(values)) == 1 and not self._static
                 rows = [list(row) for row in zip(times.tolist(), map(short, values))]
                 _add(tables, group, {"bars": group, **({"value": short(values[0])} if same else {"table": rows})})
@@ -583,7 +566,7 @@ class Conditions:
             else:
                 velocity[self._deck.members_of("NSET", block, words[0]), int(axis) - 1] = value
         groups = self._mesh.node_groups
-        return {name: {"node_set": name, "velocity": row} for row, name in _alike(groups, velocity, "velocity")}
+        return {name: {"node_set": name, "velocity": row} for row, name in alike(groups, velocity, "velocity")}
 
     # ---- masses, springs, dashpots
 
@@ -606,9 +589,9 @@ class Conditions:
             self._told.append(
                 f"{self._deck.path}: left out {bare} masses, springs or dashpots without *MASS, *SPRING or *DASHPOT"
             )
-        for (value,), name in _alike(groups, values["MASS"], "mass"):
+        for (value,), name in alike(groups, values["MASS"], "mass"):
             tables["mass"][name] = {"node_set": name, "value": value}
-        for row, name in _alike(groups, values["SPRING"], "spring"):
+        for row, name in alike(groups, values["SPRING"], "spring"):
             _add(tables["spring"], name, {"node_set": name, "stiffness": row})
         # a dashpot of a case acts in all directions: those in which a node is held do not matter
         damped = values["DASHPOT"]
@@ -619,7 +602,7 @@ class Conditions:
                 f"{self._deck.path}: left out the dashpots of {int(uneven.sum())} nodes: those of a case act equally "
                 "in all directions"
             )
-        for (value,), name in _alike(groups, np.where(uneven[:, None], 0.0, most), "dashpot"):
+        for (value,), name in alike(groups, np.where(uneven[:, None], 0.0, most), "dashpot"):
             _add(tables["dashpot"], name, {"node_set": name, "coefficient": value})
         return tables
 
@@ -656,7 +639,7 @@ class Conditions:
         if axes and not (axes[0] == axes[1] and np.count_nonzero(line) == 1 and line[int(axes[0]) - 1]):
             return "those of a case act along the line between their nodes"
         names = [
-            _name_of(
+            name_of(
                 self._mesh.node_groups, np.array([node]), "node_" + (f"{instance}.{label}" if instance else f"{label}")
             )
             for node, (instance, label) in zip(nodes, element.nodes)

@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
 from ._numbers import numbers_of, shown
+from ._polygons import edges
 
 SUFFIXES = (".stl",)
 
@@ -48,18 +49,12 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     points, number = np.unique(corners + 0.0, axis=0, return_inverse=True)  # -0.0 is 0.0
     triangles = number.reshape(-1, 3)
     flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
-    mesh = WholeMesh(points, _edges(triangles[~flat], len(points)))
+    mesh = WholeMesh(points, edges(np.concatenate([triangles[~flat][:, [i, i - 1]] for i in range(3)]))[0])
     if flat.any():
         mesh.warnings.append(f"{path}: left out {int(flat.sum())} triangles with two corners at the same place")
     if len(mesh.bars) == 0:
         raise InputError(f"{path}: has no triangles, whose edges would be bars")
     return mesh
-
-
-def _edges(triangles: np.ndarray, n: int) -> np.ndarray:
-    pairs = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
-    keys = np.unique(pairs[:, 0].astype(np.int64) * n + pairs[:, 1])
-    return np.stack([keys // n, keys % n], axis=1)
 
 
 def _text(path: Path, content: bytes) -> np.ndarray:

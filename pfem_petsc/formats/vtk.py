@@ -1,6 +1,7 @@
-"""VTK files (.vtu, .vtkhdf): lines are bars, arrays of points and cells are groups and bar fields.
+"""VTK files (.vtu, .vtp, .vtk, .vtkhdf): lines are bars, arrays of points and cells are groups and bar fields.
 
-Other cells are left out, with a warning; a line of several points is as many bars less one. A cell array of integers
+Other cells are left out, with a warning; without lines, the edges of triangles, quadrilaterals and polygons are bars,
+with fields of nodes alone. A line of several points is as many bars less one. A cell array of integers
 named ``group`` or ``section`` assigns every bar with value i to the bar group ``group_i`` or ``section_i``; a field
 array of strings named ``group_names`` or ``section_names`` replaces these names by its i-th entry. Point arrays of the
 same names define node groups (a negative value: no group). An array named ``group:NAME`` is the group NAME of those
@@ -27,15 +28,18 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from ..errors import InputError
+from ._polygons import drop_bare_nodes, edges
 
 if TYPE_CHECKING:
     import pyvista
 
     from ..mesh.whole import WholeMesh
 
-SUFFIXES = (".vtu", ".vtkhdf")
+SUFFIXES = (".vtu", ".vtp", ".vtk", ".vtkhdf")
 
 _LINE, _POLY_LINE = 3, 4
+_FACES = (5, 7, 9)
+"""Triangles, polygons and quadrilaterals."""
 _NAMED = ("group", "section")
 """Arrays of numbers of groups, whose names are elsewhere."""
 _MASK = "group:"
@@ -49,7 +53,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     Raises
     ------
     InputError
-        For any content that is not an unstructured grid of lines.
+        For any content that is not an unstructured grid or polygonal data, of lines or faces.
     """
     from ..mesh.whole import WholeMesh
 
@@ -67,13 +71,17 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
         raise InputError(f"{path}: cannot be read with VTK ({last[0]}); is VTK 9.2 or newer installed?")
     arrays = pickle.loads(done.stdout)
-    left_out, snapshots = arrays.pop("left_out"), arrays.pop("snapshots")
+    left_out, snapshots, faces = (arrays.pop(name) for name in ("left_out", "snapshots", "faces"))
     mesh = WholeMesh(points=arrays.pop("points"), bars=arrays.pop("bars"))
     for key, values in arrays.items():
         kind, _, name = key.partition("/")
         getattr(mesh, kind)[name] = values
+    if faces:
+        mesh.warnings.append(f"{path}: has no lines: the {len(mesh.bars)} edges of its {faces} faces are bars")
     if left_out:
-        mesh.warnings.append(f"{path}: left out {left_out} cells that are not lines")
+        mesh.warnings.append(f"{path}: left out {left_out} cells that are not {'faces' if faces else 'lines'}")
+    if left_out or faces:
+        drop_bare_nodes(path, mesh)
     if snapshots > 1:
         mesh.warnings.append(f"{path}: has {snapshots} snapshots: the mesh and its fields are those of the last one")
     return mesh
@@ -87,10 +95,15 @@ def _extract(path: str) -> int:
     ``node_fields/NAME`` of the last of several snapshots to stdout, as a pickled dictionary."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
-    if path.lower().endswith(".vtu"):
-        from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader as Reader
-    else:
-        from vtkmodules.vtkIOHDF import vtkHDFReader as Reader
+    match Path(path).suffix.lower():
+        case ".vtu":
+            from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader as Reader
+        case ".vtp":
+            from vtkmodules.vtkIOXML import vtkXMLPolyDataReader as Reader
+        case ".vtk":
+            from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader as Reader
+        case _:
+            from vtkmodules.vtkIOHDF import vtkHDFReader as Reader
 
     # a damaged file can request any amount of memory, which takes time to fill: compressed files need at most 200 times
     # their size, including arrays and copies
@@ -123,15 +136,31 @@ def _extract(path: str) -> int:
 def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    if grid is None or not grid.IsA("vtkUnstructuredGrid"):
-        raise ValueError(f"holds a {grid.GetClassName() if grid else 'nothing'}, not an unstructured grid")
+    if grid is None or not (grid.IsA("vtkUnstructuredGrid") or grid.IsA("vtkPolyData")):
+        raise ValueError(
+            f"holds a {grid.GetClassName() if grid else 'nothing'}, not an unstructured grid or polygonal data"
+        )
+    texts = grid.GetFieldData()
+    if grid.IsA("vtkPolyData"):
+        from vtkmodules.vtkFiltersCore import vtkAppendFilter
+
+        join = vtkAppendFilter()
+        join.AddInputData(grid)
+        join.Update()
+        grid = join.GetOutput()
     n_nodes, n_cells = grid.GetNumberOfPoints(), grid.GetNumberOfCells()
     if n_nodes == 0 or n_cells == 0:
         raise ValueError(f"{n_nodes} points and {n_cells} cells: not a mesh of bars, or a damaged file")
     kinds = vtk_to_numpy(grid.GetCellTypesArray())
     cells = np.flatnonzero((kinds == _LINE) | (kinds == _POLY_LINE))
+    of_faces = len(cells) == 0
+    if of_faces:
+        cells = np.flatnonzero(np.isin(kinds, _FACES))
     if len(cells) == 0:
-        raise ValueError(f"cells of types {np.unique(kinds).tolist()}; bars are lines (type 3), and there are none")
+        raise ValueError(
+            f"cells of types {np.unique(kinds).tolist()}; bars are lines (type 3) or edges of faces (types 5, 7, 9), "
+            "and there are none"
+        )
     ends = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
     offsets = vtk_to_numpy(grid.GetCells().GetOffsetsArray()).astype(np.int64)
     first, size = offsets[cells], offsets[cells + 1] - offsets[cells]
@@ -139,21 +168,23 @@ def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
         raise ValueError("lines that do not have two ends; a bar has two")
     if first.min() < 0 or (first + size).max() > len(ends):
         raise ValueError("lines whose nodes do not exist: a damaged file")
-    # a line of several points is as many bars less one: the cell of each bar, and where its ends are listed
-    lines = np.repeat(cells, size - 1)
-    place = np.arange(len(lines)) - np.repeat(np.cumsum(size - 1) - (size - 1), size - 1) + np.repeat(first, size - 1)
+    # a line of several points is as many bars less one, a face as many as it has corners: the cell of each bar, and
+    # which of its points come first and second
+    count = size if of_faces else size - 1
+    lines, start = np.repeat(cells, count), np.repeat(first, count)
+    one = np.arange(len(lines)) - np.repeat(np.cumsum(count) - count, count)
+    bars = ends[np.stack([start + one, start + (one + 1) % np.repeat(size, count)], axis=1)].astype(np.int64)
     yield "points", vtk_to_numpy(grid.GetPoints().GetData()).astype(np.float64)
-    yield "bars", ends[place[:, None] + np.array([0, 1])].astype(np.int64)
+    yield "bars", edges(bars)[0] if of_faces else bars
+    yield "faces", len(cells) if of_faces else 0
     yield "left_out", n_cells - len(cells)
-    for kind, data, kept in (
-        ("node_groups", grid.GetPointData(), slice(None)),
-        ("bar_groups", grid.GetCellData(), lines),
-    ):
-        for name, members in _groups_of(data, grid.GetFieldData(), kept).items():
-            yield f"{kind}/{name}", members
+    of_nodes, of_bars = ("node", grid.GetPointData(), slice(None)), ("bar", grid.GetCellData(), lines)
+    for kind, data, kept in (of_nodes,) if of_faces else (of_nodes, of_bars):
+        for name, members in _groups_of(data, texts, kept).items():
+            yield f"{kind}_groups/{name}", members
         for name, values in _numbers(data).items():
             if not name.startswith(_MASK) and name not in _NAMED:
-                yield f"{kind.replace('groups', 'fields')}/{name}", values.astype(np.float64)[kept]
+                yield f"{kind}_fields/{name}", values.astype(np.float64)[kept]
 
 
 def _numbers(data: Any) -> dict[str, np.ndarray]:

@@ -36,6 +36,7 @@ _POWERS = {
     "coefficient": -1,
 }
 """Powers of a unit of length in those of keys, with newtons and seconds: MPa are N/mm2, t/mm3 are N s2/mm4."""
+_OF_MASSES = {"value": -1}
 
 
 def lengths(mesh: WholeMesh) -> np.ndarray:
@@ -227,15 +228,25 @@ def scaled(mesh: WholeMesh, scale: float) -> WholeMesh:
     fields = {name: values * scale**2 if name == "area" else values for name, values in mesh.bar_fields.items()}
     tables = {
         table: {
-            name: {
-                key: _scaled_value(value, scale ** (-1 if table == "mass" else _POWERS.get(key, 0)))
-                for key, value in keys.items()
-            }
-            for name, keys in rows.items()
+            name: _scaled_keys(keys, scale, _OF_MASSES if table == "mass" else _POWERS) for name, keys in rows.items()
         }
         for table, rows in mesh.tables.items()
     }
     return replace(mesh, points=mesh.points * scale, bar_fields=fields, tables=tables)
+
+
+def _scaled_keys(keys: dict[str, Any], scale: float, powers: dict[str, int]) -> dict[str, Any]:
+    """Return the keys of a table; those of tables in it have their own powers."""
+    found: dict[str, Any] = {}
+    for key, value in keys.items():
+        match value:
+            case dict():
+                found[key] = _scaled_keys(value, scale, powers)
+            case [{}, *_]:
+                found[key] = [_scaled_keys(row, scale, powers) for row in value]
+            case _:
+                found[key] = _scaled_value(value, scale ** powers.get(key, 0))
+    return found
 
 
 def _scaled_value(value: Any, factor: float) -> Any:
@@ -301,7 +312,7 @@ def _named(mesh: WholeMesh) -> Iterator[tuple[str, str]]:
 def _short(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
-    if isinstance(value, list) and value and isinstance(value[0], list):
+    if isinstance(value, list) and value and isinstance(value[0], list | dict):
         return f"of {len(value)} rows"
     return f"[{', '.join(map(_short, value))}]" if isinstance(value, list) else str(value)
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,8 @@ class WholeMesh:
     """(n_nodes,) float64."""
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)
     """What a file has besides the mesh: ``material``, ``section``, ``support``, ``load``, ``mass``, ``spring``,
-    ``dashpot``, ``temperature``, ``initial`` and ``gravity``, each with the keys of a case by name, and ``analysis``:
-    ``static``, ``time`` and ``modes``."""
+    ``dashpot``, ``temperature``, ``initial``, ``gravity`` and ``load_case``, each with the keys of a case by name, and
+    ``analysis``: ``static``, ``time`` and ``modes``."""
     warnings: list[str] = field(default_factory=list)
     source: str = "mesh"
     """The file, for messages."""
@@ -52,7 +53,7 @@ class WholeMesh:
         return found
 
 
-_CONDITIONS = ("support", "load", "gravity", "temperature", "initial", "mass", "spring", "dashpot")
+_CONDITIONS = ("support", "load", "gravity", "temperature", "initial", "mass", "spring", "dashpot", "load_case")
 PLANE = "plane elements"
 """Name of a support that only holds a plane truss in its plane."""
 
@@ -63,9 +64,10 @@ def case_tables(tables: dict[str, dict[str, Any]]) -> dict[str, Any]:
     for name in _CONDITIONS:
         rows = list(tables.get(name, {}).values())
         if rows:
-            found[name] = {"gravity": rows[0], "initial": {"on": rows}}.get(name, rows)
-        for row in rows:
-            for own in row.get("between", [row[key] for key in ("node_set",) if key in row]):
+            cases = [{"name": own, **keys} for own, keys in tables[name].items()]
+            found[name] = {"gravity": rows[0], "initial": {"on": rows}, "load_case": cases}.get(name, rows)
+        for keys in chain.from_iterable(row.get("load", [row]) for row in rows):
+            for own in keys.get("between", [keys[key] for key in ("node_set",) if key in keys]):
                 found.setdefault("node_set", {})[own] = {"group": own}
     return found
 

@@ -1,0 +1,340 @@
+"""Nastran bulk data (.bdf, .nas, .dat): rods, their sections, materials, supports, forces and subcases, by pyNastran.
+
+CROD, CONROD and CTUBE are bars; CBAR and CBEAM are read as bars, with a warning unless both of their ends are hinges.
+Properties are sections and groups of bars. Supports, forces, gravity and nodal masses are those of the first subcases
+that name them; the subcases of a linear static solution with loads of their own are load cases. Cards that are not read
+are told with their numbers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import tempfile
+from collections import Counter
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..mesh.whole import WholeMesh
+from ._tables import alike, free_name, name_of
+
+SUFFIXES = (".bdf", ".nas", ".dat")
+
+_BARS = ("CROD", "CONROD", "CTUBE", "CBAR", "CBEAM")
+_PROPERTIES = ("PROD", "PTUBE", "PBAR", "PBARL", "PBEAM", "PBEAML")
+_COORDINATES = ("CORD1R", "CORD1C", "CORD1S", "CORD2R", "CORD2C", "CORD2S")
+_READ = (*("GRID", "GRDSET", "MAT1", "SPC", "SPC1", "SPCADD", "FORCE", "FORCE1", "FORCE2", "GRAV", "LOAD", "CONM2"),
+         *("EIGRL", "PARAM", "BAROR", "BEAMOR"), *_BARS, *_PROPERTIES, *_COORDINATES)  # fmt: skip
+_SILENT = ("ENDDATA", "GRDSET", "PARAM", "BAROR", "BEAMOR", "EIGRL", "EIGR", "EIGB", "NLPARM")
+
+
+def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
+    """Return the bars of a deck as a mesh with tables of a case.
+
+    Raises
+    ------
+    InputError
+        If pyNastran is not installed or cannot read the deck, or it has no bars.
+    """
+    deck = _deck(path)
+    bars = [element for _, element in sorted(deck.elements.items())]
+    if not bars:
+        raise InputError(f"{path}: has no {', '.join(_BARS)}, which would be bars{_cards(deck, ': it has ')}")
+    ends = np.array([bar.node_ids[:2] for bar in bars], np.int64)
+    labels = np.unique(ends)
+    missing = [label for label in labels.tolist() if label not in deck.nodes]
+    if missing:
+        raise InputError(f"{path}: there is no GRID {missing[0]}, at which a bar ends")
+    points = np.array([deck.nodes[label].get_position() for label in labels.tolist()])
+    mesh = WholeMesh(points, np.searchsorted(labels, ends))
+    told = _Told(path, mesh.warnings)
+    left = len(deck.nodes) - len(labels)
+    told(left, f"left out {left} GRID where no bar ends")
+    text = _cards(deck, "left out cards that are not read: ")
+    told(text, text)
+    _add_sections(mesh, deck, bars, told)
+    _Conditions(mesh, deck, labels, told).add()
+    return mesh
+
+
+class _Told:
+    """Collects warnings about a file."""
+
+    def __init__(self, path: Path, warnings: list[str]) -> None:
+        self._path, self._warnings = path, warnings
+
+    def __call__(self, condition: object, text: str) -> None:
+        """Add a warning if a condition holds."""
+        if condition:
+            self._warnings.append(f"{self._path}: {text}")
+
+
+def _deck(path: Path) -> Any:
+    """Return the cards of a file and of those that it includes; coordinates are those of the basic system."""
+    try:
+        from cpylog import SimpleLogger
+        from pyNastran.bdf.bdf import BDF
+    except ImportError as error:
+        raise InputError(
+            f"{path}: Nastran bulk data is read by pyNastran, which is not installed: pip install pyNastran ({error})"
+        ) from None
+    lines: list[str] = []
+    deck = BDF(log=SimpleLogger("error", log_func=lambda _, text: lines.append(text)))
+    deck.enable_cards(_READ)
+    bulk_only = not re.search(rb"^\s*(CEND|BEGIN\s+BULK)", path.read_bytes(), re.MULTILINE | re.IGNORECASE)
+    file = str(path.absolute())
+    try:
+        # it prints, and writes a file into the current folder, when an included file is missing
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            contextlib.chdir(folder),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
+            deck.read_bdf(file, xref=False, punch=bulk_only)
+            deck.cross_reference(
+                **{f"xref_{what}": False for what in ("elements", "properties", "masses", "materials", "loads")},
+                **{f"xref_{what}": False for what in ("constraints", "aero", "sets", "optimization")},
+            )
+    except Exception as error:  # noqa: BLE001 - damaged cards raise anything
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
+        raise InputError(f"{path}: pyNastran cannot read it: {reason}") from None
+    return deck
+
+
+def _cards(deck: Any, text: str) -> str:
+    """Return the cards that are not read, with their numbers, after a text; nothing without any."""
+    counts = {**deck.card_count, **deck.reject_count}
+    other = [f"{n} {name}" for name, n in sorted(counts.items()) if name not in (*_READ, *_SILENT)]
+    return text + ", ".join(other) if other else ""
+
+
+# ---- sections and materials
+
+
+def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: _Told) -> None:
+    """Add sections and materials, groups of bars by property, and the field ``area``."""
+    members: dict[tuple[Any, ...], list[int]] = {}
+    counts: Counter[str] = Counter()
+    for i, bar in enumerate(bars):
+        key = (bar.A, bar.mid) if bar.type == "CONROD" else (bar.pid,)
+        members.setdefault((bar.type == "CONROD", *key), []).append(i)
+        if bar.type in ("CBAR", "CBEAM"):
+            pins = [set(str(pin)) for pin in (bar.pa, bar.pb)]
+            counts[f"{bar.type}, without bending stiffness"] += any(not {"5", "6"} <= pin for pin in pins)
+            counts[f"{bar.type} between their GRID, without offsets"] += any(map(np.any, (bar.wa, bar.wb)))
+    for what, n in counts.items():
+        told(n, f"{n} {what}, are read as bars".replace(",,", ","))
+    area, without, mass = np.full(len(bars), np.nan), 0, 0
+    sections, weight = mesh.tables.setdefault("section", {}), _mass_scale(deck)
+    for (of_rod, *_), numbers in members.items():
+        bar = bars[numbers[0]]
+        source = bar if of_rod else deck.properties.get(bar.pid)
+        if source is None:
+            without += len(numbers)
+            continue
+        group = free_name(sections, "conrod" if of_rod else f"{source.type.lower()}_{source.pid}")
+        mesh.bar_groups[group] = np.array(numbers)
+        sections[group] = {"bars": group}
+        if (size := float(source.Area())) > 0.0:
+            sections[group]["area"] = area[numbers] = size
+        if source.type == "PTUBE":
+            told(source.OD2 not in (None, source.OD1), f"PTUBE {source.pid} has two diameters: its area is their mean")
+            sections[group] |= {"shape": "tube", "thickness": source.t} if 0.0 < source.t < 0.5 * source.OD1 else {}
+        mass += len(numbers) * bool(np.any(source.nsm))
+        material = deck.materials.get(source.mid)
+        sections[group]["material"] = f"mat1_{source.mid}"
+        values = {"young_modulus": "e", "density": "rho", "thermal_expansion": "a"}
+        found = {key: float(getattr(material, name, None) or 0.0) for key, name in values.items()}
+        found["density"] *= weight
+        mesh.tables.setdefault("material", {})[f"mat1_{source.mid}"] = {k: v for k, v in found.items() if v}
+    told(without, f"{without} bars have a property that is not read or not there: they have no section")
+    told(mass, f"left out the nonstructural mass of {mass} bars")
+    if (area > 0.0).all():
+        mesh.bar_fields["area"] = area
+
+
+def _mass_scale(deck: Any) -> float:
+    """Return PARAM WTMASS, by which densities and masses are multiplied."""
+    return float(deck.params["WTMASS"].values[0]) if "WTMASS" in deck.params else 1.0
+
+
+# ---- supports, loads, masses, analysis
+
+
+class _Conditions:
+    """Supports, loads, masses and the analysis of a deck as tables; ``labels`` (n,) are the GRID of the nodes."""
+
+    def __init__(self, mesh: WholeMesh, deck: Any, labels: np.ndarray, told: _Told) -> None:
+        self._mesh, self._deck, self._told = mesh, deck, told
+        self._labels = labels.tolist()
+        self._at = {label: i for i, label in enumerate(self._labels)}
+        control = deck.case_control_deck
+        self._subcases = dict(control.subcases) if control is not None else {}
+
+    def add(self) -> None:
+        """Add the tables to the mesh."""
+        tables = {"support": self._supports(), "mass": self._masses(), **self._loads(), "analysis": self._analysis()}
+        self._mesh.tables |= {name: table for name, table in tables.items() if table}
+
+    def _chosen(self, key: str, sets: Collection[int]) -> dict[int, str]:
+        """Return the different sets that subcases choose by a key, with the name of the first subcase of each.
+
+        Without subcases, as in bulk data alone, it is the first set, or the one that combines others.
+        """
+        found: dict[int, str] = {}
+        for number, subcase in sorted(self._subcases.items()):
+            if key in subcase.params:
+                value = subcase.params[key][0]
+                words = [subcase.params[word][0] for word in ("SUBTITLE", "LABEL") if word in subcase.params]
+                name = re.sub(r"[^\w.-]+", "_", str(words[-1] if words else "")).strip("_.")[:40]
+                # what stands before all subcases is taken by each of them
+                if value in sets and not (number == 0 and len(self._subcases) > 1):
+                    found.setdefault(int(value), name if name not in found.values() and name else f"subcase_{number}")
+        if not found and not any(key in subcase.params for subcase in self._subcases.values()):
+            found = {int(value): f"{key.lower()}_{value}" for value in list(sets)[:1]}
+        return found
+
+    def _vector(self, system: int, values: np.ndarray, what: str) -> np.ndarray:
+        """Return a vector of a rectangular coordinate system in the basic one; NaN for others."""
+        found = self._deck.coords[system]
+        if system and not found.type.endswith("R"):
+            self._told(True, f"{what} in the coordinate system {system}, which is not rectangular, is left out")
+            return np.full(3, np.nan)
+        return found.transform_vector_to_global(np.asarray(values, float)) if system else np.asarray(values, float)
+
+    def _named(self, members: np.ndarray, wanted: str) -> str:
+        """Return the name of the group of nodes; of one node, with its GRID."""
+        wanted = f"node_{self._labels[members[0]]}" if len(members) == 1 else wanted
+        return name_of(self._mesh.node_groups, members, wanted)
+
+    def _supports(self) -> dict[str, dict[str, Any]]:
+        deck, n = self._deck, len(self._labels)
+        held, moved = np.zeros((n, 3), bool), np.zeros((n, 3))
+        chosen = self._chosen("SPC", [*deck.spcadds, *deck.spcs])
+        sets = [number for card in deck.spcadds.get(next(iter(chosen), 0), []) for number in card.sets] or [*chosen][:1]
+        unused = sorted(set(deck.spcs) - set(sets))
+        self._told(unused, f"left out the SPC sets {unused}: the case has {' and '.join(map(str, sets))}")
+        lines = [(label, str(node.ps or ""), 0.0) for label, node in deck.nodes.items() if label in self._at]
+        for card in (card for number in sets for card in deck.spcs.get(number, [])):
+            if card.type == "SPC1":
+                lines += [(label, card.components, 0.0) for label in card.node_ids]
+            else:
+                lines += list(zip(card.node_ids, card.components, card.enforced))
+        for label, components, value in lines:
+            i, axes = self._at.get(label, -1), ["123".index(c) for c in str(components) if c in "123"]
+            if i < 0 or not axes:  # of other nodes, and rotations, which bars do not have
+                continue
+            system = int(deck.nodes[label].cd)
+            for axis in axes:
+                across = (
+                    self._vector(system, np.eye(3)[axis], f"the support of GRID {label}") if system else np.eye(3)[axis]
+                )
+                own = int(np.nan_to_num(abs(across)).argmax())
+                if len(axes) < 3 and not abs(across[own]) > 1.0 - 1e-9:
+                    self._told(
+                        True, f"the support of GRID {label} along {axis + 1} of {system} is left out: not an axis"
+                    )
+                    continue
+                held[i, axis if len(axes) == 3 else own] = True
+                moved[i] += value * np.nan_to_num(across)
+        switch = deck.params["AUTOSPC"].values[0] if "AUTOSPC" in deck.params else "YES"
+        for axis in np.flatnonzero(np.ptp(self._mesh.points, axis=0) == 0.0) if switch == "YES" else ():
+            free = int((~held[:, axis]).sum())
+            self._told(free, f"the case holds {free} nodes of a flat truss along {'xyz'[axis]}, as AUTOSPC does")
+            held[:, axis] = True
+        tables: dict[str, dict[str, Any]] = {}
+        rows, which = np.unique(np.hstack([held, moved]), axis=0, return_inverse=True)
+        for k in np.flatnonzero(rows[:, :3].any(axis=1)):
+            fix = "".join(axis for axis, on in zip("xyz", rows[k]) if on)
+            name = self._named(np.flatnonzero(which.ravel() == k), f"fixed_{fix}")
+            motion = [[0.0, 0.0, 0.0, 0.0], [1.0, *rows[k, 3:].tolist()]]
+            moves = {"motion": motion, "interpolation": "linear"} if rows[k, 3:].any() else {}
+            tables[name] = {"node_set": name, "fix": fix, **moves}
+        return tables
+
+    def _masses(self) -> dict[str, dict[str, Any]]:
+        values, others = np.zeros((len(self._labels), 1)), 0
+        for card in self._deck.masses.values():
+            i = self._at.get(card.nid, -1)
+            others += i < 0
+            if i >= 0:
+                values[i] += card.mass * _mass_scale(self._deck)
+        self._told(others, f"left out {others} CONM2 where no bar ends")
+        found = alike(self._mesh.node_groups, values, "mass")
+        return {name: {"node_set": name, "value": value} for (value,), name in found}
+
+    def _loads(self) -> dict[str, dict[str, Any]]:
+        """Return loads and gravity, or load cases if subcases of a linear static solution have different loads."""
+        deck = self._deck
+        chosen = self._chosen("LOAD", [*deck.load_combinations, *deck.loads])
+        found = {}
+        used: set[int] = set()
+        for number, name in chosen.items() if deck.sol in (101, 1) else list(chosen.items())[:1]:
+            parts = [
+                (one, card.scale * scale)
+                for card in deck.load_combinations.get(number, [])
+                for scale, one in zip(card.scale_factors, card.load_ids)
+            ] or [(number, 1.0)]
+            used |= {one for one, _ in parts}
+            found[name] = self._load_tables(parts)
+        unused = sorted(set(deck.loads) - used)
+        self._told(
+            unused, f"left out the load sets {unused}: the case has {', '.join(map(str, sorted(used))) or 'none'}"
+        )
+        if len(found) == 1:
+            return next(iter(found.values()))
+        rows = {name: {"load": list(t["load"].values()), **t["gravity"]} for name, t in found.items()}
+        return {
+            "load_case": {
+                name: {k: v for k, v in keys.items() if v} for name, keys in rows.items() if any(keys.values())
+            }
+        }
+
+    def _load_tables(self, parts: list[tuple[int, float]]) -> dict[str, dict[str, Any]]:
+        forces, gravity, others = np.zeros((len(self._labels), 3)), np.zeros(3), 0
+        for number, factor in parts:
+            for card in self._deck.loads.get(number, []):
+                if card.type == "GRAV":
+                    gravity += factor * card.scale * np.nan_to_num(self._vector(card.cid, card.N, "GRAV"))
+                    continue
+                i = self._at.get(card.node, -1)
+                others += i < 0
+                if card.type == "FORCE":
+                    direction = self._vector(card.cid, card.xyz, f"FORCE at GRID {card.node}")
+                else:  # along the line of two nodes, or across the plane of two lines
+                    first = ("g1", "g2") if card.type == "FORCE1" else ("g1", "g2", "g3", "g4")
+                    place = [self._deck.nodes[getattr(card, key)].get_position() for key in first]
+                    across = [b - a for a, b in zip(place[::2], place[1::2])]
+                    direction = across[0] if len(across) == 1 else np.cross(*across)
+                    direction = direction / np.linalg.norm(direction)
+                if i >= 0:
+                    forces[i] += np.nan_to_num(factor * card.mag * direction)
+        self._told(others, f"left out {others} forces where no bar ends")
+        rows, which = np.unique(forces, axis=0, return_inverse=True)
+        loads = {}
+        for k in np.flatnonzero(rows.any(axis=1)):
+            name = self._named(np.flatnonzero(which.ravel() == k), "loaded")
+            loads[name] = {"node_set": name, "force": rows[k].tolist()}
+        return {"load": loads, "gravity": {"gravity": {"acceleration": gravity.tolist()}} if gravity.any() else {}}
+
+    def _analysis(self) -> dict[str, dict[str, Any]]:
+        deck = self._deck
+        small = "is linear: the case has large displacements, as all cases do"
+        match deck.sol:
+            case None | 1 | 101 | 106 as sol:
+                self._told(sol in (1, 101), f"SOL {sol} {small}")
+                return {"static": {"step": 0.1 if sol == 106 else 1.0}} if sol else {}
+            case 103 | 105 as sol:
+                method = next(iter(self._chosen("METHOD", deck.methods)), 0)
+                count = getattr(deck.methods.get(method), "nd", None)
+                self._told(not count, "a limit of the eigenvalues is not supported: modes.count = 10")
+                kind = {"kind": "vibration"} if sol == 103 else {"kind": "buckling", "linear": True}
+                return {"modes": {"count": int(count or 10), **kind}}
+            case sol:
+                self._told(True, f"SOL {sol} is left out: the case has no analysis; known are 101, 103, 105 and 106")
+                return {}

@@ -1,0 +1,71 @@
+"""Wavefront OBJ files (.obj): lines and polylines are bars, objects and groups are bar groups.
+
+In a file without lines, the edges of the faces are bars. Coordinates are taken as metres.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..mesh.whole import WholeMesh
+from ._polygons import drop_bare_nodes, edges, mesh_of
+
+SUFFIXES = (".obj",)
+
+_LOOKS = ("vt", "vn", "vp", "usemtl", "mtllib", "s", "p", "")
+"""What does not describe bars; points are nodes that lines name too."""
+
+
+def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
+    """Return the lines, or the edges of the faces, of an OBJ file.
+
+    Raises
+    ------
+    InputError
+        Naming file and line, for a number that is none, and a point that does not exist.
+    """
+    points: list[list[float]] = []
+    pairs: dict[str, list[tuple[int, int]]] = {"l": [], "f": []}
+    groups: dict[str, dict[str, list[int]]] = {"l": {}, "f": {}}
+    named: dict[str, list[str]] = {"o": [], "g": []}
+    faces, other = 0, Counter[str]()
+    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    for number, line in enumerate(text.splitlines(), 1):
+        word, *rest = line.partition("#")[0].split() or [""]
+        try:
+            if word == "v":
+                x, y, z = map(float, rest[:3])
+                points.append([x, y, z])
+            elif word in ("l", "f"):
+                ends = [int(text.partition("/")[0]) for text in rest]
+                ends = [end - 1 if end > 0 else len(points) + end for end in ends]
+                if min(ends) < 0:
+                    raise IndexError
+                own = pairs[word]
+                new = [*pairwise(ends), *([(ends[-1], ends[0])] if word == "f" else [])]
+                for name in (*named["o"], *named["g"]):
+                    groups[word].setdefault(name, []).extend(range(len(own), len(own) + len(new)))
+                own += new
+                faces += word == "f"
+            elif word in named:
+                named[word] = [name.replace("/", "_") for name in ([" ".join(rest)] if word == "o" else rest)]
+            elif word not in _LOOKS:
+                other[word] += 1
+        except (ValueError, IndexError):
+            expected = "three numbers" if word == "v" else "the numbers of points that precede it"
+            raise InputError(f"{path}: line {number}: {line[:60]!r}: expected {expected}") from None
+    around = np.array(pairs["f"], np.int64).reshape(-1, 2)
+    mesh = mesh_of(path, np.array(points).reshape(-1, 3), np.array(pairs["l"]).reshape(-1, 2), around, faces)
+    place = np.arange(len(mesh.bars)) if pairs["l"] else edges(around)[1]
+    members = groups["l" if pairs["l"] else "f"]
+    mesh.bar_groups = {name: np.unique(place[own]) for name, own in members.items()}
+    if other:
+        mesh.warnings.append(f"{path}: left out {', '.join(f'{n} {word}' for word, n in other.items())}: not read")
+    drop_bare_nodes(path, mesh)
+    return mesh

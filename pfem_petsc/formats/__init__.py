@@ -32,15 +32,27 @@ if TYPE_CHECKING:
 
 __all__ = ["read_slab", "read_whole", "suffixes", "write_whole", "writer_of"]
 
-_GEOMETRY = "; this is a geometry: mesh it by `gmsh -1 {name} -o {stem}.msh`"
-_GMSH = "; convert it by `gmsh {name} -save -o {stem}.msh`"
-_MESHIO = "; convert it by `meshio convert {name} {stem}.vtu`"
+_GEOMETRY = (
+    "; this is a geometry: mesh its curves by `gmsh -1 -clmin 1e22 {name} -o {stem}.msh`, one bar each, or with the "
+    "length of bars after -clmin (pip install gmsh)"
+)
+_GMSH = "; convert it by `gmsh {name} -save -o {stem}.msh` (pip install gmsh)"
+_MESHIO = "; convert it by `meshio convert {name} {stem}.vtk` (pip install meshio)"
+_DRAWING = (
+    "; export its lines as Wavefront OBJ from the program that made it, or convert it by the script for drawings in "
+    "docs/meshes.md"
+)
 _CONVERT = {
-    **dict.fromkeys((".geo", ".geo_unrolled", ".step", ".stp", ".brep"), _GEOMETRY),
-    **dict.fromkeys((".vtk", ".med", ".bdf", ".nas", ".fem", ".xdmf", ".mesh"), _MESHIO),
-    ".unv": _GMSH,
+    **dict.fromkeys((".geo", ".geo_unrolled", ".step", ".stp", ".iges", ".igs", ".brep"), _GEOMETRY),
+    **dict.fromkeys((".unv", ".med"), _GMSH),
+    **dict.fromkeys((".xdmf", ".mesh", ".mdpa", ".avs"), _MESHIO),
+    **dict.fromkeys((".dxf", ".3dm"), _DRAWING),
+    **dict.fromkeys((".dwg", ".skp", ".blend", ".3ds", ".fbx"), "; export its lines as Wavefront OBJ or DXF"),
+    ".ifc": "; export the axes of the members as lines (Wavefront OBJ or DXF) from the program that made it",
+    ".fem": "; this is bulk data: `(echo SOL 101; echo CEND; cat {name}) > {stem}.bdf`",
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "; save the sheets of nodes and bars as {stem}_nodes.csv and _bars.csv"),
 }
-"""How to make a file that is read out of another; meshio, which does not read .unv, comes with the extra ``mesh``."""
+"""How to make a file that is read out of another."""
 
 
 def suffixes(*what: str) -> dict[str, ModuleType]:

@@ -73,8 +73,8 @@ def _structures(value: Any) -> Iterator[tuple[dict[str, Any], str]]:
 
 def _edges_of(data: dict[str, Any], number: dict[str, int]) -> tuple[Sequence[Any], list[dict[str, Any]]]:
     """Return the ends of edges, and their attributes."""
-    if "face" not in data:
-        of = data["edge"]
+    of = data.get("edge")
+    if of:
         pairs = [(u, v) for u in of for v in of[u]]
         return [(number[str(u)], number[str(v)]) for u, v in pairs], [dict(of[u][v] or {}) for u, v in pairs]
     loops = [[number[str(key)] for key in face] for face in data["face"].values() if face]

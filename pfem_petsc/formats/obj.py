@@ -1,6 +1,7 @@
 """Wavefront OBJ files (.obj): lines and polylines are bars, objects and groups are bar groups.
 
-In a file without lines, the edges of the faces are bars. Coordinates are taken as metres.
+Curves of degree 1 are polylines. In a file without lines, the edges of the faces are bars. Coordinates are taken as
+metres.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from ._polygons import drop_bare_nodes, edges, mesh_of
 
 SUFFIXES = (".obj",)
 
-_LOOKS = ("vt", "vn", "vp", "usemtl", "mtllib", "s", "p", "")
-"""What does not describe bars; points are nodes that lines name too."""
+_SILENT = ("", "vt", "vn", "vp", "usemtl", "mtllib", "s", "cstype", "parm", "end")
+"""What describes how bars look, or belongs to curves."""
 
 
 def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
@@ -34,7 +35,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     pairs: dict[str, list[tuple[int, int]]] = {"l": [], "f": []}
     groups: dict[str, dict[str, list[int]]] = {"l": {}, "f": {}}
     named: dict[str, list[str]] = {"o": [], "g": []}
-    faces, other = 0, Counter[str]()
+    faces, degree, other = 0, 0, Counter[str]()
     text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
         word, *rest = line.partition("#")[0].split() or [""]
@@ -42,7 +43,9 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
             if word == "v":
                 x, y, z = map(float, rest[:3])
                 points.append([x, y, z])
-            elif word in ("l", "f"):
+            elif word in ("l", "f") or (word == "curv" and degree == 1):
+                # what Rhino writes for lines: curves of degree 1, between two parameters
+                word, rest = ("l", rest[2:]) if word == "curv" else (word, rest)
                 ends = [int(text.partition("/")[0]) for text in rest]
                 ends = [end - 1 if end > 0 else len(points) + end for end in ends]
                 if min(ends) < 0:
@@ -53,9 +56,11 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
                     groups[word].setdefault(name, []).extend(range(len(own), len(own) + len(new)))
                 own += new
                 faces += word == "f"
+            elif word == "deg":
+                degree = int(rest[0])
             elif word in named:
                 named[word] = [name.replace("/", "_") for name in ([" ".join(rest)] if word == "o" else rest)]
-            elif word not in _LOOKS:
+            elif word not in _SILENT:
                 other[word] += 1
         except (ValueError, IndexError):
             expected = "three numbers" if word == "v" else "the numbers of points that precede it"

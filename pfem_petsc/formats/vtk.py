@@ -230,11 +230,19 @@ def write(path: Path, mesh: WholeMesh) -> None:
         kinds = ("node_groups", "bar_groups", "bar_fields", "node_fields")
         _write_vtkhdf(path, replace(mesh, **{kind: without_slashes(getattr(mesh, kind)) for kind in kinds}))
         return
-    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
-
-    writer = vtkXMLUnstructuredGridWriter()
+    match path.suffix.lower():
+        case ".vtk":
+            from vtkmodules.vtkIOLegacy import vtkUnstructuredGridWriter as Writer
+        case ".vtp":
+            from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter as Writer
+        case _:
+            from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter as Writer
+    legacy = path.suffix.lower() == ".vtk"
+    writer = Writer()
     writer.SetFileName(str(path))
-    writer.SetInputData(grid_of(mesh, _escaped))
+    if legacy:
+        writer.SetFileTypeToBinary()
+    writer.SetInputData(grid_of(mesh, str if legacy else _escaped, polygonal=path.suffix.lower() == ".vtp"))
     if not writer.Write() or not path.is_file():
         raise InputError(f"{path}: VTK could not write the file; is there room?")
 
@@ -243,12 +251,16 @@ def _escaped(name: str) -> str:
     return escape(name, {'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"})  # VTK writes names as they are
 
 
-def grid_of(mesh: WholeMesh, named: Callable[[str], str] = str) -> pyvista.UnstructuredGrid:
-    """Return a grid of lines with the fields; groups are ``group:NAME``, 1 for members; ``named`` gives names."""
+def grid_of(mesh: WholeMesh, named: Callable[[str], str] = str, polygonal: bool = False) -> pyvista.DataSet:
+    """Return an unstructured grid of lines, or polygonal data, with the fields; groups are ``group:NAME``, 1 for
+    members; ``named`` gives names."""
     import pyvista
 
     cells = np.column_stack([np.full(len(mesh.bars), 2), mesh.bars]).ravel()
-    grid = pyvista.UnstructuredGrid(cells, np.full(len(mesh.bars), _LINE, np.uint8), mesh.points)
+    if polygonal:
+        grid = pyvista.PolyData(np.asarray(mesh.points), lines=cells)
+    else:
+        grid = pyvista.UnstructuredGrid(cells, np.full(len(mesh.bars), _LINE, np.uint8), mesh.points)
     for kind, arrays in _data(mesh).items():
         for name, values in arrays.items():
             getattr(grid, kind)[named(name)] = values

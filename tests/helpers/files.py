@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import random
 import re
 import signal
@@ -332,6 +333,20 @@ def sound_meshes(folder: Path) -> list[Path]:
     corners = "\n".join(f"vertex {x} {y} {z}" for x, y, z in POINTS[[0, 1, 2, 0, 1, 3]])
     found.append(folder / "mesh.stl")
     found[-1].write_text(f"solid\nfacet normal 0 0 1\nouter loop\n{corners}\nendloop\nendfacet\nendsolid\n")
+    vertices = "\n".join(f"v {x} {y} {z}" for x, y, z in POINTS)
+    places, ends = vertices.replace("v ", ""), "\n".join(f"{a} {b}" for a, b in BARS)
+    header = f"element vertex {len(POINTS)}\n" + "".join(f"property double {axis}\n" for axis in "xyz")
+    header += f"element edge {len(BARS)}\nproperty int vertex1\nproperty int vertex2\nend_header"
+    network = {"node": {str(i): dict(zip("xyz", row)) for i, row in enumerate(np.asarray(POINTS).tolist())}, "edge": {}}
+    for a, b in np.asarray(BARS).tolist():
+        network["edge"].setdefault(str(a), {})[str(b)] = {"q": 1.0}
+    for name, text in (
+        ("mesh.obj", f"{vertices}\no legs\n" + "".join(f"l {a + 1} {b + 1}\n" for a, b in BARS)),
+        ("mesh.ply", f"ply\nformat ascii 1.0\n{header}\n{places}\n{ends}\n"),
+        ("mesh.json", json.dumps(network)),
+    ):
+        found.append(folder / name)
+        found[-1].write_text(text)
     return found
 
 

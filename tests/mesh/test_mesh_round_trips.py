@@ -12,8 +12,8 @@ from pfem_petsc.errors import InputError
 from pfem_petsc.formats import read_whole, suffixes, write_whole
 from pfem_petsc.mesh import load_slab
 
-NAMES = ["t.h5", "t.vtu", "t.vtkhdf", "t.msh", "t.inp", "t.3mf", "t_bars.csv"]
-EXACT = ("t.h5", "t.vtu", "t.vtkhdf", "t.msh", "t_bars.csv")
+NAMES = ["t.h5", "t.vtu", "t.vtp", "t.vtk", "t.vtkhdf", "t.msh", "t.inp", "t.3mf", "t_bars.csv"]
+EXACT = ("t.h5", "t.vtu", "t.vtp", "t.vtk", "t.vtkhdf", "t.msh", "t_bars.csv")
 """Have all bar fields; the others the areas."""
 
 
@@ -86,8 +86,9 @@ def test_sections_and_materials_of_abaqus_come_back(tmp_path):
 
 def test_every_format_that_is_written_is_read():
     read = set(suffixes("read", "read_on"))
-    assert set(suffixes("write")) == read - {".stl"}
-    assert {".inp", ".msh", ".vtu", ".vtkhdf", ".3mf", ".csv", ".h5", ".stl"} == read
+    written = {".inp", ".msh", ".vtu", ".vtp", ".vtk", ".vtkhdf", ".3mf", ".csv", ".h5"}
+    assert set(suffixes("write")) == written
+    assert read - written == {".stl", ".obj", ".ply", ".json", ".bdf", ".nas", ".dat"}
 
 
 def test_gmsh_and_vtk_as_meshio_reads_them(tmp_path):

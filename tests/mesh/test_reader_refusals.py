@@ -166,7 +166,9 @@ def test_hdf5_that_declares_more_than_it_holds(tmp_path):
 GARBAGE = [b"", b"\0" * 1000, b"$", b"*", b"<VTKFile", b"\x89HDF\r\n\x1a\n" + b"\xff" * 500, b"PK\3\4" + b"\xff" * 500]
 
 
-@pytest.mark.parametrize("suffix", ["msh", "vtu", "vtkhdf", "h5", "inp", "stl", "3mf"])
+@pytest.mark.parametrize(
+    "suffix", ["msh", "vtu", "vtp", "vtk", "vtkhdf", "h5", "inp", "stl", "3mf", "obj", "ply", "json"]
+)
 @pytest.mark.parametrize("content", GARBAGE)
 def test_garbage_is_refused_without_a_word_on_stderr(tmp_path, capfd, suffix, content):
     path = tmp_path / f"garbage.{suffix}"
@@ -200,8 +202,8 @@ def test_vtk_with_other_cells(tmp_path):
     import pyvista
 
     path = tmp_path / "solid.vtu"
-    pyvista.Sphere().cast_to_unstructured_grid().save(path)
-    assert "cells of types [5]; bars are lines (type 3), and there are none" in refusal(path)
+    pyvista.ImageData(dimensions=(2, 2, 2)).cast_to_unstructured_grid().save(path)
+    assert "cells of types [11]; bars are lines (type 3) or edges of faces (types 5, 7, 9), and" in refusal(path)
     pyvista.Sphere().save(tmp_path / "sphere.vtp")
     (tmp_path / "sphere.vtp").rename(path)
     assert "FILE" in refusal(path)
@@ -232,7 +234,18 @@ def read_or_refused(path):
 
 
 NAMES = [f"{kind.replace(' ', '-')}.msh" for kind in GMSH]
-NAMES += ["mesh.h5", "mesh.inp", "parts.inp", "mesh.3mf", "mesh_bars.csv", "mesh_nodes.csv", "mesh.stl"]
+NAMES += [
+    "mesh.h5",
+    "mesh.inp",
+    "parts.inp",
+    "mesh.3mf",
+    "mesh_bars.csv",
+    "mesh_nodes.csv",
+    "mesh.stl",
+    "mesh.obj",
+    "mesh.ply",
+    "mesh.json",
+]
 
 
 @pytest.mark.slow

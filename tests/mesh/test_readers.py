@@ -143,14 +143,14 @@ def test_the_other_meshes_in_the_repository_are_braced_trusses(comm, name, nodes
         ("ring.vtu", "there is no file .*ring.vtu, did you mean 'ring.msh'"),
         ("house.vtu", "there is no file .*house.vtu; that folder has ring.msh"),
         ("sub/ring.msh", "there is no file .*sub/ring.msh: there is no folder .*sub"),
-        ("ring.dxf", "no reader for 'ring.dxf'; known.*.msh"),
-        ("ring.geo", "no reader for 'ring.geo'; .*; this is a geometry: mesh it by `gmsh -1 .*ring.geo -o .*ring.msh`"),
-        ("ring.vtk", "no reader for 'ring.vtk'; .*; convert it by `meshio convert .*ring.vtk .*ring.vtu`"),
+        ("ring.dxf", "no reader for 'ring.dxf'; known.*.msh.*; export its lines as Wavefront OBJ"),
+        ("ring.geo", "no reader for 'ring.geo'; .*: mesh its curves by `gmsh -1 -clmin 1e22 .*ring.geo -o .*ring.msh`"),
+        ("ring.xdmf", "no reader for 'ring.xdmf'; .*; convert it by `meshio convert .*ring.xdmf .*ring.vtk`"),
         ("ring.unv", "no reader for 'ring.unv'; .*; convert it by `gmsh .*ring.unv -save -o .*ring.msh`"),
     ],
 )
 def test_files_that_are_not_there_or_not_known(comm, shared_tmp_path, name, text):
-    for there in ("ring.msh", "ring.dxf", "ring.geo", "ring.vtk", "ring.unv"):
+    for there in ("ring.msh", "ring.dxf", "ring.geo", "ring.xdmf", "ring.unv"):
         written(comm, shared_tmp_path, there, b"solid")
     with pytest.raises(InputError, match=text):
         read_slab(shared_tmp_path / name, comm)

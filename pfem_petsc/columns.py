@@ -1,8 +1,8 @@
 """The columns of the history, one line each: recorder, files, units, stages, curves and compiled loops read them here.
 
 A rank's share of a row is a vector of sums: :data:`HEAD`, then for cases with walls the changes of the active set and
-one :data:`WALL` per wall, one :data:`PAIR` per table of contact pairs or constraints, and the probes. Compiled loops
-use the positions as integers at module level, which are constants of the machine code.
+one :data:`WALL` per wall, one :data:`PAIR` per table of contact pairs or constraints, and the probes, of bars first.
+Compiled loops use the positions as integers at module level, which are constants of the machine code.
 """
 
 from __future__ import annotations
@@ -142,9 +142,11 @@ MOTION = (Column("position", "m", 3, stages=LASTING), Column("velocity", "m/s", 
 OF_PAIRS = tuple(column for column in OF_WALLS if column.name in ("force", "impulse", "jump_impulse"))
 PROBED = (*MOTION, Column("acceleration", "m/s²", 3), Column("reaction", "N", 3))
 """Of each node of a probe."""
+OF_BARS = (Column("strain"), Column("stress", "Pa"), Column("axial_force", "N"))
+"""Of each bar of a probe of bars."""
 OF_MODES = (Column("frequency", "Hz"), Column("eigenvalue", "1/s²"))
 
-_GROUPS = (OF_RUN, OF_ANALYSES, ITERATIONS, COUNTS, ENERGIES, VECTORS, OF_WALLS, PROBED, OF_MODES)
+_GROUPS = (OF_RUN, OF_ANALYSES, ITERATIONS, COUNTS, ENERGIES, VECTORS, OF_WALLS, PROBED, OF_BARS, OF_MODES)
 DECLARED = {
     column.name: column for column in (*(column for group in _GROUPS for column in group), STAGE, IMBALANCE, CHANGES)
 }
@@ -260,18 +262,21 @@ def fill_at_state(columns: Iterable[Column], stepper: Any, head: np.ndarray) -> 
 
 
 class Share:
-    """This rank's share of a row with some walls, tables and nodes of probes, zero.
+    """This rank's share of a row with some walls, tables, numbers of probes of bars, and nodes of probes, zero.
 
     Attributes
     ----------
     numbers : (width,) the sums of HEAD; with walls, the changes of the active set; the sums of WALL of each wall, those
         of PAIR of each table, and the probes
     head : (width of HEAD,)
+    bars : (numbers of probes of bars,)
     probes : (nodes, number of PROBED, 3)
     """
 
-    def __init__(self, walls: int, tables: int, probes: int) -> None:
-        parts = (HEAD.width, int(walls > 0), walls * WALL.width, tables * PAIR.width, probes * len(PROBED) * 3)
+    def __init__(self, walls: int, tables: int, bars: int, probes: int) -> None:
+        parts = (HEAD.width, int(walls > 0), walls * WALL.width, tables * PAIR.width, bars, probes * len(PROBED) * 3)
         self.numbers = np.zeros(sum(parts))
         self.head = self.numbers[: HEAD.width]
-        self.probes = self.numbers[sum(parts[:-1]) :].reshape(probes, len(PROBED), 3)
+        at = sum(parts[:-1])
+        self.bars = self.numbers[at - bars : at]
+        self.probes = self.numbers[at:].reshape(probes, len(PROBED), 3)

@@ -246,8 +246,7 @@ def _tables(case: CaseModel, given: bool) -> dict[str, Any]:
         elif content is not None:
             data[key] = content.as_table(given)
     data["initial"] = _initial(data["initial"])
-    if not data["output"].get("probe"):
-        data["output"].pop("probe", None)
+    data["output"] = {key: value for key, value in data["output"].items() if value or not key.endswith("probe")}
     optional = [key for key in data if CaseModel.model_fields[key].default is None]
     return {key: value for key, value in data.items() if value or key in optional}
 

@@ -137,6 +137,15 @@ BarGroup = Annotated[
 """A group of bars: a name in the mesh, or a value of a field; its text is the name in ``bar_groups`` in both cases."""
 
 
+def distinct_numbers(what: str, indices: tuple[int, ...] | None) -> tuple[int, ...] | None:
+    """Return numbers of nodes or bars, of which there is at least one, and none is listed twice."""
+    if indices is not None and not indices:
+        raise ValueError(f"expected at least one {what} number")
+    if indices is not None and len(set(indices)) < len(indices):
+        raise ValueError(f"a {what} number is listed twice")
+    return indices
+
+
 class NodeSet(StrictModel):
     """A named set of nodes, selected by exactly one key; ``field`` goes with ``value``."""
 
@@ -180,11 +189,7 @@ class NodeSet(StrictModel):
     @field_validator("indices")
     @classmethod
     def _distinct(cls, indices: tuple[int, ...] | None) -> tuple[int, ...] | None:
-        if indices is not None and not indices:
-            raise ValueError("expected at least one node number")
-        if indices is not None and len(set(indices)) < len(indices):
-            raise ValueError("a node number is listed twice")
-        return indices
+        return distinct_numbers("node", indices)
 
 
 class Rupture(StrictModel):
@@ -763,6 +768,26 @@ class Probe(StrictModel):
     """name of a node set"""
 
 
+class BarProbe(StrictModel):
+    """Bars whose strain, stress and axial force are recorded in the history, selected by exactly one key."""
+
+    exactly_one = (("bars", "indices", "nearest"),)
+
+    name: Name
+    """name of the probe in the results"""
+    bars: BarGroup | None = None
+    """bar group of the mesh, or bars with a value of a field, as in a section"""
+    indices: Indices | None = None
+    """bar numbers of the mesh, from 0"""
+    nearest: Vector3 | None = None
+    """a point [m]: selects the bar whose middle is nearest in the mesh"""
+
+    @field_validator("indices")
+    @classmethod
+    def _distinct(cls, indices: tuple[int, ...] | None) -> tuple[int, ...] | None:
+        return distinct_numbers("bar", indices)
+
+
 class Output(StrictModel):
     """Outputs and their intervals."""
 
@@ -782,6 +807,8 @@ class Output(StrictModel):
     """lossless, of positions and fields in the result file; "gzip" takes ten times as long to write"""
     probe: Annotated[tuple[Probe, ...], listed, distinct("probe")] = ()
     """node sets whose motion and reaction the history has"""
+    bar_probe: Annotated[tuple[BarProbe, ...], listed, distinct("bar probe")] = ()
+    """bars whose strain, stress and axial force the history has"""
 
 
 class Solver(StrictModel):

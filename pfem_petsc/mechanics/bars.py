@@ -88,6 +88,7 @@ def _bar_groups(case: Case) -> Iterator[tuple[str, str | FieldValue]]:
     tables = [(f"section.{name}", section) for name, section in case.section.items()]
     for kind in ("temperature", "remove"):
         tables += [(f"{kind}[{i}]", entry) for i, entry in enumerate(getattr(case, kind))]
+    tables += [(f"output.bar_probe[{i}]", entry) for i, entry in enumerate(case.output.bar_probe)]
     for key, table in tables:
         if table.bars is not None:
             yield f"{case.source}: {key}.bars", table.bars
@@ -747,7 +748,7 @@ class Bars:
     def fields(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Return, per local bar at the end of the last step, ``strain``, ``stress`` [Pa], ``axial_force`` [N],
         ``plastic_strain``, and the internal variables of the case's laws; zero for bars without such a variable."""
-        out = dict(zip(("strain", "stress", "axial_force"), self._states(x), strict=True))
+        out = dict(zip(("strain", "stress", "axial_force"), self.axial(x), strict=True))
         out |= {name: np.zeros(len(self.ends)) for name in ("plastic_strain", *self.internal)}
         for block in self.blocks:
             for name, _, values in block.variables():
@@ -758,11 +759,12 @@ class Bars:
     def densities(self, x: np.ndarray) -> np.ndarray:
         """Return the energies per rest volume (number of BAR_ENERGIES, b) [J/m3] at the end of the last step."""
         densities = np.zeros((len(BAR_ENERGIES), len(self.ends)))
-        self._states(x, densities)
+        self.axial(x, densities)
         return densities
 
-    def _states(self, x: np.ndarray, densities: np.ndarray | None = None) -> np.ndarray:
-        """Return total strain, stress and axial force (3, b); write the ``densities``, if they are given."""
+    def axial(self, x: np.ndarray, densities: np.ndarray | None = None) -> np.ndarray:
+        """Return strain, stress [Pa] and axial force [N] (3, b) of local bars at the end of the last step; write the
+        ``densities``, if they are given."""
         split_components(x, self.components[0])
         out = np.empty((3, len(self.ends)))
         densities = np.empty((0, 0)) if densities is None else densities

@@ -334,6 +334,7 @@ class Outputs:
         if plan.steps is not None:
             attributes["steps"] = plan.steps
         attributes |= {f"probe_nodes/{name}": nodes.tolist() for name, nodes in recorder.probe_nodes.items()}
+        attributes |= {f"probe_bars/{name}": bars.tolist() for name, bars in recorder.probe_bars.items()}
         return Contents(
             self.fields.points,
             self.fields.cells,

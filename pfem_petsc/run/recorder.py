@@ -18,6 +18,7 @@ from ..columns import (
     ITERATIONS,
     LASTING,
     MOTION,
+    OF_BARS,
     OF_PAIRS,
     OF_RUN,
     OF_WALLS,
@@ -145,7 +146,7 @@ class Recorder:
     carried : (width of a row of this stage,) sums of the stages before, added to its columns; None without
     rest : (width of a row of all stages,) values of the columns that this stage does not have; None without stages
     probed : nodes of all probes on this rank
-    probe_nodes : probe name to the mesh numbers of its nodes, ascending, the order of rows in a probe's columns
+    probe_nodes, probe_bars : name of a probe to the mesh numbers of its nodes or bars, ascending, as in its columns
     """
 
     def __init__(self, stepper: Stepper, columns: Mapping[str, np.dtype] | None = None) -> None:
@@ -158,6 +159,7 @@ class Recorder:
         probes = {probe.name: model.nodes[probe.node_set] for probe in model.case.output.probe}
         self._probes = Probes(model.comm, probes, model.mesh.node_ids)
         self.probe_nodes, self.probed = self._probes.ids, self._probes.nodes
+        self.probe_bars = model.probed_bars.ids
         # static analyses have no velocities
         self._ground = Ground(model.bars.springs, model.inertia.points.damping, self.probed)
         self._layout = Layout(self._columns())
@@ -180,6 +182,8 @@ class Recorder:
             found |= {f"wall/{name}/{one.name}": one.dtype for one in (*OF_WALLS, *(MOTION if moves else ()))}
         for table in model.links.columns:
             found |= {f"{table}/{one.name}": one.dtype for one in OF_PAIRS}
+        for name, ids in self.probe_bars.items():
+            found |= {f"bar/{name}/{one.name}": np.dtype((float, (len(ids),))) for one in OF_BARS}
         for name, ids in self.probe_nodes.items():
             found |= {f"probe/{name}/{one.name}": np.dtype((float, (len(ids), 3))) for one in PROBED}
         return found
@@ -191,7 +195,9 @@ class Recorder:
         names = [*HEAD.places, *([CHANGES.name] if contact.any else [])]
         names += [wall + one for wall in walls for one in WALL.places]
         names += [f"{table}/{one}" for table in tables for one in PAIR.places]
-        sums = Layout({name: declared(name).dtype for name in names})
+        of_bars = {name: dtype for name, dtype in layout.columns.items() if name.startswith("bar/")}
+        sums = Layout({name: declared(name).dtype for name in names} | of_bars)
+        names += of_bars
         recorded = [name for name in names if name in layout.places]
         self._from, self._to = sums.indices(recorded), layout.indices(recorded)
         self._probed = sums.width  # where probes begin
@@ -256,7 +262,9 @@ class Recorder:
         """Return what a row needs of the present state."""
         stepper, state, contact = self.stepper, self.stepper.state, self.model.contact
         impulses, walls = stepper.ledger.impulses, stepper.solution.walls
-        share = Share(len(contact.names), len(self.model.links.columns), len(self._probes.nodes))
+        model = self.model
+        bars = model.probed_bars.width
+        share = Share(len(contact.names), len(model.links.columns), bars, len(self._probes.nodes))
         head = share.head
         head[:] = stepper.ledger.sums
         head[_BARS] += stepper.energy.energies
@@ -270,6 +278,7 @@ class Recorder:
         )
         record_forces(impulses.state.v, sums, changes, share.numbers)
         fill_at_state(self._at_state, stepper, head)
+        model.probed_bars.fill(model.bars, state.x, share.bars)
         held = self.model.supports.any or self.model.bars.springs is not None
         reacts = held and not stepper.scheme.balance_at_endpoints
         if self.probe_nodes or reacts:

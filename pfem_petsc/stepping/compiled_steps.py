@@ -138,9 +138,12 @@ class CompiledSteps:
         self._messages, self._calls = model.mesh.messages(), Calls(*_mpi(), self._called.function)
         self._references, self._phases = References(), None
         self._energies, self._particles = np.zeros(len(BAR_ENERGIES)), np.empty(self.ledger.impulses.state.v.shape)
-        share = Share(len(model.contact.names), len(model.links.columns), len(stepper.probed))
+        bars, nodes = model.probed_bars.width, stepper.probed
+        share = Share(len(model.contact.names), len(model.links.columns), bars, len(nodes))
         self._width, self._at_state = len(share.numbers), at_state(model)
-        self._ends_at_rows = not all(column.looped for column in self._at_state)
+        at = self._width - share.probes.size
+        self._bar_probes = slice(at - bars, at)
+        self._ends_at_rows = bars > 0 or not all(column.looped for column in self._at_state)
         return_freed_memory()
 
     def _make_nodes(self) -> Nodes:
@@ -337,6 +340,7 @@ class CompiledSteps:
         end, row = made[PASSED], shares[made[RECORDED] - 1]
         sound = self._take(made, contacts, row[_BARS])
         fill_at_state(self._at_state, stepper, row)
+        model.probed_bars.fill(model.bars, state.x, row[self._bar_probes])
         ledger.follow_compiled(row[: HEAD.width], contacts.friction)
         log.changes, noted = contacts.changes, np.zeros(end, dtype=np.int64)
         if len(log.releases):

@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..mechanics.bars import Bars, check_areas, mesh_of_cases, section_of_bars
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia, PointInertia, add_at_ends
+from ..mechanics.probed_bars import ProbedBars
 from ..mechanics.rest_lengths import RestLengths, Temperatures, unstressed_lengths
 from ..mechanics.springs import add_connectors, connected, make_springs, with_connectors
 from ..mechanics.supports import Supports
@@ -100,7 +101,7 @@ class Model:
 
     Attributes
     ----------
-    mesh, nodes, bars, inertia, external, supports, temperatures, rest_lengths, contact
+    mesh, nodes, bars, probed_bars, inertia, external, supports, temperatures, rest_lengths, contact
     length : largest extent of the mesh [m]
     reach : largest coordinate magnitude [m], which sets the rounding of positions
     size : length that tolerances are relative to [m], see :mod:`~pfem_petsc.tolerances`
@@ -129,6 +130,7 @@ class Model:
         springs = make_springs(case, self.nodes, mesh)
         if springs is not None:
             self.bars.families.append(springs)
+        self.probed_bars = ProbedBars(case, mesh)
         self.bars.mass_lengths = unstressed_lengths(case.editor[0].stages[0], self.bars)
         self.inertia = Inertia(mesh, self.bars, case.mass == "consistent", PointInertia(case, self.nodes, mesh))
         if case.time is not None:

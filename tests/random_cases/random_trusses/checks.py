@@ -90,12 +90,59 @@ def check_result(folder: Path, warned: list[str]) -> Faults:
     faults += _sections(case)
     if case.stage:
         faults += _stages(result, case, history) + _momentum(case, history) + _states(folder, result)
-        return faults or _members_table(folder, result)
+        return faults or _members_table(folder, result) or _bar_probes(folder, result)
     faults += _mass(case, history)
     faults += _walls(result, case, history)
     faults += _energy(case, history, warned, result.size)
     faults += _momentum(case, history)
-    return faults or _members_table(folder, result)
+    return faults or _members_table(folder, result) or _bar_probes(folder, result)
+
+
+_STRAINS = {
+    "engineering": lambda stretch: stretch - 1.0,
+    "green": lambda stretch: 0.5 * (stretch**2 - 1.0),
+    "logarithmic": np.log,
+}
+_SLOPES = {
+    "engineering": np.ones_like,
+    "green": lambda strain: np.sqrt(1.0 + 2.0 * strain),
+    "logarithmic": lambda strain: np.exp(-strain),
+}
+"""Of the strain over the stretch: the axial force is the stress times area and slope."""
+
+
+def _bar_probes(folder: Path, result: Loaded) -> Faults:
+    """Check bars of probes: the strain of their lengths, the force of stress and area, and the fields of snapshots."""
+    opened, case, faults = open_result(folder), result.case, []
+    plain = not any(section.prestressed for stage in case.stages for section in stage.section.values())
+    plain &= all(stage.static is None or stage.static.method != "force_density" for stage in case.stages)
+    single = len(case.section) == 1
+    (section, *_), rounding = case.section.values(), 1e-6 if case.output.precision == "float32" else 0.0
+    for probe in case.output.bar_probe:
+        (bar,) = opened.attributes[f"probe_bars/{probe.name}"]
+        rows = {name: result.history[f"bar/{probe.name}/{name}"][:, 0] for name in ("strain", "stress", "axial_force")}
+        if single and section.uniform_area is not None:
+            slope = _SLOPES[case.material[section.material].strain](rows["strain"])
+            apart = np.abs(rows["stress"] * section.uniform_area * slope - rows["axial_force"]).max()
+            if not apart <= 1e-12 * np.abs(rows["axial_force"]).max():
+                faults.append(("bar probe: the force is not that of the stress", f"{apart}"))
+        ends = np.diff(result.positions[:, opened.bars[bar]], axis=1)[:, 0]
+        lengths = np.linalg.norm(ends, axis=1)
+        for i, step in enumerate(result.steps):
+            here = np.flatnonzero(result.history["step"] == step)
+            if not len(here):
+                continue
+            for name in rows.keys() & result.fields.keys():
+                apart = np.abs(rows[name][here] - result.fields[name][i, bar]).min()
+                if not apart <= rounding * np.abs(result.fields[name][i, bar]):
+                    faults.append((f"bar probe: {name} is not that of the snapshot", f"step {step}: {apart}"))
+            if plain and single and result.steps[0] == 0:
+                strain = _STRAINS[case.material[section.material].strain](lengths[i] / lengths[0])
+                apart = np.abs(rows["strain"][here] - strain).min()
+                reach = np.abs(result.positions).max() / lengths[0]
+                if not apart <= 1e-14 * reach + 1e-9 * abs(strain):
+                    faults.append(("bar probe: the strain is not that of the length", f"step {step}: {apart}"))
+    return faults
 
 
 def _stages(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults:

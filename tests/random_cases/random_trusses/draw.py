@@ -947,6 +947,11 @@ def _output(chance: random.Random, motion: Motion, sets: dict[str, Any]) -> dict
     names = chance.sample(sorted(sets), chance.choice((0, 1, 1, 2)))
     if names:
         table["probe"] = [{"name": f"at {name}", "node_set": name} for name in names]
+    own = random.Random(repr(table))  # so that other cases stay as they are
+    if own.random() < 0.4:
+        table["bar_probe"] = [{"name": "first bar", "indices": [0]}]
+        near = [own.uniform(-1.0, 1.0) * motion.speed * motion.end for _ in range(3)]
+        table["bar_probe"] += [{"name": "some-bar", "nearest": near}] if own.random() < 0.5 else []
     return table
 
 

@@ -88,6 +88,8 @@ def draw_staged(seed: int) -> dict[str, Any]:
         case["stage"].append(table)
     case["output"] = {"fields_every": chance.choice((1, 4)), "history_every": chance.choice((1, 1, 3))}
     case["output"]["probe"] = [{"name": "pr", "node_set": "one"}]
+    if seed % 2:
+        case["output"]["bar_probe"] = [{"name": "first bar", "indices": [0]}]
     case["solver"] = {"linear": chance.choice(("auto", "auto", "gamg", "cg", "mumps")), "rtol": 1e-12}
     body = Body(
         {}, *(np.array(case["mesh"][key]) for key in ("points", "bars")), {}, 2.0 * STEP, stiffness=YOUNG * AREA

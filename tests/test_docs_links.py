@@ -98,6 +98,19 @@ def test_pages_lead_to_every_script():
             assert f"scripts/{script.name}" in text, script
 
 
+def test_scripts_find_their_marks():
+    """Where scripts write tables, the page has each mark once."""
+    found = 0
+    for script in sorted((ROOT / "scripts").glob("*.py")):
+        text = script.read_text()
+        pages = {DOCS / name for name in re.findall(r'\binsert\("(\w+\.md)"', text)}
+        for page in pages:
+            marks = re.findall(r'"(<!-- [^"]*? -->)', text)
+            assert len(marks) >= 2 and all(page.read_text().count(mark + "\n") == 1 for mark in marks), script
+            found += len(marks)
+    assert found == 12
+
+
 def test_one_version():
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert version == __version__

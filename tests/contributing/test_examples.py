@@ -29,12 +29,12 @@ def test_one_example_of_each_kind(examples):
 
 @pytest.mark.slow
 def test_case_of_the_folder_runs_where_it_is(own_registry, tmp_path):
-    """Corners of the polygon hit the funnel after they fell 0.6 - 0.5 m at 1 m/s."""
+    """Without the spin corners of the polygon hit the funnel after they fell 0.6 - 0.5 m at 1 m/s."""
     command = ["run", str(EXAMPLES / "polygon_spin.toml"), "-o", str(tmp_path / "out"), "--quiet"]
-    assert main(command) == 0
+    assert main([*command, "--set", "initial.angular_velocity=[0,0,0]"]) == 0
     history = open_result(tmp_path / "out").history
     first = history["time"][np.flatnonzero(history["wall/funnel/contacts"])[0]]
-    assert first == pytest.approx(0.1, abs=2e-3)
+    assert first == pytest.approx(0.1, abs=1.1e-3)
 
 
 def test_they_are_listed(examples, capsys):

@@ -125,6 +125,13 @@ def test_document_has_the_measured_numbers(measures):
     assert "$" not in text
 
 
+def test_text_of_the_page_is_that_of_its_template():
+    page = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    parts = re.split(r"\$\w+", document.TEMPLATE.read_text(encoding="utf-8"))
+    assert len(parts) > 10
+    assert re.fullmatch(".*?".join(re.escape(part) for part in parts), page, flags=re.DOTALL)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(integrator_tables.TABLES))
 def test_tables_of_integrators_are_up_to_date(name):

@@ -41,7 +41,7 @@ def cook(tmp_path, monkeypatch, capfd):
             elif text.startswith("#!"):
                 submit(text)
             else:
-                for line in text.splitlines():
+                for line in text.replace("\\\n", " ").splitlines():
                     words = shlex.split(line, comments=True)
                     if words[:3] == ["python", "-m", "pfem_petsc"]:
                         assert main(words[3:]) == 0, (line, capfd.readouterr().err)

@@ -32,6 +32,7 @@ PACKAGES = {  # distribution: module, and what it is for
     "imageio-ffmpeg": ("imageio_ffmpeg", "films"),
 }
 OPTIONAL = {
+    "pyNastran": ("pyNastran", "Nastran files"),
     "meshio": ("meshio", "foreign mesh formats"),
     "plotly": ("plotly", "render --html"),
     "slepc4py": ("slepc4py", "modes of large models"),

@@ -178,6 +178,9 @@ class _Conditions:
 
     def add(self) -> None:
         """Add the tables to the mesh."""
+        if self._deck.sol in (153, 159) or self._deck.app == "HEAT":
+            self._told(True, "left out supports, loads and the analysis: they are those of heat transfer")
+            return
         tables = {"support": self._supports(), "mass": self._masses(), **self._loads(), "analysis": self._analysis()}
         self._mesh.tables |= {name: table for name, table in tables.items() if table}
 

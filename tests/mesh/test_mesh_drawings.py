@@ -1,10 +1,13 @@
 """Lines, polylines and faces of drawings and surfaces: OBJ, PLY, VTK, and data structures of COMPAS."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from helpers.files import written
+from helpers.pages import DOCS, blocks
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.formats import read_slab, read_whole
@@ -170,6 +173,27 @@ def test_faces_of_vtk(tmp_path):
     assert len(mesh.bars) == 12 and not mesh.bar_fields
     assert (mesh.node_fields["height"] == mesh.points[:, 2]).all()
     assert mesh.warnings == [f"{tmp_path / 'a.vtp'}: has no lines: the 12 edges of its 6 faces are bars"]
+
+
+def test_the_script_for_drawings(tmp_path):
+    """Of lines and polylines, with layers; other entities are told."""
+    ezdxf = pytest.importorskip("ezdxf")
+    drawing = ezdxf.new()
+    model = drawing.modelspace()
+    model.add_line((0, 0, 0), (1 / 3, 0, 0), dxfattribs={"layer": "legs"})
+    model.add_polyline3d([(0, 0, 0), (0, 1, 0), (1, 1, 2)])
+    model.add_lwpolyline([(0, 0), (2, 0), (2, 2)])
+    model.add_circle((0, 0), 1)
+    drawing.saveas(tmp_path / "a.dxf")
+    (script,) = blocks(DOCS / "meshes.md", "py")
+    (tmp_path / "drawing.py").write_text(script)
+    done = subprocess.run(
+        [sys.executable, "drawing.py", "a.dxf", "a.obj"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "left out: CIRCLE\n"
+    mesh = read_whole(tmp_path / "a.obj")
+    assert mesh.bars.tolist() == [[0, 1], [2, 3], [3, 4], [5, 6], [6, 7]] and mesh.points[1, 0] == 1 / 3
+    assert members(mesh.bar_groups) == {"legs": [0], "0": [1, 2, 3, 4]}
 
 
 NODES = {"0": {"is_support": True}, "1": {"x": 1.0}, "2": {"y": 1.0, "z": 0.5, "load": 3}, "'a'": {"z": 2, "name": "n"}}

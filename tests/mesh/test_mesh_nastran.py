@@ -169,6 +169,7 @@ def test_beams_motions_and_masses(tmp_path):
          {"modes": {"count": 10, "kind": "buckling", "linear": True}}, ["a limit of the eigenvalues is not supported"]),
         ("SOL 106\nCEND\nBEGIN BULK\n", {"static": {"step": 0.1}}, []),
         ("SOL 129\nCEND\nBEGIN BULK\n", None, ["SOL 129 is left out: the case has no analysis"]),
+        ("SOL 153\nCEND\nBEGIN BULK\nSPC,1,1,1,5.\n", None, ["left out supports, loads and the analysis"]),
         ("", None, []),
     ],
 )  # fmt: skip

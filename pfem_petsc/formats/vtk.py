@@ -1,4 +1,4 @@
-"""VTK files (.vtu, .vtp, .vtk, .vtkhdf): lines are bars, arrays of points and cells are groups and bar fields.
+"""VTK files (.vtu, .vtp, .vtk, .vtkhdf), and STL: lines are bars, arrays of points and cells groups and bar fields.
 
 Other cells are left out, with a warning; without lines, the edges of triangles, quadrilaterals and polygons are bars,
 with fields of nodes alone. A line of several points is as many bars less one. A cell array of integers
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from ..mesh.whole import WholeMesh
 
-SUFFIXES = (".vtu", ".vtp", ".vtk", ".vtkhdf")
+SUFFIXES = (".vtu", ".vtp", ".vtk", ".vtkhdf", ".stl")
 
 _LINE, _POLY_LINE = 3, 4
 _FACES = (5, 7, 9)
@@ -57,6 +57,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     """
     from ..mesh.whole import WholeMesh
 
+    if path.suffix.lower() == ".stl":
+        _check_stl(path)
     command = [sys.executable, "-P", "-m", __name__, str(path.resolve())]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     done = subprocess.run(command, env=environment, capture_output=True, check=False)
@@ -87,6 +89,19 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     return mesh
 
 
+def _check_stl(path: Path) -> None:
+    """Refuse a binary STL file that is not as long as it declares, which VTK reads up to its end."""
+    size = path.stat().st_size
+    with open(path, "rb") as file:
+        head = file.read(84)
+    expected = 84 + 50 * int.from_bytes(head[80:], "little")
+    if not head.lstrip().lower().startswith(b"solid") and size != expected:
+        raise InputError(
+            f"{path}: is not STL: neither text that begins with 'solid', nor binary: the triangles that it declares "
+            f"take {expected} bytes, and it has {size}; is it truncated?"
+        )
+
+
 # ---- the process that reads by VTK
 
 
@@ -102,6 +117,8 @@ def _extract(path: str) -> int:
             from vtkmodules.vtkIOXML import vtkXMLPolyDataReader as Reader
         case ".vtk":
             from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader as Reader
+        case ".stl":
+            from vtkmodules.vtkIOGeometry import vtkSTLReader as Reader
         case _:
             from vtkmodules.vtkIOHDF import vtkHDFReader as Reader
 

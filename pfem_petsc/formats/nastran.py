@@ -130,7 +130,8 @@ def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: _Told) -> N
     for what, n in counts.items():
         told(n, f"{n} {what}, are read as bars".replace(",,", ","))
     area, without, mass = np.full(len(bars), np.nan), 0, 0
-    sections, weight = mesh.tables.setdefault("section", {}), _mass_scale(deck)
+    sections, materials = (mesh.tables.setdefault(name, {}) for name in ("section", "material"))
+    weight = _mass_scale(deck)
     for (of_rod, *_), numbers in members.items():
         bar = bars[numbers[0]]
         source = bar if of_rod else deck.properties.get(bar.pid)
@@ -151,7 +152,9 @@ def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: _Told) -> N
         values = {"young_modulus": "e", "density": "rho", "thermal_expansion": "a"}
         found = {key: float(getattr(material, name, None) or 0.0) for key, name in values.items()}
         found["density"] *= weight
-        mesh.tables.setdefault("material", {})[f"mat1_{source.mid}"] = {k: v for k, v in found.items() if v}
+        materials[f"mat1_{source.mid}"] = {key: value for key, value in found.items() if value}
+    massless = ", ".join(name for name, keys in materials.items() if "density" not in keys)
+    told(massless, f"{massless} has no density, which is 0 in Nastran: a case needs a positive one")
     told(without, f"{without} bars have a property that is not read or not there: they have no section")
     told(mass, f"left out the nonstructural mass of {mass} bars")
     if (area > 0.0).all():

@@ -112,6 +112,39 @@ def test_load_cases_of_a_deck_run(tmp_path):
     np.testing.assert_allclose(down, share * [2**0.5, 1.0, 2**0.5], rtol=1e-4)
 
 
+@pytest.mark.slow
+def test_three_bars_as_msc_nastran_prints_them(tmp_path):
+    """Forces and displacements of SOL 101; a load times 1e-4 keeps displacements small, as in the linear solution."""
+    text = """SOL 101
+CEND
+SPC = 2
+LOAD = 13
+BEGIN BULK
+MAT1    5       3.+7            .3      .284
+PROD    11      5       1.
+PROD    12      5       2.
+PROD    13      5       3.
+CROD    1       11      1       2
+CROD    2       12      1       3
+CROD    3       13      1       4
+GRID    1               0.      0.      0.
+GRID    2               -100.   100.    0.
+GRID    3               0.      100.    0.
+GRID    4               100.    100.    0.
+SPC1    2       123456  2       3       4
+LOAD    13      1.-4    1.      8
+FORCE   8       1       0       1.      50000.  100000. 0.
+ENDDATA
+"""
+    mesh = read(tmp_path, text)
+    case = Case.from_toml(skeleton(mesh, write_whole(tmp_path / "a.h5", mesh), tmp_path / "a.toml"), tmp_path)
+    assert Simulation(case, output=tmp_path / "out", quiet=True).run() == 0
+    result = open_result(tmp_path / "out")
+    np.testing.assert_allclose(result.field("axial_force", -1) * 1e4, [-700.7184, -49009.04, -71411.40], rtol=4e-6)
+    moved = (result.positions(-1) - result.positions(0))[0] * 1e4
+    np.testing.assert_allclose(moved, [7.701027e-2, 8.168172e-2, 0.0], rtol=1e-6, atol=1e-12)
+
+
 def test_coordinate_systems_and_the_sums_of_pynastran(tmp_path):
     """Cylindrical places, rotated supports, forces along lines and across planes."""
     text = MIDDLE + (
@@ -183,6 +216,8 @@ def test_a_flat_truss_is_held_as_by_autospc(tmp_path):
     mesh = read(tmp_path, MIDDLE.replace("AUTOSPC,NO", "AUTOSPC,YES"))
     assert [keys["fix"] for keys in mesh.tables["support"].values()] == ["z"]
     assert mesh.warnings == ["the case holds 3 nodes of a flat truss along z, as AUTOSPC does"]
+    mesh = read(tmp_path, MIDDLE.replace(",.3,2.", ",.3"))
+    assert mesh.warnings == ["mat1_1 has no density, which is 0 in Nastran: a case needs a positive one"]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
 from typing import Any
 
@@ -24,8 +24,14 @@ def free_name(taken: dict[str, Any], wanted: str) -> str:
     return next(name for k in count(1) if (name := wanted if k == 1 else f"{wanted}_{k}") not in taken)
 
 
-def alike(groups: dict[str, np.ndarray], values: np.ndarray, wanted: str) -> Iterator[tuple[list[float], str]]:
-    """Yield the rows of values (n, k) that differ and are not zero, each with the name of the group that has it."""
+def alike(
+    groups: dict[str, np.ndarray], values: np.ndarray, wanted: str | Callable[[list[float], np.ndarray], str]
+) -> Iterator[tuple[list[float], str]]:
+    """Yield the rows of values (n, k) that differ and are not zero, each with the name of the group that has it.
+
+    ``wanted`` is the name of a new group, or gives it for a row and its members.
+    """
     rows, which = np.unique(values, axis=0, return_inverse=True)
     for i in np.flatnonzero(rows.any(axis=1)):
-        yield rows[i].tolist(), name_of(groups, np.flatnonzero(which.ravel() == i), wanted)
+        row, members = rows[i].tolist(), np.flatnonzero(which.ravel() == i)
+        yield row, name_of(groups, members, wanted if isinstance(wanted, str) else wanted(row, members))

@@ -13,7 +13,7 @@ import io
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,12 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
-from ._tables import alike, free_name, name_of
+from ._tables import alike, free_name
 
 SUFFIXES = (".bdf", ".nas", ".dat")
+
+Told = Callable[[object, str], None]
+"""Adds a warning about the file if a condition holds."""
 
 _BARS = ("CROD", "CONROD", "CTUBE", "CBAR", "CBEAM")
 _PROPERTIES = ("PROD", "PTUBE", "PBAR", "PBARL", "PBEAM", "PBEAML")
@@ -52,26 +55,16 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         raise InputError(f"{path}: there is no GRID {missing[0]}, at which a bar ends")
     points = np.array([deck.nodes[label].get_position() for label in labels.tolist()])
     mesh = WholeMesh(points, np.searchsorted(labels, ends))
-    told = _Told(path, mesh.warnings)
-    left = len(deck.nodes) - len(labels)
+
+    def told(condition: object, text: str) -> None:
+        mesh.warnings += [f"{path}: {text}"] if condition else []
+
+    left, cards = len(deck.nodes) - len(labels), _cards(deck, "left out cards that are not read: ")
     told(left, f"left out {left} GRID where no bar ends")
-    text = _cards(deck, "left out cards that are not read: ")
-    told(text, text)
+    told(cards, cards)
     _add_sections(mesh, deck, bars, told)
     _Conditions(mesh, deck, labels, told).add()
     return mesh
-
-
-class _Told:
-    """Collects warnings about a file."""
-
-    def __init__(self, path: Path, warnings: list[str]) -> None:
-        self._path, self._warnings = path, warnings
-
-    def __call__(self, condition: object, text: str) -> None:
-        """Add a warning if a condition holds."""
-        if condition:
-            self._warnings.append(f"{self._path}: {text}")
 
 
 def _deck(path: Path) -> Any:
@@ -116,7 +109,7 @@ def _cards(deck: Any, text: str) -> str:
 # ---- sections and materials
 
 
-def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: _Told) -> None:
+def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: Told) -> None:
     """Add sections and materials, groups of bars by property, and the field ``area``."""
     members: dict[tuple[Any, ...], list[int]] = {}
     counts: Counter[str] = Counter()
@@ -129,7 +122,7 @@ def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: _Told) -> N
             counts[f"{bar.type} between their GRID, without offsets"] += any(map(np.any, (bar.wa, bar.wb)))
     for what, n in counts.items():
         told(n, f"{n} {what}, are read as bars".replace(",,", ","))
-    area, without, mass = np.full(len(bars), np.nan), 0, 0
+    area, without, mass, massless = np.full(len(bars), np.nan), 0, 0, set()
     sections, materials = (mesh.tables.setdefault(name, {}) for name in ("section", "material"))
     weight = _mass_scale(deck)
     for (of_rod, *_), numbers in members.items():
@@ -152,9 +145,9 @@ def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: _Told) -> N
         values = {"young_modulus": "e", "density": "rho", "thermal_expansion": "a"}
         found = {key: float(getattr(material, name, None) or 0.0) for key, name in values.items()}
         found["density"] *= weight
+        massless |= {source.mid} if material is not None and not found["density"] else set()
         materials[f"mat1_{source.mid}"] = {key: value for key, value in found.items() if value}
-    massless = ", ".join(name for name, keys in materials.items() if "density" not in keys)
-    told(massless, f"{massless} has no density, which is 0 in Nastran: a case needs a positive one")
+    told(massless, f"MAT1 {sorted(massless)} have no density, which is 0 in Nastran: a case needs a positive one")
     told(without, f"{without} bars have a property that is not read or not there: they have no section")
     told(mass, f"left out the nonstructural mass of {mass} bars")
     if (area > 0.0).all():
@@ -172,12 +165,12 @@ def _mass_scale(deck: Any) -> float:
 class _Conditions:
     """Supports, loads, masses and the analysis of a deck as tables; ``labels`` (n,) are the GRID of the nodes."""
 
-    def __init__(self, mesh: WholeMesh, deck: Any, labels: np.ndarray, told: _Told) -> None:
+    def __init__(self, mesh: WholeMesh, deck: Any, labels: np.ndarray, told: Told) -> None:
         self._mesh, self._deck, self._told = mesh, deck, told
         self._labels = labels.tolist()
         self._at = {label: i for i, label in enumerate(self._labels)}
         control = deck.case_control_deck
-        self._subcases = dict(control.subcases) if control is not None else {}
+        self._subcases = {} if deck.punch or control is None else dict(control.subcases)
 
     def add(self) -> None:
         """Add the tables to the mesh."""
@@ -190,20 +183,17 @@ class _Conditions:
     def _chosen(self, key: str, sets: Collection[int]) -> dict[int, str]:
         """Return the different sets that subcases choose by a key, with the name of the first subcase of each.
 
-        Without subcases, as in bulk data alone, it is the first set, or the one that combines others.
+        Of bulk data alone, it is the first set, or the one that combines others.
         """
         found: dict[int, str] = {}
         for number, subcase in sorted(self._subcases.items()):
-            if key in subcase.params:
-                value = subcase.params[key][0]
-                words = [subcase.params[word][0] for word in ("SUBTITLE", "LABEL") if word in subcase.params]
-                name = re.sub(r"[^\w.-]+", "_", str(words[-1] if words else "")).strip("_.")[:40]
-                # what stands before all subcases is taken by each of them
-                if value in sets and not (number == 0 and len(self._subcases) > 1):
-                    found.setdefault(int(value), name if name not in found.values() and name else f"subcase_{number}")
-        if not found and not any(key in subcase.params for subcase in self._subcases.values()):
-            found = {int(value): f"{key.lower()}_{value}" for value in list(sets)[:1]}
-        return found
+            value = subcase.params.get(key, [None])[0]
+            # what stands before all subcases is taken by each of them
+            if value in sets and value not in found and (number or len(self._subcases) == 1):
+                words = [subcase.params[word][0] for word in ("LABEL", "SUBTITLE") if word in subcase.params]
+                name = re.sub(r"[^\w.-]+", "_", str(*words[:1])).strip("_.")[:40]
+                found[value] = name if name and name not in found.values() else f"subcase_{number}"
+        return found if self._subcases else {value: "" for value in list(sets)[:1]}
 
     def _vector(self, system: int, values: np.ndarray, what: str) -> np.ndarray:
         """Return a vector of a rectangular coordinate system in the basic one; NaN for others."""
@@ -213,10 +203,12 @@ class _Conditions:
             return np.full(3, np.nan)
         return found.transform_vector_to_global(np.asarray(values, float)) if system else np.asarray(values, float)
 
-    def _named(self, members: np.ndarray, wanted: str) -> str:
-        """Return the name of the group of nodes; of one node, with its GRID."""
-        wanted = f"node_{self._labels[members[0]]}" if len(members) == 1 else wanted
-        return name_of(self._mesh.node_groups, members, wanted)
+    def _tables(self, values: np.ndarray, wanted: Callable[[list[float]], str]) -> Iterator[tuple[list[float], str]]:
+        """Yield the different rows of values with the group of their nodes; one node has its GRID as name."""
+        labels = self._labels
+        return alike(
+            self._mesh.node_groups, values, lambda row, own: wanted(row) if len(own) > 1 else f"node_{labels[own[0]]}"
+        )
 
     def _supports(self) -> dict[str, dict[str, Any]]:
         deck, n = self._deck, len(self._labels)
@@ -224,7 +216,7 @@ class _Conditions:
         chosen = self._chosen("SPC", [*deck.spcadds, *deck.spcs])
         sets = [number for card in deck.spcadds.get(next(iter(chosen), 0), []) for number in card.sets] or [*chosen][:1]
         unused = sorted(set(deck.spcs) - set(sets))
-        self._told(unused, f"left out the SPC sets {unused}: the case has {' and '.join(map(str, sets))}")
+        self._told(unused, f"left out the SPC sets {unused}: the case has {', '.join(map(str, sets)) or 'none'}")
         lines = [(label, str(node.ps or ""), 0.0) for label, node in deck.nodes.items() if label in self._at]
         for card in (card for number in sets for card in deck.spcs.get(number, [])):
             if card.type == "SPC1":
@@ -235,32 +227,27 @@ class _Conditions:
             i, axes = self._at.get(label, -1), ["123".index(c) for c in str(components) if c in "123"]
             if i < 0 or not axes:  # of other nodes, and rotations, which bars do not have
                 continue
-            system = int(deck.nodes[label].cd)
+            system, every = int(deck.nodes[label].cd), len(axes) == 3
             for axis in axes:
-                across = (
-                    self._vector(system, np.eye(3)[axis], f"the support of GRID {label}") if system else np.eye(3)[axis]
-                )
-                own = int(np.nan_to_num(abs(across)).argmax())
-                if len(axes) < 3 and not abs(across[own]) > 1.0 - 1e-9:
-                    self._told(
-                        True, f"the support of GRID {label} along {axis + 1} of {system} is left out: not an axis"
-                    )
-                    continue
-                held[i, axis if len(axes) == 3 else own] = True
-                moved[i] += value * np.nan_to_num(across)
+                across = np.eye(3)[axis]
+                if system and (value or not every):
+                    across = self._vector(system, across, f"the support of GRID {label}")
+                own = axis if every else int(abs(across).argmax())
+                if every or abs(across[own]) > 1.0 - 1e-9:
+                    held[i, own] = True
+                    moved[i] += value * np.nan_to_num(across)
+                else:
+                    what = f"the support of GRID {label} along {axis + 1} of {system}"
+                    self._told(np.isfinite(across).all(), f"{what} is left out: not an axis")
         switch = deck.params["AUTOSPC"].values[0] if "AUTOSPC" in deck.params else "YES"
         for axis in np.flatnonzero(np.ptp(self._mesh.points, axis=0) == 0.0) if switch == "YES" else ():
             free = int((~held[:, axis]).sum())
             self._told(free, f"the case holds {free} nodes of a flat truss along {'xyz'[axis]}, as AUTOSPC does")
             held[:, axis] = True
         tables: dict[str, dict[str, Any]] = {}
-        rows, which = np.unique(np.hstack([held, moved]), axis=0, return_inverse=True)
-        for k in np.flatnonzero(rows[:, :3].any(axis=1)):
-            fix = "".join(axis for axis, on in zip("xyz", rows[k]) if on)
-            name = self._named(np.flatnonzero(which.ravel() == k), f"fixed_{fix}")
-            motion = [[0.0, 0.0, 0.0, 0.0], [1.0, *rows[k, 3:].tolist()]]
-            moves = {"motion": motion, "interpolation": "linear"} if rows[k, 3:].any() else {}
-            tables[name] = {"node_set": name, "fix": fix, **moves}
+        for row, name in self._tables(np.hstack([held, moved]), lambda row: f"fixed_{_axes(row)}"):
+            motion = {"motion": [[0.0] * 4, [1.0, *row[3:]]], "interpolation": "linear"} if any(row[3:]) else {}
+            tables[name] = {"node_set": name, "fix": _axes(row), **motion}
         return tables
 
     def _masses(self) -> dict[str, dict[str, Any]]:
@@ -271,15 +258,14 @@ class _Conditions:
             if i >= 0:
                 values[i] += card.mass * _mass_scale(self._deck)
         self._told(others, f"left out {others} CONM2 where no bar ends")
-        found = alike(self._mesh.node_groups, values, "mass")
+        found = self._tables(values, lambda _: "mass")
         return {name: {"node_set": name, "value": value} for (value,), name in found}
 
     def _loads(self) -> dict[str, dict[str, Any]]:
         """Return loads and gravity, or load cases if subcases of a linear static solution have different loads."""
         deck = self._deck
-        chosen = self._chosen("LOAD", [*deck.load_combinations, *deck.loads])
-        found = {}
-        used: set[int] = set()
+        chosen = self._chosen("LOAD", [*deck.load_combinations, *deck.loads]) if deck.sol != 103 else {}
+        found, used = {}, set()
         for number, name in chosen.items() if deck.sol in (101, 1) else list(chosen.items())[:1]:
             parts = [
                 (one, card.scale * scale)
@@ -294,12 +280,11 @@ class _Conditions:
         )
         if len(found) == 1:
             return next(iter(found.values()))
-        rows = {name: {"load": list(t["load"].values()), **t["gravity"]} for name, t in found.items()}
-        return {
-            "load_case": {
-                name: {k: v for k, v in keys.items() if v} for name, keys in rows.items() if any(keys.values())
-            }
-        }
+        cases = {}
+        for name, tables in found.items():
+            rows = {"load": list(tables["load"].values()), **tables["gravity"]}
+            cases[name] = {key: value for key, value in rows.items() if value}
+        return {"load_case": {name: keys for name, keys in cases.items() if keys}}
 
     def _load_tables(self, parts: list[tuple[int, float]]) -> dict[str, dict[str, Any]]:
         forces, gravity, others = np.zeros((len(self._labels), 3)), np.zeros(3), 0
@@ -321,11 +306,7 @@ class _Conditions:
                 if i >= 0:
                     forces[i] += np.nan_to_num(factor * card.mag * direction)
         self._told(others, f"left out {others} forces where no bar ends")
-        rows, which = np.unique(forces, axis=0, return_inverse=True)
-        loads = {}
-        for k in np.flatnonzero(rows.any(axis=1)):
-            name = self._named(np.flatnonzero(which.ravel() == k), "loaded")
-            loads[name] = {"node_set": name, "force": rows[k].tolist()}
+        loads = {name: {"node_set": name, "force": force} for force, name in self._tables(forces, lambda _: "loaded")}
         return {"load": loads, "gravity": {"gravity": {"acceleration": gravity.tolist()}} if gravity.any() else {}}
 
     def _analysis(self) -> dict[str, dict[str, Any]]:
@@ -344,3 +325,7 @@ class _Conditions:
             case sol:
                 self._told(True, f"SOL {sol} is left out: the case has no analysis; known are 101, 103, 105 and 106")
                 return {}
+
+
+def _axes(row: list[float]) -> str:
+    return "".join(axis for axis, held in zip("xyz", row) if held)

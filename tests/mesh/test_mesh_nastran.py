@@ -16,6 +16,7 @@ TRUSS = """SOL 101
 CEND
 SPC = 2
 SUBCASE 1
+  SUBTITLE = first
   LABEL = down
   LOAD = 13
 SUBCASE 2
@@ -212,12 +213,24 @@ def test_solutions(tmp_path, head, tables, told):
     assert len(mesh.warnings) == len(told) and all(a.startswith(b) for a, b in zip(mesh.warnings, told))
 
 
+def test_sets_that_no_subcase_names_are_left_out(tmp_path):
+    sets = "SPC1,1,123,1\nFORCE,3,2,0,10.,1.,0.,0.\n"
+    mesh = read(tmp_path, "SOL 106\nCEND\nBEGIN BULK\n" + MIDDLE + sets)
+    assert "support" not in mesh.tables and "load" not in mesh.tables
+    assert mesh.warnings == [
+        "left out the SPC sets [1]: the case has none",
+        "left out the load sets [3]: the case has none",
+    ]
+    mesh = read(tmp_path, "SOL 103\nCEND\nSPC = 1\nLOAD = 3\nBEGIN BULK\n" + MIDDLE + sets)
+    assert list(mesh.tables["support"]) == ["node_1"] and "load" not in mesh.tables
+
+
 def test_a_flat_truss_is_held_as_by_autospc(tmp_path):
     mesh = read(tmp_path, MIDDLE.replace("AUTOSPC,NO", "AUTOSPC,YES"))
     assert [keys["fix"] for keys in mesh.tables["support"].values()] == ["z"]
     assert mesh.warnings == ["the case holds 3 nodes of a flat truss along z, as AUTOSPC does"]
     mesh = read(tmp_path, MIDDLE.replace(",.3,2.", ",.3"))
-    assert mesh.warnings == ["mat1_1 has no density, which is 0 in Nastran: a case needs a positive one"]
+    assert mesh.warnings == ["MAT1 [1] have no density, which is 0 in Nastran: a case needs a positive one"]
 
 
 @pytest.mark.parametrize(

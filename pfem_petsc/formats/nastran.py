@@ -63,7 +63,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     told(left, f"left out {left} GRID where no bar ends")
     told(cards, cards)
     _add_sections(mesh, deck, bars, told)
-    _Conditions(mesh, deck, labels, told).add()
+    # a run takes mesh and groups alone
+    _Conditions(mesh, deck, labels, told if fields is None else lambda *_: None).add()
     return mesh
 
 

@@ -23,6 +23,7 @@ from ..errors import InputError
 from ..mesh.slab import check_memory
 from ..mesh.whole import WholeMesh
 from ._numbers import whole_numbers
+from ._polygons import drop_bare_nodes
 
 SUFFIXES = (".3mf",)
 
@@ -108,7 +109,7 @@ class _Texts:
 
 class _Object:
     """An object: ``points`` (n, 3), ``ends`` (m, 2) and ``radii`` (m, 2) of beams, ``sets`` of beams by name,
-    ``components``, and which points are ``used`` (n,), as ends of beams."""
+    and ``components``."""
 
     def __init__(self, where: str, texts: _Texts) -> None:
         self.name, self.components = texts.name, texts.components
@@ -130,8 +131,6 @@ class _Object:
         for group, numbers in texts.sets:
             members = _numbers(numbers, f"{where}: beamset {group}").ravel()
             self.sets[group.replace("/", "_")] = _whole(members, len(self.ends), f"{where}: beamset {group}: beam")
-        self.used = np.zeros(len(self.points), bool)
-        self.used[self.ends] = True
 
 
 class _Model:
@@ -209,7 +208,7 @@ class _Model:
         return number, _numbers([tuple(numbers)], f"{self.where}: transform of object {number}", 12).reshape(4, 3)
 
     def count(self, number: str, depth: int = 0) -> tuple[int, int]:
-        """Return how many objects and components an object consists of, and their number of vertices with beams.
+        """Return how many objects and components an object consists of, and the number of vertices of those with beams.
 
         Raises
         ------
@@ -223,7 +222,7 @@ class _Model:
         if number not in self._counts:
             found = self.objects[number]
             parts = [self.count(other, depth + 1) for other, _ in found.components]
-            nodes = int(found.used.sum()) + sum(part[1] for part in parts)
+            nodes = len(found.points) * bool(len(found.ends)) + sum(part[1] for part in parts)
             self._counts[number] = 1 + sum(part[0] for part in parts), nodes
         return self._counts[number]
 
@@ -270,12 +269,11 @@ def _assembled(path: Path, model: _Model) -> WholeMesh:
     groups: dict[str, dict[str, list[np.ndarray]]] = {"node_groups": {}, "bar_groups": {}}
     n_nodes = n_bars = 0
     for k, (found, place) in enumerate(placed):
-        own = found.points[found.used] * model.scale
+        own = found.points * model.scale
         if not np.array_equal(place, np.eye(4, 3)):
             own = own @ place[:3] + place[3] * model.scale
-        number = np.cumsum(found.used) - 1 + n_nodes
         points.append(own)
-        bars.append(number[found.ends])
+        bars.append(found.ends + n_nodes)
         radii.append(found.radii * (abs(np.linalg.det(place[:3])) ** (1.0 / 3.0) * model.scale))
         sets = dict(found.sets)
         if len(placed) > 1:
@@ -284,8 +282,7 @@ def _assembled(path: Path, model: _Model) -> WholeMesh:
         for group, members in sets.items():
             groups["bar_groups"].setdefault(group, []).append(members + n_bars)
         for group, members in model.node_groups.items():
-            inside = members[members < len(found.used)]
-            groups["node_groups"].setdefault(group, []).append(number[inside[found.used[inside]]])
+            groups["node_groups"].setdefault(group, []).append(members[members < len(own)] + n_nodes)
         n_nodes, n_bars = n_nodes + len(own), n_bars + len(found.ends)
     mesh = WholeMesh(np.concatenate(points), np.concatenate(bars))
     for kind, named in groups.items():
@@ -299,9 +296,9 @@ def _assembled(path: Path, model: _Model) -> WholeMesh:
         mesh.warnings.append(
             f"{path}: {int((one != two).sum())} beams whose radii differ have a constant area, with the same volume"
         )
-    left = sum(int((~found.used).sum()) for found, _ in placed)
-    if left or model.triangles:
-        mesh.warnings.append(f"{path}: left out {model.triangles} triangles and {left} vertices where no beam ends")
+    if model.triangles:
+        mesh.warnings.append(f"{path}: left out {model.triangles} triangles")
+    drop_bare_nodes(path, mesh)
     return mesh
 
 

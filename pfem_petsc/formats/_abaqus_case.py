@@ -12,7 +12,7 @@ from ..mesh.whole import PLANE, WholeMesh
 from ._abaqus_keywords import Block
 from ._abaqus_model import AtNodes, Deck, listed
 from ._numbers import number_of
-from ._tables import alike, name_of
+from ._tables import alike, free_name, name_of
 
 MADE = "_section_"
 """Beginning of the names of element sets that the writer makes for areas."""
@@ -226,9 +226,7 @@ def _own_material(mesh: WholeMesh, block: Block, rows: np.ndarray, group: str) -
     if not keys:
         return {}
     materials = mesh.tables.setdefault("material", {})
-    name = next((name for name, own in materials.items() if own == keys), group)
-    while name in materials and materials[name] != keys:
-        name += "_"
+    name = next((name for name, own in materials.items() if own == keys), free_name(materials, group))
     materials[name] = keys
     return {"material": name}
 
@@ -471,8 +469,8 @@ class Conditions:
             if name and np.array_equal(groups[name], members):
                 return name, members
         name = f"node_{wanted}" if last.isdecimal() else wanted
-        while name in groups and not np.array_equal(groups[name], members):
-            name += "_"
+        if name in groups and not np.array_equal(groups[name], members):
+            name = free_name(groups, name)
         groups[name] = members
         return name, members
 
@@ -495,7 +493,7 @@ class Conditions:
                 keys[kind] = rows[0][1:] if kind == "velocity" else rows
             if kind == "motion":
                 keys["interpolation"] = "linear"
-            _add(tables, name, keys)
+            tables[free_name(tables, name)] = keys
         return tables
 
     def _plane_tables(self) -> dict[str, dict[str, Any]]:
@@ -515,7 +513,7 @@ class Conditions:
         tables: dict[str, dict[str, Any]] = {}
         for (name, rows), force in self._forces.items():
             table = {"table": [list(row) for row in rows]} if rows else {}
-            _add(tables, name, {"node_set": name, "force": force.tolist(), **table})
+            tables[free_name(tables, name)] = {"node_set": name, "force": force.tolist(), **table}
         return tables
 
     def _gravity_tables(self) -> dict[str, dict[str, Any]]:
@@ -551,7 +549,8 @@ class Conditions:
             for values, group in alike(mesh.bar_groups, above[mesh.bars].mean(axis=1), "temperature"):
                 same = len(set(values)) == 1 and not self._static
                 rows = [list(row) for row in zip(times.tolist(), map(short, values))]
-                _add(tables, group, {"bars": group, **({"value": short(values[0])} if same else {"table": rows})})
+                own = {"value": short(values[0])} if same else {"table": rows}
+                tables[free_name(tables, group)] = {"bars": group, **own}
         return tables
 
     def _velocity_tables(self) -> dict[str, dict[str, Any]]:
@@ -592,7 +591,7 @@ class Conditions:
         for (value,), name in alike(groups, values["MASS"], "mass"):
             tables["mass"][name] = {"node_set": name, "value": value}
         for row, name in alike(groups, values["SPRING"], "spring"):
-            _add(tables["spring"], name, {"node_set": name, "stiffness": row})
+            tables["spring"][free_name(tables["spring"], name)] = {"node_set": name, "stiffness": row}
         # a dashpot of a case acts in all directions: those in which a node is held do not matter
         damped = values["DASHPOT"]
         most = damped.max(axis=1, keepdims=True)
@@ -603,7 +602,7 @@ class Conditions:
                 "in all directions"
             )
         for (value,), name in alike(groups, np.where(uneven[:, None], 0.0, most), "dashpot"):
-            _add(tables["dashpot"], name, {"node_set": name, "coefficient": value})
+            tables["dashpot"][free_name(tables["dashpot"], name)] = {"node_set": name, "coefficient": value}
         return tables
 
     def _add_of_nodes(
@@ -645,15 +644,9 @@ class Conditions:
             for node, (instance, label) in zip(nodes, element.nodes)
         ]
         key = {"SPRING": "stiffness", "DASHPOT": "coefficient"}[block.keyword]
-        _add(tables[block.keyword.lower()], " to ".join(names), {"between": names, key: value})
+        own = tables[block.keyword.lower()]
+        own[free_name(own, " to ".join(names))] = {"between": names, key: value}
         return ""
-
-
-def _add(tables: dict[str, dict[str, Any]], name: str, keys: dict[str, Any]) -> None:
-    """Add a table by a name that no other one has."""
-    while name in tables:
-        name += " again"
-    tables[name] = keys
 
 
 def _times_value(rows: Rows, value: float) -> Rows:

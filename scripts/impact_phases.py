@@ -224,7 +224,7 @@ def cell(found: Impacts | None) -> str:
 def refused(scheme: Scheme, treatment: str, restitution: float = 0.0) -> bool:
     """Return whether a scheme cannot have a treatment or restitution."""
     if treatment == "scheme":
-        return bool(restitution) and not scheme.allows_restitution
+        return bool(restitution) and not scheme.jumps_known
     return lookup("pfem_petsc.contact.treatments", treatment, "").Treatment.refuses(scheme) is not None
 
 

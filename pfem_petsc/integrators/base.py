@@ -108,14 +108,14 @@ class Scheme(ABC):
     turns_held : x1 - x0 = h (v0 + v1)/2 and nothing else relates velocity to position, so the velocity of a node that
         is fixed from one step to the next is reversed
     substeps : of a step that solves several balances: of each the share of the step, and where it ends in the step
-    allows_restitution : whether walls may have restitution
+    jumps_known : whether the velocity jumps of restitution, and of friction in an impact, are known for it
     notice : message to users who choose the scheme; empty for none
     inertial : whether its balance has inertia; without it there are no velocities, impulses and impacts
     """
 
     explicit = False
     inertial = True
-    allows_restitution = True
+    jumps_known = True
     solves_next_position = False
     balance_at_endpoints = True
     solves_end = True

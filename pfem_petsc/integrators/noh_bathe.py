@@ -38,7 +38,7 @@ class Scheme(ExplicitScheme):
     """
 
     solves_next_position = True
-    allows_restitution = False  # which of the two velocities jumps, and when, is not known
+    jumps_known = False  # which of the two velocities jumps, and when, is not known
     remembers = ("half_velocity", "first_known", "second_known")
 
     def __init__(self, parameters: StrictModel) -> None:

@@ -459,6 +459,11 @@ def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) ->
             _check_serves(treatment, "tied", key)
         if model.contact.static_friction[k]:
             _check_serves(treatment, "friction", key)
+            if treatment is not None and not plan.scheme.jumps_known:
+                raise InputError(
+                    f'{key}: friction with {model.case.time.integrator} needs contact.treatment = "scheme": the '
+                    "friction of velocity jumps is not known for it; use another treatment or integrator"
+                )
 
 
 def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> None:
@@ -473,7 +478,7 @@ def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> Non
 def _check_restitution(model: Model, plan: Plan, treatment: type[Treatment] | None, k: int, key: str) -> None:
     if model.inertia.consistent:
         raise InputError(f'{key}: restitution needs time.mass = "lumped": one node\'s velocity jumps')
-    if not plan.scheme.allows_restitution:
+    if not plan.scheme.jumps_known:
         raise InputError(
             f"{key}: restitution with {model.case.time.integrator}, whose substeps differ, is not known; use "
             "another integrator"

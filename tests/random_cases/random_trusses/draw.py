@@ -673,14 +673,15 @@ def _law(chance: random.Random, wall: dict[str, Any], treatment: str, time: dict
     """Friction, restitution, a tie, or none of them."""
     kind = chance.choices(("smooth", "friction", "restitution", "tied"), (45, 27, 15, 13))[0]
     odd = chance.random() < ODD
-    if kind == "friction" and (odd or treatment in ("scheme", "stick")):
+    jumps = time["integrator"] != "noh_bathe"  # are known
+    if kind == "friction" and (odd or treatment == "scheme" or treatment == "stick" and jumps):
         wall["friction"] = 10 ** chance.uniform(-1.3, 0.3)
         if chance.random() < 0.4:
             wall["static_friction"] = wall["friction"] * chance.uniform(1.0, 1.6)
     solves_next_position = time["integrator"] == "central_differences"
     fits = (
         "mass" not in time
-        and time["integrator"] != "noh_bathe"
+        and jumps
         and (treatment == "scheme" or treatment == "stick" and not solves_next_position)
     )
     if kind == "restitution" and (odd or fits and (solves_next_position or "mass" not in wall)):

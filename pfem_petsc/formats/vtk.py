@@ -1,4 +1,4 @@
-"""VTK files (.vtu, .vtp, .vtk, .vtkhdf), and STL: lines are bars, arrays of points and cells groups and bar fields.
+"""VTK files (.vtu, .vtp, .vtk, .vtkhdf): lines are bars, arrays of points and cells are groups and bar fields.
 
 Other cells are left out, with a warning; without lines, the edges of triangles, quadrilaterals and polygons are bars,
 with fields of nodes alone. A line of several points is as many bars less one. A cell array of integers
@@ -7,8 +7,8 @@ array of strings named ``group_names`` or ``section_names`` replaces these names
 same names define node groups (a negative value: no group). An array named ``group:NAME`` is the group NAME of those
 with a value other than 0; these may overlap. Other arrays with one component are fields of bars and nodes.
 
-VTK reads in a process of its own, because it aborts the process on some damaged files. That process runs this module
-as a program, which therefore imports no MPI.
+VTK reads, STL files too (:mod:`~pfem_petsc.formats.stl`), in a process of its own, because it aborts the process on
+some damaged files. That process runs this module as a program, which therefore imports no MPI.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from ..mesh.whole import WholeMesh
 
-SUFFIXES = (".vtu", ".vtp", ".vtk", ".vtkhdf", ".stl")
+SUFFIXES = (".vtu", ".vtp", ".vtk", ".vtkhdf")
 
 _LINE, _POLY_LINE = 3, 4
 _FACES = (5, 7, 9)
@@ -57,8 +57,6 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     """
     from ..mesh.whole import WholeMesh
 
-    if path.suffix.lower() == ".stl":
-        _check_stl(path)
     command = [sys.executable, "-P", "-m", __name__, str(path.resolve())]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     done = subprocess.run(command, env=environment, capture_output=True, check=False)
@@ -87,19 +85,6 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     if snapshots > 1:
         mesh.warnings.append(f"{path}: has {snapshots} snapshots: the mesh and its fields are those of the last one")
     return mesh
-
-
-def _check_stl(path: Path) -> None:
-    """Refuse a binary STL file that is not as long as it declares, which VTK reads up to its end."""
-    size = path.stat().st_size
-    with open(path, "rb") as file:
-        head = file.read(84)
-    expected = 84 + 50 * int.from_bytes(head[80:], "little")
-    if not head.lstrip().lower().startswith(b"solid") and size != expected:
-        raise InputError(
-            f"{path}: is not STL: neither text that begins with 'solid', nor binary: the triangles that it declares "
-            f"take {expected} bytes, and it has {size}; is it truncated?"
-        )
 
 
 # ---- the process that reads by VTK

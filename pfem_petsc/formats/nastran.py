@@ -31,9 +31,13 @@ Told = Callable[[object, str], None]
 _BARS = ("CROD", "CONROD", "CTUBE", "CBAR", "CBEAM")
 _PROPERTIES = ("PROD", "PTUBE", "PBAR", "PBARL", "PBEAM", "PBEAML")
 _COORDINATES = ("CORD1R", "CORD1C", "CORD1S", "CORD2R", "CORD2C", "CORD2S")
-_READ = (*("GRID", "GRDSET", "MAT1", "SPC", "SPC1", "SPCADD", "FORCE", "FORCE1", "FORCE2", "GRAV", "LOAD", "CONM2"),
-         *("EIGRL", "PARAM", "BAROR", "BEAMOR"), *_BARS, *_PROPERTIES, *_COORDINATES)  # fmt: skip
-_SILENT = ("ENDDATA", "GRDSET", "PARAM", "BAROR", "BEAMOR", "EIGRL", "EIGR", "EIGB", "NLPARM")
+_READ = (
+    *("GRID", "GRDSET", "MAT1", "SPC", "SPC1", "SPCADD", "FORCE", "FORCE1", "FORCE2", "GRAV", "LOAD", "CONM2", "EIGRL"),
+    *("EIGR", "NLPARM", "PARAM", "BAROR", "BEAMOR", "ENDDATA"),
+    *(*_BARS, *_PROPERTIES, *_COORDINATES),
+)
+_PARAMETERS = ("AUTOSPC", "WTMASS", "LGDISP", "POST", "PRTMAXIM", "GRDPNT", "K6ROT")
+"""Those that are read, or change nothing for bars with large displacements."""
 
 
 def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
@@ -103,7 +107,8 @@ def _deck(path: Path) -> Any:
 def _cards(deck: Any, text: str) -> str:
     """Return the cards that are not read, with their numbers, after a text; nothing without any."""
     counts = {**deck.card_count, **deck.reject_count}
-    other = [f"{n} {name}" for name, n in sorted(counts.items()) if name not in (*_READ, *_SILENT)]
+    other = [f"{n} {name}" for name, n in sorted(counts.items()) if name not in _READ]
+    other += [f"PARAM {name}" for name in sorted(deck.params) if name not in _PARAMETERS]
     return text + ", ".join(other) if other else ""
 
 
@@ -123,7 +128,7 @@ def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: Told) -> No
             counts[f"{bar.type} between their GRID, without offsets"] += any(map(np.any, (bar.wa, bar.wb)))
     for what, n in counts.items():
         told(n, f"{n} {what}, are read as bars".replace(",,", ","))
-    area, without, mass, massless = np.full(len(bars), np.nan), 0, 0, set()
+    area, without, mass, massless, damped = np.full(len(bars), np.nan), 0, 0, set(), set()
     sections, materials = (mesh.tables.setdefault(name, {}) for name in ("section", "material"))
     weight = _mass_scale(deck)
     for (of_rod, *_), numbers in members.items():
@@ -146,8 +151,10 @@ def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: Told) -> No
         values = {"young_modulus": "e", "density": "rho", "thermal_expansion": "a"}
         found = {key: float(getattr(material, name, None) or 0.0) for key, name in values.items()}
         found["density"] *= weight
+        damped |= {source.mid} if getattr(material, "ge", None) else set()
         massless |= {source.mid} if material is not None and not found["density"] else set()
         materials[f"mat1_{source.mid}"] = {key: value for key, value in found.items() if value}
+    told(damped, f"left out the damping GE of MAT1 {sorted(damped)}")
     told(massless, f"MAT1 {sorted(massless)} have no density, which is 0 in Nastran: a case needs a positive one")
     told(without, f"{without} bars have a property that is not read or not there: they have no section")
     told(mass, f"left out the nonstructural mass of {mass} bars")
@@ -314,9 +321,12 @@ class _Conditions:
         deck = self._deck
         small = "is linear: the case has large displacements, as all cases do"
         match deck.sol:
-            case None | 1 | 101 | 106 as sol:
-                self._told(sol in (1, 101), f"SOL {sol} {small}")
-                return {"static": {"step": 0.1 if sol == 106 else 1.0}} if sol else {}
+            case None:
+                return {}
+            case 1 | 101 | 106 as sol:
+                self._told(sol != 106, f"SOL {sol} {small}")
+                increments = [deck.nlparms[number].ninc for number in self._chosen("NLPARM", deck.nlparms)][:1]
+                return {"static": {"step": 1.0 / ((increments or [10])[0] or 10) if sol == 106 else 1.0}}
             case 103 | 105 as sol:
                 method = next(iter(self._chosen("METHOD", deck.methods)), 0)
                 count = getattr(deck.methods.get(method), "nd", None)

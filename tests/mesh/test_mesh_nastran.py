@@ -201,7 +201,9 @@ def test_beams_motions_and_masses(tmp_path):
         ("SOL 103\nCEND\nMETHOD = 4\nBEGIN BULK\nEIGRL,4,,,6\n", {"modes": {"count": 6, "kind": "vibration"}}, []),
         ("SOL 105\nCEND\nMETHOD = 4\nBEGIN BULK\nEIGRL,4,0.,9.\n",
          {"modes": {"count": 10, "kind": "buckling", "linear": True}}, ["a limit of the eigenvalues is not supported"]),
-        ("SOL 106\nCEND\nBEGIN BULK\n", {"static": {"step": 0.1}}, []),
+        ("SOL 106\nCEND\nBEGIN BULK\nPARAM,G,.1\n", {"static": {"step": 0.1}}, ["left out cards that are not read: PARAM G"]),
+        ("SOL 106\nCEND\nNLPARM = 2\nBEGIN BULK\nNLPARM,2,4\n", {"static": {"step": 0.25}}, []),
+        ("SOL 103\nCEND\nMETHOD = 4\nBEGIN BULK\nEIGR,4,LAN,,,,5\n", {"modes": {"count": 5, "kind": "vibration"}}, []),
         ("SOL 129\nCEND\nBEGIN BULK\n", None, ["SOL 129 is left out: the case has no analysis"]),
         ("SOL 153\nCEND\nBEGIN BULK\nSPC,1,1,1,5.\n", None, ["left out supports, loads and the analysis"]),
         ("", None, []),
@@ -229,8 +231,11 @@ def test_a_flat_truss_is_held_as_by_autospc(tmp_path):
     mesh = read(tmp_path, MIDDLE.replace("AUTOSPC,NO", "AUTOSPC,YES"))
     assert [keys["fix"] for keys in mesh.tables["support"].values()] == ["z"]
     assert mesh.warnings == ["the case holds 3 nodes of a flat truss along z, as AUTOSPC does"]
-    mesh = read(tmp_path, MIDDLE.replace(",.3,2.", ",.3"))
-    assert mesh.warnings == ["MAT1 [1] have no density, which is 0 in Nastran: a case needs a positive one"]
+    mesh = read(tmp_path, MIDDLE.replace(",.3,2.", ",.3,,,,.02"))
+    assert mesh.warnings == [
+        "left out the damping GE of MAT1 [1]",
+        "MAT1 [1] have no density, which is 0 in Nastran: a case needs a positive one",
+    ]
 
 
 @pytest.mark.parametrize(

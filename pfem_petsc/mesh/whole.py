@@ -180,7 +180,7 @@ def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
     told = (
         "Replace what is not known from it:"
         if made
-        else "Supports, loads and the analysis are those of the first step."
+        else "Supports, loads and the analysis are those of the file."
     )
     lines = [f"# A case for {file.name}. {told}\n", *(f"#   {key}\n" for key in made), "\n"]
     data = {

@@ -200,8 +200,11 @@ import re, sys, tomllib
 project = tomllib.load(open("pyproject.toml", "rb"))["project"]
 extras = project["optional-dependencies"]
 chosen = extras if sys.argv[1] == "yes" else ["mesh"]
-wanted = [*project["dependencies"], *(r for name in chosen for r in extras[name])]
-print(*(r for r in wanted if re.match(r"[\w-]+", r)[0] not in sys.argv[2:]), sep="\n")
+for line in [*project["dependencies"], *(r for name in chosen for r in extras[name])]:
+    below = re.search(r"; python_version < '(\d+)\.(\d+)'", line)
+    serves = below is None or sys.version_info < tuple(map(int, below.groups()))
+    if serves and re.match(r"[\w-]+", line)[0] not in sys.argv[2:]:
+        print(line)
 PYTHON
 }
 

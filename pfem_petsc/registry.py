@@ -181,7 +181,7 @@ def blame(error: BaseException) -> str:
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if Path(frame.filename) in _sources:
             return f"{frame.filename}, line {frame.lineno}, in {frame.name}: {type(error).__name__}: {error}"
-    text = str(error)
+    text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))  # Numba highlights where colorama is installed
     for found in re.finditer(r'File "(.+)", line (\d+)', text):  # as Numba quotes a function that it cannot compile
         path = Path(found[1]).resolve()
         if path in _sources:

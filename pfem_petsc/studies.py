@@ -32,7 +32,8 @@ from .case.toml import plain
 from .columns import LOST, STORED, SUPPLIED
 from .errors import InputError, PfemError
 from .output.result import Result, open_result, peak_force, touch_impulse
-from .output.table import SWEEP, Table, flat_columns, selected
+from .output.selected import select
+from .output.table import SWEEP, Table, flat_columns
 from .registry import nearest
 
 if TYPE_CHECKING:
@@ -410,7 +411,7 @@ def _check(history: Mapping[str, np.ndarray], name: str) -> None:
     if name.startswith(("final_", "peak_", "touch_")):
         raise InputError(f"sweep: results: there is no {name!r}{nearest(name, usual)}")
     try:
-        selected(history, name)
+        select(history, name)
     except InputError as error:
         raise InputError(f"sweep: results: {error}") from None
 
@@ -420,8 +421,8 @@ def _column(result: Result, label: str, name: str) -> dict[str, Any]:
     usual = _usual_results(result.history)
     if name in usual:
         return {label: usual[name](result)}
-    last = selected(result.history, name)[-1:]
-    return {each: column[0] for each, column in flat_columns(label, last).items()}
+    found = select(result.history, name)
+    return {each: column[0] for each, column in flat_columns(label, found.values[-1:], found.vector).items()}
 
 
 def _usual_results(columns: Iterable[str]) -> dict[str, ResultFunction]:

@@ -23,6 +23,11 @@ _SOLVER = ("snes_", "ksp_", "pc_", "mg_", "sub_", "mat_mumps_", "esteig_", "line
 _FILES = ("-options_file", "-options_file_yaml")
 
 
+_NUMBER = r"(\d+\.?\d*|\.\d+)(e[-+]?\d+)?"
+_OF_EXPRESSIONS = {"--curves", "--against", "--spectrum", "--inset", "--displacement", "--results"}
+"""Options whose values are computed from columns of the history."""
+
+
 class Argument(NamedTuple):
     """An argument of a verb: what ``argparse`` takes."""
 
@@ -82,7 +87,11 @@ class Parser(argparse.ArgumentParser):
         settings.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(allow_abbrev=False, **settings)  # type: ignore[arg-type]
         # argparse treats -1 as a number and -1e8 as an option.
-        self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$", re.IGNORECASE)
+        self._negative_number_matcher = re.compile(rf"^-{_NUMBER}$", re.IGNORECASE)
+
+    def take_expressions(self) -> None:
+        """Take words like ``-wall/floor/force.z`` and ``-(a-b)``, which begin with no option, as values."""
+        self._negative_number_matcher = re.compile(rf"^-({_NUMBER}$|\(|[a-z][a-z_]+)", re.IGNORECASE)
 
     def error(self, message: str) -> NoReturn:
         """Raise the error as invalid input."""
@@ -112,10 +121,12 @@ PLUGINS = argument(
 _DEBUG = argument("--debug", action="store_true", help="print the traceback of a failure")
 
 
-def fill(parser: argparse.ArgumentParser, arguments: Sequence[Argument]) -> None:
+def fill(parser: Parser, arguments: Sequence[Argument]) -> None:
     """Add arguments to a parser, and --debug."""
     for flags, settings in (*arguments, _DEBUG):
         parser.add_argument(*flags, **settings)
+        if _OF_EXPRESSIONS & set(flags):
+            parser.take_expressions()
 
 
 def surviving(result: str, deep: bool | None = None, refuse: bool = False) -> Path:

@@ -26,6 +26,7 @@ from .layout import (
     mesh_sizes,
     read_attributes,
 )
+from .selected import select
 from .table import Table, flat_columns
 from .units import AXES, LOAD_FACTOR, TIME, Axis
 
@@ -323,7 +324,8 @@ class Result:
 
         Parameters
         ----------
-        names : of columns, or of groups of them as ``wall/floor``; default: all but those of events
+        names : of columns, of groups of them as ``wall/floor``, or expressions as of
+            :func:`~pfem_petsc.output.selected.select`; default: all but those of events
 
         Raises
         ------
@@ -334,12 +336,11 @@ class Result:
         chosen = known if names is None else [name for name in ("step", "time") if name in known]
         for name in () if names is None else names:
             found = [column for column in known if column == name or column.startswith(f"{name}/")]
-            if not found:
-                raise InputError(f"{self.path}: history has no {name}{nearest(name, known)}")
-            chosen += [column for column in found if column not in chosen]
+            chosen += [column for column in found or [name] if column not in chosen]
         columns: dict[str, np.ndarray] = {}
         for name in chosen:
-            columns |= flat_columns(name, self.history[name])
+            found = select(self.history, name)
+            columns |= flat_columns(name if found.single else f"({name})", found.values, found.vector)
         return Table(columns)
 
     def _snapshot(self, name: str, i: int, n_rows: int) -> np.ndarray:

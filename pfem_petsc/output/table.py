@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import html
 import itertools
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,12 +13,11 @@ import numpy as np
 
 from ..errors import InputError, written
 from ..registry import nearest
-from .units import unit_of
 
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["SWEEP", "Table", "flat_columns", "over_nodes", "selected", "source_of", "varied"]
+__all__ = ["SWEEP", "Table", "flat_columns", "varied"]
 
 _SHOWN = 10  # rows shown at the beginning and at the end of a long table
 
@@ -159,15 +157,18 @@ class Table(Mapping[str, np.ndarray]):
         return f"<table><thead><tr>{heading}</tr></thead><tbody>{rows}</tbody></table><p>{self.n_rows} rows</p>"
 
 
-def flat_columns(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return columns (rows,) of values (rows,), (rows, 3) or (rows, nodes, 3): ``name``, ``name.x``, ``name[0].x``."""
+def flat_columns(name: str, values: np.ndarray, vector: bool) -> dict[str, np.ndarray]:
+    """Return columns (rows,) of numbers or vectors, also of each node or bar of a probe: ``name``, ``name[0].x``.
+
+    ``values`` : (rows,) or (rows, members), of a ``vector`` with three components behind.
+    """
     if values.ndim == 1:
         return {name: values}
-    if values.ndim == 2 and values.shape[1] == 3:
+    if vector and values.ndim == 2:
         return {f"{name}.{axis}": values[:, k] for k, axis in enumerate("xyz")}
     found: dict[str, np.ndarray] = {}
     for k in range(values.shape[1]):
-        found |= flat_columns(f"{name}[{k}]", values[:, k])
+        found |= flat_columns(f"{name}[{k}]", values[:, k], vector)
     return found
 
 
@@ -184,73 +185,6 @@ def varied(folder: Path) -> dict[str, str]:
         return {}
     values = itertools.takewhile(lambda item: item[0] != "status", row.items())
     return {key: value for key, value in values if key != "run" and value != "nan"}
-
-
-_DISPLACEMENT = "/displacement"
-MINUS = " - "
-"""Between two names, of which the difference is selected."""
-_SELECTION = re.compile(r"(?P<whole>.+?)(\[(?P<node>\d+)\])?(\.(?P<part>x|y|z|norm))?")
-
-
-def source_of(name: str) -> str:
-    """Return the column of the history that a name of :func:`selected` is computed from, of a difference the first."""
-    whole = _SELECTION.fullmatch(name.partition(MINUS)[0])["whole"]
-    if not whole.endswith(_DISPLACEMENT):
-        return whole
-    return whole.removesuffix(_DISPLACEMENT) + ("/position" if whole.startswith("probe/") else "")
-
-
-def selected(history: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    """Return a column of a history, (rows,), (rows, 3) or (rows, nodes, 3), or what a name selects of it.
-
-    ``NAME[0]`` is the value of the first node, and ``.x``, ``.y``, ``.z``, ``.norm`` are components; of all nodes, that
-    of their mean, of reactions that of the sum. ``probe/NAME/displacement`` is the position relative to that of the
-    first row, and ``centre_of_mass/displacement`` that of the centre of mass. ``A - B`` is the difference of two such
-    names, as of a probe and the ground.
-
-    Raises
-    ------
-    InputError
-        If the history has no such column, or the column no such component or node.
-    """
-    known = [column for column in history if not column.startswith("event/")]
-    if name in known:
-        return np.asarray(history[name])
-    if MINUS in name:
-        both = {each: selected(history, each) for each in name.split(MINUS, 1)}
-        one, other = (over_nodes(each, values) if values.ndim == 3 else values for each, values in both.items())
-        if one.shape != other.shape:
-            raise InputError(f"{name}: one is a vector and the other is not; select a component, like .x")
-        units = [unit_of(source_of(each)) for each in both]
-        if units[0] != units[1]:
-            raise InputError(f"{name}: the units {units[0] or '1'} and {units[1] or '1'} differ")
-        return one - other
-    whole, node, part = _SELECTION.fullmatch(name).group("whole", "node", "part")
-    source = whole if whole in known else source_of(whole)
-    if source not in known:
-        moved = [column.replace("/position", _DISPLACEMENT) for column in known if column.startswith("probe/")]
-        hint = nearest(whole, list(dict.fromkeys([*known, *moved])))
-        blanks = f", or a difference, which is written with blanks, 'A{MINUS}B'" if "-" in whole else ""
-        raise InputError(f"the history has no column '{whole}'{blanks}{hint}")
-    values = np.asarray(history[source])
-    if values.ndim == 1:
-        raise InputError(f"{name}: column '{whole}' is a number and has no components")
-    if node and (values.ndim == 2 or int(node) >= values.shape[1]):
-        raise InputError(f"{name}: the column {whole} has {', '.join(list(flat_columns(whole, values))[:6])}")
-    if source != whole:
-        values = values - values[:1]
-    if node:
-        values = values[:, int(node)]
-    if part and values.ndim == 3:
-        values = over_nodes(whole, values)
-    if part == "norm":
-        return np.linalg.norm(values, axis=1)
-    return values[:, "xyz".index(part)] if part else values
-
-
-def over_nodes(name: str, values: np.ndarray) -> np.ndarray:
-    """Return the sum (rows, 3) over the nodes of a column of reactions (rows, nodes, 3), of others the mean."""
-    return values.sum(axis=1) if name.endswith("/reaction") else values.mean(axis=1)
 
 
 def _column(values: Sequence[Any] | np.ndarray) -> np.ndarray:

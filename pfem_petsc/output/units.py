@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import NamedTuple
 
 from ..columns import declared
+from ..errors import InputError
 from ..fields import FIELDS
 from ..mechanics.materials.base import LAWS
 from ..registry import modules
@@ -23,7 +25,9 @@ __all__ = [
     "duration",
     "engineering",
     "field_unit",
+    "powers_of",
     "prefix_for",
+    "text_of",
     "unit_of",
 ]
 
@@ -99,6 +103,48 @@ def field_unit(name: str) -> str:
 @cache
 def _units_of_variables() -> dict[str, str]:
     return dict(variable for law in modules(LAWS).values() for variable in law.LAW.internal)
+
+
+_ATOMS = ("m", "s", "kg", "N", "Pa", "J", "K", "Hz", "W", "rad", "1")
+_SUPERSCRIPTS = {2: "²", 3: "³"}
+
+
+def powers_of(unit: str) -> dict[str, int]:
+    """Return the units that one is a product of, and their powers: ``"kg m²/s"`` -> {kg: 1, m: 2, s: -1}.
+
+    Pascal are N/m², so that forces over areas are pressures. Powers may also be written ``m2`` or ``m^2``.
+
+    Raises
+    ------
+    InputError
+        For a unit that is not known here.
+    """
+    powers: dict[str, int] = {}
+    for number, part in enumerate(unit.split("/")):
+        for word in part.replace("(", " ").replace(")", " ").replace("*", " ").replace("·", " ").split():
+            found = re.fullmatch(r"([A-Za-z]+|1)\^?(-?\d+|[²³])?", word)
+            if found is None or found[1] not in _ATOMS:
+                raise InputError(f"[{unit}]: {word!r} is not a unit; units are SI: {', '.join(_ATOMS)} and powers, m2")
+            power = {"²": 2, "³": 3}.get(found[2] or "1") or int(found[2] or 1)
+            power = -power if number else power
+            for atom, of in (("N", 1), ("m", -2)) if found[1] == "Pa" else ((found[1], 1),):
+                powers[atom] = powers.get(atom, 0) + of * power
+    return {atom: power for atom, power in powers.items() if power and atom != "1"}
+
+
+def text_of(powers: Mapping[str, int]) -> str:
+    """Return the text of a unit from its powers, as of :func:`powers_of`; empty for a pure number."""
+    powers = {atom: power for atom, power in powers.items() if power}
+    if powers == {"N": 1, "m": -2}:
+        return "Pa"
+
+    def product(sign: int) -> list[str]:
+        sizes = {atom: sign * power for atom, power in powers.items() if sign * power > 0}
+        return [atom + ("" if n == 1 else _SUPERSCRIPTS.get(n, f"^{n}")) for atom, n in sizes.items()]
+
+    above, below = product(1), product(-1)
+    divided = f"({' '.join(below)})" if len(below) > 1 else "".join(below)
+    return f"{' '.join(above) or '1'}/{divided}" if below else " ".join(above)
 
 
 def prefix_for(magnitude: float, unit: str) -> tuple[float, str]:

@@ -24,6 +24,8 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6
 
 DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))
 
+_MARKERS = ("", "o", "s", "^", "D", "v", "P", "X")
+
 FORMATS = ("png", "svg", "pdf", "csv")
 
 REFERENCE: dict[str, Any] = {"color": "#000000", "linewidth": 1.1, "linestyle": (0, (5, 2.5)), "zorder": 3}
@@ -128,17 +130,21 @@ class Panel:
 def distinct(k: int, dash: int | None = None) -> dict[str, Any]:
     """Return the style of the ``k``-th line of a panel, which differs from those of all others.
 
-    There are eight colours, each with four dashes, and these with widths that grow.
+    There are eight colours, and each time that they begin again other dashes and another marker: 256 styles.
 
     Parameters
     ----------
     k : from 0
     dash : number of another dash, for lines that their colours tell apart
     """
-    wider, own = divmod(k // len(COLOURS), len(DASHES))
+    lap, number = divmod(k, len(COLOURS))
     # the dashes of closed forms, which are black as well, come last
-    style = {"color": COLOURS[k % len(COLOURS)], "linestyle": DASHES[(0, 2, 3, 1)[own] if dash is None else dash]}
-    return style | ({"linewidth": STYLE["lines.linewidth"] * (1.0 + wider)} if wider else {})
+    own = (0, 2, 3, 1)[lap % len(DASHES)] if dash is None else dash
+    style = {"color": COLOURS[number], "linestyle": DASHES[own]}
+    apart = (0.012 * (k % 10), 0.12)  # shares of the picture, so that markers of curves upon each other are beside
+    marker = _MARKERS[(lap + lap // len(_MARKERS)) % len(_MARKERS)]
+    marked = {"marker": marker, "markersize": 4.5, "markevery": apart}
+    return style | (marked if lap else {})
 
 
 def area(k: int) -> dict[str, Any]:
@@ -257,7 +263,7 @@ class Chart:
 
         drawn = [panel for panel in panels if panel]
         heights = [max(p.height for p in panels[k : k + columns] if p) for k in range(0, len(panels), columns)]
-        names = [curve.name for panel in drawn if panel.legend for curve in panel.curves]
+        names = [line for panel in drawn if panel.legend for curve in panel.curves for line in curve.name.split("\n")]
         # long names in legends make the picture wider, and no panel narrower
         wider = max(0.0, _LETTER * (max(map(len, names), default=0) - _LETTERS))
         size = (_WIDTHS.get(columns, 4.4 * columns) + columns * wider, 0.9 + 2.5 * sum(heights))
@@ -319,7 +325,7 @@ class Chart:
             if not any(heading == other and over == before for before, _, other, _ in self._columns):
                 known = np.isfinite(values) if panel.over else slice(None)
                 self._columns.append((over, place[known], heading, np.asarray(curve.values)[known]))
-        axes.set_ylabel(f"{panel.label} [{shown}]" if shown else panel.label)
+        axes.set_ylabel(f"{panel.label} [{shown}]".lstrip() if shown else panel.label)
         axes.set_title(literal(panel.title))
         axes.margins(x=0.02 if panel.over else 0.0)
         if panel.log:

@@ -23,7 +23,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..output.result import impulse_of
-from ..output.table import Table, selected
+from ..output.selected import select
+from ..output.table import Table
 from ..registry import nearest
 from .options import WINDOW
 
@@ -207,10 +208,7 @@ def _way(result: Any, wall: str, displacement: str | None) -> tuple[np.ndarray, 
     """Return the compression (rows,) [m] and the unit vector (3,) along which forces count."""
     history = result.history
     if displacement is not None:
-        try:
-            values = np.asarray(selected(history, displacement), dtype=float)
-        except KeyError as error:
-            raise InputError(str(error.args[0])) from error
+        values = select(history, displacement).reduced().values
         if values.ndim != 1:
             raise InputError(f"crush: {displacement} has several components; name one, like {displacement}.z")
         force = np.asarray(history[f"wall/{wall}/force"]).sum(axis=0)

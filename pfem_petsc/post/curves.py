@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +13,8 @@ import numpy as np
 
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.table import MINUS, over_nodes, selected, source_of, varied
+from ..output.selected import Selected, select
+from ..output.table import varied
 from ..output.units import TIME, unit_of
 from .chart import COLOURS, DASHES, REFERENCE, Chart, Curve, Panel, distinct, largest
 from .filters import AS_COMPUTED, Filter, amplitude_spectrum
@@ -190,6 +192,8 @@ CLOSED_FORM = " closed form"
 
 _LONGEST = 50  # number of letters of a label that tells the values of a run
 
+_LINE = 40  # letters of a line of a legend
+
 _PEAKS = 5  # of a spectrum, at most, that are told
 
 
@@ -204,7 +208,7 @@ def words(name: str) -> str:
 
 
 def column(history: History, name: str) -> dict[str, np.ndarray]:
-    """Return the curves (n,) of a name, which :func:`~pfem_petsc.output.table.selected` takes.
+    """Return the curves (n,) of a name or an expression, which :func:`~pfem_petsc.output.selected.select` takes.
 
     Columns of nodes are the mean over the nodes, of reactions the sum. A vector without component gives those that are
     not zero up to rounding.
@@ -214,11 +218,13 @@ def column(history: History, name: str) -> dict[str, np.ndarray]:
     InputError
         If the history has no such column.
     """
-    values = selected(history, name).astype(float)
-    if values.ndim == 3:
-        values = over_nodes(name, values)
-    if values.ndim == 1:
+    found = select(history, name).reduced()
+    values = found.values.astype(float)
+    if not found.single and values.size and not np.isfinite(values).any():
+        raise InputError(f"plot: {name}: is a number in no row, as it divides by zero")
+    if not found.vector:
         return {name: values}
+    name = name if found.single else f"({name})"
     largest = float(np.nanmax(np.abs(values), initial=0.0))
     kept = [k for k in range(3) if np.nanmax(np.abs(values[:, k]), initial=0.0) > 1e-9 * largest]
     return {f"{name}.{'xyz'[k]}": values[:, k] for k in kept or range(3)}
@@ -239,11 +245,12 @@ def smoothed(result: Any, chosen: Filter, values: np.ndarray, touch: bool = Fals
 def exact_curves(exact: ClosedForm | None, names: Sequence[str], place: np.ndarray | None = None) -> list[Curve]:
     """Return the closed forms of curves of :func:`column`, where they are known."""
     curves: list[Curve] = []
-    for name in names:
-        whole = name if exact is None or name in exact.columns else name.rpartition(".")[0] or name
-        if exact is not None and MINUS not in name and source_of(whole) in exact.columns:
+    for name in names if exact is not None else ():
+        try:
             values = column(exact.columns, name)[name]
-            curves.append(Curve("" if curves else exact.name, values, REFERENCE, name + CLOSED_FORM, place))
+        except InputError:  # of columns, or in an expression of some, that have none
+            continue
+        curves.append(Curve("" if curves else exact.name, values, REFERENCE, name + CLOSED_FORM, place))
     return curves
 
 
@@ -275,20 +282,22 @@ def draw_curves(
     against: str | None = None,
     chosen: Filter | None = None,
     closed_forms: bool = True,
+    labels: Sequence[str] | None = None,
 ) -> Chart:
     """Draw panels of columns, with the curves of all results, over time or another column.
 
     Parameters
     ----------
     results : open results
-    panels : columns, or components of them, and the filter of each; energies are never filtered
-    against : a column of numbers, or a component; None: time
+    panels : columns, components of them or expressions, and the filter of each; energies are never filtered
+    against : a column of numbers, a component or an expression; None: time
     chosen : filter of the column that they are drawn over
     closed_forms : whether to draw the closed form of the first result
+    labels : names of the results in the legends; None: see :func:`labels_of`
     """
     if not panels:
         raise InputError("plot: no curves named; columns: " + ", ".join(results[0].history))
-    first, labels = results[0], labels_of(results)
+    first, labels = results[0], labels_of(results, labels)
     if len({result.axis.symbol for result in results}) > 1 and against is None:
         raise InputError("plot: the results are over different axes: " + ", ".join({r.axis.symbol for r in results}))
     exact = closed_form(first) if closed_forms and against is None else None
@@ -300,10 +309,10 @@ def draw_curves(
             raise InputError(f"plot: against = {against!r} is a vector: name a component, {against}.x, .y, .z or .norm")
         places = [_filtered(r, chosen, against, each[against]) for r, each in zip(results, found, strict=True)]
     shared = all(np.array_equal(place, places[0]) for place in places)
-    over = None if against is None else (against, unit_of_curve(against))
+    over = None if against is None else (against, select(first.history, against).unit or "")
     drawn = []
     for name, smoothing in panels:
-        found = [column(result.history, name) for result in results]
+        found, whole = [column(result.history, name) for result in results], select(first.history, name)
         parts = list(dict.fromkeys(part for curves in found for part in curves))
         # a vector that is zero in some results has all components there
         parts = [part for part in parts if any(np.any(curves.get(part, 0.0)) for curves in found)] or parts
@@ -318,39 +327,53 @@ def draw_curves(
                 words_of = (label if len(found) > 1 else "", part if len(parts) > 1 else "")
                 key = f"{part}: {label}" if len(found) > 1 else part
                 key += f", {smoothing.name}" if smoothing is not None and (name, None) in panels else ""
-                text = " ".join(word for word in words_of if word) or part
+                text = " ".join(word for word in words_of if word) or "computed"
                 curves.append(Curve(text, shown, style, key, place, "" if shared else label))
         for known in exact_curves(exact, [part for part in parts if part in found[0]], places[0]):
             part = known.key.removesuffix(CLOSED_FORM)
             curves.append(known._replace(values=_filtered(first, smoothing, part, known.values)))
         title = parts[0] if len(parts) == 1 else name  # which component it is
         if smoothing is not None and smoothing.name != AS_COMPUTED:
-            state = f"{AS_COMPUTED}, as all energies" if unit_of_curve(name) == "J" else smoothing.name
+            state = f"{AS_COMPUTED}, as all energies" if _is_energy(whole) else smoothing.name
             title = f"{title}: {state}"
-        label = words(name.rsplit("/", 1)[-1])
-        height = max(0.9, 0.11 * len(curves))  # of the legend
-        drawn.append(Panel(label, unit_of_curve(name), curves, title, height, over, None, len(curves) > 1))
+        label = words(name.rsplit("/", 1)[-1]) if whole.single else ""
+        lines = sum(1 + curve.name.count("\n") for curve in curves)
+        height = max(0.9, 0.11 * lines)  # of the legend
+        drawn.append(Panel(label, whole.unit or "", curves, title, height, over, None, len(curves) > 1))
     axis = max((result.axis for result in results), key=lambda axis: axis.staged)
     ends = first.stage_ends if len(results) == 1 and axis.staged else ()
     return Chart(drawn, first.case.title or first.case.name, np.concatenate(times), axis, ends=ends)
 
 
 def _filtered(result: Any, chosen: Filter | None, name: str, values: np.ndarray) -> np.ndarray:
-    """Return the values (rows,) of a column after a filter, those of energies as they are."""
-    if chosen is None or unit_of_curve(name) == "J":
+    """Return the values (rows,) of a column or expression after a filter, those of energies as they are."""
+    history = result.history
+    if chosen is None or _is_energy(select(history, name)):
         return values
-    touch = name.startswith(("wall/", "pair/", "constraint/")) and "/force" in name  # zero before the run
-    return smoothed(result, chosen, values, touch)
+    sources = select(history, name).sources
+    # forces of contact are zero before the run, and so is what is computed from them, unless something is added
+    touch = all(one.startswith(("wall/", "pair/", "constraint/")) and one.endswith("/force") for one in sources)
+    before = {one: np.zeros_like(history[one][:1]) for one in sources if touch}
+    return smoothed(result, chosen, values, touch and not np.any(select(before, name).values))
 
 
-def unit_of_curve(name: str) -> str:
-    """Return the SI unit of a column or a component of one."""
-    return unit_of(source_of(name))
+def _is_energy(found: Selected) -> bool:
+    return all(unit_of(source) == "J" for source in found.sources)
 
 
-def labels_of(results: Sequence[Any]) -> list[str]:
-    """Return distinct names of results: what varies in runs of a sweep, else folders, or as much of the paths as it
-    takes."""
+def labels_of(results: Sequence[Any], given: Sequence[str] | None = None) -> list[str]:
+    """Return distinct names of results: those given, else what varies in runs of a sweep, else folders, or as much of
+    the paths as it takes.
+
+    Raises
+    ------
+    InputError
+        If names are given, but not one for each result.
+    """
+    if given is not None:
+        if len(given) != len(results) or len(set(given)) < len(given):
+            raise InputError(f"plot: labels: {len(results)} results need as many different labels, not {list(given)}")
+        return [textwrap.fill(label, _LINE) for label in given]
     paths = [Path(result.path).absolute() for result in results]
     labels = _values_of_runs([varied(path.parent) for path in paths])
     if len(set(labels)) == len(labels) and all(0 < len(label) <= _LONGEST for label in labels):
@@ -374,16 +397,21 @@ def _values_of_runs(runs: Sequence[Mapping[str, str]]) -> list[str]:
 
 
 def draw_spectra(
-    results: Sequence[Any], names: Sequence[str], window: str = "hann", highest: float | None = None
+    results: Sequence[Any],
+    names: Sequence[str],
+    window: str = "hann",
+    highest: float | None = None,
+    labels: Sequence[str] | None = None,
 ) -> Chart:
     """Draw a panel with the amplitude spectrum of each named column; natural frequencies are dotted lines.
 
     Parameters
     ----------
     results : open results of runs over time; with static stages, the longest part without them is taken
-    names : columns, or components of them
+    names : columns, components of them or expressions
     window : see :func:`~pfem_petsc.post.filters.amplitude_spectrum`
     highest : frequency at which the picture ends [Hz]; None: half the sampling rate
+    labels : names of the results, as of :func:`draw_curves`
     """
     first = results[0]
     if not names:
@@ -396,16 +424,17 @@ def draw_spectra(
     natural = first.modes.frequency if getattr(first, "n_modes", 0) and first.modes.kind == "vibration" else ()
     panels = []
     for name in names:
-        unit = unit_of_curve(name)
+        whole = select(first.history, name)
+        unit = whole.unit or ""
         curves = []
-        for label, result in zip(labels_of(results), results, strict=True):
+        for label, result in zip(labels_of(results, labels), results, strict=True):
             time = read(result.history, "time")
             rows = max(result.stretches, key=lambda rows, time=time: float(np.ptp(time[rows])))
             for part, values in column(result.history, name).items():
                 key = f"{part}: {label}" if len(results) > 1 else part
                 frequency, amplitude = amplitude_spectrum(time[rows], values[rows], window)
                 curves.append(Curve(key, amplitude, place=frequency))
-        label = f"amplitude of\n{words(name.rsplit('/', 1)[-1])}"
+        label = f"amplitude of\n{words(name.rsplit('/', 1)[-1])}" if whole.single else "amplitude"
         legend, title = len(curves) > 1, f"{name}, window: {window}"
         panels.append(Panel(label, unit, curves, title, 1.1, ("frequency", "Hz"), (1.0, unit), legend, log=True))
     title = first.case.title or first.case.name

@@ -189,17 +189,17 @@ class PlotOptions:
 
     curves: Iterable[str] | None = _option(
         None,
-        "columns of the history to plot in one picture (info lists them), or components: probe/tip/velocity.x, "
-        "momentum.norm; default: the usual pictures",
+        "columns of the history to plot in one picture (info lists them), components, or expressions of them: "
+        "probe/tip/velocity.x, momentum.norm, '-wall/plate/force.z/1.2e-3[m2]'; default: the usual pictures",
         metavar="NAME",
         nargs="+",
         action="extend",
     )
     against: str | None = _option(
-        None, "column or component over which the curves are drawn; default: time", metavar="NAME"
+        None, "column, component or expression over which the curves are drawn; default: time", metavar="NAME"
     )
     spectrum: Iterable[str] | None = _option(
-        None, "columns whose amplitude spectra are drawn", metavar="NAME", nargs="+", action="extend"
+        None, "columns or expressions whose amplitude spectra are drawn", metavar="NAME", nargs="+", action="extend"
     )
     window: str = _option("hann", "window of spectra: hann, flattop, hamming, blackman, rectangular; default: hann")
     highest: float | None = _option(None, "frequency at which the spectra end", metavar="HZ", type=float)
@@ -218,6 +218,9 @@ class PlotOptions:
         metavar="FORMAT",
         nargs="+",
         action="extend",
+    )
+    labels: Sequence[str] | None = _option(
+        None, "names of the results in legends; default: their folders", metavar="TEXT", nargs="+"
     )
     closed_forms: bool = _option(True, "do not draw closed forms", flag="--no-closed-form", action="store_false")
 

@@ -18,7 +18,8 @@ from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 
 from ..errors import InputError
-from ..output.units import prefix_for, unit_of
+from ..output.selected import select
+from ..output.units import prefix_for
 from .camera import Camera, direction, fit
 from .chart import STYLE, boxes_allowed, largest, literal
 from .colours import ColourScale, Mark
@@ -191,10 +192,11 @@ class Page:
         room : left, bottom, width and height as shares of a drawing
         """
         curves = [(np.asarray(r.history["time"], dtype=float), history_curve(r.history, name)) for r in results]
-        factor, unit = prefix_for(max(largest(values) for _, values in curves), unit_of(name.partition(".")[0]))
+        chosen = select(results[0].history, name)
+        factor, unit = prefix_for(max(largest(values) for _, values in curves), chosen.unit or "")
         axis = results[0].axis
         time_factor, time_unit = axis.scale(max(largest(times) for times, _ in curves))
-        kind, *parts, last = name.split("/") if "/" in name else ("", name)
+        kind, *parts, last = name.split("/") if "/" in name and chosen.single else ("", name)
         label = (f"{kind} '{'/'.join(parts)}', {last}" if parts else last).replace("_", " ")
         left, bottom, width, height = room
         place = left + 0.117 * width, bottom + 0.222 * height, 0.848 * width, 0.634 * height  # labels are around it
@@ -224,7 +226,7 @@ def history_curve(history: Any, name: str) -> np.ndarray:
         If there is no such column.
     """
     found = column(history, name)
-    return found[name] if name in found else column(history, f"{name}.norm")[f"{name}.norm"]
+    return found[name] if name in found else column(history, f"({name}).norm")[f"({name}).norm"]
 
 
 def inset_room(drawings: Sequence[np.ndarray], several: bool) -> tuple[float, float, float, float]:

@@ -42,7 +42,7 @@ _QUANTITIES = ("displacement", "velocity", "reaction")
 
 
 def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | None = None, **options: Any) -> list[Path]:
-    """Draw the history: ``energies.png``, ``momentum.png``, ``probes.png``, ``walls.png``, ``solver.png`` and others.
+    """Draw the history: ``energies.png``, ``momentum.png``, ``probes.png``, ``bars.png``, ``walls.png`` and others.
 
     Parameters
     ----------
@@ -84,11 +84,11 @@ def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | Non
                     f"{result.path}: filter = {given.force_filter!r} needs a run over time, not a static analysis"
                 )
         if given.spectrum is not None:
-            chart = draw_spectra(results, list(given.spectrum), given.window, given.highest)
+            chart = draw_spectra(results, list(given.spectrum), given.window, given.highest, given.labels)
             return chart.save(_free(folder / "spectra", suffixes), suffixes)
         if given.curves is not None:
             panels = [(name, chosen) for name in given.curves]
-            chart = draw_curves(results, panels, given.against, chosen, given.closed_forms)
+            chart = draw_curves(results, panels, given.against, chosen, given.closed_forms, given.labels)
             return chart.save(_free(folder / "curves", suffixes), suffixes)
         if len(results) > 1:
             forces = chosen or _usual_filter(results[0])
@@ -96,7 +96,8 @@ def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | Non
             for name in usual_curves(results):  # forces as computed and, in a panel below, filtered
                 smoothed_too = name.endswith("/force") and forces.name != AS_COMPUTED
                 panels += [(name, None), (name, forces)] if smoothed_too else [(name, None)]
-            return draw_curves(results, panels, closed_forms=given.closed_forms).save(folder / "comparison", suffixes)
+            chart = draw_curves(results, panels, closed_forms=given.closed_forms, labels=given.labels)
+            return chart.save(folder / "comparison", suffixes)
         (result,) = results
         return _usual(result, folder, suffixes, chosen, given.closed_forms)
 
@@ -112,6 +113,7 @@ def _usual(
         "energies": energies(history, exact),
         "momentum": momentum(history, exact) if result.stretches else ([], "", 1),
         "probes": probes(history, exact),
+        "bars": bars(history),
         "walls": force_panels(result, "wall", forces, exact),
         "pairs": force_panels(result, "pair", forces),
         "constraints": force_panels(result, "constraint", forces),
@@ -230,6 +232,23 @@ def probes(history: History, exact: ClosedForm | None = None) -> tuple[list[Pane
     keys = {(panel.title.partition(",")[0], panel.label): panel for panel in shown}
     rows, columns = (list(dict.fromkeys(names)) for names in zip(*keys, strict=True))
     return [keys.get(place) for place in itertools.product(rows, columns)], note, len(columns)
+
+
+def bars(history: History) -> tuple[list[Panel], str, int]:
+    """Axial force and stress of the bars of each probe."""
+    panels = []
+    names = [name for name in history if name.startswith("bar/") and not name.endswith("/strain")]
+    for name in names:
+        probe, quantity = name.removeprefix("bar/").rsplit("/", 1)
+        values = read(history, name)
+        title, bounds = probe, np.stack([values.min(axis=1), values.max(axis=1)], axis=1)
+        curves = [Curve("", values.mean(axis=1), {"color": COLOURS[0]}, name)]
+        if values.shape[1] > 1:
+            title = f"{probe}, mean of {values.shape[1]} bars"
+            curves.append(Curve("", bounds, {"color": COLOURS[0], "alpha": 0.15}, kind="band"))
+        panels.append(Panel(words(quantity), unit_of(name), curves, title, 0.9, legend=False))
+    several = any(len(panel.curves) > 1 for panel in panels)
+    return panels, "Shaded: the range of the bars." if several else "", 2
 
 
 def _vector(history: History, name: str, label: str, exact: ClosedForm | None) -> Panel:

@@ -70,6 +70,7 @@ class SyntheticResult:
         self.point_fields, self.cell_fields = ["displacement", "velocity"], ["plastic_strain", "strain", "stress"]
         self.times = np.linspace(0.0, end, snapshots)
         self.case = SyntheticCase(title=title, name="synthetic", wall=list(walls), stage=(), gravity=None)
+        self.case.output = SimpleNamespace(bar_probe=())
         normal = np.array(walls[0].normal if walls else (-1.0, 0.0, 0.0))
         normal = normal / np.linalg.norm(normal)
         away = (points - np.array(walls[0].point if walls else (1.2, 0, 0))) @ normal

@@ -121,8 +121,8 @@ def test_energies_are_never_filtered(tmp_path, result):
 
 def test_many_lines_and_areas_differ():
     """From each other, and lines from closed forms; those of two results differ by their dashes as well."""
-    styles = [distinct(k) for k in range(96)]
-    assert len({(s["color"], str(s["linestyle"]), s.get("linewidth")) for s in styles}) == 96
+    styles = [distinct(k) for k in range(256)]
+    assert len({(s["color"], str(s["linestyle"]), s.get("marker", "")) for s in styles}) == 256
     assert len({(s["color"], str(s["linestyle"])) for s in styles[:32]}) == 32
     assert not any(s["color"] == REFERENCE["color"] and s["linestyle"] == DASHES[1] for s in styles[:31])
     areas = [chart.area(k) for k in range(16)]

@@ -1,0 +1,169 @@
+"""Curves that are computed from columns: values, units, filters, labels, bars of probes; by Python and by the words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.pictures import table_columns
+from helpers.synthetic import SyntheticResult, ring
+from matplotlib import rc_context
+from mpi4py import MPI
+
+from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.cli.main import main
+from pfem_petsc.errors import InputError
+from pfem_petsc.output.selected import select
+from pfem_petsc.post.chart import STYLE
+from pfem_petsc.post.curves import draw_curves
+from pfem_petsc.post.filters import window_mean
+from pfem_petsc.post.plot import plot
+
+
+@pytest.fixture
+def result(tmp_path):
+    return SyntheticResult(tmp_path / "result.vtkhdf", *ring())
+
+
+@pytest.fixture(scope="module")
+def rod(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rod")
+    case = Case.load("rod_impact", ["time.end=1.5", "output.fields_every=0"])
+    case.output.bar_probe = [{"name": "front", "indices": [19]}, {"name": "all three", "indices": [1, 8, 12]}]
+    assert Simulation(case, MPI.COMM_SELF, output=folder, quiet=True).run() == 0
+    return open_result(folder)
+
+
+def drawn(folder, result, *curves, **options):
+    """Columns of the table of curves, by their headings."""
+    (file,) = plot(result, folder, curves=curves, formats="csv", **options)
+    return dict(zip(*table_columns(file), strict=True))
+
+
+def test_columns_of_expressions_have_their_units(tmp_path, result):
+    force, energy = result.history["wall/wall/force"][:, 0], result.history["kinetic_energy"]
+    found = drawn(tmp_path, result, "-wall/wall/force.x/1.2e-3", "-wall/wall/force.x/2[m2]", "kinetic_energy - 1")
+    assert list(found) == [
+        "time [s]",
+        "-wall/wall/force.x/1.2e-3",
+        "-wall/wall/force.x/2[m2] [Pa]",
+        "kinetic_energy - 1 [J]",
+    ]
+    for values, expected in zip(list(found.values())[1:], (-force / 1.2e-3, -force / 2.0, energy - 1.0), strict=True):
+        np.testing.assert_allclose(values, expected, rtol=1e-12)
+
+
+def test_the_axis_of_an_expression_has_its_unit_and_no_other(result):
+    names = ["wall/wall/force.x", "-wall/wall/force.x/1.2e-3", "-wall/wall/force.x/1e-9[m2]"]
+    with rc_context(STYLE):
+        panels = draw_curves([result], [(name, None) for name in names]).axes
+    shown = [axes.get_ylabel() for axes in panels]
+    assert shown[0].startswith("force.x [") and shown[1] == "" and shown[2].endswith("Pa]")
+    assert [axes.get_title(loc="left") for axes in panels] == names
+
+
+def test_curves_are_filtered_if_a_filter_is_named(tmp_path, result):
+    """As computed without; with one also in expressions; energies, and what is computed from them alone, never."""
+    time, force = result.history["time"], result.history["wall/wall/force"][:, 0]
+    names = ["wall/wall/force.x", "3[1] - wall/wall/force.x / 2[N]", "2*kinetic_energy"]
+    plain = list(drawn(tmp_path, result, *names).values())[1:]
+    smooth = list(drawn(tmp_path, result, *names, force_filter="mean:0.005").values())[1:]
+    np.testing.assert_array_equal(plain[0], force)
+    np.testing.assert_array_equal(smooth[2], 2.0 * result.history["kinetic_energy"])
+    np.testing.assert_allclose(smooth[0], window_mean(time, force, 0.005, True), atol=1e-12 * np.abs(force).max())
+    # a constant is there before the run, and a force is not
+    np.testing.assert_allclose(smooth[1], window_mean(time, 3.0 - force / 2.0, 0.005, False), rtol=1e-12)
+    (file,) = plot(result, tmp_path, spectrum=["wall/wall/force.x"], formats="csv", window="rectangular")
+    assert "filter" not in " ".join(table_columns(file)[0])
+
+
+def test_an_expression_has_the_closed_form_of_its_columns(tmp_path, rod):
+    """A wave compresses the end of the rod: rho c A v on 1.2e-3 m2, in tables also with the filter."""
+    found = drawn(tmp_path, rod, "-wall/wall/force.x/1.2e-3[m2]", "bar/front/axial_force")
+    assert list(found)[1:] == [
+        "-wall/wall/force.x/1.2e-3[m2] [Pa]",
+        "-wall/wall/force.x/1.2e-3[m2] closed form [Pa]",
+        "bar/front/axial_force [N]",
+    ]
+    exact = found["-wall/wall/force.x/1.2e-3[m2] closed form [Pa]"]
+    (material,), (section,) = rod.case.material.values(), rod.case.section.values()
+    speed = np.linalg.norm(rod.case.initial[0].velocity)
+    peak = np.sqrt(material.young_modulus * material.density) * section.area * speed / 1.2e-3
+    assert exact.max() == pytest.approx(peak) and exact.min() == 0.0
+    # behind the front of the wave, the bar at the wall has the same force
+    assert found["bar/front/axial_force [N]"][-1] == pytest.approx(-peak * 1.2e-3, rel=0.02)
+
+
+def test_bars_of_probes_have_a_picture(tmp_path, rod):
+    written = plot(rod, tmp_path, formats=["csv", "png"])
+    assert tmp_path / "bars.png" in written
+    head, columns = table_columns(tmp_path / "bars.csv")
+    assert head[1:] == [
+        f"bar/{name} [{unit}]"
+        for name, unit in [
+            (f"{probe}/{kind}", unit)
+            for probe in ("all three", "front")
+            for kind, unit in (("axial_force", "N"), ("stress", "Pa"))
+        ]
+    ]
+    np.testing.assert_allclose(columns[1], rod.history["bar/all three/axial_force"].mean(axis=1), rtol=1e-12)
+    head, columns = table_columns(tmp_path / "history.csv")
+    of_bar = dict(zip(head, columns, strict=True))["bar/all three/strain[2]"]
+    np.testing.assert_array_equal(of_bar, rod.history["bar/all three/strain"][:, 2])
+
+
+def test_bars_of_a_probe_by_number_mean_and_extremes(rod):
+    forces = rod.history["bar/all three/axial_force"]
+    for part, expected in (("[1]", forces[:, 1]), (".min", forces.min(axis=1)), (".max", forces.max(axis=1))):
+        np.testing.assert_array_equal(select(rod.history, f"bar/all three/axial_force{part}").values, expected)
+    table = rod.table(["-bar/all three/axial_force.min / 2", "bar/front"])
+    assert list(table) == [
+        *("step", "time", "(-bar/all three/axial_force.min / 2)"),
+        *(f"bar/front/{name}[0]" for name in ("axial_force", "strain", "stress")),
+    ]
+    np.testing.assert_allclose(table["(-bar/all three/axial_force.min / 2)"], -forces.min(axis=1) / 2.0, rtol=1e-15)
+
+
+def test_labels_name_the_results(tmp_path, result):
+    other = SyntheticResult(tmp_path / "other" / "result.vtkhdf", *ring())
+    long = "a label that says at length in how many steps, and with which law, this was computed"
+    chart = draw_curves([result, other], [("kinetic_energy", None)], labels=[long, "short"])
+    texts = [text.get_text() for text in chart.axes[0].get_legend().get_texts()]
+    assert [" ".join(text.split()) for text in texts[:2]] == [long, "short"]
+    assert max(len(line) for line in texts[0].split("\n")) <= 40
+    with pytest.raises(InputError, match="2 results need as many different labels"):
+        plot([result, other], tmp_path, labels=["one"])
+    with pytest.raises(InputError, match="2 results need as many different labels"):
+        plot([result, other], tmp_path, labels=["one", "one"])
+
+
+def test_no_text_of_many_results_overlaps_another(tmp_path, result):
+    others = [SyntheticResult(tmp_path / str(k) / "result.vtkhdf", *ring()) for k in range(11)]
+    labels = [f"result {k} of a study of many parameters, of which this is number {k}" for k in range(12)]
+    with rc_context(STYLE):
+        chart = draw_curves([result, *others], [("kinetic_energy", None), ("momentum.x", None)], labels=labels)
+        chart.figure.draw_without_rendering()
+    for axes in chart.axes:
+        boxes = [text.get_window_extent() for text in axes.get_legend().get_texts()]
+        assert len(boxes) == 12
+        assert all(one.y0 >= other.y1 for one, other in zip(boxes, boxes[1:], strict=False))
+    legends = [axes.get_legend().get_window_extent() for axes in chart.axes]
+    assert legends[0].y0 > legends[1].y1 and legends[0].x1 <= chart.figure.bbox.x1
+    styles = {(line.get_color(), str(line.get_linestyle()), line.get_marker()) for line in chart.axes[0].get_lines()}
+    assert len(styles) == 12
+
+
+def test_an_expression_that_begins_with_a_minus_is_no_option(tmp_path, rod, capsys):
+    words = ["plot", str(rod.path.parent), "-o", str(tmp_path), "--format", "csv"]
+    assert main([*words, "--curves", "-wall/wall/force.x/1.2e-3", "-kinetic_energy", "-(time - 1)"]) == 0
+    head, columns = table_columns(tmp_path / "curves.csv")
+    assert "-wall/wall/force.x/1.2e-3" in head and "-kinetic_energy [J]" in head and "-(time - 1) [s]" in head
+    np.testing.assert_allclose(columns[head.index("-(time - 1) [s]")], 1.0 - rod.history["time"], rtol=1e-12)
+    assert main([*words, "--curves", "time", "--against", "-wall/wall/force.x"]) == 0
+    assert table_columns(tmp_path / "curves_2.csv")[0] == ["-wall/wall/force.x [N]", "time [s]"]
+    assert main([*words, "--curves", "time", "-x"]) == 2
+    assert "unrecognized arguments: -x" in capsys.readouterr().err
+
+
+def test_what_is_zero_throughout_divides_nothing(tmp_path, rod):
+    with pytest.raises(InputError, match="momentum.x / broken_bars: is a number in no row, as it divides by zero"):
+        plot(rod, tmp_path, curves=["momentum.x / broken_bars"])

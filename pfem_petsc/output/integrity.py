@@ -24,6 +24,7 @@ from ..errors import InputError
 from ..mechanics.compiled import kernel
 from .hdf5 import dataset_names
 from .layout import (
+    BARS,
     CHECKS,
     EVENT,
     MODE_VALUES,
@@ -33,6 +34,7 @@ from .layout import (
     complete_modes,
     complete_rows,
     complete_snapshots,
+    constants,
     field_datasets,
     mesh_sizes,
     row_type,
@@ -239,6 +241,9 @@ def damages(file: h5py.File, deep: bool = True) -> Iterator[str]:
     vtk, steps, checks = file["VTKHDF"], file["VTKHDF/Steps"], file[CHECKS]
     n_nodes, n_bars = mesh_sizes(file)
     yield from _mesh_damages(vtk, int(checks["mesh"][0]), n_bars)
+    found = sum(seeded(name, stored_sum(file[BARS][name], 0, n_bars)) for name in constants(file)) & _WORD
+    if BARS in checks and found != int(checks[BARS][0]):
+        yield "what bars have in all snapshots does not match its checksum"
     n = complete_snapshots(file)
     expected = {"PointOffsets": n_nodes, "CellDataRows": n_bars}
     for name in PER_STEP:

@@ -20,8 +20,9 @@ from .units import field_unit, unit_of
 
 LONGEST_ATTRIBUTE = 1 << 15
 """HDF5 1.10 limits an attribute, including its metadata, to 64 KiB."""
-CHECKS, EVENT, MODES = "checks", "event", "modes"
-"""Groups of checksums, of the table of events (what happened between recorded steps), and of modes."""
+CHECKS, EVENT, MODES, BARS = "checks", "event", "modes", "bars"
+"""Groups of checksums, of the table of events (what happened between recorded steps), of modes, and of what bars have
+in all snapshots."""
 MODE_VALUES = {"vibration": ("frequency", "Hz"), "buckling": ("load_factor", "")}
 """Name and unit of the numbers of each kind of modes."""
 VTK_LINE = 3
@@ -30,6 +31,14 @@ ROWS_PER_CHUNK, CHUNK_BYTES = 512, 1 << 16
 """Of a table: few, so that a short run has a small file (the first row allocates a whole chunk)."""
 PER_STEP = ("PointOffsets", "CellDataRows", "CellOffsets", "ConnectivityIdOffsets", "PartOffsets", "NumberOfParts")
 """Entries of a snapshot in /VTKHDF/Steps besides its time."""
+
+
+class Constant(NamedTuple):
+    """What a bar has in all snapshots: values (local bars,), their SI unit, and the names that numbers stand for."""
+
+    values: np.ndarray
+    unit: str = ""
+    names: Sequence[str] = ()
 
 
 class Contents(NamedTuple):
@@ -46,6 +55,7 @@ class Contents(NamedTuple):
     precision : of the fields, "float64" or "float32"; points are always float64, because strains from positions in
         single precision are noise
     compressed : whether points and fields are compressed without loss; a file that is continued keeps what it has
+    constants : what bars have in all snapshots, by name; a file that is continued keeps what it has
     """
 
     point_fields: Sequence[str]
@@ -57,6 +67,7 @@ class Contents(NamedTuple):
     modes: str | None = None
     precision: str = "float64"
     compressed: bool = False
+    constants: Mapping[str, Constant] = {}
 
     @property
     def fields(self) -> dict[str, list[str]]:
@@ -161,11 +172,20 @@ def create_result(file: h5py.File, n_nodes: int, n_bars: int, contents: Contents
     for group in ("PointData", "CellData"):
         vtk.create_group(group)
         steps.create_group(group + "Offsets")
+    for name, constant in contents.constants.items():
+        # the fields of VTK, and a group of their own, which tells them from those of snapshots
+        data = file.create_dataset(f"{BARS}/{name}", shape=(n_bars,), dtype=constant.values.dtype)
+        set_unit(data, constant.unit)
+        if constant.names:
+            data.attrs["names"] = list(constant.names)
+        vtk["CellData"][name] = data
+        steps["CellDataOffsets"][name] = steps["PartOffsets"]  # zero in all steps
     snapshots = file.create_group("snapshots")
     create_growing(snapshots, "step", (), np.int64, STEPS_PER_CHUNK)
     create_growing(snapshots, "time", (), np.float64, STEPS_PER_CHUNK)
     checks = file.create_group(CHECKS)
-    checks.create_dataset("mesh", data=np.zeros(1, dtype=np.uint64))
+    for name in ("mesh", *([BARS] if contents.constants else [])):
+        checks.create_dataset(name, data=np.zeros(1, dtype=np.uint64))
     _create_table(file, "history", contents.columns)
     if contents.events:
         _create_table(file, EVENT, contents.events)
@@ -229,10 +249,21 @@ def create_snapshot_checks(file: h5py.File) -> h5py.Dataset:
     )
 
 
+def field_names(vtk: h5py.Group, kind: str) -> list[str]:
+    """Return the sorted names of the fields of snapshots, ``kind`` "PointData" or "CellData"."""
+    return sorted(set(vtk[kind]) - (set(constants(vtk.file)) if kind == "CellData" else set()))
+
+
+def constants(file: h5py.File) -> list[str]:
+    """Return the sorted names of what bars have in all snapshots."""
+    return sorted(file[BARS]) if BARS in file else []
+
+
 def field_datasets(vtk: h5py.Group) -> dict[str, h5py.Dataset]:
     """Return the datasets of points and fields: {"Points": …, "PointData/velocity": …, "CellData/stress": …}."""
     kinds = "PointData", "CellData"
-    return {"Points": vtk["Points"]} | {f"{kind}/{name}": data for kind in kinds for name, data in vtk[kind].items()}
+    found = {f"{kind}/{name}": vtk[kind][name] for kind in kinds for name in field_names(vtk, kind)}
+    return {"Points": vtk["Points"]} | found
 
 
 def row_type(dataset: h5py.Dataset) -> np.dtype:

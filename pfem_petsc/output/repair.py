@@ -15,17 +15,21 @@ from ..errors import InputError
 from .hdf5 import create_checked, dataset_names, fsync_all, is_compressed, write_rows
 from .integrity import examine
 from .layout import (
+    BARS,
     CHECKS,
     EVENT,
     PER_STEP,
+    Constant,
     Contents,
     Kept,
     complete_rows,
     complete_snapshots,
+    constants,
     create_field,
     create_result,
     create_snapshot_checks,
     field_datasets,
+    field_names,
     mesh_sizes,
     prepare_modes,
     read_attributes,
@@ -67,9 +71,9 @@ def repair(path: Path | str, kept: Kept | None = None) -> tuple[int, int]:
         if n_snapshots == 0:
             # The first snapshot creates the fields, possibly not all of them.
             file[CHECKS].pop("snapshots", None)
-            for group in (vtk["PointData"], vtk["CellData"], steps["PointDataOffsets"], steps["CellDataOffsets"]):
-                for name in list(group):
-                    del group[name]
+            for kind in ("PointData", "CellData"):
+                for name in field_names(vtk, kind):
+                    del vtk[kind][name], steps[f"{kind}Offsets"][name]
         for name, n in _extents(file, counts).items():
             file[name].resize(n, axis=0)
     fsync_all(path)
@@ -157,9 +161,9 @@ def _check_same(file: h5py.File, path: Path, n_snapshots: int, sizes: tuple[int,
             "written with another mesh; restart the case it belongs to, or write elsewhere (-o)"
         )
     for kind, names in contents.fields.items():
-        if n_snapshots and sorted(vtk[kind]) != names:
+        if n_snapshots and field_names(vtk, kind) != names:
             raise InputError(
-                f"{path}: has the fields {', '.join(sorted(vtk[kind])) or 'none'} ({kind}), the case requests "
+                f"{path}: has the fields {', '.join(field_names(vtk, kind)) or 'none'} ({kind}), the case requests "
                 f"{', '.join(names) or 'none'}: keep [output] fields unchanged, or write elsewhere (-o)"
             )
     found = {name: file["history"][name].shape[1:] for name in dataset_names(file["history"])}
@@ -183,7 +187,12 @@ def _rebuild(target: h5py.File, source: h5py.File, counts: tuple[int, int, int],
     columns = {name: row_type(history[name]) for name in dataset_names(history)}
     events = {name: dataset.dtype for name, dataset in source[EVENT].items()} if EVENT in source else {}
     compressed = is_compressed(vtk["Points"])
-    create_result(target, n_nodes, n_bars, contents._replace(columns=columns, events=events, compressed=compressed))
+    kept = {name: source[BARS][name] for name in constants(source)}
+    has = {}
+    for name, data in kept.items():
+        has[name] = Constant(data[:0], data.attrs["unit"].decode(), list(data.attrs.get("names", ())))
+    of_file = {"columns": columns, "events": events, "compressed": compressed, "constants": has}
+    create_result(target, n_nodes, n_bars, contents._replace(**of_file))
     if counts[0]:
         for name, dataset in field_datasets(vtk).items():
             kind, _, field = name.partition("/")
@@ -191,6 +200,7 @@ def _rebuild(target: h5py.File, source: h5py.File, counts: tuple[int, int, int],
                 create_field(target["VTKHDF"], kind, field, dataset.shape[1:], dataset.dtype)
         create_snapshot_checks(target)
     rows = {"VTKHDF/Connectivity": 2 * n_bars, "VTKHDF/Offsets": n_bars + 1, f"{CHECKS}/mesh": 1}
+    rows |= {f"{BARS}/{name}": n_bars for name in kept} | ({f"{CHECKS}/{BARS}": 1} if kept else {})
     rows |= _extents(target, counts)
     for name, n in rows.items():
         old, new = source[name], target[name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import time
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -16,6 +17,7 @@ from ..errors import InputError
 from ..registry import nearest
 from .hdf5 import HDF5_ERRORS, dataset_names, first_line
 from .layout import (
+    BARS,
     EVENT,
     MODE_VALUES,
     MODES,
@@ -23,12 +25,14 @@ from .layout import (
     complete_modes,
     complete_rows,
     complete_snapshots,
+    constants,
+    field_names,
     mesh_sizes,
     read_attributes,
 )
 from .selected import select
 from .table import Table, flat_columns
-from .units import AXES, LOAD_FACTOR, TIME, Axis
+from .units import AXES, LOAD_FACTOR, TIME, Axis, engineering
 
 if TYPE_CHECKING:
     import pyvista
@@ -172,6 +176,8 @@ class Result:
         Numbers of the time steps.
     n_nodes, n_bars : int
     point_fields, cell_fields : list of str
+    bar_data : list of str
+        Names of what bars have in all snapshots: ``section``, ``material``, ``area``, ``group:NAME``.
     case_text : str
         The resolved case.
     attributes : dict
@@ -195,7 +201,8 @@ class Result:
         self.times: np.ndarray = file["snapshots/time"][:n]
         self.steps: np.ndarray = file["snapshots/step"][:n]
         self.n_nodes, self.n_bars = mesh_sizes(file)
-        self.point_fields, self.cell_fields = sorted(vtk["PointData"]), sorted(vtk["CellData"])
+        self.point_fields, self.cell_fields = field_names(vtk, "PointData"), field_names(vtk, "CellData")
+        self.bar_data = constants(file)
         self.case_text: str = file["case/text"][()].decode()
         # a mesh of arrays makes a long text, which is not parsed without need
         staged = any(f"[[{key}]]" in self.case_text for key in ("stage", "load_case"))
@@ -211,6 +218,56 @@ class Result:
             self._columns += [f"{EVENT}/{name}" for name in dataset_names(file[EVENT])]
         self.n_modes = complete_modes(file)
         self._names = sorted(file[MODES]) if self.n_modes else []
+
+    def summary(self) -> dict[str, str]:
+        """Return what matters of the run, as texts by name: file, mesh, end, snapshots, energies, largest forces."""
+        history, n = self.history, self._n_rows
+        rows = {"file": str(self.path), "mesh": f"{self.n_nodes:,} nodes, {self.n_bars:,} bars"}
+        if n:
+            last, steps = int(history["step"][-1]), self.attributes.get("steps")
+            rows["end"] = f"step {last:,}, {self.place(float(history['time'][-1]))}"
+            if self._static_stages:
+                rows["end"] += f", stage {int(history['stage'][-1]) + 1} of {len(self._static_stages)}"
+            elif steps is not None and self.axis is TIME:
+                rows["end"] += ", which is the end of the run" if last >= steps else f", of {int(steps):,} steps"
+        rows["snapshots"] = f"{len(self.times)}"
+        names = [name for name in ("kinetic_energy", "elastic_energy", "plastic_dissipation") if name in history]
+        for name in (*names, "external_work") if n else ():
+            values = history[name]
+            if np.any(values):
+                most = engineering(float(values[np.argmax(np.abs(values))]), "J")
+                rows[name.replace("_", " ")] = f"{engineering(float(values[-1]), 'J')} at the end, largest {most}"
+        if n and "energy_imbalance" in history:
+            rows["energy imbalance"] = engineering(float(np.abs(history["energy_imbalance"]).max()), "J")
+        for name in (*(name for name in history if name.startswith("wall/")), "support_force") if n else ():
+            if name.endswith("force") and np.any(history[name]):
+                force, time, _ = peak_force(self, name)
+                rows[f"largest {name}"] = f"{engineering(force, 'N')} at {self.place(time)}"
+        if n and history["broken_bars"][-1]:
+            rows["broken bars"] = f"{int(history['broken_bars'][-1]):,} of {self.n_bars:,}"
+        return rows
+
+    def __str__(self) -> str:
+        rows = self.summary()
+        width = max(map(len, rows))
+        return "\n".join([self._title, *(f"  {name:{width}}  {text}" for name, text in rows.items())])
+
+    def _repr_html_(self) -> str:
+        texts = [[html.escape(text) for text in row] for row in self.summary().items()]
+        rows = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in texts)
+        return f"<table><caption>{html.escape(self._title)}</caption><tbody>{rows}</tbody></table>"
+
+    @property
+    def _title(self) -> str:
+        return self.case.title or self.case.name
+
+    def bar_table(self, i: int = -1) -> Table:
+        """Return the bars at snapshot i (-1: the last) as a table: number, ends, section, material, area, groups, and
+        all fields of bars."""
+        ends = self.bars
+        columns = {"bar": np.arange(self.n_bars), "node1": ends[:, 0], "node2": ends[:, 1]}
+        names = sorted(self.bar_data, key=lambda name: (name.startswith("group:"), name == "area"))
+        return Table(columns | {name: self.field(name, i) for name in (*names, *self.cell_fields)})
 
     @property
     def axis(self) -> Axis:
@@ -287,8 +344,11 @@ class Result:
         """Return the positions at snapshot i (-1: the last), (nodes, 3) float64 [m]."""
         return self._snapshot("VTKHDF/Points", i, self.n_nodes)
 
-    def field(self, name: str, i: int) -> np.ndarray:
+    def field(self, name: str, i: int = -1) -> np.ndarray:
         """Return a field at snapshot i (-1: the last), (nodes, 3), (nodes,) or (bars,), in SI units.
+
+        What bars have in all snapshots is a field too: the names of their ``section`` and ``material``, their ``area``
+        [m2], and whether they are in ``group:NAME``.
 
         Raises
         ------
@@ -299,19 +359,29 @@ class Result:
             return self._snapshot(f"VTKHDF/PointData/{name}", i, self.n_nodes)
         if name in self.cell_fields:
             return self._snapshot(f"VTKHDF/CellData/{name}", i, self.n_bars)
-        known = self.point_fields + self.cell_fields
+        if name in self.bar_data:
+            values, names = self._patiently(lambda file: (file[BARS][name][:], file[BARS][name].attrs.get("names")))
+            if name.startswith("group:"):
+                return values.astype(bool)
+            return values if names is None else names.astype(str)[values]
+        known = self.point_fields + self.cell_fields + self.bar_data
         raise InputError(f"{self.path}: has no field {name!r}{nearest(name, known)}")
 
     def mesh(self, i: int) -> pyvista.UnstructuredGrid:
-        """Return snapshot i (-1: the last) as a pyvista grid of lines with all its fields."""
+        """Return snapshot i (-1: the last) as a pyvista grid of lines with all its fields, as readers of VTK see them:
+        ``section`` and ``material`` are numbers, whose names are in ``field_data["section_names"]``."""
         from ..formats.vtk import grid_of
         from ..mesh.whole import WholeMesh
 
         fields = {name: self.field(name, i) for name in self.cell_fields}
+        fields |= {name: self.read(f"{BARS}/{name}", slice(None)) for name in self.bar_data}
         grid = grid_of(WholeMesh(self.positions(i), self.bars, bar_fields=fields))
         for name in self.point_fields:
             grid.point_data[name] = self.field(name, i)
         grid.field_data["TimeValue"] = [self.times[i]]
+        for name in {"section", "material"} & {*self.bar_data}:
+            names = self._patiently(lambda file, name=name: file[BARS][name].attrs["names"])
+            grid.field_data[f"{name}_names"] = names.astype(str)
         return grid
 
     grid = mesh
@@ -333,8 +403,8 @@ class Result:
             If there is no such column.
         """
         known = [name for name in self._columns if not name.startswith(f"{EVENT}/")]
-        chosen = known if names is None else [name for name in ("step", "time") if name in known]
-        for name in () if names is None else names:
+        chosen = [name for name in ("step", "time") if name in known]
+        for name in known if names is None else names:
             found = [column for column in known if column == name or column.startswith(f"{name}/")]
             chosen += [column for column in found or [name] if column not in chosen]
         columns: dict[str, np.ndarray] = {}

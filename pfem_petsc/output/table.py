@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["SWEEP", "Table", "flat_columns", "varied"]
 
 _SHOWN = 10  # rows shown at the beginning and at the end of a long table
+_COLUMNS = 12  # columns shown of a wide one
 
 
 class Table(Mapping[str, np.ndarray]):
@@ -126,17 +127,21 @@ class Table(Mapping[str, np.ndarray]):
                 Path(path).write_text(text, encoding="utf-8")
         return text
 
-    def _texts(self) -> list[list[str]]:
-        """The heading and the shown rows as texts."""
-        shown = list(range(self.n_rows))
+    def _texts(self) -> tuple[list[list[str]], str]:
+        """The heading and the shown rows as texts, and what is left out of a wide table: columns of zeros first."""
+        shown, names = list(range(self.n_rows)), list(self)
         if self.n_rows > 2 * _SHOWN:
             shown = [*shown[:_SHOWN], -1, *shown[-_SHOWN:]]
-        lines = [list(self)]
-        lines += [["…"] * len(self) if i < 0 else [_text(values[i]) for values in self.values()] for i in shown]
-        return lines
+        if len(names) > _COLUMNS:
+            names = [name for name in names if self[name].dtype.kind in "OU" or np.any(self[name])][:_COLUMNS]
+        lines = [names]
+        lines += [["…"] * len(names) if i < 0 else [_text(self[name][i]) for name in names] for i in shown]
+        left = [name for name in self if name not in names]
+        return lines, f"and {len(left)} more columns: {', '.join(left[:3])}, ..." if left else ""
 
     def __str__(self) -> str:
-        return self._aligned(self._texts())
+        lines, more = self._texts()
+        return f"{self._aligned(lines)}\n{more}".rstrip()
 
     def text(self, most: int | None = None) -> str:
         """Return all rows, or the first ones, as text in columns."""
@@ -144,17 +149,18 @@ class Table(Mapping[str, np.ndarray]):
         return self._aligned([list(self), *([_text(value) for value in row] for row in rows)])
 
     def _aligned(self, lines: Sequence[Sequence[str]]) -> str:
-        widths = [max(len(line[k]) for line in lines) for k in range(len(self))]
+        widths = [max(len(line[k]) for line in lines) for k in range(len(lines[0]))]
         return "\n".join("  ".join(f"{text:>{w}}" for text, w in zip(line, widths, strict=True)) for line in lines)
 
     def __repr__(self) -> str:
         return f"<Table of {self.n_rows} rows: {', '.join(self)}>"
 
     def _repr_html_(self) -> str:
-        head, *body = self._texts()
+        (head, *body), more = self._texts()
         rows = "".join(f"<tr>{''.join(f'<td>{html.escape(text)}</td>' for text in line)}</tr>" for line in body)
         heading = "".join(f"<th>{html.escape(text)}</th>" for text in head)
-        return f"<table><thead><tr>{heading}</tr></thead><tbody>{rows}</tbody></table><p>{self.n_rows} rows</p>"
+        below = f"{self.n_rows} rows. {more}".rstrip(" .")
+        return f"<table><thead><tr>{heading}</tr></thead><tbody>{rows}</tbody></table><p>{below}</p>"
 
 
 def flat_columns(name: str, values: np.ndarray, vector: bool) -> dict[str, np.ndarray]:

@@ -17,14 +17,16 @@ from ..errors import InputError, PfemError, SimulationFailure
 from ..parallel.agreement import on_root
 from ..parallel.heap import SharedArrays
 from .hdf5 import Growing, SharedFile, create_new, require_parallel_hdf5, require_room, write_rows, writing
-from .integrity import RowDigests, mark_digest, numbers_digest, snapshot_digests, summed, word_sum
+from .integrity import RowDigests, mark_digest, numbers_digest, seeded, snapshot_digests, summed, word_sum
 from .layout import (
+    BARS,
     CHECKS,
     CHUNK_BYTES,
     EVENT,
     MODE_VALUES,
     MODES,
     PER_STEP,
+    Constant,
     Contents,
     Kept,
     create_field,
@@ -46,6 +48,24 @@ _PIECE = 2**18  # number of bars whose connectivity is written at once on one ra
 _BUFFER_ROWS, _BUFFER_BYTES = 1024, 1 << 24
 # bytes of a snapshot from which it is written beside the steps: less takes as long as handing it to a thread
 _BESIDE = 1 << 18
+
+
+def _write_constants(shared: SharedFile, mesh: DistributedMesh, constants: Mapping[str, Constant]) -> None:
+    """Write what bars have in all snapshots, and its digest. Collective."""
+    order, file, total = mesh.bar_order, shared.file, 0
+    for name, constant in sorted(constants.items()):
+        slab = np.ascontiguousarray(order.to_slab(constant.values[mesh.counted]))
+        total += seeded(name, word_sum(slab, order.first))
+        shared.write(Growing(file[BARS][name]) if file else None, order.first, slab)
+    digest = summed(shared.comm, [total])
+
+    def finish() -> None:
+        with shared.writing():
+            if shared.comm.rank == 0:
+                write_rows(file[CHECKS][BARS], 0, digest)
+            file.flush()
+
+    shared.call(finish)
 
 
 def _write_connectivity(shared: SharedFile, mesh: DistributedMesh) -> None:
@@ -298,9 +318,10 @@ class ResultWriter:
     """Writes snapshots and history of a run to one file, the same for any number of ranks.
 
     ``/VTKHDF`` is a temporal UnstructuredGrid of lines in mesh numbering: the connectivity once, and points (the
-    current positions) and fields for each snapshot. A kill may occur at any time, even within a flush, whose order of
-    writes is undefined. Therefore the data and offsets of a snapshot are flushed before it is counted, and its count is
-    flushed before its time is written: VTK cannot read a step without data, and crashes on more times than steps.
+    current positions) and fields for each snapshot. What bars have in all snapshots is there once, and in ``/bars``. A
+    kill may occur at any time, even within a flush, whose order of writes is undefined. Therefore the data and offsets
+    of a snapshot are flushed before it is counted, and its count is flushed before its time is written: VTK cannot read
+    a step without data, and crashes on more times than steps.
     ``/history`` has one row per recorded step, ``/event`` one per event of analyses with events, ``/case`` the data
     needed to run the case again, ``/snapshots`` step and time of each snapshot.
 
@@ -353,6 +374,8 @@ class ResultWriter:
         if kept is None:
             with self._whole_or_failed():
                 _write_connectivity(self._shared, mesh)
+                if contents.constants:
+                    _write_constants(self._shared, mesh, contents.constants)
 
     @property
     def n_snapshots(self) -> int:

@@ -15,9 +15,11 @@ from ..columns import Row, declared
 from ..errors import EarlyStop, SimulationFailure, printable
 from ..fields import Fields
 from ..mechanics.compiled import Compilation
+from ..mechanics.springs import with_connectors
+from ..mesh.whole import without_slashes
 from ..output.checkpoint import NAME as CHECKPOINT
 from ..output.checkpoint import ORIGIN, Checkpoint
-from ..output.layout import MODE_VALUES, Contents, Kept
+from ..output.layout import MODE_VALUES, Constant, Contents, Kept
 from ..output.progress import Progress, Span
 from ..output.result import RESULT_NAME
 from ..output.units import MODE, TIME, duration
@@ -178,6 +180,24 @@ def _wave_times(case: Case, model: Model) -> dict[str, float]:
                 shortest = float(bars.mesh_lengths[own][near].min())
                 times.append(shortest * float(np.sqrt(block.density / block.modulus)))
         found[f"wave_time/{column}"] = model.comm.allreduce(min(times), op=MPI.MIN)
+    return found
+
+
+def _constants(model: Model) -> dict[str, Constant]:
+    """Return what bars have in all snapshots: section, material, area, and which groups they are in."""
+    bars, case = model.bars, with_connectors(model.case)
+    sections, materials = list(case.section), list(case.material)
+    section = bars.of_blocks(lambda block: sections.index(block.section)).astype(np.int32)
+    material = bars.of_blocks(lambda block: materials.index(case.section[block.section].material)).astype(np.int32)
+    found = {
+        "section": Constant(section, names=sections),
+        "material": Constant(material, names=materials),
+        "area": Constant(bars.of_blocks(lambda block: block.area), "m²"),
+    }
+    for name, members in without_slashes(model.mesh.bar_groups).items():
+        mask = np.zeros(len(section), dtype=np.uint8)
+        mask[members] = 1
+        found[f"group:{name}"] = Constant(mask)
     return found
 
 
@@ -345,6 +365,7 @@ class Outputs:
             case.modes.kind if case.modes is not None else None,
             case.output.precision,
             case.output.compression == "gzip",
+            _constants(model),
         )
 
     def _write_to(self, writer: ResultWriter) -> None:

@@ -107,7 +107,11 @@ class Page:
         for axes in (*tiles, self._triad):
             axes.axis("off")
         for axes, caption in zip(self.tiles, captions, strict=True):
-            axes.set_title(literal(caption), loc="left", color=INK, fontsize=14.5, pad=8.0)
+            text = axes.set_title(literal(caption), loc="left", color=INK, fontsize=14.5, pad=8.0)
+            head, comma, time = caption.rpartition(", ")  # long names of results are cut, and times are not
+            while head and text.get_window_extent().width > self.tile[0] - 12.0 * _unit_of(size):
+                head = head[:-1]
+                text.set_text(literal(f"{head.rstrip()}…{comma}{time}"))
         letters = max(4, int((width / _unit_of(size) - 230) / 10.5))  # space for the time is left empty
         title = heading.title if len(heading.title) <= letters else heading.title[: letters - 1].rstrip() + "…"
         self._write(0.2, high - 0.38, literal(title), fontsize=16, weight="bold")

@@ -7,6 +7,7 @@ import pytest
 from helpers.pictures import table_columns
 from helpers.synthetic import SyntheticResult, ring
 from matplotlib import rc_context
+from matplotlib.text import Text
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
@@ -14,8 +15,10 @@ from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.selected import select
 from pfem_petsc.post.chart import STYLE
+from pfem_petsc.post.colours import ColourScale
 from pfem_petsc.post.curves import draw_curves
 from pfem_petsc.post.filters import window_mean
+from pfem_petsc.post.page import Heading, Page
 from pfem_petsc.post.plot import plot
 
 
@@ -167,3 +170,16 @@ def test_an_expression_that_begins_with_a_minus_is_no_option(tmp_path, rod, caps
 def test_what_is_zero_throughout_divides_nothing(tmp_path, rod):
     with pytest.raises(InputError, match="momentum.x / broken_bars: is a number in no row, as it divides by zero"):
         plot(rod, tmp_path, curves=["momentum.x / broken_bars"])
+
+
+def test_captions_of_drawings_side_by_side_do_not_overlap():
+    """Long names are cut, the times behind them are not."""
+    scale = ColourScale((0.0, 1.0), unit="Pa")
+    captions = [f"{name}, t = {k}.00 s" for name in ("short", "a name that is longer than " * 4) for k in range(3)]
+    page = Page((1280, 720), Heading("title", "stress", scale), captions, 3)
+    texts = [tile.get_title(loc="left") for tile in page.tiles]
+    assert texts[:3] == captions[:3]
+    assert all(text.startswith("a name") and text.endswith(f"…, t = {k}.00 s") for k, text in enumerate(texts[3:]))
+    for tile in page.tiles:
+        found = [child for child in tile.get_children() if isinstance(child, Text) and child.get_text()]
+        assert found[0].get_window_extent().x1 <= tile.get_window_extent().x1

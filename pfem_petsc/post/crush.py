@@ -258,20 +258,29 @@ def draw_crush(test: CrushTest, file: Path | str, title: str = "") -> Path:
     InputError
         If the file cannot be written.
     """
-    from .chart import Chart, Curve, Panel, distinct
+    from matplotlib import rc_context
+
+    from .chart import STYLE, Chart, Curve, Panel, largest
 
     file = Path(file)
     over = ("strain", "")
     figures = {row["figure"]: row["value"] for row in test.figures().rows}
     plateau, (first, last) = figures["plateau stress (20 to 40 %)"], _PLATEAU
-    curves = [Curve("stress", test.stress, distinct(0), place=test.strain)]
+    curves = [Curve("stress", test.stress, place=test.strain)]
     if np.isfinite(plateau):
-        level = np.full(2, plateau)
-        curves.append(Curve("plateau", level, distinct(1), place=np.array([first, last])))
+        curves.append(Curve("plateau", np.full(2, plateau), place=np.array([first, last])))
+    energy, efficiency = (
+        [Curve(name, values, place=test.strain)]
+        for name, values in (("energy", test.energy), ("efficiency", test.efficiency))
+    )
     panels = [
         Panel("stress", "Pa", curves, over=over),
-        Panel("energy by volume", "J/m³", [Curve("energy", test.energy, distinct(0), place=test.strain)], over=over),
-        Panel("efficiency", "", [Curve("efficiency", test.efficiency, distinct(0), place=test.strain)], over=over),
+        Panel("energy by volume", "J/m³", energy, over=over, scale=(1e-6, "MJ/m³"), legend=False),
+        Panel("efficiency", "", efficiency, over=over, legend=False),
     ]
-    made = Chart(panels, title or "Crush test", test.strain).save(file.with_suffix(""), (file.suffix[1:] or "png",))
-    return made[0]
+    with rc_context(STYLE):
+        chart = Chart(panels, title or "Crush test", test.strain)
+        for axes, panel in zip(chart.axes, panels, strict=True):
+            if min(curve.values.min() for curve in panel.curves) >= 0.0 < largest(panel.curves[0].values):
+                axes.set_ylim(bottom=0.0)
+        return chart.save(file.with_suffix(""), (file.suffix[1:] or "png",))[0]

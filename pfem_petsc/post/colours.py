@@ -11,11 +11,11 @@ from ..errors import InputError
 from ..output.units import field_unit, prefix_for
 from ..registry import nearest
 
-# Middle and start are a dark grey, so that bars at rest stand out from a white page as well as strained ones.
-DIVERGING = ("#16b1f3", "#1f74d4", "#535b68", "#d2402f", "#fb8a1e")
-SEQUENTIAL = ("#535b68", "#6b429f", "#b5307c", "#ea5a3d", "#f9a11b")
+# Zero is a light grey, so that bars without a force recede, and the lightness falls with the magnitude on both sides.
+DIVERGING = ("#0a3580", "#1f63b8", "#5f9bd1", "#b6bbc3", "#e8825a", "#c8312e", "#84101f")
+SEQUENTIAL = ("#b6bbc3", "#eda540", "#dd5a3a", "#a3216b", "#3f0f5c")
 
-GHOST = (168, 176, 188)
+GHOST = (208, 214, 222)
 TRAILS = ((0, 158, 115), (204, 121, 167), (86, 180, 233), (230, 159, 0))
 """Told apart with any colour vision (Okabe and Ito 2008)."""
 
@@ -148,7 +148,10 @@ class ColourScale:
         if not (np.isfinite(low) and np.isfinite(high) and low < high):
             raise InputError(f"render: colour limits {low:g}, {high:g} must be two finite, increasing numbers")
         if cmap is None:
-            cmap = LinearSegmentedColormap.from_list("bars", DIVERGING if low < 0 < high else SEQUENTIAL)
+            cmap = LinearSegmentedColormap.from_list("bars", DIVERGING if low < 0.0 else SEQUENTIAL)
+            if low < 0.0:  # the part with zero at the grey, and equal magnitudes equally dark
+                shares = 0.5 + 0.5 * np.linspace(low, high, 257) / max(-low, abs(high))
+                cmap = LinearSegmentedColormap.from_list("bars", cmap(shares))
         elif isinstance(cmap, str):
             if cmap not in matplotlib.colormaps:
                 raise InputError(f"render: unknown colour map '{cmap}'{nearest(cmap, list(matplotlib.colormaps))}")

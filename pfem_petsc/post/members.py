@@ -103,7 +103,7 @@ def truss_of(result: Any) -> Truss:
     stages = result.case.stages
     model = Model(stages[0], MPI.COMM_SELF, later=stages[1:])
     mesh, case, n = model.mesh, model.case, len(result.bars)
-    _check_mesh(result, mesh)
+    check_mesh(result, mesh)
     sections = list(case.section)
     values = {name: np.full(n, np.nan) for name in Bars._fields}
     values["section"] = np.full(n, -1)
@@ -130,7 +130,7 @@ def truss_of(result: Any) -> Truss:
     return Truss(Bars(**values), mesh.node_ids[nodes], sections)
 
 
-def _check_mesh(result: Any, mesh: Any) -> None:
+def check_mesh(result: Any, mesh: Any) -> None:
     """Refuse a mesh that is not the one of a result.
 
     Raises

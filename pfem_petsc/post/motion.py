@@ -15,8 +15,9 @@ from ..contact.walls.base import WALLS, Surface, perpendicular, slab
 from ..errors import InputError
 from ..fields import STATUS
 from ..mechanics.bars import bar_shapes, mesh_of_cases, section_of_bars
-from ..output.units import MODE, Axis
+from ..output.units import MODE, POINT, Axis
 from ..registry import choices, lookup, nearest
+from .actions import Actions
 from .camera import Camera
 from .colours import GHOST, MARKS, TRAILS
 from .scene import Layer, Scene
@@ -80,10 +81,18 @@ class Motion:
         if options.ghost:
             low, high = np.fmin(low, self.start.min(axis=0)), np.fmax(high, self.start.max(axis=0))
         self.bounds = np.array([low, high])
+        self.actions = Actions(result, options.show, self.times, self.bounds) if options.show else None
+        if self.actions is not None:
+            for k, frame in enumerate(self.frames):
+                ends = self.actions.arrows(k, self.positions(frame)).reshape(-1, 3)
+                self.hulls[k] = np.concatenate([self.hulls[k], ends])
+            self.reach = self.actions.size
         walls = result.case.every_wall
         self.surfaces = self._moved(walls)
         self.normals = [wall.normal / np.linalg.norm(wall.normal) for wall in walls if hasattr(wall, "normal")]
         every = np.asarray(result.times, dtype=float)
+        known = result.axis is POINT and "load_factor" in result.history
+        self._factors = [np.asarray(result.history[name]) for name in ("time", "load_factor")] if known else []
         self.time_factor, self.time_unit = result.axis.scale(float(np.abs(every).max()))
         steps = np.diff(np.unique(self.time_factor * every))
         self._decimals = int(np.clip(np.ceil(0.3 - np.log10(np.median(steps))), 0, 6)) if len(steps) else 2
@@ -139,6 +148,14 @@ class Motion:
             return np.array([0.0, -float(np.sign(pull[1])), 0.0])
         return np.array([0.0, 0.0, 1.0])
 
+    @property
+    def notes(self) -> list[str]:
+        """What is not true to scale, and what acts: for the foot of the picture."""
+        untrue = getattr(self.result, "untrue", None)
+        notes = [untrue(self.scale)] if untrue is not None else []
+        notes += [f"displacements × {self.scale:g}"] if untrue is None and self.scale != 1.0 else []
+        return notes + (self.actions.notes if self.actions is not None else [])
+
     def positions(self, frame: int) -> np.ndarray:
         """Positions (nodes, 3) [m] as drawn."""
         points = np.asarray(self.result.positions(frame), dtype=float)
@@ -165,7 +182,7 @@ class Motion:
         if axis.staged:
             return self.result.place(time)
         if not axis.unit:
-            return axis.place(time)
+            return axis.place(time) + (f", load factor {np.interp(time, *self._factors):.4g}" if self._factors else "")
         return f"{axis.symbol} = {time * self.time_factor:.{self._decimals}f} {self.time_unit}"
 
     def probe(self, name: str) -> np.ndarray:
@@ -201,6 +218,8 @@ class Motion:
             made.append(scene.rim(points, np.flatnonzero(yielded), MARKS["yielded"].colour))
         if "broken" in self._options.marks and gone is not None:
             made.append(self._stubs(points, gone, width))
+        if self.actions is not None:
+            made += self.actions.layers(self.frames.index(frame), points, camera)
         for number, (when, places) in enumerate(self._trails.values()):
             past = max(1, int(np.searchsorted(when, self.result.times[frame], side="right")))
             rows = np.stack([np.arange(past - 1), np.arange(1, past)], axis=1)
@@ -442,6 +461,10 @@ class ModeFrames:
     def field(self, name: str, i: int) -> np.ndarray:
         """The amplitudes (nodes,) of frame i."""
         return self._amplitudes[i // self._period]
+
+    def untrue(self, scale: float) -> str:
+        """What displacements are, as they are no true ones."""
+        return f"largest displacement drawn as {scale * _LARGEST:g} of the extent"
 
     def caption(self, i: int) -> str:
         """The caption of frame i."""

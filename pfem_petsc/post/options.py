@@ -15,6 +15,7 @@ PER = ("member", "bar")
 WINDOW = 0.01
 """Window of strain of a crush test, unless one is given."""
 
+SHOWN = ("supports", "loads")
 STYLES = ("auto", "tubes", "lines")
 VIDEOS = {
     "mp4": ("mp4",),
@@ -121,6 +122,9 @@ class Options:
         metavar="STATE",
         nargs="+",
     )
+    show: Sequence[str] = _option(
+        (), "draw supports (as triangles) or loads (as arrows) or both", metavar="KIND", nargs="+"
+    )
     trails: Sequence[str] = _option((), "draw the trajectories of probes", metavar="PROBE", nargs="+")
     inset: str | None = _option(
         None, "curve of the history with a moving marker, as wall/floor/force.z", metavar="COLUMN"
@@ -161,6 +165,9 @@ class Options:
             )
         if self.style not in STYLES:
             raise InputError(f"render: style = {self.style!r} is not known; it is one of {', '.join(STYLES)}")
+        for kind in self.show:
+            if kind not in SHOWN:
+                raise InputError(f"render: show = {kind!r} is not known; it is one of {', '.join(SHOWN)}")
         for name, (low, high) in _RANGES.items():
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"render: {name} = {getattr(self, name):g} must be from {low:g} to {high:g}")

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import io
-import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -59,6 +58,7 @@ class Heading(NamedTuple):
     title, field : titles
     scale : colours of the field
     marks : what is marked, told below the picture
+    notes : texts below the picture
     transparent : whether the background is
     """
 
@@ -66,6 +66,7 @@ class Heading(NamedTuple):
     field: str
     scale: ColourScale
     marks: Sequence[Mark] = ()
+    notes: Sequence[str] = ()
     transparent: bool = False
 
 
@@ -80,6 +81,7 @@ class Page:
     heading : texts and colours
     captions : above the drawings, one for each; a single drawing has none
     columns : of the drawings
+    room : width and height in pixels of what is free on the right of and below each drawing, for a curve
 
     Attributes
     ----------
@@ -88,7 +90,12 @@ class Page:
     """
 
     def __init__(
-        self, size: tuple[int, int], heading: Heading, captions: Sequence[str] = ("",), columns: int = 1
+        self,
+        size: tuple[int, int],
+        heading: Heading,
+        captions: Sequence[str] = ("",),
+        columns: int = 1,
+        room: tuple[int, int] = (0, 0),
     ) -> None:
         self._figure = figure = _figure(size, 0.0 if heading.transparent else 1.0)
         self._inches, self._channels = figure.dpi_scale_trans, 4 if heading.transparent else 3
@@ -97,9 +104,11 @@ class Page:
         wide, high = figure.get_size_inches()
         left, top, width, height = self.region_of(size)
         strip, rows = self.strip_of(size) if len(captions) > 1 else 0, -(-len(captions) // columns)
-        self.tile = width // columns, height // rows - strip
-        edges = {"left": left / size[0], "bottom": 1.0 - (top + height) / size[1], "top": 1.0 - (top + strip) / size[1]}
-        places = {**edges, "right": (left + width) / size[0], "wspace": 0.0, "hspace": strip / self.tile[1]}
+        self._room, beside, below = room, *room
+        self.tile = width // columns - beside, height // rows - strip - below
+        low, upper = 1.0 - (top + height - below) / size[1], 1.0 - (top + strip) / size[1]
+        edges = {"left": left / size[0], "right": (left + width - beside) / size[0], "bottom": low, "top": upper}
+        places = {**edges, "wspace": beside / self.tile[0], "hspace": (strip + below) / self.tile[1]}
         tiles = figure.subplots(rows, columns, squeeze=False, gridspec_kw=places).ravel()
         self.tiles = tiles[: len(captions)].tolist()
         self._triad = figure.add_axes((1.0 - 1.48 / wide, 0.06 / high, 1.12 / wide, 1.12 / high))
@@ -121,6 +130,7 @@ class Page:
         ]
         place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0 - 1.5 / wide, 0.0)}
         figure.legend(handles=keys, frameon=False, fontsize=11.5, ncols=max(1, len(keys)), **place)
+        self._notes = self._write(0.24, 0.22, literal("   ".join(heading.notes)), va="center_baseline", fontsize=11.5)
         scale = heading.scale
         bar = figure.add_axes((1.0 - 1.16 / wide, 1.6 / high, 0.2 / wide, 1.0 - 2.91 / high))
         figure.colorbar(scale.shown, cax=bar, ticks=MaxNLocator(nbins=7, steps=[1, 2, 2.5, 5, 10]))
@@ -141,7 +151,12 @@ class Page:
         return round(34 * _unit_of(size))
 
     def draw(
-        self, drawings: Sequence[np.ndarray], camera: Camera, time: str = "", moments: Sequence[float] = ()
+        self,
+        drawings: Sequence[np.ndarray],
+        camera: Camera,
+        time: str = "",
+        moments: Sequence[float] = (),
+        acting: Mapping[str, np.ndarray] | None = None,
     ) -> np.ndarray:
         """Return the page (height, width, 3 or 4) uint8 with drawings (h, w, 3 or 4) of the size of a tile.
 
@@ -151,18 +166,21 @@ class Page:
         camera : for the axes
         time : text of the time
         moments : times of the insets [s]
+        acting : directions (3,) of gravity and wind, beside the axes
         """
         for artist in (*self._figure.images, *self._triad.texts):
             artist.remove()
         for axes, drawing in zip(self.tiles, drawings, strict=True):
             self._figure.figimage(drawing, *axes.bbox.min.round(), origin="upper", zorder=-1)
         self._time.set_text(time)
-        arrow = {"arrowstyle": "<|-", "color": PALE, "shrinkA": 0.0, "shrinkB": 0.0}
-        for name, way in sorted(zip("xyz", np.eye(3)), key=lambda axis: float(axis[1] @ camera.towards)):
+        ways = {**dict(zip("xyz", np.eye(3))), **(acting or {})}
+        for name, way in sorted(ways.items(), key=lambda axis: float(axis[1] @ camera.towards)):
+            colour = PALE if name in ("x", "y", "z") else _MARKER
+            arrow = {"arrowstyle": "<|-", "color": colour, "shrinkA": 0.0, "shrinkB": 0.0}
             tip = np.array([way @ camera.right, way @ camera.up])
             length = float(np.linalg.norm(tip))
             if length > 0.05:
-                label = {"color": PALE, "fontsize": 11, "ha": "center", "va": "center"}
+                label = {"color": colour, "fontsize": 11, "ha": "center", "va": "center"}
                 self._triad.annotate(name, (0.0, 0.0), tip * (1.0 + 0.33 / length), arrowprops=arrow, **label)
         for (marker, times, curve), moment in zip(self._insets, moments, strict=False):
             if len(times):
@@ -177,23 +195,24 @@ class Page:
         return self._figure.text(x, y, text, transform=self._inches, **{"color": INK, "fontsize": 14.5, **style})
 
     def add_length_scale(self, camera: Camera) -> None:
-        """Draw a line of 1, 2 or 5 times a power of ten, and its length, for a camera without perspective."""
+        """Draw a line of 1, 2 or 5 times a power of ten, and its length; with perspective, it is that at mid-depth."""
         metres = 2.0 * camera.half_height / self.tile[1]
         length = float(MaxNLocator(9, steps=[1, 2, 5, 10]).tick_values(0.0, metres * self.tile[0])[1])
         end = 0.24 + length / metres / self._figure.dpi
         style = {"color": PALE, "linewidth": 1.0, "marker": "|", "markersize": 8}
         self._figure.add_artist(Line2D([0.24, end], [0.22, 0.22], transform=self._inches, **style))
         factor, name = prefix_for(length, "m")
-        self._write(end + 0.1, 0.22, f"{length * factor:g} {name}", color=PALE, va="center_baseline", fontsize=11.5)
+        text = f"{length * factor:g} {name}" + ("" if camera.parallel else " at mid-depth")
+        self._write(end + 0.1, 0.22, text, color=PALE, va="center_baseline", fontsize=11.5)
+        self._notes.set_x(end + 0.4 + 0.085 * len(text))
 
-    def add_insets(self, results: Sequence[Any], name: str, room: tuple[float, float, float, float]) -> None:
-        """Add to each drawing a curve of the history with a marker, which :meth:`draw` moves.
+    def add_insets(self, results: Sequence[Any], name: str) -> None:
+        """Add a curve of the history to the room of each drawing, with a marker, which :meth:`draw` moves.
 
         Parameters
         ----------
         results : open results, whose curves are all in the range of the axes
         name : of a column, see :func:`history_curve`
-        room : left, bottom, width and height as shares of a drawing
         """
         curves = [(np.asarray(r.history["time"], dtype=float), history_curve(r.history, name)) for r in results]
         chosen = select(results[0].history, name)
@@ -202,9 +221,13 @@ class Page:
         time_factor, time_unit = axis.scale(max(largest(times) for times, _ in curves))
         kind, *parts, last = name.split("/") if "/" in name and chosen.single else ("", name)
         label = (f"{kind} '{'/'.join(parts)}', {last}" if parts else last).replace("_", " ")
-        left, bottom, width, height = room
-        place = left + 0.117 * width, bottom + 0.222 * height, 0.848 * width, 0.634 * height  # labels are around it
-        pixel = width * self.tile[0] / self._figure.dpi / 2.9
+        high = self._room[1] or round(min(0.62 * self._room[0], self.tile[1]))
+        wide = self._room[0] or min(3 * high, self.tile[0])
+        left, bottom = (0.0, -high) if self._room[1] else (self.tile[0], 0.5 * (self.tile[1] - high))
+        pixel = high / self._figure.dpi / 1.8
+        margin = 34.0 * pixel * self._figure.dpi / 100.0, 40.0 * pixel * self._figure.dpi / 100.0  # of labels
+        inside = left + 1.4 * margin[0], bottom + margin[1], wide - 2.0 * margin[0], high - 1.7 * margin[1]
+        place = np.array(inside) / np.tile(self.tile, 2)
         with rc_context({**STYLE, "font.size": 8.0 * pixel, "axes.titlesize": 8.5 * pixel}):
             for tile, (times, values) in zip(self.tiles, curves, strict=True):
                 axes = tile.inset_axes(place)
@@ -233,31 +256,30 @@ def history_curve(history: Any, name: str) -> np.ndarray:
     return found[name] if name in found else column(history, f"({name}).norm")[f"({name}).norm"]
 
 
-def inset_room(drawings: Sequence[np.ndarray], several: bool) -> tuple[float, float, float, float]:
-    """Return left, bottom, width and height of an inset that covers least of what is drawn, as shares of a drawing.
+def inset_room(tile: tuple[int, int], aspect: float, least: int) -> tuple[int, int]:
+    """Return the width or the height of a strip for a curve, beside or below a drawing: what leaves more for the truss.
 
     Parameters
     ----------
-    drawings : some frames of the film
-    several : whether there are several results
+    tile : width and height of the drawing and the strip in pixels
+    aspect : width of the truss over its height
+    least : width of a legible curve
 
     Raises
     ------
     InputError
-        If the frames are too narrow.
+        If the drawings are too small.
     """
-    least, (height, width) = 220, drawings[0].shape[:2]
-    if several and width < least:
+    (width, height), lowest = tile, round(0.6 * least)
+    beside, below = max(least, round(0.27 * width)), max(lowest, round(0.3 * height))
+    if width < least or height < 2 * lowest:
         raise InputError(
-            f"render: inset needs tiles of {least} pixels or more, and these have {width}: give a larger size, or "
-            "fewer results"
+            f"render: inset needs tiles of {least} x {2 * lowest} pixels or more, and these have {width} x {height}: "
+            "give a larger size, or fewer results"
         )
-    ink = np.mean([(each != each[0, 0]).any(axis=2) for each in drawings], axis=0)
-    wide = round(max(0.27 * width, min((0.5 if several else 1.0) * width, least)))
-    high = round(0.62 * wide)
-    corners = itertools.product((0, width - wide), (0, height - high))
-    x, y = min(corners, key=lambda at: float(ink[at[1] : at[1] + high, at[0] : at[0] + wide].sum()))
-    return x / width, 1.0 - (y + high) / height, wide / width, high / height
+    if min(width, aspect * (height - below)) >= min(width - beside, aspect * height):
+        return 0, below
+    return beside, 0
 
 
 def grid(count: int, aspect: float, room: tuple[int, int]) -> tuple[int, int]:
@@ -310,7 +332,7 @@ def mesh_page(mesh: WholeMesh, size: tuple[int, int] = (1280, 720), view: str = 
     wide, high = axes.bbox.size.astype(int).tolist()
     camera = fit(points, direction(view, bounds, [], (0.0, 0.0, 1.0)), wide / high)
     motion = SimpleNamespace(start=points, bars=mesh.bars, bounds=bounds)
-    scene = Scene(motion, camera, (wide, high), Style(tubes=False, shaded=False), unit=_unit_of(size))
+    scene = Scene(motion, camera, (wide, high), Style(tubes=False, rims=False), unit=_unit_of(size))
     picture = scene.draw(points, (255.0 * palette[group]).astype(np.uint8), camera)
     scene.close()
     figure.figimage(picture, *axes.bbox.min.round(), origin="upper")

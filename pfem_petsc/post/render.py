@@ -20,6 +20,7 @@ from ..parallel.agreement import agreed
 from .camera import at_one_scale, cameras
 from .chart import opened
 from .colours import MARKS, ColourField, ColourScale, limits_of
+from .members import instants_of, unfinished
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_times
 from .options import Options
 from .page import Heading, Page, grid, inset_room
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
 SHORT = 2.0  # seconds below which a film is too short to follow
 TELL = 5.0  # seconds between two progress messages
 SHARE = 12  # frames for which it is worth to start another process
-_POSTER, _TILES = (1600, 900), 6
+_TILES = 6
+_CURVE = 220  # pixels of a page of 1280 by 720: width of an inset
 
 # H.264 with 4:2:0 colours is supported everywhere, and requires even sizes
 _ENCODERS = {
@@ -192,7 +194,7 @@ class Film:
         self.styles = [_style(options, result, note) for result in results]
         for motion, style in zip(self.motions, self.styles, strict=True):
             if style.radius is not None and len(style.radius):
-                motion.reach = 1.2 * float(style.radius.max())  # balls of nodes are that much wider than bars
+                motion.reach = max(motion.reach, float(style.radius.max()))
         case = results[0].case
         self.title = options.title if options.title is not None else (case.title or case.name)
         self._scenes: list[Scene] = []
@@ -224,34 +226,39 @@ class Film:
         """Prepare frames of a size."""
         several, columns = len(self.motions) > 1, 1
         if several:
-            aspect = np.mean([self._aspect(motion) for motion in self.motions])
-            columns, _ = grid(len(self.motions), float(aspect), Page.region_of(size)[2:])
-        self._prepare(size, self._labels if several else [""], columns)
+            columns, _ = grid(len(self.motions), self._aspect(), Page.region_of(size)[2:])
+        room = (0, 0)
         if self.options.inset is not None:
-            frames = {0, self.count // 2, self.count - 1}
-            shown = [self._draw(k, number) for k in range(len(self.motions)) for number in frames]
-            results = [motion.result for motion in self.motions]
-            self._page.add_insets(results, self.options.inset, inset_room(shown, several))
+            rows, (width, height) = -(-len(self.motions) // columns), Page.region_of(size)[2:]
+            unit = min(size[0] / 1280, size[1] / 720)
+            tile = width // columns, height // rows - (Page.strip_of(size) if several else 0)
+            room = inset_room(tile, self._aspect(), round(_CURVE * unit))
+        self._prepare(size, self._labels if several else [""], columns, room)
+        if self.options.inset is not None:
+            self._page.add_insets([motion.result for motion in self.motions], self.options.inset)
 
     def frame(self, number: int) -> np.ndarray:
         """Return a page (height, width, 3 or 4) uint8."""
         drawings = [self._draw(k, number) for k in range(len(self.motions))]
         motion, moments = self.motions[0], [motion.times[number] for motion in self.motions]
-        return self._page.draw(drawings, self._cameras[0][number], motion.time(motion.frames[number]), moments)
+        acting = motion.actions.everywhere(number) if motion.actions is not None else {}
+        return self._page.draw(drawings, self._cameras[0][number], motion.time(motion.frames[number]), moments, acting)
 
     def poster(self) -> np.ndarray:
         """Return six instants on one page, in a grid that suits the shape of the motion."""
+        size = self.options.size
         motion, several = self.motions[0], len(self.motions) > 1
         own = getattr(motion.result, "instants", None)
         wanted = max(2, _TILES // len(self.motions))
         chosen = instants(motion.result, motion.frames, wanted) if own is None else own(wanted)
         heads = [f"{label}, " if several else "" for label in self._labels]
         captions = [head + motion.time(frame) for head in heads for frame in chosen]
-        columns, _ = grid(len(chosen), self._aspect(motion), Page.region_of(_POSTER)[2:])
-        self._prepare(_POSTER, captions, len(chosen) if several else columns)
+        columns, _ = grid(len(chosen), self._aspect(), Page.region_of(size)[2:])
+        self._prepare(size, captions, len(chosen) if several else columns)
         numbers = [motion.frames.index(frame) for frame in chosen]
         drawings = [self._draw(k, number) for k in range(len(self.motions)) for number in numbers]
-        return self._page.draw(drawings, self._cameras[0][0])
+        acting = motion.actions.everywhere(numbers[-1]) if motion.actions is not None else {}
+        return self._page.draw(drawings, self._cameras[0][0], acting=acting)
 
     def close(self) -> None:
         """Give the windows back."""
@@ -259,19 +266,20 @@ class Film:
             scene.close()
         self._scenes = []
 
-    def _prepare(self, size: tuple[int, int], captions: Sequence[str], columns: int) -> None:
+    def _prepare(
+        self, size: tuple[int, int], captions: Sequence[str], columns: int, room: tuple[int, int] = (0, 0)
+    ) -> None:
         """Make page, cameras and scenes for a size in pixels and drawings with captions in columns."""
         self.close()
         options = self.options
         marks = [MARKS[mark] for mark in options.marks]
-        heading = Heading(self.title, self.colours[0].title, self.scale, marks, options.transparent)
-        self._page = Page(size, heading, captions, columns)
+        heading = Heading(self.title, self.colours[0].title, self.scale, marks, self.notes, options.transparent)
+        self._page = Page(size, heading, captions, columns, room)
         tile = self._page.tile
         self._cameras = [cameras(options, motion, tile[0] / tile[1]) for motion in self.motions]
         if len(self.motions) > 1:
             self._cameras = at_one_scale(self._cameras)
-        if self._cameras[0][0].parallel:
-            self._page.add_length_scale(self._cameras[0][0])
+        self._page.add_length_scale(self._cameras[0][0])
         _, _, width, height = Page.region_of(size)
         for motion, style, colour, film in zip(self.motions, self.styles, self.colours, self._cameras, strict=True):
             # lines of a small model stay visible in a tile; those of a large one would merge
@@ -287,11 +295,20 @@ class Film:
         surfaces, gone = motion.surfaces[frame], motion.gone(frame)
         return scene.draw(motion.positions(frame), shades, camera, surfaces, gone, layers)
 
-    def _aspect(self, motion: Motion) -> float:
-        """Return the width of the motion over its height, in the picture."""
-        look, points = cameras(self.options, motion, 1.0)[0], motion.surroundings
-        across, along = (float(np.ptp(points @ way)) for way in (look.right, look.up))
-        return across / max(along, 1e-3 * across, 1e-300)
+    @property
+    def notes(self) -> list[str]:
+        """What the foot of each picture says."""
+        factor, tubes = self.options.radius_scale, any(style.radius is not None for style in self.styles)
+        return self.motions[0].notes + ([f"radii × {factor:g}"] if tubes and factor != 1.0 else [])
+
+    def _aspect(self) -> float:
+        """Return the width of the motions over their height, in the picture, their mean."""
+        found = []
+        for motion in self.motions:
+            look, points = cameras(self.options, motion, 1.0)[0], motion.surroundings
+            across, along = (float(np.ptp(points @ way)) for way in (look.right, look.up))
+            found.append(across / max(along, 1e-3 * across, 1e-300))
+        return float(np.mean(found))
 
 
 def _nothing(text: str) -> None:
@@ -325,6 +342,9 @@ def instants(result: Any, frames: Sequence[int], count: int) -> list[int]:
     count : maximum number of snapshots
     """
     frames = sorted(set(frames))
+    if any(stage.starts_from is not None for stage in result.case.stage):  # of load cases, their ends
+        ends = {instant.snapshot for instant in instants_of(result, None, None)} if not unfinished(result) else set()
+        frames = [frame for frame in frames if frame in ends] or frames
     if len(frames) <= count:
         return frames
     times = np.asarray(result.times, dtype=float)[frames]
@@ -500,7 +520,7 @@ def _figure(film: Film) -> Any:
     if style.tubes:
         corners, trace = bars.mesh.regular_faces, plotly.Mesh3d
         look |= dict(zip("ijk", np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]).T, strict=True))
-        look |= {"intensity": values, "lighting": {"ambient": 0.5, "diffuse": 0.6, "specular": 0.2}, **shades}
+        look |= {"intensity": values, "lighting": {"ambient": 0.8, "diffuse": 0.25, "specular": 0.0}, **shades}
     else:
         # a line ends where a number is missing
         places = [np.insert(x.reshape(3, 2, -1).swapaxes(1, 2), 2, np.nan, axis=2).reshape(3, -1) for x in places]
@@ -514,9 +534,9 @@ def _figure(film: Film) -> Any:
     ]
     now = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
     choices = [{"label": each.name, "method": "animate", "args": [[each.name], now]} for each in figure.frames]
-    hidden = {"visible": False}
+    hidden, told = {"visible": False}, ", ".join([motion.time(frame), *film.notes])
     figure.update_layout(
-        title={"text": f"<b>{html.escape(film.title)}</b><br>{html.escape(motion.time(frame))}", "x": 0.01},
+        title={"text": f"<b>{html.escape(film.title)}</b><br>{html.escape(told)}", "x": 0.01},
         margin={"l": 0, "r": 0, "t": 60, "b": 20},
         showlegend=False,
         sliders=[

@@ -21,7 +21,8 @@ from .chart import opened
 from .plot import balance_error, plot
 
 NAME = "report.html"
-POSTER_FRAMES = 6
+SIZE = (1600, 900)
+"""Pixels of the picture of the truss."""
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -74,22 +75,25 @@ def write_report(
             raise InputError(f"{file}: is a folder; name a file for the report, {file / NAME}")
         with tempfile.TemporaryDirectory() as folder:
             curves = plot(result, folder, force_filter=force_filter)
-            drawn, reason = _draw(result, Path(folder) / "truss", field) if pictures else (None, "not asked for")
+            drawn, reason = _draw(result, Path(folder) / "truss.png", field) if pictures else (None, "not asked for")
             text = _document(result, curves, drawn, reason)
     with written(file, "the report"):
         file.write_text(text, encoding="utf-8")
     return file
 
 
-def _draw(result: Any, folder: Path, field: str) -> tuple[Path | None, str]:
+def _draw(result: Any, file: Path, field: str) -> tuple[Path | None, str]:
     """Draw six instants of the truss; return the picture, or why there is none."""
-    from .render import render
+    from .options import Options
+    from .render import Film, save
 
     try:
-        made = render(result, folder, field=field, frames=POSTER_FRAMES, video="none", note=lambda _: None)
+        film = Film([result], Options(field=field, size=SIZE), lambda text: None)
+        picture = save(film.poster(), file)
     except InputError as error:
         return None, str(error)
-    return next((path for path in made if path.name == "render.png"), made[0]), ""
+    film.close()
+    return picture, ""
 
 
 def _document(result: Any, curves: Sequence[Path], drawn: Path | None, reason: str) -> str:

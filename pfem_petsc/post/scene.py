@@ -24,10 +24,13 @@ FEW = 2000
 WALL_COLOUR, EDGE_COLOUR, NODE_COLOUR = (116, 125, 138), (75, 85, 99), (31, 36, 44)
 VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 
-_LIGHT = np.array([-0.4, 0.7, 1.0]) / np.linalg.norm([-0.4, 0.7, 1.0])  # right, up, to the eye
-_AMBIENT, _DIFFUSE, _SPECULAR = 0.42, 0.58, 0.35  # the first two make 1: colours without lighting are as given
 _ANYWHERE = np.array([0.36, 0.48, 0.8])
-_ROUND = 2.5  # pixels: radius from which a bar has a round surface; thinner ones are flat, with a shade across
+_STOUT = 16.0  # pixels: width from which bars show their ends themselves, without dots at nodes
+_ROUND = 2.5  # pixels: radius from which a bar has a round surface; thinner ones are flat
+# Crossing bars are told apart by their rims, where the surface faces the eye with a cosine below the first number: the
+# outer 12 % of the radius. Between, colours are those of the field. The share of black at the edge grows with the width
+# of bars [pixels], so that thin ones keep their colour.
+_RIM, _BLACK, _WIDTHS = 0.48, (0.45, 0.75), (2.0, 6.0)
 _MOST_PIXELS = (1.5e6, 1e7)  # up to which 3 x 3 (small models) and 2 x 2 pixels are averaged to one
 
 # Nothing is shown, so a display is not tried first: it may be closed, or remote over ssh.
@@ -98,11 +101,15 @@ def _form(kind: str) -> tuple[np.ndarray, np.ndarray]:
 
     A point is (end, along, across, facing): ``x[end] + radius (along a + across u + facing v)`` with the direction a of
     the bar, u across it and the view, and v towards the eye. A ``line`` is two points, a ``strip`` faces the eye, a
-    ``prism`` has open ends, and ``round`` bars and ``rough`` ones, of fewer sides, are cylinders with half a sphere at
-    each end.
+    ``ribbon`` does so between two rims, a ``prism`` has open ends, and ``round`` bars and ``rough`` ones, of fewer
+    sides, are cylinders with half a sphere at each end. Nothing is lit: colours do not depend on where a bar is.
     """
     if kind == "line":
         return np.array([[0.0, 0, 0, 0], [1, 0, 0, 0]]), np.array([[0, 1]])
+    if kind == "ribbon":
+        wide, high = np.array([-1.0, -0.8, 0.8, 1.0]), np.array([0.0, 0.6, 0.6, 0.0])
+        points = [[end, 0.0, a, b] for end in (0.0, 1.0) for a, b in zip(wide, high, strict=True)]
+        return np.array(points), np.array([[k, k + 1, k + 5, k + 4] for k in range(3)])
     if kind == "strip":
         return np.array([[0.0, 0, -1, 0], [0, 0, 1, 0], [1, 0, 1, 0], [1, 0, -1, 0]]), np.array([[0, 1, 2, 3]])
     sides, rings = {"round": (20, 5), "rough": (8, 2), "prism": (6, 1)}[kind]
@@ -150,18 +157,12 @@ class Segments:
         kept = pyvista.CellArray.from_regular_cells(
             (count * cells + np.arange(count)[:, None, None]).reshape(-1, cells.shape[1])
         )
-        places, self._solid = np.zeros((count * len(form), 3), dtype=np.float32), kind not in ("line", "strip")
+        places = np.zeros((count * len(form), 3), dtype=np.float32)
         self.mesh = pyvista.PolyData(places, lines=kept) if kind == "line" else pyvista.PolyData(places, faces=kept)
         self.mesh.point_data["colour"] = np.zeros(places.shape, dtype=np.uint8)
-        self.mesh.point_data.active_normals = places.copy()
-        if plotter is None:
-            return
-        options: dict[str, Any] = {"scalars": "colour", "rgb": True, "preference": "point", "line_width": width}
-        shine = {"ambient": _AMBIENT, "diffuse": _DIFFUSE, "specular": _SPECULAR if self._solid else 0.0}
-        self.actor = plotter.add_mesh(
-            self.mesh, lighting=True, reset_camera=False, render=False, specular_power=10.0, **options, **shine
-        )
-        self.actor.prop.interpolation = "Phong" if kind == "round" else "Gouraud"
+        if plotter is not None:
+            options: dict[str, Any] = {"scalars": "colour", "rgb": True, "preference": "point", "line_width": width}
+            self.actor = plotter.add_mesh(self.mesh, lighting=False, reset_camera=False, render=False, **options)
 
     def move(
         self,
@@ -169,7 +170,7 @@ class Segments:
         radius: np.ndarray,
         colours: np.ndarray | None = None,
         ahead: np.ndarray = _ANYWHERE,
-        pale: np.ndarray | None = None,
+        black: np.ndarray | float = 0.0,
     ) -> None:
         """Draw bars between points.
 
@@ -179,14 +180,15 @@ class Segments:
         radius : (b,), or (2, b) at both ends [m]; negative: the bar is not drawn
         colours : (n or b, 3) uint8
         ahead : (3,), or (n, 3) at each node: the direction to the eye
-        pale : (n,), the share of white at each node
+        black : (b,), the share of black at the rim
         """
         # single precision, component by component: passes over a million bars
         first, last = ends = np.stack([x.astype(np.float32)[self.ends] for x in points.T], axis=1)
         shape = len(self._end), -1, 3
         axis = _unit(last - first)
         towards = np.broadcast_to(ahead, points.shape).astype(np.float32).T
-        side = np.cross(axis, _unit(np.stack([x[self.ends[0]] for x in towards])), axis=0)
+        eye = _unit(np.stack([x[self.ends[0]] for x in towards]))
+        side = np.cross(axis, eye, axis=0)
         along = np.flatnonzero((side**2).sum(axis=0) < 1e-10)  # seen along its axis: any direction is across
         side[:, along] = np.cross(axis[:, along], np.eye(3)[:, np.abs(axis[:, along]).argmin(axis=0)], axis=0)
         side = _unit(side)
@@ -194,18 +196,19 @@ class Segments:
         wide = np.broadcast_to(radius, self.ends.shape).astype(np.float32)
         if (hidden := wide[0] < 0.0).any():
             wide[:, hidden], last[:, hidden] = 0.0, first[:, hidden]
-        places, normals = self.mesh.points.reshape(shape), self.mesh.point_data["Normals"].reshape(shape)
-        away = self._form @ np.stack([axis, side, facing], axis=1)
+        places, ways = self.mesh.points.reshape(shape), np.stack([axis, side, facing], axis=1)
         for k in range(3):
-            places[..., k] = ends[self._end, k] + wide[self._end] * away[k]
-            normals[..., k] = away[k] if self._solid else facing[k]
+            places[..., k] = ends[self._end, k] + wide[self._end] * (self._form @ ways[k])
         if colours is None:
             return
-        white = 0.0 if pale is None else pale.astype(np.float32)[self.ends]
+        left: Any = 1.0
+        if np.any(black):  # at the edge, the surface is seen along itself
+            facing = np.maximum(self._form @ np.einsum("kjb,kb->jb", ways, eye), self._form[:, 2:])
+            left = 1.0 - np.asarray(black, dtype=np.float32) * np.clip(1.0 - facing / _RIM, 0.0, 1.0)
         shades = self.mesh.point_data["colour"].reshape(shape)
         for k in range(3):
             ink = colours[:, k].astype(np.float32)[self._colour_rows]
-            shades[..., k] = (ink + white * (255.0 - ink) + 0.5).astype(np.uint8)[self._end]
+            shades[..., k] = (ink[self._end] * left + 0.5).astype(np.uint8)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -227,14 +230,14 @@ class Style:
     radius : (b,) [m] of the bars; None: not known
     bar_width : of bars without radii, and the least width of tubes, in pixels; None: by the size of the model
     nodes : whether to draw nodes as balls; None: for small models
-    shaded : whether bars have shades
+    rims : whether bars that are wide enough have dark rims
     """
 
     tubes: bool
     radius: np.ndarray | None = field(default=None, repr=False)
     bar_width: float | None = None
     nodes: bool | None = None
-    shaded: bool = True
+    rims: bool = True
 
 
 class Layer(NamedTuple):
@@ -298,30 +301,31 @@ class Scene:
         window = [side * self._factor for side in size]
         self._plotter = pyvista.Plotter(off_screen=True, window_size=window, lighting="none")
         self._plotter.disable_anti_aliasing()
-        self._plotter.add_light(pyvista.Light(position=_LIGHT, light_type="camera light"))
         self._plotter.renderer.SetUseOIT(False)  # walls are drawn in their order
         self._plotter.background_color = "black" if transparent else "white"
         self._plotter.screenshot(return_img=True)  # the first one draws by itself, and chooses a camera
         self._transparent = transparent
         thick = max(self.width, 2.0 * pixels * float(np.quantile(self._radius, 0.9)) if count else 0.0)
-        solid = style.shaded and (count <= FEW or (thick >= 2.0 * _ROUND * unit and count <= TUBE_LIMIT))
+        solid = style.rims and (count <= FEW or (thick >= 2.0 * _ROUND * unit and count <= TUBE_LIMIT))
         if solid:
             kind = "round" if thick >= 2.0 * _ROUND * unit and count <= FEW else "rough"
         else:
-            kind = "line" if count > TUBE_LIMIT and not style.tubes else "strip"
+            many = "strip" if style.tubes else "line"
+            kind = many if count > TUBE_LIMIT else "ribbon" if style.rims else "strip"
+        self._rims = kind not in ("line", "strip")
         self.segments = Segments(self._plotter, self._bars, kind, on_nodes, self.width * self._factor)
-        self.segments.actor.prop.lighting = style.shaded
-        nodes = count <= 400 and shortest > 3.0 * self.width if style.nodes is None else style.nodes
+        few = count <= 400 and shortest > 3.0 * self.width and thick < _STOUT * unit
+        nodes = few if style.nodes is None else style.nodes
         self._nodes = self._balls() if nodes else None
         self._extra: list[Any] = []
 
     def _balls(self) -> tuple[Segments, np.ndarray]:
-        """Return nodes as bars without length, and their radii."""
+        """Return nodes as bars without length, and the radii of the widest bars there."""
         used, radius = np.unique(self._bars), np.zeros(int(self._bars.max(initial=-1)) + 1)
         np.maximum.at(radius, self._bars, self._radius[:, None])
-        balls = Segments(self._plotter, np.stack([used, used], axis=1), "rough", False)
+        balls = Segments(self._plotter, np.stack([used, used], axis=1), "round", False)
         balls.mesh.point_data["colour"][:] = NODE_COLOUR
-        return balls, 1.2 * radius[used]
+        return balls, radius[used]
 
     def close(self) -> None:
         """Give the window back."""
@@ -358,14 +362,19 @@ class Scene:
         radius = np.maximum(self._radius, 0.5 * self.width * pixel[self.segments.ends])
         if gone is not None:
             radius[:, gone] = -1.0
-        pale = None
-        if not camera.parallel:  # what is far away is paler, to show thousands of bars in space
-            depths = self._corners @ camera.towards
-            pale = 0.5 * np.clip((depths.max() - points @ camera.towards) / max(np.ptp(depths), 1e-300), 0.0, 1.0)
-        self.segments.move(points, radius, colours, camera.ahead(points), pale)
-        if self._nodes is not None:
+        ahead = camera.ahead(points)
+        black = 0.0
+        if self._rims:
+            wide = 2.0 * radius[0] / np.maximum(pixel[self.segments.ends[0]], 1e-300) / self.unit
+            black = np.interp(wide, _WIDTHS, _BLACK)
+        self.segments.move(points, radius, colours, ahead, black)
+        if self._nodes is not None:  # dots on the bars, half as wide
             balls, sizes = self._nodes
-            balls.move(points, np.maximum(sizes, 0.7 * self.width * pixel[balls.ends[0]]))
+            rows = balls.ends[0]
+            sizes = np.maximum(sizes, 0.5 * self.width * pixel[rows])
+            dots = points.copy()
+            dots[rows] += 2.2 * sizes[:, None] * np.transpose(_unit(np.broadcast_to(ahead, points.shape)[rows].T))
+            balls.move(dots, np.maximum(0.5 * sizes, 1.3 * self.unit * pixel[rows]))
         self._extra = [self._add(layer, camera) for layer in layers if len(layer.lines)]
         self._extra += self._add_walls(surfaces, camera)
         eye = camera.centre + camera.distance * camera.towards
@@ -391,11 +400,12 @@ class Scene:
 
     def _add(self, layer: Layer, camera: Camera) -> Any:
         pixel = 2.0 * camera.half_height / self.size[1] * self.unit
-        points = np.asarray(layer.points, dtype=float) + layer.shift * pixel * camera.towards
+        points, ahead = np.asarray(layer.points, dtype=float), camera.ahead(np.asarray(layer.points, dtype=float))
+        far = np.linalg.norm(ahead, axis=-1, keepdims=True)  # along the ray, so that it is seen at the same place
+        points = points + np.minimum(layer.shift * pixel / far, np.inf if camera.parallel else 0.6) * ahead
         made = Segments(self._plotter, layer.lines, "strip", False)
         least = max(0.5 * layer.width * self.unit, 0.4) * camera.metres(points)[made.ends] / self.size[1]
         radius = layer.radius + 2.0 * pixel if np.any(layer.radius) else 0.0
-        made.actor.prop.lighting = False
         made.mesh.point_data["colour"][:] = layer.colour
         made.move(points, np.maximum(radius, least), ahead=camera.ahead(points))
         return made.actor
@@ -413,7 +423,7 @@ class Scene:
             normal = np.cross(*np.diff(points[faces[0]][:3], axis=0))
             facing = float(normal @ camera.towards) > 1e-12 * float(np.linalg.norm(normal))
             # a wall between the eye and the structure must be transparent
-            strength = 150 if camera.parallel else 110 if facing else 35
+            strength = 150 if camera.parallel else 110 if facing else 12
             order = np.argsort((points @ camera.towards)[faces].mean(axis=1), kind="stable")
             mesh = pyvista.PolyData.from_regular_faces(points.astype(np.float32), faces[order])
             opacity = strength * (1.0 - np.clip(np.asarray(surface.depth), 0.0, 1.0))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import base64
+import io
 import re
 from html.parser import HTMLParser
 
 import pytest
+from PIL import Image
 
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
+from pfem_petsc.post.render import Film
 from pfem_petsc.post.report import write_report
 
 
@@ -83,6 +86,15 @@ def test_report_of_a_run(run, capsys):
     links = [source for source in page.sources if source not in pictures]
     assert links and all(link.startswith("#") and f'id="{link[1:]}"' in text for link in links)
     assert not re.search(r"https?://|url\(", text)
+
+
+@pytest.mark.slow
+def test_report_draws_only_the_picture_that_it_shows(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(Film, "frame", None)
+    text = write_report(run, tmp_path / "report.html").read_text()
+    data = re.findall(r'alt="Six instants[^"]*" src="data:image/png;base64,([^"]+)"', text)
+    (picture,) = (Image.open(io.BytesIO(base64.b64decode(each))) for each in data)
+    assert picture.size == (1600, 900)
 
 
 @pytest.mark.slow

@@ -1,0 +1,259 @@
+"""Pictures for papers: exact colours, scales that are told, supports and loads, curves beside the truss."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.pictures import camera_of, draw, near, picture_of, pixels, projected
+from helpers.synthetic import SyntheticResult, ring
+from matplotlib.colors import to_rgb
+
+from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.errors import InputError
+from pfem_petsc.output.units import POINT
+from pfem_petsc.post.actions import Actions
+from pfem_petsc.post.camera import cameras
+from pfem_petsc.post.colours import ColourScale
+from pfem_petsc.post.motion import Motion
+from pfem_petsc.post.page import Page, inset_room
+from pfem_petsc.post.render import Film, Options, instants
+from pfem_petsc.post.scene import Style
+
+
+@pytest.fixture
+def flying(tmp_path):
+    return SyntheticResult(tmp_path / "x" / "result.vtkhdf", *ring(), walls=())
+
+
+BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+
+
+@pytest.mark.parametrize("view", ["xy", (0.3, 0.2, 1.0)], ids=["parallel", "perspective"])
+@pytest.mark.parametrize("count", [1, 2001], ids=["few", "some"])
+def test_bars_have_the_colours_of_the_scale_wherever_they_are(view, count):
+    """Three bars, near, far and inclined to the view: three quarters of their pixels have the very colour."""
+    colours = [(30, 90, 200), (200, 60, 40), (90, 160, 70)]
+    points = np.array(
+        [[-0.8, 0.6, 0.9], [0.8, 0.6, 0.9], [-0.8, 0.0, -0.9], [0.8, 0.0, -0.9], [-0.8, -0.6, -0.4], [0.8, -0.6, 0.4]]
+    )
+    bars = np.repeat([[0, 1], [2, 3], [4, 5]], count, axis=0)
+    camera, style = camera_of(BOX, view), Style(True, np.full(len(bars), 0.1), nodes=False)
+    picture = picture_of(points, bars, np.repeat(colours, count, axis=0), camera, (300, 300), style)
+    x, y, _ = projected(camera, points.reshape(3, 2, 3).mean(axis=1), (300, 300))
+    for column, row, colour in zip(x.round().astype(int), y.round().astype(int), colours, strict=True):
+        assert picture[row, column].tolist() == list(colour)
+        dyed = (picture[:, column - 5 : column + 5] != 255).any(axis=2)
+        same = near(picture[row - 8 : row + 8, column - 5 : column + 5], colour, 2)
+        assert len(same[0]) > 40 and dyed.any()
+
+
+def test_rims_leave_thin_bars_their_colour():
+    """A bar four pixels wide: its darkest pixel across is at least 70 % of its colour, and crossing bars have edges."""
+    points, style = np.array([[-0.8, 0.0, 0.0], [0.8, 0.0, 0.0]]), Style(False, bar_width=4.0, nodes=False)
+    picture = picture_of(points, [[0, 1]], [(200, 100, 100)], camera_of(BOX, "xy"), (300, 300), style)
+    across = picture[140:160, 150, 0]
+    assert (across == 200).any()
+    assert across.min() >= 140
+
+
+@pytest.mark.parametrize("limits", [(-2.0, 2.0), (-1.0, 3.0), (-5.0, 0.0), (0.0, 4.0)])
+def test_zero_is_light_and_equal_magnitudes_are_equally_strong(limits):
+    """Zero is grey, everything else darker, the more so the larger; one magnitude has one colour on each side."""
+    scale = ColourScale(limits)
+    (zero,) = scale.colours(np.zeros(1)).astype(int)
+    assert np.ptp(zero) < 16 and zero.min() > 170
+    largest = max(map(abs, limits))
+    for end in (value for value in limits if value):
+        values = np.linspace(0.0, end, 9)
+        light = scale.colours(values) @ [0.299, 0.587, 0.114]
+        assert (np.diff(light) < 0.0).all()
+        same = ColourScale((-largest, largest) if limits[0] < 0.0 else limits).colours(values[-1:])
+        assert np.abs(scale.colours(values[-1:]).astype(int) - same).max() <= 2
+
+
+def foot(file) -> np.ndarray:
+    picture = pixels(file)
+    return picture[-round(0.06 * len(picture)) :, : picture.shape[1] // 2]
+
+
+def test_what_is_not_true_to_scale_says_so(tmp_path, flying):
+    for options, notes in (
+        ({}, []),
+        ({"scale": 20.0}, ["displacements × 20"]),
+        ({"scale": 0.5}, ["displacements × 0.5"]),
+    ):
+        assert Film([flying], Options(**options), print).notes == notes
+    plain, poster = draw(tmp_path / "a", flying, frames=[0], poster=True, size=(640, 360))
+    scaled, larger = draw(tmp_path / "b", flying, frames=[0], poster=True, size=(640, 360), scale=1.5)
+    for without, told in ((plain, scaled), (poster, larger)):
+        assert pixels(told).shape == (360, 640, 4)  # posters too
+        assert (foot(told)[..., 0] < 128).sum() > (foot(without)[..., 0] < 128).sum() + 60
+    modes = SimpleNamespace(untrue=lambda scale: f"as {scale:g}")
+    motion = Motion(flying, [0], Options(scale=2.0), print)
+    motion.result = modes
+    assert motion.notes == ["as 2"]
+
+
+@pytest.mark.parametrize("view", ["xy", "iso"], ids=["parallel", "perspective"])
+def test_length_scale_is_that_at_mid_depth(tmp_path, flying, view):
+    """The line at the foot is 1, 2 or 5 times a power of ten at the distance of the middle of the picture."""
+    options = {"frames": [0], "size": (1280, 720), "view": view}
+    line = near(foot(draw(tmp_path, flying, **options)[0]), np.multiply(to_rgb("#5b6472"), 255), 30)
+    length = np.bincount(line[0]).argmax()
+    columns = line[1][line[0] == length]
+    run = columns[: np.flatnonzero(np.diff(columns, append=10_000) > 1)[0] + 1]
+    film = Film([flying], Options(**options), print)
+    (camera,) = cameras(film.options, film.motions[0], np.divide(*Page.region_of((1280, 720))[2:]))
+    x, _, _ = projected(
+        camera, camera.centre + np.outer([0.0, 1.0], camera.right), (1110, Page.region_of((1280, 720))[3])
+    )
+    metres = np.ptp(run) / np.ptp(x)
+    assert min(abs(metres / (10.0 ** np.floor(np.log10(metres) + 0.02)) / k - 1.0) for k in (1, 2, 5)) < 0.02
+
+
+def test_curves_are_beside_what_is_drawn(flying):
+    """Below a wide truss, beside a tall one, and never over the drawings."""
+    assert inset_room((1000, 600), 4.0, 220) == (0, 180)
+    assert inset_room((1000, 600), 0.5, 220) == (270, 0)
+    with pytest.raises(InputError, match="inset needs tiles of 220 x 264 pixels or more, and these have 200 x 600"):
+        inset_room((200, 600), 1.0, 220)
+    for points in (np.array([1.0, 0.2, 1.0]), np.array([0.2, 1.0, 1.0])):
+        result = SyntheticResult("x/result.vtkhdf", ring()[0] * points, ring()[1], walls=())
+        for results in ([result], [result, flying]):
+            film = Film(results, Options(inset="kinetic_energy", size=(960, 540)), print)
+            film.start((960, 540))
+            film.frame(0)
+            boxes = [tile.bbox for tile in film._page.tiles]
+            curves = [tile.child_axes[0].get_tightbbox() for tile in film._page.tiles]
+            for k, curve in enumerate(curves):
+                others = [*boxes, *curves[:k]]
+                assert not any(
+                    curve.overlaps(other)
+                    and min(curve.x1, other.x1) - max(curve.x0, other.x0) > 1
+                    and min(curve.y1, other.y1) - max(curve.y0, other.y0) > 1
+                    for other in others
+                )
+            film.close()
+
+
+def test_points_of_a_path_are_told_with_their_load_factor(flying):
+    flying.axis, flying.times = POINT, np.arange(13.0)
+    flying.positions = lambda i: flying.start
+    flying.history = {"time": np.arange(13.0), "load_factor": -0.0123456 * np.arange(13)}
+    assert Motion(flying, [3], Options(), print).time(3) == "point 3, load factor -0.03704"
+
+
+CASE = {
+    "mesh": {
+        "generator": "arrays",
+        "points": [[0.0, 0, 0], [2, 0, 0], [1, 0, 1], [1, 1, 0]],
+        "bars": [[0, 1], [0, 2], [1, 2], [3, 2]],
+    },
+    "node_set": {
+        "left": {"indices": [0]},
+        "right": {"indices": [1]},
+        "head": {"indices": [2]},
+        "back": {"indices": [3]},
+    },
+    "material": {"m": {"young_modulus": 1e9, "density": 1e3}},
+    "section": {"s": {"area": 1e-4, "material": "m"}},
+    "support": [
+        {"node_set": "left", "fix": "xyz"},
+        {"node_set": "right", "fix": "yz"},
+        {"node_set": "back", "fix": "xyz"},
+    ],
+    "load": [{"node_set": "head", "force": [0.0, 0.0, -100.0]}],
+    "gravity": {"acceleration": [0.0, 0.0, -10.0]},
+    "static": {"step": 0.5},
+    "output": {"fields_every": 1},
+    "load_case": [
+        {"name": "push", "load": [{"node_set": "head", "force": [40.0, 0.0, 0.0]}]},
+        {"name": "pull", "load": [{"node_set": "right", "force": [0.0, 0.0, 30.0]}]},
+    ],
+    "combination": [{"name": "both", "factors": {"push": 2.0, "pull": 1.0}}],
+}
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("loads") / "result"
+    with Simulation(Case.from_dict(CASE), output=folder, quiet=True) as simulation:
+        simulation.run()
+    return folder
+
+
+def test_loads_are_those_of_the_load_case_at_its_load_factor(loaded):
+    """Permanent loads by their load factor, then in full; those of load cases by theirs."""
+    with open_result(loaded) as result:
+        bounds = np.array([[0.0, 0, 0], [2, 1, 1]])
+        actions = Actions(result, ["loads"], result.times, bounds)
+        head = {"permanent": (0.0, -100.0), "push": (40.0, -100.0), "pull": (0.0, -100.0), "both": (80.0, -100.0)}
+        largest = np.hypot(80.0, 100.0)
+        assert actions.notes == ["longest arrow 128 N"]
+        assert list(actions.everywhere(2)) == ["g"] and actions.everywhere(2)["g"].tolist() == [0, 0, -1]
+        told = [result.place(time) for time in result.times]
+        for number, text in enumerate(told):
+            name, _, factor = text.partition(", load factor ")
+            share = float(factor)
+            side, down = (part * share for part in (head[name][0], 1.0))
+            down = -100.0 * (share if name == "permanent" else 1.0)
+            tails, tips = actions.arrows(number, result.positions(number))
+            ways = {tuple(np.round((tip - tail) * largest / 0.14 / np.sqrt(6.0), 6)) for tail, tip in zip(tails, tips)}
+            expected = {(side, 0.0, down)} if down else set()
+            expected |= {(0.0, 0.0, 30.0 * share)} if name in ("pull", "both") and share else set()
+            assert ways == expected, text
+            # one end of each is at its node: those that pull outwards begin there, the others end there
+            nodes = result.positions(number)
+            for tail, tip in zip(tails, tips, strict=True):
+                assert min(np.linalg.norm(nodes - end, axis=1).min() for end in (tail, tip)) < 1e-12
+        assert instants(result, list(range(len(told))), 6) == [
+            k for k, text in enumerate(told) if text[:4] in ("push", "pull", "both") and text.endswith(" 1")
+        ]
+
+
+def test_supports_have_symbols_of_what_they_hold(loaded, tmp_path):
+    """Along y, a node held along x and z has one triangle with strokes, one held along z a triangle with a line."""
+    with open_result(loaded) as result:
+        actions = Actions(result, ["supports"], result.times[-1:], np.array([[0.0, 0, 0], [2, 1, 1]]))
+        flat, solid = (
+            cameras(Options(view=view), Motion(result, [0], Options(), print), 1.0)[0] for view in ("xz", "iso")
+        )
+        points = result.positions(-1)
+        _, symbols = actions.layers(0, points, flat)
+        assert len(symbols.lines) == 2 * (3 + 4) + (3 + 1)
+        _, symbols = actions.layers(0, points, solid)
+        assert len(symbols.lines) == 2 * (3 + 4) + 2 * (3 + 1)
+        # each triangle begins at its node, and is 3 % of the diagonal high
+        corners = symbols.points.reshape(-1, 2, 3)
+        tops = corners[np.isin(np.arange(len(corners)), [0, 7, 11, 15])][:, 0]
+        assert {tuple(np.round(top, 6)) for top in tops} <= {tuple(np.round(points[k], 6)) for k in (0, 1, 3)}
+        plain = draw(tmp_path / "a", result, frames=[-1], size=(640, 480))
+        shown = draw(tmp_path / "b", result, frames=[-1], size=(640, 480), show=["supports", "loads"])
+        inks = [len(near(pixels(file)[60:440, :540], (31, 36, 44), 30)[0]) for file in (plain[0], shown[0])]
+        assert inks[1] > inks[0] + 80
+        with pytest.raises(InputError, match="show = 'weights' is not known; it is one of supports, loads"):
+            draw(tmp_path, result, show=["weights"])
+
+
+def test_many_loads_are_thinned_and_counted(tmp_path):
+    """A net of 441 loaded nodes has arrows at distances of a twentieth of its diagonal, one in each cell."""
+    data = {
+        "mesh": {"generator": "net", "size": [1.0, 1.0], "cells": [20, 20]},
+        "node_set": {"all": {"all": True}},
+        "material": {"m": {"young_modulus": 1e9, "density": 1e3}},
+        "section": {"s": {"area": 1e-6, "material": "m"}},
+        "support": [{"node_set": "all", "fix": "xyz"}],
+        "load": [{"node_set": "all", "force": [0.0, 0.0, -1.0]}],
+        "time": {"integrator": "central_differences", "step": 1e-7, "end": 1e-7},
+    }
+    with Simulation(Case.from_dict(data), output=tmp_path / "net", quiet=True) as simulation:
+        simulation.run()
+    with open_result(tmp_path / "net") as result:
+        points = result.positions(0)
+        bounds = np.array([points.min(axis=0), points.max(axis=0)])
+        actions = Actions(result, ["loads"], result.times[:1], bounds)
+        cells = np.unique(np.floor((points - bounds.mean(axis=0)) / (0.05 * np.sqrt(2.0))), axis=0)
+        assert actions.notes == ["longest arrow 1.00 N", f"symbols at {len(cells)} of 441 loaded nodes"]
+        assert len(actions.arrows(0, points)[0]) == len(cells) < 441

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,15 +20,6 @@ _APART = 0.05  # of the diagonal: about the distance of symbols where there are 
 _FRONT = 700.0  # pixels of a page of 1280 by 720: symbols are before the truss
 _SMALL = 0.02  # of the largest load: smaller ones have no arrow
 _ALONG = 0.999  # cosine from which a direction is that of the view
-
-
-class Acting(NamedTuple):
-    """What acts at a time: loads (nodes, 3) [N], gravity [m/s2] and wind [m/s], (3,), and the number of the stage."""
-
-    stage: int
-    loads: np.ndarray
-    gravity: np.ndarray
-    wind: np.ndarray
 
 
 class Actions:
@@ -57,73 +48,72 @@ class Actions:
 
         from ..stepping.model import Model
 
-        stages, self._result = result.case.stages, result
-        model = Model(stages[0], MPI.COMM_SELF, later=stages[1:])
+        self._stages, self._start, history = result.case.stages, np.asarray(result.positions(0)), result.history
+        model = Model(self._stages[0], MPI.COMM_SELF, later=self._stages[1:])
         check_mesh(result, model.mesh)
-        models = [model, *(Model(stage, MPI.COMM_SELF, model.mesh) for stage in stages[1:])]
+        self._models = [model, *(Model(stage, MPI.COMM_SELF, model.mesh) for stage in self._stages[1:])]
         self._ids, self._centre, self.notes = model.mesh.node_ids[: model.mesh.n_owned], bounds.mean(axis=0), []
-        self._diagonal, self.size = float(np.linalg.norm(bounds[1] - bounds[0])), 0.0
-        self._supports: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in stages]
-        self._acting: list[Acting] = []
-        if "supports" in kinds:
-            self.size = 1.5 * _SIZE * self._diagonal
-            for stage, own, found in zip(stages, models, self._supports, strict=True):
-                found += [(self._ids[own.nodes[each.node_set]], directions_of(each)[0]) for each in stage.support]
-            nodes = [numbers for each in self._supports for numbers, _ in each]
-            self._shown = self._thinned(np.unique(np.concatenate([np.zeros(0, dtype=int), *nodes])), "supported")
-        acting = self._forces(models, times)
-        self._stages = [each.stage for each in acting]
-        self._acting = acting if "loads" in kinds else []
-        sizes = [np.linalg.norm(each.loads, axis=1) for each in self._acting]
-        self._largest = max((float(size.max()) for size in sizes), default=0.0)
-        self._loaded = np.zeros(0, dtype=int)
+        self._diagonal, self._kinds = float(np.linalg.norm(bounds[1] - bounds[0])), kinds
+        self.size = 1.5 * _SIZE * self._diagonal if "supports" in kinds else 0.0
+        when = np.asarray(history["time"], dtype=float)
+        rows = np.asarray(history["stage"]) if "stage" in history else np.zeros(len(when), dtype=int)
+        self._history = when, rows, np.asarray(history.get("load_factor", when), dtype=float)
+        for number in np.unique(rows)[1:].tolist():  # each stage takes over what acts at the end of another one
+            first = self._stages[number].starts_from
+            before = number - 1 if first is None else first
+            external = self._models[before].external
+            end = self._own(before, float(when[rows == before][-1]))
+            held = external.loads_at(end), external.gravity_at(end), external.wind_at(end)
+            self._models[number].external.hold(*held, True)
+        numbers = rows[np.minimum(np.searchsorted(when, times), len(when) - 1)].tolist()
+        self._moments = [(k, self._own(k, float(time))) for k, time in zip(numbers, times, strict=True)]
+        self._supports = [
+            [(self._ids[own.nodes[each.node_set]], directions_of(each)[0]) for each in stage.support]
+            for stage, own in zip(self._stages, self._models, strict=True)
+        ]
+        held_nodes = np.unique(
+            np.concatenate([self._ids[:0], *(nodes for each in self._supports for nodes, _ in each)])
+        )
+        self._shown = self._thinned(held_nodes, "supported") if "supports" in kinds else self._ids[:0]
+        size = np.zeros(len(self._ids))
+        for number in range(len(times)) if "loads" in kinds else ():
+            size = np.maximum(size, np.linalg.norm(self._loads(number), axis=1))
+        self._largest, self._loaded = float(size.max(initial=0.0)), self._ids[:0]
         if self._largest > 0.0:
             self.notes.append(f"longest arrow {engineering(self._largest, 'N', 3)}")
-            rows = np.flatnonzero(np.any([size > _SMALL * self._largest for size in sizes], axis=0))
-            self._loaded = self._thinned(rows, "loaded")
+            self._loaded = self._thinned(np.flatnonzero(size > _SMALL * self._largest), "loaded")
+
+    def _own(self, number: int, time: float) -> float:
+        """Return the load factor of a static stage, or the time since the start of another, at a time of the run."""
+        when, rows, factors = self._history
+        begin, own = float(when[rows < number].max(initial=0.0)), rows == number
+        if self._stages[number].static is None:
+            return time - begin
+        start = ([begin], [0.0]) if number else ([], [])  # of which the history has no row
+        return float(np.interp(time, [*start[0], *when[own]], [*start[1], *factors[own]]))
+
+    def _loads(self, number: int) -> np.ndarray:
+        """Return the loads (nodes, 3) [N] of a frame."""
+        (stage, own), loads = self._moments[number], np.zeros((len(self._ids), 3))
+        loads[self._ids] = self._models[stage].external.loads_at(own)
+        return loads
 
     def _thinned(self, nodes: np.ndarray, what: str) -> np.ndarray:
         """Return nodes for symbols, of many one in each cell of a grid."""
         if len(nodes) <= MOST:
             return nodes
-        cells = np.floor((np.asarray(self._result.positions(0))[nodes] - self._centre) / (_APART * self._diagonal))
+        cells = np.floor((self._start[nodes] - self._centre) / (_APART * self._diagonal))
         some = nodes[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
         self.notes.append(f"symbols at {len(some):,} of {len(nodes):,} {what} nodes")
         return some
 
-    def _forces(self, models: Sequence[Any], times: np.ndarray) -> list[Acting]:
-        """Return what acts at times; each stage takes over what acts at the end of the one that it starts from."""
-        history, stages = self._result.history, self._result.case.stages
-        when = np.asarray(history["time"], dtype=float)
-        of_row = np.asarray(history["stage"]) if "stage" in history else np.zeros(len(when), dtype=int)
-        factors = np.asarray(history.get("load_factor", when), dtype=float)
-
-        def at(number: int, time: float) -> Acting:
-            rows, external = of_row == number, models[number].external
-            begin = float(when[of_row < number].max(initial=0.0))
-            if stages[number].static is None:
-                own = time - begin
-            elif number:  # whose history has no row of its start
-                own = float(np.interp(time, [begin, *when[rows]], [0.0, *factors[rows]]))
-            else:
-                own = float(np.interp(time, when[rows], factors[rows]))
-            loads = np.zeros_like(external.loads_at(own))
-            loads[self._ids] = external.loads_at(own)
-            return Acting(number, loads, external.gravity_at(own), external.wind_at(own))
-
-        for number in range(1, len(models)):
-            first = stages[number].starts_from
-            before = number - 1 if first is None else first
-            if np.any(of_row == number):
-                _, loads, *held = at(before, float(when[of_row == before][-1]))
-                models[number].external.hold(loads[self._ids], *held, True)
-        return [at(int(of_row[min(np.searchsorted(when, time), len(when) - 1)]), float(time)) for time in times]
-
     def everywhere(self, number: int) -> dict[str, np.ndarray]:
         """Gravity and wind (3,) of a frame, if there are any, by their names."""
-        if not self._acting:
+        if "loads" not in self._kinds:
             return {}
-        ways = {"g": self._acting[number].gravity, "wind": self._acting[number].wind}
+        stage, own = self._moments[number]
+        external = self._models[stage].external
+        ways = {"g": external.gravity_at(own), "wind": external.wind_at(own)}
         return {name: way / np.linalg.norm(way) for name, way in ways.items() if way.any()}
 
     def arrows(self, number: int, points: np.ndarray) -> np.ndarray:
@@ -133,7 +123,7 @@ class Actions:
         """
         if not len(self._loaded):
             return np.zeros((2, 0, 3))
-        force = self._acting[number].loads[self._loaded] / self._largest
+        force = self._loads(number)[self._loaded] / self._largest
         kept = np.linalg.norm(force, axis=1) > _SMALL
         force, at = force[kept], points[self._loaded[kept]]
         way = _ARROW * self._diagonal * force
@@ -150,7 +140,7 @@ class Actions:
         head = np.minimum(_HEAD * self._diagonal, 0.5 * length)
         ends = [tips - head * way + side * 0.4 * head * across for side in (1.0, -1.0)]
         pairs = [np.stack(pair, axis=1) for pair in [(tails, tips), *((tips, end) for end in ends)]]
-        return [_lines(pairs, 2.2), _lines(self._triangles(self._stages[number], points, camera), 1.5)]
+        return [_lines(pairs, 2.2), _lines(self._triangles(self._moments[number][0], points, camera), 1.5)]
 
     def _triangles(self, stage: int, points: np.ndarray, camera: Camera) -> list[np.ndarray]:
         """Return the lines (n, 2, 3) of supports: one triangle with strokes below where all seen directions are

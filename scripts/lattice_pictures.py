@@ -23,7 +23,7 @@ from pfem_petsc.post.render import render
 ROOT = Path(__file__).resolve().parent.parent
 BRACKET = ROOT / "pfem_petsc" / "cases" / "bracket.stl"
 SIZE = (1000, 800)
-CROP = (slice(55, 795), slice(75, 885))
+CROP = (slice(55, 757), slice(75, 885))
 """Rows and columns of a frame without title and legend."""
 
 DENSE = {"cubic": (1, 1, 1), "octet": (1, 1, 1), "bcc": (1, 1, 1), "tetrahedral_octahedral": (2, 1, 3)}

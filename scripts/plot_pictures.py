@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/plotting.md, and of docs/rendering.md those of rings and of the page for a browser.
+"""Draws the pictures of docs/plotting.md, and of docs/rendering.md.
 
 python scripts/plot_pictures.py            # a minute; the page needs Chromium
 """
@@ -18,8 +18,13 @@ RUNS = {
     "rod_newmark": ["rod_impact", "--set", "time.integrator=newmark"],
     "ring": ["ring_impact"],
     "30 m per s": ["ring_impact", "--set", "initial.velocity=[30.0,0.0,0.0]"],
+    "mast": ["guyed_mast"],
     "path": ["von_mises"],
     "pendulum": ["pendulum"],
+    "octet": [
+        *("lattice_drop", "--set", "mesh.kind=octet", "mesh.cells=[6,6,6]", "section.strut.area=3e-6"),
+        *("initial.velocity=[0.0,0.0,-60.0]", "title=Octet lattice dropped at 60 m/s", "output.fields_every=5"),
+    ],
     "lattice": ["lattice_drop", "--set", "mesh.cells=[8,8,8]", "section.strut.area=2e-6"],
 }
 PLOTS = {
@@ -32,6 +37,8 @@ PLOTS = {
 RING = ["--ghost", "--mark", "yielded", "--trails", "opposite", "--inset", "kinetic_energy"]
 FRAMES = {
     "render_extras": ["ring", *RING, "--frames", "0,50,100,150,200"],
+    "render_tubes": ["octet", "--frames", "0,16"],
+    "render_loads": ["mast", "--scale", "20", "--field", "axial_force", "--show", "supports", "loads", "--frames", "1"],
     "render_side_by_side": ["ring", "30 m per s", "--labels", "20 m/s", "30 m/s", "--frames", "0,20,130"],
 }
 

@@ -102,7 +102,7 @@ class Actions:
         """Return nodes for symbols, of many one in each cell of a grid."""
         if len(nodes) <= MOST:
             return nodes
-        cells = np.floor((self._start[nodes] - self._centre) / (_APART * self._diagonal))
+        cells = np.round((self._start[nodes] - self._centre) / (_APART * self._diagonal))
         some = nodes[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
         self.notes.append(f"symbols at {len(some):,} of {len(nodes):,} {what} nodes")
         return some

@@ -112,7 +112,7 @@ class Options:
     radius_scale: float = _option(1.0, "factor on the radii of tubes; default: 1", type=float)
     bar_width: float | None = _option(None, "minimum width of the bars", metavar="PIXELS", type=float)
     nodes: bool | None = _option(
-        None, "draw nodes as balls; default: for small models", action=argparse.BooleanOptionalAction
+        None, "draw nodes as dots; default: for small models", action=argparse.BooleanOptionalAction
     )
     ghost: bool = _option(False, "draw the first snapshot, pale, behind the others", action="store_true")
     marks: Sequence[str] = _option(
@@ -152,8 +152,14 @@ class Options:
 
     def __post_init__(self) -> None:
         video, size = self.video or ("webm" if self.transparent else "mp4"), self.size
-        if video not in VIDEOS:
-            raise InputError(f"render: video = {video!r} is not known; it is one of {', '.join(VIDEOS)}")
+        given = [
+            ("video", video, VIDEOS),
+            ("style", self.style, STYLES),
+            *(("show", each, SHOWN) for each in self.show),
+        ]
+        for name, value, known in given:
+            if value not in known:
+                raise InputError(f"render: {name} = {value!r} is not known; it is one of {', '.join(known)}")
         if self.transparent and video in ("mp4", "both"):
             raise InputError(
                 f"render: video = {video!r}: MP4 has no transparent background; use webm, webp, gif or none"
@@ -163,11 +169,6 @@ class Options:
                 f"render: size = {size[0]} x {size[1]} pixels is out of range; widths are 160 to 8192, heights 120 to "
                 "8192"
             )
-        if self.style not in STYLES:
-            raise InputError(f"render: style = {self.style!r} is not known; it is one of {', '.join(STYLES)}")
-        for kind in self.show:
-            if kind not in SHOWN:
-                raise InputError(f"render: show = {kind!r} is not known; it is one of {', '.join(SHOWN)}")
         for name, (low, high) in _RANGES.items():
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"render: {name} = {getattr(self, name):g} must be from {low:g} to {high:g}")

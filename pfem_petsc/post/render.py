@@ -449,7 +449,7 @@ def encode(pattern: Path, target: Path, fps: float) -> Path:
 
 _WIDTHS = ((300, 3.0), (20_000, 1.8))  # least widths of bars in pixels, by the number of bars
 _CONFIG = {"displaylogo": False, "scrollZoom": True}
-_SHAPES = ((2000, 5), (20_000, 3))  # from the initial one to that of the snapshot, by the number of bars
+_SHAPES = 5  # from the initial one to that of the snapshot; of large models two
 
 
 def render_html(
@@ -502,7 +502,7 @@ def _figure(film: Film) -> Any:
     radius = np.zeros(motion.n_bars) if style.radius is None else style.radius
     radius = np.maximum(radius, least * camera.half_height / 720)
     bars = Segments(None, motion.bars, kind, colour.on_nodes)
-    steps = np.linspace(0.0, 1.0, next((count for most, count in _SHAPES if motion.n_bars <= most), 2))
+    steps = np.linspace(0.0, 1.0, _SHAPES if motion.n_bars <= TUBE_LIMIT else 2)
     places = []
     for step in steps:
         bars.move(start + step * (now - start), radius if gone is None else np.where(gone, -1.0, radius))

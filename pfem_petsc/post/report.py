@@ -99,7 +99,9 @@ def _draw(result: Any, file: Path, field: str) -> tuple[Path | None, str]:
 def _document(result: Any, curves: Sequence[Path], drawn: Path | None, reason: str) -> str:
     case, log = result.case, _log(result)
     title = case.title or case.name
-    truss = _figure(drawn, "Six instants, coloured by the field named beside the scale") if drawn else ""
+    truss = (
+        _figure(drawn, "Instants, or ends of load cases, coloured by the field named beside the scale") if drawn else ""
+    )
     if not drawn:
         truss = f"<p>No pictures of the truss: {html.escape(reason)}</p>"
     sections = {

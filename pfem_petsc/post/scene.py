@@ -297,7 +297,10 @@ class Scene:
         shortest = float(np.quantile(lengths, 0.1)) if count else 1.0
         self.width = style.bar_width or _width(count, lengths, shortest, unit)
         self._radius = np.zeros(count) if not style.tubes or style.radius is None else np.asarray(style.radius, float)
-        self._apart = 1.0 - 1e-3 * (np.arange(count) % 16)  # so that the ends of two bars at a node are not one surface
+        # at each node one of the widest bars has its end, and the others taper into it: equal ends would be speckled
+        order, ends = np.argsort(-np.tile(self._radius, 2), kind="stable"), self._bars.T.ravel()
+        self._apart = np.full(2 * count, 0.96)
+        self._apart[order[np.unique(ends[order], return_index=True)[1]]] = 1.0
         self._corners = np.array(np.meshgrid(*motion.bounds.T)).reshape(3, -1).T
         window = [side * self._factor for side in size]
         self._plotter = pyvista.Plotter(off_screen=True, window_size=window, lighting="none")
@@ -360,7 +363,7 @@ class Scene:
 
         self._plotter.remove_actor(self._extra, reset_camera=False, render=False)
         pixel = camera.metres(points) / self.size[1]
-        radius = np.maximum(self._radius, 0.5 * self.width * pixel[self.segments.ends]) * self._apart
+        radius = np.maximum(self._radius, 0.5 * self.width * pixel[self.segments.ends]) * self._apart.reshape(2, -1)
         if gone is not None:
             radius[:, gone] = -1.0
         ahead = camera.ahead(points)

@@ -321,6 +321,10 @@ def _page(paths: list[Path], arguments: argparse.Namespace) -> int:
         raise InputError("render: --frames is the number of one snapshot with --html, as --frames 12")
     chosen = ("field", "component", "clim", "symmetric", "cmap", "scale", "style", "radius_scale", "title", "view")
     options = {name: getattr(arguments, name) for name in chosen}
+    others = [each.name for each in fields(Options) if each.name not in (*chosen, "frames")]
+    given = [name for name in others if getattr(arguments, name) != getattr(Options(), name)]
+    if given:
+        raise InputError(f"render: --html does not take {', '.join(given)}; it takes frames, {', '.join(chosen)}")
     frame = -1 if arguments.frames is None else arguments.frames
     print(render_html(paths[0], arguments.output, frame=frame, **options))
     return 0

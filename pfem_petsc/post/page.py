@@ -130,7 +130,8 @@ class Page:
         ]
         place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0 - 1.5 / wide, 0.0)}
         figure.legend(handles=keys, frameon=False, fontsize=11.5, ncols=max(1, len(keys)), **place)
-        self._notes = self._write(0.24, 0.22, literal("   ".join(heading.notes)), va="center_baseline", fontsize=11.5)
+        lines = "\n".join("   ".join(heading.notes[k : k + 2]) for k in range(0, len(heading.notes), 2))
+        self._notes = self._write(0.24, 0.22, literal(lines), va="center", fontsize=11.5, linespacing=1.1)
         scale = heading.scale
         bar = figure.add_axes((1.0 - 1.16 / wide, 1.6 / high, 0.2 / wide, 1.0 - 2.91 / high))
         figure.colorbar(scale.shown, cax=bar, ticks=MaxNLocator(nbins=7, steps=[1, 2, 2.5, 5, 10]))

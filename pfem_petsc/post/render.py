@@ -297,9 +297,13 @@ class Film:
 
     @property
     def notes(self) -> list[str]:
-        """What the foot of each picture says."""
+        """What the foot of each picture says: of all results, then of one."""
+        every = [motion.notes for motion in self.motions]
+        shared = [note for note in every[0] if all(note in notes for notes in every)]
+        own = zip(self._labels, every, strict=True)
+        shared += [f"{label}: {note}" for label, notes in own for note in notes if note not in shared]
         factor, tubes = self.options.radius_scale, any(style.radius is not None for style in self.styles)
-        return self.motions[0].notes + ([f"radii × {factor:g}"] if tubes and factor != 1.0 else [])
+        return shared + ([f"radii × {factor:g}"] if tubes and factor != 1.0 else [])
 
     def _aspect(self) -> float:
         """Return the width of the motions over their height, in the picture, their mean."""

@@ -85,6 +85,9 @@ def test_what_is_not_true_to_scale_says_so(tmp_path, flying):
         ({"scale": 0.5}, ["displacements × 0.5"]),
     ):
         assert Film([flying], Options(**options), print).notes == notes
+    both = Film([flying, flying], Options(scale=2.0, labels=["one", "other"]), print)
+    both.motions[1].actions = SimpleNamespace(notes=["longest arrow 3.00 N"])
+    assert both.notes == ["displacements × 2", "other: longest arrow 3.00 N"]
     plain, poster = draw(tmp_path / "a", flying, frames=[0], poster=True, size=(640, 360))
     scaled, larger = draw(tmp_path / "b", flying, frames=[0], poster=True, size=(640, 360), scale=1.5)
     for without, told in ((plain, scaled), (poster, larger)):

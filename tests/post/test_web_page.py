@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from helpers.synthetic import SyntheticResult, lattice
+from helpers.synthetic import SyntheticResult, lattice, write_result
 
+from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.render import render_html
 
@@ -33,3 +34,9 @@ def test_one_file_that_loads_nothing(tmp_path, result):
 def test_refused_pages(tmp_path, result, options, message):
     with pytest.raises(InputError, match=message):
         render_html(result, tmp_path, **options)
+
+
+def test_options_of_pictures_alone_are_refused(tmp_path, capsys):
+    file = str(write_result(tmp_path))
+    assert main(["render", file, "--html", "--ghost", "--show", "loads"]) == 2
+    assert "--html does not take ghost, show; it takes frames, field," in capsys.readouterr().err

@@ -67,12 +67,16 @@ class Actions:
             self._models[number].external.hold(*held, True)
         numbers = rows[np.minimum(np.searchsorted(when, times), len(when) - 1)].tolist()
         self._moments = [(k, self._own(k, float(time))) for k, time in zip(numbers, times, strict=True)]
-        self._supports = [
-            [(self._ids[own.nodes[each.node_set]], directions_of(each)[0]) for each in stage.support]
-            for stage, own in zip(self._stages, self._models, strict=True)
-        ]
+        self._supports: list[list[tuple[np.ndarray, np.ndarray, float]]] = []  # nodes, directions, until when
+        removed: list[dict[str | None, float]] = []
+        for number, (stage, own) in enumerate(zip(self._stages, self._models, strict=True)):
+            before = removed[number - 1 if stage.starts_from is None else stage.starts_from] if number else {}
+            ends = dict.fromkeys(before, -np.inf) | {entry.supports: entry.time for entry in stage.remove}
+            removed.append(ends)
+            sets = [(self._ids[own.nodes[each.node_set]], each) for each in stage.support]
+            self._supports.append([(n, directions_of(each)[0], ends.get(each.name or "", np.inf)) for n, each in sets])
         held_nodes = np.unique(
-            np.concatenate([self._ids[:0], *(nodes for each in self._supports for nodes, _ in each)])
+            np.concatenate([self._ids[:0], *(nodes for each in self._supports for nodes, *_ in each)])
         )
         self._shown = self._thinned(held_nodes, "supported") if "supports" in kinds else self._ids[:0]
         size = np.zeros(len(self._ids))
@@ -140,13 +144,16 @@ class Actions:
         head = np.minimum(_HEAD * self._diagonal, 0.5 * length)
         ends = [tips - head * way + side * 0.4 * head * across for side in (1.0, -1.0)]
         pairs = [np.stack(pair, axis=1) for pair in [(tails, tips), *((tips, end) for end in ends)]]
-        return [_lines(pairs, 2.2), _lines(self._triangles(self._moments[number][0], points, camera), 1.5)]
+        return [_lines(pairs, 2.2), _lines(self._triangles(number, points, camera), 1.5)]
 
-    def _triangles(self, stage: int, points: np.ndarray, camera: Camera) -> list[np.ndarray]:
+    def _triangles(self, number: int, points: np.ndarray, camera: Camera) -> list[np.ndarray]:
         """Return the lines (n, 2, 3) of supports: one triangle with strokes below where all seen directions are
         held; else one for each direction, with a second line, along which the node may move."""
         held: dict[int, list[np.ndarray]] = {}
-        for nodes, directions in self._supports[stage]:
+        stage, now = self._moments[number]
+        for nodes, directions, end in self._supports[stage]:
+            if now > end * (1.0 + 1e-9):
+                continue
             seen = [d for d in directions if not (camera.parallel and abs(d @ camera.towards) > _ALONG)]
             for node in np.intersect1d(nodes, self._shown).tolist():
                 held.setdefault(node, []).extend(seen)

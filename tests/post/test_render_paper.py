@@ -240,6 +240,26 @@ def test_supports_have_symbols_of_what_they_hold(loaded, tmp_path):
             draw(tmp_path, result, show=["weights"])
 
 
+def test_removed_supports_have_no_symbols(tmp_path):
+    """Let go at 2 ms of the first stage, and gone in the second one, which still names the support."""
+    data = {key: CASE[key] for key in ("mesh", "node_set", "material", "section", "output")}
+    data["support"] = [{"node_set": "left", "fix": "xyz"}, {"node_set": "right", "fix": "xyz", "name": "bearing"}]
+    data["output"] = {"fields_every": 2}
+    time = {"integrator": "central_differences", "step": 1e-3, "end": 4e-3}
+    data["stage"] = [
+        {"name": "let go", "remove": [{"supports": "bearing", "time": 2e-3}], "time": time},
+        {"name": "free", "time": time},
+    ]
+    with Simulation(Case.from_dict(data), output=tmp_path / "result", quiet=True) as simulation:
+        simulation.run()
+    with open_result(tmp_path / "result") as result:
+        assert result.times == pytest.approx([0.0, 2e-3, 4e-3, 6e-3, 8e-3])
+        actions = Actions(result, ["supports"], result.times, np.array([[0.0, 0, 0], [2, 1, 1]]))
+        camera = camera_of(BOX, "xz")
+        drawn = [len(actions.layers(k, result.positions(k), camera)[1].lines) // 7 for k in range(5)]
+        assert drawn == [2, 2, 1, 1, 1]
+
+
 def test_many_loads_are_thinned_and_counted(tmp_path):
     """A net of 441 loaded nodes has arrows at distances of a twentieth of its diagonal, one in each cell."""
     data = {

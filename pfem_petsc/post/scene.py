@@ -299,7 +299,7 @@ class Scene:
         self._radius = np.zeros(count) if not style.tubes or style.radius is None else np.asarray(style.radius, float)
         # at each node one of the widest bars has its end, and the others taper into it: equal ends would be speckled
         order, ends = np.argsort(-np.tile(self._radius, 2), kind="stable"), self._bars.T.ravel()
-        self._apart = np.full(2 * count, 0.96)
+        self._apart = np.full(2 * count, 0.98)
         self._apart[order[np.unique(ends[order], return_index=True)[1]]] = 1.0
         self._corners = np.array(np.meshgrid(*motion.bounds.T)).reshape(3, -1).T
         window = [side * self._factor for side in size]

@@ -20,7 +20,6 @@ from ..parallel.agreement import agreed
 from .camera import at_one_scale, cameras
 from .chart import opened
 from .colours import MARKS, ColourField, ColourScale, limits_of
-from .members import instants_of, unfinished
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_times
 from .options import Options
 from .page import Heading, Page, grid, inset_room
@@ -346,9 +345,11 @@ def instants(result: Any, frames: Sequence[int], count: int) -> list[int]:
     count : maximum number of snapshots
     """
     frames = sorted(set(frames))
-    if any(stage.starts_from is not None for stage in result.case.stage):  # of load cases, their ends
-        ends = {instant.snapshot for instant in instants_of(result, None, None)} if not unfinished(result) else set()
-        frames = [frame for frame in frames if frame in ends] or frames
+    cases = [number for number, stage in enumerate(result.case.stage) if stage.starts_from is not None]
+    if cases:  # of load cases, their ends
+        when, given = result.history["time"], np.asarray(result.times)[frames]
+        number = np.asarray(result.history["stage"])[np.minimum(np.searchsorted(when, given), len(when) - 1)]
+        frames = [frames[np.flatnonzero(number == k)[-1]] for k in cases if k in number] or frames
     if len(frames) <= count:
         return frames
     times = np.asarray(result.times, dtype=float)[frames]

@@ -322,6 +322,7 @@ class Scene:
         nodes = few if style.nodes is None else style.nodes
         self._nodes = self._balls() if nodes else None
         self._extra: list[Any] = []
+        self._outline = max(1.2, 1.0 / unit)  # of marked bars: a pixel at least
 
     def _balls(self) -> tuple[Segments, np.ndarray]:
         """Return nodes as bars without length, and the radii of the widest bars there."""
@@ -399,8 +400,9 @@ class Scene:
         return max(self.width, 2.0 * pixels * float(self._radius.max(initial=0.0))) / self.unit
 
     def rim(self, points: np.ndarray, bars: np.ndarray, colour: tuple[int, int, int]) -> Layer:
-        """Return a layer that outlines bars (numbers) by two pixels."""
-        return Layer(points, self._bars[bars], colour, self.width / self.unit + 4.0, -1.0, self._radius[bars])
+        """Return a layer that outlines bars (numbers) by a pixel or so."""
+        width = self.width / self.unit + 2.0 * self._outline
+        return Layer(points, self._bars[bars], colour, width, -1.0, self._radius[bars])
 
     def _add(self, layer: Layer, camera: Camera) -> Any:
         pixel = 2.0 * camera.half_height / self.size[1] * self.unit
@@ -409,7 +411,7 @@ class Scene:
         points = points + np.minimum(layer.shift * pixel / far, np.inf if camera.parallel else 0.6) * ahead
         made = Segments(self._plotter, layer.lines, "strip", False)
         least = max(0.5 * layer.width * self.unit, 0.4) * camera.metres(points)[made.ends] / self.size[1]
-        radius = layer.radius + 2.0 * pixel if np.any(layer.radius) else 0.0
+        radius = layer.radius + self._outline * pixel if np.any(layer.radius) else 0.0
         made.mesh.point_data["colour"][:] = layer.colour
         made.move(points, np.maximum(radius, least), ahead=camera.ahead(points))
         return made.actor

@@ -45,7 +45,7 @@ def stage_rows(cases: Sequence[Any], combinations: Sequence[Any], common: Mappin
         If a combination has no meaning, such as of two winds.
     """
     own = {case.name: _tables(case) for case in cases}
-    rows = [{"name": name, **_joined(common, {name: tables}, name)} for name, tables in own.items()]
+    rows = [{"name": case.name, **_joined(common, {case.name: own[case.name]}, case.name)} for case in cases]
     for combination in combinations:
         scaled = {n: _scaled(own[n], factor, combination.name) for n, factor in combination.factors.items() if factor}
         rows.append({"name": combination.name, **_joined(common, scaled, combination.name)})

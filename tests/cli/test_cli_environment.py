@@ -167,7 +167,7 @@ def test_probes_run_here():
         (
             ".venv",
             ("made-from", "setup-done"),
-            "lacks what it had: run bash scripts/setup.sh (No module named 'numba')",
+            "lacks what it had: run bash scripts/setup.sh, then source .venv/bin/activate (No module named 'numba')",
         ),
     ],
 )

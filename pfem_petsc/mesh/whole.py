@@ -177,11 +177,7 @@ def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
         made.append("supports and loads" if analysis else "supports, loads, and the analysis")
     elif not analysis:
         made.append("the analysis, which is an explicit one of a millisecond")
-    told = (
-        "Replace what is not known from it:"
-        if made
-        else "Supports, loads and the analysis are those of the file."
-    )
+    told = "Replace what is not known from it:" if made else "Supports, loads and the analysis are those of the file."
     lines = [f"# A case for {file.name}. {told}\n", *(f"#   {key}\n" for key in made), "\n"]
     data = {
         "title": file.stem,

@@ -679,11 +679,7 @@ def _law(chance: random.Random, wall: dict[str, Any], treatment: str, time: dict
         if chance.random() < 0.4:
             wall["static_friction"] = wall["friction"] * chance.uniform(1.0, 1.6)
     solves_next_position = time["integrator"] == "central_differences"
-    fits = (
-        "mass" not in time
-        and jumps
-        and (treatment == "scheme" or treatment == "stick" and not solves_next_position)
-    )
+    fits = "mass" not in time and jumps and (treatment == "scheme" or treatment == "stick" and not solves_next_position)
     if kind == "restitution" and (odd or fits and (solves_next_position or "mass" not in wall)):
         wall["restitution"] = chance.choice((0.3, 0.7, 1.0, chance.random()))
         if solves_next_position and chance.random() < 0.2:

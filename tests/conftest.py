@@ -172,6 +172,19 @@ def wait_for_all(what: str, outcome: int, text: str) -> int:
 
 
 @pytest.fixture
+def own_registry(monkeypatch):
+    """A registry of plugins of the test's own."""
+    from pfem_petsc import registry
+
+    monkeypatch.setattr(registry, "_plugins", {package: {} for package in registry.KINDS})
+    monkeypatch.setattr(registry, "_sources", {})
+    yield
+    for package, modules in registry._plugins.items():
+        for name in modules:
+            sys.modules.pop(f"{package}.{name}", None)
+
+
+@pytest.fixture
 def comm() -> MPI.Intracomm:
     """All ranks of the run."""
     return WORLD

@@ -13,7 +13,7 @@ import pytest
 from helpers.launch import environment
 from helpers.pages import DOCS, ROOT
 
-from pfem_petsc import open_result, registry
+from pfem_petsc import open_result
 from pfem_petsc.cli.main import main
 
 PAGE = (DOCS / "recipes.md").read_text()
@@ -22,11 +22,9 @@ BLOCK = re.compile(r"^```(toml|python|bash)\n(.*?)^```$", flags=re.MULTILINE | r
 
 
 @pytest.fixture
-def cook(tmp_path, monkeypatch, capfd):
+def cook(tmp_path, monkeypatch, capfd, own_registry):
     """Run a recipe in an empty folder that has the meshes of the checkout, and return what it prints."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "_plugins", {package: {} for package in registry.KINDS})
-    monkeypatch.setattr(registry, "_sources", {})
     (tmp_path / "pfem_petsc").mkdir()
     for folder in ("meshes", "pfem_petsc/cases"):
         (tmp_path / folder).symlink_to(ROOT / folder)

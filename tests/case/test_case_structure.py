@@ -89,6 +89,6 @@ def test_set_makes_the_first_of_a_list_of_constraints():
     """``constraint.0`` where the case has none is refused for its kind, not for the key."""
     with pytest.raises(
         InputError,
-        match=r"constraint\[0\]\.kind = \"thether\" \(given by --set\): unknown value; none is built in, CONTR",
+        match=r"constraint\[0\]\.kind = \"thether\" \(given by --set\): unknown value; none is built in, docs",
     ):
         Case.load("rod_impact", ["constraint.0.kind=thether"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 
 import pytest
 from helpers.pages import PLUGINS, SPIN
@@ -22,17 +21,6 @@ def plugin_files(comm, shared_tmp_path):
             (folder / name).write_text(code)
     comm.Barrier()
     return folder
-
-
-@pytest.fixture
-def own_registry(monkeypatch):
-    """A registry of plugins of the test's own."""
-    monkeypatch.setattr(registry, "_plugins", {package: {} for package in registry.KINDS})
-    monkeypatch.setattr(registry, "_sources", {})
-    yield
-    for package, modules in registry._plugins.items():
-        for name in modules:
-            sys.modules.pop(f"{package}.{name}", None)
 
 
 @pytest.fixture

@@ -26,6 +26,6 @@ def test_history_as_a_table(result):
     assert list(result.table(["wall/wall", "kinetic_energy"]))[:3] == ["step", "time", "wall/wall/contact_time"]
     probe = next(name for name in table if name.startswith("probe/"))
     assert re.fullmatch(r"probe/\w+/\w+\[0\]\.x", probe)
-    with pytest.raises(InputError, match="has no kinetic_enrgy, did you mean 'kinetic_energy'"):
+    with pytest.raises(InputError, match="no column 'kinetic_enrgy', did you mean 'kinetic_energy'"):
         result.table(["kinetic_enrgy"])
     assert result.grid(-1).n_cells == result.n_bars

@@ -483,7 +483,8 @@ def _check_sections(model: CaseModel, stages: list[CaseModel], problems: Problem
             text = "has no effect: bars of this material and section are not checked for buckling; remove the key"
             problems.add(("section", name, "effective_length"), text, section.effective_length)
         path = ("section", name, "thickness")
-        if path in problems.overridden and section.diameter is None and not wind:
+        follows = section.area is None and section.area_field is None  # from the sizes
+        if path in problems.overridden and not follows and not wind:
             text = (
                 "changes no result: stiffness and mass follow from area, and the law does not buckle; change area, or "
                 "give diameter instead of it"

@@ -210,6 +210,8 @@ def on_first_rank(function: Callable[[], int], debug: bool, uses_mpi: bool) -> i
         rank = MPI.COMM_WORLD.rank
     if rank:
         return 0
+    # where a verb imports PETSc, its handlers would end the process at a closed pipe
+    os.environ["PETSC_OPTIONS"] = f"{os.environ.get('PETSC_OPTIONS', '')} -no_signal_handler".strip()
     try:
         status = function()
         sys.stdout.flush()  # errors of writing are reported here, not lost at the end of the process

@@ -175,6 +175,14 @@ def _check_same(file: h5py.File, path: Path, n_snapshots: int, sizes: tuple[int,
                 f"{path}: history/{name}: the run records {records}, the file has {has}: it was written with another "
                 "case; restart with the same walls and probes, or write elsewhere (-o)"
             )
+    known = read_attributes(file["case"])
+    for name, numbers in contents.attributes.items():
+        if name.startswith(("probe_nodes/", "probe_bars/")) and list(known.get(name, numbers)) != list(numbers):
+            what, _, probe = name.removeprefix("probe_").partition("/")
+            raise InputError(
+                f"{path}: probe {probe!r}: the {what} {known[name]} of the file are now {numbers}: restart with the "
+                "same ones, or write elsewhere (-o)"
+            )
 
 
 def _rebuild(target: h5py.File, source: h5py.File, counts: tuple[int, int, int], contents: Contents) -> None:

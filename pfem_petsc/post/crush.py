@@ -11,7 +11,8 @@ strain d/h from the first contact on. Definitions are those of ISO 13314:2011 fo
 - densification: the strain at which the efficiency, this integral over the largest stress so far, is largest (Q. M. Li,
   I. Magkiriadis, J. J. Harrigan, Journal of Cellular Plastics 42 (2006) 371-392).
 
-All but energies are those of the mean stress over a window of strain, so that a peak of a single row is none.
+All but energies are those of the mean stress over a window of strain, so that a peak of a single row is none. The
+window is about the strain, and narrower near both ends of the curve, where it is that of the rows.
 """
 
 from __future__ import annotations
@@ -197,8 +198,9 @@ def crush(
     work = cumulative_trapezoid(force, strain, initial=0.0) / area
     strain, energy, stress = strain[kept], work[kept], force[kept] / area
     if window > 0.0:
-        low, high = np.maximum(strain - 0.5 * window, 0.0), np.minimum(strain + 0.5 * window, strain[-1])
-        stress = (np.interp(high, strain, energy) - np.interp(low, strain, energy)) / (high - low)
+        half = np.minimum(0.5 * window, np.minimum(strain, strain[-1] - strain))  # narrower towards both ends
+        rise = np.interp(strain + half, strain, energy) - np.interp(strain - half, strain, energy)
+        stress = np.where(half > 0.0, rise / np.where(half > 0.0, 2.0 * half, 1.0), stress)
     largest = np.maximum.accumulate(stress)
     efficiency = np.divide(energy, largest, out=np.zeros_like(energy), where=largest > 0.0)
     return CrushTest(strain, stress, energy, efficiency, area, height, _mass(case), window)
@@ -208,9 +210,14 @@ def _way(result: Any, wall: str, displacement: str | None) -> tuple[np.ndarray, 
     """Return the compression (rows,) [m] and the unit vector (3,) along which forces count."""
     history = result.history
     if displacement is not None:
-        values = select(history, displacement).reduced().values
+        selected = select(history, displacement).reduced()
+        values = selected.values
         if values.ndim != 1:
             raise InputError(f"crush: {displacement} has several components; name one, like {displacement}.z")
+        if selected.unit not in ("m", None):
+            raise InputError(f"crush: {displacement} is in {selected.unit or '1'}: expected a length in m")
+        if not np.isfinite(values).all():
+            raise InputError(f"crush: {displacement} is no number in {(~np.isfinite(values)).sum()} rows")
         force = np.asarray(history[f"wall/{wall}/force"]).sum(axis=0)
         size = float(np.linalg.norm(force))
         if size == 0.0:

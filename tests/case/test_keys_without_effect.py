@@ -50,6 +50,8 @@ def test_refused(section, overrides, more, text):
 
 
 def test_accepted():
+    angle = {"area": None, "shape": "angle", "width": 0.1, "thickness": 1e-3}
+    assert case(angle, ["section.a.thickness=2e-3"]).section["a"].uniform_area == pytest.approx(0.198 * 2e-3)
     case({"diameter": 0.1, "drag_coefficient": 1.0}, **WIND)
     case({"area": None, "shape": "tube", "diameter": 0.1, "thickness": 1e-3}, ["section.a.thickness=2e-3"])
     case(TUBE)  # compared with Euler's load

@@ -1,8 +1,12 @@
 """From a case to results, and from results to summaries and pictures, by the command line."""
 
 import re
+import shlex
+import subprocess
+import sys
 
 import pytest
+from helpers.launch import environment
 
 from pfem_petsc.cli.main import main
 
@@ -91,3 +95,16 @@ def test_result_that_is_none(verb, tmp_path, capsys):
     (tmp_path / "result.vtkhdf").write_text("this is no HDF5 file")
     assert main([verb, str(tmp_path)]) == 2
     assert str(tmp_path / "result.vtkhdf") in capsys.readouterr().err
+
+
+def test_a_reader_that_ends_early_ends_the_verb(short_run):
+    """Also of verbs that import PETSc, whose handler of broken pipes ends a process with a message of its own."""
+    command = f"{shlex.quote(sys.executable)} -m pfem_petsc members {shlex.quote(str(short_run))}"
+    done = subprocess.run(
+        ["bash", "-c", f"{command} | true; echo ${{PIPESTATUS[0]}}"],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert (done.stdout, done.stderr) == ("0\n", "")

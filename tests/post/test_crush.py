@@ -65,6 +65,24 @@ def test_first_peak_is_the_mean_over_the_window(monkeypatch):
     assert figures(block(strain, stress), monkeypatch, window=0.0)["first peak"] == pytest.approx(8e6, rel=1e-9)
 
 
+def test_both_ends_of_the_curve_are_those_of_the_rows(monkeypatch):
+    """And the mean over a window about any point of a line is the line."""
+    monkeypatch.setattr(module, "_mass", lambda _: 5.0)
+    strain = np.linspace(0.0, 0.3, 3001)
+    test = crush(block(strain, 2e6 * strain), "w", window=0.02)
+    np.testing.assert_allclose(test.stress, 2e6 * test.strain, rtol=1e-4, atol=1e-6)
+    assert (test.stress[0], test.stress[-1]) == pytest.approx((0.0, 0.6e6), rel=1e-9)
+
+
+def test_displacements_that_are_no_lengths():
+    strain = np.linspace(0.0, 0.3, 31)
+    result = block(strain, 1e6 * strain, kinetic_energy=np.ones(32))
+    with pytest.raises(InputError, match="kinetic_energy is in J: expected a length in m"):
+        crush(result, "w", displacement="kinetic_energy")
+    with pytest.raises(InputError, match="is no number in 1 rows"):
+        crush(result, "w", displacement="wall/w/position.y/wall/w/position.y*1[m]")
+
+
 def test_a_peak_within_the_window_is_told_and_not_guessed(monkeypatch):
     """A strut that buckles at a strain of 0.1 %: 8 MPa, of which a mean over 1 % knows nothing."""
     strain = np.linspace(0.0, 0.3, 30001)

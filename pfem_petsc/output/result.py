@@ -230,6 +230,9 @@ class Result:
                 rows["end"] += f", stage {int(history['stage'][-1]) + 1} of {len(self._static_stages)}"
             elif steps is not None and self.axis is TIME:
                 rows["end"] += ", which is the end of the run" if last >= steps else f", of {int(steps):,} steps"
+            elif (end := self.case.end or 0.0) and self.axis is not TIME:  # a path has none
+                done = float(history["time"][-1]) >= end * (1.0 - 1e-9)
+                rows["end"] += ", which is the end of the run" if done else f", of {end:g}"
         rows["snapshots"] = f"{len(self.times)}"
         names = [name for name in ("kinetic_energy", "elastic_energy", "plastic_dissipation") if name in history]
         for name in (*names, "external_work") if n else ():

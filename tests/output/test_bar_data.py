@@ -203,3 +203,11 @@ def test_wide_tables_show_a_dozen_columns_that_are_not_zero(result):
     assert all(np.any(table[name]) for name in names)
     assert more.startswith(f"and {len(table) - 12} more columns: ")
     assert "support_force.x" in table.text(1)
+
+
+def test_a_printed_result_of_a_failed_analysis_tells_where_it_ended(tmp_path):
+    """The limit of the load is 38 N of 100 N."""
+    words = ["von_mises", "-o", str(tmp_path), "--quiet", "--set", "static.method=newton"]
+    assert main([*words, *(f"static.{key}=" for key in ("node_set", "direction", "displacement"))]) == 3
+    (end,) = (line for line in str(open_result(tmp_path)).splitlines() if line.startswith("  end"))
+    assert "load factor 0.3" in end and end.endswith(", of 1")

@@ -91,7 +91,9 @@ def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = Non
 
 
 def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
-    """Read a mesh file as it is, unchecked, with the named fields; None: with all. For one rank.
+    """Read a mesh file as it is, with the named fields; None: with all. For one rank.
+
+    The mesh need not be one that can be simulated, but its numbers are checked: coordinates and ends of bars.
 
     Raises
     ------
@@ -100,7 +102,7 @@ def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     """
     from mpi4py import MPI
 
-    from ..mesh.whole import WholeMesh
+    from ..mesh.whole import WholeMesh, check_numbers
 
     path = Path(path)
     reader = _reader_of(path, "")
@@ -112,6 +114,7 @@ def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     else:
         whole = _read(reader, path, wanted)
     whole.source = str(path)
+    check_numbers(whole.slab(whole.source), MPI.COMM_SELF)
     return whole
 
 
@@ -151,7 +154,9 @@ def _reader_of(path: Path, key: str) -> Any:
 
 
 def _near(path: Path, known: Collection[str]) -> str:
-    """Return a hint at a mesh file with a similar name."""
+    """Return a hint at what the path is, or at a mesh file with a similar name."""
+    if path.is_symlink():
+        return f": it is a link to {path.readlink()}, which is not there"
     folder = path.parent
     try:
         there = sorted(entry.name for entry in folder.iterdir() if entry.suffix.lower() in known)

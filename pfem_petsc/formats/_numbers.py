@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 
 import numpy as np
 
 from ..errors import InputError
+
+_NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
 
 
 def numbers_of(text: bytes) -> np.ndarray:
@@ -25,8 +28,9 @@ def numbers_of(text: bytes) -> np.ndarray:
         warnings.simplefilter("error")
         try:
             return np.fromstring(text, dtype=np.float64, sep=" ")
-        except DeprecationWarning as error:
-            raise ValueError(str(error)) from None
+        except (DeprecationWarning, ValueError):
+            other = next((word for word in text.split() if not _NUMBER.fullmatch(word)), text.strip())
+            raise ValueError(f"{shown(other)!r} is not a number") from None
 
 
 def number_of(text: str) -> float:

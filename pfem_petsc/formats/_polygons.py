@@ -28,10 +28,13 @@ def edges(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([keys // n, keys % n], axis=1), number.ravel()
 
 
-def mesh_of(path: Path, points: np.ndarray, lines: np.ndarray, around: np.ndarray, faces: int) -> WholeMesh:
+def mesh_of(
+    path: Path, points: np.ndarray, lines: np.ndarray, around: np.ndarray, faces: int, first: int = 0
+) -> WholeMesh:
     """Return the mesh of lines (m, 2); without any, of the edges of faces with the sides ``around`` (k, 2).
 
-    Nodes that faces alone have are left out with them; what is left out, or made of faces, is told.
+    Nodes that faces alone have are left out with them; what is left out, or made of faces, is told. Messages number
+    points from ``first``, as the file does.
     """
     from ..mesh.whole import WholeMesh
 
@@ -40,7 +43,9 @@ def mesh_of(path: Path, points: np.ndarray, lines: np.ndarray, around: np.ndarra
         raise InputError(f"{path}: has neither lines nor faces, whose edges would be bars")
     if bars.min() < 0 or bars.max() >= len(points):
         wrong = int(bars[(bars < 0) | (bars >= len(points))][0])
-        raise InputError(f"{path}: there is no point {wrong} (from 0): the file has {len(points)}")
+        raise InputError(
+            f"{path}: there is no point {wrong + first}: the file has {len(points)}, numbered from {first}"
+        )
     mesh = WholeMesh(points, bars)
     if len(lines) and faces:
         mesh.warnings.append(f"{path}: the lines are bars: left out {faces} faces")

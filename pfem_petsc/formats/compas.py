@@ -33,7 +33,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         If it is not JSON, or has none.
     """
     try:
-        found = list(_structures(json.loads(path.read_bytes())))
+        # whole numbers of any length, of which the longest are infinite
+        found = list(_structures(json.loads(path.read_bytes(), parse_int=_whole)))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON: {error}") from None
     if not found:
@@ -42,16 +43,22 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     number = {key: i for i, key in enumerate(data[kind])}
     try:
         nodes = _with_defaults(data, _DEFAULTS[kind], data[kind].values())
-        points = np.array([[float(node.pop(axis, 0.0)) for axis in "xyz"] for node in nodes])
+        points = np.array([_place(kind, key, node) for key, node in zip(number, nodes)])
         ends, given = _edges_of(data, number)
         bars = _with_defaults(data, _OF_EDGES, given)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: {type(error).__name__}: {error}: expected what COMPAS writes") from None
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (TypeError, AttributeError) as error:
+        raise InputError(f"{path}: its {kind} or edges are not what COMPAS writes: {error}") from None
     mesh = WholeMesh(points.reshape(-1, 3), np.array(ends, np.int64).reshape(-1, 2))
     left = [
         *_attributes(nodes, mesh.node_fields, mesh.node_groups),
         *_attributes(bars, mesh.bar_fields, mesh.bar_groups),
     ]
+    for name, values in (mesh.node_fields | mesh.bar_fields).items():
+        if not np.isfinite(values).all():
+            n = int((~np.isfinite(values)).sum())
+            mesh.warnings.append(f"{path}: the attribute {name} is not a finite number {n} times")
     if left:
         mesh.warnings.append(f"{path}: left out the attributes {', '.join(left)}: not one number for each node or edge")
     if len(found) > 1:
@@ -76,14 +83,36 @@ def _edges_of(data: dict[str, Any], number: dict[str, int]) -> tuple[Sequence[An
     of = data.get("edge")
     if of:
         pairs = [(u, v) for u in of for v in of[u]]
-        return [(number[str(u)], number[str(v)]) for u, v in pairs], [dict(of[u][v] or {}) for u, v in pairs]
-    loops = [[number[str(key)] for key in face] for face in data["face"].values() if face]
+        ends = [[_number(number, key, f"edge {u}-{v}") for key in (u, v)] for u, v in pairs]
+        return ends, [dict(of[u][v] or {}) for u, v in pairs]
+    faces = data.get("face") or {}
+    loops = [[_number(number, key, f"face {name}") for key in face] for name, face in faces.items() if face]
     around = [pair for loop in loops for pair in pairwise([*loop, loop[0]])]
     ends, _ = edges(np.array(around, np.int64).reshape(-1, 2))
     given = {frozenset(key.strip("()").replace(",", "-").replace(" ", "").split("-")): own
              for key, own in (data.get("edgedata") or {}).items()}  # fmt: skip
     keys = list(number)
     return ends, [dict(given.get(frozenset((keys[a], keys[b])), {})) for a, b in ends.tolist()]
+
+
+def _number(number: dict[str, int], key: Any, of: str) -> int:
+    if str(key) not in number:
+        raise ValueError(f"{of} ends at {str(key)!r}, and there is no such node or vertex")
+    return number[str(key)]
+
+
+def _place(kind: str, key: str, node: dict[str, Any]) -> list[float]:
+    """Take the coordinates out of the attributes of a node."""
+    found = [(axis, node.pop(axis, None)) for axis in "xyz"]
+    for axis, value in found:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            has = "no" if value is None else f"{value!r} as"
+            raise ValueError(f"{kind} {key!r} has {has} {axis}: expected a number, there or in the default attributes")
+    return [float(value) for _, value in found]
+
+
+def _whole(text: str) -> float:
+    return int(text) if len(text) < 19 else float(text)
 
 
 def _with_defaults(

@@ -6,6 +6,7 @@ metres.
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Collection
 from itertools import pairwise
@@ -36,7 +37,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     groups: dict[str, dict[str, list[int]]] = {"l": {}, "f": {}}
     named: dict[str, list[str]] = {"o": [], "g": []}
     faces, degree, other = 0, 0, Counter[str]()
-    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    text = path.read_text(encoding="utf-8-sig", errors="replace").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
         word, *rest = line.partition("#")[0].split() or [""]
         try:
@@ -48,8 +49,11 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
                 word, rest = ("l", rest[2:]) if word == "curv" else (word, rest)
                 ends = [int(text.partition("/")[0]) for text in rest]
                 ends = [end - 1 if end > 0 else len(points) + end for end in ends]
-                if min(ends) < 0:
+                if min(ends) < 0 or max(ends) > sys.maxsize:
                     raise IndexError
+                if len(ends) == 1:
+                    other[f"{word} of one point"] += 1
+                    continue
                 own = pairs[word]
                 new = [*pairwise(ends), *([(ends[-1], ends[0])] if word == "f" else [])]
                 for name in (*named["o"], *named["g"]):
@@ -66,7 +70,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
             expected = "three numbers" if word == "v" else "the numbers of points that precede it"
             raise InputError(f"{path}: line {number}: {line[:60]!r}: expected {expected}") from None
     around = np.array(pairs["f"], np.int64).reshape(-1, 2)
-    mesh = mesh_of(path, np.array(points).reshape(-1, 3), np.array(pairs["l"]).reshape(-1, 2), around, faces)
+    mesh = mesh_of(path, np.array(points).reshape(-1, 3), np.array(pairs["l"]).reshape(-1, 2), around, faces, 1)
     place = np.arange(len(mesh.bars)) if pairs["l"] else edges(around)[1]
     members = groups["l" if pairs["l"] else "f"]
     mesh.bar_groups = {name: np.unique(place[own]) for name, own in members.items()}

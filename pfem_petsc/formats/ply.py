@@ -42,7 +42,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         If the file is not PLY, or ends early.
     """
     content = path.read_bytes()
-    head = re.match(rb"ply\s*\n(.*?)end_header[ \t]*\r?\n", content, re.DOTALL)
+    head = re.match(rb"(?:\xef\xbb\xbf)?ply\s*\n(.*?)end_header[ \t]*\r?\n", content, re.DOTALL)
     if head is None:
         raise InputError(f"{path}: is not PLY: it does not begin with 'ply' and a header")
     order, elements = _header(path, head[1].decode("ascii", "replace"))
@@ -55,7 +55,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         faces = tables.get("face", {})
         corners, offsets = next((faces[key] for key in ("vertex_indices", "vertex_index") if key in faces), ([], [0]))
     except (ValueError, KeyError) as error:
-        raise InputError(f"{path}: {error}: expected vertices with x, y and z, and edges or faces of them") from None
+        what = f"the header has no {error}" if isinstance(error, KeyError) else error
+        raise InputError(f"{path}: {what}: expected vertices with x, y and z, and edges or faces of them") from None
     around = sides(np.array(corners, np.int64), np.array(offsets))
     mesh = mesh_of(path, points.astype(np.float64), lines.astype(np.int64), around, len(offsets) - 1)
     mesh.node_fields = {name: values for name, values in vertices.items() if isinstance(values, np.ndarray)}
@@ -63,6 +64,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     other = [
         f"{element.count} {element.name}" for element in elements if element.name not in ("vertex", "edge", "face")
     ]
+    other += [f"{body.left} {'bytes' if order else 'numbers'} after the last element"] if body.left else []
     if other:
         mesh.warnings.append(f"{path}: left out {', '.join(other)}: not read")
     drop_bare_nodes(path, mesh)
@@ -94,6 +96,12 @@ class _Body:
     def __init__(self, order: str, content: bytes) -> None:
         self._order, self._at = order, 0
         self._all = content if order else numbers_of(content)
+
+    @property
+    def left(self) -> int:
+        """How many bytes, of text numbers, nothing has taken; white space at the end of the file is none."""
+        rest = self._all[self._at :]
+        return len(rest.strip() if self._order else rest)
 
     def _take(self, n: int, kind: np.dtype | str) -> np.ndarray:
         kind = np.dtype(kind).newbyteorder(self._order) if self._order else np.dtype(kind)

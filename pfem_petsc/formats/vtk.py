@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import resource
 import signal
 import subprocess
@@ -122,17 +123,34 @@ def _extract(path: str) -> int:
         reader.SetStep(snapshots - 1)
     reader.Update()
     # "ERROR: In FILE, line N", then on the next line "CLASS (ADDRESS): " and the message.
-    lines = listener.GetOutput().splitlines()
+    output = listener.GetOutput()  # of bytes if the file is no text
+    lines = (output.decode(errors="replace") if isinstance(output, bytes) else output).splitlines()
     messages = [line.split("): ", 1)[-1] for line in lines if line and not line.startswith(("ERROR", "Warning"))]
     try:
         if lines:
-            raise ValueError(f"cannot be read: {(messages or lines)[0].strip()}")
+            raise ValueError(f"cannot be read: {(messages or lines)[0].strip()[:200]}")
+        if path.lower().endswith(".vtk"):
+            _check_legacy(Path(path), reader.GetOutputDataObject(0))
         arrays = dict(_arrays(reader.GetOutputDataObject(0)))
     except ValueError as error:
         print(error)
         return _REFUSED
     pickle.dump({"snapshots": snapshots, **arrays}, sys.stdout.buffer)
     return 0
+
+
+def _check_legacy(path: Path, grid: Any) -> None:
+    """Refuse a legacy file whose cells need more numbers than it says that they have: VTK reads past their end."""
+    declared = re.findall(rb"^(?:VERTICES|LINES|POLYGONS|TRIANGLE_STRIPS|CELLS)\s+(\d+)\s+(\d+)\s*\n(?!OFFSETS)",
+                          path.read_bytes(), re.MULTILINE)  # fmt: skip
+    if not declared or grid is None:
+        return
+    kinds = ("GetVerts", "GetLines", "GetPolys", "GetStrips") if grid.IsA("vtkPolyData") else ("GetCells",)
+    cells = [getattr(grid, kind)() for kind in kinds if hasattr(grid, kind)]
+    taken = sum(part.GetNumberOfCells() + part.GetNumberOfConnectivityIds() for part in cells)
+    size = sum(int(count) for _, count in declared)
+    if taken != size:
+        raise ValueError(f"its cells need {taken} numbers, and it says that they have {size}: write it again")
 
 
 def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
@@ -170,6 +188,9 @@ def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
         raise ValueError("lines that do not have two ends; a bar has two")
     if first.min() < 0 or (first + size).max() > len(ends):
         raise ValueError("lines whose nodes do not exist: a damaged file")
+    wrong = ends[(ends < 0) | (ends >= n_nodes)]
+    if len(wrong):
+        raise ValueError(f"there is no point {wrong[0]}, at which a cell ends: the file has {n_nodes}, numbered from 0")
     # a line of several points is as many bars less one, a face as many as it has corners: the cell of each bar, and
     # which of its points come first and second
     count = size if of_faces else size - 1

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from ..errors import InputError
-from .whole import WholeMesh
+from .whole import WholeMesh, check_numbers
 
 MERGED = 1e-6
 """Default of the distance up to which nodes are merged, over the mean length of the bars."""
@@ -232,7 +233,9 @@ def scaled(mesh: WholeMesh, scale: float) -> WholeMesh:
         }
         for table, rows in mesh.tables.items()
     }
-    return replace(mesh, points=mesh.points * scale, bar_fields=fields, tables=tables)
+    found = replace(mesh, points=mesh.points * scale, bar_fields=fields, tables=tables)
+    check_numbers(found.slab(mesh.source), MPI.COMM_SELF)
+    return found
 
 
 def _scaled_keys(keys: dict[str, Any], scale: float, powers: dict[str, int]) -> dict[str, Any]:

@@ -244,16 +244,7 @@ def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
         hint = _NO_LINES if slab.source.endswith(".msh") and slab.n_nodes else ""
         raise InputError(f"{slab.source}: {slab.n_nodes} nodes and {slab.n_bars} bars: nothing to simulate{hint}")
     refuse, bar = partial(_refuse, slab, comm), partial(_bar, slab)
-    refuse(
-        ~(np.abs(slab.points) < LARGE).all(axis=1),
-        lambda i: f"node {slab.first_node + i} at ({', '.join(f'{x:g}' for x in slab.points[i])})",
-        f"nodes have coordinates that are not numbers below {LARGE:g}",
-        "correct them",
-        mended=False,
-    )
-    missing = ((slab.bars < 0) | (slab.bars >= slab.n_nodes)).any(axis=1)
-    remedy = f"nodes are numbered from 0 to {slab.n_nodes - 1}"
-    refuse(missing, bar, "bars have an end that does not exist", remedy, mended=False)
+    check_numbers(slab, comm)
     refuse(slab.bars[:, 0] == slab.bars[:, 1], bar, "bars start and end at the same node", "remove them")
     used, length = _lengths(slab, comm)
     remedy = "remove them: a node without bars has neither mass nor stiffness"
@@ -276,6 +267,29 @@ def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
         warnings = [*warnings, f"{slab.source}: {text}; the explicit time step decreases with the shortest bar"]
     _check_duplicates(slab, comm)
     return warnings
+
+
+def check_numbers(slab: MeshSlab, comm: MPI.Comm) -> None:
+    """Refuse coordinates that are not finite or too large, and bars whose ends do not exist: what no operation on
+    meshes can mend. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks.
+    """
+    _refuse(
+        slab,
+        comm,
+        ~(np.abs(slab.points) < LARGE).all(axis=1),
+        lambda i: f"node {slab.first_node + i} at ({', '.join(f'{x:g}' for x in slab.points[i])})",
+        f"nodes have coordinates that are not numbers below {LARGE:g}",
+        "correct them",
+        mended=False,
+    )
+    missing = ((slab.bars < 0) | (slab.bars >= slab.n_nodes)).any(axis=1)
+    remedy = f"nodes are numbered from 0 to {slab.n_nodes - 1}"
+    _refuse(slab, comm, missing, partial(_bar, slab), "bars have an end that does not exist", remedy, mended=False)
 
 
 def _lengths(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:

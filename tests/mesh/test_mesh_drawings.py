@@ -9,6 +9,7 @@ import pytest
 from helpers.files import written
 from helpers.pages import DOCS, blocks
 
+from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.formats import read_slab, read_whole
 
@@ -31,6 +32,8 @@ RHINO = "v 0 0 0\nv 2 0 0\ncstype bspline\ndeg 1\ncurv 0 2 1 2\nparm u 0 0 2 2\n
 RHINO += "v 0 0 0\nv 0 1 0\nv 0 1 5\ndeg 1\ncurv 0 6 -3 -2 -1\nend\n"
 
 
+AT_7 = '{"7": {"x": 1, "y": 2, "z": 3}}'
+VTK = "# vtk DataFile Version 3.0\nt\nASCII\nDATASET POLYDATA\nPOINTS 3 double\n0 0 0 1 0 0 0 1 0\n"
 HEADER = "ply\nformat ascii 1.0\n"
 
 
@@ -50,6 +53,48 @@ def test_lines_of_obj(tmp_path):
     assert mesh.bars.tolist() == [[0, 1], [1, 2], [3, 0]]
     assert members(mesh.bar_groups) == {"tower": [0, 1, 2], "legs": [0, 1], "outer": [0, 1], "top": [2]}
     assert mesh.warnings == ["the lines are bars: left out 1 faces"]
+
+
+@pytest.mark.parametrize("name", ["a.obj", "a.ply", "a.json"])
+def test_a_byte_order_mark_is_skipped(tmp_path, name):
+    ply = "element vertex 2\nproperty float x\nproperty float y\nproperty float z\nelement edge 1\n"
+    ply += "property int vertex1\nproperty int vertex2\nend_header\n1 2 3\n4 5 6\n0 1\n"
+    nodes = '{"node": {"0": {"x": 1, "y": 2, "z": 3}, "1": {"x": 4, "y": 5, "z": 6}}, "edge": {"0": {"1": {}}}}'
+    text = {"a.obj": "v 1 2 3\nv 4 5 6\nl 1 2\n", "a.ply": HEADER + ply, "a.json": nodes}[name]
+    mesh = read(tmp_path, f"\ufeff{text}", name)
+    assert mesh.points.tolist() == [[1, 2, 3], [4, 5, 6]] and mesh.bars.tolist() == [[0, 1]] and not mesh.warnings
+
+
+def test_what_has_no_bar_or_number_is_told(tmp_path):
+    mesh = read(tmp_path, "v 0 0 0\nv 1 0 0\nl 1 2\nl 1\n", "a.obj")
+    assert mesh.bars.tolist() == [[0, 1]] and mesh.warnings == ["left out 1 l of one point: not read"]
+    ply = f"{HEADER}element vertex 2\nproperty float x\nproperty float y\nproperty float z\nelement edge 1\n"
+    ply += "property int vertex1\nproperty int vertex2\nend_header\n0 0 0\n1 0 0\n0 1\n7 8 9\n"
+    assert read(tmp_path, ply, "a.ply").warnings == ["left out 3 numbers after the last element: not read"]
+    nodes = {str(i): {"x": i, "y": 0, "z": 0} for i in range(3)}
+    content = {"node": nodes, "edge": {"0": {"1": {"q": float("nan")}}, "1": {"2": {"q": 10**400}}}}
+    mesh = read(tmp_path, json.dumps(content), "a.json")
+    assert mesh.warnings == ["the attribute q is not a finite number 2 times"]
+
+
+def test_links_and_bytes_that_are_no_text(tmp_path):
+    (tmp_path / "a.obj").symlink_to("b.obj")
+    with pytest.raises(InputError, match="there is no file .*a.obj: it is a link to b.obj, which is not there"):
+        read_whole(tmp_path / "a.obj")
+    (tmp_path / "a.vtk").write_bytes(bytes(range(128, 256)) * 9)
+    with pytest.raises(InputError, match="a.vtk: cannot be read: Unrecognized file type"):
+        read_whole(tmp_path / "a.vtk")
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-1e200"])
+def test_no_verb_takes_coordinates_that_are_not_finite(tmp_path, capsys, number):
+    file = written(tmp_path, f"v 0 0 0\nv 1 {number} 0\nl 1 2\n", "a.obj")
+    for verb in (["info", str(file)], ["convert", str(file), str(tmp_path / "a.vtu")]):
+        assert main(["mesh", *verb]) == 2
+        assert "1 nodes have coordinates that are not numbers below" in capsys.readouterr().err
+    assert not (tmp_path / "a.vtu").exists()
+    good = written(tmp_path, "v 0 0 0\nv 1 0 0\nl 1 2\n", "b.obj")
+    assert main(["mesh", "convert", str(good), str(tmp_path / "b.vtu"), "--scale", "1e300"]) == 2
 
 
 def test_faces_of_obj(tmp_path):
@@ -72,18 +117,29 @@ def test_curves_of_degree_1_in_obj_are_polylines(tmp_path):
         ("a.obj", "v 0 0\n", "line 1: 'v 0 0': expected three numbers"),
         ("a.obj", "v 0 0 x\n", "line 1: 'v 0 0 x': expected three numbers"),
         ("a.obj", "v 0 0 0\nv 0 0 1\nl -3 1\n", "line 3: 'l -3 1': expected the numbers of points that precede it"),
-        ("a.obj", "v 0 0 0\nv 0 0 1\nl 1 3\n", "there is no point 2 .from 0.: the file has 2"),
+        ("a.obj", "v 0 0 0\nv 0 0 1\nl 1 3\n", "there is no point 3: the file has 2, numbered from 1"),
+        ("a.obj", f"v 0 0 0\nl 1 {9**25}\n", "line 2: .*: expected the numbers of points that precede it"),
+        ("a.obj", "v 0 0 0\nv 0 1e300 1\nl 1 2\n", r"1 nodes .* not numbers below 1e.150: node 1 at \(0, 1e.300, 1\)"),
         ("a.obj", "v 0 0 0\n", "has neither lines nor faces"),
         ("a.ply", "solid", "is not PLY"),
         ("a.ply", f"{HEADER}element vertex x\nend_header\n", "a line that is not known: 'element vertex x'"),
         ("a.ply", "ply\nelement vertex 0\nend_header\n", "the header has no format"),
-        ("a.ply", f"{HEADER}element vertex 2\nproperty float x\nend_header\n0 1\n", "'y': expected vertices"),
+        ("a.ply", f"{HEADER}element vertex 2\nproperty float x\nend_header\n0 1\n", "header has no 'y': expected"),
+        ("a.ply", f"{HEADER}element vertex 2\nproperty float x\nend_header\n0 nan a\n", "'a' is not a number"),
         ("a.ply", f"{HEADER}element vertex 2\nproperty float x\nend_header\n0\n", "it ends early"),
         ("a.json", "{", "is not JSON"),
         ("a.json", "[1, {}]", "has no network, graph or mesh"),
-        ("a.json", '{"node": {"0": {"x": "a"}}, "edge": {}}', "ValueError: .* expected what COMPAS writes"),
-        ("a.json", '{"node": {"0": {"x": 1}}, "edge": {"0": {"1": {}}}}', "KeyError: '1': expected what COMPAS writes"),
+        ("a.json", '{"node": {"0": {"x": "a"}}, "edge": {}}', "node '0' has 'a' as x: expected a number"),
+        ("a.json", '{"node": {"7": {"x": 0, "y": 1}}, "edge": {}}', "node '7' has no z: .* or in the default att"),
+        ("a.json", f'{{"node": {AT_7}, "edge": {{"7": {{"1": {{}}}}}}}}', "edge 7-1 ends at '1', and there is no such"),
+        ("a.json", f'{{"vertex": {AT_7}, "face": {{"5": [7, 8]}}}}', "face 5 ends at '8', and there is no such"),
+        ("a.json", f'{{"node": {AT_7.replace("3", "9" * 400)}, "edge": {{}}}}', r"node 0 at \(1, 2, inf\)"),
+        ("a.json", f'{{"node": {AT_7}, "edge": {{"7": null}}}}', "its node or edges are not what COMPAS writes"),
         ("a.vtk", "x", "cannot be read"),
+        ("a.vtk", f"{VTK}LINES 2 6\n2 0 1\n2 1 9\n", "there is no point 9, at which a cell ends: the file has 3"),
+        ("a.vtk", f"{VTK}LINES 2 6\n2 0 1\n2 1 -2\n", "there is no point -2, at which a cell ends: the file has 3"),
+        ("a.vtk", f"{VTK}LINES 2 6\n2 0 1\n9 1 2\n", "its cells need 13 numbers, and it says that they have 6"),
+        ("a.vtk", f"{VTK}LINES 1 3\n2 0 1\n".replace("0 1 0", "0 nan 0"), r"node 2 at \(0, nan, 0\)"),
     ],
 )  # fmt: skip
 def test_what_is_wrong(tmp_path, name, content, told):
@@ -240,7 +296,7 @@ def test_meshes_of_compas(tmp_path, version):
 
 
 @pytest.mark.parallel
-@pytest.mark.parametrize(("name", "content"), [("a.obj", OBJ), ("a.json", json.dumps(MESH))])
+@pytest.mark.parametrize(("name", "content"), [("a.obj", OBJ), ("a.json", json.dumps({**MESH, "dva": AT_0}))])
 def test_ranks_share_a_drawing(comm, shared_tmp_path, name, content):
     if comm.rank == 0:
         (shared_tmp_path / name).write_text(content)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -52,7 +53,10 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     bars = [element for _, element in sorted(deck.elements.items())]
     if not bars:
         raise InputError(f"{path}: has no {', '.join(_BARS)}, which would be bars{_cards(deck, ': it has ')}")
-    ends = np.array([bar.node_ids[:2] for bar in bars], np.int64)
+    pairs = [bar.node_ids[:2] for bar in bars]
+    if (largest := max(map(max, pairs))) > sys.maxsize:
+        raise InputError(f"{path}: GRID {largest}, at which a bar ends: a GRID has at most 8 digits in Nastran")
+    ends = np.array(pairs, np.int64)
     labels = np.unique(ends)
     missing = [label for label in labels.tolist() if label not in deck.nodes]
     if missing:
@@ -66,7 +70,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     left, cards = len(deck.nodes) - len(labels), _cards(deck, "left out cards that are not read: ")
     told(left, f"left out {left} GRID where no bar ends")
     told(cards, cards)
-    _add_sections(mesh, deck, bars, told)
+    _add_sections(path, mesh, deck, bars, told)
     # a run takes mesh and groups alone
     _Conditions(mesh, deck, labels, told if fields is None else lambda *_: None).add()
     return mesh
@@ -84,8 +88,9 @@ def _deck(path: Path) -> Any:
     lines: list[str] = []
     deck = BDF(log=SimpleLogger("error", log_func=lambda _, text: lines.append(text)))
     deck.enable_cards(_READ)
-    bulk_only = not re.search(rb"^\s*(CEND|BEGIN\s+BULK)", path.read_bytes(), re.MULTILINE | re.IGNORECASE)
-    file = str(path.absolute())
+    content = path.read_bytes()
+    bulk_only = not re.search(rb"^\s*(CEND|BEGIN\s+BULK)", content, re.MULTILINE | re.IGNORECASE)
+    source = _source(path, content)
     try:
         # it prints, and writes a file into the current folder, when an included file is missing
         with (
@@ -93,15 +98,31 @@ def _deck(path: Path) -> Any:
             contextlib.chdir(folder),
             contextlib.redirect_stdout(io.StringIO()),
         ):
-            deck.read_bdf(file, xref=False, punch=bulk_only)
+            deck.read_bdf(**source, xref=False, punch=bulk_only)
             deck.cross_reference(
                 **{f"xref_{what}": False for what in ("elements", "properties", "masses", "materials", "loads")},
                 **{f"xref_{what}": False for what in ("constraints", "aero", "sets", "optimization")},
             )
+    except RecursionError:
+        raise InputError(
+            f"{path}: coordinate systems ({', '.join(_COORDINATES)}) define each other in a circle"
+        ) from None
     except Exception as error:  # noqa: BLE001 - damaged cards raise anything
         reason = " ".join(str(error).split())[:300] or type(error).__name__
         raise InputError(f"{path}: pyNastran cannot read it: {reason}") from None
     return deck
+
+
+def _source(path: Path, content: bytes) -> dict[str, Any]:
+    """Return what pyNastran reads, and the encoding: Latin-1, common in comments, of a deck that is not UTF-8."""
+    try:
+        content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        # it opens no file in another encoding than that of the system, and a text has no folder
+        prefix = rf"\1{path.absolute().parent.as_posix()}/"
+        text = re.sub(r"(?im)^(INCLUDE\s+['\"]?)(?![/\\%$'\"\s]|\w+:)", prefix, content.decode("latin1"))
+        return {"bdf_filename": io.StringIO(text), "encoding": "latin1"}
+    return {"bdf_filename": str(path.absolute()), "encoding": "utf-8-sig"}
 
 
 def _cards(deck: Any, text: str) -> str:
@@ -115,7 +136,7 @@ def _cards(deck: Any, text: str) -> str:
 # ---- sections and materials
 
 
-def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: Told) -> None:
+def _add_sections(path: Path, mesh: WholeMesh, deck: Any, bars: list[Any], told: Told) -> None:
     """Add sections and materials, groups of bars by property, and the field ``area``."""
     members: dict[tuple[Any, ...], list[int]] = {}
     counts: Counter[str] = Counter()
@@ -128,7 +149,7 @@ def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: Told) -> No
             counts[f"{bar.type} between their GRID, without offsets"] += any(map(np.any, (bar.wa, bar.wb)))
     for what, n in counts.items():
         told(n, f"{n} {what}, are read as bars".replace(",,", ","))
-    area, without, mass, massless, damped = np.full(len(bars), np.nan), 0, 0, set(), set()
+    area, without, mass, massless, damped, bare = np.full(len(bars), np.nan), 0, 0, set(), set(), set()
     sections, materials = (mesh.tables.setdefault(name, {}) for name in ("section", "material"))
     weight = _mass_scale(deck)
     for (of_rod, *_), numbers in members.items():
@@ -140,7 +161,11 @@ def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: Told) -> No
         group = free_name(sections, "conrod" if of_rod else f"{source.type.lower()}_{source.pid}")
         mesh.bar_groups[group] = np.array(numbers)
         sections[group] = {"bars": group}
-        if (size := float(source.Area())) > 0.0:
+        if not (size := float(source.Area())) >= 0.0:
+            card = f"CONROD {bar.eid}" if of_rod else f"{source.type} {source.pid}"
+            raise InputError(f"{path}: {card} has the area {size:g}: expected a positive one")
+        bare |= set() if size else {group}
+        if size:
             sections[group]["area"] = area[numbers] = size
         if source.type == "PTUBE":
             told(source.OD2 not in (None, source.OD1), f"PTUBE {source.pid} has two diameters: its area is their mean")
@@ -156,6 +181,7 @@ def _add_sections(mesh: WholeMesh, deck: Any, bars: list[Any], told: Told) -> No
         materials[f"mat1_{source.mid}"] = {key: value for key, value in found.items() if value}
     told(damped, f"left out the damping GE of MAT1 {sorted(damped)}")
     told(massless, f"MAT1 {sorted(massless)} have no density, which is 0 in Nastran: a case needs a positive one")
+    told(bare, f"{', '.join(sorted(bare))} have the area 0: a case needs a positive one")
     told(without, f"{without} bars have a property that is not read or not there: they have no section")
     told(mass, f"left out the nonstructural mass of {mass} bars")
     if (area > 0.0).all():
@@ -179,6 +205,8 @@ class _Conditions:
         self._at = {label: i for i, label in enumerate(self._labels)}
         control = deck.case_control_deck
         self._subcases = {} if deck.punch or control is None else dict(control.subcases)
+        above = self._subcases[0].params if 0 in self._subcases else {}
+        mesh.title = ": ".join(str(above[word][0]) for word in ("TITLE", "SUBTITLE") if word in above)
 
     def add(self) -> None:
         """Add the tables to the mesh."""
@@ -231,6 +259,9 @@ class _Conditions:
                 lines += [(label, card.components, 0.0) for label in card.node_ids]
             else:
                 lines += list(zip(card.node_ids, card.components, card.enforced))
+        absent = sorted({label for label, *_ in lines} - self._deck.nodes.keys())
+        some = ", ".join(map(str, absent[:5])) + (", ..." if len(absent) > 5 else "")
+        self._told(absent, f"left out the supports of {len(absent)} GRID that do not exist: {some}")
         for label, components, value in lines:
             i, axes = self._at.get(label, -1), ["123".index(c) for c in str(components) if c in "123"]
             if i < 0 or not axes:  # of other nodes, and rotations, which bars do not have

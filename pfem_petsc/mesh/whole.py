@@ -38,6 +38,8 @@ class WholeMesh:
     """What a file has besides the mesh: ``material``, ``section``, ``support``, ``load``, ``mass``, ``spring``,
     ``dashpot``, ``temperature``, ``initial``, ``gravity`` and ``load_case``, each with the keys of a case by name, and
     ``analysis``: ``static``, ``time`` and ``modes``."""
+    title: str = ""
+    """Of a case, where the file has one."""
     warnings: list[str] = field(default_factory=list)
     source: str = "mesh"
     """The file, for messages."""
@@ -180,7 +182,7 @@ def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
     told = "Replace what is not known from it:" if made else "Supports, loads and the analysis are those of the file."
     lines = [f"# A case for {file.name}. {told}\n", *(f"#   {key}\n" for key in made), "\n"]
     data = {
-        "title": file.stem,
+        "title": mesh.title or file.stem,
         "mesh": {"file": relative},
         **{name: table for name, table in tables.items() if table},
         **({} if known else {"gravity": {"acceleration": [0.0, 0.0, -9.81]}}),

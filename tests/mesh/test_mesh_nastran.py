@@ -2,6 +2,7 @@
 
 import re
 import sys
+import tomllib
 
 import numpy as np
 import pytest
@@ -216,6 +217,29 @@ def test_solutions(tmp_path, head, tables, told):
     assert len(mesh.warnings) == len(told) and all(a.startswith(b) for a, b in zip(mesh.warnings, told))
 
 
+def test_supports_and_areas_that_are_not_there_are_told(tmp_path):
+    mesh = read(tmp_path, MIDDLE + "SPC1,1,123,1,7,8\nPROD,2,1,0.\nCROD,3,2,3,1\n")
+    assert list(mesh.tables["support"]) == ["node_1"]
+    assert mesh.warnings == [
+        "prod_2 have the area 0: a case needs a positive one",
+        "left out the supports of 2 GRID that do not exist: 7, 8",
+    ]
+
+
+@pytest.mark.parametrize("encoding", ["latin1", "utf-8-sig", "utf-8"])
+def test_encodings_and_title_of_a_deck(tmp_path, encoding):
+    """Comments and the title have letters that are not ASCII; an included file is in a folder beside the deck."""
+    head = "$ Brücke\nSOL 101\nCEND\nTITLE = Brücke\nSUBTITLE = dead load\nBEGIN BULK\n$ Stäbe\n"
+    body = MIDDLE.replace("GRID,3,,2.,1.,0.", "INCLUDE 'parts/grid.inc'")
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "grid.inc").write_text("GRID,3,,2.,1.,0.\n$ Stäbe\n", encoding=encoding.removesuffix("-sig"))
+    (tmp_path / "a.bdf").write_text(head + body + "ENDDATA\n", encoding=encoding)
+    mesh = read_whole(tmp_path / "a.bdf")
+    assert mesh.points.tolist() == [[0, 0, 0], [2, 0, 0], [2, 1, 0]] and mesh.title == "Brücke: dead load"
+    text = skeleton(scaled(mesh, 0.001), tmp_path / "a.bdf", tmp_path / "a.toml")
+    assert tomllib.loads(text)["title"] == "Brücke: dead load"
+
+
 def test_sets_that_no_subcase_names_are_left_out(tmp_path):
     sets = "SPC1,1,123,1\nFORCE,3,2,0,10.,1.,0.,0.\n"
     mesh = read(tmp_path, "SOL 106\nCEND\nBEGIN BULK\n" + MIDDLE + sets)
@@ -244,6 +268,12 @@ def test_a_flat_truss_is_held_as_by_autospc(tmp_path):
     [
         (MIDDLE.replace("PROD,1,1,3.", "PROD,1,1,three"), "pyNastran cannot read it: A = 'THREE'"),
         (MIDDLE.replace("GRID,3,,2.,1.,0.\n", ""), "there is no GRID 3, at which a bar ends"),
+        (MIDDLE.replace("D,3", f"D,{9**25}").replace("2,3", f"2,{9**25}"), f"GRID {9**25}, .* at most 8 digits"),
+        (MIDDLE.replace("0.,0.,0.", "nan,0.,0."), r"1 nodes .* not numbers below .*: node 0 at \(nan, 0, 0\)"),
+        (MIDDLE.replace("2.,0.,0.", "2.,inf,0."), r"1 nodes .* not numbers below .*: node 1 at \(2, inf, 0\)"),
+        (MIDDLE.replace("PROD,1,1,3.", "PROD,1,1,-3."), "PROD 1 has the area -3: expected a positive one"),
+        (MIDDLE + "CONROD,3,1,3,1,-2.\n", "CONROD 3 has the area -2: expected a positive one"),
+        (MIDDLE.replace("GRID,3,", "GRID,3,4") + "CORD1R,4,1,2,3\n", "coordinate systems .* in a circle"),
         (MIDDLE + "INCLUDE 'other.bdf'\n", "pyNastran cannot read it: .*other.bdf"),
         ("GRID,1,,0.,0.,0.\nGRID,2,,0.,1.,0.\nCELAS2,1,3.,1,1,2,1\n", "has no CROD, .*: it has 1 CELAS2"),
         ("", "has no CROD"),

@@ -114,7 +114,7 @@ def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     else:
         whole = _read(reader, path, wanted)
     whole.source = str(path)
-    check_numbers(whole.slab(whole.source), MPI.COMM_SELF)
+    check_numbers(WholeMesh(whole.points, whole.bars).slab(whole.source), MPI.COMM_SELF)
     return whole
 
 

@@ -45,7 +45,7 @@ def whole_numbers(values: np.ndarray, first: int, end: int, refused: Callable[[s
     """Return numbers as int64, from ``first`` to ``end`` - 1; ``refused`` makes a message about another one."""
     wrong = values[~((values >= first) & (values < end) & (values == np.rint(values)))]
     if wrong.size:
-        raise InputError(refused("nothing" if np.isnan(wrong.flat[0]) else f"{wrong.flat[0]:g}"))
+        raise InputError(refused("nothing" if np.isnan(wrong.flat[0]) else f"{wrong.flat[0]:.15g}"))
     return values.astype(np.int64)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
+from ._numbers import whole_numbers
 
 if TYPE_CHECKING:
     from ..mesh.whole import WholeMesh
@@ -38,14 +39,15 @@ def mesh_of(
     """
     from ..mesh.whole import WholeMesh
 
-    bars = np.asarray(lines if len(lines) else edges(around)[0], np.int64)
-    if len(bars) == 0:
+    given, n = lines if len(lines) else around, len(points)
+    if len(given) == 0:
         raise InputError(f"{path}: has neither lines nor faces, whose edges would be bars")
-    if bars.min() < 0 or bars.max() >= len(points):
-        wrong = int(bars[(bars < 0) | (bars >= len(points))][0])
-        raise InputError(
-            f"{path}: there is no point {wrong + first}: the file has {len(points)}, numbered from {first}"
-        )
+
+    def refused(found: str) -> str:
+        return f"{path}: there is no point {found}: the file has {n}, numbered from {first}"
+
+    given = whole_numbers(given + first, first, first + n, refused) - first
+    bars = given if len(lines) else edges(given)[0]
     mesh = WholeMesh(points, bars)
     if len(lines) and faces:
         mesh.warnings.append(f"{path}: the lines are bars: left out {faces} faces")

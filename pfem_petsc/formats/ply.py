@@ -57,8 +57,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     except (ValueError, KeyError) as error:
         what = f"the header has no {error}" if isinstance(error, KeyError) else error
         raise InputError(f"{path}: {what}: expected vertices with x, y and z, and edges or faces of them") from None
-    around = sides(np.array(corners, np.int64), np.array(offsets))
-    mesh = mesh_of(path, points.astype(np.float64), lines.astype(np.int64), around, len(offsets) - 1)
+    around = sides(np.array(corners), np.array(offsets))
+    mesh = mesh_of(path, points.astype(np.float64), lines, around, len(offsets) - 1)
     mesh.node_fields = {name: values for name, values in vertices.items() if isinstance(values, np.ndarray)}
     mesh.bar_fields = {name: values for name, values in ends.items() if isinstance(values, np.ndarray)}
     other = [

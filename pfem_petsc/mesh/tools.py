@@ -234,7 +234,7 @@ def scaled(mesh: WholeMesh, scale: float) -> WholeMesh:
         for table, rows in mesh.tables.items()
     }
     found = replace(mesh, points=mesh.points * scale, bar_fields=fields, tables=tables)
-    check_numbers(found.slab(mesh.source), MPI.COMM_SELF)
+    check_numbers(WholeMesh(found.points, found.bars).slab(mesh.source), MPI.COMM_SELF)
     return found
 
 

@@ -35,6 +35,8 @@ RHINO += "v 0 0 0\nv 0 1 0\nv 0 1 5\ndeg 1\ncurv 0 6 -3 -2 -1\nend\n"
 AT_7 = '{"7": {"x": 1, "y": 2, "z": 3}}'
 VTK = "# vtk DataFile Version 3.0\nt\nASCII\nDATASET POLYDATA\nPOINTS 3 double\n0 0 0 1 0 0 0 1 0\n"
 HEADER = "ply\nformat ascii 1.0\n"
+EDGE_OF_PLY = f"{HEADER}element vertex 2\nproperty float x\nproperty float y\nproperty float z\nelement edge 1\n"
+EDGE_OF_PLY += "property int vertex1\nproperty int vertex2\nend_header\n"
 
 
 def read(folder, content, name):
@@ -57,10 +59,8 @@ def test_lines_of_obj(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.obj", "a.ply", "a.json"])
 def test_a_byte_order_mark_is_skipped(tmp_path, name):
-    ply = "element vertex 2\nproperty float x\nproperty float y\nproperty float z\nelement edge 1\n"
-    ply += "property int vertex1\nproperty int vertex2\nend_header\n1 2 3\n4 5 6\n0 1\n"
     nodes = '{"node": {"0": {"x": 1, "y": 2, "z": 3}, "1": {"x": 4, "y": 5, "z": 6}}, "edge": {"0": {"1": {}}}}'
-    text = {"a.obj": "v 1 2 3\nv 4 5 6\nl 1 2\n", "a.ply": HEADER + ply, "a.json": nodes}[name]
+    text = {"a.obj": "v 1 2 3\nv 4 5 6\nl 1 2\n", "a.ply": f"{EDGE_OF_PLY}1 2 3\n4 5 6\n0 1\n", "a.json": nodes}[name]
     mesh = read(tmp_path, f"\ufeff{text}", name)
     assert mesh.points.tolist() == [[1, 2, 3], [4, 5, 6]] and mesh.bars.tolist() == [[0, 1]] and not mesh.warnings
 
@@ -68,9 +68,8 @@ def test_a_byte_order_mark_is_skipped(tmp_path, name):
 def test_what_has_no_bar_or_number_is_told(tmp_path):
     mesh = read(tmp_path, "v 0 0 0\nv 1 0 0\nl 1 2\nl 1\n", "a.obj")
     assert mesh.bars.tolist() == [[0, 1]] and mesh.warnings == ["left out 1 l of one point: not read"]
-    ply = f"{HEADER}element vertex 2\nproperty float x\nproperty float y\nproperty float z\nelement edge 1\n"
-    ply += "property int vertex1\nproperty int vertex2\nend_header\n0 0 0\n1 0 0\n0 1\n7 8 9\n"
-    assert read(tmp_path, ply, "a.ply").warnings == ["left out 3 numbers after the last element: not read"]
+    mesh = read(tmp_path, f"{EDGE_OF_PLY}0 0 0\n1 0 0\n0 1\n7 8 9\n", "a.ply")
+    assert mesh.warnings == ["left out 3 numbers after the last element: not read"]
     nodes = {str(i): {"x": i, "y": 0, "z": 0} for i in range(3)}
     content = {"node": nodes, "edge": {"0": {"1": {"q": float("nan")}}, "1": {"2": {"q": 10**400}}}}
     mesh = read(tmp_path, json.dumps(content), "a.json")
@@ -127,6 +126,8 @@ def test_curves_of_degree_1_in_obj_are_polylines(tmp_path):
         ("a.ply", f"{HEADER}element vertex 2\nproperty float x\nend_header\n0 1\n", "header has no 'y': expected"),
         ("a.ply", f"{HEADER}element vertex 2\nproperty float x\nend_header\n0 nan a\n", "'a' is not a number"),
         ("a.ply", f"{HEADER}element vertex 2\nproperty float x\nend_header\n0\n", "it ends early"),
+        ("a.ply", f"{EDGE_OF_PLY}0 0 0\n1 0 0\n0 1.5\n", "there is no point 1.5: the file has 2, numbered from 0"),
+        ("a.ply", f"{EDGE_OF_PLY}0 0 0\n1 0 0\n0 1234567\n", "there is no point 1234567: the file has 2"),
         ("a.json", "{", "is not JSON"),
         ("a.json", "[1, {}]", "has no network, graph or mesh"),
         ("a.json", '{"node": {"0": {"x": "a"}}, "edge": {}}', "node '0' has 'a' as x: expected a number"),

@@ -281,7 +281,12 @@ def chosen_frames(
         raise InputError(f"render: frames = {frames} must be positive; a list of numbers may count from the end")
     if wanted == 1:
         return within[-1:].tolist()  # at the first one, most structures are at rest and look like their mesh
-    return within[np.linspace(0, count - 1, min(wanted, count)).round().astype(int)].tolist()
+    return within[even_rows(count, wanted)].tolist()
+
+
+def even_rows(rows: int, count: int) -> list[int]:
+    """Return at most a count of rows at even distances, among them the first and the last."""
+    return np.linspace(0, rows - 1, min(count, rows)).round().astype(int).tolist()
 
 
 def even_times(times: np.ndarray, rate: float, span: Sequence[float] | None) -> np.ndarray:

@@ -20,7 +20,7 @@ from ..parallel.agreement import agreed
 from .camera import at_one_scale, cameras
 from .chart import opened
 from .colours import MARKS, ColourField, ColourScale, limits_of
-from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_times
+from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_rows, even_times
 from .options import Options
 from .page import Heading, Page, grid, inset_room
 from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Segments, Style, few_threads
@@ -336,34 +336,21 @@ def _timed(results: Sequence[Any], options: Options, note: Callable[[str], None]
 
 
 def instants(result: Any, frames: Sequence[int], count: int) -> list[int]:
-    """Select snapshots: first, last, first contact, most deformed, and those that fill the longest gaps.
+    """Select snapshots at even distances, among them the first and the last; of load cases, their ends.
 
     Parameters
     ----------
-    result : an open result, whose history has contact and deformation
+    result : an open result
     frames : snapshots to choose from
-    count : maximum number of snapshots
+    count : maximum number of snapshots, 2 or more
     """
     frames = sorted(set(frames))
     cases = [number for number, stage in enumerate(result.case.stage) if stage.starts_from is not None]
-    if cases:  # of load cases, their ends
+    if cases:
         when, given = result.history["time"], np.asarray(result.times)[frames]
         number = np.asarray(result.history["stage"])[np.minimum(np.searchsorted(when, given), len(when) - 1)]
         frames = [frames[np.flatnonzero(number == k)[-1]] for k in cases if k in number] or frames
-    if len(frames) <= count:
-        return frames
-    times = np.asarray(result.times, dtype=float)[frames]
-    chosen = {0, len(frames) - 1}
-    history = result.history
-    when = np.asarray(history["time"], dtype=float)
-    for name, pick in (("active_contacts", lambda v: np.argmax(v > 0)), ("elastic_energy", np.argmax)):
-        values = np.asarray(history[name]) if name in history else np.zeros(0)
-        if values.size and values.max() > 0:
-            chosen.add(int(np.argmin(np.abs(times - when[int(pick(values))]))))
-    while len(chosen) < count:
-        distance = np.abs(np.arange(len(frames))[:, None] - np.array(sorted(chosen))).min(axis=1)
-        chosen.add(int(np.argmax(distance)))
-    return [frames[k] for k in sorted(chosen)]
+    return [frames[k] for k in even_rows(len(frames), count)]
 
 
 def _helpers(paths: Sequence[Any], folder: Path, options: Options, count: int) -> list[subprocess.Popen]:

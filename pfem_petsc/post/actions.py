@@ -15,10 +15,10 @@ from .scene import NODE_COLOUR, Layer
 
 MOST = 40
 """Nodes with symbols; of more, some of them, at distances."""
-_SIZE, _ARROW, _HEAD = 0.03, 0.14, 0.022  # of the diagonal of the truss: supports, the largest load, heads of arrows
-_APART = 0.05  # of the diagonal: about the distance of symbols where there are many nodes
+_SIZE, _ARROW, _HEAD = 0.03, 0.14, 0.022  # of the diagonal of the truss: supports, the longest arrow, its head
+_APART = 0.05  # of the diagonal: the least distance of symbols, about, where there are many nodes
 _FRONT = 700.0  # pixels of a page of 1280 by 720: symbols are before the truss
-_SMALL = 0.02  # of the largest load: smaller ones have no arrow
+_SMALL = 0.02  # of the largest load of a stage: smaller ones have no arrow
 _ALONG = 0.999  # cosine from which a direction is that of the view
 
 
@@ -79,13 +79,14 @@ class Actions:
             np.concatenate([self._ids[:0], *(nodes for each in self._supports for nodes, *_ in each)])
         )
         self._shown = self._thinned(held_nodes, "supported") if "supports" in kinds else self._ids[:0]
-        size = np.zeros(len(self._ids))
+        size = np.zeros((len(self._stages), len(self._ids)))
         for number in range(len(times)) if "loads" in kinds else ():
-            size = np.maximum(size, np.linalg.norm(self._loads(number), axis=1))
-        self._largest, self._loaded = float(size.max(initial=0.0)), self._ids[:0]
-        if self._largest > 0.0:
-            self.notes.append(f"longest arrow {engineering(self._largest, 'N', 3)}")
-            self._loaded = self._thinned(np.flatnonzero(size > _SMALL * self._largest), "loaded")
+            own = size[self._moments[number][0]]
+            np.maximum(own, np.linalg.norm(self._loads(number), axis=1), out=own)
+        self._largest, self._loaded = size.max(axis=1, initial=0.0), self._ids[:0]
+        if self._largest.any():
+            large = size > _SMALL * self._largest[:, None]
+            self._loaded = self._thinned(np.flatnonzero(large.any(axis=0)), "loaded")
 
     def _own(self, number: int, time: float) -> float:
         """Return the load factor of a static stage, or the time since the start of another, at a time of the run."""
@@ -103,13 +104,22 @@ class Actions:
         return loads
 
     def _thinned(self, nodes: np.ndarray, what: str) -> np.ndarray:
-        """Return nodes for symbols, of many one in each cell of a grid."""
-        if len(nodes) <= MOST:
+        """Return nodes for symbols, of many those nearest to the middles of the cells of a grid."""
+        some, apart = nodes, _APART * self._diagonal
+        while len(some) > MOST:
+            places = (self._start[nodes] - self._centre) / apart
+            order = np.argsort(np.linalg.norm(places - np.round(places), axis=1).round(6), kind="stable")
+            some = nodes[np.sort(order[np.unique(np.round(places[order]), axis=0, return_index=True)[1]])]
+            apart *= 1.1
+        if len(some) == len(nodes):
             return nodes
-        cells = np.round((self._start[nodes] - self._centre) / (_APART * self._diagonal))
-        some = nodes[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
         self.notes.append(f"symbols at {len(some):,} of {len(nodes):,} {what} nodes")
         return some
+
+    def longest(self, number: int) -> str:
+        """Say which load the longest arrow is, in all frames of the same stage or load case; nothing without loads."""
+        largest = float(self._largest[self._moments[number][0]])
+        return f"longest arrow {engineering(largest, 'N', 3)}" if largest else ""
 
     def everywhere(self, number: int) -> dict[str, np.ndarray]:
         """Gravity and wind (3,) of a frame, if there are any, by their names."""
@@ -121,18 +131,14 @@ class Actions:
         return {name: way / np.linalg.norm(way) for name, way in ways.items() if way.any()}
 
     def arrows(self, number: int, points: np.ndarray) -> np.ndarray:
-        """Return tails and tips (2, n, 3) [m] of the loads of a frame, at points (nodes, 3) [m].
-
-        Loads that pull the truss outwards have their tails at the nodes, the others their tips.
-        """
-        if not len(self._loaded):
+        """Return tails and tips (2, n, 3) [m] of the loads of a frame, whose tips are at points (nodes, 3) [m]."""
+        largest = self._largest[self._moments[number][0]]
+        if not largest:
             return np.zeros((2, 0, 3))
-        force = self._loads(number)[self._loaded] / self._largest
+        force = self._loads(number)[self._loaded] / largest
         kept = np.linalg.norm(force, axis=1) > _SMALL
         force, at = force[kept], points[self._loaded[kept]]
-        way = _ARROW * self._diagonal * force
-        outwards = ((at - self._centre) * force).sum(axis=1, keepdims=True) > 0.0
-        return np.stack([np.where(outwards, at, at - way), np.where(outwards, at + way, at)])
+        return np.stack([at - _ARROW * self._diagonal * force, at])
 
     def layers(self, number: int, points: np.ndarray, camera: Camera) -> list[Layer]:
         """Return the symbols of a frame at points (nodes, 3) [m]."""

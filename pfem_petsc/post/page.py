@@ -130,8 +130,8 @@ class Page:
         ]
         place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0 - 1.5 / wide, 0.0)}
         figure.legend(handles=keys, frameon=False, fontsize=11.5, ncols=max(1, len(keys)), **place)
-        lines = "\n".join("   ".join(heading.notes[k : k + 2]) for k in range(0, len(heading.notes), 2))
-        self._notes = self._write(0.24, 0.22, literal(lines), va="center", fontsize=11.5, linespacing=1.1)
+        self._notes = heading.notes
+        self._foot = self._write(0.24, 0.22, "", va="center", fontsize=11.5, linespacing=1.1)
         scale = heading.scale
         bar = figure.add_axes((1.0 - 1.16 / wide, 1.6 / high, 0.2 / wide, 1.0 - 2.91 / high))
         figure.colorbar(scale.shown, cax=bar, ticks=MaxNLocator(nbins=7, steps=[1, 2, 2.5, 5, 10]))
@@ -157,7 +157,8 @@ class Page:
         camera: Camera,
         time: str = "",
         moments: Sequence[float] = (),
-        acting: Mapping[str, np.ndarray] | None = None,
+        acting: Sequence[Mapping[str, np.ndarray]] = (),
+        told: Sequence[str] = (),
     ) -> np.ndarray:
         """Return the page (height, width, 3 or 4) uint8 with drawings (h, w, 3 or 4) of the size of a tile.
 
@@ -167,22 +168,22 @@ class Page:
         camera : for the axes
         time : text of the time
         moments : times of the insets [s]
-        acting : directions (3,) of gravity and wind, beside the axes
+        acting : directions (3,) of gravity and wind of each drawing: in it, or beside the axes if there is one drawing
+        told : of the loads of each drawing: in it, or below if there is one drawing
         """
-        for artist in (*self._figure.images, *self._triad.texts):
+        for artist in (*self._figure.images, *self._triad.texts, *(text for axes in self.tiles for text in axes.texts)):
             artist.remove()
         for axes, drawing in zip(self.tiles, drawings, strict=True):
             self._figure.figimage(drawing, *axes.bbox.min.round(), origin="upper", zorder=-1)
         self._time.set_text(time)
-        ways = {**dict(zip("xyz", np.eye(3))), **(acting or {})}
-        for name, way in sorted(ways.items(), key=lambda axis: float(axis[1] @ camera.towards)):
-            colour = PALE if name in ("x", "y", "z") else _MARKER
-            arrow = {"arrowstyle": "<|-", "color": colour, "shrinkA": 0.0, "shrinkB": 0.0}
-            tip = np.array([way @ camera.right, way @ camera.up])
-            length = float(np.linalg.norm(tip))
-            if length > 0.05:
-                label = {"color": colour, "fontsize": 11, "ha": "center", "va": "center"}
-                self._triad.annotate(name, (0.0, 0.0), tip * (1.0 + 0.33 / length), arrowprops=arrow, **label)
+        single, unit, high = len(drawings) == 1, self._figure.dpi / 100.0, self.tile[1]
+        notes = [*self._notes, *(text for text in told if text and single)]
+        self._foot.set_text(literal("\n".join("   ".join(notes[k : k + 2]) for k in range(0, len(notes), 2))))
+        _draw_ways(self._triad, dict(zip("xyz", np.eye(3))) | (dict(*acting) if single else {}), camera)
+        for axes, ways, text in zip(self.tiles, acting, told, strict=False) if not single else ():
+            place = {"xycoords": "axes pixels", "ha": "left", "va": "top", "color": PALE, "fontsize": 11.5}
+            axes.annotate(literal(text), (0.0, high), **place)
+            _draw_ways(axes, ways, camera, (24.0 * unit, high - 52.0 * unit), 20.0 * unit, "axes pixels")
         for (marker, times, curve), moment in zip(self._insets, moments, strict=False):
             if len(times):
                 marker.set_data(*([np.interp(moment, times, values)] for values in curve.T))
@@ -205,7 +206,7 @@ class Page:
         factor, name = prefix_for(length, "m")
         text = f"{length * factor:g} {name}" + ("" if camera.parallel else " at mid-depth")
         self._write(end + 0.1, 0.22, text, color=PALE, va="center_baseline", fontsize=11.5)
-        self._notes.set_x(end + 0.4 + 0.085 * len(text))
+        self._foot.set_x(end + 0.4 + 0.085 * len(text))
 
     def add_insets(self, results: Sequence[Any], name: str) -> None:
         """Add a curve of the history to the room of each drawing, with a marker, which :meth:`draw` moves.
@@ -243,6 +244,25 @@ class Page:
                 axes.set_title(literal(label + (f" [{unit}]" if unit else "")))
                 (marker,) = axes.plot([], [], "o", color=_MARKER, markersize=6 * pixel)
                 self._insets.append((marker, times, curve))
+
+
+def _draw_ways(
+    axes: Any,
+    ways: Mapping[str, np.ndarray],
+    camera: Camera,
+    origin: tuple[float, float] = (0.0, 0.0),
+    unit: float = 1.0,
+    coordinates: str = "data",
+) -> None:
+    """Draw directions (3,) as arrows of a unit from an origin with their names, the farthest first."""
+    for name, way in sorted(ways.items(), key=lambda each: float(each[1] @ camera.towards)):
+        colour = PALE if name in ("x", "y", "z") else _MARKER
+        arrow = {"arrowstyle": "<|-", "color": colour, "shrinkA": 0.0, "shrinkB": 0.0}
+        tip = np.array([way @ camera.right, way @ camera.up])
+        length = float(np.linalg.norm(tip))
+        if length > 0.05:
+            label = {"color": colour, "fontsize": 11, "ha": "center", "va": "center", "xycoords": coordinates}
+            axes.annotate(name, origin, origin + unit * tip * (1.0 + 0.33 / length), arrowprops=arrow, **label)
 
 
 def history_curve(history: Any, name: str) -> np.ndarray:

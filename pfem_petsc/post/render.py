@@ -240,8 +240,8 @@ class Film:
         """Return a page (height, width, 3 or 4) uint8."""
         drawings = [self._draw(k, number) for k in range(len(self.motions))]
         motion, moments = self.motions[0], [motion.times[number] for motion in self.motions]
-        acting = motion.actions.everywhere(number) if motion.actions is not None else {}
-        return self._page.draw(drawings, self._cameras[0][number], motion.time(motion.frames[number]), moments, acting)
+        time, acting = motion.time(motion.frames[number]), self._acting([number])
+        return self._page.draw(drawings, self._cameras[0][number], time, moments, *acting)
 
     def poster(self) -> np.ndarray:
         """Return six instants on one page, in a grid that suits the shape of the motion."""
@@ -256,8 +256,7 @@ class Film:
         self._prepare(size, captions, len(chosen) if several else columns)
         numbers = [motion.frames.index(frame) for frame in chosen]
         drawings = [self._draw(k, number) for k in range(len(self.motions)) for number in numbers]
-        acting = motion.actions.everywhere(numbers[-1]) if motion.actions is not None else {}
-        return self._page.draw(drawings, self._cameras[0][0], acting=acting)
+        return self._page.draw(drawings, self._cameras[0][0], "", (), *self._acting(numbers))
 
     def close(self) -> None:
         """Give the windows back."""
@@ -293,6 +292,14 @@ class Film:
         shades, layers = self.scale.colours(colour.values(frame)), motion.layers(frame, scene, camera)
         surfaces, gone = motion.surfaces[frame], motion.gone(frame)
         return scene.draw(motion.positions(frame), shades, camera, surfaces, gone, layers)
+
+    def _acting(self, numbers: Sequence[int]) -> tuple[list[dict[str, np.ndarray]], list[str]]:
+        """Return the directions of gravity and wind in each drawing of frames, and what is told of its loads."""
+        found = [(motion.actions, number) for motion in self.motions for number in numbers]
+        return (
+            [{} if actions is None else actions.everywhere(number) for actions, number in found],
+            ["" if actions is None else actions.longest(number) for actions, number in found],
+        )
 
     @property
     def notes(self) -> list[str]:

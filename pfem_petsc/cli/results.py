@@ -201,7 +201,7 @@ def print_members(arguments: argparse.Namespace) -> int:
             getattr(table, f"to_{name}")(file)
             print(file)
     if arguments.picture is not None:
-        print(draw_members(result, table, arguments.picture))
+        print(draw_members(result, table, arguments.picture, arguments.each_case))
     return 0
 
 

@@ -237,6 +237,8 @@ def _finds_form(stage: Any) -> bool:
     return stage.static is not None and stage.static.method == "force_density"
 
 
+_ENVELOPE = "largest utilisation of strength and Euler's load"
+_MOST_CASES = 12  # drawings of a picture
 UTILISATIONS = ("yield_utilisation", "buckling_utilisation")
 """Columns that may be empty."""
 
@@ -362,7 +364,9 @@ def _bars_of(text: str) -> list[int]:
     return list(range(int(first), int(last) + 1) if last else map(int, first.split()))
 
 
-def draw_members(result_path: Path | str | Any, table: Table, file: Path | str, **options: Any) -> Path:
+def draw_members(
+    result_path: Path | str | Any, table: Table, file: Path | str, each_case: bool = False, **options: Any
+) -> Path:
     """Draw the truss with each bar in the colour of the utilisation of its member; return the file.
 
     Parameters
@@ -370,12 +374,13 @@ def draw_members(result_path: Path | str | Any, table: Table, file: Path | str, 
     result_path : result file or its folder, or an open result
     table : of :func:`members`, of the same result
     file : PNG file
+    each_case : whether each load case, combination or stage of the table has a drawing of its own
     options : see :class:`~pfem_petsc.post.options.Options`
 
     Raises
     ------
     InputError
-        If no member has a utilisation, or the picture cannot be made.
+        If no member has a utilisation, there are too many cases, or the picture cannot be made.
     """
     from .chart import opened
     from .options import Options
@@ -387,28 +392,40 @@ def draw_members(result_path: Path | str | Any, table: Table, file: Path | str, 
             "members: nothing to draw: utilisations need a yield_stress or design_strength of the material, or a "
             "shape or second_moment of the section"
         )
+    cases, number = np.unique(table["case"], return_inverse=True)
+    if not each_case:
+        cases, number = np.array([_ENVELOPE]), np.zeros_like(number)
+    if len(cases) > _MOST_CASES:
+        raise InputError(
+            f"members: a picture has at most {_MOST_CASES} drawings, and the table has {len(cases)} cases: draw one "
+            "with case (--case NAME), or the envelope of all without each_case (--each-case)"
+        )
     with opened(result_path) as result:
-        each = np.zeros(len(result.bars))
-        for bars, value in zip(table["bars"], values, strict=True):
+        each = np.zeros((len(cases), len(result.bars)))
+        for bars, row, value in zip(table["bars"], number, values, strict=True):
             chosen = _bars_of(str(bars))
-            each[chosen] = np.fmax(each[chosen], value)
-        # the first snapshot, with the utilisations as its field
+            each[row, chosen] = np.fmax(each[row, chosen], value)
+        names = [stage.name for stage in result.case.stage]
+        order = sorted(range(len(cases)), key=lambda k: names.index(cases[k]) if cases[k] in names else 0)
+        # the first snapshot, with the utilisations as its field, once for each case
         drawn = SimpleNamespace(
             path=result.path,
             case=result.case,
             bars=result.bars,
             axis=result.axis,
             history=result.history,
-            times=result.times[:1],
-            positions=result.positions,
+            times=np.repeat(result.times[:1], len(cases)),
+            positions=lambda snapshot: result.positions(0),
             point_fields=(),
             cell_fields=("utilisation",),
-            field=lambda name, snapshot: each,
-            caption=lambda snapshot: "largest utilisation of strength and Euler's load",
+            field=lambda name, snapshot: each[order[snapshot]],
+            caption=lambda snapshot: str(cases[order[snapshot]]),
+            instants=lambda count: list(range(len(cases))),
         )
         defaults = {"field": "utilisation", "clim": (0.0, max(1.0, float(each.max())))}
-        film = Film([drawn], Options(frames=[0], **(defaults | options)), lambda _: None)
-        film.start(film.options.size)
-        file = save(film.frame(0), Path(file))
+        film = Film([drawn], Options(frames=list(range(len(cases))), **(defaults | options)), lambda _: None)
+        if len(cases) == 1:
+            film.start(film.options.size)
+        file = save(film.frame(0) if len(cases) == 1 else film.poster(), Path(file))
         film.close()
     return file

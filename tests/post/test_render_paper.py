@@ -12,10 +12,12 @@ from matplotlib.colors import to_rgb
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError
+from pfem_petsc.output.table import Table
 from pfem_petsc.output.units import POINT
 from pfem_petsc.post.actions import Actions
 from pfem_petsc.post.camera import cameras
 from pfem_petsc.post.colours import ColourScale
+from pfem_petsc.post.members import draw_members
 from pfem_petsc.post.motion import Motion
 from pfem_petsc.post.page import Page, inset_room
 from pfem_petsc.post.render import Film, Options, instants
@@ -205,7 +207,9 @@ def test_loads_are_those_of_the_load_case_at_its_load_factor(loaded):
             down = -100.0 * (share if name == "permanent" else 1.0)
             tails, tips = actions.arrows(number, result.positions(number))
             assert actions.longest(number) == f"longest arrow {largest[name]:.0f} N"
-            ways = {tuple(np.round((tip - tail) * largest[name] / 0.14 / np.sqrt(6.0), 6)) for tail, tip in zip(tails, tips)}
+            ways = {
+                tuple(np.round((tip - tail) * largest[name] / 0.14 / np.sqrt(6.0), 6)) for tail, tip in zip(tails, tips)
+            }
             expected = {(side, 0.0, down)} if down else set()
             expected |= {(0.0, 0.0, 30.0 * share)} if name in ("pull", "both") and share else set()
             assert ways == expected, text
@@ -297,3 +301,26 @@ def test_many_loads_are_thinned_and_counted(tmp_path):
         # as many in each half, and no node farther from one than the diagonal of a cell of 1/5 and half a mesh
         assert all(np.sum(tips[:, k] < 0.499) == np.sum(tips[:, k] > 0.501) for k in (0, 1))
         assert np.linalg.norm(points[:, None] - tips, axis=2).min(axis=1).max() < np.sqrt(2.0) * (0.2 + 0.025)
+
+
+def test_members_of_each_case_have_a_drawing(loaded, tmp_path):
+    """In the order of the cases, whatever that of the table; without, the largest of all."""
+    with open_result(loaded) as result:
+        bars = f"0-{len(result.bars) - 1}"
+        table = Table(
+            {
+                "bars": np.array([bars] * 3),
+                "yield_utilisation": np.array([1.0, 0.2, 0.0]),
+                "buckling_utilisation": np.array([np.nan, 0.1, np.nan]),
+                "case": np.array(["pull", "both", "push"]),
+            }
+        )
+        full = ColourScale((0.0, 1.0), Options().cmap, "").colours(np.array([1.0]))[0]
+        picture = pixels(draw_members(result, table, tmp_path / "each.png", each_case=True))[:, : 1280 - 150]
+        rows, columns = near(picture, full, 12)  # of three drawings in two rows, the second is at the upper right
+        assert len(rows) > 500 and rows.max() < 0.5 * 720 and columns.min() > 0.5 * 1130
+        envelope = pixels(draw_members(result, table, tmp_path / "all.png"))[:, : 1280 - 150]
+        assert np.ptp(near(envelope, full, 12)[1]) > 0.5 * 1130
+        many = Table({name: np.repeat(table[name], 5) for name in table} | {"case": np.arange(15).astype(str)})
+        with pytest.raises(InputError, match="at most 12 drawings, and the table has 15 cases: draw one with case"):
+            draw_members(result, many, tmp_path / "many.png", each_case=True)

@@ -31,7 +31,7 @@ from .layout import (
     read_attributes,
 )
 from .selected import select
-from .table import Table, flat_columns
+from .table import SWEEP, Table, flat_columns
 from .units import AXES, LOAD_FACTOR, TIME, Axis, engineering
 
 if TYPE_CHECKING:
@@ -152,6 +152,10 @@ def result_file(path: Path | str) -> Path:
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
     """Context that converts errors in reading a result file to an InputError."""
+    sweep = path.name == SWEEP or (path.name == RESULT_NAME and not path.exists())
+    if sweep and (path.parent / SWEEP).is_file():
+        runs = f"{path.parent}/*/"
+        raise InputError(f"{path}: is no result, but in the folder of a sweep: the results of its runs are {runs}")
     if not path.is_file():
         raise InputError(f"{path}: there is no such result file; give a {RESULT_NAME} or the folder that holds one")
     try:

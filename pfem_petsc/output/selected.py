@@ -194,6 +194,10 @@ class _Reader:
         found = _UNKNOWN.match(self._text, self.at)
         if found is None:
             return self.error(f"a column or a number is missing at '{self._text[self.at :]}'")
+        function = re.match(r"[A-Za-z]\w*(?=\s*\()", self._text[self.at :])
+        if function is not None:
+            signs = "expressions have + - * / and parentheses, and .norm of vectors"
+            return self.error(f"'{function[0]}(...)': there are no functions; {signs}")
         whole = re.sub(r"(\[\d+\])?(\.(x|y|z|norm|min|max))?([-*/]\d[\d.e-]*)*$", "", found[0])
         hint = nearest(whole, [name for name in self._names if not _is_change(name, self._names[name])])
         return InputError(f"the history has no column '{whole}'{hint}")

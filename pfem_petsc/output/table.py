@@ -137,7 +137,8 @@ class Table(Mapping[str, np.ndarray]):
         lines = [names]
         lines += [["…"] * len(names) if i < 0 else [_text(self[name][i]) for name in names] for i in shown]
         left = [name for name in self if name not in names]
-        return lines, f"and {len(left)} more columns: {', '.join(left[:3])}, ..." if left else ""
+        told = ", ".join([*left[:3], "..."] if len(left) > 3 else left)
+        return lines, f"and {len(left)} more column{'s' if len(left) > 1 else ''}: {told}" if left else ""
 
     def __str__(self) -> str:
         lines, more = self._texts()

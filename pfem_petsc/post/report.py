@@ -186,7 +186,7 @@ def _energies(history: Mapping[str, np.ndarray]) -> str:
         [
             name.replace("_", " "),
             side[name],
-            *(engineering(float(v), "J") for v in (values[0], values.max(), values[-1])),
+            *(engineering(float(v), "J") for v in (values[0], values[np.abs(values).argmax()], values[-1])),
         ]
         for name, values in held.items()
         if np.any(values)

@@ -15,6 +15,7 @@ from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.cli.main import main
 from pfem_petsc.output.integrity import damages
 from pfem_petsc.output.repair import repair
+from pfem_petsc.output.table import Table
 
 POINTS = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1.0]]
 BARS = [[0, 4], [1, 4], [2, 4], [3, 4], [0, 1], [1, 2], [2, 3], [3, 0]]
@@ -201,7 +202,10 @@ def test_wide_tables_show_a_dozen_columns_that_are_not_zero(result):
     names = head.split()
     assert len(names) == 12 and names[:2] == ["step", "time"]
     assert all(np.any(table[name]) for name in names)
-    assert more.startswith(f"and {len(table) - 12} more columns: ")
+    assert more.startswith(f"and {len(table) - 12} more columns: ") and more.endswith(", ...")
+    wide = Table({f"c{k}": [1.0 + k] for k in range(14)})
+    assert str(wide).splitlines()[-1] == "and 2 more columns: c12, c13"
+    assert str(Table(dict(list(wide.items())[:13]))).splitlines()[-1] == "and 1 more column: c12"
     assert "support_force.x" in table.text(1)
 
 

@@ -115,6 +115,7 @@ def test_arithmetic(text, expected, unit):
         ("time ** 2", "a column or a number is missing at '\\* 2'"),
         ("time * 3[furlong]", "'furlong' is not a unit"),
         ("__import__('os')", "no column '__import__'"),
+        ("2 * abs(time)", r"'abs\(...\)': there are no functions; expressions have \+ - \* /"),
         ("time.__class__", "no column 'time.__class__'"),
     ],
 )

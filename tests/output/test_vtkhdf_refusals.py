@@ -36,6 +36,16 @@ def test_going_on_with_another_case_is_refused(shared_tmp_path):
         ResultWriter(path.with_name("none.vtkhdf"), COMM, truss.mesh, **options(append_after_step=5))
 
 
+def test_the_folder_of_a_sweep_is_no_result(tmp_path):
+    (tmp_path / "sweep.csv").write_text("run,status\n0,0\n")
+    for named in (tmp_path, tmp_path / "sweep.csv"):
+        with pytest.raises(InputError) as told:
+            open_result(named)
+        assert f"the results of its runs are {tmp_path}/*/" in str(told.value)
+    with pytest.raises(InputError, match="no such result file"):
+        open_result(tmp_path / "0000")
+
+
 @pytest.mark.parallel
 def test_unwritable_folder_is_refused_on_all_ranks(shared_tmp_path):
     if COMM.rank == 0:

@@ -7,13 +7,14 @@ import io
 import re
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.render import Film
-from pfem_petsc.post.report import write_report
+from pfem_petsc.post.report import _energies, write_report
 
 
 class Balanced(HTMLParser):
@@ -106,3 +107,9 @@ def test_reports_that_cannot_be_written_are_refused(run, tmp_path, capsys):
     assert "the report cannot be written" in capsys.readouterr().err
     assert main(["report", str(tmp_path / "nothing")]) == 2
     assert "there is no such result file" in capsys.readouterr().err
+
+
+def test_the_largest_energy_is_that_of_the_largest_magnitude():
+    history = {"kinetic_energy": np.array([1.0, 3.0, 2.0]), "numerical_dissipation": np.array([0.0, -0.2, -0.1])}
+    cells = re.findall(r"<td[^>]*>([^<]*)</td>", _energies(history))
+    assert cells[-5:] == ["numerical dissipation", "lost", "0 J", "-200.0 mJ", "-100.0 mJ"]

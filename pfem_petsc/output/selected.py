@@ -12,7 +12,7 @@ from ..columns import declared
 from ..errors import InputError
 from ..registry import nearest
 from .table import flat_columns
-from .units import powers_of, text_of
+from .units import dimensions, powers_of, product, simplest
 
 __all__ = ["Selected", "select"]
 
@@ -187,7 +187,7 @@ class _Reader:
         unit = _UNIT.match(self._text, self.at)
         if unit is not None:
             self.at = unit.end()
-        known = None if unit is None else text_of(powers_of(unit[1]))
+        known = None if unit is None else simplest(powers_of(unit[1]))
         return Selected(np.asarray(float(number[0])), known)
 
     def _unknown(self) -> InputError:
@@ -215,12 +215,9 @@ class _Reader:
         one, other = one.reduced(), other.reduced()
         if other.vector and (one.vector or power < 0):
             raise self.error("a vector is multiplied and divided by numbers only; select a component, like .x")
-        known, unit = one.unit is not None and other.unit is not None, None
-        if known:
-            powers = powers_of(one.unit)
-            for atom, of in powers_of(other.unit).items():
-                powers[atom] = powers.get(atom, 0) + power * of
-            unit = text_of(powers)
+        unit = None
+        if one.unit is not None and other.unit is not None:
+            unit = simplest(product((powers_of(one.unit), 1), (powers_of(other.unit), power)))
         a, b = (
             q.values[:, None] if q.values.ndim and not q.vector and p.vector else q.values
             for q, p in ((one, other), (other, one))
@@ -231,8 +228,10 @@ class _Reader:
 
 
 def _common(one: str | None, other: str | None) -> str | None:
-    """Return the unit of both; None if one is not known, or they differ."""
-    return one if None not in (one, other) and powers_of(one) == powers_of(other) else None
+    """Return the unit of both; None if one is not known, or their dimensions differ."""
+    if one is None or other is None:
+        return None
+    return one if dimensions(powers_of(one)) == dimensions(powers_of(other)) else None
 
 
 def _is_change(name: str, source: str) -> bool:

@@ -22,16 +22,19 @@ __all__ = [
     "TIME",
     "Axis",
     "common_prefix",
+    "dimensions",
     "duration",
     "engineering",
     "field_unit",
     "powers_of",
     "prefix_for",
+    "product",
+    "simplest",
     "text_of",
     "unit_of",
 ]
 
-_LEAST = {"Pa": 0, "N": -6, "J": -9, "m/s": -6, "m/s²": -3}
+_LEAST = {"Pa": 0, "Hz": 0, "N": -6, "J": -9, "W": -9, "m/s": -6, "m/s²": -3}
 """Powers of the smallest prefixes in use: no one thinks in millipascal, and a picojoule is mostly rounding."""
 
 PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
@@ -107,12 +110,21 @@ def _units_of_variables() -> dict[str, str]:
 
 _ATOMS = ("m", "s", "kg", "N", "Pa", "J", "K", "Hz", "W", "rad", "1")
 _SUPERSCRIPTS = {2: "²", 3: "³"}
+_DERIVED: dict[str, dict[str, int]] = {
+    "N": {"kg": 1, "m": 1, "s": -2},
+    "Pa": {"kg": 1, "m": -1, "s": -2},
+    "J": {"kg": 1, "m": 2, "s": -2},
+    "W": {"kg": 1, "m": 2, "s": -3},
+    "Hz": {"s": -1},
+}
+_USUAL: tuple[dict[str, int], ...] = ({}, {"m": 1, "s": -1}, {"m": 1, "s": -2})
+"""Products that are shown as such although others are as short: m/s² and not N/kg."""
 
 
 def powers_of(unit: str) -> dict[str, int]:
     """Return the units that one is a product of, and their powers: ``"kg m²/s"`` -> {kg: 1, m: 2, s: -1}.
 
-    Pascal are N/m², so that forces over areas are pressures. Powers may also be written ``m2`` or ``m^2``.
+    Powers may also be written ``m2`` or ``m^2``.
 
     Raises
     ------
@@ -127,22 +139,47 @@ def powers_of(unit: str) -> dict[str, int]:
                 raise InputError(f"[{unit}]: {word!r} is not a unit; units are SI: {', '.join(_ATOMS)} and powers, m2")
             power = {"²": 2, "³": 3}.get(found[2] or "1") or int(found[2] or 1)
             power = -power if number else power
-            for atom, of in (("N", 1), ("m", -2)) if found[1] == "Pa" else ((found[1], 1),):
-                powers[atom] = powers.get(atom, 0) + of * power
+            powers[found[1]] = powers.get(found[1], 0) + power
     return {atom: power for atom, power in powers.items() if power and atom != "1"}
+
+
+def product(*factors: tuple[Mapping[str, int], int]) -> dict[str, int]:
+    """Return the powers of a product of units, each with a power."""
+    powers: dict[str, int] = {}
+    for factor, power in factors:
+        for atom, of in factor.items():
+            powers[atom] = powers.get(atom, 0) + power * of
+    return {atom: power for atom, power in powers.items() if power}
+
+
+def dimensions(powers: Mapping[str, int]) -> dict[str, int]:
+    """Return the powers of kg, m, s, K and rad that those of a unit are: N/kg and m/s² have the same."""
+    return product(*((_DERIVED.get(atom, {atom: 1}), power) for atom, power in powers.items()))
+
+
+def simplest(powers: Mapping[str, int]) -> str:
+    """Return the text of the simplest unit of the same dimensions: ``N s²/(kg m)`` -> none, ``J/m`` -> ``N``.
+
+    That is a single unit, else one of the usual products, else what has the least powers of these: the unit itself, and
+    base units with at most one of N, J, Pa, W. Products of base units only stay as they are.
+    """
+    base = dimensions(powers)
+    single = [{name: 1} for name in _DERIVED if name != "Hz"]
+    usual = next((unit for unit in (*single, *_USUAL) if dimensions(unit) == base), None)
+    if usual is not None or not set(powers) & set(_DERIVED):
+        return text_of(powers if usual is None else usual)
+    others = [product((base, 1), (dimensions(unit), -1), (unit, 1)) for unit in single]
+    return text_of(min(powers, base, *others, key=lambda unit: sum(map(abs, unit.values()))))
 
 
 def text_of(powers: Mapping[str, int]) -> str:
     """Return the text of a unit from its powers, as of :func:`powers_of`; empty for a pure number."""
-    powers = {atom: power for atom, power in powers.items() if power}
-    if powers == {"N": 1, "m": -2}:
-        return "Pa"
 
-    def product(sign: int) -> list[str]:
+    def side(sign: int) -> list[str]:
         sizes = {atom: sign * power for atom, power in powers.items() if sign * power > 0}
         return [atom + ("" if n == 1 else _SUPERSCRIPTS.get(n, f"^{n}")) for atom, n in sizes.items()]
 
-    above, below = product(1), product(-1)
+    above, below = side(1), side(-1)
     divided = f"({' '.join(below)})" if len(below) > 1 else "".join(below)
     return f"{' '.join(above) or '1'}/{divided}" if below else " ".join(above)
 
@@ -154,7 +191,7 @@ def prefix_for(magnitude: float, unit: str) -> tuple[float, str]:
     values that are not finite, and values too small for a prefix in use (``0.5 Pa``, ``2e-13 J``). Kilograms already
     have a prefix.
     """
-    plain = unit in ("s", "m", "m/s", "m/s²", "N", "Pa", "J", "B")
+    plain = unit in ("s", "m", "m/s", "m/s²", "N", "Pa", "J", "W", "Hz", "B")
     if not plain or not math.isfinite(magnitude) or magnitude == 0.0:
         return 1.0, unit
     # with a small tolerance, so that 999.9999999 ms is shown as 1 s

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from ..case.base import StrictModel
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.selected import Selected, select
 from ..output.table import varied
-from ..output.units import TIME, unit_of
-from .chart import COLOURS, DASHES, REFERENCE, Chart, Curve, Panel, distinct, largest
+from ..output.units import TIME, prefix_for, unit_of
+from .chart import DASHES, REFERENCE, Chart, Curve, Panel, distinct, largest
 from .filters import AS_COMPUTED, Filter, amplitude_spectrum
 
 _ABSENT = ("load", "support", "temperature", "contact_pair", "constraint", "remove", "point_mass", "spring", "dashpot")
@@ -194,6 +196,28 @@ _LONGEST = 50  # number of letters of a label that tells the values of a run
 
 _LINE = 40  # letters of a line of a legend
 
+_HEIGHT = 26  # letters of a line beside a panel
+
+_QUANTITIES = {
+    "": "ratio",
+    "N": "force",
+    "Pa": "stress",
+    "J": "energy",
+    "W": "power",
+    "m": "length",
+    "m²": "area",
+    "m³": "volume",
+    "m/s": "velocity",
+    "m/s²": "acceleration",
+    "s": "time",
+    "N s": "impulse",
+    "kg m/s": "momentum",
+    "N/m": "force by length",
+}
+"""What expressions are called on their axis, by their unit."""
+
+_UNIT = re.compile(r"\[((?:kg|Pa|Hz|rad|[msNJKW]|1/)(?:kg|Pa|Hz|rad|[msNJKW]|[²³ /()])*)\]")
+
 _PEAKS = 5  # of a spectrum, at most, that are told
 
 
@@ -293,11 +317,12 @@ def draw_curves(
     against : a column of numbers, a component or an expression; None: time
     chosen : filter of the column that they are drawn over
     closed_forms : whether to draw the closed form of the first result
-    labels : names of the results in the legends; None: see :func:`labels_of`
+    labels : names of the results in the legends, None: see :func:`labels_of`; of a single result, names of the curves
     """
     if not panels:
         raise InputError("plot: no curves named; columns: " + ", ".join(results[0].history))
-    first, labels = results[0], labels_of(results, labels)
+    first = results[0]
+    labels, captions = _labels_and_captions(results, [name for name, _ in panels], labels)
     if len({result.axis.symbol for result in results}) > 1 and against is None:
         raise InputError("plot: the results are over different axes: " + ", ".join({r.axis.symbol for r in results}))
     exact = closed_form(first) if closed_forms and against is None else None
@@ -310,36 +335,36 @@ def draw_curves(
         places = [_filtered(r, chosen, against, each[against]) for r, each in zip(results, found, strict=True)]
     shared = all(np.array_equal(place, places[0]) for place in places)
     over = None if against is None else (against, select(first.history, against).unit or "")
+    columns = {name: [column(result.history, name) for result in results] for name, _ in panels}
+    components = {name: _parts(found) for name, found in columns.items()}
+    split = any(len(parts) > 1 for parts in components.values())
     drawn = []
-    for name, smoothing in panels:
-        found, whole = [column(result.history, name) for result in results], select(first.history, name)
-        parts = list(dict.fromkeys(part for curves in found for part in curves))
-        # a vector that is zero in some results has all components there
-        parts = [part for part in parts if any(np.any(curves.get(part, 0.0)) for curves in found)] or parts
-        alike = len(results) * len(parts) > len(COLOURS) or len(results) > len(DASHES)  # else dashes tell results apart
+    for (name, smoothing), caption in zip(panels, captions, strict=True):
+        found, parts, whole = columns[name], components[name], select(first.history, name)
         curves = []
         for number, (each, label, result, place) in enumerate(zip(found, labels, results, places, strict=True)):
             for k, part in enumerate(parts):
                 if part not in each:
                     continue
                 shown = _filtered(result, smoothing, part, each[part])
-                style = distinct(number * len(parts) + k, None if alike else number)
-                words_of = (label if len(found) > 1 else "", part if len(parts) > 1 else "")
+                style = _line(number, k, len(results), split)
+                component = part.rpartition(".")[2] if caption else part
+                words_of = (label if len(found) > 1 else "", component if len(parts) > 1 else "")
                 key = f"{part}: {label}" if len(found) > 1 else part
                 key += f", {smoothing.name}" if smoothing is not None and (name, None) in panels else ""
-                text = " ".join(word for word in words_of if word) or "computed"
+                text = " ".join(word for word in words_of if word) or caption or "computed"
                 curves.append(Curve(text, shown, style, key, place, "" if shared else label))
         for known in exact_curves(exact, [part for part in parts if part in found[0]], places[0]):
             part = known.key.removesuffix(CLOSED_FORM)
             curves.append(known._replace(values=_filtered(first, smoothing, part, known.values)))
         title = parts[0] if len(parts) == 1 else name  # which component it is
+        label = caption or quantity_of(name, whole)
+        titles = [title] if not caption and words(title) != label else []
         if smoothing is not None and smoothing.name != AS_COMPUTED:
-            state = f"{AS_COMPUTED}, as all energies" if _is_energy(whole) else smoothing.name
-            title = f"{title}: {state}"
-        label = words(name.rsplit("/", 1)[-1]) if whole.single else ""
+            titles.append(f"{AS_COMPUTED}, as all energies" if _is_energy(whole) else smoothing.name)
         lines = sum(1 + curve.name.count("\n") for curve in curves)
         height = max(0.9, 0.11 * lines)  # of the legend
-        drawn.append(Panel(label, whole.unit or "", curves, title, height, over, None, len(curves) > 1))
+        drawn.append(Panel(label, whole.unit or "", curves, ": ".join(titles), height, over, None, len(curves) > 1))
     axis = max((result.axis for result in results), key=lambda axis: axis.staged)
     ends = first.stage_ends if len(results) == 1 and axis.staged else ()
     return Chart(drawn, first.case.title or first.case.name, np.concatenate(times), axis, ends=ends)
@@ -361,6 +386,43 @@ def _is_energy(found: Selected) -> bool:
     return all(unit_of(source) == "J" for source in found.sources)
 
 
+def quantity_of(name: str, found: Selected) -> str:
+    """Return the label of the axis of a column, as words, or of an expression, by its unit."""
+    if found.single:
+        return words(name.rsplit("/", 1)[-1])
+    if found.unit is None:
+        return "value of unknown unit"
+    return "displacement" if found.unit == "m" and "displacement" in name else _QUANTITIES.get(found.unit, "value")
+
+
+def _parts(found: Sequence[Mapping[str, np.ndarray]]) -> list[str]:
+    """Return the names of the curves of :func:`column` of results: a vector that is zero in some has all components
+    there."""
+    parts = list(dict.fromkeys(part for curves in found for part in curves))
+    return [part for part in parts if any(np.any(curves.get(part, 0.0)) for curves in found)] or parts
+
+
+def _line(number: int, part: int, results: int, split: bool) -> dict[str, Any]:
+    """Return the style of a curve: a result has its colour in all panels.
+
+    Dashes are those of components, in charts ``split`` into them, else of a few results.
+    """
+    if results == 1:
+        return distinct(part, 0)
+    return distinct(number, part if split else number if results <= len(DASHES) else None)
+
+
+def _labels_and_captions(
+    results: Sequence[Any], names: Sequence[str], labels: Sequence[str] | None
+) -> tuple[list[str], list[str]]:
+    """Return the names of results, and those of the curves, which labels are for a single result, else empty."""
+    if len(results) > 1 or labels is None:
+        return labels_of(results, labels), [""] * len(names)
+    if len(labels) != len(names):
+        raise InputError(f"plot: labels: {len(names)} curves of one result need as many labels, not {list(labels)}")
+    return labels_of(results), [textwrap.fill(label, _HEIGHT) for label in labels]
+
+
 def labels_of(results: Sequence[Any], given: Sequence[str] | None = None) -> list[str]:
     """Return distinct names of results: those given, else what varies in runs of a sweep, else folders, or as much of
     the paths as it takes.
@@ -375,7 +437,7 @@ def labels_of(results: Sequence[Any], given: Sequence[str] | None = None) -> lis
             raise InputError(f"plot: labels: {len(results)} results need as many different labels, not {list(given)}")
         return [textwrap.fill(label, _LINE) for label in given]
     paths = [Path(result.path).absolute() for result in results]
-    labels = _values_of_runs([varied(path.parent) for path in paths])
+    labels = _values_of_runs(results[0].case, [varied(path.parent) for path in paths])
     if len(set(labels)) == len(labels) and all(0 < len(label) <= _LONGEST for label in labels):
         return labels
     for count in range(1, max(len(path.parts) for path in paths)):
@@ -387,13 +449,35 @@ def labels_of(results: Sequence[Any], given: Sequence[str] | None = None) -> lis
     )
 
 
-def _values_of_runs(runs: Sequence[Mapping[str, str]]) -> list[str]:
+def _values_of_runs(case: Any, runs: Sequence[Mapping[str, str]]) -> list[str]:
     """Return for each run of a sweep the values that differ between some of them, with as much of the keys as it takes;
     empty texts for others."""
     keys = [key for key in runs[0] if len({run.get(key) for run in runs}) > 1]
     short = [key.rpartition(".")[2] for key in keys]
     names = short if len(set(short)) == len(short) else keys
-    return [", ".join(f"{name} = {run[key]}" for name, key in zip(names, keys) if key in run) for run in runs]
+    units = [_unit_of_key(case, key) for key in keys]
+    return [
+        ", ".join(f"{name} = {_text(run[key], unit)}" for name, key, unit in zip(names, keys, units) if key in run)
+        for run in runs
+    ]
+
+
+def _unit_of_key(case: Any, key: str) -> str:
+    """Return the unit that the text of a key of a case names, empty without: ``section.legs.thickness`` -> ``m``."""
+    *way, last = key.split(".")
+    table = case
+    for part in way:
+        table = table.get(part) if isinstance(table, Mapping) else getattr(table, part, None)
+    found = _UNIT.search(table.description(last)) if isinstance(table, StrictModel) else None
+    return found[1] if found else ""
+
+
+def _text(value: str, unit: str) -> str:
+    """Return a value with its unit and a prefix; a text that is no number as it is."""
+    if not unit or not re.fullmatch(r"-?\d+\.?\d*(e[-+]?\d+)?", value):
+        return value
+    factor, shown = prefix_for(float(value), unit)
+    return f"{float(value) * factor:.9g} {shown}"
 
 
 def draw_spectra(
@@ -422,25 +506,31 @@ def draw_spectra(
         if not result.stretches:
             raise InputError(f"{result.path}: spectra need a run over time, not a static analysis")
     natural = first.modes.frequency if getattr(first, "n_modes", 0) and first.modes.kind == "vibration" else ()
+    labels, captions = _labels_and_captions(results, names, labels)
+    columns = [[column(result.history, name) for result in results] for name in names]
+    split = any(len(_parts(found)) > 1 for found in columns)
     panels = []
-    for name in names:
-        whole = select(first.history, name)
+    for name, caption, found in zip(names, captions, columns, strict=True):
+        whole, parts = select(first.history, name), _parts(found)
         unit = whole.unit or ""
         curves = []
-        for label, result in zip(labels_of(results, labels), results, strict=True):
+        for number, (label, result) in enumerate(zip(labels, results, strict=True)):
             time = read(result.history, "time")
             rows = max(result.stretches, key=lambda rows, time=time: float(np.ptp(time[rows])))
-            for part, values in column(result.history, name).items():
+            for part in (part for part in parts if part in found[number]):
                 key = f"{part}: {label}" if len(results) > 1 else part
-                frequency, amplitude = amplitude_spectrum(time[rows], values[rows], window)
-                curves.append(Curve(key, amplitude, place=frequency))
-        label = f"amplitude of\n{words(name.rsplit('/', 1)[-1])}" if whole.single else "amplitude"
-        legend, title = len(curves) > 1, f"{name}, window: {window}"
-        panels.append(Panel(label, unit, curves, title, 1.1, ("frequency", "Hz"), (1.0, unit), legend, log=True))
+                frequency, amplitude = amplitude_spectrum(time[rows], found[number][part][rows], window)
+                style = _line(number, parts.index(part), len(results), split)
+                curves.append(Curve(key, amplitude, style, place=frequency))
+        label = f"amplitude of\n{caption or quantity_of(name, whole)}"
+        legend, title = len(curves) > 1, f"window: {window}" if caption else f"{name}, window: {window}"
+        along = prefix_for(highest or max(curve.place[-1] for curve in curves), "Hz")
+        over, scale = ("frequency", "Hz"), (1.0, unit)
+        panels.append(Panel(label, unit, curves, title, 1.1, over, scale, legend, True, along))
     title = first.case.title or first.case.name
     chart = Chart(panels, title, np.zeros(1))
-    factor, shown = chart.scales["Hz"]
     for axes, panel in zip(chart.axes, panels, strict=True):
+        factor, shown = panel.along
         end = highest or max(curve.place[-1] for curve in panel.curves)
         inside = [(curve.place > 0.0) & (curve.place <= end) for curve in panel.curves]
         top = max(largest(curve.values[part]) for curve, part in zip(panel.curves, inside, strict=True))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputError
-from ..output.units import engineering
+from ..output.units import engineering, prefix_for
 
 AS_COMPUTED = "as computed"
 """The name of no filter."""
@@ -57,20 +57,27 @@ def make_filter(text: str) -> Filter:
         case "none", []:
             return Filter(AS_COMPUTED, lambda time, values, zero=False: np.array(values, dtype=float))
         case "mean", [width] if good:
-            corner = f"{0.4429 / width:.3g} Hz"
+            corner = _hertz(0.4429 / width)
             name = f"mean of the {engineering(width, 's', 3)} before (−3 dB at {corner})"
             return Filter(name, lambda time, values, zero=False: _chosen_mean(time, values, width, zero))
         case "cfc", [size] if good:
-            corner = f"{CFC_CORNER * size * (math.sqrt(2.0) - 1.0) ** 0.25:.3g} Hz"
+            corner = _hertz(CFC_CORNER * size * (math.sqrt(2.0) - 1.0) ** 0.25)
             name = f"CFC {size:g} of SAE J211-1 (two passes, −3 dB at {corner})"
             return Filter(name, lambda time, values, zero=False: cfc(time, values, size, zero))
         case "butterworth", [cutoff, order] if good and order == int(order) <= 10:
-            name = f"Butterworth of order {order:g} (two passes, −3 dB at {cutoff:g} Hz)"
+            name = f"Butterworth of order {order:g} (two passes, −3 dB at {_hertz(cutoff, 6)})"
             return Filter(name, lambda time, values, zero=False: butterworth(time, values, cutoff, int(order), zero))
     raise InputError(
         f"filter = {text!r} is not known; give cfc:CLASS, butterworth:FREQUENCY[:ORDER] [Hz, up to order 10], "
         "mean:SECONDS or none, like cfc:180"
     )
+
+
+def _hertz(frequency: float, digits: int = 3) -> str:
+    """Return the text of a frequency: ``88571.4`` -> ``"88.6 kHz"``."""
+    rounded = float(f"{frequency:.{digits}g}")
+    factor, unit = prefix_for(rounded, "Hz")
+    return f"{rounded * factor:.{digits}g} {unit}"
 
 
 def _chosen_mean(time: np.ndarray, values: np.ndarray, width: float, zero_before: bool) -> np.ndarray:

@@ -228,7 +228,10 @@ class PlotOptions:
         action="extend",
     )
     labels: Sequence[str] | None = _option(
-        None, "names of the results in legends; default: their folders", metavar="TEXT", nargs="+"
+        None,
+        "names of the results in legends, or, with one result, of its curves; default: folders, and what is drawn",
+        metavar="TEXT",
+        nargs="+",
     )
     closed_forms: bool = _option(True, "do not draw closed forms", flag="--no-closed-form", action="store_false")
 

@@ -83,6 +83,8 @@ def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | Non
                 raise InputError(
                     f"{result.path}: filter = {given.force_filter!r} needs a run over time, not a static analysis"
                 )
+        if given.labels is not None and len(results) == 1 and given.spectrum is None and given.curves is None:
+            raise InputError("plot: labels name several results, or the curves of one: give curves, or more results")
         if given.spectrum is not None:
             chart = draw_spectra(results, list(given.spectrum), given.window, given.highest, given.labels)
             return chart.save(_free(folder / "spectra", suffixes), suffixes)

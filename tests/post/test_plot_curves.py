@@ -14,7 +14,8 @@ from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.errors import InputError
 from pfem_petsc.post import chart
 from pfem_petsc.post.chart import DASHES, REFERENCE, distinct
-from pfem_petsc.post.filters import window_mean
+from pfem_petsc.post.curves import draw_spectra
+from pfem_petsc.post.filters import make_filter, window_mean
 from pfem_petsc.post.plot import plot
 
 
@@ -168,3 +169,14 @@ def test_spectra_have_the_amplitude(tmp_path, result):
     assert head == ["frequency [Hz]", "probe/tip/velocity.y [m/s]"]
     assert places[20] == pytest.approx(frequency) and amplitude.argmax() == 20 and amplitude[20] == pytest.approx(3.0)
     assert len(saturated(plot(result, tmp_path, spectrum=["probe/tip/velocity"])[0])) > 300
+
+
+def test_frequencies_have_prefixes(tmp_path, result):
+    """Of filters, and of the axis of a spectrum by the highest frequency that is shown."""
+    assert make_filter("mean:5e-6").name == "mean of the 5.00 µs before (−3 dB at 88.6 kHz)"
+    assert "−3 dB at 12.5 kHz" in make_filter("butterworth:12500").name
+    assert "−3 dB at 1.67 kHz" in make_filter("cfc:1000").name
+    result.history["time"] = result.history["time"] / 1e4
+    ends = [draw_spectra([result], ["momentum.x"], highest=highest).axes[0] for highest in (None, 4e2)]
+    assert [axes.get_xlabel() for axes in ends] == ["frequency [MHz]", "frequency [Hz]"]
+    assert ends[1].get_xlim() == (0.0, 400.0)

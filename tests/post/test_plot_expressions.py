@@ -16,8 +16,8 @@ from pfem_petsc.errors import InputError
 from pfem_petsc.output.selected import select
 from pfem_petsc.post.chart import STYLE
 from pfem_petsc.post.colours import ColourScale
-from pfem_petsc.post.curves import draw_curves
-from pfem_petsc.post.filters import window_mean
+from pfem_petsc.post.curves import draw_curves, draw_spectra
+from pfem_petsc.post.filters import make_filter, window_mean
 from pfem_petsc.post.page import Heading, Page
 from pfem_petsc.post.plot import plot
 
@@ -60,8 +60,12 @@ def test_the_axis_of_an_expression_has_its_unit_and_no_other(result):
     with rc_context(STYLE):
         panels = draw_curves([result], [(name, None) for name in names]).axes
     shown = [axes.get_ylabel() for axes in panels]
-    assert shown[0].startswith("force.x [") and shown[1] == "" and shown[2].endswith("Pa]")
+    assert shown[0].startswith("force.x [") and shown[1] == "value of unknown unit"
+    assert shown[2].startswith("stress [") and shown[2].endswith("Pa]")
     assert [axes.get_title(loc="left") for axes in panels] == names
+    with rc_context(STYLE):
+        (axes,) = draw_curves([result], [("kinetic_energy", None)]).axes
+    assert axes.get_ylabel().startswith("kinetic energy [") and axes.get_title(loc="left") == ""
 
 
 def test_curves_are_filtered_if_a_filter_is_named(tmp_path, result):
@@ -137,6 +141,39 @@ def test_labels_name_the_results(tmp_path, result):
         plot([result, other], tmp_path, labels=["one"])
     with pytest.raises(InputError, match="2 results need as many different labels"):
         plot([result, other], tmp_path, labels=["one", "one"])
+
+
+def test_labels_of_a_single_result_name_its_curves(tmp_path, result):
+    panels = [("-wall/wall/force.x/2[m2]", None), ("wall/wall/force", make_filter("mean:0.005"))]
+    with rc_context(STYLE):
+        chart = draw_curves([result], panels, labels=["mean stress", "wall"])
+        (axes,) = draw_spectra([result], ["momentum.x"], labels=["all nodes"]).axes
+    assert [axes.get_ylabel().partition(" [")[0] for axes in chart.axes] == ["mean stress", "wall"]
+    assert chart.axes[0].get_title(loc="left") == ""
+    assert chart.axes[1].get_title(loc="left").startswith("mean of the 5.00 ms before")
+    assert axes.get_ylabel().startswith("amplitude of\nall nodes")
+    with pytest.raises(InputError, match=r"2 curves of one result need as many labels, not \['one'\]"):
+        draw_curves([result], panels, labels=["one"])
+    with pytest.raises(InputError, match="labels name several results, or the curves of one: give curves"):
+        plot(result, tmp_path, labels=["one"])
+
+
+def test_a_result_has_one_colour_in_all_panels(tmp_path, result):
+    """Beside components, which have dashes of their own; without any, dashes tell results apart as well."""
+    other = SyntheticResult(tmp_path / "other" / "result.vtkhdf", *ring())
+    for each in (result, other):
+        each.history["wall/wall/force"][:, 2] = 5.0 * each.history["time"]
+    panels = [("kinetic_energy", None), ("wall/wall/force", None)]
+    energy, force = draw_curves([result, other], panels, closed_forms=False, labels=["one", "two"]).axes
+    colours = {line.get_label(): line.get_color() for line in energy.get_lines()}
+    lines = force.get_lines()
+    assert len(lines) == 4 and len(set(colours.values())) == 2
+    assert all(line.get_color() == colours[line.get_label().partition(" ")[0]] for line in lines)
+    assert {(line.get_label()[-1], line.is_dashed()) for line in lines} == {("x", False), ("z", True)}
+    (axes,) = draw_curves([result, other], panels[:1], closed_forms=False).axes
+    assert [line.is_dashed() for line in axes.get_lines()] == [False, True]
+    axes = draw_spectra([result, other], ["momentum.x", "wall/wall/force"], labels=["one", "two"]).axes
+    assert [line.get_color() for line in axes[1].get_lines()] == [c for c in colours.values() for _ in range(2)]
 
 
 def test_no_text_of_many_results_overlaps_another(tmp_path, result):

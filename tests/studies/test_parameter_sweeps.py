@@ -212,8 +212,12 @@ def test_comparisons_name_what_varies(rod, tmp_path):
     changes = [{"time.step": step, "time.end": end} for step, end in ((0.01, 0.1), (0.02, 0.1), (0.01, 0.2))]
     sweep(rod, [*changes, {"time.end": 0.2}], output=tmp_path / "out", quiet=True)
     runs = [open_result(tmp_path / "out" / f"{number:04d}") for number in range(4)]
-    assert labels_of(runs[:2]) == ["step = 0.01", "step = 0.02"]
-    assert labels_of(runs[:3]) == ["step = 0.01, end = 0.1", "step = 0.02, end = 0.1", "step = 0.01, end = 0.2"]
+    assert labels_of(runs[:2]) == ["step = 10 ms", "step = 20 ms"]
+    assert labels_of(runs[:3]) == [
+        "step = 10 ms, end = 100 ms",
+        "step = 20 ms, end = 100 ms",
+        "step = 10 ms, end = 200 ms",
+    ]
     assert labels_of(runs[2:]) == ["0002", "0003"]
     assert labels_of([runs[0], runs[0]])[0].startswith("0: ")
     (tmp_path / "out" / "sweep.csv").unlink()

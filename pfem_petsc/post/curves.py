@@ -419,7 +419,9 @@ def _labels_and_captions(
     if len(results) > 1 or labels is None:
         return labels_of(results, labels), [""] * len(names)
     if len(labels) != len(names):
-        raise InputError(f"plot: labels: {len(names)} curves of one result need as many labels, not {list(labels)}")
+        raise InputError(
+            f"plot: labels: one result needs a label for each curve ({len(names)} here), not {list(labels)}"
+        )
     return labels_of(results), [textwrap.fill(label, _HEIGHT) for label in labels]
 
 

@@ -152,7 +152,7 @@ def test_labels_of_a_single_result_name_its_curves(tmp_path, result):
     assert chart.axes[0].get_title(loc="left") == ""
     assert chart.axes[1].get_title(loc="left").startswith("mean of the 5.00 ms before")
     assert axes.get_ylabel().startswith("amplitude of\nall nodes")
-    with pytest.raises(InputError, match=r"2 curves of one result need as many labels, not \['one'\]"):
+    with pytest.raises(InputError, match=r"one result needs a label for each curve \(2 here\), not \['one'\]"):
         draw_curves([result], panels, labels=["one"])
     with pytest.raises(InputError, match="labels name several results, or the curves of one: give curves"):
         plot(result, tmp_path, labels=["one"])

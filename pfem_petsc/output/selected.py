@@ -88,8 +88,14 @@ def select(history: Mapping[str, np.ndarray], text: str) -> Selected:
         If the history has no such column, the column no such component or member, units of sums differ, or the text is
         no expression.
     """
+    if not text.strip() or len(text) > _LONGEST:
+        what = f"{len(text)} letters, at most {_LONGEST} are read" if text.strip() else "the expression is empty"
+        raise InputError(f"a column of the history, or an expression of columns, is expected: {what}")
     reader = _Reader(history, text)
-    found = reader.sum()
+    try:
+        found = reader.sum()
+    except RecursionError:
+        raise InputError(f"{text[:40]} ...: parentheses and signs within each other are too many") from None
     reader.skip()
     if reader.at < len(text):
         raise reader.error(f"expected +, -, * or / before '{text[reader.at :].strip()}'")
@@ -98,6 +104,7 @@ def select(history: Mapping[str, np.ndarray], text: str) -> Selected:
     return found
 
 
+_LONGEST = 2000
 _MOVED = "/displacement"
 _NUMBER = re.compile(r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _UNIT = re.compile(r"\s*\[([^\[\]]*)\]")

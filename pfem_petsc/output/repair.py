@@ -179,9 +179,12 @@ def _check_same(file: h5py.File, path: Path, n_snapshots: int, sizes: tuple[int,
     for name, numbers in contents.attributes.items():
         if name.startswith(("probe_nodes/", "probe_bars/")) and list(known.get(name, numbers)) != list(numbers):
             what, _, probe = name.removeprefix("probe_").partition("/")
+            old, new = (
+                ", ".join([*map(str, each[:6]), *(["..."] if len(each) > 6 else [])]) for each in (known[name], numbers)
+            )
             raise InputError(
-                f"{path}: probe {probe!r}: the {what} {known[name]} of the file are now {numbers}: restart with the "
-                "same ones, or write elsewhere (-o)"
+                f"{path}: probe {probe!r}: the {what} {old} of the file are now {new}: restart with the same ones, or "
+                "write elsewhere (-o)"
             )
 
 

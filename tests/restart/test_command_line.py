@@ -158,7 +158,8 @@ def test_other_members_of_a_probe(tmp_path, capsys, kind):
     file.write_text(
         '[mesh]\ngenerator = "rod"\nlength = 1.0\nelements = 4\n[material.m]\nyoung_modulus = 1.0\ndensity = 1.0\n'
         '[section.s]\narea = 1.0\nmaterial = "m"\n[time]\nintegrator = "newmark"\nstep = 0.1\nend = 1.0\n'
-        f"[node_set]\none.indices = [ 1 ]\ntwo.indices = [ 2 ]\n[output]\ncheckpoint_every = 5\n[[output.{kind}]]\nname = 'a'\n{given}\n"
+        "[node_set]\none.indices = [ 1 ]\ntwo.indices = [ 2 ]\n"
+        f"[output]\ncheckpoint_every = 5\n[[output.{kind}]]\nname = 'a'\n{given}\n"
     )
     words = [str(file), "-o", str(tmp_path / "out"), "--quiet"]
     assert main(words) == 0
@@ -166,7 +167,7 @@ def test_other_members_of_a_probe(tmp_path, capsys, kind):
     assert main([*words, "--restart", "--set", "time.end=2.0"]) == 2
     said = capsys.readouterr().err
     members = "nodes" if kind == "probe" else "bars"
-    assert f"probe 'a': the {members} [1] of the file are now [2]: restart with the same ones" in said
+    assert f"probe 'a': the {members} 1 of the file are now 2: restart with the same ones" in said
 
 
 def test_another_folder_gets_results_from_the_checkpoint_on(copy, tmp_path):

@@ -20,6 +20,7 @@ from .friction import StepFriction
 from .node_walls import WallForces, held_by_supports
 from .projection import project
 from .transform import RowCoordinates, Transform
+from .wall_motion import Poses
 
 if TYPE_CHECKING:
     from ..solvers.problem import StepProblem
@@ -67,25 +68,26 @@ class Bounds:
 
 def broken_walls(
     contact: Contact,
-    displacements: np.ndarray,
+    poses: Poses,
     candidates: Candidates,
     frames: NodalFrames,
     x: np.ndarray,
     tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (k,) beyond walls that no bound of theirs represents, and these walls (k, walls) bool.
+    """Return nodes (k,) beyond walls that no bound of theirs represents, and these walls (k, slots) bool.
 
     Parameters
     ----------
     contact : Contact
-    displacements : (walls, 3) of walls [m]
+    poses : of walls
     candidates, frames : of the solve
     x : (owned, 3) solution [m]
     tolerance : depth that counts as zero [m]
     """
-    beyond = np.flatnonzero(contact.near(x, displacements, np.array([-tolerance])))
-    applicable = contact.applicable(beyond, x[beyond], displacements)
-    normals, gaps = contact.distances(applicable, x[beyond], displacements)
+    beyond = np.flatnonzero(contact.near(x, poses, np.array([-tolerance])))
+    contact.find_faces(beyond, x[beyond], poses, tolerance)
+    applicable = contact.applicable(beyond, x[beyond], poses)
+    normals, gaps = contact.distances(applicable, x[beyond], poses, beyond)
     broken = gaps < -tolerance
     place = np.searchsorted(candidates.nodes, beyond)
     known = place < len(candidates.nodes)
@@ -115,7 +117,7 @@ def is_misaligned(frames: NodalFrames, strengths: np.ndarray) -> bool:
 
 def is_off_surface(
     contact: Contact,
-    displacements: np.ndarray,
+    poses: Poses,
     frames: NodalFrames,
     strengths: np.ndarray,
     x: np.ndarray,
@@ -128,19 +130,21 @@ def is_off_surface(
     :meth:`~pfem_petsc.contact.contact.Contact.acting`.
     """
     at = frames.nodes
-    acting = contact.acting(at, x[at], displacements, part)
-    normals, _ = contact.planes(strengths > 0.0, x[at], displacements, acting)
+    if contact.find_faces(at, x[at], poses, tolerance):
+        return True
+    acting = contact.acting(at, x[at], poses, part)
+    normals, _ = contact.planes(strengths > 0.0, x[at], poses, acting, at)
     for k in np.flatnonzero(~contact.flat):
-        pressed = strengths[:, k] > 0.0
+        wall, pressed = contact.wall_of[k], strengths[:, k] > 0.0
         passed = ~pressed & (frames.rows[:, k] >= 0)
-        if passed.any() and (contact.gap(k, x[at[passed]], displacements) < -tolerance).any():
+        if passed.any() and (contact.gap(wall, x[at[passed]], poses) < -tolerance).any():
             return True
         if pressed.any():
             turn = np.abs(normals[pressed, k] - frames.normals[pressed, k]).max(axis=1)
             # far from the origin, the rounding of positions turns normals by more
             moved = np.abs(x[at[pressed]] - frames.places[pressed]).max(axis=1)
             turned = (turn > ON_BOUND) & (moved > PROJECTED * contact.size)
-            if np.abs(contact.gap(k, x[at[pressed]], displacements)).max() > tolerance or turned.any():
+            if np.abs(contact.gap(wall, x[at[pressed]], poses)).max() > tolerance or turned.any():
                 return True
     return False
 
@@ -219,9 +223,9 @@ class ActiveSet:
         self.state = state
         self.balance = balance
         self._iterations = self._link_iterations = 0
-        self._displacements = self.contact.motion.displacements(balance.time)
+        self._poses = self.contact.motion.poses(balance.time)
         self.friction = StepFriction(model.contact, model.inertia, model.nodal_stiffness, state, balance)
-        self.candidates = expected_candidates(model.contact, state, balance, held, self._displacements)
+        self.candidates = expected_candidates(model.contact, state, balance, held, self._poses)
         move, slack = (balance.time - state.time) * state.v, BEYOND * model.size
         self._all_links = tuple(links)
         self.links = tuple(link for link in links if link.reached(state, move, slack))
@@ -235,7 +239,7 @@ class ActiveSet:
             On all ranks, if the walls and supports of a node are infeasible together.
         """
         contact, time = self.contact, self.balance.time
-        frames, tied = NodalFrames(candidates.nodes, len(contact.walls)), contact.ties.nobody
+        frames, tied = NodalFrames(candidates.nodes, len(contact.wall_of)), contact.ties.nobody
         if candidates.anywhere:
             least = MIN_VOLUME if self._iterations < _PATIENCE else _SMALL_VOLUME
             untied = candidates.without(contact.ties.held)
@@ -322,31 +326,31 @@ class ActiveSet:
         x, at = self.balance.predictor + u, trial.candidates.nodes
         slack = ON_BOUND * self.model.size
         settled, links, g = self._check_links(trial, bounds, w, x, g, noise, slack)
-        normal_forces, pull = np.zeros((len(at), len(contact.walls))), np.where(contact.fixed[at], 0.0, g[at])
+        normal_forces, pull = np.zeros((len(at), len(contact.wall_of))), np.where(contact.fixed[at], 0.0, g[at])
         if not contact.any:
             return Outcome(settled, candidates, links, trial, normal_forces, pull)
         if candidates.anywhere:
             turned = np.einsum("nji,nj->ni", frames.inverse, g[at])
             normal_forces = contact.strengths(frames, turned, bounds.active(at, w, turned, noise))
-        joined, broken = broken_walls(contact, self._displacements, candidates, frames, x, slack)
+        joined, broken = broken_walls(contact, self._poses, candidates, frames, x, slack)
         if candidates.anywhere:
             normal_forces = self.friction.check(frames, x[at], pull, normal_forces, noise, tolerance)
         left = np.union1d(joined, self.friction.unsettled)
         unsettled = is_misaligned(frames, normal_forces)
         part = self.balance.acting
-        unsettled = unsettled or is_off_surface(contact, self._displacements, frames, normal_forces, x, slack, part)
+        unsettled = unsettled or is_off_surface(contact, self._poses, frames, normal_forces, x, slack, part)
         if self.model.comm.allreduce(int(unsettled or len(left) > 0), op=MPI.MAX):
             self._iterations += 1
             if self._iterations >= _ITERATIONS:
                 raise NotConverged(self._why(left, x))
             rank = PROJECTED * self.model.size
-            candidates = candidates.join(contact, self._displacements, joined, broken, x, normal_forces, rank)
+            candidates = candidates.join(contact, self._poses, joined, broken, x, normal_forces, rank)
             settled = False
         return Outcome(settled, candidates, links, trial, normal_forces, pull)
 
     def _why(self, left: np.ndarray, x: np.ndarray) -> str:
         """Return why the solves of nodes (k,) at (owned, 3) do not converge, and the remedy. Collective."""
-        comm, jams = self.model.comm, self.friction.jams(left, x, self._displacements)
+        comm, jams = self.model.comm, self.friction.jams(left, x)
         jams = [text for part in comm.allgather(jams[:1]) for text in part]
         if jams:
             return jams[0]
@@ -392,6 +396,7 @@ class ActiveSet:
         friction = self.friction.add(force, at, x)
         touching = outcome.normal_forces > 0.0
         tied, owners, _ = outcome.trial.tied
+        owners = self.contact.first[owners]
         force[tied, owners] = outcome.pull[tied]
         touching[tied, owners] = True
         total[at] += force.sum(axis=1)

@@ -69,7 +69,7 @@ class _WallsAtRows:
         met = self._members.any(axis=1)
         self.nodes, self.any = np.flatnonzero(met), bool(met.any())
         self.everywhere = bool(rows.mesh.comm.allreduce(self.any, op=MPI.LOR))
-        self.flags = len(contact.walls) if self.everywhere and contact.partial else 0
+        self.flags = len(contact.wall_of) if self.everywhere and contact.partial else 0
         self._places = np.where(met, np.cumsum(met) - 1, -1)
         self._normals = np.tile(contact.normals, (len(self.nodes), 1, 1))
 
@@ -82,8 +82,8 @@ class _WallsAtRows:
         if self.flags:
             where = self._rows.where[nodes]
             own = where >= 0
-            displacements = contact.motion.displacements(time)
-            gaps[own] = np.where(contact.applicable(where[own], x[nodes][own], displacements), gaps[own], np.inf)
+            poses = contact.motion.poses(time)
+            gaps[own] = np.where(contact.applicable(where[own], x[nodes][own], poses), gaps[own], np.inf)
             gaps[~own] = np.where(flags[-1 - where[~own]] > 0.0, gaps[~own], np.inf)
         return self._places, self._normals, gaps
 
@@ -220,8 +220,8 @@ class ConstraintSet:
             free_positions(at, balance.predictor, u, far, leaving)
             leaving[:, 3] = stiffness[at]
             if walls.flags:
-                displacements = self.contact.motion.displacements(balance.time)
-                leaving[:, flags] = self.contact.applicable(at, leaving[:, :3], displacements)
+                poses = self.contact.motion.poses(balance.time)
+                leaving[:, flags] = self.contact.applicable(at, leaving[:, :3], poses)
             if turns:
                 leaving[:, flags.stop :] = state.position[at]
             far = rows.partners.bring(leaving)
@@ -322,7 +322,7 @@ class ConstraintSet:
         special = walls.special & met
         if special.any():
             raise InputError(
-                f"{self.source}: contact_pair, constraint: wall {walls.names[int(special.argmax())]!r} stops nodes of "
+                f"{self.source}: contact_pair, constraint: wall {walls.names[walls.wall_of[special.argmax()]]!r} stops nodes of "
                 "pairs or constraints: such a wall must be flat, without mass, friction and restitution, and not tied; "
                 "or give it a node_set without them"
             )
@@ -373,7 +373,7 @@ class ConstraintSet:
             return change
         rests = rows.gather(on_walls) > 0.0
         every, hard = rows.gather(a), rows.gather(mass)
-        normals, _ = contact.planes(rests, rows.gather(state.position), contact.motion.displacements(state.time))
+        normals, _ = contact.planes(rests, rows.gather(state.position), contact.motion.poses(state.time))
         gaps = np.where(rests, np.einsum("nwi,ni->nw", normals, every), np.inf)
         values = rows.along(self.jacobian, every) + closed
         largest = self.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)

@@ -16,6 +16,7 @@ from .explicit import ExplicitContact
 from .frames import MIN_VOLUME, NodalFrames, Planes, build_frames
 from .node_walls import WallForces
 from .tied import FreshTies
+from .wall_motion import Poses
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -27,10 +28,10 @@ class Contact(ExplicitContact):
 
     @property
     def special(self) -> np.ndarray:
-        """(walls,) bool: walls other than plain planes with prescribed motion: curved, with mass, friction or
-        restitution, or tied."""
+        """(slots,) bool: of walls other than plain planes with prescribed displacements: curved, turning, with mass,
+        friction or restitution, or tied."""
         special = ~self.flat | (self.restitution > 0.0) | (self.static_friction > 0.0) | self.ties.tying
-        special[self.motion.bodies.at] = True
+        special |= np.isin(self.wall_of, self.motion.bodies.at)
         return special
 
     @property
@@ -61,9 +62,10 @@ class Contact(ExplicitContact):
         ``least``: see :func:`~pfem_petsc.contact.frames.build_frames`; ``part``: see :meth:`acting`.
         """
         nodes, rank = candidates.nodes, candidates.priority
-        at, displacements = x[nodes], self.motion.displacements(time)
-        acting = self.acting(nodes, at, displacements, part)
-        normals, offsets = self.planes(candidates.applicable, at, displacements, acting)
+        at, poses = x[nodes], self.motion.poses(time)
+        self.find_faces(nodes, at, poses, ON_BOUND * self.size)
+        acting = self.acting(nodes, at, poses, part)
+        normals, offsets = self.planes(candidates.applicable, at, poses, acting, nodes)
         if rank is None:
             rank = np.einsum("iwk,ik->iw", normals, at) - offsets
         tolerance = ON_BOUND * self.size
@@ -75,7 +77,7 @@ class Contact(ExplicitContact):
         return frames
 
     def strengths(self, frames: NodalFrames, residual: np.ndarray, active: np.ndarray) -> np.ndarray:
-        """Return normal forces (m, walls) [N] of an implicit step from its residual on the active bounds.
+        """Return normal forces (m, slots) [N] of an implicit step from its residual on the active bounds.
 
         Parameters
         ----------
@@ -86,7 +88,7 @@ class Contact(ExplicitContact):
         strengths = np.zeros(frames.rows.shape)
         every = np.arange(len(frames.nodes))
         left = np.where(active != 0, residual, 0.0)
-        for k in range(len(self.walls)):
+        for k in range(len(self.wall_of)):
             row = frames.rows[:, k]
             sign = frames.signs[:, k]
             safe = np.maximum(row, 0)
@@ -105,8 +107,8 @@ class Candidates:
 
     Attributes
     ----------
-    nodes : (m,) owned local indices, ascending; applicable : (m, walls) bool, walls that may stop them
-    priority : (m, walls) order of the walls, lowest first; None: by distance
+    nodes : (m,) owned local indices, ascending; applicable : (m, slots) bool, walls that may stop them
+    priority : (m, slots) order of the walls, lowest first; None: by distance
     anywhere : whether any rank has candidates
     """
 
@@ -118,7 +120,7 @@ class Candidates:
     def join(
         self,
         contact: Contact,
-        displacements: np.ndarray,
+        poses: Poses,
         joined: np.ndarray,
         broken: np.ndarray,
         x: np.ndarray,
@@ -130,18 +132,18 @@ class Candidates:
         Parameters
         ----------
         contact : Contact
-        displacements : (walls, 3) of walls [m]
-        joined, broken : (k,) nodes beyond walls, and (k, walls) bool, which walls
+        poses : of walls
+        joined, broken : (k,) nodes beyond walls, and (k, slots) bool, which walls
         x : (owned, 3) positions [m]
-        strengths : (m, walls) normal forces on the present candidates [N]
+        strengths : (m, slots) normal forces on the present candidates [N]
         largest_rank : offset that orders walls that press before all open ones [m]
         """
         nodes = np.union1d(self.nodes, joined)
-        applicable = np.zeros((len(nodes), len(contact.walls)), dtype=bool)
+        applicable = np.zeros((len(nodes), len(contact.wall_of)), dtype=bool)
         applicable[np.searchsorted(nodes, joined)] = broken
         place = np.searchsorted(nodes, self.nodes)
         applicable[place] |= self.applicable
-        _, priority = contact.distances(applicable, x[nodes], displacements)
+        _, priority = contact.distances(applicable, x[nodes], poses, nodes)
         normal_forces = strengths > 0.0
         largest = max(float(strengths.max(initial=0.0)), 1e-300)
         held = priority[place]
@@ -154,38 +156,37 @@ class Candidates:
         return replace(self, applicable=self.applicable & ~held[self.nodes][:, None])
 
 
-def expected_candidates(
-    contact: Contact, state: State, balance: Balance, held: np.ndarray, displacements: np.ndarray
-) -> Candidates:
+def expected_candidates(contact: Contact, state: State, balance: Balance, held: np.ndarray, poses: Poses) -> Candidates:
     """Return the owned nodes that may touch a wall in a step, among them those in contact before it. Collective.
 
-    ``held`` (owned,) bool : nodes in contact before the step; ``displacements`` (walls, 3) : of the walls at the time
-    of the balance [m]
+    ``held`` (owned,) bool : nodes in contact before the step; ``poses`` : of the walls at the time of the balance
     """
-    walls = len(contact.walls)
-    nobody = Candidates(np.empty(0, dtype=np.int64), np.zeros((0, walls), dtype=bool), anywhere=False)
+    slots = len(contact.wall_of)
+    nobody = Candidates(np.empty(0, dtype=np.int64), np.zeros((0, slots), dtype=bool), anywhere=False)
     if not contact.any:
         return nobody
     move = (balance.time - state.time) * state.v
     reach = 0.5 * np.linalg.norm(move, axis=1) + BEYOND * contact.size
-    near = held | contact.near(state.position + move, displacements, reach) | contact.ties.held
+    contact.forget_faces()
+    near = held | contact.near(state.position + move, poses, reach) | contact.ties.held
     if contact.mesh.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
         return nobody
     nodes = np.flatnonzero(near)
-    return Candidates(
-        nodes, _within_reach(contact, state, nodes, (state.position + move)[nodes], displacements, reach[nodes])
-    )
+    return Candidates(nodes, _within_reach(contact, state, nodes, (state.position + move)[nodes], poses, reach[nodes]))
 
 
 def _within_reach(
-    contact: Contact, state: State, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray, reach: np.ndarray
+    contact: Contact, state: State, nodes: np.ndarray, x: np.ndarray, poses: Poses, reach: np.ndarray
 ) -> np.ndarray:
-    """Return (m, walls) bool: walls that nodes (m,) moving to (m, 3) touch or come within reach (m,) [m] of."""
-    applicable = contact.applicable(nodes, x, displacements)
+    """Return (m, slots) bool: walls that nodes (m,) moving to (m, 3) touch or come within reach (m,) [m] of."""
+    applicable = contact.applicable(nodes, x, poses)
     within = np.zeros_like(applicable)
-    starts = state.position[nodes], contact.motion.displacements(state.time), BEYOND * contact.size
-    for place, there, distance in ((x, displacements, reach[:, None]), starts):
+    starts = state.position[nodes], contact.motion.poses(state.time), BEYOND * contact.size
+    for place, there, distance in ((x, poses, reach[:, None]), starts):
         within |= contact.distances(applicable, place, there)[1] < distance
+    for k in contact.surfaces_of_triangles:  # whose other faces are found when nodes touch them
+        slots = slice(contact.first[k], contact.first[k] + contact.walls[k].faces)
+        within[:, slots] = within[:, slots].any(axis=1, keepdims=True)
     return within & applicable
 
 
@@ -245,7 +246,7 @@ def check_start(contact: Contact, x: np.ndarray, length: float, adjusts: bool = 
     if found is not None:
         depth, node, wall, count = found
         remedy = "let 'adjust = true' move the nodes" if adjusts else "let an earlier stage move the nodes"
-        side = "turn the normal to the allowed side" if contact.flat[wall] else "choose the other 'side'"
+        side = "turn the normal to the allowed side" if contact.walls[wall].flat else "choose the other 'side'"
         raise InputError(
             f"{contact.source}: wall {contact.names[wall]!r}: node {node} starts {depth:.6g} "
             f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "

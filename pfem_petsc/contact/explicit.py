@@ -38,7 +38,8 @@ _ROOT = 1e-14  # relative error of squares, more than those of sums of three and
 
 @record
 class PressedWalls(NamedTuple):
-    """Walls (w,) and the nodes (n,) of a rank that they can stop, in a step.
+    """Slots (w,) of walls, see :class:`~pfem_petsc.contact.node_walls.NodeWalls`, and the nodes (n,) of a rank that they
+    can stop, in a step.
 
     Attributes
     ----------
@@ -47,7 +48,8 @@ class PressedWalls(NamedTuple):
     all_nodes : (w,) bool, whether a wall applies to all nodes; members : (n, w) bool, to which nodes otherwise
     tolerance : a wall violated by at most this counts as satisfied [m]
     room : (n,) int64, workspace
-    way : (w, 3) displacements of the walls in the step [m]; unpushed : those without the forces of nodes
+    wall_of : (w,) the wall of each slot
+    way : (w, 3) displacements in the step [m] of walls that do not turn; pushed : how far nodes push them (w, 3) [m]
     friction : (2, w) coefficients of dynamic and static friction; (2, 0) if all are zero
     restitution : (w,) coefficients, (0,) if all are zero
     rebound, arrival : (n, w) memory of the last step of nodes that hit walls; (0, w) without restitution
@@ -59,8 +61,9 @@ class PressedWalls(NamedTuple):
     members: np.ndarray
     tolerance: float
     room: np.ndarray
+    wall_of: np.ndarray
     way: np.ndarray
-    unpushed: np.ndarray
+    pushed: np.ndarray
     friction: np.ndarray
     restitution: np.ndarray
     rebound: np.ndarray
@@ -73,6 +76,7 @@ class Arrivals(NamedTuple):
     Attributes
     ----------
     start : (m, 3) positions at its start [m]
+    ways : (m, w, 3) how far walls carry their points from there [m]
     drift : (m, 3) how far they would move without forces [m]
     stiffness : (m,) force for a displacement of each [N/m]
     fixed : (m, 3) bool, components that supports prescribe
@@ -84,6 +88,7 @@ class Arrivals(NamedTuple):
     """
 
     start: np.ndarray
+    ways: np.ndarray
     drift: np.ndarray
     stiffness: np.ndarray
     fixed: np.ndarray
@@ -165,7 +170,7 @@ def _list_penetrating(free, first, last, walls, returning, m):
 @inlined
 def _directions(free, walls, given):
     """Return the directions (m, w, 3) of :meth:`~pfem_petsc.contact.node_walls.NodeWalls.acting` of nodes at (m, 3)."""
-    surfaces, way, part, start = walls.surfaces, walls.way, walls.part, given.start
+    surfaces, ways, part, start = walls.surfaces, given.ways, walls.part, given.start
     m, w = len(free), len(surfaces.radii)
     directions = np.zeros((m, w, 3))
     for j in range(m):
@@ -173,7 +178,7 @@ def _directions(free, walls, given):
         for k in range(w):
             if not is_round(surfaces.radii[k]):
                 continue
-            bx, by, bz = start[j, 0] + way[k, 0], start[j, 1] + way[k, 1], start[j, 2] + way[k, 2]
+            bx, by, bz = start[j, 0] + ways[j, k, 0], start[j, 1] + ways[j, k, 1], start[j, 2] + ways[j, k, 2]
             there = bx + part * (x - bx), by + part * (y - by), bz + part * (z - bz)
             nx, ny, nz, _ = tangent(k, surfaces, there[0], there[1], there[2])
             ex, ey, ez, _ = tangent(k, surfaces, x, y, z)
@@ -267,7 +272,8 @@ def _rub_on_round(j, x, free, drag, strengths, walls, given, planes):
     positions of friction alone alternate or creep."""
     normals, offsets, stiffness = planes.normals[j : j + 1], planes.offsets[j : j + 1], given.stiffness[j : j + 1]
     rough = walls.friction[0], walls.friction[1]
-    rubbing = Rubbing(given.start[j : j + 1], walls.way, given.fixed[j : j + 1], normals, offsets, *rough, stiffness)
+    before, ways, fixed = given.start[j : j + 1], given.ways[j : j + 1], given.fixed[j : j + 1]
+    rubbing = Rubbing(before, ways, fixed, normals, offsets, *rough, stiffness)
     at, last, part, near = np.empty(3), np.zeros(3), 1.0, False
     earlier, distances = np.empty((offsets.shape[1], 3)), np.empty(offsets.shape[1])
     for c in range(3):
@@ -335,9 +341,9 @@ def press_nodes(places, given, walls, sums, curved, rough, several):
     without a place, or -1, and why; the planes at the nodes, with offset -inf where a wall does not apply; the
     total force (m, 3) [N]; walls that they touch (m, w); and the energy that friction dissipates [J].
     """
-    way, unpushed, tolerance, restitution = walls.way, walls.unpushed, walls.tolerance, walls.restitution
+    wall_of, pushed, tolerance, restitution = walls.wall_of, walls.pushed, walls.tolerance, walls.restitution
     force, contacts, moment = sums.force, sums.contacts, sums.moment
-    start, stiffness, fixed = given.start, given.stiffness, given.fixed
+    start, ways, stiffness, fixed = given.start, given.ways, given.stiffness, given.fixed
     m, w = given.applies.shape
     bounces = len(restitution) > 0
     free = places.copy()
@@ -358,18 +364,18 @@ def press_nodes(places, given, walls, sums, curved, rough, several):
             wrong = _settle_on_round(j, places, free, strengths, walls, given, planes)
             if wrong > 0 and (failed < 0 or wrong < why or (wrong == why and j < failed)):
                 failed, why = j, wrong
-    smooth, pushed = np.empty((m if bounces else 0, 3)), np.empty((m if bounces else 0, w), dtype=np.bool_)
-    for j in range(len(pushed)):
+    smooth, stopped = np.empty((m if bounces else 0, 3)), np.empty((m if bounces else 0, w), dtype=np.bool_)
+    for j in range(len(stopped)):
         for c in range(3):
             smooth[j, c] = places[j, c]
         for k in range(w):
-            pushed[j, k] = strengths[j, k] > 0.0
+            stopped[j, k] = strengths[j, k] > 0.0
     for j in range(m):
         for k in range(w):
             strengths[j, k] *= stiffness[j]
     drag = np.zeros((m, w, 3))
     if rough is not None:
-        rubbing = Rubbing(start, way, fixed, normals, planes.offsets, walls.friction[0], walls.friction[1], stiffness)
+        rubbing = Rubbing(start, ways, fixed, normals, planes.offsets, walls.friction[0], walls.friction[1], stiffness)
         unsettled = add_friction(rubbing, places, strengths, drag)
         if curved is not None:
             for j in range(m if failed < 0 else 0):
@@ -379,11 +385,11 @@ def press_nodes(places, given, walls, sums, curved, rough, several):
             failed, why = unsettled, JAMMED
     for j in range(m if bounces else 0):
         for k in range(w):
-            fresh = pushed[j, k] and not given.touching[j, k] and restitution[k] > 0.0
+            fresh = stopped[j, k] and not given.touching[j, k] and restitution[k] > 0.0
             approach = arrived = 0.0
             for c in range(3):
-                approach -= normals[j, k, c] * (free[j, c] - start[j, c] - unpushed[k, c])
-                arrived -= normals[j, k, c] * (smooth[j, c] - start[j, c] - way[k, c])
+                approach -= normals[j, k, c] * (free[j, c] - start[j, c] - (ways[j, k, c] - pushed[k, c]))
+                arrived -= normals[j, k, c] * (smooth[j, c] - start[j, c] - ways[j, k, c])
             square = max(approach * approach - pull[j, k] * (approach - arrived), 0.0)
             given.rebound[j, k] = square if fresh and approach > 0.0 else 0.0
             given.arrival[j, k] = arrived if fresh else 0.0
@@ -402,18 +408,23 @@ def press_nodes(places, given, walls, sums, curved, rough, several):
                 fy += drag[j, k, 1]
                 fz += drag[j, k, 2]
                 for c in range(3):
-                    dissipated -= drag[j, k, c] * (places[j, c] - start[j, c] - way[k, c])
+                    dissipated -= drag[j, k, c] * (places[j, c] - start[j, c] - ways[j, k, c])
             total[j, 0] += fx
             total[j, 1] += fy
             total[j, 2] += fz
-            force[k, 0] += fx
-            force[k, 1] += fy
-            force[k, 2] += fz
-            moment[k, 0] += y * fz - z * fy
-            moment[k, 1] += z * fx - x * fz
-            moment[k, 2] += x * fy - y * fx
+            wall = wall_of[k]
+            force[wall, 0] += fx
+            force[wall, 1] += fy
+            force[wall, 2] += fz
+            moment[wall, 0] += y * fz - z * fy
+            moment[wall, 1] += z * fx - x * fz
+            moment[wall, 2] += x * fy - y * fx
             touching[j, k] = True
-            contacts[k] += 1
+            contacts[wall] += 1
+            for earlier in range(k):  # a node in several slots of a wall counts once
+                if wall_of[earlier] == wall and touching[j, earlier]:
+                    contacts[wall] -= 1
+                    break
     return failed, why, planes, total, touching, dissipated
 
 
@@ -464,6 +475,7 @@ class ExplicitContact(NodeWalls):
     ) -> None:
         super().__init__(case, nodes, mesh, fixed, parameters)
         self.ties = Ties(self, case.wall if parameters is None else parameters)
+        self._unmoved = np.zeros((len(self.wall_of), 3))
         self.plain = bool((self.surfaces.radii != OTHER).all()) and not (self.partial or self.ties.any)
         self._part = 1.0  # see :meth:`acting`
         self._room = np.empty(len(self.members) if self.any else 0, dtype=np.int64)
@@ -525,16 +537,17 @@ class ExplicitContact(NodeWalls):
         """Return walls for compiled passes, see :class:`PressedWalls`."""
         members = self.members
         friction = np.array([self.friction, self.static_friction]) if self.has_friction else np.empty((2, 0))
-        memory = 2 * [np.empty((0, len(self.walls)))]
+        memory = 2 * [np.empty((0, len(self.wall_of)))]
         if self.rebounds:
             memory = [self.state.memory.setdefault(name, np.zeros(members.shape)) for name in ("rebound", "arrival")]
-        restitution, unpushed = self.restitution if self.rebounds else np.empty(0), way
+        restitution, pushed = self.restitution if self.rebounds else np.empty(0), self._unmoved
         bodies = self.motion.bodies
         if bodies.any:
-            unpushed = way.copy()
-            unpushed[bodies.at] = bodies.unpushed() - bodies.state.x
-        sets = self.all_nodes, members
-        return PressedWalls(surfaces, part, *sets, tolerance, self._room, way, unpushed, friction, restitution, *memory)
+            pushes = np.zeros((len(self.walls), 3))
+            pushes[bodies.at] = bodies.displacements(np.inf) - bodies.unpushed()
+            pushed = pushes[self.wall_of]
+        sets, moved = (self.all_nodes, members), (self.wall_of, way, pushed)
+        return PressedWalls(surfaces, part, *sets, tolerance, self._room, *moved, friction, restitution, *memory)
 
     def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
         """Find the final positions of walls with mass in an explicit step. Collective."""
@@ -553,7 +566,7 @@ class ExplicitContact(NodeWalls):
                 tied, at = self.ties.nodes()
                 gives = stiffness[tied, None] * ~self.fixed[tied]
                 np.add.at(slope, at, gives[:, :, None] * np.eye(3))
-            return walls.force[free.at], slope[free.at]
+            return walls.force[free.at], self.of_walls(slope)[free.at]
 
         found = free.solve(forces, FIXED_POINT * self.size)
         if failure is not None:
@@ -579,28 +592,28 @@ class ExplicitContact(NodeWalls):
         walls: WallForces,
         time: float,
     ) -> np.ndarray:
-        """Return the derivatives (w, 3, 3) [N/m] of the walls' forces on untied nodes by the walls' positions.
+        """Return the derivatives (slots, 3, 3) [N/m] of the walls' forces on untied nodes by the walls' positions.
 
         Nodes (m,) at ``free`` (m, 3) without walls are moved by ``correction`` (m, 3) [m]. The normal force of a node
         that slips drags it by mu times itself against the slip, which turns with the wall; one that sticks follows the
         wall in all directions. Exact for nodes at one wall.
         """
         touching = walls.touching
-        displacements = self.motion.displacements(time)
-        acting = self.acting(nodes, free, displacements, self._part)
-        normals, _ = self.planes(touching, walls.places, displacements, acting)
+        poses = self.motion.poses(time)
+        acting = self.acting(nodes, free, poses, self._part)
+        normals, _ = self.planes(touching, walls.places, poses, acting, nodes)
         if self.ties.any:
             touching = touching & ~self.ties.held[nodes][:, None]
         held = touching[:, :, None] & ~self.fixed[nodes][:, None, :]
         active = np.where(held, normals, 0.0)
-        inverse = np.linalg.pinv(active, rcond=RANK) if len(nodes) else np.zeros((0, 3, len(self.walls)))
+        inverse = np.linalg.pinv(active, rcond=RANK) if len(nodes) else np.zeros((0, 3, len(self.wall_of)))
         weight = stiffness[:, None] * (inverse * inverse).sum(axis=1)  # the diagonal of k (N N^T)^-1
         weight = np.where(touching, weight, 0.0)
         slope = np.einsum("mw,mwi,mwj->wij", weight, normals, normals)
         if not self.has_friction:
             return slope
-        way = displacements - self.motion.displacements(self.state.time)
-        slip = (walls.places - self.state.position[nodes])[:, None, :] - way
+        start = self.state.position[nodes]
+        slip = (walls.places - start)[:, None, :] - self.ways(start, self._poses_before(), poses)
         slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
         size = np.linalg.norm(slip, axis=2)
         slips = size > PROJECTED * self.size
@@ -625,10 +638,10 @@ class ExplicitContact(NodeWalls):
         nodes, moved, force, sums = self._press(x, stiffness, time, tolerance, booked)
         if self.ties.any:
             tied, walls, places, pull = self.ties.hold(x, stiffness, time)
-            every = np.zeros((len(tied), len(self.walls), 3))
-            every[np.arange(len(tied)), walls] = pull
+            every = np.zeros((len(tied), len(self.wall_of), 3))
+            every[np.arange(len(tied)), self.first[walls]] = pull
             own = np.zeros(every.shape[:2], dtype=bool)
-            own[np.arange(len(tied)), walls] = True
+            own[np.arange(len(tied)), self.first[walls]] = True
             nodes, moved, force = np.append(nodes, tied), np.vstack([moved, places]), np.vstack([force, pull])
             touching = np.vstack([sums.touching, own])
             held = self.sums(tied, every, places, own)
@@ -644,16 +657,18 @@ class ExplicitContact(NodeWalls):
     def _press(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool) -> tuple:
         """Return nodes (m,) near walls that are not tied to them, positions (m, 3), forces (m, 3), and the sums per
         wall."""
-        w, state, displacements = len(self.walls), self.state, self.motion.displacements(time)
-        way = displacements if state is None else displacements - self.motion.displacements(state.time)
-        walls = self.pressed_walls(self.surfaces.at(displacements), self._part, tolerance, way)
+        w, state, poses = len(self.wall_of), self.state, self.motion.poses(time)
+        before = poses if state is None else self._poses_before()
+        surfaces = self.surfaces.at(poses.shifts[self.wall_of])
+        walls = self.pressed_walls(surfaces, self._part, tolerance, self._unmoved)
+        self.forget_faces()
         bounces = len(walls.restitution) > 0
         others = (walls.surfaces.radii == OTHER).any()
         marked = np.full(len(x) // NODE_BLOCK + 1, bounces)
         reference = by_reference(walls)
         nodes = walls.room[: find_penetrating(np.ascontiguousarray(x.T), reference, marked)].copy()
         if others:
-            nodes = np.union1d(nodes, np.flatnonzero(self.near(x, displacements)))
+            nodes = np.union1d(nodes, np.flatnonzero(self.near(x, poses)))
         if self.ties.any:
             nodes = nodes[~self.ties.held[nodes]]
         if len(nodes) == 0:
@@ -662,20 +677,26 @@ class ExplicitContact(NodeWalls):
         start, drift = free if state is None else state.position[nodes], np.zeros_like(free)
         if bounces:
             drift = (time - state.time) * state.memory["half_velocity"][nodes]
-        applies = self.applicable(nodes, free, displacements)
-        acting = self.acting(nodes, free, displacements, self._part) if others else None
+        applies = self.applicable(nodes, free, poses)
+        acting = self.acting(nodes, free, poses, self._part) if others else None
         planes = np.empty((0, w, 3)), np.empty((0, w))
+        ways = self.ways(start, before, poses)
+        self.find_faces(nodes, free, poses, 0.0)
         of_nodes = stiffness[nodes], self.fixed[nodes], applies, self.log.touching[nodes]
         for _ in range(_CURVED_ROUNDS):
             if others:
-                planes = self.planes(applies, at, displacements, acting)
+                planes = self.planes(applies, at, poses, acting, nodes)
             memory = [
                 array[nodes] if bounces else np.empty((len(nodes), 0)) for array in (walls.rebound, walls.arrival)
             ]
-            sums, places = WallSums(np.zeros((w, 3)), np.zeros(w, int), np.zeros((w, 3))), free.copy()
-            given = Arrivals(start, drift, *of_nodes, *memory, *planes)
+            sums, places = (
+                WallSums(*(np.zeros_like(getattr(self.nothing, name)) for name in WallForces.sums)),
+                free.copy(),
+            )
+            given = Arrivals(start, ways, drift, *of_nodes, *memory, *planes)
             failed, why, found, force, touching, friction = press_nodes(places, given, reference, sums, *kind_of(walls))
-            if failed >= 0 or not others or np.abs(places - at).max() <= tolerance:
+            more = self.find_faces(nodes, places, poses, tolerance)
+            if failed >= 0 or not others or (np.abs(places - at).max() <= tolerance and not more):
                 break
             at = places
         else:

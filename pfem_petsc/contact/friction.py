@@ -26,11 +26,11 @@ _OVERSHOOT = 0.9  # of the drag over the normal force, from which on sweeps go a
 
 
 class Rubbing(NamedTuple):
-    """Nodes (m,) at walls (w,) with friction in a step.
+    """Nodes (m,) at slots (w,) of walls with friction in a step.
 
     Attributes
     ----------
-    before, way : (m, 3), (w, 3) positions of the nodes at its start, and displacements of the walls [m]
+    before, ways : (m, 3), (m, w, 3) positions of the nodes at its start, and how far walls carry them from there [m]
     fixed : (m, 3) bool, components that supports prescribe
     normals, offsets : (m, w, 3), (m, w) planes n . x >= d; -inf where a wall does not apply
     dynamic, static : (w,) coefficients of friction
@@ -38,7 +38,7 @@ class Rubbing(NamedTuple):
     """
 
     before: np.ndarray
-    way: np.ndarray
+    ways: np.ndarray
     fixed: np.ndarray
     normals: np.ndarray
     offsets: np.ndarray
@@ -48,7 +48,9 @@ class Rubbing(NamedTuple):
 
     def of(self, some: np.ndarray, static: np.ndarray) -> Rubbing:
         """Return some of the nodes (k,), with other static coefficients."""
-        nodes = {name: getattr(self, name)[some] for name in ("before", "fixed", "normals", "offsets", "stiffness")}
+        nodes = {
+            name: getattr(self, name)[some] for name in ("before", "ways", "fixed", "normals", "offsets", "stiffness")
+        }
         return self._replace(static=static, **nodes)
 
     def apply(self, some: np.ndarray, static: np.ndarray, x: np.ndarray, normal: np.ndarray, drag: np.ndarray) -> None:
@@ -71,7 +73,7 @@ def slides_along_guide(i, rubbing, x, normal_forces, drag):
     bool
         Whether it is such a node, slides, and a normal force does it; otherwise nothing has changed.
     """
-    before, way, fixed, normals, _, dynamic, _, _ = rubbing
+    before, ways, fixed, normals, _, dynamic, _, _ = rubbing
     free = -1
     for c in range(3):
         if not fixed[i, c]:
@@ -91,22 +93,22 @@ def slides_along_guide(i, rubbing, x, normal_forces, drag):
     n = normals[i, wall]
     along = 0.0
     for c in range(3):
-        along += (x[i, c] - before[i, c] - way[wall, c]) * n[c]
+        along += (x[i, c] - before[i, c] - ways[i, wall, c]) * n[c]
     size, where = 0.0, 0.0
     for c in range(3):
-        slip = x[i, c] - before[i, c] - way[wall, c] - along * n[c]
+        slip = x[i, c] - before[i, c] - ways[i, wall, c] - along * n[c]
         size += slip * slip
         where += abs(x[i, c])
     size = math.sqrt(size)
     if not size > _SLIDES * where:
         return False
-    slip = x[i, free] - before[i, free] - way[wall, free] - along * n[free]
+    slip = x[i, free] - before[i, free] - ways[i, wall, free] - along * n[free]
     helped = 1.0 - dynamic[wall] * slip / (size * n[free])
     if not helped > _SLIDES:
         return False
     normal_forces[i, wall] /= helped
     for c in range(3):
-        slip = x[i, c] - before[i, c] - way[wall, c] - along * n[c]
+        slip = x[i, c] - before[i, c] - ways[i, wall, c] - along * n[c]
         drag[i, wall, c] = -dynamic[wall] * normal_forces[i, wall] * slip / size
     return True
 
@@ -127,7 +129,7 @@ def add_friction(rubbing, x, normal_forces, drag):
     int
         First node whose sweeps did not converge, or -1.
     """
-    before, way, fixed, normals, offsets, dynamic, static, stiffness = rubbing
+    before, ways, fixed, normals, offsets, dynamic, static, stiffness = rubbing
     m, w = offsets.shape
     trial = np.zeros(3)
     unsettled = -1
@@ -192,7 +194,7 @@ def add_friction(rubbing, x, normal_forces, drag):
                     continue
                 slip = 0.0
                 for c in range(3):
-                    trial[c] = x[i, c] - before[i, c] - way[k, c]
+                    trial[c] = x[i, c] - before[i, c] - ways[i, k, c]
                     slip += trial[c] * normals[i, k, c]
                 size = 0.0
                 for c in range(3):
@@ -239,7 +241,7 @@ def jam(contact: NodeWalls, node: int, normals: np.ndarray) -> str:
     wall = int(np.flatnonzero(jams)[0])
     return (
         f"friction jams node {contact.mesh.node_ids[node]}: its supports let it move only at an angle at which wall "
-        f"{contact.names[wall]!r} cannot push it if the coefficient of friction is {least[wall]:.3g} or more, and it "
+        f"{contact.names[contact.wall_of[wall]]!r} cannot push it if the coefficient of friction is {least[wall]:.3g} or more, and it "
         f"is {contact.static_friction[wall]:.3g}; reduce the friction, free the node, or name the nodes that the wall "
         "stops with 'node_set'"
     )
@@ -320,8 +322,7 @@ class StepFriction:
     ) -> None:
         self.contact, self.comm = contact, contact.mesh.comm
         self.state = state
-        displacements = self.contact.motion.displacements
-        self._way = displacements(balance.time) - displacements(state.time)
+        self._poses = contact.motion.poses(state.time), contact.motion.poses(balance.time)
         self._inertial = balance.alpha * inertia.mass + balance.eta * inertia.damping
         self._stiffness = self._inertial + balance.weight * stiffness
         owned, walls = self.contact.members.shape
@@ -341,8 +342,12 @@ class StepFriction:
     def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
         """Add friction to the forces (m, walls, 3) on nodes (m,) at (m, 3) [N]; return the energy dissipated [J]."""
         force += self.drag
-        slip = (x - self.state.position[nodes])[:, None, :] - self._way
+        slip = (x - self.state.position[nodes])[:, None, :] - self._ways(nodes)
         return -float((self.drag * slip).sum())
+
+    def _ways(self, nodes: np.ndarray) -> np.ndarray:
+        """Return how far walls carry nodes (k,) that stick to them in the step, (k, slots, 3) [m]."""
+        return self.contact.ways(self.state.position[nodes], *self._poses)
 
     def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
         """Fix the sticking nodes of the frames and apply friction to the slipping ones, at a guess (owned, 3)."""
@@ -431,9 +436,9 @@ class StepFriction:
         lagged, self._lagged = self._lagged, True
         return moving and not lagged
 
-    def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
+    def jams(self, nodes: np.ndarray, x: np.ndarray) -> list[str]:
         """Return messages about nodes (k,) at (owned, 3) that are jammed in a self-locking wedge by friction."""
-        normals, _ = self.contact.planes(self.contact.members[nodes], x[nodes], displacements)
+        normals, _ = self.contact.planes(self.contact.members[nodes], x[nodes], self._poses[1], nodes=nodes)
         return [text for node, n in zip(nodes, normals, strict=True) if (text := jam(self.contact, node, n))]
 
     def _has_friction(self, frames: NodalFrames) -> np.ndarray:
@@ -447,7 +452,7 @@ class StepFriction:
         nodes, contact = frames.nodes[at], self.contact
         planes = contact.fixed[nodes], frames.normals[at], frames.offsets[at]
         rough = contact.friction, contact.static_friction
-        rubbing = Rubbing(self.state.position[nodes], self._way, *planes, *rough, self._stiffness[nodes])
+        rubbing = Rubbing(self.state.position[nodes], self._ways(nodes), *planes, *rough, self._stiffness[nodes])
         return solve_locally(rubbing, x, reaction, slipping, contact.size)
 
     def _may_stick(
@@ -463,7 +468,7 @@ class StepFriction:
 
     def _slip(self, nodes: np.ndarray, x: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return the slip of nodes at (k, 3) on their walls (k, w, 3) [m]."""
-        slip = x[:, None, :] - self.state.position[nodes][:, None, :] - self._way
+        slip = x[:, None, :] - self.state.position[nodes][:, None, :] - self._ways(nodes)
         return slip - np.einsum("kwi,kwi->kw", slip, normals)[:, :, None] * normals
 
     def _decide(
@@ -497,7 +502,7 @@ class StepFriction:
         nodes = frames.nodes[at]
         wall = self._sticks[nodes]
         row = frames.rows[at, wall]
-        place = self.state.position[nodes] + self._way[wall]
+        place = self.state.position[nodes] + self._ways(nodes)[np.arange(len(at)), wall]
         n = frames.normals[at, wall]
         place += (frames.offsets[at, wall] - np.einsum("ki,ki->k", n, place))[:, None] * n
         held = np.einsum("kij,kj->ki", frames.basis[at], place)
@@ -531,7 +536,7 @@ class StepFriction:
             frames.signs[at],
             friction,
             frames.normals[at],
-            self.state.position[nodes][:, None, :] + self._way,
+            self.state.position[nodes][:, None, :] + self._ways(nodes),
             start,
             np.where(slips, self._stiffness[nodes], 0.0),
         )

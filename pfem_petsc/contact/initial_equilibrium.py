@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from .constraint_set import ConstraintSet
 
 Speeds = tuple[np.ndarray, np.ndarray]
-"""Velocities of nodes (m, 3) and walls (w, 3) [m/s]."""
+"""Velocities of nodes (m, 3) and of walls there (m, w, 3) [m/s]."""
 
 _ROUNDS = 60  # each at least halves the error
 _FAST = 1e16  # weight of velocities relative to accelerations in the direction of slip
@@ -65,19 +65,21 @@ def start_at_rest(
     """
     contact, comm, mass = links.contact, links.contact.mesh.comm, inertia.mass
     x, v = state.position, state.v
-    displacements, rates = contact.motion.displacements(state.time), contact.motion.rates(state.time, ahead=True)
+    poses = contact.motion.poses(state.time)
     slack = ON_BOUND * contact.size
-    nodes = np.flatnonzero(contact.near(x, displacements, np.array([slack])))
+    nodes = np.flatnonzero(contact.near(x, poses, np.array([slack])))
     applicable = contact.members[nodes]
-    normals, gaps = contact.distances(applicable, x[nodes], displacements)
+    normals, gaps = contact.distances(applicable, x[nodes], poses)
+    rates = contact.rates(x[nodes], state.time, ahead=True)
     away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - rates)
     resting = applicable & (np.abs(gaps) <= slack) & (np.abs(away) <= still)
-    resting[:, [wall.partial for wall in contact.walls]] = False  # the plane of a partial wall extends beyond the wall
-    resting[:, contact.motion.bodies.at] = False  # walls with mass are not fixed
+    partial = np.array([wall.partial for wall in contact.walls], dtype=bool)
+    resting[:, partial[contact.wall_of]] = False  # the plane of a partial wall extends beyond the wall
+    resting[:, np.isin(contact.wall_of, contact.motion.bodies.at)] = False  # walls with mass are not fixed
     kept = resting.any(axis=1)
-    nodes, normals, resting = nodes[kept], normals[kept], resting[kept]
-    accelerations = contact.motion.accelerations(state.time)
-    planes = np.where(resting, np.einsum("mwi,wi->mw", normals, accelerations), -np.inf)
+    nodes, normals, rates, resting = nodes[kept], normals[kept], rates[kept], resting[kept]
+    accelerations = contact.motion.accelerations_at(x[nodes], state.time)[:, contact.wall_of]
+    planes = np.where(resting, np.einsum("mwi,mwi->mw", normals, accelerations), -np.inf)
     fixed = contact.fixed[nodes]
     share = 0.5 if inertia.consistent else 1.0
     weight = share * mass[nodes]
@@ -138,7 +140,7 @@ def _apply_friction(
     largest = max(float(np.abs(a).max(initial=0.0)), float((normal_forces / weight).max(initial=0.0)))
     for group in (slides, ~slides):
         part = np.flatnonzero(group)
-        fast = np.linalg.norm(v[part], axis=1).max(initial=0.0) + np.abs(rates).max(initial=0.0)
+        fast = np.linalg.norm(v[part], axis=1).max(initial=0.0) + np.abs(rates[part]).max(initial=0.0)
         factor = _FAST * largest / fast if group is slides and fast > 0.0 else 0.0
-        along = rubbing._replace(before=-factor * v, way=factor * rates if factor else rubbing.way)
+        along = rubbing._replace(before=-factor * v, ways=factor * rates if factor else rubbing.ways)
         along.apply(part, rubbing.static, a, normal_forces, drag)

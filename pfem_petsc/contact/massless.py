@@ -73,7 +73,7 @@ class MasslessNodes:
     def gaps(self, x: np.ndarray, time: float) -> np.ndarray:
         """Return the distances (m,) of the nodes from the wall along their vectors [m]."""
         gaps = self.model.contact.gaps(x[self.moved.nodes], time, self.moved.nodes)
-        return gaps[np.arange(len(gaps)), self.moved.walls] / self.moved.across
+        return gaps[np.arange(len(gaps)), self.model.contact.wall_of[self.moved.walls]] / self.moved.across
 
     def press(self, x: np.ndarray, load: np.ndarray, time: float) -> tuple[np.ndarray, WallForces]:
         """Return wall forces (owned, 3) that balance a load on nodes at x (owned, 3), and their sums.
@@ -90,7 +90,7 @@ class MasslessNodes:
         force[nodes] = strength[:, None] * full
         if not len(nodes):
             return force, contact.nothing
-        touched = np.zeros((len(nodes), len(contact.names)), dtype=bool)
+        touched = np.zeros((len(nodes), len(contact.wall_of)), dtype=bool)
         touched[np.arange(len(nodes)), moved.walls] = strength > 0.0
         each = touched[:, :, None] * (strength[:, None] * full)[:, None, :]
         return force, contact.sums(nodes, each, x[nodes], touched)

@@ -17,6 +17,7 @@ from ..tolerances import BEYOND
 from .contact import Contact
 from .neighbours import Points, Segments, find_pairs
 from .node_walls import held_by_supports
+from .wall_motion import Poses
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -84,7 +85,10 @@ class CarriedNodes:
         self.of: dict[int, np.ndarray] = {}
         for k, wall in enumerate(contact.walls):
             if wall.partial:
-                nodes = np.flatnonzero(contact.members[:, k] & held_by_supports(contact.fixed, wall.normal))
+                held = held_by_supports(contact.fixed, wall.normal) | (
+                    contact.fixed.any(axis=1) & contact.motion.turning[k]
+                )
+                nodes = np.flatnonzero(contact.members[:, contact.first[k]] & held)
                 self.of |= {k: nodes} if len(nodes) else {}
 
     def start(self, x: np.ndarray, time: float) -> None:
@@ -94,8 +98,8 @@ class CarriedNodes:
 
     def _places(self, x: np.ndarray, time: float) -> dict[int, np.ndarray]:
         """Return their positions (k, 3) [m] relative to the rectangles, from all positions (owned, 3)."""
-        displacements = self._contact.motion.displacements(time)
-        return {k: x[nodes] - displacements[k] for k, nodes in self.of.items()}
+        poses = self._contact.motion.poses(time)
+        return {k: poses.rest(k, x[nodes]) for k, nodes in self.of.items()}
 
     def crossing(self, x: np.ndarray, time: float, where: str) -> str | None:
         """Return the message about nodes that have crossed a rectangle since :meth:`start`, None if there are none."""
@@ -119,10 +123,8 @@ def _prescribed(contact: Contact, node: int, wall: int, x: np.ndarray, time: flo
     """
     if contact.ties.any and contact.ties.held[node] and contact.fixed[node].any():
         return True
-    normals, _ = contact.planes(
-        np.ones((1, len(contact.walls)), dtype=bool), x[[node]], contact.motion.displacements(time)
-    )
-    return bool(held_by_supports(contact.fixed[node], normals[0, wall]))
+    normals, _ = contact.planes(np.ones((1, len(contact.wall_of)), dtype=bool), x[[node]], contact.motion.poses(time))
+    return bool(held_by_supports(contact.fixed[node], normals[0, contact.first[wall]]))
 
 
 DEEP = 0.25
@@ -175,7 +177,7 @@ class Piercing:
             return
         mesh = model.mesh
         members = np.zeros((mesh.n_local, len(self.walls)))
-        members[: mesh.n_owned] = model.contact.members[:, self.walls]
+        members[: mesh.n_owned] = model.contact.members[:, model.contact.first[self.walls]]
         mesh.update_ghosts(members)
         self._bars = mesh.bars[mesh.counted]
         self._applicable = (members[self._bars[:, 0]] > 0.0) & (members[self._bars[:, 1]] > 0.0)
@@ -188,8 +190,8 @@ class Piercing:
         if not self.walls:
             return []
         self.looks += 1
-        displacements = self._model.contact.motion.displacements(time)
-        found = np.array([self._across(i, k, x, displacements[k]) for i, k in enumerate(self.walls)])
+        poses = self._model.contact.motion.poses(time)
+        found = np.array([self._across(i, k, x, poses) for i, k in enumerate(self.walls)])
         counts, lowest = found[:, 0].copy(), found[:, 1].copy()
         comm = self._model.comm
         comm.Allreduce(MPI.IN_PLACE, counts, op=MPI.SUM)
@@ -206,11 +208,11 @@ class Piercing:
                 )
         return told
 
-    def _across(self, i: int, k: int, x: np.ndarray, shift: np.ndarray) -> tuple[int, int]:
+    def _across(self, i: int, k: int, x: np.ndarray, poses: Poses) -> tuple[int, int]:
         """Return the number of this rank's bars across wall ``k``, and the lowest of their mesh numbers."""
         mesh, wall = self._model.mesh, self._model.contact.walls[k]
         rows = np.flatnonzero(self._applicable[:, i])
-        starts, ends = x[self._bars[rows, 0]] - shift, x[self._bars[rows, 1]] - shift
+        starts, ends = (poses.rest(k, x[self._bars[rows, end]]) for end in (0, 1))
         if wall.partial:
             across = _crossing(wall, starts, ends, 1e-6 * self._model.length)
         else:

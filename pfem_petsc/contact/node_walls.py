@@ -16,7 +16,8 @@ from ..mechanics.compiled import kernel
 from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, FREE_PART, resolvable
 from .surfaces import Surfaces
-from .wall_motion import WallMotion
+from .touched_faces import TouchedFaces
+from .wall_motion import Poses, WallMotion
 from .walls.base import made_wall
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class WallForces:
     contacts : (walls,) nodes in contact
     moment : (walls, 3) of the force about the origin [N m]
     nodes : (m,) owned nodes near walls
-    touching : (m, walls) bool, walls that they touch
+    touching : (m, slots) bool, planes of walls that they touch
     places : (m, 3) their positions [m]
     friction : energy that friction on these nodes dissipates in the step solved for [J]
     sums : names of the attributes that are sums
@@ -52,14 +53,14 @@ class WallForces:
     friction: float = 0.0
 
     @classmethod
-    def none(cls, walls: int) -> Self:
+    def none(cls, walls: int, slots: int) -> Self:
         """Return zero forces, shared by all steps without contact; the sums are read-only."""
         none = cls(
             np.zeros((walls, 3)),
             np.zeros(walls, dtype=np.int64),
             np.zeros((walls, 3)),
             np.empty(0, dtype=np.int64),
-            np.empty((0, walls), dtype=bool),
+            np.empty((0, slots), dtype=bool),
             np.empty((0, 3)),
         )
         for name in none.sums:
@@ -82,9 +83,9 @@ NOTED = 4096
 
 
 @kernel
-def compare_contacts(touching, before, nodes, now, present, releases):
-    """Update ``touching`` (owned, w) from the nodes that touched ``before`` to the walls that ``nodes`` (m,) touch
-    ``now`` (m, w), and count ``releases`` (w,).
+def compare_contacts(touching, before, nodes, now, present, releases, wall_of):
+    """Update ``touching`` (owned, s) from the nodes that touched ``before`` to the planes of walls that ``nodes`` (m,)
+    touch ``now`` (m, s), and count ``releases`` (w,); ``wall_of`` (s,): the wall of each.
 
     ``present`` (owned,) bool is workspace, all False. Returns the number of changes and the nodes that touch walls.
     """
@@ -100,7 +101,7 @@ def compare_contacts(touching, before, nodes, now, present, releases):
             if touching[i, k] != now[j, k]:
                 changes += 1
                 if touching[i, k]:
-                    releases[k] += 1
+                    releases[wall_of[k]] += 1
                 touching[i, k] = now[j, k]
             any_wall = any_wall or now[j, k]
         if any_wall:
@@ -111,7 +112,7 @@ def compare_contacts(touching, before, nodes, now, present, releases):
             for k in range(walls):
                 if touching[i, k]:
                     changes += 1
-                    releases[k] += 1
+                    releases[wall_of[k]] += 1
                     touching[i, k] = False
     for i in nodes:
         present[i] = False
@@ -123,7 +124,7 @@ class ContactLog:
 
     Attributes
     ----------
-    touching : (owned, walls) bool, contacts after the last step
+    touching : (owned, slots) bool, contacts after the last step
     releases : (walls,) number of releases of this rank's nodes from each wall
     changes : number of contacts of this rank that closed or opened since the last row of the history
     last : (m,) nodes that touch any wall after the last step
@@ -132,8 +133,8 @@ class ContactLog:
     time : (walls,) time during which any node of the model touched each wall [s]; the same on all ranks
     """
 
-    def __init__(self, n_owned: int, n_walls: int) -> None:
-        self.touching = np.zeros((n_owned, n_walls), dtype=bool)
+    def __init__(self, n_owned: int, n_walls: int, wall_of: np.ndarray) -> None:
+        self.touching, self._wall_of = np.zeros((n_owned, len(wall_of)), dtype=bool), wall_of
         self.releases = np.zeros(n_walls, dtype=np.int64)
         self.changes = 0
         self.time = np.zeros(n_walls)
@@ -149,7 +150,7 @@ class ContactLog:
         if len(walls.nodes) == 0 and len(self.last) == 0:
             return
         changes, self.last = compare_contacts(
-            self.touching, self.last, walls.nodes, walls.touching, self.present, self.releases
+            self.touching, self.last, walls.nodes, walls.touching, self.present, self.releases, self._wall_of
         )
         self.changes += changes
 
@@ -245,17 +246,20 @@ TURN = 0.8
 
 
 class NodeWalls:
-    """All walls of a case and this rank's nodes.
+    """All walls of a case and this rank's nodes. A node touches a wall along one plane at a time, or several faces of a
+    surface of triangles: these are slots, one or three of each wall.
 
     Attributes
     ----------
     names : of the walls, in the order of the case
     any : whether the case has walls
     moving : (walls,) bool
-    normals : (walls, 3) of flat walls, zero for the others
+    wall_of, first : (slots,) and (walls,): the wall of each slot, and the first slot of each wall
+    members : (owned, slots) bool, nodes that a wall can stop
+    flat : (slots,) bool, planes that never turn; normals : (slots, 3) of these, zero for the others
     surfaces : Surfaces of the walls at rest
     log : ContactLog
-    restitution, friction, static_friction : (walls,); has_friction : whether any wall has friction
+    restitution, friction, static_friction : (slots,); has_friction : whether any wall has friction
     size : length that tolerances are relative to [m], see :mod:`~pfem_petsc.tolerances`
     rebounds : whether restitution is a bound on the next position, for schemes that solve for the next position
     state : of the nodes, for walls that need their previous positions; set by the stepper
@@ -280,26 +284,31 @@ class NodeWalls:
             self.walls = [made_wall(wall, mesh.points[: mesh.n_owned]) for wall in walls]
         self.motion = WallMotion(walls, case.holds("wall"))
         self.moving = self.motion.moving
-        self.all_nodes = np.array([wall.node_set is None for wall in walls], dtype=bool)
-        self.members = np.ones((mesh.n_owned, len(walls)), dtype=bool)
-        for k, wall in enumerate(walls):
-            if wall.node_set is not None:
-                self.members[:, k] = False
-                self.members[nodes[wall.node_set], k] = True
-        self.log = ContactLog(mesh.n_owned, len(walls))
-        self.friction = np.array([wall.friction for wall in walls], dtype=np.float64)
+        faces = np.array([wall.faces for wall in self.walls], dtype=np.int64)
+        self.wall_of, self.first = np.repeat(np.arange(len(walls)), faces), np.cumsum(faces) - faces
+        self.all_nodes = np.array([wall.node_set is None for wall in walls], dtype=bool)[self.wall_of]
+        self.members = np.ones((mesh.n_owned, len(self.wall_of)), dtype=bool)
+        for s, k in enumerate(self.wall_of):
+            if walls[k].node_set is not None:
+                self.members[:, s] = False
+                self.members[nodes[walls[k].node_set], s] = True
+        self.log = ContactLog(mesh.n_owned, len(walls), self.wall_of)
+        self.friction = np.array([wall.friction for wall in walls], dtype=np.float64)[self.wall_of]
         static = [wall.friction if wall.static_friction is None else wall.static_friction for wall in walls]
-        self.static_friction = np.array(static, dtype=np.float64)
-        self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)
+        self.static_friction = np.array(static, dtype=np.float64)[self.wall_of]
+        self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)[self.wall_of]
         self.rebounds = False
         self.has_friction = bool(self.static_friction.any())
-        self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
-        self.surfaces = Surfaces.of(self.walls)
+        flat = np.array([wall.flat for wall in self.walls], dtype=bool) & ~self.motion.turning
+        self.flat = flat[self.wall_of]
+        self.surfaces = Surfaces.of([self.walls[k] for k in self.wall_of], self.motion.turning[self.wall_of])
         self.partial = any(wall.partial for wall in self.walls)
-        self.normals = np.zeros((len(walls), 3))
-        self._offsets = np.zeros(len(walls))
-        for k in np.flatnonzero(self.flat):
-            self.normals[k], self._offsets[k] = self.walls[k].normal, self.walls[k].offset
+        self.normals = np.zeros((len(self.wall_of), 3))
+        self._offsets = np.zeros(len(self.wall_of))
+        for s in np.flatnonzero(self.flat):
+            wall = self.walls[self.wall_of[s]]
+            self.normals[s], self._offsets[s] = wall.normal, wall.offset
+        self._faces = {k: TouchedFaces(wall, mesh.n_owned) for k, wall in enumerate(self.walls) if wall.faces > 1}
         ends = np.stack([-mesh.points.min(axis=0, initial=np.inf), mesh.points.max(axis=0, initial=-np.inf)])
         mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
         centres = np.array([wall.centre for wall in self.walls])
@@ -309,11 +318,29 @@ class NodeWalls:
     @cached_property
     def nothing(self) -> WallForces:
         """Zero contact forces; read-only."""
-        return WallForces.none(len(self.walls))
+        return WallForces.none(len(self.walls), len(self.wall_of))
+
+    def of_walls(self, sums: np.ndarray) -> np.ndarray:
+        """Return sums over the slots of each wall (walls, ...) from those of slots (slots, ...)."""
+        return np.add.reduceat(sums, self.first, axis=0) if len(self.first) < len(sums) else sums
 
     def positions(self, time: float) -> np.ndarray:
         """Return the positions of the walls' centres (walls, 3) [m]."""
-        return np.array([wall.centre for wall in self.walls]).reshape(-1, 3) + self.motion.displacements(time)
+        poses = self.motion.poses(time)
+        return np.array([poses.reached(k, wall.centre) for k, wall in enumerate(self.walls)]).reshape(-1, 3)
+
+    def velocities(self, time: float) -> np.ndarray:
+        """Return the velocities of the walls' centres (walls, 3) [m/s]."""
+        every = np.arange(len(self.walls))
+        return self.motion.rates_at(self.positions(time), time)[every, every]
+
+    def ways(self, x: np.ndarray, before: Poses, after: Poses) -> np.ndarray:
+        """Return how far walls carry their points at (m, 3) from earlier to later poses, (m, slots, 3) [m]."""
+        return before.ways(after, x)[:, self.wall_of]
+
+    def rates(self, x: np.ndarray, time: float, ahead: bool = False) -> np.ndarray:
+        """Return the velocities of the walls' points at (m, 3), (m, slots, 3) [m/s]; see :meth:`WallMotion.rates`."""
+        return self.motion.rates_at(x, time, ahead)[:, self.wall_of]
 
     def gaps(self, x: np.ndarray, time: float, nodes: np.ndarray | None = None) -> np.ndarray:
         """Return distances (m, walls) [m] of owned nodes at (m, 3) from walls, infinite where a wall does not apply.
@@ -321,25 +348,25 @@ class NodeWalls:
         ``nodes`` (m,) : indices of these nodes; default: all owned nodes.
         """
         members = self.members if nodes is None else self.members[nodes]
-        displacements = self.motion.displacements(time)
+        poses = self.motion.poses(time)
         gaps = np.full((len(x), len(self.walls)), np.inf)
-        for k in range(len(self.walls)):
-            gaps[:, k] = self.gap(k, x, displacements)
-            if not self.all_nodes[k]:
-                gaps[~members[:, k], k] = np.inf
+        for k, s in enumerate(self.first):
+            gaps[:, k] = self.gap(k, x, poses)
+            if not self.all_nodes[s]:
+                gaps[~members[:, s], k] = np.inf
         return gaps
 
-    def gap(self, k: int, x: np.ndarray, displacements: np.ndarray) -> np.ndarray:
+    def gap(self, k: int, x: np.ndarray, poses: Poses) -> np.ndarray:
         """Return distances (m,) [m] of positions (m, 3) from wall k."""
-        return self.walls[k].gaps(x - displacements[k])
+        return self.walls[k].gaps(poses.rest(k, x))
 
     def plane_offsets(self, time: float) -> np.ndarray:
-        """Return offsets (w,) [m] of the planes n . x = d of flat walls at a time [s]."""
+        """Return offsets (slots,) [m] of the planes n . x = d of flat walls at a time [s]."""
         if not self.moving.any():
             return self._offsets
-        return self._offsets + np.einsum("ij,ij->i", self.normals, self.motion.displacements(time))
+        return self._offsets + np.einsum("ij,ij->i", self.normals, self.motion.poses(time).shifts[self.wall_of])
 
-    def near(self, x: np.ndarray, displacements: np.ndarray, reach: np.ndarray = _ZERO) -> np.ndarray:
+    def near(self, x: np.ndarray, poses: Poses, reach: np.ndarray = _ZERO) -> np.ndarray:
         """Return (owned,) bool: nodes at positions (owned, 3) within ``reach``, (owned,) or (1,) [m], of a wall.
 
         With a reach of zero these are the nodes beyond a wall.
@@ -347,54 +374,118 @@ class NodeWalls:
         near = np.zeros(len(x), dtype=bool)
         if self.flat.any():
             at = self.flat
-            offsets = self._offsets[at] + np.einsum("ij,ij->i", self.normals[at], displacements[at])
+            offsets = self._offsets[at] + np.einsum("ij,ij->i", self.normals[at], poses.shifts[self.wall_of[at]])
             members = self.members if self.flat.all() else np.ascontiguousarray(self.members[:, at])
             near_planes(x, self.normals[at], offsets, self.all_nodes[at], members, reach, near)
-        for k in np.flatnonzero(~self.flat):
-            near |= (self.gap(k, x, displacements) < reach) & self.members[:, k]
+        if self._faces:
+            start, earlier, slack = self._starts(slice(None), x, poses)
+        for k, s in enumerate(self.first):
+            if k in self._faces:
+                ways = earlier.rest(k, start), poses.rest(k, x)
+                near |= self._faces[k].near(*ways, reach, slack) & self.members[:, s]
+            elif not self.flat[s]:
+                near |= (self.gap(k, x, poses) < reach) & self.members[:, s]
         return near
 
-    def applicable(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> np.ndarray:
-        """Return (m, walls) bool: walls that can stop nodes that move to positions (m, 3)."""
+    def applicable(self, nodes: np.ndarray, x: np.ndarray, poses: Poses) -> np.ndarray:
+        """Return (m, slots) bool: walls that can stop nodes that move to positions (m, 3)."""
         applicable = self.members[nodes]
         if self.partial and self.state is not None:
             state = self.state
             before = state.position[nodes]
-            earlier = self.motion.displacements(state.time)
+            earlier = self.motion.poses(state.time)
             for k, wall in enumerate(self.walls):
                 if wall.partial:
                     # a node in contact may lie beyond the wall, because the balance need not hold at its position
-                    held = state.contact[nodes] @ wall.normal > 0.0
+                    held = state.contact[nodes] @ earlier.turned(k, wall.normal) > 0.0
                     slack = np.where(held, 0.1 * wall.half.min(), BEYOND * self.size)
-                    applicable[:, k] &= wall.stops(before - earlier[k], x - displacements[k], slack)
+                    applicable[:, self.first[k]] &= wall.stops(earlier.rest(k, before), poses.rest(k, x), slack)
         return applicable
 
+    @property
+    def surfaces_of_triangles(self) -> list[int]:
+        """The walls that are surfaces of triangles."""
+        return list(self._faces)
+
+    def forget_faces(self) -> None:
+        """Begin a step: find the faces of surfaces that nodes touch anew."""
+        for faces in self._faces.values():
+            faces.forget()
+
+    def find_faces(self, nodes: np.ndarray, x: np.ndarray, poses: Poses, tolerance: float) -> bool:
+        """Find the faces of surfaces that stop nodes (m,) which move to (m, 3), beside those found in this step; return
+        whether there are other ones now. ``tolerance``: depth that counts as zero [m]."""
+        if not self._faces:
+            return False
+        start, earlier, slack = self._starts(nodes, x, poses)
+        found = False
+        for k, faces in self._faces.items():
+            mine = self.members[nodes, self.first[k]]
+            ways = (
+                earlier.rest(k, start[mine]),
+                poses.rest(k, x[mine]),
+                self.fixed[nodes[mine]] & ~self.motion.turning[k],
+                slack[mine],
+            )
+            found |= faces.find(nodes[mine], ways, tolerance)
+        return found
+
+    def _starts(self, nodes: np.ndarray | slice, x: np.ndarray, poses: Poses) -> tuple[np.ndarray, Poses, np.ndarray]:
+        """Return where nodes that move to (m, 3) were at the start of the step, the poses of the walls there, and by
+        how much they may have been behind a wall (m,) [m]."""
+        if self.state is None:  # they are where they should not be
+            return x, poses, np.full(len(x), np.inf)
+        start = self.state.position[nodes]
+        # a node in contact may lie beyond the wall, because the balance need not hold at its position
+        held = (self.state.contact[nodes] != 0.0).any(axis=1)
+        slack = np.where(held, np.linalg.norm(x - start, axis=1), 0.0) + BEYOND * self.size
+        return start, self._poses_before(), slack
+
+    def _poses_before(self) -> Poses:
+        return self.motion.poses(self.state.time)
+
     def planes(
-        self, applicable: np.ndarray, x: np.ndarray, displacements: np.ndarray, acting: np.ndarray | None = None
+        self,
+        applicable: np.ndarray,
+        x: np.ndarray,
+        poses: Poses,
+        acting: np.ndarray | None = None,
+        nodes: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return planes (m, w, 3), (m, w) at positions (m, 3), with offset -inf for walls that do not apply.
+        """Return planes (m, slots, 3), (m, slots) at positions (m, 3), with offset -inf for walls that do not apply.
 
         ``acting`` : result of :meth:`acting`. Planes of curved walls then have these normals, at the same distance.
+        ``nodes`` (m,) : owned nodes, whose faces of surfaces are those that :meth:`find_faces` has found; default: the
+        face nearest to each position.
         """
-        normals = np.empty((len(x), len(self.walls), 3))
-        offsets = np.empty((len(x), len(self.walls)))
+        normals = np.zeros((len(x), len(self.wall_of), 3))
+        offsets = np.full((len(x), len(self.wall_of)), -np.inf)
         for k, wall in enumerate(self.walls):
-            normals[:, k], offsets[:, k] = wall.planes(x - displacements[k])
-            offsets[:, k] += normals[:, k] @ displacements[k]
-            if not wall.flat:
+            s = self.first[k]
+            if k in self._faces:
+                own, distances = self._faces[k].planes(nodes, poses.rest(k, x))
+                last = s + wall.faces
+                normals[:, s:last] = poses.turned(k, own)
+                along = np.einsum("mwi,mi->mw", normals[:, s:last], x)
+                offsets[:, s:last] = np.where(np.isfinite(distances), along - distances, -np.inf)
+                continue
+            own, offsets[:, s] = wall.planes(poses.rest(k, x))
+            normals[:, s] = poses.turned(k, own)
+            offsets[:, s] += normals[:, s] @ poses.shifts[k]
+            if not self.flat[s]:
                 if acting is not None:
-                    other = acting[:, k].any(axis=1)
-                    normals[other, k] = acting[other, k]
-                offsets[:, k] = np.einsum("mi,mi->m", normals[:, k], x) - self.gap(k, x, displacements)
+                    other = acting[:, s].any(axis=1)
+                    normals[other, s] = acting[other, s]
+                offsets[:, s] = np.einsum("mi,mi->m", normals[:, s], x) - self.gap(k, x, poses)
         offsets[~applicable] = -np.inf
         return normals, offsets
 
     def distances(
-        self, applicable: np.ndarray, x: np.ndarray, displacements: np.ndarray
+        self, applicable: np.ndarray, x: np.ndarray, poses: Poses, nodes: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return normals (m, w, 3) at positions (m, 3), and distances (m, w) along them, infinite for walls that do not
-        apply."""
-        normals, offsets = self.planes(applicable, x, displacements)
+        """Return normals (m, slots, 3) at positions (m, 3), and distances (m, slots) along them, infinite for walls
+        that do not apply; ``nodes``: see :meth:`planes`."""
+        normals, offsets = self.planes(applicable, x, poses, nodes=nodes)
         return normals, np.einsum("mwi,mi->mw", normals, x) - offsets
 
     def deepest(self, x: np.ndarray, time: float, tolerance: float) -> tuple[float, int, int, int] | None:
@@ -417,37 +508,45 @@ class NodeWalls:
         depth, node, wall = min(comm.allgather(lowest))
         return -depth, node, wall, comm.allreduce(int((gaps[:, wall] < -tolerance).sum()))
 
-    def acting(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray, part: float) -> np.ndarray | None:
-        """Return the directions (m, w, 3) in which curved walls push nodes (m,) that move to (m, 3) in a step.
+    def acting(self, nodes: np.ndarray, x: np.ndarray, poses: Poses, part: float) -> np.ndarray | None:
+        """Return the directions (m, slots, 3) in which curved walls push nodes (m,) that move to (m, 3) in a step.
 
         These are the normals where the forces of the step's balance act, at the fraction ``part`` of the way
         (:attr:`~pfem_petsc.integrators.base.Balance.acting`). None: all are the normals at the end. So are those that
-        are zero in the result: of flat walls, and where the normal turns by more than 37 degrees on the way, because a
-        force along the earlier normal may not reach the surface.
+        are zero in the result: of flat walls, of triangles, and where the normal turns by more than 37 degrees on the
+        way, because a force along the earlier normal may not reach the surface.
 
-        ``displacements`` (w, 3) : of the walls at the end [m]
+        ``poses`` : of the walls at the end
         """
         if part == 1.0 or self.flat.all():
             return None
-        earlier, start = self.motion.displacements(self.state.time), self.state.position[nodes]
-        acting = np.zeros((len(x), len(self.walls), 3))
-        for k in np.flatnonzero(~self.flat):
-            end, before = x - displacements[k], start - earlier[k]
+        earlier, start = self._poses_before(), self.state.position[nodes]
+        acting = np.zeros((len(x), len(self.wall_of), 3))
+        between = self.motion.poses(earlier.time + part * (poses.time - earlier.time)) if len(poses.turns) else poses
+        for k, s in enumerate(self.first):
+            if self.flat[s] or k in self._faces:
+                continue
+            end, before = poses.rest(k, x), earlier.rest(k, start)
             there, _ = self.walls[k].planes(before + part * (end - before))
-            turn = np.einsum("mi,mi->m", there, self.walls[k].planes(end)[0])
-            acting[:, k] = np.where((turn > TURN)[:, None], there, 0.0)
+            there = between.turned(k, there)
+            turn = np.einsum("mi,mi->m", there, poses.turned(k, self.walls[k].planes(end)[0]))
+            acting[:, s] = np.where((turn > TURN)[:, None], there, 0.0)
         return acting
 
     def sums(
         self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray, friction: float = 0.0
     ) -> WallForces:
-        """Return sums of forces (m, w, 3) on nodes at (m, 3); ``friction``: energy dissipated in the step [J]."""
-        moment = np.cross(x[:, None, :], force).sum(axis=0)
-        return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching, x, friction)
+        """Return sums of forces (m, slots, 3) on nodes at (m, 3); ``friction``: energy dissipated in the step [J]."""
+        moment = self.of_walls(np.cross(x[:, None, :], force).sum(axis=0))
+        contacts = touching
+        if len(self.first) < len(self.wall_of):
+            contacts = np.logical_or.reduceat(touching, self.first, axis=1)
+        force = self.of_walls(force.sum(axis=0))
+        return WallForces(force, contacts.sum(axis=0), moment, nodes, touching, x, friction)
 
     def infeasible_message(self, node: int, offsets: np.ndarray) -> str:
-        """Return the message about a node (owned index) whose planes are infeasible together."""
-        touched = [name for name, offset in zip(self.names, offsets, strict=True) if offset > -np.inf]
+        """Return the message about a node (owned index) whose planes (slots,) are infeasible together."""
+        touched = dict.fromkeys(self.names[k] for k in self.wall_of[offsets > -np.inf])
         return (
             f"no position of node {self.mesh.node_ids[node]} satisfies all walls "
             f"({', '.join(touched)}) and its supports: they are infeasible together; move the "

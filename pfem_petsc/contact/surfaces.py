@@ -35,13 +35,15 @@ class Surfaces(NamedTuple):
     radii: np.ndarray
 
     @classmethod
-    def of(cls, walls: Sequence[BaseWall]) -> Self:
-        """Return the surfaces of walls at rest."""
+    def of(cls, walls: Sequence[BaseWall], turning: np.ndarray) -> Self:
+        """Return the surfaces of walls at rest; ``turning`` (w,) bool: walls that turn, which are other ones."""
         normals, centres, axes = np.zeros((3, len(walls), 3))
         made = cls(normals, np.zeros(len(walls)), centres, axes, np.zeros(len(walls)))
         for k, wall in enumerate(walls):
             kind = type(wall)
-            if wall.flat:
+            if turning[k]:
+                made.radii[k] = OTHER
+            elif wall.flat:
                 made.normals[k], made.offsets[k] = wall.normal, wall.offset
             # a class that derives from such a wall may be another surface
             elif (kind.planes, kind.gaps) == (RoundWall.planes, RoundWall.gaps):

@@ -3,8 +3,8 @@
 In the step in which a node reaches such a wall it is stopped along the normal, as by any wall. From then on its
 position relative to the wall is constant in all three directions, whatever the sign of the force. Prescribed components
 still follow the supports; if these move a node through its wall, the run ends. Ties are part of the state: ``tied_to``
-(owned,) is the index of the wall plus one, 0 if there is none, and ``tied_at`` (owned, 3) the position relative to the
-wall [m].
+(owned,) is the index of the wall plus one, 0 if there is none, and ``tied_at`` (owned, 3) the position on the wall at
+rest [m].
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Ties:
     Attributes
     ----------
     any : whether the case has walls with ``tied = true``
-    tying : (walls,) bool
+    tying : (slots,) bool
     nobody : empty arrays of nodes, walls and vectors
     """
 
@@ -42,7 +42,7 @@ class Ties:
 
     def __init__(self, contact: NodeWalls, walls: Sequence[WallKeys]) -> None:
         self.contact = contact
-        self.tying = np.array([wall.tied for wall in walls], dtype=bool)
+        self.tying = np.array([wall.tied for wall in walls], dtype=bool)[contact.wall_of]
         self.any = bool(self.tying.any())
         self._nowhere = np.zeros(contact.mesh.n_owned if not self.any else 0, dtype=bool)
         self._nowhere.flags.writeable = False
@@ -65,7 +65,7 @@ class Ties:
     def targets(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return tied nodes (m,), their walls (m,), and their positions at a time [s] (m, 3) [m]."""
         nodes, walls = self.nodes()
-        return nodes, walls, self._memory()[1][nodes] + self.contact.motion.displacements(time)[walls]
+        return nodes, walls, self.contact.motion.poses(time).carried(walls, self._memory()[1][nodes])
 
     def hold(self, x: np.ndarray, stiffness: np.ndarray, time: float) -> tuple[np.ndarray, ...]:
         """Return tied nodes (m,) in an explicit step, their walls (m,), positions and forces (m, 3) [m], [N].
@@ -118,32 +118,35 @@ class Ties:
         """
         contact = self.contact
         partly = contact.fixed[nodes].any(axis=1)
-        if len(contact.walls) == 1 and not partly.any():
+        if len(contact.wall_of) == 1 and not partly.any():
             return
         partly &= ~np.isin(walls, contact.motion.bodies.at)  # their positions may be trial values
         if len(nodes) == 0:
             return
-        displacements = contact.motion.displacements(time)
-        applicable = contact.applicable(nodes, places, displacements)
-        applicable[np.arange(len(nodes)), walls] = partly
-        normals, gaps = contact.distances(applicable, places, displacements)
+        poses = contact.motion.poses(time)
+        applicable = contact.applicable(nodes, places, poses)
+        applicable[contact.wall_of == walls[:, None]] = np.repeat(
+            partly, (contact.wall_of == walls[:, None]).sum(axis=1)
+        )
+        normals, gaps = contact.distances(applicable, places, poses)
         gaps[held_by_supports(contact.fixed[nodes][:, None, :], normals)] = np.inf
-        node, other = np.unravel_index(np.argmin(gaps), gaps.shape)
-        if gaps[node, other] < -BEYOND * contact.size and other == walls[node]:
+        node, slot = np.unravel_index(np.argmin(gaps), gaps.shape)
+        depth, other = -gaps[node, slot], contact.wall_of[slot]
+        if depth > BEYOND * contact.size and other == walls[node]:
             raise SimulationFailure(
                 f"node {contact.mesh.node_ids[nodes[node]]} is tied to wall {contact.names[other]!r} and its supports "
-                f"move it {-gaps[node, other]:.3g} m beyond the wall; free these components, move the wall with the "
+                f"move it {depth:.3g} m beyond the wall; free these components, move the wall with the "
                 "supports, or do not tie the node"
             )
-        if gaps[node, other] < -BEYOND * contact.size:
+        if depth > BEYOND * contact.size:
             raise SimulationFailure(
                 f"node {contact.mesh.node_ids[nodes[node]]}, tied to wall {contact.names[walls[node]]!r}, is moved "
-                f"{-gaps[node, other]:.3g} m beyond wall {contact.names[other]!r}; keep the walls "
+                f"{depth:.3g} m beyond wall {contact.names[other]!r}; keep the walls "
                 "apart, or name the nodes that they stop with 'node_set'"
             )
 
     def take(self, nodes: np.ndarray, touching: np.ndarray, places: np.ndarray, time: float) -> FreshTies:
-        """Tie nodes (m,) at (m, 3) that touch (m, walls) walls with ``tied = true``, to the first of several.
+        """Tie nodes (m,) at (m, 3) that touch (m, slots) walls with ``tied = true``, to the first of several.
 
         Returns the newly tied nodes (k,), their walls (k,), and the walls' normals there (k, 3).
         """
@@ -152,17 +155,17 @@ class Ties:
         tied_to, tied_at = self._memory()
         fresh = touching & self.tying & (tied_to[nodes] == 0)[:, None]
         met = fresh.any(axis=1)
-        walls = fresh[met].argmax(axis=1)
+        walls, poses = self.contact.wall_of[fresh[met].argmax(axis=1)], self.contact.motion.poses(time)
         tied_to[nodes[met]] = walls + 1
-        own = places[met] - self.contact.motion.displacements(time)[walls]
-        tied_at[nodes[met]] = own
         normals = np.zeros((len(walls), 3))
         for k in np.unique(walls):
-            normals[walls == k] = self.contact.walls[k].planes(own[walls == k])[0]
+            own = poses.rest(k, places[met][walls == k])
+            tied_at[nodes[met][walls == k]] = own
+            normals[walls == k] = poses.turned(k, self.contact.walls[k].planes(own)[0])
         return nodes[met], walls, normals
 
     def damp_velocity(
-        self, nodes: np.ndarray, walls: np.ndarray, normals: np.ndarray, v: np.ndarray, rates: np.ndarray, h: float
+        self, nodes: np.ndarray, walls: np.ndarray, normals: np.ndarray, v: np.ndarray, time: float, h: float
     ) -> None:
         """Tie nodes where they come to rest on their walls, for schemes with x1 - x0 = h (v0 + v1)/2.
 
@@ -173,17 +176,20 @@ class Ties:
         Parameters
         ----------
         nodes, walls, normals : results of :meth:`take`
-        v : (owned, 3) velocities [m/s]; rates : (walls, 3) those of the walls
-        h : step [s]
+        v : (owned, 3) velocities [m/s]
+        time, h : of the walls, and step [s]
         """
         if not self.any:
             return
         tied_to, tied_at = self._memory()
-        relative = v[nodes] - rates[walls]
+        poses = self.contact.motion.poses(time)
+        places = poses.carried(walls, tied_at[nodes])
+        relative = v[nodes] - self.contact.motion.rates_at(places, time)[np.arange(len(nodes)), walls]
         away = np.einsum("ki,ki->k", relative, normals)
         later = away < -1e-9 * np.linalg.norm(relative, axis=1)
         tied_to[nodes[later]] = 0
-        tied_at[nodes] += 0.5 * h * relative
+        along = np.einsum("mji,mj->mi", poses.turns[walls], relative) if len(poses.turns) else relative
+        tied_at[nodes] += 0.5 * h * along
         tied_at[nodes[later]] = 0.0
 
     def _memory(self) -> tuple[np.ndarray, np.ndarray]:

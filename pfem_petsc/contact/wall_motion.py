@@ -1,15 +1,15 @@
-"""Motion of walls: prescribed displacements, and walls with mass that move under the contact forces."""
+"""Motion of walls: prescribed displacements and rotations, and walls with mass that move under the contact forces."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from mpi4py import MPI
 
 from ..integrators.base import Balance, Scheme, State
-from ..mechanics.motion import motion_of
+from ..mechanics.motion import Motion, motion_of, rotation_of
 
 if TYPE_CHECKING:
     from .walls.base import WallKeys
@@ -19,6 +19,47 @@ _ITERATIONS = 200
 _FULL_MOVES = 20  # Newton's method converges after a few active sets, or else alternates between some of them
 
 Answer = tuple[np.ndarray, np.ndarray | None]
+
+
+class Poses(NamedTuple):
+    """Where walls (w,) are at a time [s]: a point X of a wall at rest is at ``turns`` X + ``shifts``; (w, 3, 3) and
+    (w, 3) [m]. The former is (0, 3, 3) if no wall turns."""
+
+    shifts: np.ndarray
+    turns: np.ndarray
+    time: float = 0.0
+
+    def rest(self, k: int, x: np.ndarray) -> np.ndarray:
+        """Return where points of wall k at (m, 3) are at rest."""
+        x = x - self.shifts[k]
+        return x @ self.turns[k] if len(self.turns) else x
+
+    def reached(self, k: int, x: np.ndarray) -> np.ndarray:
+        """Return where points of wall k are that are at (m, 3) at rest."""
+        return self.turned(k, x) + self.shifts[k]
+
+    def carried(self, walls: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Return where points of walls (m,) are that are at (m, 3) at rest, each of one wall."""
+        return (np.einsum("mij,mj->mi", self.turns[walls], x) if len(self.turns) else x) + self.shifts[walls]
+
+    def turned(self, k: int, vectors: np.ndarray) -> np.ndarray:
+        """Return vectors (m, 3) that turn with wall k, given at rest."""
+        return vectors @ self.turns[k].T if len(self.turns) else vectors
+
+    def ways(self, later: Self, x: np.ndarray) -> np.ndarray:
+        """Return how far the points of all walls at (m, 3) are from there at ``later`` poses, (m, w, 3) [m]."""
+        if not len(self.turns):
+            return np.broadcast_to(later.shifts - self.shifts, (len(x), *self.shifts.shape))
+        turns = later.turns @ self.turns.swapaxes(1, 2)
+        moved = np.einsum("wij,mwj->mwi", turns, x[:, None, :] - self.shifts)
+        return moved + later.shifts - x[:, None, :]
+
+
+def turns_about(axes: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Return matrices (w, 3, 3) of rotations by angles (w,) [rad] about unit axes (w, 3), by Rodrigues' formula."""
+    across = np.cross(np.eye(3), axes[:, None, :])  # the matrices of axis x ...
+    sine, versed = np.sin(angles), 2.0 * np.sin(0.5 * angles) ** 2
+    return np.eye(3) + sine[:, None, None] * across + versed[:, None, None] * (across @ across)
 
 
 class FreeWalls:
@@ -198,55 +239,102 @@ class FreeWalls:
 
 
 class WallMotion:
-    """Displacements of all walls of a case.
+    """Displacements and rotations of all walls of a case.
 
     Attributes
     ----------
-    moving : (w,) bool, walls that move
+    moving, turning : (w,) bool, walls that move, and those of them that turn
     bodies : FreeWalls, the walls with mass
-    held : (w, 3) displacements at the start of a stage [m] of walls that stay in force and rest there
+    held : Poses at the start of a stage of walls that stay in force and rest there
     """
 
     def __init__(self, walls: Sequence[WallKeys], holds: bool = False) -> None:
         self._motions = [None if holds else motion_of(wall) for wall in walls]
-        self.held = np.zeros((len(walls), 3))
+        self._rotations = [None if holds else rotation_of(wall) for wall in walls]
+        n = len(walls)
+        self.turning = np.array([wall.rotation is not None for wall in walls], dtype=bool)
+        self.held = Poses(np.zeros((n, 3)), np.tile(np.eye(3), (n if self.turning.any() else 0, 1, 1)))
+        self._axes, self._centres = np.zeros((2, n, 3))
+        for k in np.flatnonzero(self.turning):
+            axis = np.array(walls[k].rotation.axis)
+            self._axes[k], self._centres[k] = axis / np.linalg.norm(axis), walls[k].rotation.centre
         self.bodies = FreeWalls([])  # until their scheme is known
-        self.moving = np.array(
-            [wall.velocity is not None or wall.motion is not None or wall.mass is not None for wall in walls],
-            dtype=bool,
-        )
+        moves = [wall.velocity is not None or wall.motion is not None or wall.mass is not None for wall in walls]
+        self.moving = np.array(moves, dtype=bool) | self.turning
 
-    def _prescribed(self, quantity: int, time: float, ahead: bool = True) -> np.ndarray:
-        """Return the prescribed displacements, velocities or accelerations (w, 3) at a time [s], zero for others."""
-        values = np.zeros((len(self._motions), 3))
-        for k, motion in enumerate(self._motions):
+    def _prescribed(self, motions: list[Motion | None], quantity: int, time: float, ahead: bool = True) -> np.ndarray:
+        """Return the displacements, velocities or accelerations (w, 3) of motions at a time [s], zero for none."""
+        values = np.zeros((len(motions), 3))
+        for k, motion in enumerate(motions):
             if motion is not None:
                 values[k] = motion.at(time, ahead=ahead)[quantity]
         return values
 
     def displacements(self, time: float) -> np.ndarray:
-        """Return displacements (w, 3) [m] at a time [s]."""
-        displacements = self.held + self._prescribed(0, time)
+        """Return displacements (w, 3) [m] at a time [s], those of the centres of rotation of walls that turn."""
+        displacements = self._prescribed(self._motions, 0, time)
         displacements[self.bodies.at] = self.bodies.displacements(time)
         return displacements
+
+    def poses(self, time: float) -> Poses:
+        """Return where walls are at a time [s]."""
+        held, bodies = self.held, self.bodies
+        shifts, turns = held.shifts + self._prescribed(self._motions, 0, time), held.turns
+        shifts[bodies.at] = bodies.displacements(time)
+        if not len(turns):
+            return Poses(shifts, turns, time)
+        turned = turns_about(self._axes, self._prescribed(self._rotations, 0, time)[:, 0])
+        turns = turned @ turns
+        about = np.where(np.isin(np.arange(len(turns)), bodies.at)[:, None, None], turns, turned)
+        return Poses(shifts + self._centres - np.einsum("wij,wj->wi", about, self._centres), turns, time)
 
     def schedule(self, times: np.ndarray) -> np.ndarray:
         """Return displacements [m] and velocities [m/s] (t, 2, w, 3) of walls with prescribed motion at times (t,) [s];
         at the kinks of a linear table the right limit."""
         values = np.zeros((len(times), 2, len(self._motions), 3))
-        values[:, 0] = self.held
+        values[:, 0] = self.held.shifts
         for k, motion in enumerate(self._motions):
             if motion is not None:
                 values[:, :, k] += motion.at(times)[:, :2]
         return values
 
     def rates(self, time: float, ahead: bool = False) -> np.ndarray:
-        """Return velocities (w, 3) [m/s] at a time [s]; at the kinks of a linear table the left limit, or the right one
-        if ``ahead``."""
-        rates = self._prescribed(1, time, ahead)
+        """Return velocities (w, 3) [m/s] at a time [s], those of the centres of rotation of walls that turn; at the
+        kinks of a linear table the left limit, or the right one if ``ahead``."""
+        rates = self._prescribed(self._motions, 1, time, ahead)
         rates[self.bodies.at] = self.bodies.state.v
         return rates
 
-    def accelerations(self, time: float) -> np.ndarray:
-        """Return accelerations (w, 3) [m/s2] of walls with prescribed motion at a time [s]; zero for others."""
-        return self._prescribed(2, time)
+    def spins(self, time: float, ahead: bool = False) -> np.ndarray:
+        """Return angular velocities (w, 3) [rad/s] at a time [s]."""
+        return self._axes * self._prescribed(self._rotations, 1, time, ahead)[:, :1]
+
+    def rates_at(self, x: np.ndarray, time: float, ahead: bool = False) -> np.ndarray:
+        """Return the velocities (m, w, 3) [m/s] of the walls' points that are at (m, 3) at a time [s]."""
+        rates = self.rates(time, ahead)
+        if not self.turning.any():
+            return np.broadcast_to(rates, (len(x), *rates.shape))
+        return rates + np.cross(self.spins(time, ahead), self._arms(x, time))
+
+    def _arms(self, x: np.ndarray, time: float) -> np.ndarray:
+        """Return positions (m, w, 3) [m] of points (m, 3) relative to the centres of rotation."""
+        return x[:, None, :] - (self._centres + self.displacements(time))
+
+    def accelerations_at(self, x: np.ndarray, time: float) -> np.ndarray:
+        """Return accelerations (m, w, 3) [m/s2] of the points at (m, 3) of walls with prescribed motion at a time
+        [s]; zero for others."""
+        accelerations = self._prescribed(self._motions, 2, time)
+        if not self.turning.any():
+            return np.broadcast_to(accelerations, (len(x), *accelerations.shape))
+        arms, spins = self._arms(x, time), self.spins(time, ahead=True)
+        twists = self._axes * self._prescribed(self._rotations, 2, time)[:, :1]
+        return accelerations + np.cross(twists, arms) + np.cross(spins, np.cross(spins, arms))
+
+    def torques(self, force: np.ndarray, moment: np.ndarray, time: float) -> np.ndarray:
+        """Return the moments (w,) [N m] about the axes of rotation of forces (w, 3) with moments about the origin."""
+        centres = self._centres + self.displacements(time)
+        return np.einsum("wi,wi->w", self._axes, moment - np.cross(centres, force))
+
+    def angles(self, time: float) -> np.ndarray:
+        """Return the angles (w,) [rad] by which walls have turned at a time [s]."""
+        return self._prescribed(self._rotations, 0, time)[:, 0]

@@ -98,6 +98,20 @@ def motion_of(entry: Support | WallKeys) -> Motion | None:
     return None
 
 
+def rotation_of(wall: WallKeys) -> Motion | None:
+    """Return the rotation of a wall as a motion whose first component is the angle [rad]; None if it does not turn."""
+    if wall.rotation is None:
+        return None
+    if wall.rotation.angles is None:
+        coefficients = np.zeros((1, 4, 3))
+        coefficients[0, 1, 0] = wall.rotation.angular_velocity
+        return Motion(np.zeros(1), coefficients)
+    rows = np.array(wall.rotation.angles, dtype=np.float64)
+    values = np.column_stack([rows[:, 1], np.zeros((len(rows), 2))])
+    smooth = wall.rotation.interpolation == "smooth"
+    return Motion(rows[:, 0], pieces(rows[:, 0], values, smooth), jumps=not smooth)
+
+
 def pieces(times: np.ndarray, values: np.ndarray, smooth: bool) -> np.ndarray:
     """Return the coefficients (n, 4, k) of the cubics through values (n, k), by a spline if ``smooth``, else linear;
     see :class:`Motion`. The last one is constant."""

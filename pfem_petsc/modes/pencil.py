@@ -82,16 +82,18 @@ class Holds:
         presses = weight > _PRESSES * model.nodal_stiffness * model.length
         tied = contact.ties.held if contact.ties.any else np.zeros(owned, dtype=bool)
         self._nodes = nodes = np.flatnonzero(presses | tied)
-        x, displacements = state.position[nodes], contact.motion.displacements(state.time)
-        applicable = contact.applicable(nodes, x, displacements)
-        normals, offsets = contact.planes(applicable, x, displacements)
+        x, poses = state.position[nodes], contact.motion.poses(state.time)
+        contact.forget_faces()
+        contact.find_faces(nodes, x, poses, -10.0 * BEYOND * contact.size)
+        applicable = contact.applicable(nodes, x, poses)
+        normals, offsets = contact.planes(applicable, x, poses, nodes=nodes)
         gaps = np.einsum("mwi,mi->mw", normals, x) - offsets
         touched = np.abs(gaps) <= 10.0 * BEYOND * contact.size
         unknown = nodes[~touched.any(axis=1) & ~tied[nodes]]
         if len(unknown):
             what = f"node {model.mesh.node_ids[unknown[0]]} has a contact force, but there is no wall"
             raise SimulationFailure(_LINKED.format(what))
-        massive = [k for k in contact.motion.bodies.at if touched[:, k].any()]
+        massive = [k for k in contact.motion.bodies.at if touched[:, contact.wall_of == k].any()]
         if massive:
             raise SimulationFailure(
                 f"modes: wall {contact.names[massive[0]]!r} has mass and is in contact: modes of a truss with such a "
@@ -116,7 +118,7 @@ class Holds:
     def _curvature(self, model: Model, state: State, touched: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return minus the force times the derivative of the normal (m, 3, 3) [N/m], of nodes at walls."""
         contact, nodes = model.contact, self._nodes
-        displacements = contact.motion.displacements(state.time)
+        poses = contact.motion.poses(state.time)
         blocks, forces = np.zeros((len(nodes), 3, 3)), np.zeros(touched.shape)
         for m, node in enumerate(nodes):
             at = np.flatnonzero(touched[m])
@@ -124,11 +126,16 @@ class Holds:
             forces[m, at] = np.linalg.lstsq(normals[m, at].T, state.contact[node], rcond=None)[0]
         h = _DIFFERENCE * model.length
         for k in np.flatnonzero(~contact.flat):
-            x = state.position[nodes] - displacements[k]
+            wall = contact.wall_of[k]
+            if contact.walls[wall].faces > 1:  # flat faces
+                continue
             for axis in range(3):
                 shift = h * np.eye(3)[axis]
-                slope = (contact.walls[k].planes(x + shift)[0] - contact.walls[k].planes(x - shift)[0]) / (2.0 * h)
-                blocks[:, :, axis] -= forces[:, k, None] * slope
+                ahead, behind = (
+                    poses.turned(wall, contact.walls[wall].planes(poses.rest(wall, state.position[nodes] + side))[0])
+                    for side in (shift, -shift)
+                )
+                blocks[:, :, axis] -= forces[:, k, None] * (ahead - behind) / (2.0 * h)
         return 0.5 * (blocks + blocks.transpose(0, 2, 1))
 
     def _take_directions(self, directions: Directions) -> None:

@@ -330,7 +330,7 @@ def idle_walls(model: Model) -> list[str]:
     members = model.comm.allreduce(model.contact.members.sum(axis=0))
     return [
         f"wall {name!r} applies to no node: name a node_set that has nodes, or omit node_set"
-        for name, count in zip(model.contact.names, members, strict=True)
+        for name, count in zip(model.contact.names, members[model.contact.first], strict=True)
         if not count
     ]
 
@@ -341,7 +341,7 @@ def narrow_walls(model: Model) -> list[str]:
     real = mesh.bar_ids < mesh.n_bars - mesh.n_connectors
     for k in small_walls(contact.walls):
         members = np.zeros(mesh.n_local, dtype=bool)
-        members[: mesh.n_owned] = contact.members[:, k]
+        members[: mesh.n_owned] = contact.members[:, contact.first[k]]
         near = real & members[mesh.bars].any(axis=1)
         longest = model.comm.allreduce(float(model.bars.mesh_lengths[near].max(initial=0.0)), op=MPI.MAX)
         width = contact.walls[k].width
@@ -390,8 +390,8 @@ def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
     now, then = contact.gaps(points, 0.0), contact.gaps(points + ahead * v, ahead)
     bodies = contact.motion.bodies  # not moving yet: displacements of nodes relative to these walls
     for k, speed in zip(bodies.at, bodies.state.v, strict=True):
-        seen = contact.gap(k, points + ahead * (v - speed), contact.motion.displacements(0.0))
-        then[:, k] = np.where(contact.members[:, k], seen, np.inf)
+        seen = contact.gap(k, points + ahead * (v - speed), contact.motion.poses(0.0))
+        then[:, k] = np.where(contact.members[:, contact.first[k]], seen, np.inf)
     with np.errstate(invalid="ignore"):
         rate = np.nanmin((then - now) / ahead, axis=0, initial=np.inf)
     comm.Allreduce(MPI.IN_PLACE, rate, op=MPI.MIN)

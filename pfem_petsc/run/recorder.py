@@ -238,7 +238,7 @@ class Recorder:
         with np.errstate(invalid="ignore", over="ignore"):  # sums that are not finite are told by the checks of rows
             vectors = self._unpack(total, (instants.place, instants.number, stepper.smallest), times)
         for vector, time in zip(vectors, instants.time.tolist() if len(self._motion) else [], strict=False):
-            motion = np.hstack([contact.positions(time), contact.motion.rates(time)])
+            motion = np.hstack([contact.positions(time), contact.velocities(time)])
             vector[self._motion] = motion[contact.moving].ravel()
         if self.rest is not None:
             own, vectors = vectors, np.repeat(self.rest[None], len(vectors), axis=0)

@@ -260,7 +260,7 @@ def _end_of_stage(old: Stepper, ended: Stepper) -> StageStart:
         force=external.loads_at(time),
         gravity=np.array(external.gravity_at(time)),
         wind=np.array(external.wind_at(time)),
-        walls=model.contact.motion.displacements(time),
+        walls=model.contact.motion.poses(time),
     )
 
 
@@ -287,14 +287,20 @@ def _hand_over_contact(old: Stepper, new: Stepper) -> None:
     before, contact = old.model.contact, new.model.contact
     pairs = [(before.names.index(name), k) for k, name in enumerate(contact.names) if name in before.names]
     if pairs:
-        from_, to = np.array(pairs, dtype=np.int64).T
+        walls_from, walls_to = np.array(pairs, dtype=np.int64).T
+        slots = [
+            (before.first[one] + s, contact.first[other] + s)
+            for one, other in pairs
+            for s in range(min(before.walls[one].faces, contact.walls[other].faces))
+        ]
+        from_, to = np.array(slots, dtype=np.int64).T
         new.touching[:, to] = old.touching[:, from_] & contact.members[:, to]
         new.closed[:, to] = old.closed[:, from_] & contact.members[:, to]
         contact.log.last = np.flatnonzero(new.touching.any(axis=1))
-        contact.log.time[to] = before.log.time[from_]
+        contact.log.time[walls_to] = before.log.time[walls_from]
     if pairs and not new.scheme.inertial:
         force = contact.nothing.force.copy()
-        force[to] = old.solution.walls.force[from_]
+        force[walls_to] = old.solution.walls.force[walls_from]
         new.solution.walls = dataclasses.replace(contact.nothing, force=force)
     if new.model.case.holds("wall"):
         bodies, earlier = contact.motion.bodies, before.motion.bodies
@@ -310,9 +316,10 @@ def _hand_over_ties(old: Stepper, new: Stepper, walls: dict[int, int]) -> None:
     nodes, tied = before.ties.nodes()
     owned = len(new.state.v)
     tied_to, tied_at = np.zeros(owned, dtype=np.int64), np.zeros((owned, 3))
-    displacements = contact.motion.displacements(0.0)
+    poses = contact.motion.poses(0.0)
     for node, wall in zip(nodes, tied, strict=True):
         k = walls.get(int(wall), -1)
-        if k >= 0 and contact.ties.tying[k] and contact.members[node, k]:
-            tied_to[node], tied_at[node] = k + 1, new.state.x[node] - displacements[k]
+        slot = contact.first[k]
+        if k >= 0 and contact.ties.tying[slot] and contact.members[node, slot]:
+            tied_to[node], tied_at[node] = k + 1, poses.rest(k, new.state.x[node])
     new.state.memory["tied_to"], new.state.memory["tied_at"] = tied_to, tied_at

@@ -459,8 +459,7 @@ class RelaxationStepper(StaticStepper):
         """Return the nodes near walls at the relaxed positions. Collective."""
         model, motion = self.model, self.motion
         relaxed = replace(self.state, x=motion.x, v=np.zeros_like(self.state.v))
-        displacements = model.contact.motion.displacements(balance.time)
-        return expected_candidates(model.contact, relaxed, balance, self.held, displacements)
+        return expected_candidates(model.contact, relaxed, balance, self.held, model.contact.motion.poses(balance.time))
 
     def destroy(self) -> None:
         super().destroy()
@@ -481,7 +480,7 @@ def _check(model: Model) -> None:
             f'{case.source}: static.method = "relaxation" does not support [[{what}]]; use static.method = "newton"'
         )
     for k, name in enumerate(model.contact.names):
-        if model.contact.static_friction[k]:
+        if model.contact.static_friction[model.contact.first[k]]:
             raise InputError(
                 f'{case.source}: wall {name!r}: friction: with static.method = "relaxation" walls are frictionless, '
                 'because the pseudo-motion is not the path along which friction acts; use static.method = "newton", or '

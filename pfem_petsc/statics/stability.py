@@ -163,7 +163,8 @@ class Stability:
         contact = self.model.contact
         blocks = np.zeros((self.model.mesh.n_owned, 3, 3))
         if len(walls.nodes):
-            normals, _ = contact.planes(walls.touching, walls.places, contact.motion.displacements(time))
+            poses = contact.motion.poses(time)
+            normals, _ = contact.planes(walls.touching, walls.places, poses, nodes=walls.nodes)
             blocks[walls.nodes] += np.einsum("mw,mwi,mwj->mij", walls.touching.astype(float), normals, normals)
         blocks[held_nodes(self.model, walls)] += np.eye(3)
         nodes = np.flatnonzero(blocks.any(axis=(1, 2)))

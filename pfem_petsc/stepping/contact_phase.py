@@ -104,7 +104,7 @@ def _arrivals(found, nodes, motion, walls):
     pressed, touched, h = walls.pressed, walls.touched, motion.h
     m, w = len(found), len(pressed.way)
     bounces = w if len(pressed.restitution) > 0 else 0
-    start, drift, stiffness = np.empty((m, 3)), np.empty((m, 3)), np.empty(m)
+    start, ways, drift, stiffness = np.empty((m, 3)), np.empty((m, w, 3)), np.empty((m, 3)), np.empty(m)
     fixed, applies = np.empty((m, 3), dtype=np.bool_), np.empty((m, w), dtype=np.bool_)
     touching, rebound, arrival = np.empty((m, w), dtype=np.bool_), np.empty((m, bounces)), np.empty((m, bounces))
     for j in range(m):
@@ -116,10 +116,12 @@ def _arrivals(found, nodes, motion, walls):
         for k in range(w):
             applies[j, k] = pressed.all_nodes[k] or pressed.members[i, k]
             touching[j, k] = touched.touching[i, k]
+            for c in range(3):
+                ways[j, k, c] = pressed.way[k, c]
         for k in range(bounces):
             rebound[j, k], arrival[j, k] = pressed.rebound[i, k], pressed.arrival[i, k]
     none = np.empty((0, w, 3)), np.empty((0, w))
-    return Arrivals(start, drift, stiffness, fixed, applies, touching, rebound, arrival, *none)
+    return Arrivals(start, ways, drift, stiffness, fixed, applies, touching, rebound, arrival, *none)
 
 
 @inlined
@@ -182,7 +184,13 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
                         out.normals[k, c] = planes.normals[failed, k, c]
         contacts.near = out.nodes[:m]
         more, contacts.touched = compare_contacts(
-            walls.touched.touching, contacts.touched, contacts.near, out.touching, walls.present, walls.releases
+            walls.touched.touching,
+            contacts.touched,
+            contacts.near,
+            out.touching,
+            walls.present,
+            walls.releases,
+            pressed.wall_of,
         )
         contacts.changes += more
 
@@ -257,10 +265,11 @@ def close_on_walls(s, step):
         for c in range(3):
             if walls.touched.fixed[i, c]:  # wall forces do not change prescribed components
                 free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
-    still, rates = np.zeros((gaps.shape[1], 3)), np.zeros((gaps.shape[1], 3))
-    for k in range(len(rates) if len(walls.motions) > 0 else 0):
-        for c in range(3):
-            rates[k, c] = walls.motions[step + 1, 1, k, c]
+    still, rates = np.zeros((gaps.shape[1], 3)), np.zeros(normals.shape)
+    for j in range(len(rates) if len(walls.motions) > 0 else 0):
+        for k in range(len(still)):
+            for c in range(3):
+                rates[j, k, c] = walls.motions[step + 1, 1, k, c]
     approach = Approach(normals, gaps, free_v, free_a, rates, still)
     counted = np.ones(len(still), dtype=np.bool_)
     loss, contacts.met = stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))

@@ -14,6 +14,7 @@ from ..mechanics.records import record
 from ..tolerances import ON_BOUND
 
 if TYPE_CHECKING:
+    from ..contact.wall_motion import Poses
     from .stepper import Stepper
 
 
@@ -65,7 +66,7 @@ class Approach(NamedTuple):
     ----------
     normals, gaps : (m, w, 3), (m, w) [m]
     v, a : (m, 3) without contact
-    rates, pulls : (w, 3) velocities and accelerations of the walls
+    rates, pulls : (m, w, 3), (w, 3) velocities and accelerations of the walls
     """
 
     normals: np.ndarray
@@ -128,7 +129,7 @@ def stop_nodes(nodes, approach, touched, mass, counted, speeds):
                     closed[i, k] = True
                     speed, towards = 0.0, 0.0
                     for c in range(3):
-                        speed += normals[j, k, c] * (v[j, c] - rates[k, c])
+                        speed += normals[j, k, c] * (v[j, c] - rates[j, k, c])
                         towards -= normals[j, k, c] * (a[j, c] - pulls[k, c])
                     if speed < 0.0:
                         square = speed * speed + 2.0 * towards * max(gaps[j, k], 0.0)
@@ -185,8 +186,7 @@ class Impacts:
         self.met = np.flatnonzero(stepper.closed.any(axis=1))
         self.active = self.model.can_touch and stepper.scheme.inertial
         bodies = contact.motion.bodies
-        self.counted = np.ones(len(contact.names), dtype=bool)
-        self.counted[bodies.at] = False
+        self.counted = ~np.isin(contact.wall_of, bodies.at)
         self._free_rates = bodies.state.v  # at the start of the step
         self.slack = ON_BOUND * self.model.size
         treatment = stepper.treatment
@@ -199,7 +199,7 @@ class Impacts:
         motion: tuple[np.ndarray, np.ndarray],
         load: np.ndarray | None,
         time: float,
-        displacements: np.ndarray,
+        poses: Poses,
     ) -> float:
         """Return the energy [J] lost in this rank's closing contacts in the step just solved.
 
@@ -211,11 +211,11 @@ class Impacts:
             schemes that solve for the next position, those of the balance
         load : (owned, 3) all forces there except contact and damping [N]; None if the scheme solves for the next
             position
-        time, displacements : of the walls there
+        time, poses : of the walls there
         """
         if not self.active:
             return 0.0
-        loss = self._on_walls(x, motion, load, time, displacements) if self.model.contact.any else 0.0
+        loss = self._on_walls(x, motion, load, time, poses) if self.model.contact.any else 0.0
         if len(self.model.links.two.at):
             loss += self.of_rows(x, motion, load)
         return 0.0 if self.elastic else loss
@@ -252,7 +252,7 @@ class Impacts:
         motion: tuple[np.ndarray, np.ndarray],
         load: np.ndarray | None,
         time: float,
-        displacements: np.ndarray,
+        poses: Poses,
     ) -> float:
         contact, log = self.model.contact, self.model.contact.log
         free = contact.motion.bodies
@@ -260,21 +260,22 @@ class Impacts:
             return 0.0
         nodes = join_nodes(self.met, log.last, log.present)
         if contact.plain and not free.any:
-            normals, gaps = wall_gaps(nodes, x, contact.surfaces.at(displacements))
+            normals, gaps = wall_gaps(nodes, x, contact.surfaces.at(poses.shifts[contact.wall_of]))
         else:
-            every = np.ones((len(nodes), len(contact.names)), dtype=bool)
-            normals, gaps = contact.distances(every, x[nodes], displacements)
+            every = np.ones((len(nodes), len(contact.wall_of)), dtype=bool)
+            normals, gaps = contact.distances(every, x[nodes], poses, nodes)
         free_v, free_a = self._free(nodes, motion, load)
-        rates, speeds = contact.motion.rates(time, ahead=True), np.empty(gaps.shape)
-        pulls = np.zeros(rates.shape)
+        rates, speeds = contact.rates(x[nodes], time, ahead=True), np.empty(gaps.shape)
+        pulls = np.zeros((len(contact.names), 3))
         if free.any:
-            free_fall = free.weight / free.mass[:, None]
-            rates[free.at], pulls[free.at] = self._free_rates, free_fall
+            free_fall, unpushed = free.weight / free.mass[:, None], np.zeros((len(contact.names), 3))
+            pulls[free.at], unpushed[free.at] = free_fall, self._free_rates - free.state.v
             if load is None:  # the motion without contact
                 balance = self.stepper.balance
-                rates[free.at] = free.state.v + balance.eta / balance.alpha * (free_fall - free.balanced)
+                unpushed[free.at] = balance.eta / balance.alpha * (free_fall - free.balanced)
+            rates = rates + unpushed[contact.wall_of]
             self._free_rates = free.state.v
-        approach = Approach(normals, gaps, free_v, free_a, rates, pulls)
+        approach = Approach(normals, gaps, free_v, free_a, np.ascontiguousarray(rates), pulls[contact.wall_of])
         touched = Touched(log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.slack)
         loss, self.met = stop_nodes(nodes, approach, touched, self.model.inertia.mass, self.counted, speeds)
         if contact.ties.any:
@@ -302,13 +303,14 @@ class Impacts:
         """
         contact, free = self.model.contact, self.model.contact.motion.bodies
         mass = self.model.inertia.mass[nodes, None]
-        keeps = 1.0 - contact.restitution[free.at] ** 2
+        at = contact.first[free.at]
+        keeps = 1.0 - contact.restitution[at] ** 2
         sums = np.zeros((len(free.at), 5))
-        s = speeds[:, free.at]
+        s = speeds[:, at]
         closing = np.where(s > 0.0, mass, 0.0)
         sums[:, 0] = 0.5 * (closing * s * s).sum(axis=0)
         sums[:, 1] = closing.sum(axis=0)
-        sums[:, 2:] = np.einsum("mw,mwi->wi", closing * s, normals[:, free.at])
+        sums[:, 2:] = np.einsum("mw,mwi->wi", closing * s, normals[:, at])
         self.model.comm.Allreduce(MPI.IN_PLACE, sums)
         if self.model.comm.rank:
             return 0.0

@@ -83,14 +83,14 @@ def record_forces(particles, sums, changes, row):
 
 
 def _wall_shares(stepper: Stepper, nodes: np.ndarray, touching: np.ndarray, jumps: np.ndarray) -> np.ndarray:
-    """Divide vectors (m, 3) at nodes (m,) among the walls that they touch, (m, walls) bool; return (m, walls, 3)."""
+    """Divide vectors (m, 3) at nodes (m,) among the walls that they touch, (m, slots) bool; return (m, slots, 3)."""
     contact = stepper.model.contact
     shares = np.where(touching[:, :, None], jumps[:, None, :], 0.0)
     several = np.flatnonzero(touching.sum(axis=1) > 1)
     if len(several):
         at = nodes[several]
-        displacements = contact.motion.displacements(stepper.state.time)
-        normals, _ = contact.planes(touching[several], stepper.state.position[at], displacements)
+        poses = contact.motion.poses(stepper.state.time)
+        normals, _ = contact.planes(touching[several], stepper.state.position[at], poses, nodes=at)
         normals = np.where(touching[several][:, :, None], normals, 0.0)
         parts = np.einsum("miw,mi->mw", np.linalg.pinv(normals, rcond=RANK), jumps[several])
         own = parts[:, :, None] * normals
@@ -173,7 +173,7 @@ class Impulses:
         first = self.jumps
         if self.n_walls:
             shares = _wall_shares(self.stepper, nodes, walls, momentum)
-            particles[first : first + self.n_walls] += shares.sum(axis=0)
+            particles[first : first + self.n_walls] += self.stepper.model.contact.of_walls(shares.sum(axis=0))
             momentum = momentum - shares.sum(axis=1)
         table = self.links.tables(len(mass))[nodes]
         for k in range(self.n_links):

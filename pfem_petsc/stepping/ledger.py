@@ -411,13 +411,13 @@ class Ledger:
         """Return the dissipation of closing contacts [J], of the next step if the scheme has solved it in advance."""
         stepper, state = self.stepper, self.stepper.state
         if stepper.scheme.solves_next_position and not started:
-            displacements = self.model.contact.motion.displacements(state.time)
+            poses = self.model.contact.motion.poses(state.time)
             free = self._before_contact(before) if self.impacts.active else (state.v, state.a)
-            return self.impacts.step(state.position, free, None, state.time, displacements)
+            return self.impacts.step(state.position, free, None, state.time, poses)
         load = before.external - before.internal if self.impacts.active else None
         x, time = (state.x, state.time) if started else (stepper.before, state.time - stepper.part)
         motion = (before.velocity, before.acceleration)
-        return self.impacts.step(x[: len(state.v)], motion, load, time, self._displacements)
+        return self.impacts.step(x[: len(state.v)], motion, load, time, self._poses)
 
     def _before_contact(self, before: Moment) -> tuple[np.ndarray, np.ndarray]:
         """Return velocity and acceleration (owned, 3) of a balance solved in advance, without changes by a treatment.
@@ -438,10 +438,16 @@ class Ledger:
 
     def _walls_before(self) -> None:
         """Store the state of moving walls for the next step."""
-        contact = self.model.contact
-        self._displacements = contact.motion.displacements(self.stepper.state.time)
+        contact, time = self.model.contact, self.stepper.state.time
+        self._poses, self._displacements = contact.motion.poses(time), contact.motion.displacements(time)
         if not contact.moving.any():
             return
+        if contact.motion.turning.any():
+            walls = self.stepper.solution.walls
+            self._torques, self._angles = (
+                contact.motion.torques(walls.force, walls.moment, time),
+                contact.motion.angles(time),
+            )
         bodies = contact.motion.bodies
         self._bodies_v, self._bodies_kinetic = bodies.state.v, bodies.kinetic
         self.sums[_AT["wall_kinetic_energy"]] = bodies.kinetic if self.model.comm.rank == 0 else 0.0
@@ -451,13 +457,14 @@ class Ledger:
         work of the weight of the latter, and their numerical dissipation [J].
 
         Walls do work by all the momentum that they give in the step, by forces and by velocity jumps: the mean force
-        times the displacement of the wall. A wall with mass is a particle of the same scheme, so its kinetic energy
+        times the displacement of the wall, and the mean moment about its axis times the angle by which it turns. A wall with mass is a particle of the same scheme, so its kinetic energy
         changes by that momentum, and by that of its weight, times the mean of its velocities before and after.
         """
         stepper, contact = self.stepper, self.model.contact
         if not contact.moving.any():
             return 0.0, 0.0, 0.0, 0.0
         bodies, displacements, v = contact.motion.bodies, self._displacements, self._bodies_v
+        turned = (self._torques, self._angles) if contact.motion.turning.any() else None
         self._walls_before()
         push, way = self.impulses.mean_wall_forces(), self._displacements - displacements
         fallen, moved = way[bodies.at], stepper.part * 0.5 * (v + self._bodies_v)
@@ -465,6 +472,8 @@ class Ledger:
         works = (push * way).sum(axis=1)
         given = float(works[bodies.at].sum())
         work = float(works.sum()) - given
+        if turned is not None:
+            work += 0.5 * float(((turned[0] + self._torques) * (self._angles - turned[1])).sum())
         if self.model.comm.rank:
             return work, given, 0.0, 0.0
         return work, given, float((bodies.weight * fallen).sum()), float((bodies.weight * (fallen - moved)).sum())

@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from ..contact.constraint_set import ConstraintSet
 from ..contact.contact import Contact, adjust_start
+from ..contact.wall_motion import Poses
 from ..errors import InputError
 from ..mechanics.bars import Bars, check_areas, mesh_of_cases, section_of_bars
 from ..mechanics.loads import ExternalForce
@@ -39,7 +40,7 @@ class StageStart:
     force : (owned, 3) of the loads [N]
     gravity : (3,) acceleration [m/s2]
     wind : (3,) velocity [m/s]
-    walls : (w, 3) displacements of the walls of the stage before [m]
+    walls : Poses of the walls of the stage before
     """
 
     step: int
@@ -48,7 +49,7 @@ class StageStart:
     force: np.ndarray
     gravity: np.ndarray
     wind: np.ndarray
-    walls: np.ndarray
+    walls: Poses
 
     ARRAYS = ("position", "force")
 
@@ -58,13 +59,16 @@ class StageStart:
 
     def scalars(self) -> dict[str, Any]:
         """The rest of it."""
-        return {name: np.asarray(value).tolist() for name, value in vars(self).items() if name not in self.ARRAYS}
+        others = {name: value for name, value in vars(self).items() if name not in (*self.ARRAYS, "walls")}
+        walls = {name: getattr(self.walls, name).tolist() for name in ("shifts", "turns")}
+        return {name: np.asarray(value).tolist() for name, value in others.items()} | {"walls": walls}
 
     @classmethod
     def restored(cls, scalars: dict[str, Any], arrays: dict[str, np.ndarray]) -> StageStart:
         """What :meth:`scalars` and :meth:`arrays` gave."""
         vectors = {name: np.array(scalars[name]) for name in ("gravity", "wind")}
-        walls = np.array(scalars["walls"]).reshape(-1, 3)
+        shifts, turns = (np.array(scalars["walls"][name]) for name in ("shifts", "turns"))
+        walls = Poses(shifts.reshape(-1, 3), turns.reshape(-1, 3, 3))
         return cls(int(scalars["step"]), float(scalars["time"]), **arrays, **vectors, walls=walls)
 
 
@@ -82,7 +86,7 @@ def refuse_inclined(
     with agreed(mesh.comm):
         what = "a [[support]] prescribes a direction that is not an axis at node"
         for k, name in enumerate(contact.names):
-            both = numbers[contact.members[nodes, k]]
+            both = numbers[contact.members[nodes, contact.first[k]]]
             if len(both):
                 raise InputError(
                     f"{source}: wall {name!r}: {what} {both.min()}, which the wall could also stop: contact "
@@ -202,7 +206,7 @@ class Model:
         if self.case.starts_from is not None and self.case.wind is not None:
             self.external.take_drag(start.position)
         if self.case.holds("wall"):
-            self.contact.motion.held = np.array(start.walls).reshape(-1, 3)
+            self.contact.motion.held = start.walls
 
     @property
     def bars_vary(self) -> bool:

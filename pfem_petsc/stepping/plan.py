@@ -453,11 +453,12 @@ def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) ->
     model.links.check(model.case.contact.treatment, model.size)
     for k, name in enumerate(model.contact.names):
         key = f"{model.case.source}: wall {name!r}"
-        if model.contact.restitution[k]:
+        slot = model.contact.first[k]
+        if model.contact.restitution[slot]:
             _check_restitution(model, plan, treatment, k, key)
-        if model.contact.ties.tying[k]:
+        if model.contact.ties.tying[slot]:
             _check_serves(treatment, "tied", key)
-        if model.contact.static_friction[k]:
+        if model.contact.static_friction[slot]:
             _check_serves(treatment, "friction", key)
             if treatment is not None and not plan.scheme.jumps_known:
                 raise InputError(
@@ -490,7 +491,7 @@ def _check_restitution(model: Model, plan: Plan, treatment: type[Treatment] | No
         return
     _check_serves(treatment, "restitution", key)
     # the impulse of a velocity jump causes no friction and does not move walls with mass
-    if model.contact.static_friction[k]:
+    if model.contact.static_friction[model.contact.first[k]]:
         raise InputError(f"{key}: restitution together with friction needs central_differences")
     if model.case.wall[k].mass is not None:
         raise InputError(f"{key}: restitution of a wall with mass needs central_differences")

@@ -211,7 +211,7 @@ class Stepper(ABC):
     iterations : numbers of Newton and linear iterations since the last row of the history
     before : (local, 3) positions at the start of the last part, with ghosts [m]
     massless : MasslessNodes if contact nodes are massless along their walls' normals, else None
-    closed : (owned, walls) bool, nodes that have touched a wall and not left it since
+    closed : (owned, slots) bool, nodes that have touched a wall and not left it since
     prescribed : PrescribedMotion of supports
     ruptures : Ruptures, which counts broken bars
     removals : Removals of bars and supports
@@ -640,7 +640,7 @@ class Stepper(ABC):
             self.prescribed.take_rates(state.time)
         contact.motion.bodies.finish(self.part, end)
         if scheme.turns_held and self.treatment is None:
-            contact.ties.damp_velocity(*fresh, state.v, contact.motion.rates(found.time), self.part)
+            contact.ties.damp_velocity(*fresh, state.v, found.time, self.part)
 
     def _place_supports(self, end: float) -> None:
         """Give supports that move their exact positions and rates."""

@@ -24,7 +24,7 @@ class Jump:
     Attributes
     ----------
     nodes : (m,) owned local indices
-    walls : (m, walls) bool, walls that give the momentum of the jump; none at nodes of pairs
+    walls : (m, slots) bool, walls that give the momentum of the jump; none at nodes of pairs
     v, a : (m, 3) before the jump [m/s], [m/s2]
     energy : kinetic energy that this rank's nodes gained [J]
     memory : arrays of the scheme's memory at these nodes (m, 3), by name
@@ -94,26 +94,26 @@ class Treatment(ABC):
         touching = walls.touching & applicable
         touched = touching.any(axis=1)
         nodes, touching = walls.nodes[touched], touching[touched]
-        displacements = contact.motion.displacements(stepper.state.time)
-        normals, _ = contact.planes(touching, stepper.state.position[nodes], displacements)
+        time, x = stepper.state.time, stepper.state.position[nodes]
+        normals, _ = contact.planes(touching, x, contact.motion.poses(time), nodes=nodes)
         normals = np.where(touching[:, :, None], normals, 0.0)
         # the pseudo-inverse of the normals handles any number of walls at a node, parallel ones too
         free = np.where(stepper.model.supports.fixed[nodes][:, None, :], 0.0, normals)
         free[(free * free).sum(axis=2) <= FREE_PART] = 0.0
         inverse = np.linalg.pinv(free, rcond=RANK) if len(nodes) else np.zeros((0, 3, normals.shape[1]))
-        rates = contact.motion.rates(stepper.state.time)
-        away = np.einsum("mwi,wi->mw", normals, rates) + self.leaving(nodes, touching, normals, rates)
+        rates = contact.rates(x, time)
+        away = np.einsum("mwi,mwi->mw", normals, rates) + self.leaving(nodes, touching, normals, rates)
         speeds = np.einsum("miw,mw->mi", inverse, away)
         normal = inverse @ normals
         if contact.ties.any:
             tied = contact.ties.held[nodes]
             normal[tied] = np.eye(3)
-            speeds[tied] = rates[contact.ties.walls(nodes[tied])]
+            speeds[tied] = rates[np.flatnonzero(tied), contact.first[contact.ties.walls(nodes[tied])]]
         infeasible = self.sticking(nodes, touching, normals)
         holds = infeasible.any(axis=1)
         if holds.any():  # there may be pairs without any wall
             normal[holds] = np.eye(3)
-            speeds[holds] = rates[infeasible[holds].argmax(axis=1)]
+            speeds[holds] = rates[np.flatnonzero(holds), infeasible[holds].argmax(axis=1)]
         return nodes, normal, speeds
 
     def leaving(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray, rates: np.ndarray) -> np.ndarray:
@@ -231,9 +231,10 @@ class Restitution(Treatment):
         left = ~stepper.touching[self._held].any(axis=1)
         gone, force = self._held[left], self._force[left]
         walls = self._touched[gone].argmax(axis=1)
-        motion = stepper.model.contact.motion
-        way = (motion.displacements(state.time) - motion.displacements(self._time))[walls]
-        rate = motion.rates(state.time)[walls]
+        contact, every = stepper.model.contact, np.arange(len(gone))
+        poses = contact.motion.poses(self._time), contact.motion.poses(state.time)
+        way = contact.ways(self._place[gone], *poses)[every, walls]
+        rate = contact.rates(state.position[gone], state.time)[every, walls]
         work = 0.5 * np.einsum("mi,mi->m", force, state.position[gone] - self._place[gone] - way)
         away = force / np.maximum(np.linalg.norm(force, axis=1), 1e-300)[:, None]
         speed = np.einsum("mi,mi->m", away, state.v[gone] - rate)
@@ -264,8 +265,7 @@ class Restitution(Treatment):
         stepper, state, h = self.stepper, self.stepper.state, self.stepper.part
         contact, balance, mass = stepper.model.contact, stepper.balance, stepper.model.inertia.mass[nodes, None]
         push = np.where(stepper.model.supports.fixed[nodes], 0.0, state.contact[nodes]) / mass
-        way = contact.motion.displacements(state.time) - contact.motion.displacements(self._time)
-        moved = (state.position[nodes] - self._place[nodes] - push / balance.alpha)[:, None, :] - way
+        moved = self._moved(nodes) - (push / balance.alpha)[:, None, :]
         known = 0.0 if balance.a_hat is None else balance.a_hat[nodes]
         free = balance.alpha * stepper.solution.u[nodes] + known - push
         approach, before, after = (
@@ -285,10 +285,10 @@ class Restitution(Treatment):
         return touching & still & (model.contact.static_friction > 0.0)
 
     def _moved(self, nodes: np.ndarray) -> np.ndarray:
-        """Return displacements of nodes (m,) in this step relative to the walls (m, w, 3) [m]."""
+        """Return displacements of nodes (m,) in this step relative to the walls (m, slots, 3) [m]."""
         contact, state = self.stepper.model.contact, self.stepper.state
-        way = contact.motion.displacements(state.time) - contact.motion.displacements(self._time)
-        return (state.position[nodes] - self._place[nodes])[:, None, :] - way
+        poses = contact.motion.poses(self._time), contact.motion.poses(state.time)
+        return (state.position[nodes] - self._place[nodes])[:, None, :] - contact.ways(self._place[nodes], *poses)
 
     def on_walls(self, applicable: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return nodes in contact with walls (m,), and their new velocities and accelerations (m, 3) [m/s], [m/s2]."""

@@ -76,7 +76,8 @@ class Treatment(Base):
             return nodes, speed, speed
         mass = stepper.model.inertia.mass[nodes]
         # forces act along other normals than those at the end; several walls move a node along all of theirs
-        first = stepper.model.contact.motion.rates(state.time)[stepper.touching[nodes].argmax(axis=1)]
+        rates = stepper.model.contact.rates(state.position[nodes], state.time)
+        first = rates[np.arange(len(nodes)), stepper.touching[nodes].argmax(axis=1)]
         carried = first + speed - np.einsum("mij,mj->mi", normal, first)
         work = self._work(nodes, stepper.part * carried) + debt[nodes, 0]
         push = np.einsum("mij,mj->mi", normal, state.contact[nodes])

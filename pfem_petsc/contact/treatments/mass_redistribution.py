@@ -70,9 +70,10 @@ def redistribute(model: Model) -> Redistribution:
     source = model.case.source
     key = f'{source}: contact.treatment = "mass_redistribution"'
     for k, wall in enumerate(contact.walls):
-        if not wall.flat or wall.partial or contact.all_nodes[k]:
+        if not wall.flat or wall.partial or contact.motion.turning[k] or contact.all_nodes[k]:
             raise InputError(
-                f"{key}: wall {contact.names[k]!r} must be a plane, not curved nor a rectangle, and name a node_set: "
+                f"{key}: wall {contact.names[k]!r} must be a plane, not curved nor a rectangle, must not turn, and name "
+                "a node_set: "
                 "its nodes lose mass; use another contact.treatment"
             )
     if inertia.damped:

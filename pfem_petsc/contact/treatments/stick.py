@@ -77,8 +77,8 @@ class Treatment(Restitution):
         if not contact.has_friction or stepper.scheme.solves_next_position or len(nodes) == 0:
             return v, a, 0.0
         touching = stepper.touching[nodes]
-        displacements = contact.motion.displacements(state.time)
-        normals, _ = contact.planes(touching, state.position[nodes], displacements)
+        poses = contact.motion.poses(state.time)
+        normals, _ = contact.planes(touching, state.position[nodes], poses, nodes=nodes)
         slip = self._moved(nodes)
         if not stepper.scheme.solves_end:  # friction acts along the slip to the position solved for, if any
             solved = self._moved_to_solution(nodes)
@@ -110,7 +110,7 @@ class Treatment(Restitution):
         pressed = np.einsum("kiw,ki->kw", inverse, force + np.einsum("kw,kwi->ki", drag, way))
         pressed = np.maximum(pressed, 0.0)
         change_v, change_a = v[at] - state.v[owned], a[at] - state.a[owned]
-        relative = state.v[owned][:, None, :] - contact.motion.rates(state.time)
+        relative = state.v[owned][:, None, :] - contact.rates(state.position[owned], state.time)
         speed = np.einsum("kwi,kwi->kw", slip, relative + change_v[:, None, :])
         stopping, coupling = slip @ beside.swapaxes(1, 2), (way @ inverse).swapaxes(1, 2)
 
@@ -166,9 +166,10 @@ class Treatment(Restitution):
 
     def _moved_to_solution(self, nodes: np.ndarray) -> np.ndarray:
         """Return displacements of nodes (m,) to the position solved for, relative to the walls (m, w, 3) [m]."""
-        balance, motion = self.stepper.balance, self.stepper.model.contact.motion
+        balance, contact = self.stepper.balance, self.stepper.model.contact
         moved = (balance.predictor + self.stepper.solution.u)[nodes] - self._place[nodes]
-        return moved[:, None, :] - (motion.displacements(balance.time) - motion.displacements(self._time))
+        poses = contact.motion.poses(self._time), contact.motion.poses(balance.time)
+        return moved[:, None, :] - contact.ways(self._place[nodes], *poses)
 
     def _pairs_let_go(self) -> tuple[np.ndarray, np.ndarray]:
         """Return ends (m,) of pairs that opened in this step, and their velocities (m, 3); see :meth:`_let_go`.

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from ...case.base import Finite, NonNegativeFloat, PositiveFloat, Vector3, WallParameters, listed
+from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, Vector3, WallParameters, listed
 from ...errors import InputError, raised
 from ...registry import added_file, lookup
 from ..plugins import checked
@@ -17,7 +17,45 @@ from ..plugins import checked
 WALLS = "pfem_petsc.contact.walls"
 """The package of the walls."""
 
+Row2 = Annotated[tuple[Finite, Finite], listed]
 Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
+
+
+def increasing(rows: tuple | None) -> tuple | None:
+    """Check that the times of rows [t, ...] increase; return them."""
+    if rows is not None and not rows:
+        raise ValueError("expected at least one row")
+    for k in range(1, len(rows or ())):
+        if rows[k][0] <= rows[k - 1][0]:
+            raise ValueError(f"times must increase, but row {k} has t = {rows[k][0]!r} after {rows[k - 1][0]!r}")
+    return rows
+
+
+class Rotation(StrictModel):
+    """Rotation of a wall about an axis."""
+
+    exactly_one = (("angular_velocity", "angles"),)
+
+    centre: Vector3
+    """a point of the axis at rest [m]; it moves with the wall"""
+    axis: Vector3
+    """direction of the axis, of any nonzero length"""
+    angular_velocity: Finite | None = None
+    """constant angular velocity [rad/s], by the right-hand rule"""
+    angles: Annotated[tuple[Row2, ...], listed] | None = None
+    """rows [t, angle]: rotation from rest [s, rad], at rest before the first and after the last"""
+    interpolation: Literal["smooth", "linear"] = "smooth"
+    """interpolation of ``angles`` between its rows: a cubic spline, or straight lines with velocity jumps at rows"""
+
+    @field_validator("axis")
+    @classmethod
+    def _has_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        return direction(value, "the direction of the axis of rotation")
+
+    @field_validator("angles")
+    @classmethod
+    def _times_increase(cls, rows: tuple | None) -> tuple | None:
+        return increasing(rows)
 
 
 class WallKeys(WallParameters):
@@ -25,8 +63,10 @@ class WallKeys(WallParameters):
 
     velocity: Vector3 | None = None
     """velocity of the wall [m/s]: constant, or the initial one of a wall with mass"""
+    rotation: Rotation | None = None
+    """rotation of the wall about an axis, as prescribed; beside ``velocity``, ``motion`` or ``mass``, which move it"""
     mass: PositiveFloat | None = None
-    """mass [kg] of a wall that moves under the contact forces; it does not rotate"""
+    """mass [kg] of a wall that moves under the contact forces; they do not turn it"""
     gravity: bool = False
     """true: gravity acts on a wall with mass, as on the truss"""
     motion: Annotated[tuple[Row4, ...], listed] | None = None
@@ -52,12 +92,7 @@ class WallKeys(WallParameters):
     @field_validator("motion")
     @classmethod
     def _times_increase(cls, rows: tuple | None) -> tuple | None:
-        if rows is not None and not rows:
-            raise ValueError("expected at least one row")
-        for k in range(1, len(rows or ())):
-            if rows[k][0] <= rows[k - 1][0]:
-                raise ValueError(f"times must increase, but row {k} has t = {rows[k][0]!r} after {rows[k - 1][0]!r}")
-        return rows
+        return increasing(rows)
 
     @model_validator(mode="after")
     def _moves_one_way(self) -> WallKeys:
@@ -84,12 +119,14 @@ class BaseWall(ABC):
     ----------
     flat : whether the tangent plane is the same everywhere; then ``normal`` (3,) and ``offset`` [m] are that plane
     partial : whether nodes can pass beside it, so that their previous positions matter (:meth:`stops`)
+    faces : how many planes a node can touch at once; more than one for a surface of triangles
     width : smallest extent [m] of a wall that bars can cross between their nodes, infinite for others
     centre : (3,) [m], the point whose position is recorded if the wall moves
     """
 
     flat = False
     partial = False
+    faces = 1
     width = np.inf
     centre: np.ndarray
 

@@ -401,4 +401,6 @@ class ActiveSet:
         touching[tied, owners] = True
         total[at] += force.sum(axis=1)
         held[at] = touching.any(axis=1)
-        return total, self.contact.sums(at, force, x, touching, friction), held
+        start = self.state.position[at]
+        acts = start + self.balance.acting * (x - start)
+        return total, self.contact.sums(at, force, (x, acts), touching, friction), held

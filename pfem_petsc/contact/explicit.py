@@ -396,8 +396,11 @@ def press_nodes(places, given, walls, sums, curved, rough, several):
     total = np.zeros((m, 3))
     touching = np.zeros((m, w), dtype=np.bool_)
     dissipated = 0.0
+    arm = np.empty(3)
     for j in range(m):
-        x, y, z = places[j, 0], places[j, 1], places[j, 2]
+        for c in range(3):  # where the forces of the balance act
+            arm[c] = start[j, c] + walls.part * (places[j, c] - start[j, c])
+        x, y, z = arm
         for k in range(w):
             strength = strengths[j, k]
             if strength == 0.0:
@@ -644,7 +647,8 @@ class ExplicitContact(NodeWalls):
             own[np.arange(len(tied)), self.first[walls]] = True
             nodes, moved, force = np.append(nodes, tied), np.vstack([moved, places]), np.vstack([force, pull])
             touching = np.vstack([sums.touching, own])
-            held = self.sums(tied, every, places, own)
+            start = places if self.state is None else self.state.position[tied]
+            held = self.sums(tied, every, (places, start + self._part * (places - start)), own)
             sums = WallForces(
                 *(getattr(sums, name) + getattr(held, name) for name in WallForces.sums),
                 nodes,

@@ -121,7 +121,7 @@ def start_at_rest(
     state.contact = np.zeros_like(load)
     state.contact[nodes] = force.sum(axis=1)
     links.add_forces(state.contact)
-    return contact.sums(nodes, force, x[nodes], strengths > 0.0)
+    return contact.sums(nodes, force, (x[nodes], x[nodes]), strengths > 0.0)
 
 
 def _apply_friction(

@@ -93,7 +93,7 @@ class MasslessNodes:
         touched = np.zeros((len(nodes), len(contact.wall_of)), dtype=bool)
         touched[np.arange(len(nodes)), moved.walls] = strength > 0.0
         each = touched[:, :, None] * (strength[:, None] * full)[:, None, :]
-        return force, contact.sums(nodes, each, x[nodes], touched)
+        return force, contact.sums(nodes, each, (x[nodes], x[nodes]), touched)
 
     def _stiffness(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return stiffness (m,) of nodes along their normals at fixed neighbours [N/m], and their longest moves [m].

@@ -534,10 +534,17 @@ class NodeWalls:
         return acting
 
     def sums(
-        self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray, friction: float = 0.0
+        self,
+        nodes: np.ndarray,
+        force: np.ndarray,
+        at: tuple[np.ndarray, np.ndarray],
+        touching: np.ndarray,
+        friction: float = 0.0,
     ) -> WallForces:
-        """Return sums of forces (m, slots, 3) on nodes at (m, 3); ``friction``: energy dissipated in the step [J]."""
-        moment = self.of_walls(np.cross(x[:, None, :], force).sum(axis=0))
+        """Return sums of forces (m, slots, 3) on nodes, ``at`` their positions and where the forces of the balance act
+        (m, 3); ``friction``: energy dissipated in the step [J]."""
+        x, acts = at
+        moment = self.of_walls(np.cross(acts[:, None, :], force).sum(axis=0))
         contacts = touching
         if len(self.first) < len(self.wall_of):
             contacts = np.logical_or.reduceat(touching, self.first, axis=1)

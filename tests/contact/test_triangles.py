@@ -1,0 +1,285 @@
+"""Surfaces of triangles: distances against every face by other formulas, sides by winding numbers, and nodes that are
+stopped on random ways never end behind a surface."""
+
+import numpy as np
+import pytest
+
+from pfem_petsc.contact.projection import project
+from pfem_petsc.contact.triangles import Triangles, signed_distances, stopping_faces
+from pfem_petsc.mechanics.records import by_reference
+
+
+def box(low, high):
+    """Points and corners of a box, normals outwards."""
+    points = np.array([[(low, high)[b >> k & 1][k] for k in range(3)] for b in range(8)], dtype=float)
+    quads = [(0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4, 5, 7, 6)]
+    return points, np.array([part for a, b, c, d in quads for part in ((a, b, c), (a, c, d))])
+
+
+def ball(level):
+    """A sphere of radius 1: an octahedron, whose triangles are divided into four ``level`` times."""
+    points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+    corners = np.array([[x, 2 + y, 4 + z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    odd = corners.sum(axis=1) % 2 == 1
+    corners[odd] = corners[odd, ::-1]
+    for _ in range(level):
+        ends = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=2), axis=2)
+        edges, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+        middle = len(points) + number.reshape(-1, 3)
+        points = np.concatenate([points, points[edges].mean(axis=1)])
+        (a, b, c), (ab, bc, ca) = corners.T, middle.T
+        corners = np.concatenate([np.stack(part, axis=1) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), middle.T)])
+        points /= np.linalg.norm(points, axis=1)[:, None]
+    return points, corners
+
+
+def torus(around=18, across=9, radius=0.4):
+    u, v = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
+    a, b = 2 * np.pi * u / around, 2 * np.pi * v / across
+    out = 1.0 + radius * np.cos(b)
+    points = np.stack([out * np.cos(a), out * np.sin(a), radius * np.sin(b)], axis=2).reshape(-1, 3)
+    one, two = (np.stack([u, u + 1, u + 1, u], axis=2) % around, np.stack([v, v, v + 1, v + 1], axis=2) % across)
+    quads = (one * across + two).reshape(-1, 4)
+    return points, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def groove():
+    """An open sheet: two rectangles that fall towards the line x = 0, z = 0 with the slope 1/2."""
+    points = np.array([[x, y, abs(x) / 2] for x in (-2.0, 0.0, 2.0) for y in (-3.0, 3.0)])
+    return points, np.array([[0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3]])
+
+
+BODIES = {"box": box((-1.0, -0.6, -0.3), (1.0, 0.6, 0.3)), "ball": ball(2), "torus": torus()}
+
+
+def query(triangles, x, reach=np.inf, part=0):
+    distances, faces, places = np.empty(len(x)), np.empty((len(x), 2), np.int64), np.empty((len(x), 3))
+    signed_distances(by_reference(triangles), part, x, reach, distances, faces, places)
+    return distances, faces, places
+
+
+def stopped(triangles, start, free, tolerance=1e-9, part=0):
+    """Where nodes get to, and the planes that stop them."""
+    normals, offsets = np.zeros((len(free), 3, 3)), np.zeros((len(free), 3))
+    ways = np.stack([start, free])
+    stopping_faces(by_reference(triangles), part, ways, np.full(len(free), tolerance), normals, offsets)
+    end, fixed = free.copy(), np.zeros((len(free), 3), bool)
+    assert project(end, fixed, normals, offsets, 1e-13, np.empty((len(free), 3))) == -1
+    return end, normals, offsets
+
+
+def distances_to_all(places, x):
+    """Distances (m, t) of points from triangles (t, 3, 3): from the plane if the foot is inside, else from the sides."""
+    a, b, c = places[:, 0], places[:, 1], places[:, 2]
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    height = np.einsum("mti,ti->mt", x[:, None] - a, normals)
+    foot = x[:, None] - height[:, :, None] * normals
+    inside, nearest = np.ones(height.shape, bool), np.full(height.shape, np.inf)
+    for u, v in ((a, b), (b, c), (c, a)):
+        inside &= np.einsum("mti,ti->mt", np.cross(v - u, foot - u), normals) >= 0.0
+        part = np.clip(np.einsum("mti,ti->mt", x[:, None] - u, v - u) / ((v - u) ** 2).sum(axis=1), 0.0, 1.0)
+        nearest = np.minimum(nearest, np.linalg.norm(x[:, None] - u - part[:, :, None] * (v - u), axis=2))
+    return np.where(inside, np.abs(height), nearest)
+
+
+def winding_numbers(places, x):
+    """How many times a closed surface encloses points: the sum of solid angles (A. van Oosterom, J. Strackee, 1983)."""
+    a, b, c = (places[None, :, k] - x[:, None] for k in range(3))
+    la, lb, lc = (np.linalg.norm(arm, axis=2) for arm in (a, b, c))
+    below = la * lb * lc + (a * b).sum(axis=2) * lc + (b * c).sum(axis=2) * la + (c * a).sum(axis=2) * lb
+    angles = 2.0 * np.arctan2(np.einsum("mti,mti->mt", a, np.cross(b, c)), below)
+    return angles.sum(axis=1) / (4.0 * np.pi)
+
+
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("turned", [False, True])
+def test_distances_and_sides_are_those_of_all_faces(name, turned):
+    points, corners = BODIES[name]
+    triangles = Triangles.of(points, corners[:, ::-1] if turned else corners)
+    x = np.random.default_rng(0).uniform(-1.6, 1.6, (150, 3))
+    distances, faces, places = query(triangles, x)
+    expected = distances_to_all(triangles.points, x)
+    np.testing.assert_allclose(np.abs(distances), expected.min(axis=1), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(expected[np.arange(len(x)), faces[:, 0]], np.abs(distances), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(x - places, axis=1), np.abs(distances), rtol=0, atol=1e-12)
+    enclosed = np.abs(winding_numbers(triangles.points, x)) > 0.5
+    assert 0 < enclosed.sum() < len(x)
+    np.testing.assert_array_equal(distances < 0.0, enclosed != turned)
+    near, far = np.abs(distances) < 0.3, query(triangles, x, 0.3)[0]
+    np.testing.assert_array_equal(far, np.where(near, distances, np.inf))
+
+
+def test_corners_edges_and_faces_themselves():
+    """Points along the normals of corners, edges and faces have these as the nearest, at the distance that they have."""
+    triangles = Triangles.of(*BODIES["torus"])
+    at = np.concatenate([triangles.points.mean(axis=1), triangles.points.reshape(-1, 3)])
+    normals = np.concatenate([triangles.normals[:, 0], triangles.normals[:, 4:].reshape(-1, 3)])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    np.testing.assert_allclose(query(triangles, at)[0], 0.0, atol=1e-15)
+    outside, _, places = query(triangles, at + 1e-3 * normals)
+    inside = query(triangles, at - 1e-3 * normals)[0]
+    faces = slice(len(triangles.points))
+    np.testing.assert_allclose(outside[faces], 1e-3, rtol=1e-10)
+    np.testing.assert_allclose(inside[faces], -1e-3, rtol=1e-10)
+    np.testing.assert_allclose(places[faces], at[faces], atol=1e-15)
+    assert (outside > 0.0).all() and (inside < 0.0).all()
+
+
+def test_distance_from_a_fine_sphere_is_that_of_the_sphere():
+    """Chords of length h are up to h^2 / 8 inside, triangles up to h^2 / 6."""
+    x = np.random.default_rng(1).normal(size=(200, 3))
+    for level in (3, 4, 5):
+        triangles = Triangles.of(*ball(level))
+        longest = np.linalg.norm(np.diff(triangles.points, axis=1), axis=2).max()
+        error = query(triangles, x)[0] - (np.linalg.norm(x, axis=1) - 1.0)
+        assert 0.0 <= error.min() and error.max() < longest**2 / 6.0
+    assert len(triangles.points) == 8192
+
+
+def test_triangles_of_very_different_sizes():
+    rng = np.random.default_rng(2)
+    sizes = 10.0 ** rng.uniform(-5.0, 1.0, 300)
+    points = (rng.uniform(-1.0, 1.0, (300, 1, 3)) + sizes[:, None, None] * rng.normal(size=(300, 3, 3))).reshape(-1, 3)
+    triangles = Triangles.of(points, np.arange(900).reshape(-1, 3))
+    x = rng.uniform(-2.0, 2.0, (50, 3))
+    np.testing.assert_allclose(
+        np.abs(query(triangles, x)[0]), distances_to_all(triangles.points, x).min(axis=1), atol=1e-12
+    )
+    assert len(triangles.boxes) <= len(triangles.points)
+
+
+def test_several_surfaces_in_one_record():
+    each = [Triangles.of(*BODIES["box"]), Triangles.of(*groove(), True, 1e-3), Triangles.of(*BODIES["ball"])]
+    joined = Triangles.joined(each)
+    x = np.random.default_rng(4).normal(size=(60, 3))
+    for k, one in enumerate(each):
+        for found, expected in zip(query(joined, x, 0.7, k), query(one, x, 0.7), strict=True):
+            np.testing.assert_array_equal(found, expected)
+        for found, expected in zip(stopped(joined, x, -x, part=k), stopped(one, x, -x), strict=True):
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_groove_stops_nodes_as_two_planes_do():
+    triangles = Triangles.of(*groove())
+    slopes = np.array([[1.0, 0, 2.0], [-1.0, 0, 2.0]]) / np.sqrt(5.0)
+    rng = np.random.default_rng(5)
+    start = rng.uniform([-0.5, -1, 0.4], [0.5, 1, 0.8], (400, 3))
+    free = start + rng.uniform([-0.5, -1, -1.5], [0.5, 1, 0.1], (400, 3))
+    end, normals, offsets = stopped(triangles, start, free)
+    expected = free.copy()
+    planes, levels = np.broadcast_to(slopes, (400, 2, 3)).copy(), np.zeros((400, 2))
+    project(expected, np.zeros((400, 3), bool), planes, levels, 1e-13, np.empty((400, 2)))
+    np.testing.assert_allclose(end, expected, atol=1e-12)
+    count = np.isfinite(offsets).sum(axis=1)
+    assert set(count) == {0, 1, 2}
+    valley = np.abs(expected[:, 0]) < 1e-12
+    assert valley.any() and (count[valley] == 2).all()
+    for i, k in np.argwhere(np.isfinite(offsets)):
+        assert np.abs(slopes - normals[i, k]).max(axis=1).min() < 1e-15 and abs(offsets[i, k]) < 1e-15
+
+
+def test_corner_of_a_room_has_three_faces_and_that_of_a_box_one():
+    points, corners = box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    room = Triangles.of(points, corners[:, ::-1])
+    start = np.array([[0.2, 0.3, 0.1], [0.0, 0.0, 0.0], [0.0, 0.5, 0.0]])
+    free = np.array([[-0.1, -0.2, -0.3], [-1e-3, -2e-3, -1e-3], [-1e-3, 0.5, -1e-4]])
+    end, normals, offsets = stopped(room, start, free)
+    np.testing.assert_allclose(end, [[0, 0, 0], [0, 0, 0], [0, 0.5, 0]], atol=1e-15)
+    assert np.isfinite(offsets).sum(axis=1).tolist() == [3, 3, 2]
+    np.testing.assert_allclose(np.sort(normals[0], axis=0), [[0, 0, 0], [0, 0, 0], [1, 1, 1]], atol=1e-15)
+    solid = Triangles.of(points, corners)
+    start = np.array([[0.0, 0.0, 0.0], [-0.01, -0.01, -0.02], [-0.1, 0.5, 0.5]])
+    end, _, offsets = stopped(solid, start, start + [0.05, 0.06, 0.04])
+    assert np.isfinite(offsets).sum(axis=1).tolist() == [1, 1, 0]
+    np.testing.assert_allclose(end, [[0.05, 0.06, 0.0], [0.04, 0.05, 0.0], [-0.05, 0.56, 0.54]], atol=1e-15)
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-16, -1e-16, 1e-11, -1e-11])
+def test_nodes_that_start_on_edges_slide_along_faces(off):
+    """A node that rests on the edge or corner of a table slides over it, and off it, as others do."""
+    table = Triangles.of(*box((0.0, 0.0, -1.0), (1.0, 2.0, 0.0)))
+    start = np.array([[0.0, 0.5, 0.0], [0.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 0.0]]) + off
+    way = np.array([[0.1, 0.2, -1e-4], [0.1, 0.2, -1e-4], [-0.1, 0.2, -1e-4], [-1e-4, 0.2, -0.1]])
+    end = stopped(table, start, start + way)[0]
+    np.testing.assert_allclose(end[:2], start[:2] + [0.1, 0.2, 0.0], atol=2e-11)
+    assert (end[2:, 0] < 0.0).all() and (end[2:, 2] <= 2e-11).all()
+    np.testing.assert_allclose(end[:, 1], start[:, 1] + 0.2, atol=2e-11)
+
+
+@pytest.mark.parametrize("size", [0.01, 0.1, 0.5])
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("name", BODIES)
+def test_nodes_on_random_ways_stay_in_front(name, turned, size):
+    """They are pushed against the surface for 20 steps in one direction, along it, into edges and corners."""
+    points, corners = BODIES[name]
+    triangles = Triangles.of(points, corners[:, ::-1] if turned else corners)
+    rng = np.random.default_rng(6)
+    x = rng.uniform(-1.3, 1.3, (600, 3))
+    x = x[query(triangles, x)[0] > 0.0][:100]
+    assert len(x) > 20
+    most = 0
+    for step in range(60):
+        if step % 20 == 0:
+            drift = size * rng.normal(size=x.shape)
+        free = x + drift + 0.3 * size * rng.normal(size=x.shape)
+        end, _, offsets = stopped(triangles, x, free)
+        most = max(most, int(np.isfinite(offsets).sum(axis=1).max()))
+        assert query(triangles, end)[0].min() > -1e-12
+        x = np.clip(end, -1.6, 1.6)
+    convex = name != "torus" and not turned
+    assert most == 1 if convex else most > (size > 0.05)
+
+
+def test_thin_plate_and_sheets_stop_fast_nodes():
+    plate = Triangles.of(*box((-1.0, -1.0, -1e-4), (1.0, 1.0, 1e-4)))
+    start = np.array([[0.1, 0.2, 0.5], [0.1, 0.2, -0.5], [0.1, 0.2, 1e-4], [1.1, 0.2, 0.5], [0.3, 0.3, 1e-4 - 1e-12]])
+    free = start * [1.0, 1.0, -1.0]
+    free[2, 2] = -0.3
+    end = stopped(plate, start, free)[0]
+    np.testing.assert_allclose(end[:, 2], [1e-4, -1e-4, 1e-4, -0.5, 1e-4], atol=1e-15)
+    np.testing.assert_array_equal(end[:, :2], free[:, :2])
+    points, corners = box((-1.0, -1.0, 0.0), (1.0, 1.0, 1.0))
+    for both, z in ((False, [0.0, 0.5, 0.0, -0.5, 0.0]), (True, [0.01, -0.01, 0.01, -0.5, 0.01])):
+        sheet = Triangles.of(points, corners[-4:-2, ::-1], both, 0.01 * both)  # the face z = 0, seen from above
+        start[:, 2] = [0.5, -0.5, 0.01 * both, 0.5, 0.01 * both - 1e-12]
+        free[:, 2] = [-0.5, 0.5, -0.3, -0.5, -1e-6]
+        end = stopped(sheet, start, free)[0]
+        np.testing.assert_allclose(end[:, 2], z, atol=1e-15)
+        np.testing.assert_array_equal(end[:, :2], free[:, :2])
+
+
+def test_what_was_behind_the_surface_is_not_stopped():
+    solid = Triangles.of(*BODIES["box"])
+    start = np.array([[0.0, 0.0, 0.29], [0.0, 0.0, 0.3 - 1e-6], [0.0, 0.0, 0.3 - 1e-12], [0.99, 0.0, 0.0]])
+    free = start + [1e-3, 0.0, -1e-3]
+    end = stopped(solid, start, free)[0]
+    np.testing.assert_array_equal(end[[0, 1, 3]], free[[0, 1, 3]])
+    np.testing.assert_allclose(end[2], [1e-3, 0.0, 0.3], atol=1e-15)
+
+
+def test_resting_nodes_stay_where_they_are():
+    """On faces, edges and corners of a body and of a groove, pushed downwards in 50 steps, by 1e-15 m too."""
+    for points, corners, x in (
+        (*BODIES["box"], [[0.1, 0.2, 0.3], [0.25, 0.0, 0.3], [1.0, 0.1, 0.3], [1.0, 0.6, 0.3]]),
+        (*groove(), [[0.0, 0.3, 0.0], [0.5, 0.0, 0.25], [0.0, 1.0, 0.0], [-1.0, 1.0, 0.5]]),
+    ):
+        triangles, x = Triangles.of(points, corners), np.array(x)
+        for push in (1e-15, 1e-9, 1e-3):
+            rest = x
+            for _ in range(50):
+                end, normals, offsets = stopped(triangles, rest, rest - [0.0, 0.0, push])
+                assert np.isfinite(offsets).any(axis=1).all()
+                drift = np.where(normals[:, 0, 2] > 1.0 - 1e-12, 0.0, push)  # down the slope
+                assert (np.abs(end - rest)[:, 2] <= 0.5 * drift + 1e-15).all()
+                rest = end
+
+
+def test_the_order_of_nodes_does_not_matter():
+    triangles = Triangles.of(*BODIES["torus"])
+    rng = np.random.default_rng(7)
+    start = rng.uniform(-1.5, 1.5, (80, 3))
+    free = start + rng.normal(scale=0.3, size=(80, 3))
+    order = rng.permutation(80)
+    for found, expected in zip(stopped(triangles, start[order], free[order]), stopped(triangles, start, free)):
+        np.testing.assert_array_equal(found, expected[order])

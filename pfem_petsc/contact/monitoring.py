@@ -215,6 +215,8 @@ class Piercing:
         starts, ends = (poses.rest(k, x[self._bars[rows, end]]) for end in (0, 1))
         if wall.partial:
             across = _crossing(wall, starts, ends, 1e-6 * self._model.length)
+        elif hasattr(wall, "crossed"):
+            across = wall.crossed(starts, ends)
         else:
             across = distances(starts, ends, wall.centre, getattr(wall, "axis", None)) < (1.0 - DEEP) * wall.radius
         ids = mesh.bar_ids[mesh.counted][rows[across]]

@@ -318,8 +318,8 @@ def _crossed(triangles, start, place, tolerance, least):
 
 @inlined
 def _behind(triangles, start, place, tolerance, least):
-    """Return the face nearest to a place that is behind it by more than ``least`` while ``start`` is not, -1 if there is
-    none: neither are places beside the surface behind it, nor those that are farther from it than from the start."""
+    """Return the face nearest to a place that is behind it by more than ``least`` while ``start`` is not, or -1:
+    neither are places beside the surface behind it, nor those that are farther from it than from the start."""
     both, clearance = triangles.limits[0, 0] > 0.0, triangles.limits[0, 1]
     reach = math.sqrt(_square(start, place)) + tolerance + clearance
     distance, face, feature, _, _, _ = nearest(triangles, place[0], place[1], place[2], reach)

@@ -7,6 +7,8 @@ of the functions
   that the file has (None: all);
 - ``read_on(path, comm, fields) -> MeshSlab``, in its place, of all ranks together: with exactly these fields, by the
   keys that ask for them;
+- ``read_faces(path)``, which every rank calls: points (n, 3), the numbers of the corners of faces, one face after the
+  other, and the place in them where each face begins, and the last ends;
 - ``write(path, mesh)``, which one rank calls with a :class:`~pfem_petsc.mesh.whole.WholeMesh`. What it writes, one file
   or several in the folder of ``path``, takes its place when it is complete.
 """
@@ -25,12 +27,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from types import ModuleType
 
+    import numpy as np
     from mpi4py import MPI
 
     from ..mesh.slab import MeshSlab
     from ..mesh.whole import WholeMesh
 
-__all__ = ["read_slab", "read_whole", "suffixes", "write_whole", "writer_of"]
+__all__ = ["read_slab", "read_triangles", "read_whole", "suffixes", "write_whole", "writer_of"]
 
 _GEOMETRY = (
     "; this is a geometry: mesh its curves by `gmsh -1 -clmin 1e22 {name} -o {stem}.msh`, one bar each, or with the "
@@ -118,6 +121,44 @@ def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     return whole
 
 
+def read_triangles(path: Path, key: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (n, 3) and the numbers (t, 3) of the corners of the triangles in a file; faces of more corners,
+    which must be convex, are divided. For one rank; messages begin with the key that names the file.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, no reader for its suffix, or its content is not a surface.
+    """
+    import numpy as np
+
+    from ..errors import InputError
+    from ._numbers import whole_numbers
+
+    try:
+        points, corners, offsets = _reader_of(path, "", "read_faces").read_faces(path)
+        sizes = np.diff(offsets)
+        if not sizes.size or not np.isfinite(points).all():
+            raise InputError(f"{path}: has {'coordinates that are not finite' if sizes.size else 'no faces'}")
+        if sizes.min() < 3:
+            raise InputError(f"{path}: face {sizes.argmin()} (from 0) has {sizes.min()} corners: expected 3 or more")
+        n = len(points)
+        corners = whole_numbers(corners, 0, n, f"{path}: there is no point {{}}: the file has {n}, from 0".format)
+    except InputError as error:
+        raise InputError(f"{key}{error}") from None
+    face = np.repeat(np.arange(len(sizes)), sizes - 2)
+    second = np.arange(len(face)) + 2 * face + 1
+    triangles = corners[np.stack([offsets[face], second, second + 1], axis=1)]
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    areas = np.cross(b - a, c - a)
+    total = np.add.reduceat(areas, np.concatenate([[0], np.cumsum(sizes - 2)[:-1]]))[face]
+    bent = np.flatnonzero((np.einsum("ti,ti->t", areas, total) < 0.0) & (sizes[face] > 3))
+    if len(bent):
+        x = ", ".join(f"{value:.6g}" for value in a[bent[0]])
+        raise InputError(f"{key}{path}: the face at ({x}) in the file is not convex: divide it into triangles")
+    return points, triangles
+
+
 def _read(reader: Any, path: Path, fields: Mapping[str, str] | None) -> WholeMesh:
     from ..errors import InputError
     from ..mesh.whole import check_fields
@@ -133,12 +174,12 @@ def _read(reader: Any, path: Path, fields: Mapping[str, str] | None) -> WholeMes
     return whole
 
 
-def _reader_of(path: Path, key: str) -> Any:
-    """Return the module that reads a file; messages begin with the key that names the file."""
+def _reader_of(path: Path, key: str, *what: str) -> Any:
+    """Return the module that reads a file, by ``what``; messages begin with the key that names the file."""
     from ..errors import InputError
     from ..files import readable_whole
 
-    known = suffixes("read", "read_on")
+    known = suffixes(*(what or ("read", "read_on")))
     try:
         with open(readable_whole(path), "rb"):
             pass
@@ -148,7 +189,7 @@ def _reader_of(path: Path, key: str) -> Any:
         raise InputError(f"{key}cannot open {path}: {error.strerror}") from None
     if path.suffix.lower() not in known:
         names = {"name": shlex.quote(str(path)), "stem": shlex.quote(str(path.with_suffix("")))}
-        hint = _CONVERT.get(path.suffix.lower(), "").format(**names)
+        hint = "" if what else _CONVERT.get(path.suffix.lower(), "").format(**names)
         raise InputError(f"{key}no reader for {path.name!r}; known suffixes: {', '.join(known)}{hint}")
     return known[path.suffix.lower()]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -37,20 +37,14 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     groups: dict[str, dict[str, list[int]]] = {"l": {}, "f": {}}
     named: dict[str, list[str]] = {"o": [], "g": []}
     faces, degree, other = 0, 0, Counter[str]()
-    text = path.read_text(encoding="utf-8-sig", errors="replace").replace("\\\n", " ")
-    for number, line in enumerate(text.splitlines(), 1):
-        word, *rest = line.partition("#")[0].split() or [""]
+    for number, line, word, rest in _lines(path):
         try:
             if word == "v":
-                x, y, z = map(float, rest[:3])
-                points.append([x, y, z])
+                points.append(_coordinates(rest))
             elif word in ("l", "f") or (word == "curv" and degree == 1):
                 # what Rhino writes for lines: curves of degree 1, between two parameters
                 word, rest = ("l", rest[2:]) if word == "curv" else (word, rest)
-                ends = [int(text.partition("/")[0]) for text in rest]
-                ends = [end - 1 if end > 0 else len(points) + end for end in ends]
-                if min(ends) < 0 or max(ends) > sys.maxsize:
-                    raise IndexError
+                ends = _numbers(rest, len(points))
                 if len(ends) == 1:
                     other[f"{word} of one point"] += 1
                     continue
@@ -67,8 +61,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
             elif word not in _SILENT:
                 other[word] += 1
         except (ValueError, IndexError):
-            expected = "three numbers" if word == "v" else "the numbers of points that precede it"
-            raise InputError(f"{path}: line {number}: {line[:60]!r}: expected {expected}") from None
+            raise _refusal(path, number, line, word) from None
     around = np.array(pairs["f"], np.int64).reshape(-1, 2)
     mesh = mesh_of(path, np.array(points).reshape(-1, 3), np.array(pairs["l"]).reshape(-1, 2), around, faces, 1)
     place = np.arange(len(mesh.bars)) if pairs["l"] else edges(around)[1]
@@ -78,3 +71,53 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         mesh.warnings.append(f"{path}: left out {', '.join(f'{n} {word}' for word, n in other.items())}: not read")
     drop_bare_nodes(path, mesh)
     return mesh
+
+
+def read_faces(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points (n, 3) and the corners of the faces, see :func:`~pfem_petsc.formats.read_triangles`.
+
+    Raises
+    ------
+    InputError
+        As :func:`read`.
+    """
+    points: list[list[float]] = []
+    corners: list[int] = []
+    offsets = [0]
+    for number, line, word, rest in _lines(path):
+        try:
+            if word == "v":
+                points.append(_coordinates(rest))
+            elif word == "f":
+                corners += _numbers(rest, len(points))
+                offsets.append(len(corners))
+        except (ValueError, IndexError):
+            raise _refusal(path, number, line, word) from None
+    return np.array(points).reshape(-1, 3), np.array(corners, np.int64), np.array(offsets)
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str, str, list[str]]]:
+    """Return the number of each line, itself, its first word and the others."""
+    text = path.read_text(encoding="utf-8-sig", errors="replace").replace("\\\n", " ")
+    for number, line in enumerate(text.splitlines(), 1):
+        word, *rest = line.partition("#")[0].split() or [""]
+        yield number, line, word, rest
+
+
+def _coordinates(words: list[str]) -> list[float]:
+    x, y, z = map(float, words[:3])
+    return [x, y, z]
+
+
+def _numbers(words: list[str], n: int) -> list[int]:
+    """Return the points, from 0, that a line names after n points."""
+    ends = [int(text.partition("/")[0]) for text in words]
+    ends = [end - 1 if end > 0 else n + end for end in ends]
+    if min(ends) < 0 or max(ends) > sys.maxsize:
+        raise IndexError
+    return ends
+
+
+def _refusal(path: Path, number: int, line: str, word: str) -> InputError:
+    expected = "three numbers" if word == "v" else "the numbers of points that precede it"
+    return InputError(f"{path}: line {number}: {line[:60]!r}: expected {expected}")

@@ -506,7 +506,7 @@ def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str]
     """Return the surfaces of a case's walls; a wall whose type has no drawing is skipped with a message to ``note``.
 
     A wall module may define ``surface(parameters, bounds)``, which returns a :class:`Surface`, or points (n, 3) and
-    quadrilaterals (f, 4).
+    quadrilaterals (f, 4) or triangles (f, 3).
     """
     drawn = []
     for wall in walls:
@@ -517,7 +517,11 @@ def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str]
             why = "defines no function surface" if known else "is unknown; name the file that defines it by --plugin"
             note(f"wall '{wall.name}' is left out of the picture: its type '{wall.type}' {why}")
             continue
-        shape = draw(wall, bounds)
+        try:
+            shape = draw(wall, bounds)
+        except InputError as error:  # of a file that is not on this machine, or has changed
+            note(f"wall '{wall.name}' is left out of the picture: {error}")
+            continue
         if not isinstance(shape, Surface):
             points, faces = (np.asarray(part) for part in shape)
             edge = np.zeros((0, 2), dtype=int)

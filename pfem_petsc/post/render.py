@@ -559,7 +559,8 @@ def _wall(plotly: Any, surface: Any) -> Any:
     """Return the face of a wall that nodes touch."""
     faces = np.asarray(surface.faces)
     faces = faces[(np.asarray(surface.depth)[faces] == 0.0).all(axis=1)]
-    corners = dict(zip("ijk", np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]]).T, strict=True))
+    parts = np.concatenate([faces[:, [0, k, k + 1]] for k in range(1, faces.shape[1] - 1)])
+    corners = dict(zip("ijk", parts.T, strict=True))
     x, y, z = np.asarray(surface.points, dtype=float).T
     shade = "rgb({},{},{})".format(*WALL_COLOUR)
     return plotly.Mesh3d(x=x, y=y, z=z, **corners, color=shade, opacity=0.35, hoverinfo="skip")

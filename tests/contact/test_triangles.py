@@ -69,7 +69,7 @@ def stopped(triangles, start, free, tolerance=1e-9, part=0):
 
 
 def distances_to_all(places, x):
-    """Distances (m, t) of points from triangles (t, 3, 3): from the plane if the foot is inside, else from the sides."""
+    """Distances (m, t) of points from triangles (t, 3, 3): from the plane if the foot is inside, or from the sides."""
     a, b, c = places[:, 0], places[:, 1], places[:, 2]
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
@@ -111,7 +111,7 @@ def test_distances_and_sides_are_those_of_all_faces(name, turned):
 
 
 def test_corners_edges_and_faces_themselves():
-    """Points along the normals of corners, edges and faces have these as the nearest, at the distance that they have."""
+    """Points along the normals of corners, edges and faces have these as the nearest, at their distance."""
     triangles = Triangles.of(*BODIES["torus"])
     at = np.concatenate([triangles.points.mean(axis=1), triangles.points.reshape(-1, 3)])
     normals = np.concatenate([triangles.normals[:, 0], triangles.normals[:, 4:].reshape(-1, 3)])

@@ -251,7 +251,7 @@ class Surface:
     ----------
     name : the wall's name
     points : (n, 3) float64 [m]
-    faces : (f, 4) int64, corners of quadrilaterals
+    faces : (f, 4) or (f, 3) int64, corners of quadrilaterals or triangles
     depth : (n,) float64, 0 on the face that nodes touch, 1 where the picture fades out
     edge : (e, 2) int64, lines that outline the face
     """

@@ -125,6 +125,7 @@ class ContactLog:
     Attributes
     ----------
     touching : (owned, slots) bool, contacts after the last step
+    closed : (owned, slots) bool, nodes that have touched a wall and not left it since
     releases : (walls,) number of releases of this rank's nodes from each wall
     changes : number of contacts of this rank that closed or opened since the last row of the history
     last : (m,) nodes that touch any wall after the last step
@@ -134,7 +135,8 @@ class ContactLog:
     """
 
     def __init__(self, n_owned: int, n_walls: int, wall_of: np.ndarray) -> None:
-        self.touching, self._wall_of = np.zeros((n_owned, len(wall_of)), dtype=bool), wall_of
+        self.touching, self.closed = np.zeros((2, n_owned, len(wall_of)), dtype=bool)
+        self._wall_of = wall_of
         self.releases = np.zeros(n_walls, dtype=np.int64)
         self.changes = 0
         self.time = np.zeros(n_walls)
@@ -427,7 +429,12 @@ class NodeWalls:
                 self.fixed[nodes[mine]] & ~self.motion.turning[k],
                 slack[mine],
             )
-            found |= faces.find(nodes[mine], ways, tolerance)
+            kept = np.zeros((self.mesh.n_owned, 9))
+            if self.state is not None:
+                kept = self.state.memory.setdefault(f"faces_{k}", kept)
+            slots = slice(self.first[k], self.first[k] + 3)
+            occupied = self.log.touching[:, slots] | self.log.closed[:, slots]
+            found |= faces.find(nodes[mine], ways, tolerance, (kept, occupied))
         return found
 
     def _starts(self, nodes: np.ndarray | slice, x: np.ndarray, poses: Poses) -> tuple[np.ndarray, Poses, np.ndarray]:

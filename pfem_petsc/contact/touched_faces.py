@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..mechanics.compiled import inlined, kernel
-from .triangles import Triangles, faces_at, nearest
+from .triangles import faces_at, nearest
 
 if TYPE_CHECKING:
-    from .walls.base import BaseWall
+    from .walls.surface import Wall
+
+_SAME = 1.0 - 1e-10
+"""Cosine between the normals of faces of one plane."""
 
 
 @inlined
@@ -77,21 +80,47 @@ def _mark_near(triangles, starts, ends, reach, slack, near):
                 near[i] = near[i] or gap < min(limit, 0.0)
 
 
+@inlined
+def _put(i, normal, offset, table, kept):
+    """Give node i a plane, in the slot in which it touched it before, or else in one that is free: a node that touches
+    another face has hit it."""
+    _, normals, offsets = table
+    before, occupied = kept
+    best, slot = -1, 0
+    for k in range(3):
+        if offsets[i, k] > -math.inf:
+            continue
+        along = 0.0
+        for c in range(3):
+            along += normal[c] * before[i, 3 * k + c]
+        value = 1 if not occupied[i, k] else (2 if along > _SAME else 0)
+        if value > best:
+            best, slot = value, k
+    offsets[i, slot] = offset
+    for c in range(3):
+        normals[i, slot, c] = before[i, 3 * slot + c] = normal[c]
+
+
 @kernel
-def _find(triangles, nodes, ways, tolerance, table):
+def _find(triangles, nodes, ways, tolerance, table, kept):
     """Find the planes of nodes (m,) on their ways; return whether any changed. ``ways``: starts and ends (m, 3), fixed
     (m, 3) bool, and by how much each may have been behind the surface (m,) [m]; ``table``: which nodes are known
-    (owned,), their normals (owned, 3, 3) and offsets (owned, 3)."""
+    (owned,), their normals (owned, 3, 3) and offsets (owned, 3); ``kept``: normals (owned, 9) of the planes of earlier
+    steps, and which of these they touch (owned, 3) bool."""
     starts, ends, fixed, slack = ways
     known, normals, offsets = table
     changed = False
-    own, level = np.empty((1, 3, 3)), np.empty((1, 3))
+    own, level = np.zeros((1, 3, 3)), np.empty((1, 3))
     for j in range(len(nodes)):
         i, x, gaps = nodes[j], ends[j], np.empty(3)
         if not known[i]:
             known[i] = changed = True
-            if faces_at(triangles, starts[j], x, fixed[j], slack[j], normals[i], offsets[i]) == 0 and tolerance > 0.0:
-                _tangent(triangles, i, x, math.inf, normals, offsets)
+            if faces_at(triangles, starts[j], x, fixed[j], slack[j], own[0], level[0]) == 0 and tolerance > 0.0:
+                _tangent(triangles, 0, x, math.inf, own, level)
+            offsets[i, :] = -math.inf
+            for k in range(3):
+                if level[0, k] > -math.inf:
+                    _put(i, own[0, k], level[0, k], table, kept)
             continue
         distance = _tangent(triangles, 0, x, math.inf, own, level)
         on, worst = False, 0
@@ -104,15 +133,12 @@ def _find(triangles, nodes, ways, tolerance, table):
                 on = on or abs(gaps[k]) <= tolerance
             worst = k if gaps[k] > gaps[worst] else worst
         if distance > tolerance and on:  # on the plane of a face, beside it
-            for k in range(3):
-                offsets[i, k] = -math.inf
-            worst = 0
+            offsets[i, :] = -math.inf
         elif not distance < -tolerance:
             continue
         changed = True
-        offsets[i, worst] = level[0, 0]
-        for c in range(3):
-            normals[i, worst, c] = own[0, 0, c]
+        offsets[i, worst] = -math.inf
+        _put(i, own[0, 0], level[0, 0], table, kept)
     return changed
 
 
@@ -122,12 +148,12 @@ class TouchedFaces:
 
     Parameters
     ----------
-    wall : with ``triangles``, see :class:`~pfem_petsc.contact.triangles.Triangles`
+    wall : a surface of triangles
     n_owned : number of nodes
     """
 
-    def __init__(self, wall: BaseWall, n_owned: int) -> None:
-        self._triangles: Triangles = wall.triangles
+    def __init__(self, wall: Wall, n_owned: int) -> None:
+        self._triangles = wall.compiled
         self._table = np.zeros(n_owned, dtype=bool), np.zeros((n_owned, 3, 3)), np.full((n_owned, 3), -np.inf)
 
     def forget(self) -> None:
@@ -143,17 +169,21 @@ class TouchedFaces:
         return near
 
     def find(
-        self, nodes: np.ndarray, ways: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], tolerance: float
+        self,
+        nodes: np.ndarray,
+        ways: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        tolerance: float,
+        kept: tuple[np.ndarray, np.ndarray],
     ) -> bool:
         """Find planes of nodes (m,), beside those that were found in this step; return whether there are others now.
 
         A node that is behind the surface although it satisfies its planes gets one more; one that is on the plane of a
-        face, but beside it, gets that of the nearest place. ``ways``: see :func:`_find`; ``tolerance``: depth that
-        counts as zero [m]; without any, nodes that are not stopped have no plane.
+        face, but beside it, gets that of the nearest place. ``ways``, ``kept``: see :func:`_find`; ``tolerance``: depth
+        that counts as zero [m]; without any, nodes that are not stopped have no plane.
         """
         starts, ends, fixed, slack = ways
         ways = np.ascontiguousarray(starts), np.ascontiguousarray(ends), fixed, slack
-        return bool(_find(self._triangles, nodes, ways, tolerance, self._table))
+        return bool(_find(self._triangles, nodes, ways, tolerance, self._table, kept))
 
     def planes(self, nodes: np.ndarray | None, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the normals (m, 3, 3) of the planes of nodes (m,) at (m, 3), and distances along them (m, 3) [m],
@@ -168,5 +198,5 @@ class TouchedFaces:
         if len(at):
             own, level = np.zeros((len(at), 3, 3)), np.empty((len(at), 3))
             tangent_planes(self._triangles, np.ascontiguousarray(x[at]), own, level)
-            normals[at], offsets[at] = own, level
+            normals[at], offsets[at] = (own, level) if nodes is None else (own[:, :1], level[:, :1])
         return normals, np.einsum("mki,mi->mk", normals, x) - offsets

@@ -211,7 +211,6 @@ class Stepper(ABC):
     iterations : numbers of Newton and linear iterations since the last row of the history
     before : (local, 3) positions at the start of the last part, with ghosts [m]
     massless : MasslessNodes if contact nodes are massless along their walls' normals, else None
-    closed : (owned, slots) bool, nodes that have touched a wall and not left it since
     prescribed : PrescribedMotion of supports
     ruptures : Ruptures, which counts broken bars
     removals : Removals of bars and supports
@@ -271,9 +270,7 @@ class Stepper(ABC):
         )
         self.before = mesh.points.copy()
         model.contact.state = self.state
-        self.touching = model.contact.log.touching
         self.massless = MasslessNodes(model) if model.inertia.redistribution is not None else None
-        self.closed = np.zeros_like(self.touching)
         self.step_changed = False
         self.support_changes = 0
         self.prescribed = PrescribedMotion(self)
@@ -286,6 +283,24 @@ class Stepper(ABC):
         self.walls_at_start = np.zeros((len(model.contact.names), 3))
         self.links_at_start = model.links.totals()
         self.solution = Solution(self.zero, self.state.f, model.contact.nothing)
+
+    @property
+    def touching(self) -> np.ndarray:
+        """(owned, slots) bool: contacts of nodes with walls after the last step."""
+        return self.model.contact.log.touching
+
+    @touching.setter
+    def touching(self, touching: np.ndarray) -> None:
+        self.model.contact.log.touching = touching
+
+    @property
+    def closed(self) -> np.ndarray:
+        """(owned, slots) bool: nodes that have touched a wall and not left it since."""
+        return self.model.contact.log.closed
+
+    @closed.setter
+    def closed(self, closed: np.ndarray) -> None:
+        self.model.contact.log.closed = closed
 
     @property
     def fault(self) -> SimulationFailure | None:

@@ -71,7 +71,7 @@ class Wall(BaseWall):
 
     Attributes
     ----------
-    triangles : :class:`~pfem_petsc.contact.triangles.Triangles`, for loops
+    triangles, compiled : :class:`~pfem_petsc.contact.triangles.Triangles`, as they are and for loops
     points : (n, 3) float64 [m]; corners : (t, 3) int64
     closed : whether every edge has two triangles; then nodes behind the surface are inside a body
     """
@@ -95,7 +95,7 @@ class Wall(BaseWall):
         extents = np.sort(np.ptp(self.points, axis=0))
         thickness = _THIN * extents[2] if parameters.thickness is None else parameters.thickness
         self.triangles = Triangles.of(self.points, self.corners, both, 0.5 * thickness * both)
-        self._compiled = by_reference(self.triangles)
+        self.compiled = by_reference(self.triangles)
         self.closed = bool((self._edges[1] == 2).all())
         self.centre = 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))
         a, b, c = (self.points[self.corners[:, k]] - self.centre for k in range(3))
@@ -105,7 +105,7 @@ class Wall(BaseWall):
     def _nearest(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return signed distances (m,) of positions (m, 3), the nearest faces (m,) and places (m, 3)."""
         distances, faces, places = np.empty(len(x)), np.empty((len(x), 2), np.int64), np.empty((len(x), 3))
-        signed_distances(self._compiled, 0, np.ascontiguousarray(x), np.inf, distances, faces, places)
+        signed_distances(self.compiled, 0, np.ascontiguousarray(x), np.inf, distances, faces, places)
         return distances, faces[:, 0], places
 
     def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -138,7 +138,7 @@ class Wall(BaseWall):
         apart = np.minimum(self.gaps(starts), self.gaps(ends)) > _APART * np.linalg.norm(ends - starts, axis=1)
         normals, offsets = np.empty((len(starts), 3, 3)), np.empty((2, len(starts), 3))
         for k, ways in enumerate((np.stack([starts, ends]), np.stack([ends, starts]))):
-            stopping_faces(self._compiled, 0, ways, np.zeros(len(starts)), normals, offsets[k])
+            stopping_faces(self.compiled, 0, ways, np.zeros(len(starts)), normals, offsets[k])
         return apart & np.isfinite(offsets).any(axis=(0, 2))
 
 

@@ -682,14 +682,13 @@ class ExplicitContact(NodeWalls):
         if bounces:
             drift = (time - state.time) * state.memory["half_velocity"][nodes]
         applies = self.applicable(nodes, free, poses)
-        acting = self.acting(nodes, free, poses, self._part) if others else None
         planes = np.empty((0, w, 3)), np.empty((0, w))
         ways = self.ways(start, before, poses)
         self.find_faces(nodes, free, poses, 0.0)
         of_nodes = stiffness[nodes], self.fixed[nodes], applies, self.log.touching[nodes]
         for _ in range(_CURVED_ROUNDS):
             if others:
-                planes = self.planes(applies, at, poses, acting, nodes)
+                planes = self.planes(applies, at, poses, self.acting(nodes, free, poses, self._part), nodes)
             memory = [
                 array[nodes] if bounces else np.empty((len(nodes), 0)) for array in (walls.rebound, walls.arrival)
             ]

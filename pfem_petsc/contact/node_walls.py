@@ -473,6 +473,8 @@ class NodeWalls:
                 own, distances = self._faces[k].planes(nodes, poses.rest(k, x))
                 last = s + wall.faces
                 normals[:, s:last] = poses.turned(k, own)
+                if acting is not None and self.motion.turning[k]:
+                    normals[:, s:last] = acting[:, s:last]
                 along = np.einsum("mwi,mi->mw", normals[:, s:last], x)
                 offsets[:, s:last] = np.where(np.isfinite(distances), along - distances, -np.inf)
                 continue
@@ -531,6 +533,9 @@ class NodeWalls:
         acting = np.zeros((len(x), len(self.wall_of), 3))
         between = self.motion.poses(earlier.time + part * (poses.time - earlier.time)) if len(poses.turns) else poses
         for k, s in enumerate(self.first):
+            if k in self._faces:  # faces are flat: their normals are those of where the body is there
+                own, _ = self._faces[k].planes(nodes, poses.rest(k, x))
+                acting[:, s : s + self.walls[k].faces] = between.turned(k, own)
             if self.flat[s] or k in self._faces:
                 continue
             end, before = poses.rest(k, x), earlier.rest(k, start)

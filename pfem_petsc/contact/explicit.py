@@ -698,8 +698,8 @@ class ExplicitContact(NodeWalls):
             )
             given = Arrivals(start, ways, drift, *of_nodes, *memory, *planes)
             failed, why, found, force, touching, friction = press_nodes(places, given, reference, sums, *kind_of(walls))
-            more = self.find_faces(nodes, places, poses, tolerance)
-            if failed >= 0 or not others or (np.abs(places - at).max() <= tolerance and not more):
+            settled = failed >= 0 or not others or np.abs(places - at).max() <= tolerance
+            if settled and not self.find_faces(nodes, places, poses, tolerance):
                 break
             at = places
         else:

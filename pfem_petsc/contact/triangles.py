@@ -326,7 +326,7 @@ def _behind(triangles, start, place, tolerance, least):
     if face < 0:
         return face
     border = triangles.normals[face, feature]
-    if (abs(distance) if both else distance) - clearance >= -least or (border == 0.0).all():
+    if (abs(distance) if both else distance) - clearance >= -least or border[0] == border[1] == border[2] == 0.0:
         return -1
     return face if both or _gap(triangles, face, start) - clearance >= -max(tolerance, triangles.limits[0, 2]) else -1
 
@@ -351,15 +351,14 @@ def faces_at(triangles, start, free, fixed, tolerance, normals, offsets):
     int
         Number of planes.
     """
-    offsets[:] = -math.inf
     clearance, rounding = triangles.limits[0, 1], triangles.limits[0, 2]
-    if _behind(triangles, start, free, tolerance, 0.0) < 0 and _crossed(triangles, start, free, tolerance, 0.0) < 0:
-        return 0
-    place, held, moves = np.empty((1, 3)), fixed.copy().reshape(1, 3), np.empty((1, 3))
+    place, held, moves = np.empty((1, 3)), np.empty((1, 3), np.bool_), np.empty((1, 3))
     planes, levels = np.zeros((1, 3, 3)), np.empty((1, 3))
     count = 0
     for sweeps in range(2):
-        place[0], levels[:], moves[:], count = free, -math.inf, 0.0, 0
+        count = 0
+        for c in range(3):
+            place[0, c], held[0, c], levels[0, c], moves[0, c] = free[c], fixed[c], -math.inf, 0.0
         for _ in range(_ROUNDS):
             least = rounding if count else 0.0
             behind = _behind(triangles, start, place[0], tolerance, least)
@@ -379,7 +378,8 @@ def faces_at(triangles, start, free, fixed, tolerance, normals, offsets):
                 planes[0, slot, c] = side * triangles.normals[face, 0, c]
                 level += planes[0, slot, c] * triangles.points[face, 0, c]
             levels[0, slot], count = level, max(count, slot + 1)
-            place[0] = free
+            for c in range(3):
+                place[0, c] = free[c]
             if project(place, held, planes, levels, rounding, moves) >= 0:
                 face = -1  # the caller finds the same
                 break
@@ -387,12 +387,14 @@ def faces_at(triangles, start, free, fixed, tolerance, normals, offsets):
             break
     if face >= 0:  # more than three planes: the node stays where it is
         way = math.sqrt(_square(start, free))
-        levels[:], count = -math.inf, 1
-        levels[0, 0] = 0.0
+        levels[0, 0], levels[0, 1], levels[0, 2], count = 0.0, -math.inf, -math.inf, 1
         for c in range(3):
             planes[0, 0, c] = (start[c] - free[c]) / way
             levels[0, 0] += planes[0, 0, c] * start[c]
-    normals[:], offsets[:] = planes[0], levels[0]
+    for k in range(3):
+        offsets[k] = levels[0, k]
+        for c in range(3):
+            normals[k, c] = planes[0, k, c]
     return count
 
 

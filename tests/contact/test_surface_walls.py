@@ -194,12 +194,15 @@ def test_bars_through_bodies_and_sheets_are_found(tmp_path):
 
 def test_pictures_have_the_triangles_with_outlines(tmp_path):
     path = tmp_path / "shape.obj"
-    for (points, corners), lines in (((POINTS, CORNERS), 12), (ball(3), 0), (groove(), 7)):
+    for (points, corners), lines in (((POINTS, CORNERS), 12), (ball(3), 3 * 32), (groove(), 7)):
         path.write_bytes(obj(points, corners.tolist()))
         drawn = surface.surface(surface.Parameters(name="w", type="surface", file=str(path)), np.zeros((2, 3)))
         assert drawn.faces.shape == corners.shape
         assert len(drawn.edge) == lines
         assert drawn.depth.shape == drawn.points.shape[:1]
+        if lines == 96:  # three circles, which have points on all axes' planes
+            on = np.abs(drawn.points[drawn.edge]).max(axis=1) < 1e-12
+            assert on.any(axis=1).all() and (np.linalg.norm(drawn.points, axis=1) > 0.99).all()
 
 
 def test_files_are_relative_to_the_case_and_known_by_their_content(tmp_path):

@@ -199,4 +199,24 @@ def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:
     np.add.at(total, number.ravel(), np.repeat(normals, 3, axis=0))
     # the sum of two unit vectors has the squared length 2 + 2 cos
     sharp = (count == 1) | ((total**2).sum(axis=1) < 2.0 + 2.0 * _SHARP)
-    return Surface(parameters.name, wall.points, wall.corners, np.zeros(len(wall.points)), ends[sharp])
+    points, lines = wall.points, ends[sharp]
+    if not len(lines):
+        points, lines = _with_sections(points, ends, number, wall.centre)
+    return Surface(parameters.name, points, wall.corners, np.zeros(len(points)), lines)
+
+
+def _with_sections(
+    points: np.ndarray, ends: np.ndarray, number: np.ndarray, centre: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points, and the lines (e, 2) where planes across the axes through the centre intersect triangles, from
+    which one sees that a surface is round; ``ends`` (e, 2) of edges, ``number`` (t, 3) of the sides of triangles."""
+    every, lines = [points], []
+    for axis in range(3):
+        heights = points[ends, axis] - centre[axis]
+        cut = (heights[:, 0] >= 0.0) != (heights[:, 1] >= 0.0)
+        part = heights[cut, :1] / (heights[cut, :1] - heights[cut, 1:])
+        place = np.cumsum(cut) - 1 + sum(map(len, every))
+        every.append(points[ends[cut, 0]] + part * (points[ends[cut, 1]] - points[ends[cut, 0]]))
+        lines.append(place[number[cut[number]]].reshape(-1, 2))  # each triangle has two sides of these, or none
+    points, drawn = np.concatenate(every), np.concatenate(lines)
+    return points, drawn[(points[drawn[:, 0]] != points[drawn[:, 1]]).any(axis=1)]

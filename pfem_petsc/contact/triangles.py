@@ -410,9 +410,9 @@ def signed_distances(triangles, k, x, reach, distances, faces, places):
 
 
 @kernel
-def stopping_faces(triangles, k, ways, tolerance, normals, offsets):
-    """Write :func:`faces_at` of nodes without supports that move from ``ways[0]`` to ``ways[1]``, (2, m, 3) relative to
-    surface k, with the tolerance (m,), into normals (m, 3, 3) and offsets (m, 3)."""
-    one, fixed = surface(triangles, k), np.zeros(3, np.bool_)
+def stopping_faces(triangles, k, ways, fixed, tolerance, normals, offsets):
+    """Write :func:`faces_at` of nodes that move from ``ways[0]`` to ``ways[1]``, (2, m, 3) relative to surface k, with
+    the ``fixed`` components (m, 3) bool and the tolerance (m,), into normals (m, 3, 3) and offsets (m, 3)."""
+    one = surface(triangles, k)
     for i in range(ways.shape[1]):
-        faces_at(one, ways[0, i], ways[1, i], fixed, tolerance[i], normals[i], offsets[i])
+        faces_at(one, ways[0, i], ways[1, i], fixed[i], tolerance[i], normals[i], offsets[i])

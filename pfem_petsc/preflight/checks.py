@@ -108,7 +108,8 @@ def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
     entries = {"parts": "all bars are connected" if count == 1 else f"{count} that no bar connects"}
     rigidity = geometry.rigidity()
     entries |= {"rigidity": rigidity} if rigidity else {}
-    entries |= {f"wall {name}": text for name, text in wall_gaps(model)[0].items()}
+    notes = {name: getattr(wall, "note", "") for name, wall in zip(model.contact.names, model.contact.walls)}
+    entries |= {f"wall {name}": text + notes[name] for name, text in wall_gaps(model)[0].items()}
     period, advice = _period(model)
     entries, warnings = entries | period, warnings + advice
     if not _is_own(case):

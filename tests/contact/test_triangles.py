@@ -18,12 +18,13 @@ def query(triangles, x, reach=np.inf, part=0):
     return distances, faces, places
 
 
-def stopped(triangles, start, free, tolerance=1e-9, part=0):
+def stopped(triangles, start, free, tolerance=1e-9, part=0, fixed=None):
     """Where nodes get to, and the planes that stop them."""
+    fixed = np.zeros((len(free), 3), bool) if fixed is None else fixed
     normals, offsets = np.zeros((len(free), 3, 3)), np.zeros((len(free), 3))
     ways = np.stack([start, free])
-    stopping_faces(by_reference(triangles), part, ways, np.full(len(free), tolerance), normals, offsets)
-    end, fixed = free.copy(), np.zeros((len(free), 3), bool)
+    stopping_faces(by_reference(triangles), part, ways, fixed, np.full(len(free), tolerance), normals, offsets)
+    end = free.copy()
     assert project(end, fixed, normals, offsets, 1e-13, np.empty((len(free), 3))) == -1
     return end, normals, offsets
 
@@ -189,6 +190,42 @@ def test_nodes_on_random_ways_stay_in_front(name, turned, size):
         x = np.clip(end, -1.6, 1.6)
     convex = name != "torus" and not turned
     assert most == 1 if convex else most > (size > 0.05)
+
+
+@pytest.mark.parametrize("size", [0.02, 0.4])
+def test_a_sheet_keeps_nodes_on_the_side_they_come_from(size):
+    """A bag, with nodes inside and outside, that are pushed against it at random."""
+    bag = Triangles.of(*BODIES["ball"], True, 1e-6)
+    rng = np.random.default_rng(8)
+    x = rng.normal(size=(150, 3))
+    x *= (rng.choice([0.9, 1.1], 150) / np.linalg.norm(x, axis=1))[:, None]
+    x = x[np.abs(query(bag, x)[0]) > 1e-6]
+    side = query(bag, x)[0] > 0.0
+    assert 20 < side.sum() < len(x) - 20
+    met = np.zeros(len(x), bool)
+    for _ in range(60):
+        free = x + size * rng.normal(size=x.shape)
+        x, _, offsets = stopped(bag, x, free)
+        met |= np.isfinite(offsets).any(axis=1)
+        distances = query(bag, x)[0]
+        np.testing.assert_array_equal(distances > 0.0, side)
+        assert np.abs(distances).min() > 1e-6 - 1e-12
+        far = np.linalg.norm(x, axis=1) > 1.3
+        x[far] *= 1.2 / np.linalg.norm(x[far], axis=1)[:, None]
+    assert met.mean() > 0.4
+
+
+def test_nodes_move_in_the_directions_that_supports_leave_free():
+    """Down a vertical line, and along a horizontal one, onto the slopes of a groove."""
+    triangles = Triangles.of(*groove())
+    start = np.array([[0.5, 0.1, 1.0], [-1.0, 0.2, 0.6], [0.0, 0.0, 0.3]])
+    free = np.array([[0.5, 0.1, -1.0], [-1.5, 0.2, 0.6], [0.0, 0.0, -0.2]])
+    fixed = np.array([[True, True, False], [False, True, True], [True, True, False]])
+    end, _, offsets = stopped(triangles, start, free, fixed=fixed)
+    np.testing.assert_allclose(end, [[0.5, 0.1, 0.25], [-1.2, 0.2, 0.6], [0.0, 0.0, 0.0]], atol=1e-14)
+    assert np.isfinite(offsets).any(axis=1).all()
+    held = stopped(triangles, start[:1], free[:1], fixed=np.ones((1, 3), bool))[0]
+    np.testing.assert_array_equal(held, free[:1])
 
 
 def test_thin_plate_and_sheets_stop_fast_nodes():

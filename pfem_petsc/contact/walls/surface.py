@@ -71,9 +71,10 @@ class Wall(BaseWall):
 
     Attributes
     ----------
-    triangles, compiled : :class:`~pfem_petsc.contact.triangles.Triangles`, as they are and for loops
+    triangles : :class:`~pfem_petsc.contact.triangles.Triangles`, for loops
     points : (n, 3) float64 [m]; corners : (t, 3) int64
     closed : whether every edge has two triangles; then nodes behind the surface are inside a body
+    note : what the check before a run tells of it
     """
 
     faces = 3
@@ -95,8 +96,9 @@ class Wall(BaseWall):
         extents = np.sort(np.ptp(self.points, axis=0))
         thickness = _THIN * extents[2] if parameters.thickness is None else parameters.thickness
         self.triangles = Triangles.of(self.points, self.corners, both, 0.5 * thickness * both)
-        self.compiled = by_reference(self.triangles)
+        self._compiled = by_reference(self.triangles)
         self.closed = bool((self._edges[1] == 2).all())
+        self.note = f", {len(self.corners)} triangles, {'closed' if self.closed else 'open'}"
         self.centre = 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))
         a, b, c = (self.points[self.corners[:, k]] - self.centre for k in range(3))
         holds = self.closed and not both and np.einsum("ti,ti->", a, np.cross(b, c)) < 0.0  # nodes are inside
@@ -105,7 +107,7 @@ class Wall(BaseWall):
     def _nearest(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return signed distances (m,) of positions (m, 3), the nearest faces (m,) and places (m, 3)."""
         distances, faces, places = np.empty(len(x)), np.empty((len(x), 2), np.int64), np.empty((len(x), 3))
-        signed_distances(self.compiled, 0, np.ascontiguousarray(x), np.inf, distances, faces, places)
+        signed_distances(self._compiled, 0, np.ascontiguousarray(x), np.inf, distances, faces, places)
         return distances, faces[:, 0], places
 
     def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -136,9 +138,10 @@ class Wall(BaseWall):
             inside = self.gaps((starts + parts * (ends - starts)).reshape(-1, 3)).reshape(len(parts), -1)
             return inside.min(axis=0) < -_DEEP * self.width
         apart = np.minimum(self.gaps(starts), self.gaps(ends)) > _APART * np.linalg.norm(ends - starts, axis=1)
-        normals, offsets = np.empty((len(starts), 3, 3)), np.empty((2, len(starts), 3))
+        n = len(starts)
+        free, normals, offsets = np.zeros((n, 3), dtype=bool), np.empty((n, 3, 3)), np.empty((2, n, 3))
         for k, ways in enumerate((np.stack([starts, ends]), np.stack([ends, starts]))):
-            stopping_faces(self.compiled, 0, ways, np.zeros(len(starts)), normals, offsets[k])
+            stopping_faces(self._compiled, 0, ways, free, np.zeros(n), normals, offsets[k])
         return apart & np.isfinite(offsets).any(axis=(0, 2))
 
 

@@ -351,7 +351,7 @@ def faces_at(triangles, start, free, fixed, tolerance, normals, offsets):
     int
         Number of planes.
     """
-    clearance, rounding = triangles.limits[0, 1], triangles.limits[0, 2]
+    both, clearance, rounding = triangles.limits[0, 0] > 0.0, triangles.limits[0, 1], triangles.limits[0, 2]
     place, held, moves = np.empty((1, 3)), np.empty((1, 3), np.bool_), np.empty((1, 3))
     planes, levels = np.zeros((1, 3, 3)), np.empty((1, 3))
     count = 0
@@ -363,7 +363,7 @@ def faces_at(triangles, start, free, fixed, tolerance, normals, offsets):
             least = rounding if count else 0.0
             behind = _behind(triangles, start, place[0], tolerance, least)
             crossed = _crossed(triangles, start, place[0], tolerance, least)
-            face = crossed if sweeps and crossed >= 0 else behind
+            face = crossed if (sweeps or both) and crossed >= 0 else behind
             if face < 0 and crossed >= 0:  # the nearest faces do not stop the node on its way
                 face = crossed
                 break
@@ -372,7 +372,9 @@ def faces_at(triangles, start, free, fixed, tolerance, normals, offsets):
                 slot = k if moves[0, k] == 0.0 else slot
             if face < 0 or slot == 3:
                 break
-            side = -1.0 if triangles.limits[0, 0] > 0.0 and _gap(triangles, face, start) < 0.0 else 1.0
+            # what has not passed through a sheet is on its own side, even if the face of the start has another one
+            gap = _gap(triangles, face, start) if face == crossed else _gap(triangles, face, place[0])
+            side = -1.0 if both and gap < 0.0 else 1.0
             level = clearance
             for c in range(3):
                 planes[0, slot, c] = side * triangles.normals[face, 0, c]

@@ -215,6 +215,20 @@ def test_a_sheet_keeps_nodes_on_the_side_they_come_from(size):
     assert met.mean() > 0.4
 
 
+def test_a_node_passes_the_ridge_of_a_sheet_on_its_side():
+    """It starts behind the plane of the face that it ends at, but has not passed through the sheet."""
+    points, corners = groove()
+    ridge = Triangles.of(points * [1.0, 1.0, -1.0], corners[:, ::-1], True, 0.01)
+    normal = np.array([1.0, 0.0, 2.0]) / np.sqrt(5.0)  # of the right face, upwards
+    foot = np.array([[-0.2, 0.0, 0.1], [0.5, 0.0, -0.25]])
+    start, free = foot + np.array([-0.001, 0.006])[:, None] * normal
+    for turned in (1.0, -1.0):
+        sheet = ridge if turned > 0.0 else Triangles.of(points * [1.0, 1.0, -1.0], corners, True, 0.01)
+        end, _, offsets = stopped(sheet, start[None], free[None])
+        assert np.isfinite(offsets).sum() == 1
+        np.testing.assert_allclose(end[0], foot[1] + 0.01 * normal, atol=1e-14)
+
+
 def test_nodes_move_in_the_directions_that_supports_leave_free():
     """Down a vertical line, and along a horizontal one, onto the slopes of a groove."""
     triangles = Triangles.of(*groove())

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, ValidationInfo, model_validator
 
-from ...case.base import FileName, NonNegativeFloat, PositiveFloat, Vector3, refusal
+from ...case.base import FileName, PositiveFloat, Vector3, refusal
 from ...case.files import digest_of
 from ...errors import InputError
 from ...formats import read_triangles
@@ -45,14 +45,14 @@ class Parameters(WallKeys):
     """where nodes may be: in front of the triangles, whose corners are then counter-clockwise, or on either side"""
     flip: bool = False
     """true: the front is where the file has the back"""
-    thickness: NonNegativeFloat | None = None
+    thickness: PositiveFloat | None = None
     """of a surface that stops nodes from both sides [m], half of it on each; default: 1e-6 of its size"""
     digest: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
     """SHA-256 of the content of the file, which results and checkpoints keep; default: that of the file"""
 
     @model_validator(mode="after")
     def _found(self, info: ValidationInfo) -> Parameters:
-        if self.side == "front" and (self.thickness is not None):
+        if self.side == "front" and self.thickness is not None:
             raise ValueError('thickness is that of a surface with side = "both"')
         if self.side == "both" and self.flip:
             raise ValueError('flip has no effect on a surface with side = "both"')
@@ -71,7 +71,7 @@ class Wall(BaseWall):
 
     Attributes
     ----------
-    triangles : :class:`~pfem_petsc.contact.triangles.Triangles`, for loops
+    triangles, compiled : :class:`~pfem_petsc.contact.triangles.Triangles`, as they are and for loops
     points : (n, 3) float64 [m]; corners : (t, 3) int64
     closed : whether every edge has two triangles; then nodes behind the surface are inside a body
     note : what the check before a run tells of it
@@ -83,7 +83,7 @@ class Wall(BaseWall):
         where = f"wall {parameters.name!r}: file: "
         path = Path(parameters.file)
         points, corners = read_triangles(path, where)
-        if parameters.digest not in (None, digest_of(path)):
+        if parameters.digest and parameters.digest != digest_of(path):
             raise InputError(
                 f"{where}{path}: is not the file that the case was made with (digest {parameters.digest[:12]}...): "
                 "restore it, or start a new run without the key digest"
@@ -96,7 +96,7 @@ class Wall(BaseWall):
         extents = np.sort(np.ptp(self.points, axis=0))
         thickness = _THIN * extents[2] if parameters.thickness is None else parameters.thickness
         self.triangles = Triangles.of(self.points, self.corners, both, 0.5 * thickness * both)
-        self._compiled = by_reference(self.triangles)
+        self.compiled = by_reference(self.triangles)
         self.closed = bool((self._edges[1] == 2).all())
         self.note = f", {len(self.corners)} triangles, {'closed' if self.closed else 'open'}"
         self.centre = 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))
@@ -107,7 +107,7 @@ class Wall(BaseWall):
     def _nearest(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return signed distances (m,) of positions (m, 3), the nearest faces (m,) and places (m, 3)."""
         distances, faces, places = np.empty(len(x)), np.empty((len(x), 2), np.int64), np.empty((len(x), 3))
-        signed_distances(self._compiled, 0, np.ascontiguousarray(x), np.inf, distances, faces, places)
+        signed_distances(self.compiled, 0, np.ascontiguousarray(x), np.inf, distances, faces, places)
         return distances, faces[:, 0], places
 
     def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -141,7 +141,7 @@ class Wall(BaseWall):
         n = len(starts)
         free, normals, offsets = np.zeros((n, 3), dtype=bool), np.empty((n, 3, 3)), np.empty((2, n, 3))
         for k, ways in enumerate((np.stack([starts, ends]), np.stack([ends, starts]))):
-            stopping_faces(self._compiled, 0, ways, free, np.zeros(n), normals, offsets[k])
+            stopping_faces(self.compiled, 0, ways, free, np.zeros(n), normals, offsets[k])
         return apart & np.isfinite(offsets).any(axis=(0, 2))
 
 

@@ -10,6 +10,7 @@ from helpers.triangles import ball, box, groove
 from pfem_petsc import Case
 from pfem_petsc.contact.walls import surface
 from pfem_petsc.errors import InputError
+from pfem_petsc.post.motion import wall_surfaces
 
 POINTS, CORNERS = box((-1.0, -2.0, 0.0), (1.0, 2.0, 0.5))
 QUADS = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]]
@@ -203,6 +204,18 @@ def test_pictures_have_the_triangles_with_outlines(tmp_path):
         if lines == 96:  # three circles, which have points on all axes' planes
             on = np.abs(drawn.points[drawn.edge]).max(axis=1) < 1e-12
             assert on.any(axis=1).all() and (np.linalg.norm(drawn.points, axis=1) > 0.99).all()
+
+
+def test_a_picture_is_drawn_without_a_file_that_is_gone(tmp_path):
+    path = tmp_path / "shape.obj"
+    path.write_bytes(FILES["quads.obj"])
+    parameters = surface.Parameters(name="anvil", type="surface", file=str(path))
+    notes = []
+    assert len(wall_surfaces([parameters], np.zeros((2, 3)), notes.append)) == 1
+    path.unlink()
+    assert wall_surfaces([parameters], np.zeros((2, 3)), notes.append) == []
+    (note,) = notes
+    assert note.startswith("wall 'anvil' is left out of the picture: ") and "there is no file" in note
 
 
 def test_files_are_relative_to_the_case_and_known_by_their_content(tmp_path):

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 _SAME = 1.0 - 1e-10
 """Cosine between the normals of faces of one plane."""
 
+_BEHIND = 2
+"""Mark of nodes that are behind an open surface, which they have passed beside; of others in this step 1, else 0."""
+
 
 @inlined
 def _tangent(triangles, i, x, reach, normals, offsets):
@@ -63,7 +66,7 @@ def _mark_near(triangles, starts, ends, reach, slack, near):
     clearance, root = triangles.limits[0, 1], triangles.boxes[1]
     for i in range(len(ends)):
         limit = reach[i] if len(reach) > 1 else reach[0]
-        least, apart = max(limit, 0.0) + clearance, False
+        least, apart = max(limit, 0.0) + clearance + slack[i], False
         for c in range(3):
             low, high = min(starts[i, c], ends[i, c]), max(starts[i, c], ends[i, c])
             apart = apart or low > root[c + 3] + least or high < root[c] - least
@@ -71,7 +74,7 @@ def _mark_near(triangles, starts, ends, reach, slack, near):
             continue
         if limit > 0.0:
             distance, _, _, _, _, _ = nearest(triangles, ends[i, 0], ends[i, 1], ends[i, 2], least)
-            near[i] = abs(distance) < least
+            near[i] = abs(distance) < max(limit, 0.0) + clearance
         if not near[i] and faces_at(triangles, starts[i], ends[i], fixed, slack[i], normals, offsets) > 0:
             for k in range(3):
                 gap = -offsets[k]
@@ -104,23 +107,26 @@ def _put(i, normal, offset, table, kept):
 @kernel
 def _find(triangles, nodes, ways, tolerance, table, kept):
     """Find the planes of nodes (m,) on their ways; return whether any changed. ``ways``: starts and ends (m, 3), fixed
-    (m, 3) bool, and by how much each may have been behind the surface (m,) [m]; ``table``: which nodes are known
-    (owned,), their normals (owned, 3, 3) and offsets (owned, 3); ``kept``: normals (owned, 9) of the planes of earlier
+    (m, 3) bool, and by how much each may have been behind the surface (m,) [m]; ``table``: marks of nodes (owned,), their normals (owned, 3, 3) and offsets (owned, 3); ``kept``: normals (owned, 9) of the planes of earlier
     steps, and which of these they touch (owned, 3) bool."""
     starts, ends, fixed, slack = ways
     known, normals, offsets = table
-    changed = False
+    changed, both = False, triangles.limits[0, 0] > 0.0
     own, level = np.zeros((1, 3, 3)), np.empty((1, 3))
     for j in range(len(nodes)):
         i, x, gaps = nodes[j], ends[j], np.empty(3)
         if not known[i]:
-            known[i] = changed = True
+            known[i], offsets[i, :], changed = 1, -math.inf, True
             if faces_at(triangles, starts[j], x, fixed[j], slack[j], own[0], level[0]) == 0 and tolerance > 0.0:
+                if not both and _tangent(triangles, 0, starts[j], math.inf, own, level) < -slack[j]:
+                    known[i] = _BEHIND
+                    continue
                 _tangent(triangles, 0, x, math.inf, own, level)
-            offsets[i, :] = -math.inf
             for k in range(3):
                 if level[0, k] > -math.inf:
                     _put(i, own[0, k], level[0, k], table, kept)
+            continue
+        if known[i] == _BEHIND:
             continue
         distance = _tangent(triangles, 0, x, math.inf, own, level)
         on, worst = False, 0
@@ -154,11 +160,11 @@ class TouchedFaces:
 
     def __init__(self, wall: Wall, n_owned: int) -> None:
         self._triangles = wall.compiled
-        self._table = np.zeros(n_owned, dtype=bool), np.zeros((n_owned, 3, 3)), np.full((n_owned, 3), -np.inf)
+        self._table = np.zeros(n_owned, dtype=np.int8), np.zeros((n_owned, 3, 3)), np.full((n_owned, 3), -np.inf)
 
     def forget(self) -> None:
         """Begin a step."""
-        self._table[0][:] = False
+        self._table[0][:] = 0
 
     def near(self, starts: np.ndarray, ends: np.ndarray, reach: np.ndarray, slack: np.ndarray) -> np.ndarray:
         """Return (n,) bool: nodes that move from ``starts`` to ``ends`` (n, 3) [m] and come within ``reach``, (n,) or
@@ -194,7 +200,7 @@ class TouchedFaces:
             if nodes is None
             else (normals[nodes], offsets[nodes])
         )
-        at = np.arange(len(x)) if nodes is None else np.flatnonzero(~known[nodes])
+        at = np.arange(len(x)) if nodes is None else np.flatnonzero(known[nodes] == 0)
         if len(at):
             own, level = np.zeros((len(at), 3, 3)), np.empty((len(at), 3))
             tangent_planes(self._triangles, np.ascontiguousarray(x[at]), own, level)

@@ -27,6 +27,7 @@ class FixedRows(NamedTuple):
     along : (2, p) squared lengths of the free parts of the directions
     totals : (tables, 3) room for the forces on the second nodes of each table [N]
     force, closed : (p,) forces [N]; bool, rows that have closed and not opened since; both are overwritten
+    restitution : (p,)
     """
 
     table_starts: np.ndarray
@@ -41,6 +42,7 @@ class FixedRows(NamedTuple):
     totals: np.ndarray
     force: np.ndarray
     closed: np.ndarray
+    restitution: np.ndarray
 
 
 class ClosingRows(NamedTuple):
@@ -51,6 +53,7 @@ class ClosingRows(NamedTuple):
     along: np.ndarray
     force: np.ndarray
     closed: np.ndarray
+    restitution: np.ndarray
 
 
 class TwoNodeRows:
@@ -83,7 +86,8 @@ class TwoNodeRows:
         parts = self._free * self.normals**2
         self.along = (parts[:, :, 0] + parts[:, :, 1]) + parts[:, :, 2]
         p = len(self.at)
-        self.record = ClosingRows(self.normals, self.least, self.along, np.zeros(p), np.zeros(p, dtype=bool))
+        changing = np.zeros(p), np.zeros(p, dtype=bool)
+        self.record = ClosingRows(self.normals, self.least, self.along, *changing, rows.restitution[self.at])
 
     def arrays(self, stiffness: np.ndarray, some: bool) -> FixedRows:
         """Return the rows, or none unless ``some``, for compiled steps, without forces.
@@ -108,6 +112,7 @@ class TwoNodeRows:
             totals=np.zeros((tables, 3)),
             force=np.zeros(p),
             closed=np.zeros(p, dtype=bool),
+            restitution=self.record.restitution[:p].copy(),
         )
 
     def gather(self, values: np.ndarray) -> np.ndarray:
@@ -182,5 +187,5 @@ def close_rows(rows, at, ends, counted, slack):
         if fresh and speed < 0.0 and counted[p]:
             square = max(speed * speed - 2.0 * pull * max(distance, 0.0), 0.0)
             gives = along[0, p] / ends[0, m, 9] + along[1, p] / ends[1, m, 9]
-            energy += 0.5 * square / max(gives, 1e-300)
+            energy += 0.5 * square / max(gives, 1e-300) * (1.0 - rows.restitution[p] * rows.restitution[p])
     return energy

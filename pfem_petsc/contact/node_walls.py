@@ -287,9 +287,8 @@ class NodeWalls:
                 self.members[:, k] = False
                 self.members[nodes[wall.node_set], k] = True
         self.log = ContactLog(mesh.n_owned, len(walls))
-        self.friction = np.array([wall.friction for wall in walls], dtype=np.float64)
-        static = [wall.friction if wall.static_friction is None else wall.static_friction for wall in walls]
-        self.static_friction = np.array(static, dtype=np.float64)
+        friction = np.array([wall.friction_coefficients for wall in walls], dtype=np.float64).reshape(-1, 2)
+        self.friction, self.static_friction = np.ascontiguousarray(friction.T)
         self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)
         self.rebounds = False
         self.has_friction = bool(self.static_friction.any())

@@ -83,7 +83,7 @@ class CalledRows(NamedTuple):
     predictor, u : (n, 3) positions to which nodes move without forces, and increments; (0, 3) without calls
     held, changing : (n,) nodes on which rows press, ascending; nodes of rows whose force begins or ends
     counts : (2,) their numbers
-    loss : (1,) energy that closing rows lose [J]
+    loss : (2,) energy that closing rows lose, and that friction of rows dissipates in the next step [J]
     """
 
     any: bool
@@ -322,8 +322,9 @@ def solve_called(s, step):
 
 @addressed
 def join_pressing(s, step):
-    """Find all nodes with contact forces, and the work of these."""
+    """Find all nodes with contact forces, the work of these, and what friction takes."""
     contacts = s.contacts
+    contacts.friction += s.called.loss[1]
     contacts.pressing = join_nodes(contacts.near, contacts.others, s.walls.present)
     work_of_contact(contacts.pressing, s.motion, s.sums)
 

@@ -211,7 +211,7 @@ class ConstraintSet:
         self._turning = self.mesh.comm.allreduce(not rows.fixed.all(), op=MPI.LOR)
         self.walled = self._walls.everywhere
         self.alone = not self.walled and self.mesh.comm.allreduce(self.two.every, op=MPI.LAND)
-        own = rows.partners.alone and not (self.dynamic or rows.rubs or rows.restitution.any())
+        own = rows.partners.alone and not (self.dynamic or rows.rubs or rows.rebounds)
         self.separate = self.alone and self.mesh.comm.allreduce(own, op=MPI.LAND)
         self._x = np.empty((len(rows.numbers), 3))
         self._exported: FixedRows | None = None  # for nodes of the stiffness

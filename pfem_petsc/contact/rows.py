@@ -321,7 +321,7 @@ class RowSet:
     groups : Groups; group_of_row, group_of_node : (r,), (n,)
     pairs : nodes (2, r), directions (r, 3) and bounds (r,) if these are all that the rows depend on, else None
     weights, friction, restitution : (r, k), (r, 2), (r,) see :class:`~pfem_petsc.contact.constraints.base.Constraint`
-    rubs : whether any row of the model has friction
+    rubs, rebounds : whether any table of rows of the model has friction, restitution
     """
 
     pairs: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
@@ -340,6 +340,7 @@ class RowSet:
         self.friction = np.array([source.friction for source in sources]).reshape(-1, 2)[self.source]
         self.restitution = np.array([source.restitution for source in sources], dtype=float)[self.source]
         self.rubs = any(source.friction[1] > 0.0 for source in sources)
+        self.rebounds = any(source.restitution > 0.0 for source in sources)
         self.weights = np.zeros(self.ends.shape)
         for source, first in zip(self.sources, self._first, strict=False):
             self.weights[first : first + len(source.nodes), : source.nodes.shape[1]] = source.weights()

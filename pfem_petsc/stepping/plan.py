@@ -378,7 +378,7 @@ def make_stepper(model: Model, plan: Plan) -> Stepper:
     stepper.plan = plan
     if treatment is not None:
         stepper.treatment = treatment(stepper)
-    elif model.contact.restitution.any() and not model.contact.rebounds:
+    elif (model.contact.restitution.any() or model.links.rows.rebounds) and not plan.scheme.solves_next_position:
         stepper.treatment = Restitution(stepper)
     if model.can_touch:
         _warn_of_gain(model, plan)
@@ -469,8 +469,11 @@ def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) ->
                 "friction"
             )
         model.links.rebounds |= _check_surface(model, plan, treatment, pair, key)
-        if pair.restitution and not model.links.rebounds:
-            raise InputError(f"{key}: restitution needs central_differences with lumped mass")
+        if pair.restitution and not (model.links.rebounds or (model.links.alone and not model.links.dynamic)):
+            raise InputError(
+                f"{key}: restitution of nodes that are in several pairs or constraints, or that walls stop as well, "
+                "needs central_differences"
+            )
 
 
 def _check_surface(model: Model, plan: Plan, treatment: type[Treatment] | None, keys: SurfaceKeys, key: str) -> bool:

@@ -26,6 +26,7 @@ def bodies(
     pair=None,
     pairs=True,
     on=None,
+    parameters=None,
     **tables,
 ):
     """Two level bars of three nodes, one on the other along z; all nodes of a body do the same."""
@@ -63,7 +64,7 @@ def bodies(
         ]
         if pairs
         else [],
-        "time": {"integrator": integrator, "step": 1e-3, "end": end},
+        "time": {"integrator": integrator, "step": 1e-3, "end": end, **(parameters or {})},
         "output": {"fields_every": 0},
         **tables,
     }

@@ -211,7 +211,7 @@ class ConstraintSet:
         self._turning = self.mesh.comm.allreduce(not rows.fixed.all(), op=MPI.LOR)
         self.walled = self._walls.everywhere
         self.alone = not self.walled and self.mesh.comm.allreduce(self.two.every, op=MPI.LAND)
-        own = rows.partners.alone and not (self.dynamic or rows.rubs or rows.rebounds)
+        own = rows.partners.alone and not self.dynamic
         self.separate = self.alone and self.mesh.comm.allreduce(own, op=MPI.LAND)
         self._x = np.empty((len(rows.numbers), 3))
         self._exported: FixedRows | None = None  # for nodes of the stiffness
@@ -385,13 +385,17 @@ class ConstraintSet:
             self._exported, self._exported_for = self.two.arrays(stiffness, self.separate), stiffness
         rows = self._exported
         if self.separate:
-            rows.force[:], rows.closed[:] = self.force, self.two.record.closed
+            rows.force[:], rows.closed[:], rows.drag[:] = self.force, self.two.record.closed, self.drag
+            if self.rows.rebounds:
+                rows.rebound[:], rows.arrival[:] = self.rebound, self.arrival
         return rows
 
     def import_rows(self, rows: FixedRows) -> None:
         """Take the forces after the last of the steps from rows that were exported."""
         if self.separate:
-            self.force = rows.force.copy()
+            self.force, self.drag = rows.force.copy(), rows.drag.copy()
+            if self.rows.rebounds:
+                self.rebound, self.arrival = rows.rebound.copy(), rows.arrival.copy()
             self.two.record.closed[:] = rows.closed
 
     def pressed(self) -> np.ndarray:

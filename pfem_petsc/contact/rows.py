@@ -597,15 +597,19 @@ class RowSet:
     def _solve(self, which: np.ndarray, system: System, tolerances: np.ndarray, size: float, pushes: RowPushes) -> None:
         group, why = project_groups(which, self.groups, system, tolerances, size, pushes)
         if group >= 0 and why == RUBS:
-            raise SimulationFailure(
-                f"the friction of nodes {self._shown(group)} in contact pairs and on walls did not converge: they may "
-                "be jammed between walls and supports; reduce the friction, free the nodes, or reduce time.step"
-            )
+            raise SimulationFailure(self.unsettled_message(group))
         if group >= 0:
             raise SimulationFailure(
                 f"no positions of nodes {self._shown(group)} satisfy their contact pairs, constraints, walls and "
                 "supports"
             )
+
+    def unsettled_message(self, group: int) -> str:
+        """Return the message about a group without a solution of its friction."""
+        return (
+            f"the friction of nodes {self._shown(group)} in contact pairs and on walls did not converge: they may be "
+            "jammed between walls and supports; reduce the friction, free the nodes, or reduce time.step"
+        )
 
     def _shown(self, group: int) -> str:
         _, _, starts, nodes = self.groups

@@ -160,7 +160,7 @@ class Course(NamedTuple):
     """How a step goes on, which compiled steps assign: whether increments and energies are needed; what
     :func:`~pfem_petsc.mechanics.internal_forces.internal_forces` returns; the number of shares of rows that are
     written; whether a condition holds here, and after :func:`agree` on any rank; the error code of MPI; and what a call
-    of Python returned."""
+    of Python returned, or 1 plus the number of a row without a solution."""
 
     keeps: bool
     needs_energies: bool
@@ -467,7 +467,7 @@ def run_compiled(s, phases, starts, due, flags):
     split_components(s.state.x, motion.x)
     split_components(s.state.half, motion.half)
     for step in range(count):
-        if course.failed >= 0 or turned >= 0 or pressed.failure[0] >= 0:
+        if course.failed >= 0 or turned >= 0 or pressed.failure[0] >= 0 or (course.unsolved != 0 and not calling):
             # the other ranks still need messages, until all know of the failure
             _perform(SEND, phases, starts, s, step)
             passed += 1

@@ -400,6 +400,9 @@ class CompiledSteps:
         if infeasible >= 0:
             node = pressed.nodes[infeasible]
             return self._at_balance(self.model.contact.placeless(node, why, pressed.normals, pressed.offsets))
+        if made[UNSOLVED] > 0:
+            rows = self.model.links.rows
+            return self._at_balance(rows.unsettled_message(int(rows.group_of_row[made[UNSOLVED] - 1])))
         return self._at_balance(self._called.failure) if made[UNSOLVED] else None
 
     def _at_balance(self, text: object) -> SimulationFailure:

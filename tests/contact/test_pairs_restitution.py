@@ -52,7 +52,7 @@ def test_impact_of_free_bodies(time, treatment, push, restitution, comm, shared_
     np.testing.assert_allclose(v[:, 1], 0.0, atol=1e-13)
     assert rows[-1]["impact_dissipation"] == pytest.approx(lost, rel=1e-10, abs=1e-15)
     assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-14
-    assert abs(rows[-1]["numerical_dissipation"]) < 1e-12
+    assert abs(rows[-1]["numerical_dissipation"]) < 1e-10
     given = np.array([row["momentum"] - row["external_impulse"] for row in rows])
     np.testing.assert_allclose(given, np.tile([0.1 * MASSES[1], 0.0, MASSES @ [0.2, -0.3]], (len(rows), 1)), atol=1e-13)
 

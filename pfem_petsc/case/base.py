@@ -286,6 +286,28 @@ class ConstraintKeys(StrictModel):
     """The kind of constraint: a module of ``pfem_petsc.contact.constraints``."""
 
 
+class SurfaceKeys(StrictModel):
+    """Keys of contacts that may rub and rebound."""
+
+    friction: NonNegativeFloat = 0.0
+    """coefficient of Coulomb friction"""
+    static_friction: NonNegativeFloat | None = None
+    """coefficient of static friction; default, and minimum: friction"""
+    restitution: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """coefficient of restitution: fraction of the normal velocity at which a node leaves after impact"""
+
+    @model_validator(mode="after")
+    def _rubs_more_at_rest(self) -> SurfaceKeys:
+        if self.static_friction is not None and self.static_friction < self.friction:
+            raise ValueError(f"static_friction must be no less than friction = {self.friction!r}")
+        return self
+
+    @property
+    def friction_coefficients(self) -> tuple[float, float]:
+        """The coefficients of dynamic and static friction."""
+        return self.friction, self.friction if self.static_friction is None else self.static_friction
+
+
 class WallParameters(WithFiles):
     """Keys of all walls; each type adds its own."""
 

@@ -30,6 +30,7 @@ from .base import (
     PositiveFloat,
     PositiveInt,
     StrictModel,
+    SurfaceKeys,
     Table2,
     Table4,
     Vector3,
@@ -646,7 +647,7 @@ class Temperature(_Interpolated):
     """the rows of ``table`` from the columns of a CSV or NPZ file: its name, or a table of :class:`TableFile`"""
 
 
-class ContactPair(StrictModel):
+class ContactPair(SurfaceKeys):
     """Nodes of two bodies that cannot pass each other along a direction, in pairs."""
 
     name: Name

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -16,14 +17,16 @@ from ..parallel.natural import NaturalOrder
 from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, ExpectedNodes, SetPart
+from .explicit import impact_square, rebound_way
 from .fixed_rows import FixedRows, TwoNodeRows
-from .rows import Planes, RowSet, free_positions, last_forces, push_nodes
+from .rows import FreeNodes, Planes, RowSet, WallsOfNodes, free_positions, last_forces, push_nodes
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..case.tables import ContactPair
     from ..mesh.distribution import DistributedMesh
     from .contact import Contact
+    from .wall_motion import Poses
 
 PACKAGE = "pfem_petsc.contact.constraints"
 
@@ -44,6 +47,10 @@ class PairRows(Constraint):
         self.ids = nodes[:, 1]
         self.normal = np.array(pair.direction) / np.linalg.norm(pair.direction)
         self.gap = float(pair.gap)
+        self.friction, self.restitution = pair.friction_coefficients, pair.restitution
+
+    def weights(self) -> np.ndarray:
+        return np.tile([-1.0, 1.0], (len(self.nodes), 1))
 
     def values(self, x: np.ndarray) -> np.ndarray:
         n, apart = self.normal, x[:, 1] - x[:, 0]
@@ -53,39 +60,104 @@ class PairRows(Constraint):
         return np.tile(np.stack([-self.normal, self.normal]), (len(x), 1, 1))
 
 
+class _WallStep(NamedTuple):
+    """A step in which walls may stop nodes (n,) of rows: the part of the way where forces act, its end [s]; at the
+    nodes: positions without contact and at the start of the step (n, 3) [m], walls that apply (n, w) bool; and of
+    walls with restitution displacements without forces (n, 3) [m], and the memory of the last step (n, w), see
+    :class:`~pfem_petsc.contact.explicit.Arrivals`."""
+
+    part: float
+    time: float
+    x: np.ndarray
+    start: np.ndarray
+    applies: np.ndarray
+    drift: np.ndarray
+    rebound: np.ndarray
+    arrival: np.ndarray
+
+
 class _WallsAtRows:
-    """The walls, which are flat, that can stop nodes of rows.
+    """The walls that can stop nodes of rows, in explicit steps.
 
     Attributes
     ----------
     any : whether there are any on this rank; everywhere : on any rank
     flags : how many flags of walls travel with the positions of nodes
     nodes : (m,) nodes of the rows that walls can stop
+    rubs, curved, ties : whether any wall of the model that meets rows has friction, is curved, is tied
     """
 
     def __init__(self, rows: RowSet, contact: Contact) -> None:
-        self._rows, self._contact = rows, contact
+        self._rows, self._contact, comm = rows, contact, rows.mesh.comm
         self._members = rows.gather(contact.members) > 0.0
         met = self._members.any(axis=1)
         self.nodes, self.any = np.flatnonzero(met), bool(met.any())
-        self.everywhere = bool(rows.mesh.comm.allreduce(self.any, op=MPI.LOR))
+        meets = comm.allreduce(self._members.sum(axis=0)) > 0
+        self.everywhere, self.meets = bool(meets.any()), meets
         self.flags = len(contact.wall_of) if self.everywhere and contact.partial else 0
+        self.rubs = bool((contact.static_friction > 0.0)[meets].any())
+        self.curved, self.ties = not contact.flat[meets].all(), bool(contact.ties.tying[meets].any())
         self._places = np.where(met, np.cumsum(met) - 1, -1)
         self._normals = np.tile(contact.normals, (len(self.nodes), 1, 1))
+        coefficients = np.stack([contact.friction, contact.static_friction], axis=1)
+        self._friction = np.tile(coefficients, (len(self.nodes) if self.rubs else 0, 1, 1))
 
-    def planes(self, x: np.ndarray, flags: np.ndarray, time: float) -> Planes:
-        """The planes at the nodes at x (n, 3), with ``flags`` (k, flags): walls that can stop nodes of other ranks."""
-        contact, nodes = self._contact, self.nodes
-        # bits must not depend on how many nodes this rank has, as those of a product of matrices do
-        along = sum(np.multiply.outer(x[nodes, c], contact.normals[:, c]) for c in range(3))
-        gaps = np.where(self._members[nodes], along - contact.plane_offsets(time), np.inf)
+    @property
+    def rebounds(self) -> bool:
+        """Whether restitution of a wall that meets rows is a bound on the next position."""
+        return self._contact.rebounds and bool((self._contact.restitution > 0.0)[self.meets].any())
+
+    def held(self, at: np.ndarray, time: float) -> np.ndarray:
+        """Return whether owned nodes (k,) are tied, as 1.0 or 0.0, and where to (k, 4)."""
+        held = np.zeros((len(self._contact.members), 4))
+        nodes, _, places = self._contact.ties.targets(time)
+        held[nodes] = np.column_stack([np.ones(len(nodes)), places])
+        return held[at]
+
+    def memory(self, at: np.ndarray) -> np.ndarray:
+        """Return rebound and arrival of owned nodes (k,) at all walls, (k, 2 w)."""
+        memory, none = self._contact.state.memory, np.zeros(self._contact.members.shape)
+        return np.column_stack([memory.get(name, none)[at] for name in ("rebound", "arrival")])
+
+    def applies(self, x: np.ndarray, flags: np.ndarray, time: float) -> np.ndarray:
+        """Return (n, w) bool: walls that can stop nodes that move to x (n, 3); ``flags`` (k, flags): those that can
+        stop nodes of other ranks."""
+        applies, where = self._members.copy(), self._rows.where
         if self.flags:
-            where = self._rows.where[nodes]
-            own = where >= 0
-            poses = contact.motion.poses(time)
-            gaps[own] = np.where(contact.applicable(where[own], x[nodes][own], poses), gaps[own], np.inf)
-            gaps[~own] = np.where(flags[-1 - where[~own]] > 0.0, gaps[~own], np.inf)
-        return self._places, self._normals, gaps
+            own, poses = where >= 0, self._contact.motion.poses(time)
+            applies[own] &= self._contact.applicable(where[own], x[own], poses)
+            applies[~own] &= flags[-1 - where[~own]] > 0.0
+        return applies
+
+    def planes(self, step: _WallStep, at: np.ndarray, pushed: np.ndarray) -> Planes:
+        """Return the planes of nodes at positions (n, 3), which rows alone push to positions (n, 3)."""
+        contact, nodes, x = self._contact, self.nodes, step.x[self.nodes]
+        poses, normals = contact.motion.poses(step.time), self._normals
+        if self.curved:
+            normals, offsets = self._tangents(step, at[nodes], poses)
+        else:
+            offsets = contact.plane_offsets(step.time)
+        # bits must not depend on how many nodes this rank has, as those of a product of matrices do
+        gaps = sum(x[:, c, None] * normals[:, :, c] for c in range(3)) - offsets
+        slips = np.empty((len(self._friction), len(contact.wall_of), 3))
+        if self.rubs:
+            start = step.start[nodes]
+            slips = (x - start)[:, None, :] - contact.ways(start, contact.motion.poses(contact.state.time), poses)
+        if len(step.rebound):
+            free = (pushed - step.start - step.drift)[nodes]
+            pull = -sum(free[:, c, None] * normals[:, :, c] for c in range(3))
+            rebounds = step.rebound[nodes]
+            ways = rebound_way(contact.restitution, rebounds, step.arrival[nodes], pull)
+            gaps -= np.where(rebounds > 0.0, np.maximum(ways - 0.5 * pull, 0.0), 0.0)
+        gaps = np.where(step.applies[nodes], gaps, np.inf)
+        return Planes(self._places, normals, gaps, self._friction, slips)
+
+    def _tangents(self, step: _WallStep, at: np.ndarray, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+        """Return tangent planes (m, w, 3), (m, w) at positions (m, 3); curved walls push along the normals where the
+        forces of the balance act, see :meth:`~pfem_petsc.contact.node_walls.NodeWalls.acting`."""
+        contact = self._contact
+        acting = contact.acting_from(step.start[self.nodes], step.x[self.nodes], poses, step.part)
+        return contact.planes(np.ones((len(at), len(contact.wall_of)), dtype=bool), at, poses, acting)
 
 
 class ConstraintSet:
@@ -98,6 +170,10 @@ class ConstraintSet:
     rows : RowSet, another one whenever the rows change
     force : (r,) of the rows here in the last step [N]; jacobian : (r, k, 3) gradients along which these act; the same
         on all ranks that have a row
+    drag : (r, 3) friction forces of the rows in the last step, times the weights of their nodes [N]
+    rebound, arrival : (r,) memory of rows that have closed, see :class:`~pfem_petsc.contact.explicit.Arrivals`
+    friction : energy that friction of the rows that this rank counts dissipates in the step solved for [J]
+    rebounds : whether restitution is a bound on the next position, for schemes that solve for the next position
     two : TwoNodeRows
     alone : whether all rows of the model are over two nodes that no other row and no wall stops, with fixed directions
     separate : whether moreover no ranks share rows, so that a pass over rows solves them, see :meth:`export_rows`
@@ -114,6 +190,7 @@ class ConstraintSet:
         self._sources: list[Constraint] = [_find_pairs(case, k, nodes, self.mesh) for k in range(self.n_pairs)]
         self._sources += [_source(case.source, keys, nodes, self.mesh) for keys in case.constraint]
         self.dynamic = any(source.dynamic for source in self._sources)
+        self.friction, self.rebounds = 0.0, False
         self._make()
 
     def _make(self) -> None:
@@ -141,6 +218,7 @@ class ConstraintSet:
     def release(self) -> None:
         """Set all forces to zero."""
         self.force, self.jacobian = np.zeros(len(self.rows.source)), self.rows.fixed_jacobian
+        self.drag, self.rebound, self.arrival = np.zeros((len(self.force), 3)), *np.zeros((2, len(self.force)))
 
     @property
     def state(self) -> dict[str, Any]:
@@ -181,15 +259,20 @@ class ConstraintSet:
         closed = np.zeros(len(self.force), dtype=np.uint8)
         closed[self.two.at] = self.two.record.closed
         counted = self.rows.counted
-        return {
-            "rows.force": self.force[counted],
-            "rows.gradients": self.jacobian[counted],
-            "rows.closed": closed[counted],
+        kept = {
+            "rows.force": self.force,
+            "rows.gradients": self.jacobian,
+            "rows.closed": closed,
+            "rows.drag": self.drag,
+            "rows.rebound": self.rebound,
+            "rows.arrival": self.arrival,
         }
+        return {name: values[counted] for name, values in kept.items()}
 
     def _take(self, counted: dict[str, np.ndarray], rows: RowSet) -> None:
         """Set the forces of all rows here from those of the rows counted in a set. Collective."""
-        self.force, jacobian, closed = (self.rows.of_counted(values, rows) for values in counted.values())
+        values = (self.rows.of_counted(values, rows) for values in counted.values())
+        self.force, jacobian, closed, self.drag, self.rebound, self.arrival = values
         self.jacobian = np.where(self.rows.fixed[:, None, None], self.rows.fixed_jacobian, jacobian)
         self.two.record.closed[:] = closed[self.two.at] > 0
 
@@ -213,8 +296,7 @@ class ConstraintSet:
         if self.dynamic:
             self.find(balance.predictor + u, np.zeros(len(u)), balance.time)
         rows, x, walls = self.rows, self._x, self._walls
-        turns, flags = balance.acting < 1.0 and self._turning, slice(4, 4 + walls.flags)
-        far = np.empty((0, flags.stop + 3 * turns))
+        flags, far = slice(4, 4 + walls.flags), np.empty((0, 4 + walls.flags))
         if not rows.partners.alone:
             at, leaving = rows.partners.rows, rows.partners.leaving(far.shape[1])
             free_positions(at, balance.predictor, u, far, leaving)
@@ -222,17 +304,66 @@ class ConstraintSet:
             if walls.flags:
                 poses = self.contact.motion.poses(balance.time)
                 leaving[:, flags] = self.contact.applicable(at, leaving[:, :3], poses)
-            if turns:
-                leaving[:, flags.stop :] = state.position[at]
             far = rows.partners.bring(leaving)
         free_positions(rows.where, balance.predictor, u, far, x)
-        start = rows.spread(state.position, far[:, flags.stop :]) if turns else None
-        planes = walls.planes(x, far[:, flags], balance.time) if walls.any else None
-        self.force, self.jacobian = rows.project(x, rows.spread(stiffness, far[:, 3]), tolerance, start, planes)
+        start, drift, held, memory = self._starts(balance, state)
+        free, stopping = rows.free, None
+        if walls.any:
+            applies = walls.applies(x, far[:, flags], balance.time)
+            if walls.ties:
+                tied = held[:, :1] > 0.0
+                free, applies = np.where(tied, 0.0, free), applies & ~tied
+                x[:] = np.where(tied & (rows.free > 0.0), held[:, 1:], x)
+            step = _WallStep(balance.acting, balance.time, x, start, applies, drift, *memory)
+            varying = (memory[0] > 0.0).any(axis=1) if walls.rebounds else np.zeros(len(x), dtype=bool)
+            stopping = WallsOfNodes(partial(walls.planes, step), varying | walls.curved)
+        nodes = FreeNodes(x, rows.spread(stiffness, far[:, 3]), start, balance.acting < 1.0, free)
+        moved = rows.along(rows.fixed_jacobian, x - start) if self.rebounds else np.empty(0)
+        pull = rows.along(rows.fixed_jacobian, drift) - moved if self.rebounds else moved
+        lift, before = self._lift(pull), self.force > 0.0
+        pushes, self.jacobian, system = rows.project(nodes, tolerance, stopping, lift)
+        self.force, self.drag, self.friction = pushes.force, pushes.drag, 0.0
+        if self.rebounds:
+            fresh, arrived = (self.force > 0.0) & ~before & (rows.restitution > 0.0), rows.values(start)
+            self.rebound = np.where(fresh, impact_square(-moved, arrived, pull), 0.0)
+            self.arrival = np.where(fresh, arrived, 0.0)
+        if rows.rubs:
+            slips = system.slips + rows.slips(pushes.moves)
+            self.friction = -float((self.drag * slips)[rows.counted].sum())
         if not self.force.any():
             return None
-        load = rows.forces(self.jacobian, self.force)
+        load = rows.forces(self.jacobian, self.force, self.drag)
         return load if load[rows.mine].any() else None
+
+    def _starts(self, balance: Balance, state: State) -> tuple[np.ndarray | None, ...]:
+        """Return positions at the start of a step and displacements without forces (n, 3) [m], tied nodes and where to
+        (n, 4), and the memory of walls (2, n, w); nothing of what no row or wall needs. Collective."""
+        walls, parts = self._walls, []
+        rebounds, at_start = self.rebounds or walls.rebounds, balance.acting < 1.0
+        starts = rebounds or self.rows.rubs or walls.rubs or (at_start and (self._turning or walls.curved))
+        if starts:
+            parts.append(lambda at: state.position[at])
+        if rebounds:
+            parts.append(lambda at: balance.predictor[at] - state.position[at])
+        if walls.ties:
+            parts.append(lambda at: walls.held(at, balance.time))
+        if walls.rebounds:
+            parts.append(walls.memory)
+        if not parts:
+            return None, None, np.empty((0, 4)), np.empty((2, 0, 0))
+        table = self.rows.collect(lambda at: np.column_stack([part(at) for part in parts]))
+        widths = np.cumsum([3 * starts, 3 * rebounds, 4 * walls.ties])
+        start, drift, held, memory = np.split(table, widths, axis=1)
+        memory = np.stack(np.split(memory, 2, axis=1)) if walls.rebounds else np.empty((2, 0, 0))
+        return start, drift, held, memory
+
+    def _lift(self, pull: np.ndarray) -> np.ndarray | float:
+        """Return by how much bounds of rows (r,) are above zero [m], with ``pull`` (r,) of forces [m], because they
+        rebound."""
+        if not self.rebounds or not self.rebound.any():
+            return 0.0
+        ways = rebound_way(self.rows.restitution, self.rebound, self.arrival, pull)
+        return np.where(self.rebound > 0.0, np.maximum(ways - 0.5 * pull, 0.0), 0.0)
 
     def push(self, load: np.ndarray, stiffness: np.ndarray, u: np.ndarray, contact: np.ndarray) -> None:
         """Correct increments by the forces of :meth:`explicit`, and add these to ``contact``, (owned, 3) both."""
@@ -248,13 +379,17 @@ class ConstraintSet:
             self._exported, self._exported_for = self.two.arrays(stiffness, self.separate), stiffness
         rows = self._exported
         if self.separate:
-            rows.force[:], rows.closed[:] = self.force, self.two.record.closed
+            rows.force[:], rows.closed[:], rows.drag[:] = self.force, self.two.record.closed, self.drag
+            if self.rows.rebounds:
+                rows.rebound[:], rows.arrival[:] = self.rebound, self.arrival
         return rows
 
     def import_rows(self, rows: FixedRows) -> None:
         """Take the forces after the last of the steps from rows that were exported."""
         if self.separate:
-            self.force = rows.force.copy()
+            self.force, self.drag = rows.force.copy(), rows.drag.copy()
+            if self.rows.rebounds:
+                self.rebound, self.arrival = rows.rebound.copy(), rows.arrival.copy()
             self.two.record.closed[:] = rows.closed
 
     def pressed(self) -> np.ndarray:
@@ -276,7 +411,7 @@ class ConstraintSet:
         rows, totals = self.rows, np.zeros((len(self.names), 3))
         if not self:
             return totals
-        last_forces(rows.counted, rows.source, rows.last, self.jacobian, self.force, totals)
+        last_forces(rows.counted, rows.source, rows.last, rows.loads(self.jacobian, self.force, self.drag), totals)
         return totals
 
     def tables(self, owned: int) -> np.ndarray:
@@ -287,14 +422,15 @@ class ConstraintSet:
 
     def add_forces(self, contact: np.ndarray, factor: float = 1.0) -> None:
         """Add the forces, times a factor, to those on the nodes (owned, 3) [N]."""
-        contact[self.rows.here] += factor * self.rows.forces(self.jacobian, self.force)[self.rows.mine]
+        contact[self.rows.here] += factor * self.rows.forces(self.jacobian, self.force, self.drag)[self.rows.mine]
 
-    def check(self, treatment: str, length: float) -> None:
+    def check(self, treatment: str, explicit: bool, length: float) -> None:
         """Check that the model is compatible with the rows and that none is violated at the start. Collective.
 
         Parameters
         ----------
         treatment : ``contact.treatment`` of the case
+        explicit : whether nodes are solved one by one, so that walls of any kind may stop them
         length : that tolerances are relative to [m]
 
         Raises
@@ -318,13 +454,16 @@ class ConstraintSet:
                 f"{self.source}: contact_pair: node {node} is in several pairs, or a wall stops it as well, which "
                 'needs contact.treatment = "scheme"'
             )
-        met = comm.allreduce(walls.members[rows.here].sum(axis=0)) > 0
-        special = walls.special & met
+        special, kind = walls.special, "flat, without mass, friction and restitution, and not tied"
+        if explicit:
+            open_ones = [k for k in walls.surfaces_of_triangles if not walls.walls[k].closed]
+            special = np.isin(walls.wall_of, [*walls.motion.bodies.at, *open_ones])
+            kind = "without mass, and a surface of triangles must be closed"
+        special = special & self._walls.meets
         if special.any():
             raise InputError(
-                f"{self.source}: contact_pair, constraint: wall {walls.names[walls.wall_of[special.argmax()]]!r} stops nodes of "
-                "pairs or constraints: such a wall must be flat, without mass, friction and restitution, and not tied; "
-                "or give it a node_set without them"
+                f"{self.source}: contact_pair, constraint: wall {walls.names[walls.wall_of[special.argmax()]]!r} stops "
+                f"nodes of pairs or constraints: such a wall must be {kind}; or give it a node_set without them"
             )
         x = rows.gather(points)
         with agreed(comm):
@@ -362,10 +501,13 @@ class ConstraintSet:
         closed &= np.abs(self.rows.along(self.jacobian, v)) <= still
         return np.where(closed, self.rows.drift(x, v), np.inf)
 
-    def rest(self, a: np.ndarray, mass: np.ndarray, closed: np.ndarray, on_walls: np.ndarray) -> np.ndarray:
+    def rest(
+        self, a: np.ndarray, mass: np.ndarray, closed: np.ndarray, on_walls: np.ndarray, still: float
+    ) -> np.ndarray:
         """Set the forces of closed rows at accelerations (owned, 3); return them on free components (owned, 3) [N].
 
-        ``closed`` (r,) from :meth:`resting`; ``on_walls`` (owned, walls) bool: nodes that rest on walls. Collective.
+        ``closed`` (r,) from :meth:`resting`; ``on_walls`` (owned, walls) bool: nodes that rest on walls;
+        ``still``: velocity that counts as none [m/s]. Collective.
         """
         rows, contact = self.rows, self.contact
         state, change = contact.state, np.zeros_like(a)
@@ -373,15 +515,29 @@ class ConstraintSet:
             return change
         rests = rows.gather(on_walls) > 0.0
         every, hard = rows.gather(a), rows.gather(mass)
-        normals, _ = contact.planes(rests, rows.gather(state.position), contact.motion.poses(state.time))
-        gaps = np.where(rests, np.einsum("nwi,ni->nw", normals, every), np.inf)
+        normals, _ = contact.planes(rests, x := rows.gather(state.position), contact.motion.poses(state.time))
+        relative = every[:, None, :] - contact.motion.accelerations_at(x, state.time)[:, contact.wall_of]
+        gaps = np.where(rests, np.einsum("nwi,nwi->nw", normals, relative), np.inf)
         values = rows.along(self.jacobian, every) + closed
         largest = self.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)
         place = np.where(rests.any(axis=1), np.arange(len(every)), -1)
+        coefficients, slips = np.empty((0, len(contact.walls), 2)), np.empty((0, len(contact.walls), 3))
+        nodes = FreeNodes(every, hard, np.zeros_like(every), at_start=False, free=rows.free)
+        rubs = rows.rubs or self._walls.rubs
+        if rubs:  # along the velocity where nodes slide, else along the acceleration
+            v, rates = rows.gather(state.v), contact.motion.rates(state.time, ahead=True)
+            fast = 1e16 * largest / max(np.abs(v).max(initial=0.0), np.abs(rates).max(initial=0.0), still)
+            coefficients = np.tile(np.stack([contact.friction, contact.static_friction], axis=1), (len(every), 1, 1))
+            slips = relative + fast * _sliding(v[:, None, :] - rates, normals, still)
         with agreed(self.mesh.comm):
-            system = rows.system(self.jacobian, values, hard, (place, normals, gaps))
-            self.force = rows.solve(system, 1e-13 * largest)
-        change[rows.here] = (rows.forces(self.jacobian, self.force) * rows.free)[rows.mine]
+            system = rows.system(self.jacobian, values, nodes, Planes(place, normals, gaps, coefficients, slips))
+            if rubs:
+                squares = np.maximum((rows.weights**2).sum(axis=1, keepdims=True), 1e-300)
+                along = np.einsum("rk,rki->ri", rows.weights, self.jacobian) / squares
+                system = system._replace(slips=system.slips + fast * _sliding(rows.slips(v), along, still))
+            pushes = rows.solve(system, 1e-13 * largest, largest)
+        self.force, self.drag = pushes.force, pushes.drag
+        change[rows.here] = (rows.forces(self.jacobian, self.force, self.drag) * rows.free)[rows.mine]
         return change
 
     def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
@@ -432,6 +588,12 @@ class ConstraintSet:
         nodal = self.mesh.node_order
         own = {name: v if order is nodal else order.to_slab(v) for name, (order, v) in arrays.items()}
         self.load_state(own)
+
+
+def _sliding(rates: np.ndarray, normals: np.ndarray, still: float) -> np.ndarray:
+    """Return the parts of velocities (..., 3) across unit vectors (..., 3), zero where they are at most ``still``."""
+    across = rates - np.einsum("...i,...i->...", rates, normals)[..., None] * normals
+    return np.where(np.linalg.norm(across, axis=-1, keepdims=True) > still, across, 0.0)
 
 
 def _source(file: str, parameters: ConstraintKeys, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> Constraint:

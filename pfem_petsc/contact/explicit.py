@@ -38,8 +38,8 @@ _ROOT = 1e-14  # relative error of squares, more than those of sums of three and
 
 @record
 class PressedWalls(NamedTuple):
-    """Slots (w,) of walls, see :class:`~pfem_petsc.contact.node_walls.NodeWalls`, and the nodes (n,) of a rank that they
-    can stop, in a step.
+    """Slots (w,) of walls, see :class:`~pfem_petsc.contact.node_walls.NodeWalls`, and the nodes (n,) that they can stop
+    in a step.
 
     Attributes
     ----------

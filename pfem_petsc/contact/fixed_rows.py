@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import inlined, kernel
 from ..mechanics.records import record
 from ..tolerances import FREE_PART
 from .rows import RowSet
+from .sweeps import Pushes, RubbingRows, settle_friction
 
 
 @record
@@ -27,6 +29,10 @@ class FixedRows(NamedTuple):
     along : (2, p) squared lengths of the free parts of the directions
     totals : (tables, 3) room for the forces on the second nodes of each table [N]
     force, closed : (p,) forces [N]; bool, rows that have closed and not opened since; both are overwritten
+    restitution : (p,) coefficients; friction : (p, 2) of dynamic and static friction, (0, 2) without
+    drag : (p, 3) friction forces on the second nodes [N]
+    rebound, arrival : (p,) memory of rows that have closed, see :class:`~pfem_petsc.contact.explicit.Arrivals`; (0,)
+        without restitution
     """
 
     table_starts: np.ndarray
@@ -41,6 +47,11 @@ class FixedRows(NamedTuple):
     totals: np.ndarray
     force: np.ndarray
     closed: np.ndarray
+    restitution: np.ndarray
+    friction: np.ndarray
+    drag: np.ndarray
+    rebound: np.ndarray
+    arrival: np.ndarray
 
 
 class ClosingRows(NamedTuple):
@@ -51,6 +62,7 @@ class ClosingRows(NamedTuple):
     along: np.ndarray
     force: np.ndarray
     closed: np.ndarray
+    restitution: np.ndarray
 
 
 class TwoNodeRows:
@@ -83,7 +95,8 @@ class TwoNodeRows:
         parts = self._free * self.normals**2
         self.along = (parts[:, :, 0] + parts[:, :, 1]) + parts[:, :, 2]
         p = len(self.at)
-        self.record = ClosingRows(self.normals, self.least, self.along, np.zeros(p), np.zeros(p, dtype=bool))
+        changing = np.zeros(p), np.zeros(p, dtype=bool)
+        self.record = ClosingRows(self.normals, self.least, self.along, *changing, rows.restitution[self.at])
 
     def arrays(self, stiffness: np.ndarray, some: bool) -> FixedRows:
         """Return the rows, or none unless ``some``, for compiled steps, without forces.
@@ -108,6 +121,11 @@ class TwoNodeRows:
             totals=np.zeros((tables, 3)),
             force=np.zeros(p),
             closed=np.zeros(p, dtype=bool),
+            restitution=self.record.restitution[:p].copy(),
+            friction=self.rows.friction[self.at][: p if self.rows.rubs else 0].copy(),
+            drag=np.zeros((p, 3)),
+            rebound=np.zeros(p if self.rows.rebounds else 0),
+            arrival=np.zeros(p if self.rows.rebounds else 0),
         )
 
     def gather(self, values: np.ndarray) -> np.ndarray:
@@ -141,6 +159,63 @@ class TwoNodeRows:
         """Return 1/(1/m_1 + 1/m_2) (p,) [kg] along the directions, from masses of owned nodes (owned,). Collective."""
         gives = (self.along / self.gather(mass)).sum(axis=0)
         return 1.0 / np.maximum(gives, 1e-300)
+
+
+class SingleRow(NamedTuple):
+    """Room for a row that rubs: RubbingRows and Pushes of one, between two nodes."""
+
+    rows: RubbingRows
+    pushes: Pushes
+
+
+@inlined
+def new_single_row():
+    """Return room for a row."""
+    ends, weights = np.empty((1, 2), dtype=np.int64), np.empty((1, 2))
+    ends[0, 0], ends[0, 1], weights[0, 0], weights[0, 1] = 0, 1, -1.0, 1.0
+    vectors, normals, slips = np.empty((1, 2, 3)), np.empty((1, 3)), np.empty((1, 3))
+    of_row = np.empty(1), slips, np.empty((1, 2)), np.empty((2, 3)), np.empty((1, 2))
+    rows = RubbingRows(ends, weights, vectors, normals, *of_row)
+    return SingleRow(rows, Pushes(np.empty(1), np.empty((1, 3)), np.empty((2, 3))))
+
+
+@inlined
+def rub_row(p, rows, short, stiffness, slip, size, single):
+    """Find the force and drag of a row that presses; ``short``: its gap without force, negated [m]; ``stiffness`` and
+    ``slip``: of its nodes (2,), and how far they move apart (3,); ``size``: largest coordinate [m]; ``single``:
+    SingleRow. Returns whether they were found, and the energy that friction dissipates [J]."""
+    one, pushes = single
+    force = short / rows.soft[p]
+    one.values[0], pushes.normal[0] = -short, force
+    for k in range(2):
+        one.friction[0, k] = rows.friction[p, k]
+        for c in range(3):
+            one.soft[k, c] = rows.free[k, p, c] / stiffness[k]
+            one.gradients[0, k, c] = one.weights[0, k] * rows.normals[p, c] * rows.free[k, p, c]
+            pushes.moves[k, c] = force * one.gradients[0, k, c] * one.soft[k, c]
+    for c in range(3):
+        one.normals[0, c], one.slips[0, c] = rows.normals[p, c], slip[c]
+    found, work = settle_friction(1, one, size, pushes), 0.0
+    rows.force[p] = pushes.normal[0]
+    for c in range(3):
+        rows.drag[p, c] = pushes.drag[0, c]
+        work -= rows.drag[p, c] * (slip[c] + pushes.moves[1, c] - pushes.moves[0, c])
+    return found, work
+
+
+@inlined
+def rebound_of_row(p, rows, gap, change, pull):
+    """Return by how much the bound of a row is above zero [m] as it rebounds, and set its memory if it now closes, at a
+    ``gap`` that would ``change`` in the step, of that by ``pull`` of forces that close it [m]; see
+    :func:`~pfem_petsc.contact.explicit.impact_square`."""
+    lift, e = 0.0, rows.restitution[p]
+    if rows.rebound[p] > 0.0:
+        whole = max(rows.rebound[p] + pull * rows.arrival[p] + 0.25 * pull * pull, 0.0)
+        lift = max(e * math.sqrt(whole) - 0.5 * pull, 0.0)
+    fresh = gap + change < lift and rows.soft[p] > 0.0 and e > 0.0 and rows.force[p] == 0.0
+    rows.rebound[p] = max(change * change + pull * (change + gap), 0.0) if fresh and change < 0.0 else 0.0
+    rows.arrival[p] = gap if fresh else 0.0
+    return lift
 
 
 @kernel
@@ -182,5 +257,5 @@ def close_rows(rows, at, ends, counted, slack):
         if fresh and speed < 0.0 and counted[p]:
             square = max(speed * speed - 2.0 * pull * max(distance, 0.0), 0.0)
             gives = along[0, p] / ends[0, m, 9] + along[1, p] / ends[1, m, 9]
-            energy += 0.5 * square / max(gives, 1e-300)
+            energy += 0.5 * square / max(gives, 1e-300) * (1.0 - rows.restitution[p] * rows.restitution[p])
     return energy

@@ -239,9 +239,10 @@ def jam(contact: NodeWalls, node: int, normals: np.ndarray) -> str:
     if not jams.any():
         return ""
     wall = int(np.flatnonzero(jams)[0])
+    name = contact.names[contact.wall_of[wall]]
     return (
         f"friction jams node {contact.mesh.node_ids[node]}: its supports let it move only at an angle at which wall "
-        f"{contact.names[contact.wall_of[wall]]!r} cannot push it if the coefficient of friction is {least[wall]:.3g} or more, and it "
+        f"{name!r} cannot push it if the coefficient of friction is {least[wall]:.3g} or more, and it "
         f"is {contact.static_friction[wall]:.3g}; reduce the friction, free the node, or name the nodes that the wall "
         "stops with 'node_set'"
     )

@@ -96,7 +96,7 @@ def start_at_rest(
         apart[nodes] -= hold / weight[:, None]
         earlier = between
         # links first, as in a step: they account for the walls
-        between = links.rest(apart, share * mass, closed, held)
+        between = links.rest(apart, share * mass, closed, held, still)
         free = apart[nodes] + between[nodes] / weight[:, None]
         moved = free.copy()
         project(moved, fixed, normals, planes, 0.0, strengths, NEEDED if normals.shape[1] > 1 else None)

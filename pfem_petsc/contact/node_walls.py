@@ -295,9 +295,8 @@ class NodeWalls:
                 self.members[:, s] = False
                 self.members[nodes[walls[k].node_set], s] = True
         self.log = ContactLog(mesh.n_owned, len(walls), self.wall_of)
-        self.friction = np.array([wall.friction for wall in walls], dtype=np.float64)[self.wall_of]
-        static = [wall.friction if wall.static_friction is None else wall.static_friction for wall in walls]
-        self.static_friction = np.array(static, dtype=np.float64)[self.wall_of]
+        friction = np.array([wall.friction_coefficients for wall in walls], dtype=np.float64).reshape(-1, 2)
+        self.friction, self.static_friction = np.ascontiguousarray(friction[self.wall_of].T)
         self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)[self.wall_of]
         self.rebounds = False
         self.has_friction = bool(self.static_friction.any())
@@ -529,7 +528,13 @@ class NodeWalls:
         """
         if part == 1.0 or self.flat.all():
             return None
-        earlier, start = self._poses_before(), self.state.position[nodes]
+        return self.acting_from(self.state.position[nodes], x, poses, part, nodes)
+
+    def acting_from(
+        self, start: np.ndarray, x: np.ndarray, poses: Poses, part: float, nodes: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the directions of :meth:`acting` of nodes that move from ``start`` to x (m, 3)."""
+        earlier = self._poses_before()
         acting = np.zeros((len(x), len(self.wall_of), 3))
         between = self.motion.poses(earlier.time + part * (poses.time - earlier.time)) if len(poses.turns) else poses
         for k, s in enumerate(self.first):

@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import NEEDED, kernel
+from ..mechanics.compiled import NEEDED, inlined, kernel
 from ..tolerances import FREE_PART, SINGULAR_ROW
+from .sweeps import Pushes, RubbingRows, settle_friction
 
 
 @kernel
@@ -220,6 +221,8 @@ class System(NamedTuple):
     stiffness, free : (n,), (n, 3) of nodes: force for a displacement [N/m]; 0.0 where supports prescribe a component
     plane : (n,) index of each node among those at walls, -1 for none
     normals, gaps : (m, w, 3), (m, w) of walls at these nodes: distances [m], infinite where a wall does not apply
+    weights, friction, slips : (r, k), (r, 2), (r, 3) of rows, see :class:`~pfem_petsc.contact.sweeps.RubbingRows`
+    wall_friction, wall_slips : (m, w, 2), (m, w, 3), likewise; (0, w, 2), (0, w, 3) without friction
     """
 
     ends: np.ndarray
@@ -230,10 +233,131 @@ class System(NamedTuple):
     plane: np.ndarray
     normals: np.ndarray
     gaps: np.ndarray
+    weights: np.ndarray
+    friction: np.ndarray
+    slips: np.ndarray
+    wall_friction: np.ndarray
+    wall_slips: np.ndarray
+
+
+class RowPushes(NamedTuple):
+    """Results for rows (r,) and nodes (n,): normal ``force`` (r,) and ``drag`` (r, 3) [N], displacements (n, 3) [m]."""
+
+    force: np.ndarray
+    drag: np.ndarray
+    moves: np.ndarray
+
+
+RUBS = 1
+"""Why a group has no solution: its friction, and not its rows."""
+
+
+@inlined
+def _solve_single(group, groups, system, tolerance, pushes):
+    """Solve a group of one row, if its walls remain satisfied and it does not rub; return whether they do."""
+    ends, gradients, stiffness, free, gaps = system.ends, system.gradients, system.stiffness, system.free, system.gaps
+    r, square, soft, width = groups.rows[groups.starts[group]], 0.0, 0.0, ends.shape[1]
+    force, moves = pushes.force, pushes.moves
+    for k in range(width):
+        i = ends[r, k]
+        if i >= 0:
+            along = 0.0
+            for c in range(3):
+                part = gradients[r, k, c] * free[i, c]
+                along += part * part
+            square += along
+            soft += 1.0 / stiffness[i] * along
+    force[r] = -system.values[r] / soft if system.values[r] < 0.0 and square > FREE_PART else 0.0
+    if not force[r] < math.inf or (force[r] > 0.0 and system.friction[r, 1] > 0.0):
+        return False
+    for k in range(width):
+        i = ends[r, k]
+        if i >= 0:
+            push = force[r] / stiffness[i]
+            for c in range(3):
+                moves[i, c] = push * (gradients[r, k, c] * free[i, c])
+    for q in range(groups.node_starts[group], groups.node_starts[group + 1] if gaps.shape[1] > 0 else 0):
+        i = groups.nodes[q]
+        at = system.plane[i]
+        for w in range(gaps.shape[1] if at >= 0 else 0):
+            gap, square = gaps[at, w], 0.0
+            least = gap
+            for c in range(3):
+                part = system.normals[at, w, c] * free[i, c]
+                square += part * part
+                gap += part * moves[i, c]
+            if not (least == math.inf or square <= FREE_PART or min(least, gap) >= -tolerance):
+                return False
+    return True
+
+
+@inlined
+def _gather_group(group, groups, system, soft):
+    """Return the rows of a group that can press, with those of its walls, as :class:`RubbingRows`; the number of each
+    among the rows of the system, or -1 (n,); and whether any rubs."""
+    ends, gradients, values, _, free, plane, normals, gaps, weights, friction, slips, wall_friction, wall_slips = system
+    begin, end = groups.starts[group], groups.starts[group + 1]
+    first, last = groups.node_starts[group], groups.node_starts[group + 1]
+    width, walls, size, n, rubs = ends.shape[1], gaps.shape[1], end - begin, 0, False
+    for q in range(first, last if walls > 0 else first):
+        size += walls if plane[groups.nodes[q]] >= 0 else 0
+    rows = RubbingRows(
+        np.full((size, width), -1),
+        np.zeros((size, width)),
+        np.zeros((size, width, 3)),
+        np.zeros((size, 3)),
+        np.empty(size),
+        np.zeros((size, 3)),
+        np.zeros((size, 2)),
+        soft,
+        np.empty((size, 2)),
+    )
+    row = np.full(size, -1)
+    for q in range(begin, end):
+        r, square = groups.rows[q], 0.0
+        if not values[r] < math.inf and values[r] == values[r]:
+            continue
+        for k in range(width):
+            i = ends[r, k]
+            rows.ends[n, k], rows.weights[n, k] = i, weights[r, k]
+            for c in range(3):
+                rows.gradients[n, k, c] = gradients[r, k, c] * free[i, c] if i >= 0 else 0.0
+                square += rows.gradients[n, k, c] * rows.gradients[n, k, c]
+                if weights[r, k] != 0.0:
+                    rows.normals[n, c] = gradients[r, k, c] / weights[r, k]
+        if square > FREE_PART:
+            rows.values[n], row[n] = values[r], r
+            for c in range(3):
+                rows.slips[n, c] = slips[r, c]
+            rows.friction[n, 0], rows.friction[n, 1] = friction[r, 0], friction[r, 1]
+            rubs = rubs or friction[r, 1] > 0.0
+            n += 1
+    for q in range(first, last if walls > 0 else first):
+        i = groups.nodes[q]
+        at = plane[i]
+        for w in range(walls if at >= 0 else 0):
+            if not gaps[at, w] < math.inf:
+                continue
+            square = 0.0
+            for k in range(width):
+                rows.ends[n, k] = i if k == 0 else -1
+            row[n], rows.values[n], rows.weights[n, 0] = -1, gaps[at, w], 1.0
+            for c in range(3):
+                rows.normals[n, c] = normals[at, w, c]
+                rows.gradients[n, 0, c] = normals[at, w, c] * free[i, c]
+                square += rows.gradients[n, 0, c] * rows.gradients[n, 0, c]
+            if len(wall_friction) > 0:
+                rows.friction[n, 0], rows.friction[n, 1] = wall_friction[at, w, 0], wall_friction[at, w, 1]
+                for c in range(3):
+                    rows.slips[n, c] = wall_slips[at, w, c]
+            if square > FREE_PART:
+                rubs = rubs or rows.friction[n, 1] > 0.0
+                n += 1
+    return rows, row[:n], rubs
 
 
 @kernel
-def project_groups(which, groups, system, tolerances, force, moves):
+def project_groups(which, groups, system, tolerances, size, pushes):
     """Solve for the forces of the rows of some groups (g,), and the displacements of their nodes, with their walls.
 
     Parameters
@@ -241,116 +365,56 @@ def project_groups(which, groups, system, tolerances, force, moves):
     which, groups : (g,) numbers of these groups; Groups
     system : System
     tolerances : (groups,) a row violated by at most this counts as satisfied [m]
-    force, moves : (r,), (n, 3) output [N], [m]; written for these groups only
+    size : largest coordinate [m]
+    pushes : RowPushes, output; written for these groups only
 
     Returns
     -------
-    int
-        First of the groups with infeasible rows, else -1.
+    group, why : int
+        First of the groups without a solution, or -1; :data:`RUBS`, or 0 if its rows are infeasible.
     """
-    # each field of a record would count references
-    ends, gradients, values, stiffness, free, plane, normals, gaps = system
-    starts, members, node_starts, every_node = groups
-    walls, width = gaps.shape[1], ends.shape[1]
+    stiffness, free, width = system.stiffness, system.free, system.ends.shape[1]
+    soft = np.empty(free.shape)
     for group in which:
-        tolerance = tolerances[group]
-        begin, end, first, last = starts[group], starts[group + 1], node_starts[group], node_starts[group + 1]
-        size = end - begin
-        for q in range(first, last if walls > 0 else first):
-            size += walls if plane[every_node[q]] >= 0 else 0
-        if end - begin == 1:  # the common case: a single row, whose walls remain satisfied
-            r = members[begin]
-            square, soft = 0.0, 0.0
-            for k in range(width):
-                i = ends[r, k]
-                if i >= 0:
-                    along = 0.0
-                    for c in range(3):
-                        part = gradients[r, k, c] * free[i, c]
-                        along += part * part
-                    square += along
-                    soft += 1.0 / stiffness[i] * along
-            force[r] = -values[r] / soft if values[r] < 0.0 and square > FREE_PART else 0.0
-            if not force[r] < math.inf:
-                return group
-            for k in range(width):
-                i = ends[r, k]
-                if i >= 0:
-                    push = force[r] / stiffness[i]
-                    for c in range(3):
-                        moves[i, c] = push * (gradients[r, k, c] * free[i, c])
-            fits = True
-            for q in range(first, last if size > 1 else first):
-                i = every_node[q]
-                at = plane[i]
-                for w in range(walls if at >= 0 else 0):
-                    gap, square = gaps[at, w], 0.0
-                    least = gap
-                    for c in range(3):
-                        part = normals[at, w, c] * free[i, c]
-                        square += part * part
-                        gap += part * moves[i, c]
-                    fits = fits and (least == math.inf or square <= FREE_PART or min(least, gap) >= -tolerance)
-            if fits:
-                continue
-        for q in range(first, last):
-            i = every_node[q]
-            moves[i, 0] = moves[i, 1] = moves[i, 2] = 0.0
-        node, vector = np.full((size, width), -1), np.zeros((size, width, 3))
-        value, row = np.empty(size), np.full(size, -1)
-        n = 0
+        begin, end = groups.starts[group], groups.starts[group + 1]
         for q in range(begin, end):
-            r = members[q]
-            force[r] = 0.0
-            if not values[r] < math.inf and values[r] == values[r]:
-                continue
-            square = 0.0
-            for k in range(width):
-                i = ends[r, k]
-                node[n, k] = i
-                for c in range(3):
-                    vector[n, k, c] = gradients[r, k, c] * free[i, c] if i >= 0 else 0.0
-                    square += vector[n, k, c] * vector[n, k, c]
-            if square > FREE_PART:
-                value[n], row[n] = values[r], r
-                n += 1
-        for q in range(first, last):
-            i = every_node[q]
-            at = plane[i]
-            for w in range(walls):
-                if at < 0 or not gaps[at, w] < math.inf:
-                    continue
-                square = 0.0
-                for k in range(width):
-                    node[n, k] = -1
-                node[n, 0], row[n], value[n] = i, -1, gaps[at, w]
-                for c in range(3):
-                    vector[n, 0, c] = normals[at, w, c] * free[i, c]
-                    square += vector[n, 0, c] * vector[n, 0, c]
-                if square > FREE_PART:
-                    n += 1
+            r = groups.rows[q]
+            pushes.force[r] = pushes.drag[r, 0] = pushes.drag[r, 1] = pushes.drag[r, 2] = 0.0
+        if end - begin == 1 and _solve_single(group, groups, system, tolerances[group], pushes):
+            continue
+        for q in range(groups.node_starts[group], groups.node_starts[group + 1]):
+            i = groups.nodes[q]
+            for c in range(3):
+                soft[i, c], pushes.moves[i, c] = free[i, c] / stiffness[i], 0.0
+        rows, row, rubs = _gather_group(group, groups, system, soft)
+        n = len(row)
         gram = np.zeros((n, n))
         for a in range(n):
             for b in range(a, n):
                 s = 0.0
                 for d in range(width):
-                    i = node[a, d]
+                    i = rows.ends[a, d]
                     if i < 0:
                         continue
                     for e in range(width):
-                        if node[b, e] == i:
+                        if rows.ends[b, e] == i:
                             for c in range(3):
-                                s += vector[a, d, c] * vector[b, e, c] / stiffness[i]
+                                s += rows.gradients[a, d, c] * rows.gradients[b, e, c] / stiffness[i]
                 gram[a, b] = gram[b, a] = s
-        z = np.zeros(n)
-        if not find_multipliers(gram, value[:n], tolerance, z):
-            return group
+        z, drag = np.zeros(n), np.zeros((n, 3))
+        if not find_multipliers(gram, rows.values[:n], tolerances[group], z):
+            return group, 0
         for a in range(n):
-            if row[a] >= 0:
-                force[row[a]] = z[a]
             for k in range(width):
-                i = node[a, k]
+                i = rows.ends[a, k]
                 if i >= 0:
                     for c in range(3):
-                        moves[i, c] += z[a] * vector[a, k, c] / stiffness[i]
-    return -1
+                        pushes.moves[i, c] += z[a] * rows.gradients[a, k, c] / stiffness[i]
+        if rubs and not settle_friction(n, rows, size, Pushes(z, drag, pushes.moves)):
+            return group, RUBS
+        for a in range(n):
+            if row[a] >= 0:
+                pushes.force[row[a]] = z[a]
+                for c in range(3):
+                    pushes.drag[row[a], c] = drag[a, c]
+    return -1, 0

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -21,7 +21,7 @@ from ..parallel.natural import NaturalOrder
 from ..tolerances import FREE_PART
 from .constraints.base import Constraint
 from .plugins import checked
-from .projection import Groups, System, project_groups
+from .projection import RUBS, Groups, RowPushes, System, project_groups
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -169,7 +169,7 @@ def advance_groups(which, groups, x, moves, at, tolerances, settled):
 @kernel
 def linearise(rows, system, x, at, own):
     """Extrapolate ``own`` of rows (m,) at positions ``at`` (n, 3) to ``x`` (n, 3), into the values of a System."""
-    ends, gradients, values, _, free, _, _, _ = system
+    ends, gradients, values, free = system.ends, system.gradients, system.values, system.free
     for k in range(len(rows)):
         r = rows[k]
         total = 0.0
@@ -181,9 +181,20 @@ def linearise(rows, system, x, at, own):
         values[r] = own[k] + total
 
 
+class RowForces(NamedTuple):
+    """Forces of rows (r,) on their nodes (k of each): ``normal`` (r,) times ``gradients`` (r, k, 3), and ``drag``
+    (r, 3) times ``weights`` (r, k) [N]."""
+
+    gradients: np.ndarray
+    normal: np.ndarray
+    weights: np.ndarray
+    drag: np.ndarray
+
+
 @kernel
-def add_forces(ends, gradients, force, load):
-    """Add the forces (r,) of rows to those on their nodes (n, 3)."""
+def add_forces(ends, forces, load):
+    """Add the forces of rows, RowForces, to those on their nodes (n, 3)."""
+    gradients, force, weights, drag = forces
     for r in range(len(force)):
         if force[r] == 0.0:
             continue
@@ -191,7 +202,7 @@ def add_forces(ends, gradients, force, load):
             i = ends[r, k]
             if i >= 0:
                 for c in range(3):
-                    load[i, c] += force[r] * gradients[r, k, c]
+                    load[i, c] += force[r] * gradients[r, k, c] + weights[r, k] * drag[r, c]
 
 
 @kernel
@@ -207,13 +218,14 @@ def free_positions(where, predictor, u, far, x):
 
 
 @kernel
-def last_forces(counted, source, last, gradients, force, totals):
-    """Write the forces of counted rows, sorted by source, on their last nodes to the totals (sources, 3)."""
+def last_forces(counted, source, last, forces, totals):
+    """Write the forces of counted rows, RowForces sorted by source, on their last nodes to the totals (sources, 3)."""
+    gradients, force, weights, drag = forces
     before = -1
     for r in range(len(force)):
         if counted[r]:
             for c in range(3):
-                push = force[r] * gradients[r, last[r], c]
+                push = force[r] * gradients[r, last[r], c] + weights[r, last[r]] * drag[r, c]
                 totals[source[r], c] = totals[source[r], c] + push if source[r] == before else push
             before = source[r]
 
@@ -234,8 +246,41 @@ def push_nodes(where, load, free, stiffness, u, contact):
 _ITERATIONS = 100  # linearisations of a problem
 _TAG = 7700  # of messages between ranks with nodes of the same rows, distinct from those of ghosts
 
-Planes = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Walls at nodes: ``plane``, ``normals`` and ``gaps`` of :class:`~pfem_petsc.contact.projection.System`."""
+
+class Planes(NamedTuple):
+    """Walls at nodes, see :class:`~pfem_petsc.contact.projection.System`."""
+
+    plane: np.ndarray
+    normals: np.ndarray
+    gaps: np.ndarray
+    wall_friction: np.ndarray
+    wall_slips: np.ndarray
+
+
+class FreeNodes(NamedTuple):
+    """Nodes (n,) of rows in a step without the rows.
+
+    Attributes
+    ----------
+    x, stiffness : (n, 3), (n,) positions, and forces for displacements [m], [N/m]
+    start : (n, 3) positions at the start of the step, needed by rows that rub or push as there; None if none does
+    at_start : whether rows push along their gradients at the start of the step, else at its end
+    free : (n, 3) 1.0 where a component may move, else 0.0
+    """
+
+    x: np.ndarray
+    stiffness: np.ndarray
+    start: np.ndarray | None
+    at_start: bool
+    free: np.ndarray
+
+
+class WallsOfNodes(NamedTuple):
+    """Walls that stop nodes of rows: ``planes`` at positions (n, 3), if rows alone move the nodes to others (n, 3), and
+    the nodes (n,) bool for which they differ from place to place."""
+
+    planes: Callable[[np.ndarray, np.ndarray], Planes]
+    varying: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -275,6 +320,8 @@ class RowSet:
     free : (n, 3) 1.0 where a component may move, 0.0 where a support prescribes it
     groups : Groups; group_of_row, group_of_node : (r,), (n,)
     pairs : nodes (2, r), directions (r, 3) and bounds (r,) if these are all that the rows depend on, else None
+    weights, friction, restitution : (r, k), (r, 2), (r,) see :class:`~pfem_petsc.contact.constraints.base.Constraint`
+    rubs, rebounds : whether any table of rows of the model has friction, restitution
     """
 
     pairs: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
@@ -288,7 +335,15 @@ class RowSet:
         self._away = np.flatnonzero(~self.mine)
         self._far = -1 - self.where[self._away]
         self.free = 1.0 - self.gather(fixed)
-        self._no_planes = np.full(len(self.numbers), -1), np.empty((0, 0, 3)), np.empty((0, 0))
+        nowhere = np.full(len(self.numbers), -1), np.empty((0, 0, 3)), np.empty((0, 0))
+        self._no_planes = Planes(*nowhere, np.empty((0, 0, 2)), np.empty((0, 0, 3)))
+        self.friction = np.array([source.friction for source in sources]).reshape(-1, 2)[self.source]
+        self.restitution = np.array([source.restitution for source in sources], dtype=float)[self.source]
+        self.rubs = any(source.friction[1] > 0.0 for source in sources)
+        self.rebounds = any(source.restitution > 0.0 for source in sources)
+        self.weights = np.zeros(self.ends.shape)
+        for source, first in zip(self.sources, self._first, strict=False):
+            self.weights[first : first + len(source.nodes), : source.nodes.shape[1]] = source.weights()
         self._gather_groups()
         every = np.arange(len(self.ends))
         self.counted = self.mine[self.ends[every, self.last]]
@@ -460,21 +515,43 @@ class RowSet:
             total += products
         return total
 
-    def forces(self, jacobian: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """Return J^T f (n, 3) [N] for the forces (r,) of the rows [N]."""
+    def collect(self, of_nodes: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Return values (n, m) at the nodes; ``of_nodes`` gives (k, m) at owned nodes (k,). Collective."""
+        own = of_nodes(self.here)
+        if len(self._away) == 0 and self.partners.alone:
+            return own
+        every = np.empty((len(self.numbers), own.shape[1]))
+        every[self.mine] = own
+        far = self.partners.bring(of_nodes(self.partners.rows))
+        every[self._away] = far[self._far]
+        return every
+
+    def slips(self, y: np.ndarray) -> np.ndarray:
+        """Return sums of weights times vectors (n, 3) of nodes, (r, 3)."""
+        return np.einsum("rk,rki->ri", self.weights, y[self.ends])
+
+    def forces(self, jacobian: np.ndarray, force: np.ndarray, drag: np.ndarray | None = None) -> np.ndarray:
+        """Return J^T f (n, 3) [N] for the forces (r,) of the rows, and their drags (r, 3) times weights [N]."""
         total = np.zeros((len(self.numbers), 3))
-        add_forces(self.ends, jacobian, force, total)
+        add_forces(self.ends, self.loads(jacobian, force, drag), total)
         return total
+
+    def loads(self, jacobian: np.ndarray, force: np.ndarray, drag: np.ndarray | None = None) -> RowForces:
+        """Return the forces of rows on their nodes."""
+        return RowForces(jacobian, force, self.weights, np.zeros((len(force), 3)) if drag is None else drag)
 
     def usable(self, jacobian: np.ndarray) -> np.ndarray:
         """Return (r,) bool: rows with free components, which can be satisfied."""
         return self.along(jacobian**2, self.free) > FREE_PART
 
     def system(
-        self, jacobian: np.ndarray, values: np.ndarray, stiffness: np.ndarray, planes: Planes | None = None
+        self, jacobian: np.ndarray, values: np.ndarray, nodes: FreeNodes, planes: Planes | None = None
     ) -> System:
-        """Return rows (r,) with gradients (r, k, 3) for :meth:`solve`; ``stiffness`` (n,) [N/m]."""
-        return System(self.ends, jacobian, values, stiffness, self.free, *(planes or self._no_planes))
+        """Return rows (r,) with gradients (r, k, 3) for :meth:`solve`."""
+        slips = self.slips(nodes.x - nodes.start) if self.rubs else np.zeros((len(values), 3))
+        some = self._no_planes if planes is None else planes
+        rubbing = self.weights, self.friction, slips, some.wall_friction, some.wall_slips
+        return System(self.ends, jacobian, values, nodes.stiffness, nodes.free, *some[:3], *rubbing)
 
     def gather_of(self, at: np.ndarray, of_nodes: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return values (2, m, n) at the first two nodes of rows ``at`` (m,); ``of_nodes`` gives (k, n) at owned nodes.
@@ -492,95 +569,106 @@ class RowSet:
             data[1 - end, cut] = swap(self.mesh.comm, self.owners[at[cut], 1 - end], data[end, cut])
         return data
 
-    def solve(self, system: System, tolerance: float) -> np.ndarray:
-        """Return forces (r,) [N] that satisfy linear rows; those violated by at most the tolerance count as satisfied.
+    def solve(self, system: System, tolerance: float, size: float) -> RowPushes:
+        """Return the forces that satisfy linear rows; those violated by at most the tolerance count as satisfied;
+        ``size``: largest value of what moves the rows.
 
         Raises
         ------
         SimulationFailure
             On ranks with rows that are infeasible.
         """
-        force, nowhere = np.zeros(len(system.values)), np.zeros((len(self.numbers), 3))
-        groups, tolerances = self._broken(
-            system.values, (system.plane, system.normals, system.gaps), nowhere, tolerance
-        )
-        self._solve(groups, system, tolerances, force, np.empty_like(nowhere))
-        return force
+        pushes, nowhere = self._no_pushes(), np.zeros((len(self.numbers), 3))
+        groups, tolerances = self._broken(system, nowhere, tolerance)
+        self._solve(groups, system, tolerances, size, pushes)
+        return pushes
 
-    def _broken(
-        self, values: np.ndarray, planes: Planes, x: np.ndarray, tolerance: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the groups (g,) with rows (r,) below their bounds or nodes at (n, 3) beyond walls, and the tolerances
-        of all groups."""
+    def _no_pushes(self) -> RowPushes:
+        return RowPushes(np.zeros(len(self.source)), np.zeros((len(self.source), 3)), np.zeros((len(self.numbers), 3)))
+
+    def _broken(self, system: System, x: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the groups (g,) with rows below their bounds or nodes at (n, 3) beyond walls, and the tolerances of
+        all groups."""
         tolerances = np.full(len(self.groups.starts) - 1, tolerance)
-        if not find_broken(self.groups, values, planes[0], planes[2], x, tolerances):
+        if not find_broken(self.groups, system.values, system.plane, system.gaps, x, tolerances):
             return np.empty(0, dtype=np.int64), tolerances
         return np.flatnonzero(~(tolerances < 0.0)), tolerances
 
-    def _solve(
-        self, which: np.ndarray, system: System, tolerances: np.ndarray, force: np.ndarray, moves: np.ndarray
-    ) -> None:
-        infeasible = project_groups(which, self.groups, system, tolerances, force, moves)
-        if infeasible >= 0:
+    def _solve(self, which: np.ndarray, system: System, tolerances: np.ndarray, size: float, pushes: RowPushes) -> None:
+        group, why = project_groups(which, self.groups, system, tolerances, size, pushes)
+        if group >= 0 and why == RUBS:
+            raise SimulationFailure(self.unsettled_message(group))
+        if group >= 0:
             raise SimulationFailure(
-                f"no positions of nodes {self._shown(infeasible)} satisfy their contact pairs, constraints, walls and "
+                f"no positions of nodes {self._shown(group)} satisfy their contact pairs, constraints, walls and "
                 "supports"
             )
+
+    def unsettled_message(self, group: int) -> str:
+        """Return the message about a group without a solution of its friction."""
+        return (
+            f"the friction of nodes {self._shown(group)} in contact pairs and on walls did not converge: they may be "
+            "jammed between walls and supports; reduce the friction, free the nodes, or reduce time.step"
+        )
 
     def _shown(self, group: int) -> str:
         _, _, starts, nodes = self.groups
         return ", ".join(str(number) for number in self.numbers[nodes[starts[group] : starts[group + 1]]][:6])
 
     def project(
-        self,
-        x: np.ndarray,
-        stiffness: np.ndarray,
-        tolerance: float,
-        start: np.ndarray | None = None,
-        planes: Planes | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return forces (r,) [N] that satisfy the rows, and the gradients (r, k, 3) along which they act.
+        self, nodes: FreeNodes, tolerance: float, walls: WallsOfNodes | None = None, lift: np.ndarray | float = 0.0
+    ) -> tuple[RowPushes, np.ndarray, System]:
+        """Return the forces that satisfy the rows, the gradients (r, k, 3) along which they act, and the rows as they
+        were solved.
 
         Parameters
         ----------
-        x, stiffness : (n, 3), (n,) positions without rows, and forces for displacements of the nodes [m], [N/m]
+        nodes : FreeNodes
         tolerance : [m]
-        start : (n, 3) positions where the forces act, None: at the solution
-        planes : of walls at the nodes, if there are any
+        walls : at the nodes, if there are any
+        lift : (r,) by how much the bounds of rows are above zero [m]
 
         Raises
         ------
         SimulationFailure
             On ranks with rows that are infeasible.
         """
-        values, force, jacobian = self.values(x), np.zeros(len(self.source)), self.fixed_jacobian
-        groups, tolerances = self._broken(values, planes or self._no_planes, x, tolerance)
+        x, jacobian, pushes = nodes.x, self.fixed_jacobian, self._no_pushes()
+        planes = None if walls is None else walls.planes(x, x)
+        system = self.system(jacobian, self.values(x) - lift, nodes, planes)
+        groups, tolerances = self._broken(system, x, tolerance)
         if len(groups) == 0:
-            return force, jacobian
-        moves = np.empty_like(x)
-        if not self._turning[groups].any():
-            self._solve(groups, self.system(jacobian, values, stiffness, planes), tolerances, force, moves)
-            return force, jacobian
-        jacobian, at, rows, chosen = jacobian.copy(), x.copy(), None, np.empty(len(self._turning), dtype=bool)
-        system = self.system(jacobian, values, stiffness, planes)
+            return pushes, jacobian, system
+        size, again = float(np.abs(x).max()), self._turning
+        if walls is not None:
+            again = again.copy()
+            again[self.group_of_node[walls.varying]] = True
+        if not again[groups].any():
+            self._solve(groups, system, tolerances, size, pushes)
+            return pushes, jacobian, system
+        jacobian, at, rows, chosen = jacobian.copy(), x.copy(), None, np.empty(len(again), dtype=bool)
+        system, lift = system._replace(gradients=jacobian), np.broadcast_to(lift, len(self.source))
         for _ in range(_ITERATIONS):
             chosen[:] = False
             chosen[groups] = True
             fewer = np.flatnonzero(chosen[self.group_of_row])
             turned = fewer[~self.fixed[fewer]]
-            if rows is None or start is None:
-                jacobian[turned] = self.gradients(at if start is None else start, turned)
+            if rows is None or not nodes.at_start:
+                jacobian[turned] = self.gradients(nodes.start if nodes.at_start else at, turned)
             if rows is not None:
-                linearise(fewer, system, x, at, self.values(at, fewer))
+                linearise(fewer, system, x, at, self.values(at, fewer) - lift[fewer])
+                if walls is not None:
+                    load = self.forces(jacobian, pushes.force, pushes.drag) * nodes.free
+                    system = system._replace(**walls.planes(at, x + load / nodes.stiffness[:, None])._asdict())
             rows = fewer
-            self._solve(groups, system, tolerances, force, moves)
+            self._solve(groups, system, tolerances, size, pushes)
             settled = np.empty(len(groups), dtype=bool)
-            advance_groups(groups, self.groups, x, moves, at, tolerances, settled)
-            groups = groups[~settled & self._turning[groups]]
+            advance_groups(groups, self.groups, x, pushes.moves, at, tolerances, settled)
+            groups = groups[~settled & again[groups]]
             if len(groups) == 0:
-                return force, jacobian
+                return pushes, jacobian, system
         raise SimulationFailure(
-            f"the positions of nodes {self._shown(int(groups[0]))} on their constraints did not converge in "
+            f"the positions of nodes {self._shown(int(groups[0]))} on their constraints and walls did not converge in "
             f"{_ITERATIONS} iterations; reduce time.step"
         )
 

@@ -106,9 +106,14 @@ def _put(i, normal, offset, table, kept):
 
 @kernel
 def _find(triangles, nodes, ways, tolerance, table, kept):
-    """Find the planes of nodes (m,) on their ways; return whether any changed. ``ways``: starts and ends (m, 3), fixed
-    (m, 3) bool, and by how much each may have been behind the surface (m,) [m]; ``table``: marks of nodes (owned,), their normals (owned, 3, 3) and offsets (owned, 3); ``kept``: normals (owned, 9) of the planes of earlier
-    steps, and which of these they touch (owned, 3) bool."""
+    """Find the planes of nodes (m,) on their ways; return whether any changed.
+
+    Parameters
+    ----------
+    ways : starts and ends (m, 3), fixed (m, 3) bool, and by how much each may have been behind the surface (m,) [m]
+    table : marks of nodes (owned,), their normals (owned, 3, 3) and offsets (owned, 3)
+    kept : normals (owned, 9) of the planes of earlier steps, and which of these they touch (owned, 3) bool
+    """
     starts, ends, fixed, slack = ways
     known, normals, offsets = table
     changed, both = False, triangles.limits[0, 0] > 0.0

@@ -18,6 +18,7 @@ from ..parallel.agreement import agreed
 from ..tolerances import FREE_PART, PROJECTED
 from .constraint_set import ConstraintSet
 from .frames import NodalFrames
+from .rows import FreeNodes
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -158,10 +159,10 @@ class RowCoordinates:
         rows, here = self.rows, self.rows.here
         k, x = rows.gather(stiffness), rows.gather(predictor + u)
         tolerance = PROJECTED * self.constraints.contact.size
-        start = self._start if self._part == 0.0 else None
+        nodes = FreeNodes(x, k, self._start, self._part == 0.0, rows.free)
         with agreed(self.comm):
-            force, jacobian = rows.project(x, k, tolerance, start)
-        u[here] += (rows.forces(jacobian, force) * rows.free / k[:, None])[rows.mine]
+            pushes, *_ = rows.project(nodes, tolerance)
+        u[here] += pushes.moves[rows.mine]
 
     def forward(self, w: np.ndarray) -> None:
         """Transform w to y (owned, 3), in place. Collective."""

@@ -83,7 +83,7 @@ class CalledRows(NamedTuple):
     predictor, u : (n, 3) positions to which nodes move without forces, and increments; (0, 3) without calls
     held, changing : (n,) nodes on which rows press, ascending; nodes of rows whose force begins or ends
     counts : (2,) their numbers
-    loss : (1,) energy that closing rows lose [J]
+    loss : (2,) energy that closing rows lose, and that friction of rows dissipates in the next step [J]
     """
 
     any: bool
@@ -160,7 +160,7 @@ class Course(NamedTuple):
     """How a step goes on, which compiled steps assign: whether increments and energies are needed; what
     :func:`~pfem_petsc.mechanics.internal_forces.internal_forces` returns; the number of shares of rows that are
     written; whether a condition holds here, and after :func:`agree` on any rank; the error code of MPI; and what a call
-    of Python returned."""
+    of Python returned, or 1 plus the number of a row without a solution."""
 
     keeps: bool
     needs_energies: bool
@@ -322,8 +322,9 @@ def solve_called(s, step):
 
 @addressed
 def join_pressing(s, step):
-    """Find all nodes with contact forces, and the work of these."""
+    """Find all nodes with contact forces, the work of these, and what friction takes."""
     contacts = s.contacts
+    contacts.friction += s.called.loss[1]
     contacts.pressing = join_nodes(contacts.near, contacts.others, s.walls.present)
     work_of_contact(contacts.pressing, s.motion, s.sums)
 
@@ -466,7 +467,7 @@ def run_compiled(s, phases, starts, due, flags):
     split_components(s.state.x, motion.x)
     split_components(s.state.half, motion.half)
     for step in range(count):
-        if course.failed >= 0 or turned >= 0 or pressed.failure[0] >= 0:
+        if course.failed >= 0 or turned >= 0 or pressed.failure[0] >= 0 or (course.unsolved != 0 and not calling):
             # the other ranks still need messages, until all know of the failure
             _perform(SEND, phases, starts, s, step)
             passed += 1

@@ -400,6 +400,9 @@ class CompiledSteps:
         if infeasible >= 0:
             node = pressed.nodes[infeasible]
             return self._at_balance(self.model.contact.placeless(node, why, pressed.normals, pressed.offsets))
+        if made[UNSOLVED] > 0:
+            rows = self.model.links.rows
+            return self._at_balance(rows.unsettled_message(int(rows.group_of_row[made[UNSOLVED] - 1])))
         return self._at_balance(self._called.failure) if made[UNSOLVED] else None
 
     def _at_balance(self, text: object) -> SimulationFailure:
@@ -435,7 +438,7 @@ class RowCaller:
         self._function = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(self._call)
         self.function = CFunction(self._function, _CALL)
         n = 0 if self.links.separate else len(u)
-        nodes, counts, loss = np.empty((2, n), dtype=np.int64), np.zeros(2, dtype=np.int64), np.zeros(1)
+        nodes, counts, loss = np.empty((2, n), dtype=np.int64), np.zeros(2, dtype=np.int64), np.zeros(2)
         self.record = CalledRows(not self.links.separate, np.empty((n, 3)), u[:n], *nodes, counts, loss)
         self._keep(_HELD, self.links.pressed())
         if self.record.any:
@@ -463,7 +466,7 @@ class RowCaller:
         """Solve the rows of a step, or find the energy that they lose."""
         try:
             if what == SOLVE:
-                self._solve((self._begin + step + 2) * self.stepper.h)
+                self._solve(self._begin + step + 1)
             else:
                 self._close()
         except BaseException as error:  # noqa: BLE001  # an exception cannot pass the compiled loop: end raises it
@@ -474,18 +477,19 @@ class RowCaller:
             return LOST
         return 0
 
-    def _solve(self, time: float) -> None:
-        """Solve the rows of the balance for the positions at a time [s]; if that fails, they have no forces."""
+    def _solve(self, step: int) -> None:
+        """Solve the rows of the balance at the end of a step of a number; if that fails, they have no forces."""
         links, record = self.links, self.record
         self._keep(_HELD, np.empty(0, dtype=np.int64))
         self._keep(_CHANGING, np.empty(0, dtype=np.int64))
-        self._totals[:] = 0.0
+        self._totals[:] = record.loss[:] = 0.0
         stepper = self.stepper
-        stepper.balance = replace(stepper.balance, predictor=record.predictor, time=time)
+        stepper.state.time = step * stepper.h
+        stepper.balance = replace(stepper.balance, predictor=record.predictor, time=(step + 1) * stepper.h)
         load = links.explicit(stepper.balance, stepper.state, self._u, self._stiffness, self._tolerance)
         if load is not None:
             links.push(load, self._stiffness, self._u, self._contact)
-        self._totals[:] = links.totals()
+        self._totals[:], record.loss[1] = links.totals(), links.friction
         self._keep(_HELD, links.pressed())
         two = links.two
         changed = (links.force[two.at] > 0.0) != two.record.closed

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..columns import HEAD
 from ..contact.explicit import Arrivals, PressedWalls, WallSums, find_penetrating, press_nodes
-from ..contact.fixed_rows import close_rows, pressed_nodes
+from ..contact.fixed_rows import close_rows, new_single_row, pressed_nodes, rebound_of_row, rub_row
 from ..contact.node_walls import compare_contacts
 from ..contact.surfaces import Surfaces, wall_gaps
 from ..mechanics.compiled import addressed, inlined
@@ -203,23 +203,43 @@ def project_on_rows(s, step):
     force begins or ends with respect to ``rows.closed``."""
     rows, nodes, motion, contacts = s.rows, s.nodes, s.motion, s.contacts
     where, normals, force, h = rows.where, rows.normals, rows.force, motion.h
-    count, changed = 0, 0
+    count, changed, rubs, rebounds = 0, 0, len(rows.friction) > 0, len(rows.rebound) > 0
+    single, slip, stiffness = new_single_row(), np.empty(3), np.empty(2)
+    s.called.loss[1] = 0.0
     for p in range(len(force)):
         i, j, apart = where[0, p], where[1, p], 0.0
         for c in range(3):
             there, here = motion.x[c, j] + h * motion.half[c, j], motion.x[c, i] + h * motion.half[c, i]
             apart += normals[p, c] * (there - here)
         short = rows.least[p] - apart
+        if rebounds:
+            gap, pull = -rows.least[p], 0.0
+            for c in range(3):
+                gap += normals[p, c] * (motion.x[c, j] - motion.x[c, i])
+                pull -= normals[p, c] * (motion.u[c, j] - motion.u[c, i])
+            short += rebound_of_row(p, rows, gap, -short - gap, pull)
         presses = short > 0.0 and rows.soft[p] > 0.0
         force[p] = short / rows.soft[p] if presses else 0.0
         changed += 1 if presses != rows.closed[p] else 0
+        if rubs:
+            size = 0.0
+            for c in range(3):
+                rows.drag[p, c], slip[c] = 0.0, h * (motion.half[c, j] - motion.half[c, i])
+                size += abs(motion.x[c, i]) + abs(motion.x[c, j])
+            if presses and rows.friction[p, 1] > 0.0:
+                stiffness[0], stiffness[1] = nodes.stiffness[i], nodes.stiffness[j]
+                found, work = rub_row(p, rows, short, stiffness, slip, size, single)
+                s.called.loss[1] += work
+                if not found and s.course.unsolved == 0:
+                    s.course.unsolved = 1 + p
         if not presses:
             continue
         count += 1
         for end in range(2):
             node = where[end, p]
             for c in range(3):
-                part = (force[p] if end == 1 else -force[p]) * normals[p, c]
+                part = force[p] * normals[p, c] + rows.drag[p, c] if rubs else force[p] * normals[p, c]
+                part = part if end == 1 else -part
                 motion.contact[node, c] += part
                 displace(c, node, part * rows.free[end, p, c] / nodes.stiffness[node], nodes, motion, s.sums)
     contacts.rows, contacts.altered, contacts.others = count, changed, pressed_nodes(rows, count)
@@ -234,7 +254,7 @@ def sum_rows(s, step):
     for k in range(len(rows.totals) if s.contacts.rows > 0 else 0):
         for p in range(rows.table_starts[k], rows.table_starts[k + 1]):
             for c in range(3):
-                rows.totals[k, c] += rows.force[p] * rows.normals[p, c]
+                rows.totals[k, c] += rows.force[p] * rows.normals[p, c] + rows.drag[p, c]
 
 
 @inlined

@@ -252,7 +252,7 @@ class Ledger:
             if stepper.scheme.solves_next_position:
                 self.impulses.step(stepper.totals_solved, stepper.part_before_start)
                 self.impulses.state.v[:] = 0.0  # like the nodal velocities, which have not jumped yet
-                self._pending = [self._impact(self._before, started=True), stepper.solution.walls.friction]
+                self._pending = [self._impact(self._before, started=True), self._friction()]
                 # damping treats nodes that walls stop at the start as already stopped
                 self._before.damping = damping_force(stepper, stepper.velocity_solved)
 
@@ -399,13 +399,17 @@ class Ledger:
     def _dissipated(self, before: Moment) -> tuple[float, float]:
         """Return the impact and friction dissipation of the last step [J]."""
         stepper = self.stepper
-        impact, friction = self._impact(before), stepper.solution.walls.friction
+        impact, friction = self._impact(before), self._friction()
         if not stepper.scheme.solves_next_position:
             if not stepper.scheme.solves_end:  # friction is determined with the slip to the position solved for
                 friction *= stepper.part / (stepper.balance.time - (stepper.state.time - stepper.part))
             return impact, friction
         pending, self._pending = self._pending, [0.0, friction]
         return impact + pending[0], pending[1]
+
+    def _friction(self) -> float:
+        """Return the energy that friction at walls and of rows dissipates in the step solved for [J]."""
+        return self.stepper.solution.walls.friction + self.model.links.friction
 
     def _impact(self, before: Moment, started: bool = False) -> float:
         """Return the dissipation of closing contacts [J], of the next step if the scheme has solved it in advance."""
@@ -457,8 +461,9 @@ class Ledger:
         work of the weight of the latter, and their numerical dissipation [J].
 
         Walls do work by all the momentum that they give in the step, by forces and by velocity jumps: the mean force
-        times the displacement of the wall, and the mean moment about its axis times the angle by which it turns. A wall with mass is a particle of the same scheme, so its kinetic energy
-        changes by that momentum, and by that of its weight, times the mean of its velocities before and after.
+        times the displacement of the wall, and the mean moment about its axis times the angle by which it turns. A wall
+        with mass is a particle of the same scheme, so its kinetic energy changes by that momentum, and by that of its
+        weight, times the mean of its velocities before and after.
         """
         stepper, contact = self.stepper, self.model.contact
         if not contact.moving.any():

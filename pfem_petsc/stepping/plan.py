@@ -24,6 +24,7 @@ from ..tolerances import TIME
 from .explicit import ExplicitStepper, RedistributedStepper
 
 if TYPE_CHECKING:
+    from ..case.base import SurfaceKeys
     from ..case.schema import Case
     from ..solvers.linear import LinearChoice
     from .model import Model
@@ -377,7 +378,7 @@ def make_stepper(model: Model, plan: Plan) -> Stepper:
     stepper.plan = plan
     if treatment is not None:
         stepper.treatment = treatment(stepper)
-    elif model.contact.restitution.any() and not model.contact.rebounds:
+    elif (model.contact.restitution.any() or model.links.rows.rebounds) and not plan.scheme.solves_next_position:
         stepper.treatment = Restitution(stepper)
     if model.can_touch:
         _warn_of_gain(model, plan)
@@ -450,21 +451,45 @@ def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) ->
                 "not rows over time"
             )
         model.contact.motion.bodies = FreeWalls(walls, plan.scheme, model.comm, tuple(model.external.gravity))
-    model.links.check(model.case.contact.treatment, model.size)
-    for k, name in enumerate(model.contact.names):
-        key = f"{model.case.source}: wall {name!r}"
-        slot = model.contact.first[k]
-        if model.contact.restitution[slot]:
-            _check_restitution(model, plan, treatment, k, key)
-        if model.contact.ties.tying[slot]:
+    explicit = plan.linear is None
+    model.links.check(model.case.contact.treatment, explicit, model.size)
+    for k, wall in enumerate(walls):
+        key = f"{model.case.source}: wall {model.contact.names[k]!r}"
+        model.contact.rebounds |= _check_surface(model, plan, treatment, wall, key)
+        if wall.tied:
             _check_serves(treatment, "tied", key)
-        if model.contact.static_friction[slot]:
-            _check_serves(treatment, "friction", key)
-            if treatment is not None and not plan.scheme.jumps_known:
-                raise InputError(
-                    f'{key}: friction with {model.case.time.integrator} needs contact.treatment = "scheme": the '
-                    "friction of velocity jumps is not known for it; use another treatment or integrator"
-                )
+        if wall.restitution and wall.mass is not None and not plan.scheme.solves_next_position:
+            # the impulse of a velocity jump does not move walls with mass
+            raise InputError(f"{key}: restitution of a wall with mass needs central_differences")
+    for pair in model.case.contact_pair:
+        key = f"{model.case.source}: contact_pair {pair.name!r}"
+        if pair.friction_coefficients[1] and not (explicit and treatment is None):
+            raise InputError(
+                f'{key}: friction needs an explicit integrator and contact.treatment = "scheme"; use them, or remove '
+                "friction"
+            )
+        model.links.rebounds |= _check_surface(model, plan, treatment, pair, key)
+        if pair.restitution and not (model.links.rebounds or (model.links.alone and not model.links.dynamic)):
+            raise InputError(
+                f"{key}: restitution of nodes that are in several pairs or constraints, or that walls stop as well, "
+                "needs central_differences"
+            )
+
+
+def _check_surface(model: Model, plan: Plan, treatment: type[Treatment] | None, keys: SurfaceKeys, key: str) -> bool:
+    """Refuse friction and restitution that the scheme or treatment does not support; return whether the latter is a
+    bound on the next position."""
+    rebounds, rough = False, keys.friction_coefficients[1] > 0.0
+    if keys.restitution:
+        rebounds = _check_restitution(model, plan, treatment, rough, key)
+    if rough:
+        _check_serves(treatment, "friction", key)
+        if treatment is not None and not plan.scheme.jumps_known:
+            raise InputError(
+                f'{key}: friction with {model.case.time.integrator} needs contact.treatment = "scheme": the '
+                "friction of velocity jumps is not known for it; use another treatment or integrator"
+            )
+    return rebounds
 
 
 def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> None:
@@ -476,7 +501,7 @@ def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> Non
     raise InputError(f"{key}: {what} needs contact.treatment = {' or '.join(served)}")
 
 
-def _check_restitution(model: Model, plan: Plan, treatment: type[Treatment] | None, k: int, key: str) -> None:
+def _check_restitution(model: Model, plan: Plan, treatment: type[Treatment] | None, rough: bool, key: str) -> bool:
     if model.inertia.consistent:
         raise InputError(f'{key}: restitution needs time.mass = "lumped": one node\'s velocity jumps')
     if not plan.scheme.jumps_known:
@@ -485,13 +510,11 @@ def _check_restitution(model: Model, plan: Plan, treatment: type[Treatment] | No
             "another integrator"
         )
     if plan.scheme.solves_next_position:
-        model.contact.rebounds = True
         if treatment is not None:
             raise InputError(f'{key}: with {model.case.time.integrator} restitution needs contact.treatment = "scheme"')
-        return
+        return True
     _check_serves(treatment, "restitution", key)
-    # the impulse of a velocity jump causes no friction and does not move walls with mass
-    if model.contact.static_friction[model.contact.first[k]]:
+    # the impulse of a velocity jump causes no friction
+    if rough:
         raise InputError(f"{key}: restitution together with friction needs central_differences")
-    if model.case.wall[k].mass is not None:
-        raise InputError(f"{key}: restitution of a wall with mass needs central_differences")
+    return False

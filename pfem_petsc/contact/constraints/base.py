@@ -72,6 +72,8 @@ class Constraint(ABC):
     dynamic : whether rows come and go: :meth:`find` is then called in each step, before it is solved
     ids : (r,) number of each row in its table, by which a row is the same in another step; None: counted over ranks
     name : of the table, for messages
+    friction : coefficients of dynamic and static friction; restitution : its coefficient. Rows with either need
+        :meth:`weights`
     """
 
     nodes: np.ndarray
@@ -80,6 +82,8 @@ class Constraint(ABC):
     dynamic = False
     ids: np.ndarray | None = None
     name = ""
+    friction = 0.0, 0.0
+    restitution = 0.0
 
     def of(self, nodes: np.ndarray, data: np.ndarray) -> Self:
         """Return the constraint with other rows (r, k), (r, m)."""
@@ -132,6 +136,11 @@ class Constraint(ABC):
 
         A row with force f [N] applies f times its gradient to its nodes.
         """
+
+    def weights(self) -> np.ndarray:
+        """Return the weights (r, k) of the nodes of rows n . (sum of weights times positions) >= d, whose gradients are
+        the weights times unit vectors n; zero, by default, for others, which neither rub nor rebound."""
+        return np.zeros(self.nodes.shape)
 
     def drift(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return second time derivatives (r,) of the rows [m/s2] at constant nodal velocities; zero by default.

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 
 from ...integrators.base import Scheme
 from ...tolerances import FREE_PART, RANK
@@ -162,9 +163,9 @@ _NONE = 1e-9  # of a force: what of it is rounding, and of the tolerance of the 
 
 
 class Restitution(Treatment):
-    """Makes nodes that close on walls with restitution leave them.
+    """Makes nodes that close on walls with restitution leave them, and likewise pairs, which share no nodes.
 
-    ``everywhere`` : whether the treatment applies to walls without restitution too.
+    ``everywhere`` : whether the treatment applies to walls and pairs without restitution too.
     """
 
     everywhere = False
@@ -172,11 +173,12 @@ class Restitution(Treatment):
     def before(self) -> None:
         """Record contacts and the motion of nodes."""
         self._touched = self.stepper.touching.copy()
-        contact, state = self.stepper.model.contact, self.stepper.state
+        contact, state, links = self.stepper.model.contact, self.stepper.state, self.stepper.model.links
         scheme = self.stepper.scheme
         # nodes in whose first free step the old wall force still does work
         self._frees = scheme.balance_at_endpoints and not scheme.solves_next_position
-        if self._frees or contact.has_friction or contact.restitution.any():
+        rebounds = bool(contact.restitution.any()) or links.rows.rebounds
+        if self._frees or contact.has_friction or rebounds:
             self._time, self._place = state.time, state.position.copy()
         if self._frees:
             mine = self._touched if self.everywhere else self._touched & (contact.restitution > 0.0)
@@ -187,11 +189,24 @@ class Restitution(Treatment):
             # a node that leaves by restitution has had its force removed up to rounding
             none = np.linalg.norm(self._force, axis=1) <= _NONE * np.linalg.norm(pressed, axis=1)
             self._force[none] = 0.0
-        if not contact.restitution.any():
+        self._pressed = links.force > 0.0
+        self._push = None
+        if self._frees and (self.everywhere or links.rows.rebounds) and links.any_pressed():
+            change = state.memory.get("contact_change", 0.0)
+            ends = links.two.gather(np.concatenate([state.contact + change, state.position], axis=1))
+            force = 0.5 * links.two.apart(ends[:, :, :3])  # half the relative force between the ends
+            force[force <= _NONE * links.force] = 0.0
+            self._push = self._pressed & self._treated, force, links.two.apart(ends[:, :, 3:])
+        if not rebounds:
             return
         self._speed = state.v
         if not scheme.explicit:
             self._free = self._without_contact(np.arange(len(state.v)))
+
+    @property
+    def _treated(self) -> np.ndarray:
+        """(p,) bool: pairs to which the treatment applies."""
+        return (self.stepper.model.links.rows.restitution > 0.0) | self.everywhere
 
     def _without_contact(self, nodes: np.ndarray) -> np.ndarray:
         """Return accelerations (m, 3) of nodes without contact forces [m/s2], zero in prescribed components."""
@@ -205,8 +220,63 @@ class Restitution(Treatment):
     def after(self) -> None:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         self.clear()
-        nodes, v, a = self.on_walls(self.stepper.model.contact.restitution > 0.0)
-        self.put(nodes, v, a)
+        self.put(*self.with_pairs(*self.on_walls(self.stepper.model.contact.restitution > 0.0)))
+
+    def with_pairs(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Add the nodes of pairs in contact, and of those just released, to nodes (m,) and their velocities and
+        accelerations (m, 3). Collective."""
+        stepper, links, mass = self.stepper, self.stepper.model.links, self.stepper.model.inertia.mass
+        state, two = stepper.state, links.two
+        if not (self.everywhere or links.rows.rebounds):
+            return nodes, v, a
+        if links.any_pressed():
+            closed = (links.force > 0.0) & self._treated
+            leaves = self._pairs_leave(closed & ~self._pressed)
+            end, row = np.nonzero((two.nodes >= 0) & closed)
+            ends, normals = two.nodes[end, row], two.normals[row]
+            along = np.einsum("mi,mi->m", normals, self._without_contact(ends) - state.a[ends])
+            free = state.a[ends] + along[:, None] * normals
+            held = two.together(state.a, mass, closed)[ends]
+            nodes, v = np.append(nodes, ends), np.vstack([v, two.together(state.v, mass, closed, leaves)[ends]])
+            a = np.vstack([a, np.where((leaves > 0.0)[row][:, None], free, held)])
+        if self._push is not None:
+            ends, slower = self._pairs_let_go()
+            nodes, v, a = np.append(nodes, ends), np.vstack([v, slower]), np.vstack([a, state.a[ends]])
+        return nodes, v, a
+
+    def _pairs_leave(self, fresh: np.ndarray) -> np.ndarray:
+        """Return velocities (p,) [m/s] at which the nodes of pairs leave each other, ``fresh`` (p,) bool of which have
+        just closed; see :meth:`leaving`. Collective."""
+        links, state = self.stepper.model.links, self.stepper.state
+        if not links.rows.rebounds:
+            return np.zeros(len(fresh))
+        every, two = np.arange(len(state.v)), links.two
+        moved = state.position - self._place
+        if self.stepper.scheme.explicit:
+            vectors = moved, *self._explicit_motion(every, moved)
+        else:
+            vectors = moved, self._speed, self._free + self._without_contact(every)
+        ends = two.gather(np.concatenate(vectors, axis=1))
+        towards = [-two.apart(ends[:, :, k : k + 3]) for k in range(0, ends.shape[2], 3)]
+        distance, restitution = np.maximum(towards[0], 0.0), links.rows.restitution
+        if self.stepper.scheme.explicit:
+            _, approach, before, after = towards
+            square = impact_square(approach, distance, before)
+            leaves = rebound_way(restitution, square, distance, after) / self.stepper.part
+        else:
+            _, speed, pull = towards
+            leaves = np.where(speed > 0.0, restitution * np.sqrt(np.maximum(speed * speed + pull * distance, 0.0)), 0.0)
+        return np.where(fresh, leaves, 0.0)
+
+    def _explicit_motion(self, nodes: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return displacements of nodes (m,) without contact (m, 3), which have ``moved`` by (m, 3) with it, and their
+        parts by forces before and after the impact [m]; from the balance of the step."""
+        stepper, state, h = self.stepper, self.stepper.state, self.stepper.part
+        balance, mass = stepper.balance, stepper.model.inertia.mass[nodes, None]
+        push = np.where(stepper.model.supports.fixed[nodes], 0.0, state.contact[nodes]) / mass
+        known = 0.0 if balance.a_hat is None else balance.a_hat[nodes]
+        free = balance.alpha * stepper.solution.u[nodes] + known - push
+        return moved - push / balance.alpha, h * h * free, h * h * self._without_contact(nodes)
 
     def put(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
         """Set velocities and accelerations (m, 3) of nodes (m,) in contact and of those just released."""
@@ -262,17 +332,16 @@ class Restitution(Treatment):
 
         The displacements without walls follow from the balance of the step.
         """
-        stepper, state, h = self.stepper, self.stepper.state, self.stepper.part
-        contact, balance, mass = stepper.model.contact, stepper.balance, stepper.model.inertia.mass[nodes, None]
-        push = np.where(stepper.model.supports.fixed[nodes], 0.0, state.contact[nodes]) / mass
-        moved = self._moved(nodes) - (push / balance.alpha)[:, None, :]
-        known = 0.0 if balance.a_hat is None else balance.a_hat[nodes]
-        free = balance.alpha * stepper.solution.u[nodes] + known - push
+        contact, state = self.stepper.model.contact, self.stepper.state
+        poses = contact.motion.poses(self._time), contact.motion.poses(state.time)
+        way = contact.ways(self._place[nodes], *poses)
+        moved, before, after = self._explicit_motion(nodes, state.position[nodes] - self._place[nodes])
         approach, before, after = (
             -np.einsum("mwi,mwi->mw", normals, array)
-            for array in (moved, h * h * free[:, None, :], h * h * self._without_contact(nodes)[:, None, :])
+            for array in (moved[:, None, :] - way, before[:, None, :], after[:, None, :])
         )
-        return rebound_way(contact.restitution, impact_square(approach, distance, before), distance, after) / h
+        square = impact_square(approach, distance, before)
+        return rebound_way(contact.restitution, square, distance, after) / self.stepper.part
 
     def sticking(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
@@ -306,3 +375,22 @@ class Restitution(Treatment):
         if leaves.any():
             a[leaves] += np.einsum("mij,mj->mi", normal[leaves], self._without_contact(nodes[leaves]))
         return nodes, v, a
+
+    def _pairs_let_go(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return ends (m,) of pairs that opened in this step, and their velocities (m, 3); see :meth:`_let_go`.
+
+        Collective.
+        """
+        state, links, mass = self.stepper.state, self.stepper.model.links, self.stepper.model.inertia.mass
+        two = links.two
+        pressed, force, before = self._push
+        gone = pressed & ~(links.force > 0.0)
+        if not self.stepper.model.comm.allreduce(bool(gone.any()), op=MPI.LOR):
+            return np.empty(0, dtype=np.int64), np.empty((0, 3))
+        ends = two.gather(np.concatenate([state.position, state.v], axis=1))
+        work = 0.5 * force * (two.apart(ends[:, :, :3]) - before)
+        speed = two.apart(ends[:, :, 3:])
+        gone &= (work > 0.0) & (speed > 0.0)
+        slower = np.sqrt(np.maximum(speed * speed - 2.0 * work / two.reduced_mass(mass), 0.0))
+        ends = two.nodes[(two.nodes >= 0) & gone]
+        return ends, two.together(state.v, mass, gone, slower)[ends]

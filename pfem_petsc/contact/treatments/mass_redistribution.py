@@ -72,9 +72,8 @@ def redistribute(model: Model) -> Redistribution:
     for k, wall in enumerate(contact.walls):
         if not wall.flat or wall.partial or contact.motion.turning[k] or contact.all_nodes[k]:
             raise InputError(
-                f"{key}: wall {contact.names[k]!r} must be a plane, not curved nor a rectangle, must not turn, and name "
-                "a node_set: "
-                "its nodes lose mass; use another contact.treatment"
+                f"{key}: wall {contact.names[k]!r} must be a plane, not curved nor a rectangle, must not turn, "
+                "and name a node_set: its nodes lose mass; use another contact.treatment"
             )
     if inertia.damped:
         raise InputError(f"{key}: a node without mass cannot be damped; use a material without damping, no [[dashpot]]")

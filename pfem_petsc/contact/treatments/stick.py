@@ -17,7 +17,6 @@ stops the slip: the momentum that the force has taken beyond is given back.
 from __future__ import annotations
 
 import numpy as np
-from mpi4py import MPI
 
 from ...integrators.base import State
 from ...tolerances import FREE_PART, RANK
@@ -33,34 +32,17 @@ class Treatment(Restitution):
     serves = ("tied", "friction", "restitution")
 
     def before(self) -> None:
-        """Also record the positions and forces of pairs in contact."""
+        """Also find what a force does in a step."""
         super().before()
         if self.stepper.model.contact.has_friction:
             self._response = self._response_of()
-        state, links = self.stepper.state, self.stepper.model.links
-        self._pressed = None
-        if self._frees and links.any_pressed():
-            change = state.memory.get("contact_change", 0.0)
-            ends = links.two.gather(np.concatenate([state.contact + change, state.position], axis=1))
-            force = 0.5 * links.two.apart(ends[:, :, :3])  # half the relative force between the ends
-            self._pressed = links.force > 0.0, force, links.two.apart(ends[:, :, 3:])
 
     def after(self) -> None:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         self.clear()
-        state = self.stepper.state
         nodes, v, a = self.on_walls()
         v, a, friction = self._dragged(nodes, v, a)
-        links, mass = self.stepper.model.links, self.stepper.model.inertia.mass
-        if links.any_pressed():
-            ends, _ = links.two.pressed(links.force)
-            nodes = np.append(nodes, ends)
-            v = np.vstack([v, links.two.together(state.v, mass, links.force > 0.0)[ends]])
-            a = np.vstack([a, links.two.together(state.a, mass, links.force > 0.0)[ends]])
-        if self._pressed is not None:
-            ends, slower = self._pairs_let_go()
-            nodes, v, a = np.append(nodes, ends), np.vstack([v, slower]), np.vstack([a, state.a[ends]])
-        self.put(nodes, v, a)
+        self.put(*self.with_pairs(nodes, v, a))
         if self.jump is not None:
             self.jump.friction = friction
 
@@ -170,22 +152,3 @@ class Treatment(Restitution):
         moved = (balance.predictor + self.stepper.solution.u)[nodes] - self._place[nodes]
         poses = contact.motion.poses(self._time), contact.motion.poses(balance.time)
         return moved[:, None, :] - contact.ways(self._place[nodes], *poses)
-
-    def _pairs_let_go(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return ends (m,) of pairs that opened in this step, and their velocities (m, 3); see :meth:`_let_go`.
-
-        Collective.
-        """
-        state, links, mass = self.stepper.state, self.stepper.model.links, self.stepper.model.inertia.mass
-        two = links.two
-        pressed, force, before = self._pressed
-        gone = pressed & ~(links.force > 0.0)
-        if not self.stepper.model.comm.allreduce(bool(gone.any()), op=MPI.LOR):
-            return np.empty(0, dtype=np.int64), np.empty((0, 3))
-        ends = two.gather(np.concatenate([state.position, state.v], axis=1))
-        work = 0.5 * force * (two.apart(ends[:, :, :3]) - before)
-        speed = two.apart(ends[:, :, 3:])
-        gone &= (work > 0.0) & (speed > 0.0)
-        slower = np.sqrt(np.maximum(speed * speed - 2.0 * work / two.reduced_mass(mass), 0.0))
-        ends = two.nodes[(two.nodes >= 0) & gone]
-        return ends, two.together(state.v, mass, gone, slower)[ends]

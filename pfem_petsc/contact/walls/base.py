@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, Vector3, WallParameters, listed
+from ...case.base import Finite, PositiveFloat, StrictModel, SurfaceKeys, Vector3, WallParameters, listed
 from ...errors import InputError, raised
 from ...registry import added_file, lookup
 from ..plugins import checked
@@ -58,7 +58,7 @@ class Rotation(StrictModel):
         return increasing(rows)
 
 
-class WallKeys(WallParameters):
+class WallKeys(SurfaceKeys, WallParameters):
     """Keys that all wall types share."""
 
     velocity: Vector3 | None = None
@@ -78,14 +78,6 @@ class WallKeys(WallParameters):
     adjust: bool = False
     """true: nodes that start beyond the wall are moved onto it, unstressed bars included"""
 
-    friction: NonNegativeFloat = 0.0
-    """coefficient of Coulomb friction"""
-    static_friction: NonNegativeFloat | None = None
-    """coefficient of static friction; default, and minimum: friction"""
-
-    restitution: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """coefficient of restitution: fraction of the normal velocity at which a node leaves the wall after impact"""
-
     tied: bool = False
     """true: a node that touches the wall is fixed to it from then on, in all directions"""
 
@@ -104,8 +96,6 @@ class WallKeys(WallParameters):
             raise ValueError("gravity = true needs the wall's mass [kg]")
         if self.mass is not None and self.motion is not None:
             raise ValueError("expected at most one of the keys mass, motion")
-        if self.static_friction is not None and self.static_friction < self.friction:
-            raise ValueError(f"static_friction must be no less than friction = {self.friction!r}")
         if self.tied and (self.friction or self.static_friction or self.restitution):
             raise ValueError("a tied wall cannot have friction or restitution: nodes neither slip nor leave")
         return self

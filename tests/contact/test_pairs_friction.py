@@ -1,0 +1,132 @@
+"""Bodies that rub on each other: closed forms of sliding and sticking, momentum, energy, ranks and restarts."""
+
+import numpy as np
+import pytest
+from helpers.bodies import HELD, MASSES, G, bodies, case_points, rows_of, upper
+from helpers.lattices import planes, two_lattices
+from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
+
+from pfem_petsc import Case
+
+ANGLE = 0.3
+SCHEMES = ["central_differences", "chung_lee", "hulbert_chung"]
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", SCHEMES)
+def test_block_stops_after_its_way(integrator, comm, shared_tmp_path):
+    """v^2/(2 mu g), in all directions along the face; what friction dissipates is the energy of the motion."""
+    friction, velocity = 0.4, np.array([0.0, 0.3, 0.0])
+    rows, run = rows_of(
+        bodies(comm, integrator, pair={"friction": friction}, on={"upper": velocity.tolist()}, **HELD),
+        comm,
+        shared_tmp_path,
+    )
+    x, v = upper(run)
+    way = x[:, 1]
+    np.testing.assert_allclose(way, 0.3**2 / (2.0 * friction * G), rtol=3e-3)
+    assert np.abs(v).max() < 1e-8
+    assert rows[-1]["friction_dissipation"] == pytest.approx(0.5 * MASSES[1] * 0.3**2, rel=3e-3)
+    sliding = [row["pair/faces/force"] for row in rows if row["time"] < 0.07]
+    np.testing.assert_allclose(
+        sliding, np.tile([0.0, -friction * G * MASSES[1], G * MASSES[1]], (len(sliding), 1)), rtol=1e-9, atol=1e-12
+    )
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-14
+    assert abs(rows[-1]["numerical_dissipation"]) < 1e-3 * rows[-1]["friction_dissipation"]
+    assert np.diff([row["centre_of_mass"][1] for row in rows]).min() > -1e-12  # never reversed
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", SCHEMES)
+@pytest.mark.parametrize("rough", [False, True])
+def test_bodies_that_drag_each_other(integrator, rough, comm, shared_tmp_path):
+    """Pressed together, both free: they end with one velocity, momentum is kept, and the rest of the energy is lost."""
+    friction, force = 0.3 * rough, 0.02
+    parts = ("lower_end", 0.5 * force), ("lower_middle", force), ("upper_end", -0.5 * force), ("upper_middle", -force)
+    pushes = [{"node_set": name, "force": [0.0, 0.0, f]} for name, f in parts]
+    on = {"lower": [0.0, -0.1, 0.0], "upper": [0.0, 0.2, 0.0]}
+    pair = {"friction": friction}
+    case = bodies(comm, integrator, gravity=(0.0, 0.0, 0.0), pair=pair, on=on, load=pushes, end=0.2)
+    rows, run = rows_of(case, comm, shared_tmp_path)
+    momentum = np.array([row["momentum"] for row in rows])
+    start = MASSES @ [-0.1, 0.2]
+    np.testing.assert_allclose(momentum, np.tile([0.0, start, 0.0], (len(rows), 1)), atol=1e-12 * MASSES.sum())
+    _, v = upper(run)
+    np.testing.assert_allclose(v[:, 1], start / MASSES.sum() if rough else 0.2, atol=1e-8)
+    lost = 0.5 * MASSES.prod() / MASSES.sum() * 0.3**2
+    assert rows[-1]["friction_dissipation"] == pytest.approx(lost * rough, rel=3e-3)
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-14
+    if rough:  # whether uneven masses slip: node by node the drag is mu times the force of the pair
+        sliding = np.array([row["pair/faces/force"] for row in rows[3:5]])
+        np.testing.assert_allclose(sliding[:, 1] / sliding[:, 2], -friction, rtol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", SCHEMES)
+def test_incline_holds_up_to_static_friction(integrator, comm, tmp_path):
+    """It sticks where tan(angle) is below the static coefficient, and slides by g (sin - mu cos) above."""
+    gravity = [0.0, G * np.sin(ANGLE), -G * np.cos(ANGLE)]
+    for static, holds in ((1.02, True), (0.98, False)):
+        pair = {"friction": 0.1, "static_friction": static * np.tan(ANGLE)}
+        rows, run = rows_of(bodies(comm, integrator, gravity=gravity, pair=pair, **HELD), comm, tmp_path, f"{holds}")
+        x, v = upper(run)
+        slides = 0.0 if holds else G * (np.sin(ANGLE) - 0.1 * np.cos(ANGLE))
+        np.testing.assert_allclose(x[:, 1], 0.5 * slides * 0.1**2, rtol=1e-2, atol=1e-15)
+        np.testing.assert_allclose(v[:, 1], slides * 0.1, rtol=1e-2, atol=1e-14)
+        force = rows[-1]["pair/faces/force"] / (G * MASSES[1])
+        drag = np.sin(ANGLE) if holds else 0.1 * np.cos(ANGLE)
+        np.testing.assert_allclose(force, [0.0, -drag, np.cos(ANGLE)], rtol=1e-9, atol=1e-12)
+        assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-14
+
+
+@pytest.mark.parametrize("integrator", SCHEMES)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_held_nodes_and_a_floor_with_friction(integrator, axis, comm, tmp_path):
+    """The lower body rests on a rough floor: what rubs on it moves it only beyond the friction of the floor."""
+    for floor, moves in ((0.5, False), (0.1, True)):
+        wall = {
+            "type": "plane",
+            "name": "floor",
+            "point": [0.0, 0.0, 0.0],
+            "normal": [0.0, 0.0, 1.0],
+            "friction": floor,
+        }
+        velocity = [0.0, 0.0, 0.0]
+        velocity[axis] = 1.0
+        pair = {"friction": 0.4}
+        rows, run = rows_of(
+            bodies(comm, integrator, pair=pair, on={"upper": velocity}, wall=[wall], end=0.05),
+            comm,
+            tmp_path,
+            f"{moves}",
+        )
+        upwards = G * MASSES
+        dragged = max(0.4 * upwards[1] - floor * upwards.sum(), 0.0) / MASSES[0]
+        x = run.gather(run.state.position)[:3] - case_points()[:3]
+        np.testing.assert_allclose(x[:, axis], 0.5 * dragged * 0.05**2, rtol=0.05, atol=1e-15)
+        weights = [G * MASSES[1], G * MASSES.sum()]
+        pair_force, wall_force = rows[-1]["pair/faces/force"], rows[-1]["wall/floor/force"]
+        np.testing.assert_allclose([pair_force[2], wall_force[2]], weights, rtol=1e-9)
+        assert pair_force[axis] == pytest.approx(-0.4 * weights[0], rel=1e-9)
+        assert wall_force[axis] == pytest.approx(-floor * weights[1] if moves else -0.4 * weights[0], rel=1e-9)
+        assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-14
+
+
+@pytest.mark.slow
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
+@pytest.mark.parametrize("kind", ["pairs", "beside a wall"])
+def test_any_number_of_ranks(kind, integrator, comm, shared_tmp_path):
+    """Lattices that meet, rub and rebound: the run on all ranks is that on one, and one in two parts that in one."""
+    keys = {"friction": 0.3, "static_friction": 0.4}
+    case = two_lattices(shared_tmp_path / "m.vtu", integrator, step=2e-4, end=0.02)
+    case["contact_pair"][0] |= keys | ({"restitution": 0.6} if integrator == "central_differences" else {})
+    if kind == "beside a wall":
+        case["wall"] = planes([[0.0, 0.1, 1.0]], [-0.001], **keys)
+        case["contact_pair"].append({**case["contact_pair"][0], "name": "across", "direction": [1.0, -0.4, 0.3]})
+    case = Case.from_dict(case)
+    # two bodies may be divided among ranks in another way in each run
+    history = assert_restart_is_bitwise(case, comm, shared_tmp_path, 5, 12, allowed=1e-9 if comm.size > 1 else 0.0)
+    assert history["friction_dissipation"][-1] > 0.0
+    assert np.abs(history["energy_imbalance"]).max() < 1e-10
+    names = "pair/faces/force", "impact_dissipation", "friction_dissipation", "centre_of_mass", "elastic_energy"
+    assert_as_on_one_rank(history, case, comm, shared_tmp_path, *names, within=1e-9)

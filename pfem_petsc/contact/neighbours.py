@@ -123,6 +123,35 @@ def find_pairs(comm: MPI.Comm, points: Points, own: Segments, skin: float = 0.0,
     return Pairs(np.empty((0, 2), np.int64), np.empty((0, 2, 2), np.int64), np.empty((0, 2)), np.inf)
 
 
+def largest_change(comm: MPI.Comm, motion: tuple[np.ndarray, np.ndarray], n_nodes: int, reach: float) -> float:
+    """Return by how much distances up to ``reach`` between any bars may have changed [m]; infinite for positions that
+    are not finite. Collective.
+
+    An affine map, the fit of all displacements, takes nodes to within r of where they are. With its singular values s,
+    a distance d has become one between s_min d - 2 r and s_max d + 2 r: a body that spins has not changed.
+
+    Parameters
+    ----------
+    motion : positions (owned, 3) before and now [m]
+    n_nodes : of all ranks
+    """
+    start, moved = motion[0], motion[1] - motion[0]
+    means = comm.allreduce(np.stack([start.sum(axis=0), moved.sum(axis=0)])) / n_nodes
+    start, moved = start - means[0], moved - means[1]
+    moments = comm.allreduce(np.stack([start.T @ start, start.T @ moved]))
+    if not np.isfinite(moments).all():
+        return np.inf
+    gradient = np.linalg.pinv(moments[0], rcond=1e-9, hermitian=True) @ moments[1]
+    moved -= start @ gradient
+    ends = np.stack([moved.max(axis=0, initial=-np.inf), -moved.min(axis=0, initial=np.inf)])
+    comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+    moved -= 0.5 * (ends[0] - ends[1])
+    stretches = np.abs(np.linalg.svd(np.eye(3) + gradient, compute_uv=False) - 1.0)
+    square = float(np.einsum("ij,ij->i", moved, moved).max(initial=0.0))
+    rest = 2.0 * np.sqrt(comm.allreduce(square if np.isfinite(square) else np.inf, op=MPI.MAX))
+    return rest + float(stretches.max()) * reach
+
+
 def _measure(
     comm: MPI.Comm, at: np.ndarray, own: Segments, longest: float, skin: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -481,7 +510,7 @@ def _closest(at, points, a, b):
 
 
 @inlined
-def _distance(at, points, a, b):
+def segment_distance(at, points, a, b):
     """Return the distance of segments ``a`` and ``b`` [m], and where they are closest."""
     s, t = _closest(at, points, a, b)
     square = 0.0
@@ -534,7 +563,7 @@ def _examine(points, held, grid, factor, one, two, found, out):
     if i == j:
         return 0
     reach = held.margin[i] + held.margin[j]
-    distance, s, t = _distance(points.at, held.points, i, j)
+    distance, s, t = segment_distance(points.at, held.points, i, j)
     beyond = distance - reach
     if beyond > grid.skin:
         return 0
@@ -546,7 +575,7 @@ def _examine(points, held, grid, factor, one, two, found, out):
     if min(int(s * pieces), pieces - 1) != part_i or min(int(t * others), others - 1) != part_j:
         return 0  # of other pieces
     if len(points.before) > 0:
-        distance, _, _ = _distance(points.before, held.points, i, j)
+        distance, _, _ = segment_distance(points.before, held.points, i, j)
         if distance < factor * reach:
             return 0
     if found < len(out.rows):

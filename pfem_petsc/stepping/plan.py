@@ -362,6 +362,8 @@ def make_stepper(model: Model, plan: Plan) -> Stepper:
         On all ranks, if the scheme is not compatible with the treatment.
     """
     treatment = _treatment(model, plan)
+    if model.self_contact is not None:
+        model.self_contact.begin(plan.scheme, plan.step, plan.frequency.upper, plan.critical_step)
     _check_walls(model, plan, treatment)
     _warn_of_damping(model, plan)
     _warn_of_drag(model, plan)

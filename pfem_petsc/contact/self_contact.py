@@ -5,12 +5,12 @@ The energy of two bars with the sum of radii R is
     E = m phi(d) + (1 - m)/2 (phi(d_1) + ... + phi(d_4)),    phi(d) = k/2 max(R - d, 0)^2
 
 with the distance d of their axes and those of each of the four ends from the other axis, d_1 to d_4. m goes from 0 for
-parallel bars to 1 where the square of the sine of the angle between them reaches :data:`_CROSSED`, with two continuous
-derivatives: bars that cross touch in one point, parallel ones at the ends of where they lie side by side, and nothing
-jumps in between. Distances are minima over parameters within the bars, whose derivatives are not needed (envelope
-theorem): forces act along the line between the closest points. Momentum and angular momentum are conserved; friction,
-which acts on the axes and not on the surfaces, turns bars too little by its moment about them, as bars of a truss have
-no torsion.
+parallel bars to 1 where the sine of the angle between them reaches R over the length of the shorter one, or the root
+of :data:`_CROSSED`, with two continuous derivatives: bars that cross touch in one point, those that are parallel up to
+their thickness at the ends of where they lie side by side, and nothing jumps in between. Distances are minima over
+parameters within the bars, whose derivatives are not needed (envelope theorem): forces act along the line between the
+closest points. Momentum and angular momentum are conserved; friction, which acts on the axes and not on the surfaces,
+turns bars too little by its moment about them, as bars of a truss have no torsion.
 
 The stiffness k of a pair is that of its bars, :data:`_STIFFNESS` times the harmonic mean of E A/l, unless the step
 requires less: by Gershgorin's theorem the square of the frequency of a node grows by at most the sum of 2 k/m over
@@ -24,7 +24,7 @@ could jump over another in a step, or has passed its axis, ends the run.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import acos, acosh, asin, exp, inf, pi, sqrt, tan
+from math import acosh, asin, exp, inf, pi, sqrt, tan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from ..mechanics.block_pattern import BlockPattern
     from ..stepping.model import Model
 
-_CROSSED = 0.1  # square of the sine of the angle from which bars touch in one point
+_CROSSED = 0.1  # largest square of the sine of the angle from which bars touch in one point
 _STIFFNESS = 1.0  # of a pair, over the harmonic mean of E A/l of its bars
 _SHARE = 0.2  # of the mass of a pair over the square of the step, which its stiffness does not exceed
 _ROOM = 0.1  # least sum of squared frequencies that a step must leave for contacts, over its inverse square
@@ -66,7 +66,7 @@ class PairArrays(NamedTuple):
     Attributes
     ----------
     ends : (m, 4) ends of the first bar and of the second, rows of :class:`NodeArrays`
-    reach : (m,) sum of radii, or less [m]
+    reach, crossed : (m,) sum of radii, or less [m]; square of the sine of the angle from which bars cross
     stiffness, drag : (m,) [N/m], largest damping [N s/m]
     counted : (m,) bool, whether sums of this rank include it
     wake : (m,) way of the nodes at which it may touch [m]
@@ -74,6 +74,7 @@ class PairArrays(NamedTuple):
 
     ends: np.ndarray
     reach: np.ndarray
+    crossed: np.ndarray
     stiffness: np.ndarray
     drag: np.ndarray
     counted: np.ndarray
@@ -87,6 +88,17 @@ class NodeArrays(NamedTuple):
     x: np.ndarray
     inverse: np.ndarray
     force: np.ndarray
+
+
+class Rooms(NamedTuple):
+    """Room for a pair: gradient of the energy ``g`` (4, 3) [N]; both axes ``u``, ``v``, a ``way`` between them and the
+    ``normal`` (3,)."""
+
+    g: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    way: np.ndarray
+    normal: np.ndarray
 
 
 class PairLaw(NamedTuple):
@@ -157,14 +169,14 @@ def _axes(x, ends, p, u, v):
 def _repel(pairs, p, x, s, t, rooms):
     """Write the gradient of the energy of a pair that touches at ``s`` and ``t``; return the energy, the sum of the
     forces, and their mean points."""
-    g, u, v, way = rooms
+    g, u, v, way = rooms.g, rooms.u, rooms.v, rooms.way
     ends, k, reach = pairs.ends, pairs.stiffness[p], pairs.reach[p]
     uu, vv, uv = _axes(x, ends, p, u, v)
     for i in range(4):
         for c in range(3):
             g[i, c] = 0.0
     sine = max(1.0 - uv * uv / (uu * vv), 0.0) if uu * vv > 0.0 else 0.0
-    q = min(sine / _CROSSED, 1.0)
+    q = min(sine / pairs.crossed[p], 1.0)
     m = q * q * q * (10.0 - q * (15.0 - 6.0 * q))
     energy = 0.0
     push = 0.0
@@ -196,7 +208,7 @@ def _repel(pairs, p, x, s, t, rooms):
         if d > 0.0:
             _gradient(g, s, t, force / d, way)
     if 0.0 < q < 1.0:
-        slope = excess * 30.0 * q * q * (1.0 - q) * (1.0 - q) / _CROSSED * -2.0 * uv / (uu * vv)
+        slope = excess * 30.0 * q * q * (1.0 - q) * (1.0 - q) / pairs.crossed[p] * -2.0 * uv / (uu * vv)
         for c in range(3):
             of_u, of_v = slope * (v[c] - uv / uu * u[c]), slope * (u[c] - uv / vv * v[c])
             g[0, c] -= of_u
@@ -217,8 +229,10 @@ def _damp(pairs, p, law, push, closing, mobility):
 
 
 @inlined
-def _slide(old, new, p, law, k, normal_force, way, normal, rooms):
-    """Advance the elastic slip of a pair by the way of its points; return energy and dissipation, and add the force."""
+def _slide(old, new, p, k, most, rooms):
+    """Advance the elastic slip of a pair, at ``most`` as given [m], by the way of its points; return the energy stored,
+    and that dissipated."""
+    way, normal = rooms.way, rooms.normal
     along = 0.0
     dot = 0.0
     before = 0.0
@@ -235,7 +249,6 @@ def _slide(old, new, p, law, k, normal_force, way, normal, rooms):
     for c in range(3):
         trial = turned * new[p, SPRING + c] + way[c] - along * normal[c]
         square += trial * trial
-    most = law.friction * normal_force / k if k > 0.0 else 0.0
     factor = most / np.sqrt(square) if square > most * most else 1.0
     energy = 0.0
     lost = 0.0
@@ -249,6 +262,20 @@ def _slide(old, new, p, law, k, normal_force, way, normal, rooms):
     return energy, lost
 
 
+@inlined
+def _farthest_move(x, ends, p):
+    """Return the square of the largest relative displacement of ends of both bars in the step."""
+    farthest = 0.0
+    for i in range(2):
+        for j in range(2, 4):
+            square = 0.0
+            for c in range(3):
+                moved = x[ends[p, j], 3 + c] - x[ends[p, i], 3 + c]
+                square += moved * moved
+            farthest = max(farthest, square)
+    return farthest
+
+
 @kernel
 def evaluate_pairs(pairs, old, new, nodes, law, out):
     """Compute forces and sums of all pairs, and their memory ``new`` (m, width) from the ``old`` one.
@@ -259,8 +286,8 @@ def evaluate_pairs(pairs, old, new, nodes, law, out):
     """
     x, ends, failed = nodes.x, pairs.ends, 0
     segments = ends.reshape(-1, 2)
-    g, u, v, way, normal = np.zeros((4, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
-    rooms = g, u, v, way
+    rooms = Rooms(np.zeros((4, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    g, way, normal = rooms.g, rooms.way, rooms.normal
     for p in range(len(ends)):
         if pairs.wake[p] > law.way:
             continue
@@ -274,19 +301,12 @@ def evaluate_pairs(pairs, old, new, nodes, law, out):
         if d < reach:
             energy, push, at, other = _repel(pairs, p, x, s, t, rooms)
         if not touched:
-            farthest = 0.0
-            for i in range(2):
-                for j in range(2, 4):
-                    square = 0.0
-                    for c in range(3):
-                        moved = x[ends[p, j], 3 + c] - x[ends[p, i], 3 + c]
-                        square += moved * moved
-                    farthest = max(farthest, square)
+            farthest = _farthest_move(x, ends, p)
             if failed == 0 and farthest > 0.25 * reach * reach and d < reach + np.sqrt(farthest):
                 failed = -1 - p
         if push > 0.0:
             s, t = at / push, other / push
-        moved = _point_way(x, ends, p, s, t, 3, way)
+        _point_way(x, ends, p, s, t, 3, way)
         if push <= 0.0:
             if touched:  # what spring and damper held is lost
                 for c in range(3):
@@ -316,7 +336,7 @@ def evaluate_pairs(pairs, old, new, nodes, law, out):
             _gradient(g, s, t, total - push, normal)
         held = 0.0
         if law.friction > 0.0:
-            held, rubbed = _slide(old, new, p, law, k, total, way, normal, rooms)
+            held, rubbed = _slide(old, new, p, k, law.friction * total / k, rooms)
             lost += rubbed
             for c in range(3):
                 way[c] = -new[p, SPRING + c]
@@ -518,8 +538,11 @@ class SelfContact:
         reach = sizes[:, 0] + sizes[:, 2]
         apart = np.empty(len(ends))
         distances_of(of_nodes, ends.reshape(-1, 2), apart)
+        axes = of_nodes[ends[:, 1::2], :3] - of_nodes[ends[:, ::2], :3]
+        length = np.linalg.norm(axes, axis=2).min(axis=1, initial=inf)
         closer = np.minimum(reach, apart)
         used = closer > _LEAST * reach
+        crossed = np.minimum(_CROSSED, (closer / length) ** 2)[used]
         ids, ends, data, closer = rows[used, :2], ends[used], data[used], closer[used]
         keys = ids[:, 0] * mesh.n_bars + ids[:, 1]
         memory = np.ascontiguousarray(data[:, 4:])
@@ -535,7 +558,7 @@ class SelfContact:
         self._spare = self._memory.copy()
         counted = self._own[ends[:, 0]] if len(ends) else np.empty(0, dtype=bool)
         rest = memory[:, WIDTH].copy(), memory[:, WIDTH + 1].copy()
-        self._pairs = PairArrays(np.ascontiguousarray(ends), closer, *rest, counted, np.zeros(len(ends)))
+        self._pairs = PairArrays(np.ascontiguousarray(ends), closer, crossed, *rest, counted, np.zeros(len(ends)))
         self._inverse = of_nodes[:, 4].copy()
         fresh = self._pairs.stiffness == 0.0
         if comm.allreduce(bool(fresh.any()), op=MPI.LOR):

@@ -185,8 +185,9 @@ class StepArrays(NamedTuple):
     """All that compiled steps read and write, of which the latter parts are: the sums of the ledger, of which the
     dissipations by impact and friction and the work of walls are added to; works (5,) of all balances; energies of
     bars; particles of impulses, and their increments (rows, 3) in a step; the nodes of probes; forces of walls (w, 3)
-    at the start [N]; energy of bars that touch, and what they have lost (2,) [J]; and this rank's shares (m, width) of the rows of the steps that are due, and at last of the last
-    step if it is not, see :class:`~pfem_petsc.columns.Share`."""
+    at the start [N]; energy of bars that touch, and what they have lost (2,) [J]; and this rank's shares (m, width) of
+    the rows of the steps that are due, and at last of the last step if it is not, see
+    :class:`~pfem_petsc.columns.Share`."""
 
     contacts: Contacts
     course: Course

@@ -13,9 +13,10 @@ closest points. Momentum and angular momentum are conserved; friction, which act
 turns bars too little by its moment about them, as bars of a truss have no torsion.
 
 The stiffness k of a pair is that of its bars, :data:`_STIFFNESS` times the harmonic mean of E A/l, unless the step
-requires less: by Gershgorin's theorem the square of the frequency of a node grows by at most the sum of 2 k/m over
-the pairs that touch it, of which each new one gets at most half of what the step and the others leave. It is constant
-while the pair touches. Pairs closer than R in the mesh keep their distance there instead of R.
+requires less: by Gershgorin's theorem the square of the frequency of a node with the mass m grows by at most the sum of
+2 w k/m over the pairs that touch it, with its weights w in their closest points. Those that begin to touch in a step
+get at most :data:`_PART` of what the step and the others leave. The stiffness is constant while the pair touches.
+Pairs closer than R in the mesh keep their distance there instead of R.
 
 Bars are searched with a skin. Pairs are evaluated when the ways of the nodes since then allow them to touch; a bar that
 could jump over another in a step, or has passed its axis, ends the run.
@@ -49,15 +50,19 @@ if TYPE_CHECKING:
 _CROSSED = 0.1  # largest square of the sine of the angle from which bars touch in one point
 _STIFFNESS = 1.0  # of a pair, over the harmonic mean of E A/l of its bars
 _SHARE = 0.2  # of the mass of a pair over the square of the step, which its stiffness does not exceed
+_PART = 0.1  # of the stiffness that a node may still have, for what begins to touch it in a step
 _ROOM = 0.1  # least sum of squared frequencies that a step must leave for contacts, over its inverse square
 _SKIN = 0.2  # distance beyond the radii up to which pairs are listed, over the mean length of bars
 _LEAST = 1e-3  # sum of radii of a pair, over that of its bars, below which they cross in the mesh and do not touch
 _DEEP = 0.2  # overlap over the radius from which results are doubtful
 _TAG = 7800  # of messages between ranks with nodes of the same pairs
 
-TOUCHES, NORMAL, SPRING, VISCOUS, WIDTH = 0, 1, 4, 7, 8
-"""Columns of the memory of a pair: whether it touches; unit normal from the first bar to the second; elastic part of
-their slip [m]; normal force of the damper [N]; and their number."""
+NORMAL, SPRING, VISCOUS, FIRST, SECOND, WIDTH = 0, 3, 6, 7, 8, 9
+"""Columns of the memory of a pair: unit normal from the first bar to the second; elastic part of their slip [m]; normal
+force of the damper [N]; where they touch, from 0 to 1 on each; and their number."""
+
+APART, TOUCHING, BEGINNING = range(3)
+"""States of pairs."""
 
 
 class PairArrays(NamedTuple):
@@ -67,17 +72,19 @@ class PairArrays(NamedTuple):
     ----------
     ends : (m, 4) ends of the first bar and of the second, rows of :class:`NodeArrays`
     reach, crossed : (m,) sum of radii, or less [m]; square of the sine of the angle from which bars cross
-    stiffness, drag : (m,) [N/m], largest damping [N s/m]
+    most : (m,) stiffness that they would have alone [N/m]
     counted : (m,) bool, whether sums of this rank include it
+    stiffness, drag : (m,) of those that touch [N/m], and their largest damping [N s/m]
     wake : (m,) way of the nodes at which it may touch [m]
     """
 
     ends: np.ndarray
     reach: np.ndarray
     crossed: np.ndarray
+    most: np.ndarray
+    counted: np.ndarray
     stiffness: np.ndarray
     drag: np.ndarray
-    counted: np.ndarray
     wake: np.ndarray
 
 
@@ -277,22 +284,62 @@ def _farthest_move(x, ends, p):
 
 
 @kernel
-def evaluate_pairs(pairs, old, new, nodes, law, out):
-    """Compute forces and sums of all pairs, and their memory ``new`` (m, width) from the ``old`` one.
+def find_beginning(pairs, state, memory, nodes, law, load):
+    """Find the pairs that begin to touch, and what the nodes of all pairs carry.
 
-    ``pairs``: PairArrays; ``nodes``: NodeArrays, to whose forces those of pairs are added; ``law``: PairLaw; ``out``
-    (6,): sums from :data:`ENERGY` on. Returns 0, or 1 plus the pair that has passed through itself, or minus that of
-    one that moves too far in a step.
+    ``pairs``: PairArrays; ``state`` (m,): states, of which some become :data:`BEGINNING`; ``memory`` (m, width);
+    ``nodes``: NodeArrays; ``law``: PairLaw; ``load`` (q, 3): sums over the pairs of a node, times its weight, of their
+    stiffness [N/m] and largest damping [N s/m], and of 1 for those that begin. Returns how many begin, and 1 plus the
+    pair that moves too far in a step, or 0.
+    """
+    x, ends = nodes.x, pairs.ends
+    segments = ends.reshape(-1, 2)
+    beginning, failed = 0, 0
+    for p in range(len(ends)):
+        touches = state[p] == TOUCHING
+        if not touches:
+            if pairs.wake[p] > law.way:
+                continue
+            d, s, t = segment_distance(x, segments, 2 * p, 2 * p + 1)
+            farthest = _farthest_move(x, ends, p)
+            if farthest > 0.25 * pairs.reach[p] ** 2 and d < pairs.reach[p] + np.sqrt(farthest):
+                failed = 1 + p
+            if not d < pairs.reach[p]:
+                pairs.wake[p] = law.base + (d - pairs.reach[p])
+                continue
+            beginning += 1
+            state[p], pairs.wake[p] = BEGINNING, 0.0
+            for c in range(memory.shape[1]):
+                memory[p, c] = 0.0
+            memory[p, FIRST], memory[p, SECOND] = s, t
+        for i in range(4):
+            at = memory[p, FIRST if i < 2 else SECOND]
+            weight = at if i % 2 == 1 else 1.0 - at
+            if touches:
+                load[ends[p, i], 0] += weight * pairs.stiffness[p]
+                load[ends[p, i], 1] += weight * pairs.drag[p]
+            else:
+                load[ends[p, i], 2] += weight
+    return beginning, failed
+
+
+@kernel
+def evaluate_pairs(pairs, state, old, new, nodes, law, out):
+    """Compute forces and sums of the pairs that touch, and their memory ``new`` (m, width) from the ``old`` one.
+
+    ``pairs``: PairArrays; ``state`` (m,), which is changed; ``nodes``: NodeArrays, to whose forces those of pairs are
+    added; ``law``: PairLaw; ``out`` (6,): sums from :data:`ENERGY` on. Returns 1 plus the pair that has passed through
+    itself, or 0.
     """
     x, ends, failed = nodes.x, pairs.ends, 0
     segments = ends.reshape(-1, 2)
     rooms = Rooms(np.zeros((4, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
     g, way, normal = rooms.g, rooms.way, rooms.normal
     for p in range(len(ends)):
-        if pairs.wake[p] > law.way:
+        if state[p] == APART:
             continue
         d, s, t = segment_distance(x, segments, 2 * p, 2 * p + 1)
-        k, reach, touched = pairs.stiffness[p], pairs.reach[p], old[p, TOUCHES] > 0.0
+        k, reach = pairs.stiffness[p], pairs.reach[p]
         energy = 0.0
         lost = 0.0
         push = 0.0
@@ -300,22 +347,14 @@ def evaluate_pairs(pairs, old, new, nodes, law, out):
         other = 0.0
         if d < reach:
             energy, push, at, other = _repel(pairs, p, x, s, t, rooms)
-        if not touched:
-            farthest = _farthest_move(x, ends, p)
-            if failed == 0 and farthest > 0.25 * reach * reach and d < reach + np.sqrt(farthest):
-                failed = -1 - p
         if push > 0.0:
             s, t = at / push, other / push
         _point_way(x, ends, p, s, t, 3, way)
-        if push <= 0.0:
-            if touched:  # what spring and damper held is lost
-                for c in range(3):
-                    lost += 0.5 * k * old[p, SPRING + c] * old[p, SPRING + c]
-                    lost -= 0.5 * old[p, VISCOUS] * way[c] * old[p, NORMAL + c]
-            else:
-                pairs.wake[p] = law.base + (d - reach)
-            for c in range(len(old[p])):
-                new[p, c] = 0.0
+        if push <= 0.0:  # what spring and damper held is lost
+            for c in range(3):
+                lost += 0.5 * k * old[p, SPRING + c] * old[p, SPRING + c]
+                lost -= 0.5 * old[p, VISCOUS] * way[c] * old[p, NORMAL + c]
+            state[p] = APART
             if pairs.counted[p]:
                 out[DISSIPATED] += lost
             continue
@@ -326,8 +365,8 @@ def evaluate_pairs(pairs, old, new, nodes, law, out):
             normal[c] = normal[c] / apart if apart > 0.0 else 0.0
             turn += normal[c] * old[p, NORMAL + c]
             closing += normal[c] * way[c]
-        if apart <= 0.0 or (touched and turn < 0.0):
-            failed = 1 + p if failed <= 0 else failed
+        if apart <= 0.0 or (state[p] == TOUCHING and turn < 0.0):
+            failed = 1 + p
         mobility = (1.0 - s) ** 2 * nodes.inverse[ends[p, 0]] + s**2 * nodes.inverse[ends[p, 1]]
         mobility += (1.0 - t) ** 2 * nodes.inverse[ends[p, 2]] + t**2 * nodes.inverse[ends[p, 3]]
         total = _damp(pairs, p, law, push, closing, mobility)
@@ -335,20 +374,21 @@ def evaluate_pairs(pairs, old, new, nodes, law, out):
         if total != push:
             _gradient(g, s, t, total - push, normal)
         held = 0.0
+        for c in range(3):
+            new[p, SPRING + c] = 0.0
         if law.friction > 0.0:
             held, rubbed = _slide(old, new, p, k, law.friction * total / k, rooms)
             lost += rubbed
             for c in range(3):
                 way[c] = -new[p, SPRING + c]
             _gradient(g, s, t, k, way)
-        new[p, TOUCHES] = 1.0
-        new[p, VISCOUS] = total - push
+        state[p] = TOUCHING
+        new[p, VISCOUS], new[p, FIRST], new[p, SECOND] = total - push, s, t
         for c in range(3):
             new[p, NORMAL + c] = normal[c]
         for i in range(4):
             for c in range(3):
                 nodes.force[ends[p, i], c] += g[i, c]
-        pairs.wake[p] = 0.0
         if pairs.counted[p]:
             out[ENERGY] += energy + held
             out[DISSIPATED] += lost
@@ -447,10 +487,10 @@ class SelfContact:
         self._h, self._room = 0.0, 0.0
         self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
         self.sums = np.zeros(6)
-        self._way, self._limit, self._drift = 0.0, -1.0, np.zeros(3)
+        self._way, self._limit, self._drift = 0.0, 0.0, np.zeros(3)
         self._reference, self._last = mesh.points[: mesh.n_owned].copy(), mesh.points[: mesh.n_owned].copy()
         self._exchange: GhostExchange | None = None
-        self._install(np.empty((0, 2), dtype=np.int64), np.empty((0, WIDTH + 2)))
+        self._empty()
 
     def _make_directory(self) -> None:
         """Send the ends, radius and stiffness of all bars to the ranks of their slabs."""
@@ -483,8 +523,8 @@ class SelfContact:
                 f'{source}: [self_contact] needs time.mass = "lumped", and no contact.treatment = "mass_redistribution"'
             )
         room = 1.0
-        if np.isfinite(critical):
-            room = min((frequency * h) ** 2 * ((critical / h) ** 2 - 1.0), 1.0)
+        if np.isfinite(critical):  # less a tenth, as weights change
+            room = 0.9 * (frequency * h) ** 2 * ((critical / h) ** 2 - 1.0)
         if room < _ROOM:
             raise InputError(
                 f"{source}: time.step = {h:g} s leaves no room for the stiffness of [self_contact] below the critical "
@@ -507,7 +547,7 @@ class SelfContact:
                 "[self_contact]: too many bars are in one place to find those that touch: reduce self_contact.radius, "
                 "or choose fewer bars with self_contact.bars"
             )
-        self._install(found.ids.astype(np.int64), np.zeros((len(found.ids), WIDTH + 2)))
+        self._install(found.ids.astype(np.int64))
 
     def _of_bars(self, ids: np.ndarray) -> np.ndarray:
         """Return ends, radius and stiffness (n, 4) of bars by their numbers (n,). Collective."""
@@ -515,73 +555,76 @@ class SelfContact:
         asking = Router(self.comm, slab_of(wanted, self._mesh.n_bars, self.comm.size))
         return asking.reply(self._directory[asking.send(wanted) - self._first_bar])[place.ravel()]
 
-    def _install(self, ids: np.ndarray, kept: np.ndarray) -> None:
-        """Take pairs of bars (m, 2) from any ranks, with memory, stiffness and drag (m, 10); those that touch now keep
-        theirs. Collective."""
+    def _empty(self) -> None:
+        """Begin without pairs that touch; they are searched at the next evaluation."""
+        self._keys, self._touching, self._limit = np.empty(0, dtype=np.int64), np.empty((0, WIDTH + 2)), 0.0
+        self._state = np.empty(0, dtype=np.uint8)
+
+    def _touches(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers of both bars, as one (m,), of the pairs that touch here, and memory, stiffness and largest
+        damping (m, width + 2) of each."""
+        touch, pairs = self._state == TOUCHING, self._pairs
+        return self._keys[touch], np.column_stack([self._memory, pairs.stiffness, pairs.drag])[touch]
+
+    def _install(self, ids: np.ndarray) -> None:
+        """Take pairs of bars (m, 2) from any ranks. Those that touch stay so. Collective."""
         comm, mesh, starts = self.comm, self._mesh, self._starts
+        kept = self._touches() if len(self._state) else (self._keys, self._touching)
         of_bars = self._of_bars(ids.ravel()).reshape(-1, 2, 4)
-        of_bars = np.hstack([of_bars[:, :, :2].reshape(-1, 4), of_bars[:, :, 2:].reshape(-1, 4)])
-        rows = np.hstack([ids, of_bars[:, :4].astype(np.int64), np.hstack([of_bars[:, 4:], kept]).view(np.int64)])
-        rows = to_owners(np.ascontiguousarray(rows), range(2, 6), starts, comm)
+        ends, sizes = of_bars[:, :, :2].reshape(-1, 4), np.ascontiguousarray(of_bars[:, :, 2:].reshape(-1, 4))
+        rows = to_owners(np.hstack([ids, ends.astype(np.int64), sizes.view(np.int64)]), range(2, 6), starts, comm)
+        sizes = np.ascontiguousarray(rows[:, 6:]).view(np.float64)  # radius and stiffness of both bars
         numbers, ends = np.unique(rows[:, 2:6], return_inverse=True)
-        data = np.ascontiguousarray(rows[:, 6:]).view(np.float64)
-        own = (numbers >= starts[comm.rank]) & (numbers < starts[comm.rank + 1])
+        ends = np.ascontiguousarray(ends.reshape(-1, 4))
+        self._own = own = (numbers >= starts[comm.rank]) & (numbers < starts[comm.rank + 1])
+        self._local = (numbers[own] - starts[comm.rank]).astype(np.int64)
         if self._exchange is not None:
             self._exchange.close()
         self._exchange = GhostExchange(comm, starts, numbers[~own], _TAG)
-        self._own, self._local = own, (numbers[own] - starts[comm.rank]).astype(np.int64)
-        ends, sizes = ends.reshape(-1, 4), data[:, :4]  # radius and stiffness of both bars
-        inertia, supports = self._model.inertia, self._model.supports
-        inverse = np.where(supports.fixed.all(axis=1), 0.0, 1.0 / inertia.mass)
-        of_nodes = np.column_stack([mesh.points[: mesh.n_owned], inertia.mass, inverse])
+        mass = self._model.inertia.mass
+        inverse = np.where(self._model.supports.fixed.all(axis=1), 0.0, 1.0 / mass)
+        of_nodes = np.column_stack([mesh.points[: mesh.n_owned], mass, inverse])
         of_nodes = self._gather(of_nodes.__getitem__, 5)
-        reach = sizes[:, 0] + sizes[:, 2]
-        apart = np.empty(len(ends))
+        apart, reach = np.empty(len(ends)), sizes[:, 0] + sizes[:, 2]
         distances_of(of_nodes, ends.reshape(-1, 2), apart)
         axes = of_nodes[ends[:, 1::2], :3] - of_nodes[ends[:, ::2], :3]
         length = np.linalg.norm(axes, axis=2).min(axis=1, initial=inf)
         closer = np.minimum(reach, apart)
-        used = closer > _LEAST * reach
-        crossed = np.minimum(_CROSSED, (closer / length) ** 2)[used]
-        ids, ends, data, closer = rows[used, :2], ends[used], data[used], closer[used]
-        keys = ids[:, 0] * mesh.n_bars + ids[:, 1]
-        memory = np.ascontiguousarray(data[:, 4:])
-        if hasattr(self, "_keys"):
-            touch = np.flatnonzero(self._memory[:, TOUCHES] > 0.0)
-            place = np.searchsorted(keys, self._keys[touch])
-            there = place < len(keys)
-            there[there] = keys[place[there]] == self._keys[touch][there]
-            touch, place = touch[there], place[there]
-            memory[place, :WIDTH] = self._memory[touch]
-            memory[place, WIDTH], memory[place, WIDTH + 1] = self._pairs.stiffness[touch], self._pairs.drag[touch]
-        self._keys, self.ids, self._memory = keys, ids, np.ascontiguousarray(memory[:, :WIDTH])
-        self._spare = self._memory.copy()
-        counted = self._own[ends[:, 0]] if len(ends) else np.empty(0, dtype=bool)
-        rest = memory[:, WIDTH].copy(), memory[:, WIDTH + 1].copy()
-        self._pairs = PairArrays(np.ascontiguousarray(ends), closer, crossed, *rest, counted, np.zeros(len(ends)))
-        self._inverse = of_nodes[:, 4].copy()
-        fresh = self._pairs.stiffness == 0.0
-        if comm.allreduce(bool(fresh.any()), op=MPI.LOR):
-            self._stiffen(fresh, of_nodes[:, 3], data[:, [1, 3]])
-
-    def _stiffen(self, fresh: np.ndarray, mass: np.ndarray, bars: np.ndarray) -> None:
-        """Give new pairs their stiffness and largest damping, from masses of nodes (q,) [kg] and stiffness of both bars
-        (m, 2) [N/m]. Collective."""
-        pairs, n = self._pairs, len(mass)
-        used = np.bincount(pairs.ends[~fresh].ravel(), np.repeat(pairs.stiffness[~fresh], 4), n)
-        count = np.bincount(pairs.ends[fresh].ravel(), minlength=n)
-        owned = np.zeros((self._mesh.n_owned, 2))
-        owned[self._local] = np.column_stack([used, count])[self._own]
-        used, count = self._gather(owned.__getitem__, 2).T
-        ends = pairs.ends[fresh]
-        left = 0.5 * np.maximum(0.5 * self._room * mass - used, 0.0) / np.maximum(count, 1.0)
+        lighter = np.minimum(of_nodes[ends[:, ::2], 3], of_nodes[ends[:, 1::2], 3])
         with np.errstate(divide="ignore"):
-            own = 2.0 * _STIFFNESS / (1.0 / bars[fresh]).sum(axis=1)
-        lighter = np.minimum(mass[ends[:, ::2]], mass[ends[:, 1::2]])
-        inertial = _SHARE / self._h**2 / (1.0 / lighter).sum(axis=1) if self._h else inf
-        pairs.stiffness[fresh] = np.minimum(np.minimum(own, inertial), left[ends].min(axis=1, initial=inf))
-        limit = 0.5 * (mass / np.maximum(count, 1.0))[ends].min(axis=1, initial=inf)
-        pairs.drag[fresh] = limit / self._h if self._h else 0.0
+            most = 2.0 * _STIFFNESS / (1.0 / sizes[:, 1::2]).sum(axis=1)
+        if self._h:
+            most = np.minimum(most, _SHARE / self._h**2 / (1.0 / lighter).sum(axis=1))
+        used = np.flatnonzero((closer > _LEAST * reach) & (most > 0.0))
+        self.ids, ends, n = rows[used, :2], ends[used], len(used)
+        self._keys, self._state = self.ids[:, 0] * mesh.n_bars + self.ids[:, 1], np.full(n, APART, dtype=np.uint8)
+        memory = np.zeros((n, WIDTH + 2))
+        stays = np.isin(kept[0], self._keys)  # not those of bars that have left the model
+        place = np.searchsorted(self._keys, kept[0][stays])
+        memory[place], self._state[place], self._touching = kept[1][stays], TOUCHING, kept[1][:0]
+        self._memory, self._spare = np.ascontiguousarray(memory[:, :WIDTH]), np.zeros((n, WIDTH))
+        crossed = np.minimum(_CROSSED, (closer / length) ** 2)
+        counted = self._own[ends[:, 0]] if n else np.empty(0, dtype=bool)
+        varying = memory[:, WIDTH].copy(), memory[:, WIDTH + 1].copy(), np.zeros(n)
+        self._pairs = PairArrays(ends, closer[used], crossed[used], most[used], counted, *varying)
+        self._mass, self._inverse = of_nodes[:, 3].copy(), of_nodes[:, 4].copy()
+
+    def _stiffen(self, state: np.ndarray, load: np.ndarray) -> None:
+        """Give pairs that begin to touch their stiffness and largest damping, with what the nodes (q, 3) carry, see
+        :func:`find_beginning`. Collective."""
+        pairs, begin = self._pairs, np.flatnonzero(state == BEGINNING)
+        if self.comm.size > 1:
+            owned = np.zeros((self._mesh.n_owned, 3))
+            owned[self._local] = load[self._own]
+            load = self._gather(owned.__getitem__, 3)
+        pairs.stiffness[begin], pairs.drag[begin] = pairs.most[begin], inf
+        if not self._h:
+            return
+        room = self._mass[:, None] * np.array([0.5 * self._room, 0.5 / self._h])
+        left = _PART * np.maximum(room - load[:, :2], 0.0) / np.maximum(load[:, 2:], 1e-6)
+        least = left[pairs.ends[begin]].min(axis=1, initial=inf)
+        pairs.stiffness[begin] = np.minimum(pairs.most[begin], least[:, 0])
+        pairs.drag[begin] = least[:, 1]
 
     def _gather(self, values_of: Callable[[np.ndarray], np.ndarray], width: int) -> np.ndarray:
         """Return values (q, width) at the nodes of pairs; ``values_of`` gives those of owned nodes (k,). Collective."""
@@ -617,11 +660,25 @@ class SelfContact:
         if worst[1] or way >= self._limit:
             self._renew(x, step, way, 2.0 * float(worst[0]))
         nodes = self._gather(lambda rows: np.hstack([x[rows], x[rows] - self._last[rows]]), 6)
-        force, sums = np.zeros((len(nodes), 3)), np.zeros(6)
+        force, load, sums = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3)), np.zeros(6)
         law = PairLaw(self._friction, self._damping, float(step), way, way if commit else 2.0 * self._way - way)
-        arrays = NodeArrays(nodes, self._inverse, force)
-        failed = int(evaluate_pairs(self._pairs, self._memory, self._spare, arrays, law, sums))
-        self._report(failed, nodes)
+        arrays, pairs, state = NodeArrays(nodes, self._inverse, force), self._pairs, self._state
+        if not commit:
+            state = state.copy()
+        begin, far = find_beginning(pairs, state, self._memory, arrays, law, load)
+        if self._any(begin):
+            self._report(
+                far,
+                "bars {} and {}, which are about to touch, move by more than half the sum of their radii relative to "
+                "each other in a step, so that contact may miss them: reduce time.step",
+            )
+            self._stiffen(state, load)
+        passed = evaluate_pairs(pairs, state, self._memory, self._spare, arrays, law, sums)
+        self._report(
+            passed,
+            "bars {} and {} pass through each other, which the stiffness of [self_contact] did not prevent: reduce "
+            "time.step, or use more elements, a larger self_contact.radius or lower velocities",
+        )
         f[self._local] += force[self._own]
         total = self.dissipated + float(sums[DISSIPATED])
         if commit:
@@ -631,37 +688,24 @@ class SelfContact:
             self._last[:] = x[: len(self._last)]
         return float(sums[ENERGY]), total
 
-    def _report(self, failed: int, nodes: np.ndarray) -> None:
-        """End the run on all ranks if pairs of some rank have passed through themselves. Collective."""
-        text, comm = None, self.comm
-        if failed:
-            one, other = self.ids[abs(failed) - 1].tolist()
-            ends = self._pairs.ends[abs(failed) - 1]
-            if failed > 0:
-                text = (
-                    f"bars {one} and {other} pass through each other, which the stiffness of [self_contact] did not "
-                    "prevent: reduce time.step, or use more elements, a larger self_contact.radius or lower velocities"
-                )
-            else:
-                moves = nodes[ends[2:], None, 3:] - nodes[ends[None, :2], 3:].reshape(1, 2, 3)
-                far = float(np.linalg.norm(moves, axis=2).max())
-                text = (
-                    f"bars {one} and {other}, which are about to touch, move {far:.3g} m relative to each other in a "
-                    f"step, more than half the sum of their radii of {self._pairs.reach[abs(failed) - 1]:.3g} m, so "
-                    "that contact may miss them: reduce time.step"
-                )
-        if comm.size > 1:
-            flag = np.array([text is not None], dtype=np.int32)
-            comm.Allreduce(MPI.IN_PLACE, flag, op=MPI.MAX)
-            if flag[0]:
-                text = min(each for each in comm.allgather(text) if each is not None)
-        if text is not None:
-            raise SimulationFailure(text)
+    def _any(self, here: int) -> bool:
+        """Return whether a number is not zero on some rank. Collective."""
+        if self.comm.size == 1:
+            return here != 0
+        flag = np.array([here != 0], dtype=np.int32)
+        self.comm.Allreduce(MPI.IN_PLACE, flag, op=MPI.MAX)
+        return bool(flag[0])
+
+    def _report(self, failed: int, text: str) -> None:
+        """End the run on all ranks if on some rank a pair, counted from 1, has failed. Collective."""
+        if self._any(failed):
+            texts = self.comm.allgather(text.format(*self.ids[failed - 1].tolist()) if failed else "")
+            raise SimulationFailure(min(filter(None, texts)))
 
     def _renew(self, x: np.ndarray, step: float, way: float, move: float) -> None:
         """Find out whether the list of pairs still has all that may touch, else make it again. Collective."""
         mesh, owned = self._mesh, self._mesh.n_owned
-        if self._limit >= 0.0 and not self.stale:
+        if self._limit > 0.0 and not self.stale:
             change = largest_change(self.comm, (self._reference, x[:owned]), mesh.n_nodes, self._thick + self._skin)
             left = self._skin - change
             if left > 0.25 * self._skin + move:
@@ -683,59 +727,59 @@ class SelfContact:
         value = self.comm.allreduce(float(self.sums[OVERLAP if name == "overlap" else FORCE]), op=MPI.MAX)
         return value if self.comm.rank == 0 else 0.0
 
-    # what a checkpoint keeps
+    # what a checkpoint keeps: results do not depend on which other pairs are listed
 
     def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
         """What a checkpoint keeps, name to an order and this rank's part. Collective."""
-        counted, pairs = self._pairs.counted, self._pairs
-        counts = self.comm.allgather(int(counted.sum()))
-        found = {"self_contact.reference": (self._mesh.node_order, self._reference)}
-        if sum(counts):
-            table = np.column_stack([self.ids, self._memory, pairs.stiffness, pairs.drag])[counted]
-            numbers = sum(counts[: self.comm.rank]) + np.arange(len(table))
-            found["self_contact.pairs"] = NaturalOrder(self.comm, numbers, sum(counts)), table
-        return found
+        table = self._table()
+        counts = self.comm.allgather(len(table))
+        numbers = sum(counts[: self.comm.rank]) + np.arange(len(table))
+        order = NaturalOrder(self.comm, numbers, sum(counts))
+        return {"self_contact.pairs": (order, table)} if sum(counts) else {}
+
+    def _table(self) -> np.ndarray:
+        """Return numbers and memory (m, width + 3) of the counted pairs that touch."""
+        keys, kept = self._touches() if len(self._state) else (self._keys, self._touching)
+        counted = self._pairs.counted[self._state == TOUCHING] if len(self._state) else slice(None)
+        return np.column_stack([keys, kept])[counted]
 
     def numbers(self) -> dict[str, Any]:
         """What a checkpoint keeps besides. Collective."""
-        comm = self.comm
         return {
-            "pairs": comm.allreduce(int(self._pairs.counted.sum())),
-            "way": self._way,
-            "limit": self._limit,
-            "skin": self._skin,
-            "drift": self._drift.tolist(),
-            "stale": comm.allreduce(self.stale, op=MPI.LOR),
-            "deepest": comm.allreduce(self.deepest, op=MPI.MAX),
+            "pairs": self.comm.allreduce(len(self._table())),
+            "deepest": self.comm.allreduce(self.deepest, op=MPI.MAX),
         }
 
     def orders(self, numbers: dict[str, Any]) -> dict[str, NaturalOrder]:
         """Return the orders in which :meth:`load_state` takes the arrays of a checkpoint with these numbers."""
         n, comm = numbers["pairs"], self.comm
         slab = NaturalOrder(comm, np.arange(*slab_range(n, comm.rank, comm.size)), n)
-        orders = {"self_contact.reference": self._mesh.node_order}
-        return orders | ({"self_contact.pairs": slab} if n else {})
+        return {"self_contact.pairs": slab} if n else {}
 
     def load_state(
         self, numbers: dict[str, Any], arrays: dict[str, np.ndarray], x: np.ndarray, dissipated: float
     ) -> None:
         """Go on from what a checkpoint has kept, at positions (owned, 3), with what this rank has dissipated [J].
         Collective."""
-        table = arrays.get("self_contact.pairs", np.empty((0, WIDTH + 4)))
-        self._keys, self._memory = self._keys[:0], self._memory[:0]
-        self._install(table[:, :2].astype(np.int64), table[:, 2:])
-        self._reference[:], self._last[:] = arrays["self_contact.reference"], x
-        self._way, self._limit, self._skin = (float(numbers[name]) for name in ("way", "limit", "skin"))
-        self._drift, self.stale = np.array(numbers["drift"]), bool(numbers["stale"])
         self.deepest, self.dissipated = float(numbers["deepest"]), dissipated
+        self._take(arrays.get("self_contact.pairs", np.empty((0, WIDTH + 3))), x)
 
     def take_over(self, earlier: SelfContact, x: np.ndarray) -> None:
         """Go on from the end of an earlier stage, at positions (owned, 3). Collective."""
-        pairs = earlier._pairs
-        kept = np.column_stack([earlier._memory, pairs.stiffness, pairs.drag])[pairs.counted]
-        touch = kept[:, TOUCHES] > 0.0
-        self._install(earlier.ids[pairs.counted][touch], kept[touch])
-        self._last[:], self.dissipated, self.deepest = x, earlier.dissipated, earlier.deepest
+        self.deepest, self.dissipated = earlier.deepest, earlier.dissipated
+        self._take(earlier._table(), x)
+
+    def _take(self, table: np.ndarray, x: np.ndarray) -> None:
+        """Take pairs that touch (m, width + 3) from any ranks to those of their nodes. Collective."""
+        self._empty()
+        self._last[:] = x
+        comm, starts, n_bars = self.comm, self._starts, self._mesh.n_bars
+        ids = np.column_stack(np.divmod(table[:, 0].astype(np.int64), n_bars))
+        ends = self._of_bars(ids.ravel())[:, :2].reshape(-1, 4).astype(np.int64)
+        rows = np.hstack([ids, ends, np.ascontiguousarray(table[:, 1:]).view(np.int64)])
+        rows = to_owners(rows, range(2, 6), starts, comm)
+        self._keys = rows[:, 0] * n_bars + rows[:, 1]
+        self._touching = np.ascontiguousarray(rows[:, 6:]).view(np.float64)
 
     # linear elements
 

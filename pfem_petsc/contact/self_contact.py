@@ -37,6 +37,7 @@ from ..mechanics.compiled import inlined, kernel
 from ..mesh.distribution import bars_of_group
 from ..mesh.exchange import GhostExchange, Router
 from ..mesh.slab import slab_of, slab_range
+from ..output.units import engineering
 from ..parallel.agreement import agreed
 from ..parallel.natural import NaturalOrder
 from .neighbours import Points, Segments, find_pairs, largest_change, segment_distance
@@ -467,6 +468,8 @@ class SelfContact:
     def __init__(self, model: Model) -> None:
         self._model, self._mesh, self.comm = model, model.mesh, model.comm
         table, mesh, comm = model.case.self_contact, model.mesh, model.comm
+        if model.case.time is None:
+            self._refuse()
         with agreed(comm):
             chosen = np.ones(len(mesh.bars), dtype=bool)
             if table.bars is not None:
@@ -514,10 +517,7 @@ class SelfContact:
         """
         source, self._h = self._model.case.source, h
         if not scheme.explicit:
-            raise InputError(
-                f"{source}: [self_contact] needs an explicit integrator; use time.integrator = "
-                '"central_differences", or remove the table'
-            )
+            self._refuse()
         if self._model.inertia.redistribution is not None or self._model.inertia.consistent:
             raise InputError(
                 f'{source}: [self_contact] needs time.mass = "lumped", and no contact.treatment = "mass_redistribution"'
@@ -528,9 +528,31 @@ class SelfContact:
         if room < _ROOM:
             raise InputError(
                 f"{source}: time.step = {h:g} s leaves no room for the stiffness of [self_contact] below the critical "
-                f"step of {critical:.6g} s; use at most {0.95 * critical:.6g} s"
+                f"step of {critical:.6g} s; use at most {0.9 * critical:.6g} s"
             )
         self._room = room / (h * h)
+
+    def _refuse(self) -> None:
+        """Refuse analyses that contact cannot serve."""
+        raise InputError(
+            f"{self._model.case.source}: [self_contact] needs an explicit integrator, such as time.integrator = "
+            '"central_differences"; use one, or give the table in the stages with one only'
+        )
+
+    def text(self) -> str:
+        """Return what can touch, for the user before a run. Collective."""
+        count = self.comm.allreduce(len(self._bars))
+        return f"{count:,} bars, up to {engineering(self._thick, 'm')} thick"
+
+    def doubts(self) -> list[str]:
+        """Return a text if bars have overlapped deeply. Collective."""
+        deepest = self.comm.allreduce(self.deepest, op=MPI.MAX)
+        if not deepest > _DEEP:
+            return []
+        return [
+            f"[self_contact]: bars have overlapped by up to {100.0 * deepest:.0f} % of a radius, as contacts must be "
+            "soft for this time.step: a smaller one (time.safety) makes them stiffer"
+        ]
 
     # pairs
 

@@ -727,7 +727,7 @@ class Stepper(ABC):
 
     def doubts(self) -> list[str]:
         """What makes results doubtful, as warnings at the end of a run. Collective."""
-        return []
+        return [] if self.model.self_contact is None else self.model.self_contact.doubts()
 
     def settle(self) -> None:  # noqa: B027 - steps leave nothing to settle, static ones aside
         """Reduce the residual of a static state to rounding, before a stage that begins there. Collective."""

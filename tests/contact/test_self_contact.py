@@ -19,6 +19,7 @@ from pfem_petsc.contact.self_contact import (
     find_beginning,
     restitution_of,
 )
+from pfem_petsc.errors import InputError, SimulationFailure
 
 RADIUS = 0.01
 AREA = np.pi * RADIUS**2
@@ -289,3 +290,91 @@ def test_single_steps_are_those_of_calls(tmp_path):
     for name in ("self_contact_energy", "self_contact_dissipation", "self_contact/force", "numerical_dissipation"):
         one, other = column(rows, name), column(others, name)
         np.testing.assert_allclose(one, other, atol=1e-7 * np.abs(one).max())
+
+
+@pytest.mark.parallel
+def test_a_restart_continues_to_the_bit(comm, shared_tmp_path):
+    tables = {"time": {"step": 2e-5, "end": 8e-3}, "self_contact": {"friction": 0.3, "restitution": 0.8}}
+    whole, x = rows_of(chains(**tables), comm, shared_tmp_path, "whole")
+    touching = column(whole, "self_contact/contacts")
+    for step in (int(np.argmax(touching > 0)) + 3, int(np.argmax(touching)) + 1):
+        tables["output"] = {"checkpoint_every": step}
+        tables["time"]["end"] = (step + 0.5) * 2e-5
+        name = f"part{step}"
+        rows_of(chains(**tables), comm, shared_tmp_path, name)
+        tables["time"]["end"] = 8e-3
+        with Simulation(chains(**tables), comm, output=shared_tmp_path / name, restart=True) as simulation:
+            rows = [one.row for one in simulation]
+            y = simulation.gather(simulation.state.position)
+        if comm.rank == 0:
+            np.testing.assert_array_equal(x, y)
+        for key in ("self_contact_energy", "self_contact_dissipation", "self_contact/force", "energy_imbalance"):
+            np.testing.assert_array_equal(column(whole, key)[-len(rows) :], column(rows, key))
+
+
+def test_bars_that_would_jump_end_the_run(tmp_path):
+    case = crossed(speed=200.0, time={"step": 1e-4, "end": 1e-3})
+    with (
+        pytest.raises(SimulationFailure, match="bars 0 and 1, which are about to touch, move by more than half"),
+        Simulation(case, MPI.COMM_SELF, output=tmp_path) as simulation,
+    ):
+        simulation.run()
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
+def test_bars_that_pass_through_each_other_end_the_run(integrator, tmp_path):
+    case = crossed(speed=150.0, time={"integrator": integrator, "step": 2e-5, "end": 1e-3})
+    with (
+        pytest.raises(SimulationFailure, match=r"step \d+, t = .*: bars 0 and 1 pass through each other"),
+        Simulation(case, MPI.COMM_SELF, output=tmp_path) as simulation,
+    ):
+        simulation.run()
+
+
+def test_bars_that_cross_in_the_mesh_do_not_touch(tmp_path):
+    for lift, contacts in ((0.0, 0), (0.01, 1)):
+        rows, _ = rows_of(crossed(lift=lift, speed=1.0, time={"end": 3e-3}), MPI.COMM_SELF, tmp_path, f"{lift}")
+        assert column(rows, "self_contact/contacts").max() == contacts
+    # the distance in the mesh takes the place of the sum of radii: there is no force at the start
+    assert column(rows, "self_contact/overlap")[0] == pytest.approx(5e-5)
+
+
+def test_chosen_bars_and_radius(tmp_path):
+    case = crossed(lift=0.05, time={"end": 1.2e-2}, self_contact={"radius": 0.02})
+    rows, _ = rows_of(case, MPI.COMM_SELF, tmp_path, "wide")
+    begin = rows[int(np.argmax(column(rows, "self_contact/contacts") > 0))]
+    assert begin["time"] == pytest.approx(0.01 / 2.0, abs=1e-4)
+    truss = Truss(np.eye(3)[[0, 1, 2]], [[0, 1], [1, 2]], bar_groups={"one": [0]})
+    tables = {key: value for key, value in case.to_dict().items() if key not in ("mesh", "initial", "node_set")}
+    with pytest.raises(InputError, match=r"self_contact.bars = 'two'"):
+        Simulation(Case(tables | {"self_contact": {"bars": "two"}}, mesh=truss), MPI.COMM_SELF, output=tmp_path / "no")
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"time": {"integrator": "newmark"}}, "needs an explicit integrator"),
+        ({"time": {"mass": "consistent"}}, "needs time.mass"),
+        ({"time": {"step": 7e-4}}, "leaves no room for the stiffness"),
+        ({"self_contact": {"restitution": 0.0}}, "restitution"),
+        ({"self_contact": {"radius": -1.0}}, "radius"),
+    ],
+)
+def test_what_does_not_work_is_refused(tables, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        Simulation(crossed(**tables), MPI.COMM_SELF, output=tmp_path)
+
+
+def test_broken_bars_touch_nothing(tmp_path):
+    removed = [{"bars": "gone", "time": 1e-3}]
+    base = crossed(time={"end": 1e-2}).to_dict()
+    base.pop("mesh")
+    points = np.array([[-0.5, 0, 0], [0.5, 0, 0], [0, -0.5, 0.03], [0, 0.5, 0.03]])
+    truss = Truss(points, [[0, 1], [2, 3]], bar_groups={"gone": [0]})
+    rows, _ = rows_of(Case(base | {"remove": removed}, mesh=truss), MPI.COMM_SELF, tmp_path, "run")
+    assert column(rows, "self_contact/contacts").max() == 0
+
+
+def test_deep_overlap_is_told(tmp_path, capfd):
+    rows_of(crossed(speed=40.0, time={"step": 2e-5, "end": 3e-3}), MPI.COMM_SELF, tmp_path, "run")
+    assert "bars have overlapped by up to" in capfd.readouterr().err

@@ -33,14 +33,14 @@ from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
 from ..fields import STATUS
-from ..mechanics.compiled import inlined, kernel
+from ..mechanics.compiled import add_freely, inlined, kernel
 from ..mesh.distribution import bars_of_group
 from ..mesh.exchange import GhostExchange, Router
 from ..mesh.slab import slab_of, slab_range
 from ..output.units import engineering
 from ..parallel.agreement import agreed
 from ..parallel.natural import NaturalOrder
-from .neighbours import Points, Segments, find_pairs, largest_change, segment_distance
+from .neighbours import Points, Regions, Segments, find_pairs, largest_change, make_regions, segment_distance
 from .rows import owner_starts, to_owners
 
 if TYPE_CHECKING:
@@ -51,9 +51,11 @@ if TYPE_CHECKING:
 _CROSSED = 0.1  # largest square of the sine of the angle from which bars touch in one point
 _STIFFNESS = 1.0  # of a pair, over the harmonic mean of E A/l of its bars
 _SHARE = 0.2  # of the mass of a pair over the square of the step, which its stiffness does not exceed
-_PART = 0.1  # of the stiffness that a node may still have, for what begins to touch it in a step
+_PART = 0.1, 0.5  # of the stiffness and damping that a node may still have, for what begins to touch it in a step
 _ROOM = 0.1  # least sum of squared frequencies that a step must leave for contacts, over its inverse square
-_SKIN = 0.2  # distance beyond the radii up to which pairs are listed, over the mean length of bars
+_SKIN = 0.1, 0.5  # least and largest distance beyond the radii up to which pairs are listed, over the length of bars
+_STEPS = 20.0  # steps for which the skin should be sufficient, unless it is too large then
+_FEW, _MANY = 0.25, 3.0  # pairs for each bar in lists that are made with a larger or a smaller skin the next time
 _LEAST = 1e-3  # sum of radii of a pair, over that of its bars, below which they cross in the mesh and do not touch
 _DEEP = 0.2  # overlap over the radius from which results are doubtful
 _TAG = 7800  # of messages between ranks with nodes of the same pairs
@@ -290,16 +292,17 @@ def find_beginning(pairs, state, memory, nodes, law, load):
 
     ``pairs``: PairArrays; ``state`` (m,): states, of which some become :data:`BEGINNING`; ``memory`` (m, width);
     ``nodes``: NodeArrays; ``law``: PairLaw; ``load`` (q, 3): sums over the pairs of a node, times its weight, of their
-    stiffness [N/m] and largest damping [N s/m], and of 1 for those that begin. Returns how many begin, and 1 plus the
-    pair that moves too far in a step, or 0.
+    stiffness [N/m] and largest damping [N s/m], and of 1 for those that begin. Returns how many begin, 1 plus the pair
+    that moves too far in a step, or 0, and the way at which another may touch [m], if none does.
     """
     x, ends = nodes.x, pairs.ends
     segments = ends.reshape(-1, 2)
-    beginning, failed = 0, 0
+    beginning, failed, asleep = 0, 0, np.inf
     for p in range(len(ends)):
         touches = state[p] == TOUCHING
         if not touches:
             if pairs.wake[p] > law.way:
+                asleep = min(asleep, pairs.wake[p])
                 continue
             d, s, t = segment_distance(x, segments, 2 * p, 2 * p + 1)
             farthest = _farthest_move(x, ends, p)
@@ -307,12 +310,14 @@ def find_beginning(pairs, state, memory, nodes, law, load):
                 failed = 1 + p
             if not d < pairs.reach[p]:
                 pairs.wake[p] = law.base + (d - pairs.reach[p])
+                asleep = min(asleep, pairs.wake[p])
                 continue
             beginning += 1
             state[p], pairs.wake[p] = BEGINNING, 0.0
             for c in range(memory.shape[1]):
                 memory[p, c] = 0.0
             memory[p, FIRST], memory[p, SECOND] = s, t
+        asleep = 0.0
         for i in range(4):
             at = memory[p, FIRST if i < 2 else SECOND]
             weight = at if i % 2 == 1 else 1.0 - at
@@ -321,7 +326,7 @@ def find_beginning(pairs, state, memory, nodes, law, load):
                 load[ends[p, i], 1] += weight * pairs.drag[p]
             else:
                 load[ends[p, i], 2] += weight
-    return beginning, failed
+    return beginning, failed, asleep
 
 
 @kernel
@@ -401,24 +406,49 @@ def evaluate_pairs(pairs, state, old, new, nodes, law, out):
 
 
 @kernel
-def distances_of(x, segments, apart):
-    """Write the distances (m,) [m] of segments (2 m, 2) next to each other, between points x (q, 3 or more)."""
-    for p in range(len(apart)):
-        apart[p], _, _ = segment_distance(x, segments, 2 * p, 2 * p + 1)
+def measure_pairs(nodes, ends, bars, sizes):
+    """Write the sizes of pairs in the mesh (4, m): reach [m], 0 for bars that cross there; square of the sine of the
+    angle from which they cross; stiffness [N/m]; and mass [kg].
+
+    ``nodes`` (q, 4 or more): positions [m] and masses [kg]; ``ends`` (m, 4); ``bars`` (m, 4): radius and stiffness of
+    both bars.
+    """
+    segments = ends.reshape(-1, 2)
+    for p in range(len(ends)):
+        apart, _, _ = segment_distance(nodes, segments, 2 * p, 2 * p + 1)
+        radii = bars[p, 0] + bars[p, 2]
+        shorter = np.inf
+        flexible = 0.0
+        for i in range(2):
+            square = 0.0
+            for c in range(3):
+                way = nodes[ends[p, 2 * i + 1], c] - nodes[ends[p, 2 * i], c]
+                square += way * way
+            shorter = min(shorter, square)
+            flexible += 1.0 / bars[p, 2 * i + 1]
+        light = 0.0
+        for i in range(2):
+            light += 1.0 / min(nodes[ends[p, 2 * i], 3], nodes[ends[p, 2 * i + 1], 3])
+        reach = min(radii, apart)
+        sizes[0, p] = reach if reach > _LEAST * radii else 0.0
+        sizes[1, p] = min(_CROSSED, reach * reach / shorter)
+        sizes[2, p] = 2.0 * _STIFFNESS / flexible
+        sizes[3, p] = 1.0 / light
 
 
 @kernel
 def largest_move(x, last, drift):
-    """Return the largest distance of nodes at x (n or more, 3) from last (n, 3) + drift (3,); infinite for NaN."""
-    most = 0.0
-    for i in range(len(last)):
-        square = 0.0
-        for c in range(3):
-            d = x[i, c] - last[i, c] - drift[c]
-            square += d * d
-        if not square <= most:
-            most = square if square == square else np.inf
-    return np.sqrt(most)
+    """Return a distance that no node at x (n or more, 3) is farther from last (3, n) + drift (3,) than; infinite for
+    positions that are not finite."""
+    square, total = 0.0, 0.0
+    for c in range(3):
+        most = 0.0
+        for i in range(last.shape[1]):
+            d = x[i, c] - last[c, i] - drift[c]
+            total = add_freely(total, d)
+            most = max(most, abs(d))
+        square += most * most
+    return np.sqrt(square) if np.isfinite(total) else np.inf
 
 
 def restitution_of(damping: float) -> float:
@@ -441,6 +471,20 @@ def damping_of(restitution: float) -> float:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if restitution_of(middle) > restitution else (low, middle)
     return 0.5 * (low + high) if restitution < 1.0 else 0.0
+
+
+def _numbered(ends: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct numbers (q,) of nodes among ``ends`` (m, 4), ascending, and the ends as places in them; most
+    are in the range of this rank's ``own`` numbers, where they are marked instead of sorted."""
+    mine = (ends >= own[0]) & (ends < own[1])
+    marks = np.zeros(own[1] - own[0] + 1, dtype=np.int64)
+    marks[ends[mine] - own[0] + 1] = 1
+    here, others = own[0] + np.flatnonzero(marks[1:]), np.unique(ends[~mine])
+    numbers = np.concatenate([others[others < own[0]], here, others[others >= own[1]]])
+    places = np.empty(ends.shape, dtype=np.int64)
+    places[mine] = np.searchsorted(others, own[0]) + np.cumsum(marks)[ends[mine] - own[0]]
+    places[~mine] = np.searchsorted(numbers, ends[~mine])
+    return numbers, places
 
 
 class SelfContact:
@@ -482,17 +526,20 @@ class SelfContact:
         lengths = model.bars.mesh_lengths[self._bars]
         sums = comm.allreduce(np.array([lengths.sum(), len(lengths)]))
         self._thick = 2.0 * comm.allreduce(float(self._radius[self._bars].max(initial=0.0)), op=MPI.MAX)
-        self._skin = _SKIN * sums[0] / max(sums[1], 1.0)
+        self._mean, self._listed = float(sums[0] / max(sums[1], 1.0)), -1.0
+        self._skin = 2.0 * _SKIN[0] * self._mean
         self._friction, self._damping = float(table.friction), damping_of(float(table.restitution))
         self._starts = owner_starts(mesh)
         self._numbers = np.concatenate([mesh.first_node + np.arange(mesh.n_owned), mesh.ghost_numbers])
         self._make_directory()
         self._h, self._room = 0.0, 0.0
         self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
-        self.sums = np.zeros(6)
+        self.sums = self._no_sums = np.zeros(6)
         self._way, self._limit, self._drift = 0.0, 0.0, np.zeros(3)
-        self._reference, self._last = mesh.points[: mesh.n_owned].copy(), mesh.points[: mesh.n_owned].copy()
+        self._reference = mesh.points[: mesh.n_owned].copy()
+        self._last = self._reference.T.copy()
         self._exchange: GhostExchange | None = None
+        self._near: tuple[Regions, float] | None = None
         self._empty()
 
     def _make_directory(self) -> None:
@@ -556,9 +603,17 @@ class SelfContact:
 
     # pairs
 
-    def _search(self, x: np.ndarray) -> None:
-        """Make the list of pairs at positions (local, 3). Collective."""
+    def _search(self, x: np.ndarray, move: float) -> None:
+        """Make the list of pairs at positions (local, 3); nodes ``move`` in a step [m]. Collective.
+
+        The skin grows as long as few pairs are listed, and shrinks where they are many.
+        """
         bars, model = self._bars, self._model
+        if self._listed >= 0.0:
+            factor = 2.0 if self._listed < _FEW else 0.7 if self._listed > _MANY else 1.0
+            self._skin = min(max(self._skin * factor, _SKIN[0] * self._mean), _SKIN[1] * self._mean)
+            self._skin = max(self._skin, min(_STEPS * move, _SKIN[1] * self._mean))
+        self._skin = max(self._skin, 4.0 * move)
         if model.bars.can_break:
             bars = bars[model.bars.status()[bars] != STATUS.index("broken")]
         margin = self._radius[bars] + 0.5 * self._skin
@@ -569,16 +624,21 @@ class SelfContact:
                 "[self_contact]: too many bars are in one place to find those that touch: reduce self_contact.radius, "
                 "or choose fewer bars with self_contact.bars"
             )
+        number, listed = self.comm.allreduce(np.array([len(bars), len(found.ids)]))
+        self._listed = listed / max(number, 1)
         self._install(found.ids.astype(np.int64))
 
     def _of_bars(self, ids: np.ndarray) -> np.ndarray:
         """Return ends, radius and stiffness (n, 4) of bars by their numbers (n,). Collective."""
+        if self.comm.size == 1:
+            return self._directory[ids]
         wanted, place = np.unique(ids, return_inverse=True)
         asking = Router(self.comm, slab_of(wanted, self._mesh.n_bars, self.comm.size))
         return asking.reply(self._directory[asking.send(wanted) - self._first_bar])[place.ravel()]
 
     def _empty(self) -> None:
         """Begin without pairs that touch; they are searched at the next evaluation."""
+        self._asleep = 0.0
         self._keys, self._touching, self._limit = np.empty(0, dtype=np.int64), np.empty((0, WIDTH + 2)), 0.0
         self._state = np.empty(0, dtype=np.uint8)
 
@@ -590,14 +650,18 @@ class SelfContact:
 
     def _install(self, ids: np.ndarray) -> None:
         """Take pairs of bars (m, 2) from any ranks. Those that touch stay so. Collective."""
+        self._asleep = 0.0
         comm, mesh, starts = self.comm, self._mesh, self._starts
         kept = self._touches() if len(self._state) else (self._keys, self._touching)
+        if comm.size == 1:
+            ids = ids[np.argsort(ids[:, 0] * mesh.n_bars + ids[:, 1])]
         of_bars = self._of_bars(ids.ravel()).reshape(-1, 2, 4)
-        ends, sizes = of_bars[:, :, :2].reshape(-1, 4), np.ascontiguousarray(of_bars[:, :, 2:].reshape(-1, 4))
-        rows = to_owners(np.hstack([ids, ends.astype(np.int64), sizes.view(np.int64)]), range(2, 6), starts, comm)
-        sizes = np.ascontiguousarray(rows[:, 6:]).view(np.float64)  # radius and stiffness of both bars
-        numbers, ends = np.unique(rows[:, 2:6], return_inverse=True)
-        ends = np.ascontiguousarray(ends.reshape(-1, 4))
+        ends, sizes = of_bars[:, :, :2].astype(np.int64).reshape(-1, 4), of_bars[:, :, 2:].reshape(-1, 4)
+        if comm.size > 1:
+            rows = np.hstack([ids, ends, np.ascontiguousarray(sizes).view(np.int64)])
+            rows = to_owners(rows, range(2, 6), starts, comm)
+            ids, ends, sizes = rows[:, :2], rows[:, 2:6], np.ascontiguousarray(rows[:, 6:]).view(np.float64)
+        numbers, ends = _numbered(ends, starts[comm.rank : comm.rank + 2])
         self._own = own = (numbers >= starts[comm.rank]) & (numbers < starts[comm.rank + 1])
         self._local = (numbers[own] - starts[comm.rank]).astype(np.int64)
         if self._exchange is not None:
@@ -607,28 +671,22 @@ class SelfContact:
         inverse = np.where(self._model.supports.fixed.all(axis=1), 0.0, 1.0 / mass)
         of_nodes = np.column_stack([mesh.points[: mesh.n_owned], mass, inverse])
         of_nodes = self._gather(of_nodes.__getitem__, 5)
-        apart, reach = np.empty(len(ends)), sizes[:, 0] + sizes[:, 2]
-        distances_of(of_nodes, ends.reshape(-1, 2), apart)
-        axes = of_nodes[ends[:, 1::2], :3] - of_nodes[ends[:, ::2], :3]
-        length = np.linalg.norm(axes, axis=2).min(axis=1, initial=inf)
-        closer = np.minimum(reach, apart)
-        lighter = np.minimum(of_nodes[ends[:, ::2], 3], of_nodes[ends[:, 1::2], 3])
-        with np.errstate(divide="ignore"):
-            most = 2.0 * _STIFFNESS / (1.0 / sizes[:, 1::2]).sum(axis=1)
+        measures = np.empty((4, len(ends)))
+        measure_pairs(of_nodes, ends, np.ascontiguousarray(sizes), measures)
+        reach, crossed, most, inertia = measures
         if self._h:
-            most = np.minimum(most, _SHARE / self._h**2 / (1.0 / lighter).sum(axis=1))
-        used = np.flatnonzero((closer > _LEAST * reach) & (most > 0.0))
-        self.ids, ends, n = rows[used, :2], ends[used], len(used)
+            np.minimum(most, _SHARE / self._h**2 * inertia, out=most)
+        used = np.flatnonzero((reach > 0.0) & (most > 0.0))
+        self.ids, ends, n = ids[used], ends[used], len(used)
         self._keys, self._state = self.ids[:, 0] * mesh.n_bars + self.ids[:, 1], np.full(n, APART, dtype=np.uint8)
         memory = np.zeros((n, WIDTH + 2))
         stays = np.isin(kept[0], self._keys)  # not those of bars that have left the model
         place = np.searchsorted(self._keys, kept[0][stays])
         memory[place], self._state[place], self._touching = kept[1][stays], TOUCHING, kept[1][:0]
         self._memory, self._spare = np.ascontiguousarray(memory[:, :WIDTH]), np.zeros((n, WIDTH))
-        crossed = np.minimum(_CROSSED, (closer / length) ** 2)
         counted = self._own[ends[:, 0]] if n else np.empty(0, dtype=bool)
         varying = memory[:, WIDTH].copy(), memory[:, WIDTH + 1].copy(), np.zeros(n)
-        self._pairs = PairArrays(ends, closer[used], crossed[used], most[used], counted, *varying)
+        self._pairs = PairArrays(ends, reach[used], crossed[used], most[used], counted, *varying)
         self._mass, self._inverse = of_nodes[:, 3].copy(), of_nodes[:, 4].copy()
 
     def _stiffen(self, state: np.ndarray, load: np.ndarray) -> None:
@@ -643,7 +701,7 @@ class SelfContact:
         if not self._h:
             return
         room = self._mass[:, None] * np.array([0.5 * self._room, 0.5 / self._h])
-        left = _PART * np.maximum(room - load[:, :2], 0.0) / np.maximum(load[:, 2:], 1e-6)
+        left = np.array(_PART) * np.maximum(room - load[:, :2], 0.0) / np.maximum(load[:, 2:], 1e-6)
         least = left[pairs.ends[begin]].min(axis=1, initial=inf)
         pairs.stiffness[begin] = np.minimum(pairs.most[begin], least[:, 0])
         pairs.drag[begin] = least[:, 1]
@@ -681,13 +739,18 @@ class SelfContact:
         way = self._way + 2.0 * float(worst[0])
         if worst[1] or way >= self._limit:
             self._renew(x, step, way, 2.0 * float(worst[0]))
-        nodes = self._gather(lambda rows: np.hstack([x[rows], x[rows] - self._last[rows]]), 6)
+        if way < self._asleep and self.comm.size == 1:  # nothing touches, nor can
+            if commit:
+                self._way, self.sums = way, self._no_sums
+                self._last[:] = x[: self._last.shape[1]].T
+            return 0.0, self.dissipated
+        nodes = self._gather(lambda rows: np.hstack([x[rows], x[rows] - self._last[:, rows].T]), 6)
         force, load, sums = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3)), np.zeros(6)
         law = PairLaw(self._friction, self._damping, float(step), way, way if commit else 2.0 * self._way - way)
         arrays, pairs, state = NodeArrays(nodes, self._inverse, force), self._pairs, self._state
         if not commit:
             state = state.copy()
-        begin, far = find_beginning(pairs, state, self._memory, arrays, law, load)
+        begin, far, self._asleep = find_beginning(pairs, state, self._memory, arrays, law, load)
         if self._any(begin):
             self._report(
                 far,
@@ -707,7 +770,7 @@ class SelfContact:
             self._memory, self._spare = self._spare, self._memory
             self._way, self.dissipated, self.sums = way, total, sums
             self.deepest = max(self.deepest, float(sums[DEPTH]))
-            self._last[:] = x[: len(self._last)]
+            self._last[:] = x[: self._last.shape[1]].T
         return float(sums[ENERGY]), total
 
     def _any(self, here: int) -> bool:
@@ -728,17 +791,21 @@ class SelfContact:
         """Find out whether the list of pairs still has all that may touch, else make it again. Collective."""
         mesh, owned = self._mesh, self._mesh.n_owned
         if self._limit > 0.0 and not self.stale:
-            change = largest_change(self.comm, (self._reference, x[:owned]), mesh.n_nodes, self._thick + self._skin)
+            motion = self._reference, x[:owned]
+            change = largest_change(self.comm, motion, mesh.n_nodes, self._thick + self._skin, self._near)
             left = self._skin - change
             if left > 0.25 * self._skin + move:
                 self._limit = way + 0.998 * (left - move)
                 return
         if step > 0.0:
-            moved = self.comm.allreduce((x[:owned] - self._last).sum(axis=0)) / mesh.n_nodes
+            moved = self.comm.allreduce((x[:owned] - self._last.T).sum(axis=0)) / mesh.n_nodes
             self._drift = moved / step
-        self._skin = max(self._skin, 4.0 * move)
-        self._search(x)
+        self._search(x, move)
         self._reference[:] = x[:owned]
+        ends = x[mesh.bars[self._bars]]
+        longest = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max(initial=0.0))
+        longest = self.comm.allreduce(longest, op=MPI.MAX)
+        self._near = make_regions(self.comm, self._reference, 6.0 * (longest + self._skin)), longest
         self._limit, self.stale = way + 0.998 * (self._skin - move), False
 
     def of_row(self, name: str) -> float:
@@ -794,7 +861,7 @@ class SelfContact:
     def _take(self, table: np.ndarray, x: np.ndarray) -> None:
         """Take pairs that touch (m, width + 3) from any ranks to those of their nodes. Collective."""
         self._empty()
-        self._last[:] = x
+        self._last[:] = x.T
         comm, starts, n_bars = self.comm, self._starts, self._mesh.n_bars
         ids = np.column_stack(np.divmod(table[:, 0].astype(np.int64), n_bars))
         ends = self._of_bars(ids.ravel())[:, :2].reshape(-1, 4).astype(np.int64)

@@ -14,9 +14,9 @@ from pfem_petsc.contact.self_contact import (
     PairArrays,
     PairLaw,
     damping_of,
-    distances_of,
     evaluate_pairs,
     find_beginning,
+    measure_pairs,
     restitution_of,
 )
 from pfem_petsc.errors import InputError, SimulationFailure
@@ -31,7 +31,7 @@ def evaluate(x, reach=0.1, stiffness=3.0, crossed=0.1):
     pairs, state = PairArrays(np.arange(4).reshape(1, 4), *numbers), np.zeros(1, dtype=np.uint8)
     nodes = NodeArrays(np.hstack([x, np.zeros((4, 3))]), np.ones(4), np.zeros((4, 3)))
     sums, memory, law = np.zeros(6), np.zeros((1, WIDTH)), PairLaw(0.0, 0.0, 0.0, 0.0, 0.0)
-    assert find_beginning(pairs, state, memory, nodes, law, np.zeros((4, 3))) == (1, 0)
+    assert find_beginning(pairs, state, memory, nodes, law, np.zeros((4, 3))) == (1, 0, 0.0)
     assert evaluate_pairs(pairs, state, memory, memory.copy(), nodes, law, sums) == 0
     assert sums[DISSIPATED] == 0.0
     return sums[ENERGY], nodes.force, sums[FORCE]
@@ -51,9 +51,10 @@ def near_pairs(random, count):
 
 
 def closest(x):
-    apart = np.empty(1)
-    distances_of(x, np.array([[0, 1], [2, 3]]), apart)
-    return apart[0]
+    """Distance of two bars with ends at x (4, 3) and large radii."""
+    sizes = np.empty((4, 1))
+    measure_pairs(np.hstack([x, np.ones((4, 1))]), np.arange(4).reshape(1, 4), np.full((1, 4), 100.0), sizes)
+    return sizes[0, 0]
 
 
 def test_distances_are_those_of_another_program():

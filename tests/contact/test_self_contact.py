@@ -53,7 +53,7 @@ def near_pairs(random, count):
 def closest(x):
     """Distance of two bars with ends at x (4, 3) and large radii."""
     sizes = np.empty((4, 1))
-    measure_pairs(np.hstack([x, np.ones((4, 1))]), np.arange(4).reshape(1, 4), np.full((1, 4), 100.0), sizes)
+    measure_pairs(np.hstack([x, np.ones((4, 1))]), np.arange(4).reshape(1, 4), np.full((1, 4), 1.0), sizes)
     return sizes[0, 0]
 
 

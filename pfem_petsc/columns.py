@@ -88,6 +88,8 @@ ENERGIES = (
     energy("prestress_work", "supplied", "ledger"),
     energy("numerical_dissipation", "lost", "ledger"),
     energy("spring_energy", "stored", "bars"),  # of springs to the ground, whose forces are added to those of the bars
+    energy("self_contact_energy", "stored", "bars"),  # so are those of bars that touch
+    energy("self_contact_dissipation", "lost", "bars"),
 )
 
 STORED, LOST, SUPPLIED = (tuple(e.name for e in ENERGIES if e.side == side) for side in ("stored", "lost", "supplied"))
@@ -116,6 +118,16 @@ COUNTS = (
     ),
     # others can break in the last step of a call alone
     Column("broken_bars", kind=np.int64, value=lambda now: now.ruptures.count, looped=True),
+    *(
+        Column(
+            f"self_contact/{name}",
+            unit,
+            kind=kind,
+            value=lambda now, name=name: now.model.self_contact.of_row(name),
+            exists=lambda model: model.self_contact is not None,
+        )
+        for name, unit, kind in (("contacts", "", np.int64), ("overlap", "m", float), ("force", "N", float))
+    ),
 )
 IMBALANCE = Column("energy_imbalance", "J")
 VECTORS = (
@@ -156,7 +168,7 @@ DECLARED = {
 def declared(name: str) -> Column:
     """Return the column of a name as it is in the file, ``wall/floor/force``; an unknown one is a pure number."""
     last = name.rsplit("/", 1)[-1]
-    return DECLARED.get(last) or Column(last)
+    return DECLARED.get(name) or DECLARED.get(last) or Column(last)
 
 
 class Layout:

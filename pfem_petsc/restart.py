@@ -15,6 +15,7 @@ Where the data are stored:
 - Arrays of the bars: data of the laws, thermal strains, rest lengths, history of the lagged preconditioner.
 - ``free_walls``: walls with mass, including their last increment. Forces of pairs and
   constraints, and which of them are closed: arrays of their rows; with rows that come and go, the rows themselves.
+- ``self_contact``: pairs of bars near each other with their memory, positions at the search, and the way since then.
 - ``ranks``: works and energies. Recorder: energy at the start, largest energy, iterations since the last row.
   ``blow_up``: suspicious rows, energy input, energies of the first row. Contact log: contact times and impulses.
 - Attributes (plan): time step and linear solver.
@@ -92,7 +93,8 @@ class RunState:
             own[name] = np.zeros((self.mesh.n_owned, *shape), dtype=kind)
         nodes = {name: (self.mesh.node_order, own[name]) for name in sorted(kinds)}
         bars = {name: (self.mesh.bar_order, array[self.mesh.counted]) for name, array in self._bar_arrays().items()}
-        return {**nodes, **bars, **self.model.links.arrays()}
+        touch = self.model.self_contact
+        return {**nodes, **bars, **self.model.links.arrays(), **({} if touch is None else touch.arrays())}
 
     def scalars(
         self, ledger: Mapping[str, Any], history: Mapping[str, Any], snapshots: Mapping[str, Any]
@@ -113,6 +115,7 @@ class RunState:
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
             **{name: kept for name, kept in history.items() if name != "row"},
             **self.model.links.numbers(),
+            **({} if (touch := self.model.self_contact) is None else {"self_contact": touch.numbers()}),
             "free_walls": self.model.contact.motion.bodies.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
             "row": history["row"],
@@ -157,7 +160,9 @@ class RunState:
         bars = NaturalOrder(self.comm, np.arange(mine.first, mine.first + mine.count), self.mesh.n_bars)
         orders = dict.fromkeys(scalars["node_arrays"], self.mesh.node_order)
         orders |= dict.fromkeys(scalars["bar_arrays"], bars)
-        return orders | self.model.links.orders(scalars.get("rows"))
+        orders |= self.model.links.orders(scalars.get("rows"))
+        touch = self.model.self_contact
+        return orders | ({} if touch is None else touch.orders(scalars["self_contact"]))
 
     def _load_state(self, scalars: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         stepper, state, owned = self.stepper, self.stepper.state, self.mesh.n_owned
@@ -195,6 +200,9 @@ class RunState:
         stepper.solution.contacts = int(mine["contacts"])
         self.model.contact.motion.bodies.load_state(scalars["free_walls"])
         self.model.links.load_state(arrays)
+        if self.model.self_contact is not None:
+            dissipated = stepper.energy.of("self_contact_dissipation")
+            self.model.self_contact.load_state(scalars["self_contact"], arrays, state.position, dissipated)
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
         stepper.resume()
 

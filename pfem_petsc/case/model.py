@@ -493,6 +493,7 @@ class CaseModel(StrictModel):
     wall: Annotated[list[Wall], _numbered("wall"), t.distinct("wall"), STAGED] = []
     contact_pair: Annotated[list[t.ContactPair], _numbered("contact_pair"), t.distinct("contact pair")] = []
     constraint: Annotated[list[Constraint], _numbered("constraint"), t.distinct("constraint")] = []
+    self_contact: Annotated[t.SelfContact | None, STAGED] = None
     remove: Annotated[list[t.Remove], STAGED] = []
     contact: Annotated[t.ContactSettings, STAGED] = Field(default_factory=t.ContactSettings)
     time: Time | None = None

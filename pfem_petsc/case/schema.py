@@ -79,7 +79,8 @@ class Case(_Tables):
     node_set, material, section : tables by name, in file order
     initial, support, load, temperature, wall, contact_pair, constraint, remove : lists of tables
     point_mass : list of tables ``[[mass]]``; spring, dashpot : lists of tables
-    gravity, wind : :class:`~pfem_petsc.case.tables.Gravity`, :class:`~pfem_petsc.case.tables.Wind`, or None
+    gravity, wind, self_contact : :class:`~pfem_petsc.case.tables.Gravity`, :class:`~pfem_petsc.case.tables.Wind`,
+        :class:`~pfem_petsc.case.tables.SelfContact`, or None
     contact, output, solver : tables of :mod:`~pfem_petsc.case.tables`
     time, static, modes : what is computed, None for what is not; ``time`` and ``static`` exclude each other
     stage : the cases of its stages, empty for a case without them

@@ -662,6 +662,19 @@ class ContactPair(SurfaceKeys):
     """smallest distance of second from first along the direction [m]"""
 
 
+class SelfContact(StrictModel):
+    """Bars that cannot pass through each other, as capsules; explicit integrators."""
+
+    bars: BarGroup | None = None
+    """bar group of the mesh, or bars with a value of a field, as in a section; default: every bar"""
+    radius: PositiveFloat | None = None
+    """radius of the bars [m]; default: that of the section's shape, else of the circle of its area"""
+    friction: NonNegativeFloat = 0.0
+    """Coulomb coefficient of friction"""
+    restitution: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+    """ratio of velocities after and before an impact of two bars; 1: no damping"""
+
+
 class Remove(StrictModel):
     """Bars or supports that are removed, at once or gradually."""
 

@@ -1,5 +1,5 @@
-"""Coulomb friction of nodes at walls: the local problem of a node, solved by sweeps over its walls, nodes that friction
-jams, and which nodes of an implicit step stick or slip.
+"""Coulomb friction of nodes at walls: the local problem of a node, nodes that friction jams, and which nodes of an
+implicit step stick or slip.
 """
 
 from __future__ import annotations
@@ -10,19 +10,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..integrators.base import Balance, State
-from ..mechanics.compiled import NEEDED, inlined, kernel
+from ..mechanics.compiled import NEEDED, kernel
 from ..tolerances import FREE_PART, ON_BOUND, PROJECTED
 from .frames import NodalFrames, Sliding
 from .node_walls import free_squares
 from .projection import project
+from .sweeps import Pushes, RubbingRows, settle_friction
 
 if TYPE_CHECKING:
     from ..mechanics.mass import Inertia
     from .node_walls import NodeWalls
-
-_SWEEPS = 2000
-_SLIDES = 1e-13  # of the position: slips beyond are no rounding
-_OVERSHOOT = 0.9  # of the drag over the normal force, from which on sweeps go a part of the way
 
 
 class Rubbing(NamedTuple):
@@ -60,62 +57,10 @@ class Rubbing(NamedTuple):
         x[some], normal[some], drag[some] = part
 
 
-@inlined
-def slides_along_guide(i, rubbing, x, normal_forces, drag):
-    """Forces on a node that supports leave one component, pressed by one wall with friction: in closed form.
-
-    Where it is, and so its slip s, is decided by the wall alone. Along the free component f, with lambda_0 the normal
-    force without friction, lambda (n_f - mu s_f/|s|) = lambda_0 n_f: no sweeps are needed, which creep where the wall
-    is almost parallel to the guide.
-
-    Returns
-    -------
-    bool
-        Whether it is such a node, slides, and a normal force does it; otherwise nothing has changed.
-    """
-    before, ways, fixed, normals, _, dynamic, _, _ = rubbing
-    free = -1
-    for c in range(3):
-        if not fixed[i, c]:
-            if free >= 0:
-                return False
-            free = c
-    if free < 0:
-        return False
-    wall = -1
-    for k in range(normal_forces.shape[1]):
-        if normal_forces[i, k] > 0.0:
-            if wall >= 0:
-                return False
-            wall = k
-    if wall < 0 or not dynamic[wall] > 0.0:
-        return False
-    n = normals[i, wall]
-    along = 0.0
-    for c in range(3):
-        along += (x[i, c] - before[i, c] - ways[i, wall, c]) * n[c]
-    size, where = 0.0, 0.0
-    for c in range(3):
-        slip = x[i, c] - before[i, c] - ways[i, wall, c] - along * n[c]
-        size += slip * slip
-        where += abs(x[i, c])
-    size = math.sqrt(size)
-    if not size > _SLIDES * where:
-        return False
-    slip = x[i, free] - before[i, free] - ways[i, wall, free] - along * n[free]
-    helped = 1.0 - dynamic[wall] * slip / (size * n[free])
-    if not helped > _SLIDES:
-        return False
-    normal_forces[i, wall] /= helped
-    for c in range(3):
-        slip = x[i, c] - before[i, c] - ways[i, wall, c] - along * n[c]
-        drag[i, wall, c] = -dynamic[wall] * normal_forces[i, wall] * slip / size
-    return True
-
-
 @kernel
 def add_friction(rubbing, x, normal_forces, drag):
-    """Apply friction forces to the nodes in contact with walls that have friction.
+    """Apply friction forces to the nodes in contact with walls that have friction, see
+    :mod:`~pfem_petsc.contact.sweeps`; each node is solved for by itself.
 
     Parameters
     ----------
@@ -131,94 +76,64 @@ def add_friction(rubbing, x, normal_forces, drag):
     """
     before, ways, fixed, normals, offsets, dynamic, static, stiffness = rubbing
     m, w = offsets.shape
-    trial = np.zeros(3)
+    vectors, numbers = np.empty((4, w, 3)), np.empty((3, w))
+    rows = RubbingRows(
+        np.zeros((w, 1), np.int64),
+        np.ones((w, 1)),
+        np.empty((w, 1, 3)),
+        vectors[0],
+        numbers[0],
+        vectors[1],
+        np.empty((w, 2)),
+        np.empty((1, 3)),
+        np.empty((w, 2)),
+    )
+    pushes = Pushes(numbers[1], vectors[2], np.empty((1, 3)))
+    slot = np.empty(w, np.int64)
     unsettled = -1
     for i in range(m):
-        pressed = False
+        pressed, n = False, 0
         for k in range(w):
             for c in range(3):
                 drag[i, k, c] = 0.0
-            if normal_forces[i, k] > 0.0:
-                pressed = pressed or static[k] > 0.0
-        if not pressed or slides_along_guide(i, rubbing, x, normal_forces, drag):
+            pressed = pressed or (normal_forces[i, k] > 0.0 and static[k] > 0.0)
+        if not pressed:
             continue
-        soft = 1.0 / stiffness[i]
-        reach = stiffness[i] * (
-            abs(x[i, 0]) + abs(x[i, 1]) + abs(x[i, 2])
-        )  # forces that correspond to the rounding of positions
-        # where supports leave little of a normal free, the friction force moves the node r times as far as the normal
-        # force; sweeps overshoot for r >= 1 unless they are underrelaxed
-        part = 1.0
+        for c in range(3):
+            rows.soft[0, c], pushes.moves[0, c] = 0.0 if fixed[i, c] else 1.0 / stiffness[i], 0.0
         for k in range(w):
-            if offsets[i, k] > -math.inf and static[k] > 0.0:
-                length = 0.0
-                for c in range(3):
-                    if not fixed[i, c]:
-                        length += normals[i, k, c] * normals[i, k, c]
-                if length >= 1e-12:
-                    ratio = static[k] * math.sqrt(max(1.0 - length, 0.0) / length)
-                    if ratio > _OVERSHOOT:
-                        part = min(part, 1.0 / (1.0 + ratio))
-        settled = False
-        for _ in range(_SWEEPS):
-            change = 0.0
-            largest = 0.0
-            least = 1.0  # where supports leave little of a normal free, rounding is amplified in forces
-            for k in range(w):
-                if offsets[i, k] == -math.inf:
-                    continue
-                length = 0.0
-                gap = -offsets[i, k]
-                for c in range(3):
-                    gap += normals[i, k, c] * x[i, c]
-                    if not fixed[i, c]:
-                        length += normals[i, k, c] * normals[i, k, c]
-                if length < 1e-12:
-                    continue
-                # normal
-                old = normal_forces[i, k]
-                new = max(0.0, old - gap * stiffness[i] / length)
-                if new == 0.0 and old == 0.0:
-                    continue
-                least = min(least, length)
-                change = max(change, abs(new - old))
-                if part < 1.0:
-                    new = old + part * (new - old)
-                for c in range(3):
-                    if not fixed[i, c]:
-                        x[i, c] += (new - old) * normals[i, k, c] * soft
-                normal_forces[i, k] = new
-                largest = max(largest, new)
-                # tangential: the force that would stop the slip, limited by Coulomb's law
-                if static[k] == 0.0:
-                    continue
-                slip = 0.0
-                for c in range(3):
-                    trial[c] = x[i, c] - before[i, c] - ways[i, k, c]
-                    slip += trial[c] * normals[i, k, c]
-                size = 0.0
-                for c in range(3):
-                    trial[c] = drag[i, k, c] - stiffness[i] * (trial[c] - slip * normals[i, k, c])
-                    size += trial[c] * trial[c]
-                size = math.sqrt(size)
-                factor = 1.0
-                if size > static[k] * new:
-                    factor = dynamic[k] * new / size
-                for c in range(3):
-                    force = factor * trial[c]
-                    move = force - drag[i, k, c]
-                    change = max(change, abs(move))
-                    if part < 1.0:
-                        move *= part
-                        force = drag[i, k, c] + move
-                    drag[i, k, c] = force
-                    if not fixed[i, c]:
-                        x[i, c] += move * soft
-            if change <= 1e-15 * (largest + reach / least) or largest == 0.0:
-                settled = True
-                break
-        if not settled and unsettled < 0:
+            if offsets[i, k] == -math.inf:
+                continue
+            length = 0.0
+            for c in range(3):
+                rows.normals[n, c] = normals[i, k, c]
+                rows.gradients[n, 0, c] = 0.0 if fixed[i, c] else normals[i, k, c]
+                length += rows.gradients[n, 0, c] * rows.gradients[n, 0, c]
+            if length < 1e-12:
+                continue
+            for c in range(3):
+                pushes.moves[0, c] += normal_forces[i, k] * rows.gradients[n, 0, c] * rows.soft[0, c]
+            rows.friction[n, 0], rows.friction[n, 1] = dynamic[k], static[k]
+            pushes.normal[n], slot[n] = normal_forces[i, k], k
+            n += 1
+        size = 0.0
+        for c in range(3):
+            x[i, c] -= pushes.moves[0, c]  # where the node is without forces
+            size += abs(x[i, c])
+        for a in range(n):
+            k = slot[a]
+            rows.values[a] = -offsets[i, k]
+            for c in range(3):
+                rows.values[a] += rows.normals[a, c] * x[i, c]
+                rows.slips[a, c] = x[i, c] - before[i, c] - ways[i, k, c]
+        if not settle_friction(n, rows, size, pushes) and unsettled < 0:
             unsettled = i
+        for c in range(3):
+            x[i, c] += pushes.moves[0, c]
+        for a in range(n):
+            normal_forces[i, slot[a]] = pushes.normal[a]
+            for c in range(3):
+                drag[i, slot[a], c] = pushes.drag[a, c]
     return unsettled
 
 

@@ -15,7 +15,7 @@ from ..mesh.slab import slab_of
 from ..parallel.heap import returning_freed_memory
 from ..tolerances import BEYOND
 from .contact import Contact
-from .neighbours import Points, Segments, find_pairs
+from .neighbours import Points, Segments, find_pairs, largest_change
 from .node_walls import held_by_supports
 from .wall_motion import Poses
 
@@ -276,7 +276,7 @@ class CrossingBars:
         self._bars = mesh.counted
         if not (isinstance(self._bars, slice) and slender.all()):
             self._bars = np.arange(len(mesh.bars), dtype=np.int32)[self._bars][slender]
-        self.applicable = model.comm.allreduce(int(np.count_nonzero(slender))) > 1
+        self.applicable = model.comm.allreduce(int(np.count_nonzero(slender))) > 1 and model.self_contact is None
         self._thick = 2.0 * model.comm.allreduce(float(radius[slender].max(initial=0.0)), op=MPI.MAX)
         self._kind = self._linked_bars()
         self._last: _Search | None = None
@@ -317,28 +317,12 @@ class CrossingBars:
 
     def _largest_change(self, x: np.ndarray) -> float:
         """Return by how much the distance of any two bars may have changed since the last search, relative to the sum
-        of their radii [m]; infinite if bars broke. Collective.
-
-        An affine map, the fit of all displacements, takes nodes to within r of where they are. With its singular values
-        s, a distance d has become one between s_min d - 2 r and s_max d + 2 r: a body that spins has not changed.
-        """
+        of their radii [m]; infinite if bars broke. Collective."""
         comm, last, mesh = self._model.comm, self._last, self._model.mesh
-        own, start, moved = slice(mesh.n_owned), last.x, x - last.x
-        means = comm.allreduce(np.stack([start[own].sum(axis=0), moved[own].sum(axis=0)])) / mesh.n_nodes
-        start, moved = start - means[0], moved - means[1]
-        moments = comm.allreduce(np.stack([start[own].T @ start[own], start[own].T @ moved[own]]))
-        if not np.isfinite(moments).all():
-            return np.inf
-        gradient = np.linalg.pinv(moments[0], rcond=1e-9, hermitian=True) @ moments[1]
-        moved -= start @ gradient
-        ends = np.stack([moved.max(axis=0, initial=-np.inf), -moved.min(axis=0, initial=np.inf)])
-        comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
-        moved -= 0.5 * (ends[0] - ends[1])
-        stretches = np.abs(np.linalg.svd(np.eye(3) + gradient, compute_uv=False) - 1.0)
-        square = float(np.einsum("ij,ij->i", moved, moved).max(initial=0.0))
-        broken = bool((self._intact() != last.intact).any()) or not np.isfinite(square)
-        rest = 2.0 * np.sqrt(comm.allreduce(np.inf if broken else square, op=MPI.MAX))
-        return rest + float(stretches.max()) * (self._thick + last.gap)
+        own = slice(mesh.n_owned)
+        change = largest_change(comm, (last.x[own], x[own]), mesh.n_nodes, self._thick + last.gap)
+        broken = comm.allreduce(bool((self._intact() != last.intact).any()), op=MPI.LOR)
+        return np.inf if broken else change
 
     def _count(self, pairs: np.ndarray) -> Crossing:
         """Return the number of pairs and bars from the pairs (m, 2) that this rank has found. Collective."""

@@ -123,6 +123,141 @@ def find_pairs(comm: MPI.Comm, points: Points, own: Segments, skin: float = 0.0,
     return Pairs(np.empty((0, 2), np.int64), np.empty((0, 2, 2), np.int64), np.empty((0, 2)), np.inf)
 
 
+class Regions(NamedTuple):
+    """Cells of space, by which nodes near each other are compared: of each owned node ``of`` (n,); their numbers along
+    the axes ``count`` (3,), and their width [m]."""
+
+    of: np.ndarray
+    count: np.ndarray
+    width: float
+
+
+_REGIONS = 24  # along an axis, at most
+
+
+def make_regions(comm: MPI.Comm, x: np.ndarray, width: float) -> Regions:
+    """Return cells of at least a width [m] around owned nodes at ``x`` (n, 3). Collective."""
+    ends = np.stack([x.max(axis=0, initial=-np.inf), -x.min(axis=0, initial=np.inf)])
+    comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+    width = max(width, float((ends[0] + ends[1]).max()) / _REGIONS)
+    count = ((ends[0] + ends[1]) / width).astype(np.int64) + 1
+    at = np.minimum(((x + ends[1]) / width).astype(np.int64), count - 1)
+    return Regions((at[:, 0] * count[1] + at[:, 1]) * count[2] + at[:, 2], count, width)
+
+
+def largest_change(
+    comm: MPI.Comm,
+    motion: tuple[np.ndarray, np.ndarray],
+    n_nodes: int,
+    reach: float,
+    near: tuple[Regions, float] | None = None,
+) -> float:
+    """Return by how much distances up to ``reach`` between any bars may have changed [m]; infinite for positions that
+    are not finite. Collective.
+
+    An affine map, the fit of all displacements, takes nodes to within r of where they are. With its singular values s,
+    a distance d has become one between s_min d - 2 r and s_max d + 2 r: a body that spins has not changed. Instead of
+    2 r, bars whose ends are in neighbouring regions have what these differ in at most from the map, as long as others
+    are too far from each other to come near.
+
+    Parameters
+    ----------
+    motion : positions (owned, 3) before and now [m]
+    n_nodes : of all ranks
+    near : regions of the positions before, and the length of the longest bar [m]
+    """
+    start, now = (np.asarray(x) for x in motion)
+    sums = comm.allreduce(_sum_motion(start, now)) / n_nodes
+    moments = comm.allreduce(_moments(start, now, sums))
+    if not np.isfinite(moments).all():
+        return np.inf
+    gradient = np.linalg.pinv(moments[0], rcond=1e-9, hermitian=True) @ moments[1]
+    regions, longest = near or (None, 0.0)
+    most = np.full((int(np.prod(regions.count)) if near else 0, 6), -np.inf)
+    ends = np.full(6, -np.inf)
+    _ranges(start, now, sums, gradient, regions.of if near else np.empty(0, np.int64), most, ends)
+    comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+    square = _farthest(start, now, sums, gradient, 0.5 * (ends[:3] - ends[3:]))
+    rest = 2.0 * np.sqrt(comm.allreduce(square, op=MPI.MAX))
+    stretch = float(np.abs(np.linalg.svd(np.eye(3) + gradient, compute_uv=False) - 1.0).max())
+    if near:
+        comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
+        beyond = regions.width - 2.0 * longest
+        if rest + stretch * beyond <= beyond - reach:
+            rest = min(rest, _largest_range(most.reshape(*regions.count, 6)))
+    return rest + stretch * reach
+
+
+def _largest_range(most: np.ndarray) -> float:
+    """Return the largest length of the differences of displacements in neighbouring regions, whose largest ones are
+    ``most`` (nx, ny, nz, 6), in positive and in negative directions."""
+    for axis in range(3):
+        padded = np.pad(most, [(1, 1) if k == axis else (0, 0) for k in range(4)], constant_values=-np.inf)
+        n = most.shape[axis]
+        most = np.maximum.reduce([padded.take(range(k, k + n), axis=axis) for k in range(3)])
+    ways = np.maximum(most[..., :3] + most[..., 3:], 0.0)
+    return float(np.sqrt(np.einsum("...i,...i", ways, ways).max(initial=0.0)))
+
+
+@kernel
+def _sum_motion(start, now):
+    """Return the sums of positions and displacements (2, 3) of nodes."""
+    sums = np.zeros((2, 3))
+    for i in range(len(start)):
+        for c in range(3):
+            sums[0, c] += start[i, c]
+            sums[1, c] += now[i, c] - start[i, c]
+    return sums
+
+
+@kernel
+def _moments(start, now, means):
+    """Return the products of positions with positions and with displacements (2, 3, 3), about their means (2, 3)."""
+    moments = np.zeros((2, 3, 3))
+    for i in range(len(start)):
+        for c in range(3):
+            at = start[i, c] - means[0, c]
+            for d in range(3):
+                moments[0, c, d] += at * (start[i, d] - means[0, d])
+                moments[1, c, d] += at * (now[i, d] - start[i, d] - means[1, d])
+    return moments
+
+
+@inlined
+def _rest_of(start, now, means, gradient, i, c):
+    """Return a component of the displacement of a node beyond an affine map."""
+    rest = now[i, c] - start[i, c] - means[1, c]
+    for d in range(3):
+        rest -= (start[i, d] - means[0, d]) * gradient[d, c]
+    return rest
+
+
+@kernel
+def _ranges(start, now, means, gradient, regions, most, ends):
+    """Write the largest displacements beyond an affine map, in positive and negative directions, of all nodes, ``ends``
+    (6,), and of the regions, ``most`` (k, 6)."""
+    for i in range(len(start)):
+        for c in range(3):
+            rest = _rest_of(start, now, means, gradient, i, c)
+            ends[c], ends[3 + c] = max(ends[c], rest), max(ends[3 + c], -rest)
+            if len(regions) > 0:
+                k = regions[i]
+                most[k, c], most[k, 3 + c] = max(most[k, c], rest), max(most[k, 3 + c], -rest)
+
+
+@kernel
+def _farthest(start, now, means, gradient, centre):
+    """Return the square of the largest distance of displacements beyond an affine map from a ``centre`` (3,)."""
+    farthest = 0.0
+    for i in range(len(start)):
+        square = 0.0
+        for c in range(3):
+            rest = _rest_of(start, now, means, gradient, i, c) - centre[c]
+            square += rest * rest
+        farthest = max(farthest, square)
+    return farthest
+
+
 def _measure(
     comm: MPI.Comm, at: np.ndarray, own: Segments, longest: float, skin: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -481,7 +616,7 @@ def _closest(at, points, a, b):
 
 
 @inlined
-def _distance(at, points, a, b):
+def segment_distance(at, points, a, b):
     """Return the distance of segments ``a`` and ``b`` [m], and where they are closest."""
     s, t = _closest(at, points, a, b)
     square = 0.0
@@ -534,7 +669,7 @@ def _examine(points, held, grid, factor, one, two, found, out):
     if i == j:
         return 0
     reach = held.margin[i] + held.margin[j]
-    distance, s, t = _distance(points.at, held.points, i, j)
+    distance, s, t = segment_distance(points.at, held.points, i, j)
     beyond = distance - reach
     if beyond > grid.skin:
         return 0
@@ -546,7 +681,7 @@ def _examine(points, held, grid, factor, one, two, found, out):
     if min(int(s * pieces), pieces - 1) != part_i or min(int(t * others), others - 1) != part_j:
         return 0  # of other pieces
     if len(points.before) > 0:
-        distance, _, _ = _distance(points.before, held.points, i, j)
+        distance, _, _ = segment_distance(points.before, held.points, i, j)
         if distance < factor * reach:
             return 0
     if found < len(out.rows):

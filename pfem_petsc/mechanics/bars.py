@@ -86,6 +86,8 @@ def bar_fields(case: Case) -> dict[str, str]:
 def _bar_groups(case: Case) -> Iterator[tuple[str, str | FieldValue]]:
     """Yield the groups of bars that a case names, each with its key."""
     tables = [(f"section.{name}", section) for name, section in case.section.items()]
+    if case.self_contact is not None:
+        tables.append(("self_contact", case.self_contact))
     for kind in ("temperature", "remove"):
         tables += [(f"{kind}[{i}]", entry) for i, entry in enumerate(getattr(case, kind))]
     tables += [(f"output.bar_probe[{i}]", entry) for i, entry in enumerate(case.output.bar_probe)]
@@ -555,7 +557,8 @@ class Bars:
         )
         join_components(forces, f)
         for family in self.families:
-            energies[BAR_ENERGIES.index(family.energy)] += family.add_forces(x, f)
+            for name, energy in zip(family.energies, family.add_forces(x, f, commit), strict=True):
+                energies[BAR_ENERGIES.index(name)] += energy
         return StrainEnergy(tuple(energies.tolist()), failed, shortened, changed)
 
     def set_rates(self, x0: np.ndarray, x: np.ndarray, v: np.ndarray, eta: float) -> None:

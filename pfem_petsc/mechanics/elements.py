@@ -85,13 +85,14 @@ class ElementFamily(Protocol):
 
     Attributes
     ----------
-    energy : name of the stored energy, of :data:`~pfem_petsc.columns.BAR_ENERGIES`
+    energies : names of their energies, of :data:`~pfem_petsc.columns.BAR_ENERGIES`
     """
 
-    energy: str
+    energies: tuple[str, ...]
 
-    def add_forces(self, x: np.ndarray, f: np.ndarray) -> float:
-        """Add the internal forces at positions ``x`` to ``f``, both (local, 3); return the stored energy [J]."""
+    def add_forces(self, x: np.ndarray, f: np.ndarray, commit: bool) -> tuple[float, ...]:
+        """Add the internal forces at positions ``x`` to ``f``, both (local, 3); return the energies [J]. What elements
+        remember is updated only if ``commit``."""
 
     def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
         """Add the discrete gradient of a step from ``x0`` to ``x``, whose work is the change of the energy."""

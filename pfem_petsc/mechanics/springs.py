@@ -28,17 +28,17 @@ class Springs:
     anchors : (m, 3) positions without force [m]
     """
 
-    energy = "spring_energy"
+    energies = ("spring_energy",)
 
     def __init__(self, nodes: np.ndarray, stiffness: np.ndarray, anchors: np.ndarray) -> None:
         self.nodes, self.stiffness, self.anchors = nodes, stiffness, anchors
 
-    def add_forces(self, x: np.ndarray, f: np.ndarray) -> float:
+    def add_forces(self, x: np.ndarray, f: np.ndarray, commit: bool = False) -> tuple[float]:
         """Add the internal forces, and return the stored energy [J]."""
         stretch = x[self.nodes] - self.anchors
         force = self._times(stretch)
         f[self.nodes] += force
-        return 0.5 * float((force * stretch).sum())
+        return (0.5 * float((force * stretch).sum()),)
 
     def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
         """Add the discrete gradient of a step from ``x0`` to ``x``, the force at mid-step: energies are quadratic."""

@@ -565,6 +565,7 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         **plan.texts,
         **modes,
         "walls": ", ".join(walls) or "none",
+        **({} if model.self_contact is None else {"bars that touch": model.self_contact.text()}),
         **({"contact pairs": ", ".join(pair.name for pair in case.contact_pair)} if case.contact_pair else {}),
         **({"constraints": ", ".join(f"{c.name} ({c.kind})" for c in case.constraint)} if case.constraint else {}),
         "memory": f"{engineering(comm.allreduce(_used()), 'B', 3)} used so far, on all ranks",

@@ -279,6 +279,8 @@ def _hand_over(old: Stepper, new: Stepper) -> None:
     new.model.temperatures.hold(old.model.bars.heat)
     new.model.rest_lengths.hold(old.model.bars.rest)
     new.model.links.take_over(old.model.links)
+    if new.model.self_contact is not None and old.model.self_contact is not None:
+        new.model.self_contact.take_over(old.model.self_contact, state.position)
     _hand_over_contact(old, new)
 
 

@@ -120,12 +120,14 @@ class ImpulseArrays(NamedTuple):
 
 @record
 class Calls(NamedTuple):
-    """Functions that the loop calls: of MPI, and one of Python, of a step and :data:`SOLVE` or :data:`CLOSE`."""
+    """Functions that the loop calls: of MPI, one of Python, of a step and :data:`SOLVE` or :data:`CLOSE`, and one of a
+    step that adds the forces of bars that touch."""
 
     start_all: Any
     wait_all: Any
     reduce_all: Any
     python: Any
+    touch: Any
 
 
 @record
@@ -183,8 +185,9 @@ class StepArrays(NamedTuple):
     """All that compiled steps read and write, of which the latter parts are: the sums of the ledger, of which the
     dissipations by impact and friction and the work of walls are added to; works (5,) of all balances; energies of
     bars; particles of impulses, and their increments (rows, 3) in a step; the nodes of probes; forces of walls (w, 3)
-    at the start [N]; and this rank's shares (m, width) of the rows of the steps that are due, and at last of the last
-    step if it is not, see :class:`~pfem_petsc.columns.Share`."""
+    at the start [N]; energy of bars that touch, and what they have lost (2,) [J]; and this rank's shares (m, width) of
+    the rows of the steps that are due, and at last of the last step if it is not, see
+    :class:`~pfem_petsc.columns.Share`."""
 
     contacts: Contacts
     course: Course
@@ -211,6 +214,7 @@ class StepArrays(NamedTuple):
     particles: np.ndarray
     probes: np.ndarray
     push: np.ndarray
+    touching: np.ndarray
     shares: np.ndarray
 
 
@@ -235,6 +239,7 @@ _MOMENTA, _SUPPORT, _ACTIVE = map(
 )
 _BARS, _PROBED = HEAD.indices(BAR_ENERGIES), len(PROBED)
 _ENERGIES, _SPRINGS = len(BAR_ENERGIES), BAR_ENERGIES.index("spring_energy")
+_TOUCHING, _TOUCHED = map(BAR_ENERGIES.index, ("self_contact_energy", "self_contact_dissipation"))
 
 
 BEGIN, SEND, TAKE, FORCES, PRESS, IMPACTS, BOOK, AGREE, END, RECORD = range(10)
@@ -300,6 +305,13 @@ def evaluate_forces(s, step):
     course.failed, course.shortened, course.changed = internal_forces(
         motion.x, motion.f, bars.arrays, laws, motion.h, np.bool_(True), energies
     )
+
+
+@addressed
+def touch_bars(s, step):
+    """Have Python add the forces of bars that touch."""
+    if s.calls.touch(step, np.int64(0)) != 0:
+        s.course.unsolved = LOST
 
 
 @addressed
@@ -409,6 +421,7 @@ def record_row(s, step):
     ledger, works, sums, energies, (row, _) = s.ledger, s.works, s.sums, s.energies, _probed(s)
     ends = sums.ends
     energies[_SPRINGS] = sums.springs[3]
+    energies[_TOUCHING], energies[_TOUCHED] = s.touching[0], s.touching[1]
     for k in range(len(ledger)):
         row[k] = ledger[k]
     stored = 0.0
@@ -490,6 +503,8 @@ def run_compiled(s, phases, starts, due, flags):
         course.keeps = keeps or ending
         course.needs_energies = ending or s.bars.can_break  # a bar that breaks ends the steps
         _perform(FORCES, phases, starts, s, step)
+        if course.unsolved == LOST:
+            break
         _perform(PRESS, phases, starts, s, step)
         if course.unsolved == LOST:
             break

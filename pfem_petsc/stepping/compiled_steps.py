@@ -73,6 +73,7 @@ from .compiled_loop import (
     sum_ends,
     sum_moving,
     take_positions,
+    touch_bars,
 )
 from .contact_phase import (
     WallArrays,
@@ -135,7 +136,9 @@ class CompiledSteps:
         self._pressed, self._outcome = new_contact_nodes(n, len(model.contact.names)), np.zeros(10, dtype=np.int64)
         self._stiffness = self._nodes.stiffness if model.links else np.empty(0)
         self._called = RowCaller(stepper, self._stiffness, self._u, self._contact)
-        self._messages, self._calls = model.mesh.messages(), Calls(*_mpi(), self._called.function)
+        self._toucher = TouchCaller(stepper)
+        calls = *_mpi(), self._called.function, self._toucher.function
+        self._messages, self._calls = model.mesh.messages(), Calls(*calls)
         self._references, self._phases = References(), None
         self._energies, self._particles = np.zeros(len(BAR_ENERGIES)), np.empty(self.ledger.impulses.state.v.shape)
         bars, nodes = model.probed_bars.width, stepper.probed
@@ -219,6 +222,7 @@ class CompiledSteps:
             FORCES: (
                 (evaluate_forces, True),
                 (add_springs, springs),
+                (touch_bars, model.self_contact is not None),
                 (balancing(loaded, damped), True),
                 (apply_supports, held),
             ),
@@ -295,6 +299,7 @@ class CompiledSteps:
         flags = np.zeros((count, len(log.releases)), dtype=bool)
         rows = model.links.export_rows(self._stiffness)
         called = self._called.begin(begin, rows.totals)
+        self._toucher.begin(begin)
         contacts = self._contacts(rows, called)
         ledger.sums[_BROKEN] = stepper.ruptures.count
         half, walls = state.memory["half_velocity"], self._walls
@@ -326,12 +331,14 @@ class CompiledSteps:
             self._particles,
             stepper.probed,
             stepper.solution.walls.force.copy(),
+            self._toucher.energies,
             shares,
         )
         reference = self._references.of(arrays)
         if self._phases is None:
             self._phases = self._make_phases(types.void(numba.typeof(reference), types.int64), len(rows.force) > 0)
         contacts = Contacts(*run_compiled(reference, *self._phases, due, flags), *contacts[4:])
+        self._toucher.end()
         self._called.end()
         made = self._outcome.tolist()
         if made[LOST_BY_MPI]:
@@ -373,6 +380,7 @@ class CompiledSteps:
         state.step, state.time = begin + made[DONE] - 1, (begin + made[DONE]) * stepper.h
         if made[CHANGED]:
             stepper.ruptures.note(state.x, stepper.number + 1, stepper.arrived())
+            stepper.bars_left()
         sound = made[DONE]
         if stepper.fault is not None:  # that of an earlier call, of which not all ranks know
             sound = 0
@@ -502,6 +510,44 @@ class RowCaller:
         state = self.stepper.state
         state.contact = self._contact
         self.record.loss[0] = self.stepper.ledger.impacts.of_rows(state.position, (state.v, state.a), None)
+
+
+class TouchCaller:
+    """Adds the forces of bars that touch in compiled steps, when their loop asks for it.
+
+    Attributes
+    ----------
+    function : that the loop calls
+    energies : (2,) stored and dissipated in the last call [J]
+    """
+
+    def __init__(self, stepper: Stepper) -> None:
+        self._stepper, self._begin, self._error = stepper, 0, None
+        self.energies, n = np.zeros(2), len(stepper.state.x)
+        self._x, self._f = (room.T[:n] for room in stepper.model.bars.components)
+        self._function = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(self._call)
+        self.function = CFunction(self._function, _CALL)
+
+    def begin(self, step: int) -> None:
+        """Prepare calls in steps from one of a number on."""
+        self._begin = step
+
+    def end(self) -> None:
+        """Raise what went wrong in a call."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def _call(self, step: int, _: int) -> int:
+        stepper = self._stepper
+        try:
+            self.energies[:] = stepper.model.self_contact.evaluate(self._x, self._f, stepper.h, commit=True)
+        except SimulationFailure as failure:
+            made = self._begin + step + 1
+            self._error = SimulationFailure(f"{stepper.at(made, made * stepper.h)}: {failure}")
+        except BaseException as error:  # noqa: BLE001  # an exception cannot pass the compiled loop: end raises it
+            self._error = error
+        return 0 if self._error is None else LOST
 
 
 def _mpi() -> tuple[CFunction, ...]:

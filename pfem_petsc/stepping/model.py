@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from ..contact.constraint_set import ConstraintSet
 from ..contact.contact import Contact, adjust_start
+from ..contact.self_contact import SelfContact
 from ..contact.wall_motion import Poses
 from ..errors import InputError
 from ..mechanics.bars import Bars, check_areas, mesh_of_cases, section_of_bars
@@ -113,6 +114,7 @@ class Model:
     node_rounding, rounding : residuals of nodes (owned,) due to rounding of positions [N], and their 2-norm
     warnings : about the mesh
     links : ConstraintSet, pairs and constraints that couple nodes to nodes
+    self_contact : SelfContact of bars with bars, or None
     can_touch : whether nodes can touch walls or each other
     start : where a stage starts from, None for the start of a run
     """
@@ -146,6 +148,9 @@ class Model:
             self.rest_lengths = RestLengths(case, self.bars)
         self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
         self.links = ConstraintSet(case, self.nodes, self.contact)
+        self.self_contact = SelfContact(self) if case.self_contact is not None else None
+        if self.self_contact is not None:
+            self.bars.families.append(self.self_contact)
         self.can_touch = self.contact.any or bool(self.links)
         if self.supports.inclined is not None:
             refuse_inclined(case.source, mesh, self.supports.inclined.nodes, self.contact, self.links)
@@ -224,7 +229,8 @@ class Model:
     def steady(self) -> bool:
         """Whether steps can be compiled ones: supports are along axes, bars and damping constant in time, loads
         depend on time alone, and walls are infinite planes, spheres or cylinders, without mass and not tied."""
-        others = any(family is not self.bars.springs for family in self.bars.families)
+        known = self.bars.springs, self.self_contact
+        others = any(not any(family is one for one in known) for family in self.bars.families)
         changing = self.supports.inclined is not None or self.bars_vary or others or self.inertia.varies
         return not changing and self.external.scheduled and self.contact.steady
 

@@ -126,6 +126,7 @@ def highest_frequency(model: Model, x: np.ndarray, steps: int = 60, accuracy: fl
 
 
 _LEAST = 1e-6  # ratio of frequency and rate of damping below which the frequency no longer changes the stable step
+WITH_CONTACT = 0.75  # factor on automatic steps where bars touch, whose stiffness it leaves room for
 _MOST_STEPS = 2.0**53  # beyond this, consecutive steps do not have distinct times
 
 
@@ -232,7 +233,8 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
                 f'{case.source}: time.step = "auto": {time.integrator} has no critical step here, as neither bars nor '
                 "springs resist the free nodes; give time.step [s]"
             )
-        steps = _steps_to(time.end, time.safety * critical, case.source)
+        safety = time.safety if model.self_contact is None else WITH_CONTACT * time.safety
+        steps = _steps_to(time.end, safety * critical, case.source)
         step = time.end / steps
     else:
         step = float(time.step)
@@ -363,6 +365,8 @@ def make_stepper(model: Model, plan: Plan) -> Stepper:
         On all ranks, if the scheme is not compatible with the treatment.
     """
     treatment = _treatment(model, plan)
+    if model.self_contact is not None:
+        model.self_contact.begin(plan.scheme, plan.step, plan.frequency.upper, plan.critical_step)
     _check_walls(model, plan, treatment)
     _warn_of_damping(model, plan)
     _warn_of_drag(model, plan)

@@ -571,10 +571,16 @@ class Stepper(ABC):
     def _remove_bars(self, members: np.ndarray, share: float) -> None:
         """Remove a share of local bars, with their energy."""
         change = release(self.model.bars, self.state.x, members, share)
+        self.bars_left()
         energies = np.array(self.energy.energies) + change
         self.energy = self.energy._replace(energies=tuple(energies.tolist()))
         if self.ledger is not None:
             self.ledger.follow_removal()
+
+    def bars_left(self) -> None:
+        """Take account of bars of this rank that have left the model: they touch no others."""
+        if self.model.self_contact is not None:
+            self.model.self_contact.stale = True
 
     def supports_changed(self) -> None:
         """Take account of components that are no longer prescribed, or now are. Collective."""
@@ -736,7 +742,7 @@ class Stepper(ABC):
 
     def doubts(self) -> list[str]:
         """What makes results doubtful, as warnings at the end of a run. Collective."""
-        return []
+        return [] if self.model.self_contact is None else self.model.self_contact.doubts()
 
     def settle(self) -> None:  # noqa: B027 - steps leave nothing to settle, static ones aside
         """Reduce the residual of a static state to rounding, before a stage that begins there. Collective."""
@@ -757,9 +763,13 @@ class Stepper(ABC):
         self.model.mesh.update_ghosts(state.x)
         if bars.viscous and scheme.inertial and (bars.step == 0.0 or scheme.rates_follow):
             bars.set_rates(self.before, state.x, self.on_all(state.v), 0.0)
-        self.energy = bars.forces(state.x, state.f, commit)
+        try:
+            self.energy = bars.forces(state.x, state.f, commit)
+        except SimulationFailure as failure:  # on all ranks, of bars that touch
+            raise SimulationFailure(f"{self.arrived()}: {failure}") from failure
         if commit and self.energy.changed:
             self.ruptures.note(state.x, self.number + 1, self.arrived())
+            self.bars_left()
         failed = self.energy.failed
         if failed < 0 and self.energy.shortened:
             failed = bars.first_inverted(state.x, self.before)

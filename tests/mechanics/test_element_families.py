@@ -20,7 +20,7 @@ CHAIN = {
 class Bending:
     """Second differences of the positions of consecutive nodes (chains, 3): the energy k |a - 2 b + c|^2/2."""
 
-    energy = "spring_energy"
+    energies = ("spring_energy",)
     weights = np.array([1.0, -2.0, 1.0])
 
     def __init__(self, chains, stiffness):
@@ -31,8 +31,8 @@ class Bending:
         np.add.at(out, self.chains, factor * self.stiffness * self.weights[:, None] * bent[:, None, :])
         return bent
 
-    def add_forces(self, x, f):
-        return 0.5 * self.stiffness * float((self._add(x, 1.0, f) ** 2).sum())
+    def add_forces(self, x, f, commit):
+        return (0.5 * self.stiffness * float((self._add(x, 1.0, f) ** 2).sum()),)
 
     def add_step_forces(self, x0, x, f):
         self._add(0.5 * (x0 + x), 1.0, f)

@@ -1,0 +1,883 @@
+"""Contact of bars with bars: capsules that repel each other where their axes are closer than the sum of their radii.
+
+The energy of two bars with the sum of radii R is
+
+    E = m phi(d) + (1 - m)/2 (phi(d_1) + ... + phi(d_4)),    phi(d) = k/2 max(R - d, 0)^2
+
+with the distance d of their axes and those of each of the four ends from the other axis, d_1 to d_4. m goes from 0 for
+parallel bars to 1 where the sine of the angle between them reaches R over the length of the shorter one, or the root
+of :data:`_CROSSED`, with two continuous derivatives: bars that cross touch in one point, those that are parallel up to
+their thickness at the ends of where they lie side by side, and nothing jumps in between. Distances are minima over
+parameters within the bars, whose derivatives are not needed (envelope theorem): forces act along the line between the
+closest points. Momentum and angular momentum are conserved; friction, which acts on the axes and not on the surfaces,
+turns bars too little by its moment about them, as bars of a truss have no torsion.
+
+The stiffness k of a pair is that of its bars, :data:`_STIFFNESS` times the harmonic mean of E A/l, unless the step
+requires less: by Gershgorin's theorem the square of the frequency of a node with the mass m grows by at most the sum of
+2 w k/m over the pairs that touch it, with its weights w in their closest points. Those that begin to touch in a step
+get at most :data:`_PART` of what the step and the others leave. The stiffness is constant while the pair touches.
+Pairs closer than R in the mesh keep their distance there instead of R.
+
+Bars are searched with a skin. Pairs are evaluated when the ways of the nodes since then allow them to touch; a bar that
+could jump over another in a step, or has passed its axis, ends the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import acosh, asin, exp, inf, pi, sqrt, tan
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import InputError, SimulationFailure
+from ..fields import STATUS
+from ..mechanics.compiled import add_freely, inlined, kernel
+from ..mesh.distribution import bars_of_group
+from ..mesh.exchange import GhostExchange, Router
+from ..mesh.slab import slab_of, slab_range
+from ..output.units import engineering
+from ..parallel.agreement import agreed
+from ..parallel.natural import NaturalOrder
+from .neighbours import Points, Regions, Segments, find_pairs, largest_change, make_regions, segment_distance
+from .rows import owner_starts, to_owners
+
+if TYPE_CHECKING:
+    from ..integrators.base import Scheme
+    from ..mechanics.block_pattern import BlockPattern
+    from ..stepping.model import Model
+
+_CROSSED = 0.1  # largest square of the sine of the angle from which bars touch in one point
+_STIFFNESS = 1.0  # of a pair, over the harmonic mean of E A/l of its bars
+_SHARE = 0.2  # of the mass of a pair over the square of the step, which its stiffness does not exceed
+_PART = 0.1, 0.5  # of the stiffness and damping that a node may still have, for what begins to touch it in a step
+_ROOM = 0.1  # least sum of squared frequencies that a step must leave for contacts, over its inverse square
+_SKIN = 0.1, 0.5  # least and largest distance beyond the radii up to which pairs are listed, over the length of bars
+_STEPS = 20.0  # steps for which the skin should be sufficient, unless it is too large then
+_FEW, _MANY = 0.25, 3.0  # pairs for each bar in lists that are made with a larger or a smaller skin the next time
+_LEAST = 1e-3  # sum of radii of a pair, over that of its bars, below which they cross in the mesh and do not touch
+_DEEP = 0.2  # overlap over the radius from which results are doubtful
+_TAG = 7800  # of messages between ranks with nodes of the same pairs
+
+NORMAL, SPRING, VISCOUS, FIRST, SECOND, WIDTH = 0, 3, 6, 7, 8, 9
+"""Columns of the memory of a pair: unit normal from the first bar to the second; elastic part of their slip [m]; normal
+force of the damper [N]; where they touch, from 0 to 1 on each; and their number."""
+
+APART, TOUCHING, BEGINNING = range(3)
+"""States of pairs."""
+
+
+class PairArrays(NamedTuple):
+    """Pairs of bars (m), ascending by their numbers.
+
+    Attributes
+    ----------
+    ends : (m, 4) ends of the first bar and of the second, rows of :class:`NodeArrays`
+    reach, crossed : (m,) sum of radii, or less [m]; square of the sine of the angle from which bars cross
+    most : (m,) stiffness that they would have alone [N/m]
+    counted : (m,) bool, whether sums of this rank include it
+    stiffness, drag : (m,) of those that touch [N/m], and their largest damping [N s/m]
+    wake : (m,) way of the nodes at which it may touch [m]
+    """
+
+    ends: np.ndarray
+    reach: np.ndarray
+    crossed: np.ndarray
+    most: np.ndarray
+    counted: np.ndarray
+    stiffness: np.ndarray
+    drag: np.ndarray
+    wake: np.ndarray
+
+
+class NodeArrays(NamedTuple):
+    """Nodes of pairs: ``x`` (q, 6) positions and displacements in the step [m]; ``inverse`` (q,) of the masses [1/kg],
+    zero for nodes that supports hold; ``force`` (q, 3) internal forces [N]."""
+
+    x: np.ndarray
+    inverse: np.ndarray
+    force: np.ndarray
+
+
+class Rooms(NamedTuple):
+    """Room for a pair: gradient of the energy ``g`` (4, 3) [N]; both axes ``u``, ``v``, a ``way`` between them and the
+    ``normal`` (3,)."""
+
+    g: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    way: np.ndarray
+    normal: np.ndarray
+
+
+class PairLaw(NamedTuple):
+    """Coulomb's coefficient of friction; damping ratio; the step [s]; the way of the nodes so far, and that from which
+    they have come to where pairs may sleep [m], the same unless forces are only tried."""
+
+    friction: float
+    damping: float
+    step: float
+    way: float
+    base: float
+
+
+ENERGY, DISSIPATED, CONTACTS, OVERLAP, FORCE, DEPTH = range(6)
+"""Sums over the counted pairs: stored energy, and that dissipated in the step [J]; how many touch. Largest overlap [m],
+force [N], and overlap over the radius."""
+
+
+@inlined
+def _gradient(g, s, t, push, way):
+    """Add the gradient of the energy by a force ``push`` between points of the bars, along the unit vector ``way``."""
+    for c in range(3):
+        g[0, c] += (1.0 - s) * push * way[c]
+        g[1, c] += s * push * way[c]
+        g[2, c] -= (1.0 - t) * push * way[c]
+        g[3, c] -= t * push * way[c]
+
+
+@inlined
+def _point_way(x, ends, p, s, t, first, way):
+    """Write the difference of points of both bars, or of their displacements (``first`` 3), and return its length."""
+    square = 0.0
+    for c in range(3):
+        a = (1.0 - s) * x[ends[p, 0], first + c] + s * x[ends[p, 1], first + c]
+        b = (1.0 - t) * x[ends[p, 2], first + c] + t * x[ends[p, 3], first + c]
+        way[c] = b - a
+        square += way[c] * way[c]
+    return np.sqrt(square)
+
+
+@inlined
+def _foot(x, node, one, two):
+    """Return the parameter from 0 to 1 of the point of a bar that is closest to a node."""
+    along, square = 0.0, 0.0
+    for c in range(3):
+        d = x[two, c] - x[one, c]
+        along += d * (x[node, c] - x[one, c])
+        square += d * d
+    return min(max(along / square, 0.0), 1.0) if square > 0.0 else 0.0
+
+
+@inlined
+def _axes(x, ends, p, u, v):
+    """Write both axes; return their squares and their product."""
+    uu = 0.0
+    vv = 0.0
+    uv = 0.0
+    for c in range(3):
+        u[c] = x[ends[p, 1], c] - x[ends[p, 0], c]
+        v[c] = x[ends[p, 3], c] - x[ends[p, 2], c]
+        uu += u[c] * u[c]
+        vv += v[c] * v[c]
+        uv += u[c] * v[c]
+    return uu, vv, uv
+
+
+@inlined
+def _repel(pairs, p, x, s, t, rooms):
+    """Write the gradient of the energy of a pair that touches at ``s`` and ``t``; return the energy, the sum of the
+    forces, and their mean points."""
+    g, u, v, way = rooms.g, rooms.u, rooms.v, rooms.way
+    ends, k, reach = pairs.ends, pairs.stiffness[p], pairs.reach[p]
+    uu, vv, uv = _axes(x, ends, p, u, v)
+    for i in range(4):
+        for c in range(3):
+            g[i, c] = 0.0
+    sine = max(1.0 - uv * uv / (uu * vv), 0.0) if uu * vv > 0.0 else 0.0
+    q = min(sine / pairs.crossed[p], 1.0)
+    m = q * q * q * (10.0 - q * (15.0 - 6.0 * q))
+    energy = 0.0
+    push = 0.0
+    at = 0.0
+    other = 0.0
+    excess = 0.0  # of the energy where bars cross over that where they are parallel
+    for j in range(5 if m < 1.0 else 1):
+        weight = m if j == 0 else 0.5 * (1.0 - m)
+        if j == 1:
+            s, t = 0.0, _foot(x, ends[p, 0], ends[p, 2], ends[p, 3])
+        elif j == 2:
+            s, t = 1.0, _foot(x, ends[p, 1], ends[p, 2], ends[p, 3])
+        elif j == 3:
+            s, t = _foot(x, ends[p, 2], ends[p, 0], ends[p, 1]), 0.0
+        elif j == 4:
+            s, t = _foot(x, ends[p, 3], ends[p, 0], ends[p, 1]), 1.0
+        d = _point_way(x, ends, p, s, t, 0, way)
+        overlap = reach - d
+        if not overlap > 0.0:
+            continue
+        excess += 0.5 * k * overlap * overlap * (1.0 if j == 0 else -0.5)
+        if weight == 0.0:
+            continue
+        force = weight * k * overlap
+        energy += 0.5 * force * overlap
+        push += force
+        at += force * s
+        other += force * t
+        if d > 0.0:
+            _gradient(g, s, t, force / d, way)
+    if 0.0 < q < 1.0:
+        slope = excess * 30.0 * q * q * (1.0 - q) * (1.0 - q) / pairs.crossed[p] * -2.0 * uv / (uu * vv)
+        for c in range(3):
+            of_u, of_v = slope * (v[c] - uv / uu * u[c]), slope * (u[c] - uv / vv * v[c])
+            g[0, c] -= of_u
+            g[1, c] += of_u
+            g[2, c] -= of_v
+            g[3, c] += of_v
+    return energy, push, at, other
+
+
+@inlined
+def _damp(pairs, p, law, push, closing, mobility):
+    """Return the normal force of spring and damper, which pulls never [N]; ``closing`` is the change of the distance in
+    the step. The velocity is that at the end of the step, half a step later, by the force itself."""
+    if law.damping <= 0.0 or law.step <= 0.0 or mobility <= 0.0:
+        return push
+    drag = min(2.0 * law.damping * np.sqrt(pairs.stiffness[p] / mobility), pairs.drag[p])
+    return max((push - drag * closing / law.step) / (1.0 + 0.5 * drag * law.step * mobility), 0.0)
+
+
+@inlined
+def _slide(old, new, p, k, most, rooms):
+    """Advance the elastic slip of a pair, at ``most`` as given [m], by the way of its points; return the energy stored,
+    and that dissipated."""
+    way, normal = rooms.way, rooms.normal
+    along = 0.0
+    dot = 0.0
+    before = 0.0
+    for c in range(3):
+        along += way[c] * normal[c]
+        dot += old[p, SPRING + c] * normal[c]
+        before += old[p, SPRING + c] * old[p, SPRING + c]
+    left = 0.0
+    for c in range(3):  # turned into the plane across the normal
+        new[p, SPRING + c] = old[p, SPRING + c] - dot * normal[c]
+        left += new[p, SPRING + c] * new[p, SPRING + c]
+    turned = np.sqrt(before / left) if left > 0.0 else 0.0
+    square = 0.0
+    for c in range(3):
+        trial = turned * new[p, SPRING + c] + way[c] - along * normal[c]
+        square += trial * trial
+    factor = most / np.sqrt(square) if square > most * most else 1.0
+    energy = 0.0
+    lost = 0.0
+    for c in range(3):
+        start = turned * new[p, SPRING + c]
+        trial = start + way[c] - along * normal[c]
+        end = factor * trial
+        lost += 0.5 * k * (start + end) * (trial - end)
+        energy += 0.5 * k * end * end
+        new[p, SPRING + c] = end
+    return energy, lost
+
+
+@inlined
+def _farthest_move(x, ends, p):
+    """Return the square of the largest relative displacement of ends of both bars in the step."""
+    farthest = 0.0
+    for i in range(2):
+        for j in range(2, 4):
+            square = 0.0
+            for c in range(3):
+                moved = x[ends[p, j], 3 + c] - x[ends[p, i], 3 + c]
+                square += moved * moved
+            farthest = max(farthest, square)
+    return farthest
+
+
+@kernel
+def find_beginning(pairs, state, memory, nodes, law, load):
+    """Find the pairs that begin to touch, and what the nodes of all pairs carry.
+
+    ``pairs``: PairArrays; ``state`` (m,): states, of which some become :data:`BEGINNING`; ``memory`` (m, width);
+    ``nodes``: NodeArrays; ``law``: PairLaw; ``load`` (q, 3): sums over the pairs of a node, times its weight, of their
+    stiffness [N/m] and largest damping [N s/m], and of 1 for those that begin. Returns how many begin, 1 plus the pair
+    that moves too far in a step, or 0, and the way at which another may touch [m], if none does.
+    """
+    x, ends = nodes.x, pairs.ends
+    segments = ends.reshape(-1, 2)
+    beginning, failed, asleep = 0, 0, np.inf
+    for p in range(len(ends)):
+        touches = state[p] == TOUCHING
+        if not touches:
+            if pairs.wake[p] > law.way:
+                asleep = min(asleep, pairs.wake[p])
+                continue
+            d, s, t = segment_distance(x, segments, 2 * p, 2 * p + 1)
+            farthest = _farthest_move(x, ends, p)
+            if farthest > 0.25 * pairs.reach[p] ** 2 and d < pairs.reach[p] + np.sqrt(farthest):
+                failed = 1 + p
+            if not d < pairs.reach[p]:
+                pairs.wake[p] = law.base + (d - pairs.reach[p])
+                asleep = min(asleep, pairs.wake[p])
+                continue
+            beginning += 1
+            state[p], pairs.wake[p] = BEGINNING, 0.0
+            for c in range(memory.shape[1]):
+                memory[p, c] = 0.0
+            memory[p, FIRST], memory[p, SECOND] = s, t
+        asleep = 0.0
+        for i in range(4):
+            at = memory[p, FIRST if i < 2 else SECOND]
+            weight = at if i % 2 == 1 else 1.0 - at
+            if touches:
+                load[ends[p, i], 0] += weight * pairs.stiffness[p]
+                load[ends[p, i], 1] += weight * pairs.drag[p]
+            else:
+                load[ends[p, i], 2] += weight
+    return beginning, failed, asleep
+
+
+@kernel
+def evaluate_pairs(pairs, state, old, new, nodes, law, out):
+    """Compute forces and sums of the pairs that touch, and their memory ``new`` (m, width) from the ``old`` one.
+
+    ``pairs``: PairArrays; ``state`` (m,), which is changed; ``nodes``: NodeArrays, to whose forces those of pairs are
+    added; ``law``: PairLaw; ``out`` (6,): sums from :data:`ENERGY` on. Returns 1 plus the pair that has passed through
+    itself, or 0.
+    """
+    x, ends, failed = nodes.x, pairs.ends, 0
+    segments = ends.reshape(-1, 2)
+    rooms = Rooms(np.zeros((4, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    g, way, normal = rooms.g, rooms.way, rooms.normal
+    for p in range(len(ends)):
+        if state[p] == APART:
+            continue
+        d, s, t = segment_distance(x, segments, 2 * p, 2 * p + 1)
+        k, reach = pairs.stiffness[p], pairs.reach[p]
+        energy = 0.0
+        lost = 0.0
+        push = 0.0
+        at = 0.0
+        other = 0.0
+        if d < reach:
+            energy, push, at, other = _repel(pairs, p, x, s, t, rooms)
+        if push > 0.0:
+            s, t = at / push, other / push
+        _point_way(x, ends, p, s, t, 3, way)
+        if push <= 0.0:  # what spring and damper held is lost
+            for c in range(3):
+                lost += 0.5 * k * old[p, SPRING + c] * old[p, SPRING + c]
+                lost -= 0.5 * old[p, VISCOUS] * way[c] * old[p, NORMAL + c]
+            state[p] = APART
+            if pairs.counted[p]:
+                out[DISSIPATED] += lost
+            continue
+        apart = _point_way(x, ends, p, s, t, 0, normal)
+        turn = 0.0
+        closing = 0.0
+        for c in range(3):
+            normal[c] = normal[c] / apart if apart > 0.0 else 0.0
+            turn += normal[c] * old[p, NORMAL + c]
+            closing += normal[c] * way[c]
+        if apart <= 0.0 or (state[p] == TOUCHING and turn < 0.0):
+            failed = 1 + p
+        mobility = (1.0 - s) ** 2 * nodes.inverse[ends[p, 0]] + s**2 * nodes.inverse[ends[p, 1]]
+        mobility += (1.0 - t) ** 2 * nodes.inverse[ends[p, 2]] + t**2 * nodes.inverse[ends[p, 3]]
+        total = _damp(pairs, p, law, push, closing, mobility)
+        lost -= 0.5 * (old[p, VISCOUS] + total - push) * closing
+        if total != push:
+            _gradient(g, s, t, total - push, normal)
+        held = 0.0
+        for c in range(3):
+            new[p, SPRING + c] = 0.0
+        if law.friction > 0.0:
+            held, rubbed = _slide(old, new, p, k, law.friction * total / k, rooms)
+            lost += rubbed
+            for c in range(3):
+                way[c] = -new[p, SPRING + c]
+            _gradient(g, s, t, k, way)
+        state[p] = TOUCHING
+        new[p, VISCOUS], new[p, FIRST], new[p, SECOND] = total - push, s, t
+        for c in range(3):
+            new[p, NORMAL + c] = normal[c]
+        for i in range(4):
+            for c in range(3):
+                nodes.force[ends[p, i], c] += g[i, c]
+        if pairs.counted[p]:
+            out[ENERGY] += energy + held
+            out[DISSIPATED] += lost
+            out[CONTACTS] += 1.0
+            out[OVERLAP] = max(out[OVERLAP], reach - d)
+            out[FORCE] = max(out[FORCE], np.sqrt(total * total + 2.0 * k * held))
+            out[DEPTH] = max(out[DEPTH], 2.0 * (reach - d) / reach)
+    return failed
+
+
+@kernel
+def measure_pairs(nodes, ends, bars, sizes):
+    """Write the sizes of pairs in the mesh (4, m): reach [m], 0 for bars that cross there; square of the sine of the
+    angle from which they cross; stiffness [N/m]; and mass [kg].
+
+    ``nodes`` (q, 4 or more): positions [m] and masses [kg]; ``ends`` (m, 4); ``bars`` (m, 4): radius and stiffness of
+    both bars.
+    """
+    segments = ends.reshape(-1, 2)
+    for p in range(len(ends)):
+        apart, _, _ = segment_distance(nodes, segments, 2 * p, 2 * p + 1)
+        radii = bars[p, 0] + bars[p, 2]
+        shorter = np.inf
+        flexible = 0.0
+        for i in range(2):
+            square = 0.0
+            for c in range(3):
+                way = nodes[ends[p, 2 * i + 1], c] - nodes[ends[p, 2 * i], c]
+                square += way * way
+            shorter = min(shorter, square)
+            flexible += 1.0 / bars[p, 2 * i + 1]
+        light = 0.0
+        for i in range(2):
+            light += 1.0 / min(nodes[ends[p, 2 * i], 3], nodes[ends[p, 2 * i + 1], 3])
+        reach = min(radii, apart)
+        sizes[0, p] = reach if reach > _LEAST * radii else 0.0
+        sizes[1, p] = min(_CROSSED, reach * reach / shorter)
+        sizes[2, p] = 2.0 * _STIFFNESS / flexible
+        sizes[3, p] = 1.0 / light
+
+
+@kernel
+def largest_move(x, last, drift):
+    """Return a distance that no node at x (n or more, 3) is farther from last (3, n) + drift (3,) than; infinite for
+    positions that are not finite."""
+    square, total = 0.0, 0.0
+    for c in range(3):
+        most = 0.0
+        for i in range(last.shape[1]):
+            d = x[i, c] - last[c, i] - drift[c]
+            total = add_freely(total, d)
+            most = max(most, abs(d))
+        square += most * most
+    return np.sqrt(square) if np.isfinite(total) else np.inf
+
+
+def restitution_of(damping: float) -> float:
+    """Return the ratio of velocities after and before an impact on a spring and a damper that never pull.
+
+    Source: Schwager and Pöschel, Granular Matter 9 (2007), 465, in terms of the damping ratio.
+    """
+    if damping < 1.0:
+        angle = asin(damping)
+        return exp(-tan(angle) * (pi - 2.0 * angle))
+    if damping == 1.0:
+        return exp(-2.0)
+    return exp(-2.0 * damping / sqrt(damping * damping - 1.0) * acosh(damping))
+
+
+def damping_of(restitution: float) -> float:
+    """Return the damping ratio for :func:`restitution_of`, by bisection."""
+    low, high = 0.0, 1e3
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if restitution_of(middle) > restitution else (low, middle)
+    return 0.5 * (low + high) if restitution < 1.0 else 0.0
+
+
+def _numbered(ends: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct numbers (q,) of nodes among ``ends`` (m, 4), ascending, and the ends as places in them; most
+    are in the range of this rank's ``own`` numbers, where they are marked instead of sorted."""
+    mine = (ends >= own[0]) & (ends < own[1])
+    marks = np.zeros(own[1] - own[0] + 1, dtype=np.int64)
+    marks[ends[mine] - own[0] + 1] = 1
+    here, others = own[0] + np.flatnonzero(marks[1:]), np.unique(ends[~mine])
+    numbers = np.concatenate([others[others < own[0]], here, others[others >= own[1]]])
+    places = np.empty(ends.shape, dtype=np.int64)
+    places[mine] = np.searchsorted(others, own[0]) + np.cumsum(marks)[ends[mine] - own[0]]
+    places[~mine] = np.searchsorted(numbers, ends[~mine])
+    return numbers, places
+
+
+class SelfContact:
+    """Contact of bars with bars, an :class:`~pfem_petsc.mechanics.elements.ElementFamily`. Construction is collective.
+
+    Parameters
+    ----------
+    model : Model, whose case has ``[self_contact]``; with masses and supports
+
+    Attributes
+    ----------
+    dissipated : energy that this rank's counted pairs have lost [J]
+    sums : (6,) of the last forces, see :data:`ENERGY`
+    deepest : largest overlap so far over the radius
+    stale : whether bars have left the model since the last search
+
+    Raises
+    ------
+    InputError
+        On all ranks, for a group of bars that the mesh does not have.
+    """
+
+    energies = ("self_contact_energy", "self_contact_dissipation")
+
+    def __init__(self, model: Model) -> None:
+        self._model, self._mesh, self.comm = model, model.mesh, model.comm
+        table, mesh, comm = model.case.self_contact, model.mesh, model.comm
+        if model.case.time is None:
+            self._refuse()
+        with agreed(comm):
+            chosen = np.ones(len(mesh.bars), dtype=bool)
+            if table.bars is not None:
+                chosen[:] = False
+                chosen[bars_of_group(model.case, mesh, "self_contact.bars", str(table.bars))] = True
+        chosen &= mesh.bar_ids < mesh.n_bars - mesh.n_connectors
+        self._bars = np.arange(len(mesh.bars), dtype=np.int32)[mesh.counted]
+        self._bars = self._bars[chosen[self._bars]]
+        self._radius = model.bars.radii() if table.radius is None else np.full(len(mesh.bars), float(table.radius))
+        lengths = model.bars.mesh_lengths[self._bars]
+        sums = comm.allreduce(np.array([lengths.sum(), len(lengths)]))
+        self._thick = 2.0 * comm.allreduce(float(self._radius[self._bars].max(initial=0.0)), op=MPI.MAX)
+        self._mean, self._listed = float(sums[0] / max(sums[1], 1.0)), -1.0
+        self._skin = 2.0 * _SKIN[0] * self._mean
+        self._friction, self._damping = float(table.friction), damping_of(float(table.restitution))
+        self._starts = owner_starts(mesh)
+        self._numbers = np.concatenate([mesh.first_node + np.arange(mesh.n_owned), mesh.ghost_numbers])
+        self._make_directory()
+        self._h, self._room = 0.0, 0.0
+        self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
+        self.sums = self._no_sums = np.zeros(6)
+        self._way, self._limit, self._drift = 0.0, 0.0, np.zeros(3)
+        self._reference = mesh.points[: mesh.n_owned].copy()
+        self._last = self._reference.T.copy()
+        self._exchange: GhostExchange | None = None
+        self._near: tuple[Regions, float] | None = None
+        self._empty()
+
+    def _make_directory(self) -> None:
+        """Send the ends, radius and stiffness of all bars to the ranks of their slabs."""
+        mesh, comm = self._mesh, self.comm
+        ids = mesh.bar_ids[self._bars].astype(np.int64)
+        router = Router(comm, slab_of(ids, mesh.n_bars, comm.size))
+        begin, end = slab_range(mesh.n_bars, comm.rank, comm.size)
+        at = router.send(ids) - begin
+        self._first_bar, self._directory = begin, np.zeros((end - begin, 4))
+        stiffness = self._model.bars.stiffness[self._bars]
+        ends = self._numbers[mesh.bars[self._bars]]
+        self._directory[at] = router.send(np.column_stack([ends, self._radius[self._bars], stiffness]))
+
+    def begin(self, scheme: Scheme, h: float, frequency: float, critical: float) -> None:
+        """Take the step [s], the highest frequency of the bars [rad/s] and the critical step [s].
+
+        Raises
+        ------
+        InputError
+            If the step leaves no room for the stiffness of contacts.
+        """
+        source, self._h = self._model.case.source, h
+        if not scheme.explicit:
+            self._refuse()
+        if self._model.inertia.redistribution is not None or self._model.inertia.consistent:
+            raise InputError(
+                f'{source}: [self_contact] needs time.mass = "lumped", and no contact.treatment = "mass_redistribution"'
+            )
+        room = 1.0
+        if np.isfinite(critical):  # less a tenth, as weights change
+            room = 0.9 * (frequency * h) ** 2 * ((critical / h) ** 2 - 1.0)
+        if room < _ROOM:
+            raise InputError(
+                f"{source}: time.step = {h:g} s leaves no room for the stiffness of [self_contact] below the critical "
+                f"step of {critical:.6g} s; use at most {0.9 * critical:.6g} s"
+            )
+        self._room = room / (h * h)
+
+    def _refuse(self) -> None:
+        """Refuse analyses that contact cannot serve."""
+        raise InputError(
+            f"{self._model.case.source}: [self_contact] needs an explicit integrator, such as time.integrator = "
+            '"central_differences"; use one, or give the table in the stages with one only'
+        )
+
+    def text(self) -> str:
+        """Return what can touch, for the user before a run. Collective."""
+        count = self.comm.allreduce(len(self._bars))
+        return f"{count:,} bars, up to {engineering(self._thick, 'm')} thick"
+
+    def doubts(self) -> list[str]:
+        """Return a text if bars have overlapped deeply. Collective."""
+        deepest = self.comm.allreduce(self.deepest, op=MPI.MAX)
+        if not deepest > _DEEP:
+            return []
+        return [
+            f"[self_contact]: bars have overlapped by up to {100.0 * deepest:.0f} % of a radius, as contacts must be "
+            "soft for this time.step: a smaller one (time.safety) makes them stiffer"
+        ]
+
+    # pairs
+
+    def _search(self, x: np.ndarray, move: float) -> None:
+        """Make the list of pairs at positions (local, 3); nodes ``move`` in a step [m]. Collective.
+
+        The skin grows as long as few pairs are listed, and shrinks where they are many.
+        """
+        bars, model = self._bars, self._model
+        if self._listed >= 0.0:
+            factor = 2.0 if self._listed < _FEW else 0.7 if self._listed > _MANY else 1.0
+            self._skin = min(max(self._skin * factor, _SKIN[0] * self._mean), _SKIN[1] * self._mean)
+            self._skin = max(self._skin, min(_STEPS * move, _SKIN[1] * self._mean))
+        self._skin = max(self._skin, 4.0 * move)
+        if model.bars.can_break:
+            bars = bars[model.bars.status()[bars] != STATUS.index("broken")]
+        margin = self._radius[bars] + 0.5 * self._skin
+        segments = Segments(self._mesh.bar_ids[bars].astype(np.int64), self._mesh.bars[bars], margin)
+        found = find_pairs(self.comm, Points(np.ascontiguousarray(x), self._numbers), segments)
+        if found is None:
+            raise SimulationFailure(
+                "[self_contact]: too many bars are in one place to find those that touch: reduce self_contact.radius, "
+                "or choose fewer bars with self_contact.bars"
+            )
+        number, listed = self.comm.allreduce(np.array([len(bars), len(found.ids)]))
+        self._listed = listed / max(number, 1)
+        self._install(found.ids.astype(np.int64))
+
+    def _of_bars(self, ids: np.ndarray) -> np.ndarray:
+        """Return ends, radius and stiffness (n, 4) of bars by their numbers (n,). Collective."""
+        if self.comm.size == 1:
+            return self._directory[ids]
+        wanted, place = np.unique(ids, return_inverse=True)
+        asking = Router(self.comm, slab_of(wanted, self._mesh.n_bars, self.comm.size))
+        return asking.reply(self._directory[asking.send(wanted) - self._first_bar])[place.ravel()]
+
+    def _empty(self) -> None:
+        """Begin without pairs that touch; they are searched at the next evaluation."""
+        self._asleep = 0.0
+        self._keys, self._touching, self._limit = np.empty(0, dtype=np.int64), np.empty((0, WIDTH + 2)), 0.0
+        self._state = np.empty(0, dtype=np.uint8)
+
+    def _touches(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers of both bars, as one (m,), of the pairs that touch here, and memory, stiffness and largest
+        damping (m, width + 2) of each."""
+        touch, pairs = self._state == TOUCHING, self._pairs
+        return self._keys[touch], np.column_stack([self._memory, pairs.stiffness, pairs.drag])[touch]
+
+    def _install(self, ids: np.ndarray) -> None:
+        """Take pairs of bars (m, 2) from any ranks. Those that touch stay so. Collective."""
+        self._asleep = 0.0
+        comm, mesh, starts = self.comm, self._mesh, self._starts
+        kept = self._touches() if len(self._state) else (self._keys, self._touching)
+        if comm.size == 1:
+            ids = ids[np.argsort(ids[:, 0] * mesh.n_bars + ids[:, 1])]
+        of_bars = self._of_bars(ids.ravel()).reshape(-1, 2, 4)
+        ends, sizes = of_bars[:, :, :2].astype(np.int64).reshape(-1, 4), of_bars[:, :, 2:].reshape(-1, 4)
+        if comm.size > 1:
+            rows = np.hstack([ids, ends, np.ascontiguousarray(sizes).view(np.int64)])
+            rows = to_owners(rows, range(2, 6), starts, comm)
+            ids, ends, sizes = rows[:, :2], rows[:, 2:6], np.ascontiguousarray(rows[:, 6:]).view(np.float64)
+        numbers, ends = _numbered(ends, starts[comm.rank : comm.rank + 2])
+        self._own = own = (numbers >= starts[comm.rank]) & (numbers < starts[comm.rank + 1])
+        self._local = (numbers[own] - starts[comm.rank]).astype(np.int64)
+        if self._exchange is not None:
+            self._exchange.close()
+        self._exchange = GhostExchange(comm, starts, numbers[~own], _TAG)
+        mass = self._model.inertia.mass
+        inverse = np.where(self._model.supports.fixed.all(axis=1), 0.0, 1.0 / mass)
+        of_nodes = np.column_stack([mesh.points[: mesh.n_owned], mass, inverse])
+        of_nodes = self._gather(of_nodes.__getitem__, 5)
+        measures = np.empty((4, len(ends)))
+        measure_pairs(of_nodes, ends, np.ascontiguousarray(sizes), measures)
+        reach, crossed, most, inertia = measures
+        if self._h:
+            np.minimum(most, _SHARE / self._h**2 * inertia, out=most)
+        used = np.flatnonzero((reach > 0.0) & (most > 0.0))
+        self.ids, ends, n = ids[used], ends[used], len(used)
+        self._keys, self._state = self.ids[:, 0] * mesh.n_bars + self.ids[:, 1], np.full(n, APART, dtype=np.uint8)
+        memory = np.zeros((n, WIDTH + 2))
+        stays = np.isin(kept[0], self._keys)  # not those of bars that have left the model
+        place = np.searchsorted(self._keys, kept[0][stays])
+        memory[place], self._state[place], self._touching = kept[1][stays], TOUCHING, kept[1][:0]
+        self._memory, self._spare = np.ascontiguousarray(memory[:, :WIDTH]), np.zeros((n, WIDTH))
+        counted = self._own[ends[:, 0]] if n else np.empty(0, dtype=bool)
+        varying = memory[:, WIDTH].copy(), memory[:, WIDTH + 1].copy(), np.zeros(n)
+        self._pairs = PairArrays(ends, reach[used], crossed[used], most[used], counted, *varying)
+        self._mass, self._inverse = of_nodes[:, 3].copy(), of_nodes[:, 4].copy()
+
+    def _stiffen(self, state: np.ndarray, load: np.ndarray) -> None:
+        """Give pairs that begin to touch their stiffness and largest damping, with what the nodes (q, 3) carry, see
+        :func:`find_beginning`. Collective."""
+        pairs, begin = self._pairs, np.flatnonzero(state == BEGINNING)
+        if self.comm.size > 1:
+            owned = np.zeros((self._mesh.n_owned, 3))
+            owned[self._local] = load[self._own]
+            load = self._gather(owned.__getitem__, 3)
+        pairs.stiffness[begin], pairs.drag[begin] = pairs.most[begin], inf
+        if not self._h:
+            return
+        room = self._mass[:, None] * np.array([0.5 * self._room, 0.5 / self._h])
+        left = np.array(_PART) * np.maximum(room - load[:, :2], 0.0) / np.maximum(load[:, 2:], 1e-6)
+        least = left[pairs.ends[begin]].min(axis=1, initial=inf)
+        pairs.stiffness[begin] = np.minimum(pairs.most[begin], least[:, 0])
+        pairs.drag[begin] = least[:, 1]
+
+    def _gather(self, values_of: Callable[[np.ndarray], np.ndarray], width: int) -> np.ndarray:
+        """Return values (q, width) at the nodes of pairs; ``values_of`` gives those of owned nodes (k,). Collective."""
+        if self.comm.size == 1:
+            return values_of(self._local)
+        values = np.empty((len(self._own), width))
+        values[self._own] = values_of(self._local)
+        values[~self._own] = self._exchange.bring(values_of(self._exchange.rows))
+        return values
+
+    # steps
+
+    def add_forces(self, x: np.ndarray, f: np.ndarray, commit: bool) -> tuple[float, float]:
+        """Add the forces at positions ``x`` to ``f``, see :meth:`evaluate`, in a step of the bars."""
+        step = self._model.bars.step
+        return self.evaluate(x, f, step if step < np.inf else 0.0, commit)
+
+    def evaluate(self, x: np.ndarray, f: np.ndarray, step: float, commit: bool) -> tuple[float, float]:
+        """Add the forces at positions ``x``, a ``step`` [s] after the last that were committed, to ``f``, both
+        (local, 3); return the stored energy and all that is dissipated [J]. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, if a bar has passed through another, or may have.
+        """
+        worst = np.array([largest_move(x, self._last, step * self._drift), float(self.stale)])
+        if self.comm.size > 1:
+            self.comm.Allreduce(MPI.IN_PLACE, worst, op=MPI.MAX)
+        if not worst[0] < np.inf:  # of which other checks of the step tell
+            return float(self.sums[ENERGY]), self.dissipated
+        way = self._way + 2.0 * float(worst[0])
+        if worst[1] or way >= self._limit:
+            self._renew(x, step, way, 2.0 * float(worst[0]))
+        if way < self._asleep and self.comm.size == 1:  # nothing touches, nor can
+            if commit:
+                self._way, self.sums = way, self._no_sums
+                self._last[:] = x[: self._last.shape[1]].T
+            return 0.0, self.dissipated
+        nodes = self._gather(lambda rows: np.hstack([x[rows], x[rows] - self._last[:, rows].T]), 6)
+        force, load, sums = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3)), np.zeros(6)
+        law = PairLaw(self._friction, self._damping, float(step), way, way if commit else 2.0 * self._way - way)
+        arrays, pairs, state = NodeArrays(nodes, self._inverse, force), self._pairs, self._state
+        if not commit:
+            state = state.copy()
+        begin, far, self._asleep = find_beginning(pairs, state, self._memory, arrays, law, load)
+        if self._any(begin):
+            self._report(
+                far,
+                "bars {} and {}, which are about to touch, move by more than half the sum of their radii relative to "
+                "each other in a step, so that contact may miss them: reduce time.step",
+            )
+            self._stiffen(state, load)
+        passed = evaluate_pairs(pairs, state, self._memory, self._spare, arrays, law, sums)
+        self._report(
+            passed,
+            "bars {} and {} pass through each other, which the stiffness of [self_contact] did not prevent: reduce "
+            "time.step, or use more elements, a larger self_contact.radius or lower velocities",
+        )
+        f[self._local] += force[self._own]
+        total = self.dissipated + float(sums[DISSIPATED])
+        if commit:
+            self._memory, self._spare = self._spare, self._memory
+            self._way, self.dissipated, self.sums = way, total, sums
+            self.deepest = max(self.deepest, float(sums[DEPTH]))
+            self._last[:] = x[: self._last.shape[1]].T
+        return float(sums[ENERGY]), total
+
+    def _any(self, here: int) -> bool:
+        """Return whether a number is not zero on some rank. Collective."""
+        if self.comm.size == 1:
+            return here != 0
+        flag = np.array([here != 0], dtype=np.int32)
+        self.comm.Allreduce(MPI.IN_PLACE, flag, op=MPI.MAX)
+        return bool(flag[0])
+
+    def _report(self, failed: int, text: str) -> None:
+        """End the run on all ranks if on some rank a pair, counted from 1, has failed. Collective."""
+        if self._any(failed):
+            texts = self.comm.allgather(text.format(*self.ids[failed - 1].tolist()) if failed else "")
+            raise SimulationFailure(min(filter(None, texts)))
+
+    def _renew(self, x: np.ndarray, step: float, way: float, move: float) -> None:
+        """Find out whether the list of pairs still has all that may touch, else make it again. Collective."""
+        mesh, owned = self._mesh, self._mesh.n_owned
+        if self._limit > 0.0 and not self.stale:
+            motion = self._reference, x[:owned]
+            change = largest_change(self.comm, motion, mesh.n_nodes, self._thick + self._skin, self._near)
+            left = self._skin - change
+            if left > 0.25 * self._skin + move:
+                self._limit = way + 0.998 * (left - move)
+                return
+        if step > 0.0:
+            moved = self.comm.allreduce((x[:owned] - self._last.T).sum(axis=0)) / mesh.n_nodes
+            self._drift = moved / step
+        self._search(x, move)
+        self._reference[:] = x[:owned]
+        ends = x[mesh.bars[self._bars]]
+        longest = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max(initial=0.0))
+        longest = self.comm.allreduce(longest, op=MPI.MAX)
+        self._near = make_regions(self.comm, self._reference, 6.0 * (longest + self._skin)), longest
+        self._limit, self.stale = way + 0.998 * (self._skin - move), False
+
+    def of_row(self, name: str) -> float:
+        """Return this rank's share of a value of the history: ``contacts``, ``overlap`` [m] or ``force`` [N], which are
+        the largest of all ranks, on rank 0. Collective."""
+        if name == "contacts":
+            return float(self.sums[CONTACTS])
+        value = self.comm.allreduce(float(self.sums[OVERLAP if name == "overlap" else FORCE]), op=MPI.MAX)
+        return value if self.comm.rank == 0 else 0.0
+
+    # what a checkpoint keeps: results do not depend on which other pairs are listed
+
+    def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
+        """What a checkpoint keeps, name to an order and this rank's part. Collective."""
+        table = self._table()
+        counts = self.comm.allgather(len(table))
+        numbers = sum(counts[: self.comm.rank]) + np.arange(len(table))
+        order = NaturalOrder(self.comm, numbers, sum(counts))
+        return {"self_contact.pairs": (order, table)} if sum(counts) else {}
+
+    def _table(self) -> np.ndarray:
+        """Return numbers and memory (m, width + 3) of the counted pairs that touch."""
+        keys, kept = self._touches() if len(self._state) else (self._keys, self._touching)
+        counted = self._pairs.counted[self._state == TOUCHING] if len(self._state) else slice(None)
+        return np.column_stack([keys, kept])[counted]
+
+    def numbers(self) -> dict[str, Any]:
+        """What a checkpoint keeps besides. Collective."""
+        return {
+            "pairs": self.comm.allreduce(len(self._table())),
+            "deepest": self.comm.allreduce(self.deepest, op=MPI.MAX),
+        }
+
+    def orders(self, numbers: dict[str, Any]) -> dict[str, NaturalOrder]:
+        """Return the orders in which :meth:`load_state` takes the arrays of a checkpoint with these numbers."""
+        n, comm = numbers["pairs"], self.comm
+        slab = NaturalOrder(comm, np.arange(*slab_range(n, comm.rank, comm.size)), n)
+        return {"self_contact.pairs": slab} if n else {}
+
+    def load_state(
+        self, numbers: dict[str, Any], arrays: dict[str, np.ndarray], x: np.ndarray, dissipated: float
+    ) -> None:
+        """Go on from what a checkpoint has kept, at positions (owned, 3), with what this rank has dissipated [J].
+        Collective."""
+        self.deepest, self.dissipated = float(numbers["deepest"]), dissipated
+        self._take(arrays.get("self_contact.pairs", np.empty((0, WIDTH + 3))), x)
+
+    def take_over(self, earlier: SelfContact, x: np.ndarray) -> None:
+        """Go on from the end of an earlier stage, at positions (owned, 3). Collective."""
+        self.deepest, self.dissipated = earlier.deepest, earlier.dissipated
+        self._take(earlier._table(), x)
+
+    def _take(self, table: np.ndarray, x: np.ndarray) -> None:
+        """Take pairs that touch (m, width + 3) from any ranks to those of their nodes. Collective."""
+        self._empty()
+        self._last[:] = x.T
+        comm, starts, n_bars = self.comm, self._starts, self._mesh.n_bars
+        ids = np.column_stack(np.divmod(table[:, 0].astype(np.int64), n_bars))
+        ends = self._of_bars(ids.ravel())[:, :2].reshape(-1, 4).astype(np.int64)
+        rows = np.hstack([ids, ends, np.ascontiguousarray(table[:, 1:]).view(np.int64)])
+        rows = to_owners(rows, range(2, 6), starts, comm)
+        self._keys = rows[:, 0] * n_bars + rows[:, 1]
+        self._touching = np.ascontiguousarray(rows[:, 6:]).view(np.float64)
+
+    # linear elements
+
+    def add_product(self, weight: float, u: np.ndarray, out: np.ndarray) -> None:
+        """Add nothing: the plan of explicit steps leaves room for the stiffness of contacts."""
+
+    def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
+        """Steps with discrete gradients are implicit."""
+        raise NotImplementedError
+
+    def add_tangents(self, weight: float, pattern: BlockPattern, values: np.ndarray) -> None:
+        """Add nothing, as :meth:`add_product`: what modes are found of has no bars that touch."""

@@ -1,0 +1,381 @@
+"""Bars that touch each other, as capsules: distances, forces, conservation, impacts, friction, ranks, restarts."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from pfem_petsc import Case, Simulation, Truss
+from pfem_petsc.contact.self_contact import (
+    DISSIPATED,
+    ENERGY,
+    FORCE,
+    WIDTH,
+    NodeArrays,
+    PairArrays,
+    PairLaw,
+    damping_of,
+    evaluate_pairs,
+    find_beginning,
+    measure_pairs,
+    restitution_of,
+)
+from pfem_petsc.errors import InputError, SimulationFailure
+
+RADIUS = 0.01
+AREA = np.pi * RADIUS**2
+
+
+def evaluate(x, reach=0.1, stiffness=3.0, crossed=0.1):
+    """Energy, gradient (4, 3) and force of one pair of bars with ends at x (4, 3)."""
+    numbers = (np.array([number]) for number in (reach, crossed, stiffness, True, stiffness, 0.0, 0.0))
+    pairs, state = PairArrays(np.arange(4).reshape(1, 4), *numbers), np.zeros(1, dtype=np.uint8)
+    nodes = NodeArrays(np.hstack([x, np.zeros((4, 3))]), np.ones(4), np.zeros((4, 3)))
+    sums, memory, law = np.zeros(6), np.zeros((1, WIDTH)), PairLaw(0.0, 0.0, 0.0, 0.0, 0.0)
+    assert find_beginning(pairs, state, memory, nodes, law, np.zeros((4, 3))) == (1, 0, 0.0)
+    assert evaluate_pairs(pairs, state, memory, memory.copy(), nodes, law, sums) == 0
+    assert sums[DISSIPATED] == 0.0
+    return sums[ENERGY], nodes.force, sums[FORCE]
+
+
+def near_pairs(random, count):
+    """Ends (4, 3) of bars of a length of about 1 closer than 0.1, some nearly parallel, some end on end."""
+    made = 0
+    while made < count:
+        centre, one = random.uniform(-0.3, 0.3, 3), random.normal(size=3)
+        other = random.normal(size=3) if made % 2 else one + 0.2 * random.normal(size=3)
+        x = np.array([-0.5 * one, 0.5 * one, centre - 0.5 * other, centre + 0.5 * other])
+        x[2:] += random.uniform(-0.6, 0.6) * other
+        if 0.01 < closest(x) < 0.09:
+            made += 1
+            yield x
+
+
+def closest(x):
+    """Distance of two bars with ends at x (4, 3) and large radii."""
+    sizes = np.empty((4, 1))
+    measure_pairs(np.hstack([x, np.ones((4, 1))]), np.arange(4).reshape(1, 4), np.full((1, 4), 1.0), sizes)
+    return sizes[0, 0]
+
+
+def test_distances_are_those_of_another_program():
+    ipctk = pytest.importorskip("ipctk")
+    for x in near_pairs(np.random.default_rng(5), 100):
+        square = min(
+            ipctk.edge_edge_distance(*x),
+            *(ipctk.point_edge_distance(x[i], *x[2:]) for i in (0, 1)),
+            *(ipctk.point_edge_distance(x[i], *x[:2]) for i in (2, 3)),
+        )
+        assert closest(x) == pytest.approx(np.sqrt(square), abs=1e-12)
+
+
+def test_force_is_the_gradient_of_the_energy():
+    random, h = np.random.default_rng(1), 1e-6
+    for x in near_pairs(random, 60):
+        energy, force, _ = evaluate(x)
+        assert energy >= 0.0
+        for i, c in np.ndindex(4, 3):
+            around = []
+            for sign in (-1.0, 1.0):
+                moved = x.copy()
+                moved[i, c] += sign * h
+                around.append(evaluate(moved)[0])
+            assert (around[1] - around[0]) / (2.0 * h) == pytest.approx(force[i, c], abs=2e-6)
+        np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-15)
+        np.testing.assert_allclose(np.cross(x, force).sum(axis=0), 0.0, atol=1e-15)
+
+
+def test_energies_of_simple_pairs():
+    cross = np.array([[-0.5, 0, 0], [0.5, 0, 0], [0, -0.5, 0.08], [0, 0.5, 0.08]])
+    beside = np.array([[-0.5, 0, 0], [0.5, 0, 0], [-0.2, 0, 0.08], [0.8, 0, 0.08]])
+    end_on = np.array([[-1.0, 0, 0], [0, 0, 0], [0.08, 0, 0], [1.08, 0, 0]])
+    for x in (cross, beside, end_on):
+        energy, force, pushed = evaluate(x)
+        assert energy == pytest.approx(0.5 * 3.0 * 0.02**2)
+        assert pushed == pytest.approx(3.0 * 0.02)
+        np.testing.assert_allclose(np.abs(force[:2].sum(axis=0)).max(), 3.0 * 0.02)
+    # side by side over their whole lengths, they are held at both ends
+    beside[2:, 0] = beside[:2, 0]
+    energy, force, _ = evaluate(beside)
+    np.testing.assert_allclose(force[:, 2], 3.0 * 0.02 * np.array([1, 1, -1, -1]))
+
+
+def test_damping_ratio_gives_the_restitution():
+    for restitution in (1.0, 0.9, 0.5, 0.2, 0.1, 0.02):
+        assert restitution_of(damping_of(restitution)) == pytest.approx(restitution, rel=1e-9)
+    # integrated with tiny steps: m x'' = max(-k x - c x', 0) from x = 0 with x' = -1
+    for ratio in (0.1, 0.6, 1.0, 1.5):
+        x, v, h = 0.0, -1.0, 1e-5
+        while True:
+            v_before, push = v, -x - 2.0 * ratio * v
+            if push < 0.0:
+                break
+            v += h * push
+            x += 0.5 * h * (v + v_before)
+        assert v == pytest.approx(restitution_of(ratio), abs=1e-4)
+
+
+def case_of(points, bars, speed, **tables):
+    """Bars of steel-like wood; ``speed``: velocities by rows [[nodes], [vx, vy, vz]]."""
+    sets = {f"part{k}": {"indices": nodes} for k, (nodes, _) in enumerate(speed)}
+    case = {
+        "material": {"m": {"young_modulus": 2e9, "density": 1000.0}},
+        "section": {"s": {"area": AREA, "material": "m"}},
+        "node_set": sets,
+        "initial": {"on": [{"node_set": f"part{k}", "velocity": v} for k, (_, v) in enumerate(speed)]},
+        "self_contact": {},
+        "time": {"integrator": "central_differences", "step": 5e-5, "end": 1e-2},
+        "output": {"history_every": 1, "fields_every": 0},
+    }
+    for key, value in tables.items():
+        if isinstance(value, dict) and isinstance(case.get(key), dict):
+            case[key] = case[key] | value
+        else:
+            case[key] = value
+    return Case(case, mesh=Truss(points, bars))
+
+
+def crossed(angle=90.0, speed=2.0, lift=0.03, **tables):
+    c, s = 0.5 * np.cos(np.deg2rad(angle)), 0.5 * np.sin(np.deg2rad(angle))
+    points = np.array([[-0.5, 0, 0], [0.5, 0, 0], [-c, -s, lift], [c, s, lift]])
+    return case_of(points, [[0, 1], [2, 3]], [([2, 3], [0.0, 0.0, -speed])], **tables)
+
+
+def chain_tables():
+    """Two chains of four bars that fly against each other, askew, and touch at joints and bars."""
+    points = [[0.25 * i, 0, 0.02 * (i % 2)] for i in range(5)]
+    points += [[0.52 + 0.05 * i, 0.25 * i - 0.5, 0.045 + 0.02 * (i % 2)] for i in range(5)]
+    bars = [[i, i + 1] for i in range(4)] + [[i, i + 1] for i in range(5, 9)]
+    speed = [(list(range(5)), [0.3, 0.0, 0.0]), (list(range(5, 10)), [-0.4, 0.2, -3.0])]
+    return np.array(points), np.array(bars), speed
+
+
+def chains(**tables):
+    return case_of(*chain_tables(), **tables)
+
+
+def rows_of(case, comm, folder, name):
+    with Simulation(case, comm, output=folder / name) as simulation:
+        rows = [step.row for step in simulation if step.row is not None]
+        x = simulation.gather(simulation.state.position)
+    return rows, x
+
+
+def column(rows, name):
+    return np.array([row[name] for row in rows])
+
+
+def check_conservation(rows, of_angular_momentum=1e-12):
+    kinetic = column(rows, "kinetic_energy")
+    for name, error in (("momentum", 1e-12), ("angular_momentum", of_angular_momentum)):
+        values = column(rows, name)
+        np.testing.assert_allclose(values, np.broadcast_to(values[0], values.shape), rtol=0.0, atol=error)
+    assert np.abs(column(rows, "energy_imbalance")).max() < 1e-12 * kinetic.max()
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
+@pytest.mark.parametrize("angle", [0.0, 0.5, 90.0])
+def test_two_bars_exchange_their_velocities(angle, integrator, comm, shared_tmp_path):
+    case = crossed(angle, time={"integrator": integrator})
+    rows, _ = rows_of(case, comm, shared_tmp_path, "run")
+    check_conservation(rows)
+    assert column(rows, "self_contact/contacts").max() == 1
+    kinetic, touching = column(rows, "kinetic_energy"), column(rows, "self_contact/contacts") > 0
+    assert not touching[-1]
+    # of the bars as bodies, as their waves take some where they touch askew
+    assert kinetic[-1] == pytest.approx(kinetic[0], rel=2e-3)
+    # a spring between two masses: largest overlap v sqrt(m/k), m half the mass of a bar, the force k times that
+    if angle == 90.0:
+        stiffness, mass = 2e9 * AREA, 0.5 * 1000.0 * AREA
+        overlap = 2.0 * np.sqrt(mass / stiffness)
+        assert column(rows, "self_contact/overlap").max() == pytest.approx(overlap, rel=1e-2)
+        assert column(rows, "self_contact/force").max() == pytest.approx(overlap * stiffness, rel=1e-2)
+        assert touching.sum() * 5e-5 == pytest.approx(np.pi * np.sqrt(mass / stiffness), rel=0.05)
+
+
+def test_energy_converges_with_the_square_of_the_step(tmp_path):
+    lost = []
+    for step in (4e-5, 1e-5, 2.5e-6):
+        rows, _ = rows_of(crossed(time={"step": step, "end": 8e-3}), MPI.COMM_SELF, tmp_path, f"{step}")
+        kinetic = column(rows, "kinetic_energy")
+        lost.append(abs(kinetic[-1] / kinetic[0] - 1.0))
+    assert lost[2] < 4e-6 and lost[1] < 1e-4 and lost[0] < 1e-3
+
+
+@pytest.mark.parametrize("restitution", [0.9, 0.5, 0.2])
+def test_restitution(restitution, tmp_path):
+    for step, accuracy in ((5e-5, 0.02), (5e-6, 2e-3)):
+        case = crossed(time={"step": step, "end": 8e-3}, self_contact={"restitution": restitution})
+        rows, _ = rows_of(case, MPI.COMM_SELF, tmp_path, f"{step}")
+        check_conservation(rows)
+        kinetic = column(rows, "kinetic_energy")
+        # bars of equal mass, one at rest: half of the energy is that of the centre of mass
+        assert np.sqrt(2.0 * kinetic[-1] / kinetic[0] - 1.0) == pytest.approx(restitution, abs=accuracy)
+        lost = column(rows, "self_contact_dissipation")
+        assert lost[-1] == pytest.approx(kinetic[0] - kinetic[-1], rel=0.02)
+        assert np.diff(lost).min() > -1e-12
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
+def test_chains(integrator, comm, shared_tmp_path):
+    case = chains(time={"integrator": integrator, "step": 2e-5})
+    rows, x = rows_of(case, comm, shared_tmp_path, "all")
+    check_conservation(rows, 1e-12 if integrator == "central_differences" else 1e-6)
+    assert column(rows, "self_contact/contacts").max() >= 2
+    assert column(rows, "self_contact_energy").max() > 0.05
+    # numbers of ranks, and the order of nodes and bars
+    one, y = rows_of(case, MPI.COMM_SELF, shared_tmp_path, f"one{comm.rank}")
+    for name in ("kinetic_energy", "self_contact_energy", "self_contact/force", "self_contact/contacts"):
+        np.testing.assert_allclose(column(rows, name), column(one, name), rtol=1e-7, atol=1e-9)
+    if comm.rank == 0:
+        np.testing.assert_allclose(x, y, atol=1e-12)
+
+
+def test_numbers_do_not_matter(tmp_path):
+    tables = {"time": {"step": 2e-5}, "self_contact": {"friction": 0.3, "restitution": 0.8}}
+    points, bars, speed = chain_tables()
+    random = np.random.default_rng(8)
+    order, of_bars = random.permutation(10), random.permutation(8)
+    place = np.argsort(order)
+    renumbered = points[order], place[bars][of_bars][:, ::-1], [(place[nodes].tolist(), v) for nodes, v in speed]
+    rows, x = rows_of(chains(**tables), MPI.COMM_SELF, tmp_path, "one")
+    others, y = rows_of(case_of(*renumbered, **tables), MPI.COMM_SELF, tmp_path, "other")
+    np.testing.assert_allclose(y, x[order], atol=1e-9)
+    lost = column(rows, "self_contact_dissipation")
+    assert lost[-1] > 0.01
+    np.testing.assert_allclose(column(others, "self_contact_dissipation"), lost, atol=1e-6)
+
+
+def sliding(comm, **tables):
+    """A bar that slides on two others, fixed and across it."""
+    points = np.array([[-0.3, -0.2, 0], [-0.3, 0.2, 0], [0.3, -0.2, 0], [0.3, 0.2, 0], [-0.5, 0, 0.02], [0.5, 0, 0.02]])
+    return case_of(
+        points,
+        [[0, 1], [2, 3], [4, 5]],
+        [([0, 1, 2, 3], [0.0, 0.0, 0.0]), ([4, 5], [0.3, 0.0, 0.0])],
+        support=[{"node_set": "part0", "fix": "xyz"}],
+        gravity={"acceleration": [0.0, 0.0, -10.0]},
+        time={"step": 1e-4, "end": 0.13},
+        output={"history_every": 10},
+        **tables,
+    )
+
+
+@pytest.mark.parallel
+def test_friction_stops_a_bar(comm, shared_tmp_path):
+    case = sliding(comm, self_contact={"friction": 0.3, "restitution": 0.6})
+    rows, x = rows_of(case, comm, shared_tmp_path, "run")
+    mass = 1000.0 * AREA
+    assert column(rows, "self_contact/contacts")[-1] == 2
+    assert column(rows, "self_contact_dissipation")[-1] == pytest.approx(0.5 * mass * 0.3**2, rel=0.02)
+    assert column(rows, "kinetic_energy")[-1] < 1e-4 * column(rows, "kinetic_energy")[0]
+    assert np.abs(column(rows, "energy_imbalance")).max() < 1e-12
+    if comm.rank == 0:  # v^2/(2 mu g)
+        np.testing.assert_allclose(x[4:, 0] - [-0.5, 0.5], 0.3**2 / (2.0 * 0.3 * 10.0), rtol=0.02)
+        np.testing.assert_allclose(x[4:, 2], 0.02, atol=1e-5)
+
+
+def test_single_steps_are_those_of_calls(tmp_path):
+    """The same steps in compiled calls and one by one, which a function of the user brings about."""
+    made = []
+    for called in (False, True):
+        case = chains(time={"step": 2e-5}, self_contact={"friction": 0.3, "restitution": 0.8})
+        with Simulation(case, MPI.COMM_SELF, output=tmp_path / f"{called}") as simulation:
+            if called:
+                simulation.external_force(lambda t, state: np.zeros_like(state.position))
+            rows = [step.row for step in simulation if step.row is not None]
+            made.append((rows, simulation.gather(simulation.state.position)))
+    (rows, x), (others, y) = made
+    np.testing.assert_allclose(x, y, atol=1e-11)
+    for name in ("self_contact_energy", "self_contact_dissipation", "self_contact/force", "numerical_dissipation"):
+        one, other = column(rows, name), column(others, name)
+        np.testing.assert_allclose(one, other, atol=1e-7 * np.abs(one).max())
+
+
+@pytest.mark.parallel
+def test_a_restart_continues_to_the_bit(comm, shared_tmp_path):
+    tables = {"time": {"step": 2e-5, "end": 8e-3}, "self_contact": {"friction": 0.3, "restitution": 0.8}}
+    whole, x = rows_of(chains(**tables), comm, shared_tmp_path, "whole")
+    touching = column(whole, "self_contact/contacts")
+    for step in (int(np.argmax(touching > 0)) + 3, int(np.argmax(touching)) + 1):
+        tables["output"] = {"checkpoint_every": step}
+        tables["time"]["end"] = (step + 0.5) * 2e-5
+        name = f"part{step}"
+        rows_of(chains(**tables), comm, shared_tmp_path, name)
+        tables["time"]["end"] = 8e-3
+        with Simulation(chains(**tables), comm, output=shared_tmp_path / name, restart=True) as simulation:
+            rows = [one.row for one in simulation]
+            y = simulation.gather(simulation.state.position)
+        if comm.rank == 0:
+            np.testing.assert_array_equal(x, y)
+        for key in ("self_contact_energy", "self_contact_dissipation", "self_contact/force", "energy_imbalance"):
+            np.testing.assert_array_equal(column(whole, key)[-len(rows) :], column(rows, key))
+
+
+def test_bars_that_would_jump_end_the_run(tmp_path):
+    case = crossed(speed=200.0, time={"step": 1e-4, "end": 1e-3})
+    with (
+        pytest.raises(SimulationFailure, match="bars 0 and 1, which are about to touch, move by more than half"),
+        Simulation(case, MPI.COMM_SELF, output=tmp_path) as simulation,
+    ):
+        simulation.run()
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
+def test_bars_that_pass_through_each_other_end_the_run(integrator, tmp_path):
+    case = crossed(speed=150.0, time={"integrator": integrator, "step": 2e-5, "end": 1e-3})
+    with (
+        pytest.raises(SimulationFailure, match=r"step \d+, t = .*: bars 0 and 1 pass through each other"),
+        Simulation(case, MPI.COMM_SELF, output=tmp_path) as simulation,
+    ):
+        simulation.run()
+
+
+def test_bars_that_cross_in_the_mesh_do_not_touch(tmp_path):
+    for lift, contacts in ((0.0, 0), (0.01, 1)):
+        rows, _ = rows_of(crossed(lift=lift, speed=1.0, time={"end": 3e-3}), MPI.COMM_SELF, tmp_path, f"{lift}")
+        assert column(rows, "self_contact/contacts").max() == contacts
+    # the distance in the mesh takes the place of the sum of radii: there is no force at the start
+    assert column(rows, "self_contact/overlap")[0] == pytest.approx(5e-5)
+
+
+def test_chosen_bars_and_radius(tmp_path):
+    case = crossed(lift=0.05, time={"end": 1.2e-2}, self_contact={"radius": 0.02})
+    rows, _ = rows_of(case, MPI.COMM_SELF, tmp_path, "wide")
+    begin = rows[int(np.argmax(column(rows, "self_contact/contacts") > 0))]
+    assert begin["time"] == pytest.approx(0.01 / 2.0, abs=1e-4)
+    truss = Truss(np.eye(3)[[0, 1, 2]], [[0, 1], [1, 2]], bar_groups={"one": [0]})
+    tables = {key: value for key, value in case.to_dict().items() if key not in ("mesh", "initial", "node_set")}
+    with pytest.raises(InputError, match=r"self_contact.bars = 'two'"):
+        Simulation(Case(tables | {"self_contact": {"bars": "two"}}, mesh=truss), MPI.COMM_SELF, output=tmp_path / "no")
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"time": {"integrator": "newmark"}}, "needs an explicit integrator"),
+        ({"time": {"mass": "consistent"}}, "needs time.mass"),
+        ({"time": {"step": 7e-4}}, "leaves no room for the stiffness"),
+        ({"self_contact": {"restitution": 0.0}}, "restitution"),
+        ({"self_contact": {"radius": -1.0}}, "radius"),
+    ],
+)
+def test_what_does_not_work_is_refused(tables, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        Simulation(crossed(**tables), MPI.COMM_SELF, output=tmp_path)
+
+
+def test_broken_bars_touch_nothing(tmp_path):
+    removed = [{"bars": "gone", "time": 1e-3}]
+    base = crossed(time={"end": 1e-2}).to_dict()
+    base.pop("mesh")
+    points = np.array([[-0.5, 0, 0], [0.5, 0, 0], [0, -0.5, 0.03], [0, 0.5, 0.03]])
+    truss = Truss(points, [[0, 1], [2, 3]], bar_groups={"gone": [0]})
+    rows, _ = rows_of(Case(base | {"remove": removed}, mesh=truss), MPI.COMM_SELF, tmp_path, "run")
+    assert column(rows, "self_contact/contacts").max() == 0
+
+
+def test_deep_overlap_is_told(tmp_path, capfd):
+    rows_of(crossed(speed=40.0, time={"step": 2e-5, "end": 3e-3}), MPI.COMM_SELF, tmp_path, "run")
+    assert "bars have overlapped by up to" in capfd.readouterr().err

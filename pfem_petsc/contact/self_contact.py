@@ -268,7 +268,7 @@ def _farthest_move(x, ends, p):
 
 @kernel
 def find_beginning(pairs, state, memory, nodes, law, load):
-    """Find the pairs that begin to touch, and what the nodes of all pairs carry.
+    """Find the pairs that begin to touch, and what the nodes of all pairs carry; pairs may sleep meanwhile.
 
     ``pairs``: PairArrays; ``state`` (m,): states, of which some become :data:`BEGINNING`; ``memory`` (m, width);
     ``nodes``: NodeArrays; ``law``: PairLaw; ``load`` (q, 3): sums over the pairs of a node, times its weight, of their
@@ -705,7 +705,7 @@ class SelfContact:
         SimulationFailure
             On all ranks, if a bar has passed through another, or may have.
         """
-        worst = np.array([largest_move(x, self._last, step * self._drift), float(self.stale)])
+        worst = np.array([largest_move(x, self._last, step * self._drift), float(self.stale), -self._asleep])
         if self.comm.size > 1:
             self.comm.Allreduce(MPI.IN_PLACE, worst, op=MPI.MAX)
         if not worst[0] < np.inf:  # of which other checks of the step tell
@@ -713,7 +713,7 @@ class SelfContact:
         way = self._way + 2.0 * float(worst[0])
         if worst[1] or way >= self._limit:
             self._renew(x, step, way, 2.0 * float(worst[0]))
-        if way < self._asleep and self.comm.size == 1:  # nothing touches, nor can
+        if way < -worst[2] and self._asleep > 0.0:  # nothing touches, nor can; after a search, this is not known
             if commit:
                 self._way, self.sums = way, self._no_sums
                 self._last[:] = x[: self._last.shape[1]].T
@@ -725,7 +725,7 @@ class SelfContact:
         if not commit:
             state = state.copy()
         begin, far, self._asleep = find_beginning(pairs, state, self._memory, arrays, law, load)
-        if self._any(begin):
+        if self._any(begin + far):
             self._report(
                 far,
                 "bars {} and {}, which are about to touch, move by more than half the sum of their radii relative to "

@@ -311,11 +311,13 @@ def test_a_restart_continues_to_the_bit(comm, shared_tmp_path):
             np.testing.assert_array_equal(column(whole, key)[-len(rows) :], column(rows, key))
 
 
-def test_bars_that_would_jump_end_the_run(tmp_path):
-    case = crossed(speed=200.0, time={"step": 1e-4, "end": 1e-3})
+@pytest.mark.parallel
+@pytest.mark.parametrize("speed", [200.0, 600.0])  # the fast one is beyond the other bar within a step
+def test_bars_that_would_jump_end_the_run(speed, comm, shared_tmp_path):
+    case = crossed(speed=speed, time={"step": 1e-4, "end": 1e-3})
     with (
         pytest.raises(SimulationFailure, match="bars 0 and 1, which are about to touch, move by more than half"),
-        Simulation(case, MPI.COMM_SELF, output=tmp_path) as simulation,
+        Simulation(case, comm, output=shared_tmp_path) as simulation,
     ):
         simulation.run()
 

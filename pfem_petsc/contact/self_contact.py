@@ -16,7 +16,7 @@ The stiffness k of a pair is that of its bars, :data:`_STIFFNESS` times the harm
 requires less: by Gershgorin's theorem the square of the frequency of a node with the mass m grows by at most the sum of
 2 w k/m over the pairs that touch it, with its weights w in their closest points. Those that begin to touch in a step
 get at most :data:`_PART` of what the step and the others leave. The stiffness is constant while the pair touches.
-Pairs closer than R in the mesh keep their distance there instead of R.
+Pairs closer than R in the mesh keep their distance there instead of R, and do not touch below :data:`_LEAST` of it.
 
 Bars are searched with a skin. Pairs are evaluated when the ways of the nodes since then allow them to touch; a bar that
 could jump over another in a step, or has passed its axis, ends the run.
@@ -56,7 +56,7 @@ _ROOM = 0.1  # least sum of squared frequencies that a step must leave for conta
 _SKIN = 0.1, 0.5  # least and largest distance beyond the radii up to which pairs are listed, over the length of bars
 _STEPS = 20.0  # steps for which the skin should be sufficient, unless it is too large then
 _FEW, _MANY = 0.25, 3.0  # pairs for each bar in lists that are made with a larger or a smaller skin the next time
-_LEAST = 1e-3  # sum of radii of a pair, over that of its bars, below which they cross in the mesh and do not touch
+_LEAST = 0.25  # distance in the mesh, over the sum of radii, below which bars cross there and do not touch
 _DEEP = 0.2  # overlap over the radius from which results are doubtful
 _TAG = 7800  # of messages between ranks with nodes of the same pairs
 
@@ -161,37 +161,23 @@ def _foot(x, node, one, two):
 
 
 @inlined
-def _axes(x, ends, p, u, v):
-    """Write both axes; return their squares and their product."""
-    uu = 0.0
-    vv = 0.0
-    uv = 0.0
-    for c in range(3):
-        u[c] = x[ends[p, 1], c] - x[ends[p, 0], c]
-        v[c] = x[ends[p, 3], c] - x[ends[p, 2], c]
-        uu += u[c] * u[c]
-        vv += v[c] * v[c]
-        uv += u[c] * v[c]
-    return uu, vv, uv
-
-
-@inlined
 def _repel(pairs, p, x, s, t, rooms):
     """Write the gradient of the energy of a pair that touches at ``s`` and ``t``; return the energy, the sum of the
     forces, and their mean points."""
     g, u, v, way = rooms.g, rooms.u, rooms.v, rooms.way
     ends, k, reach = pairs.ends, pairs.stiffness[p], pairs.reach[p]
-    uu, vv, uv = _axes(x, ends, p, u, v)
-    for i in range(4):
-        for c in range(3):
+    uu = vv = uv = 0.0
+    for c in range(3):
+        u[c], v[c] = x[ends[p, 1], c] - x[ends[p, 0], c], x[ends[p, 3], c] - x[ends[p, 2], c]
+        uu += u[c] * u[c]
+        vv += v[c] * v[c]
+        uv += u[c] * v[c]
+        for i in range(4):
             g[i, c] = 0.0
     sine = max(1.0 - uv * uv / (uu * vv), 0.0) if uu * vv > 0.0 else 0.0
     q = min(sine / pairs.crossed[p], 1.0)
     m = q * q * q * (10.0 - q * (15.0 - 6.0 * q))
-    energy = 0.0
-    push = 0.0
-    at = 0.0
-    other = 0.0
+    energy = push = at = other = 0.0
     excess = 0.0  # of the energy where bars cross over that where they are parallel
     for j in range(5 if m < 1.0 else 1):
         weight = m if j == 0 else 0.5 * (1.0 - m)
@@ -243,25 +229,19 @@ def _slide(old, new, p, k, most, rooms):
     """Advance the elastic slip of a pair, at ``most`` as given [m], by the way of its points; return the energy stored,
     and that dissipated."""
     way, normal = rooms.way, rooms.normal
-    along = 0.0
-    dot = 0.0
-    before = 0.0
+    along = dot = before = left = square = energy = lost = 0.0
     for c in range(3):
         along += way[c] * normal[c]
         dot += old[p, SPRING + c] * normal[c]
         before += old[p, SPRING + c] * old[p, SPRING + c]
-    left = 0.0
     for c in range(3):  # turned into the plane across the normal
         new[p, SPRING + c] = old[p, SPRING + c] - dot * normal[c]
         left += new[p, SPRING + c] * new[p, SPRING + c]
     turned = np.sqrt(before / left) if left > 0.0 else 0.0
-    square = 0.0
     for c in range(3):
         trial = turned * new[p, SPRING + c] + way[c] - along * normal[c]
         square += trial * trial
     factor = most / np.sqrt(square) if square > most * most else 1.0
-    energy = 0.0
-    lost = 0.0
     for c in range(3):
         start = turned * new[p, SPRING + c]
         trial = start + way[c] - along * normal[c]
@@ -288,7 +268,7 @@ def _farthest_move(x, ends, p):
 
 @kernel
 def find_beginning(pairs, state, memory, nodes, law, load):
-    """Find the pairs that begin to touch, and what the nodes of all pairs carry.
+    """Find the pairs that begin to touch, and what the nodes of all pairs carry; pairs may sleep meanwhile.
 
     ``pairs``: PairArrays; ``state`` (m,): states, of which some become :data:`BEGINNING`; ``memory`` (m, width);
     ``nodes``: NodeArrays; ``law``: PairLaw; ``load`` (q, 3): sums over the pairs of a node, times its weight, of their
@@ -346,11 +326,7 @@ def evaluate_pairs(pairs, state, old, new, nodes, law, out):
             continue
         d, s, t = segment_distance(x, segments, 2 * p, 2 * p + 1)
         k, reach = pairs.stiffness[p], pairs.reach[p]
-        energy = 0.0
-        lost = 0.0
-        push = 0.0
-        at = 0.0
-        other = 0.0
+        energy = push = at = other = lost = 0.0
         if d < reach:
             energy, push, at, other = _repel(pairs, p, x, s, t, rooms)
         if push > 0.0:
@@ -365,8 +341,7 @@ def evaluate_pairs(pairs, state, old, new, nodes, law, out):
                 out[DISSIPATED] += lost
             continue
         apart = _point_way(x, ends, p, s, t, 0, normal)
-        turn = 0.0
-        closing = 0.0
+        turn = closing = held = 0.0
         for c in range(3):
             normal[c] = normal[c] / apart if apart > 0.0 else 0.0
             turn += normal[c] * old[p, NORMAL + c]
@@ -379,7 +354,6 @@ def evaluate_pairs(pairs, state, old, new, nodes, law, out):
         lost -= 0.5 * (old[p, VISCOUS] + total - push) * closing
         if total != push:
             _gradient(g, s, t, total - push, normal)
-        held = 0.0
         for c in range(3):
             new[p, SPRING + c] = 0.0
         if law.friction > 0.0:
@@ -731,7 +705,7 @@ class SelfContact:
         SimulationFailure
             On all ranks, if a bar has passed through another, or may have.
         """
-        worst = np.array([largest_move(x, self._last, step * self._drift), float(self.stale)])
+        worst = np.array([largest_move(x, self._last, step * self._drift), float(self.stale), -self._asleep])
         if self.comm.size > 1:
             self.comm.Allreduce(MPI.IN_PLACE, worst, op=MPI.MAX)
         if not worst[0] < np.inf:  # of which other checks of the step tell
@@ -739,7 +713,7 @@ class SelfContact:
         way = self._way + 2.0 * float(worst[0])
         if worst[1] or way >= self._limit:
             self._renew(x, step, way, 2.0 * float(worst[0]))
-        if way < self._asleep and self.comm.size == 1:  # nothing touches, nor can
+        if way < -worst[2] and self._asleep > 0.0:  # nothing touches, nor can; after a search, this is not known
             if commit:
                 self._way, self.sums = way, self._no_sums
                 self._last[:] = x[: self._last.shape[1]].T
@@ -751,7 +725,7 @@ class SelfContact:
         if not commit:
             state = state.copy()
         begin, far, self._asleep = find_beginning(pairs, state, self._memory, arrays, law, load)
-        if self._any(begin):
+        if self._any(begin + far):
             self._report(
                 far,
                 "bars {} and {}, which are about to touch, move by more than half the sum of their radii relative to "
@@ -791,7 +765,7 @@ class SelfContact:
         """Find out whether the list of pairs still has all that may touch, else make it again. Collective."""
         mesh, owned = self._mesh, self._mesh.n_owned
         if self._limit > 0.0 and not self.stale:
-            motion = self._reference, x[:owned]
+            motion = self._reference, np.ascontiguousarray(x[:owned])
             change = largest_change(self.comm, motion, mesh.n_nodes, self._thick + self._skin, self._near)
             left = self._skin - change
             if left > 0.25 * self._skin + move:

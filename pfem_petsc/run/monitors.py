@@ -193,6 +193,7 @@ CAUSES = {
     "rupture_dissipation": "bars break",
     "viscous_dissipation": "bars or dashpots are damped",
     "damping_dissipation": "damping stops nodes",
+    "self_contact_dissipation": "bars touch bars",
 }
 """What dissipates besides friction and impact, and how messages tell it."""
 _CAUSES = [_AT[name] for name in CAUSES]

@@ -5,6 +5,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, Truss
+from pfem_petsc.contact.neighbours import segment_distance
 from pfem_petsc.contact.self_contact import (
     DISSIPATED,
     ENERGY,
@@ -16,7 +17,6 @@ from pfem_petsc.contact.self_contact import (
     damping_of,
     evaluate_pairs,
     find_beginning,
-    measure_pairs,
     restitution_of,
 )
 from pfem_petsc.errors import InputError, SimulationFailure
@@ -51,10 +51,8 @@ def near_pairs(random, count):
 
 
 def closest(x):
-    """Distance of two bars with ends at x (4, 3) and large radii."""
-    sizes = np.empty((4, 1))
-    measure_pairs(np.hstack([x, np.ones((4, 1))]), np.arange(4).reshape(1, 4), np.full((1, 4), 1.0), sizes)
-    return sizes[0, 0]
+    """Distance of two bars with ends at x (4, 3)."""
+    return segment_distance(x, np.array([[0, 1], [2, 3]]), 0, 1)[0]
 
 
 def test_distances_are_those_of_another_program():
@@ -313,11 +311,13 @@ def test_a_restart_continues_to_the_bit(comm, shared_tmp_path):
             np.testing.assert_array_equal(column(whole, key)[-len(rows) :], column(rows, key))
 
 
-def test_bars_that_would_jump_end_the_run(tmp_path):
-    case = crossed(speed=200.0, time={"step": 1e-4, "end": 1e-3})
+@pytest.mark.parallel
+@pytest.mark.parametrize("speed", [200.0, 600.0])  # the fast one is beyond the other bar within a step
+def test_bars_that_would_jump_end_the_run(speed, comm, shared_tmp_path):
+    case = crossed(speed=speed, time={"step": 1e-4, "end": 1e-3})
     with (
         pytest.raises(SimulationFailure, match="bars 0 and 1, which are about to touch, move by more than half"),
-        Simulation(case, MPI.COMM_SELF, output=tmp_path) as simulation,
+        Simulation(case, comm, output=shared_tmp_path) as simulation,
     ):
         simulation.run()
 
@@ -333,7 +333,7 @@ def test_bars_that_pass_through_each_other_end_the_run(integrator, tmp_path):
 
 
 def test_bars_that_cross_in_the_mesh_do_not_touch(tmp_path):
-    for lift, contacts in ((0.0, 0), (0.01, 1)):
+    for lift, contacts in ((0.0, 0), (0.004, 0), (0.01, 1)):
         rows, _ = rows_of(crossed(lift=lift, speed=1.0, time={"end": 3e-3}), MPI.COMM_SELF, tmp_path, f"{lift}")
         assert column(rows, "self_contact/contacts").max() == contacts
     # the distance in the mesh takes the place of the sum of radii: there is no force at the start
@@ -379,3 +379,26 @@ def test_broken_bars_touch_nothing(tmp_path):
 def test_deep_overlap_is_told(tmp_path, capfd):
     rows_of(crossed(speed=40.0, time={"step": 2e-5, "end": 3e-3}), MPI.COMM_SELF, tmp_path, "run")
     assert "bars have overlapped by up to" in capfd.readouterr().err
+
+
+def test_contact_goes_over_to_the_next_stage(tmp_path):
+    """Bars that touch when a stage ends keep their forces and friction, and the energy balance goes on."""
+    case = sliding(None, self_contact={"friction": 0.3, "restitution": 0.6}).to_dict()
+    time = case.pop("time")
+    mesh = Truss(
+        np.array([[-0.3, -0.2, 0], [-0.3, 0.2, 0], [0.3, -0.2, 0], [0.3, 0.2, 0], [-0.5, 0, 0.02], [0.5, 0, 0.02]]),
+        [[0, 1], [2, 3], [4, 5]],
+    )
+    case.pop("mesh")
+    case["stage"] = [
+        {"name": "one", "time": {**time, "end": 0.05}},
+        {"name": "two", "time": {**time, "end": 0.08}},
+    ]
+    rows, x = rows_of(Case(case, mesh=mesh), MPI.COMM_SELF, tmp_path, "stages")
+    np.testing.assert_allclose(x[4:, 0] - [-0.5, 0.5], 0.3**2 / (2.0 * 0.3 * 10.0), rtol=0.02)
+    assert np.abs(column(rows, "energy_imbalance")).max() < 1e-12
+    lost = column(rows, "self_contact_dissipation")
+    assert np.diff(lost).min() > -1e-9 and lost[-1] == pytest.approx(0.5 * 1000.0 * AREA * 0.3**2, rel=0.02)
+    with pytest.raises(InputError, match=r"self_contact.* needs an explicit integrator"):
+        case["stage"].append({"name": "still", "static": {}})
+        Simulation(Case(case, mesh=mesh), MPI.COMM_SELF, output=tmp_path / "no")

@@ -112,7 +112,7 @@ def warn_of_gain(case: Case, step: float, across: float = np.inf) -> str:
     step, parameters = float(f"{step:.2g}"), time.scheme.model_dump()
     bars = max(round(across), BARS[0]) if across < BARS[-1] else BARS[-1]
     gain, worst = -1.0, RodImpact(treatment, time.mass == "consistent", step, 0.0, bars)
-    for restitution in sorted({0.0, *(wall.restitution for wall in case.wall)}):
+    for restitution in sorted({0.0, *(keys.restitution for keys in (*case.wall, *case.contact_pair))}):
         impact = replace(worst, restitution=restitution)
         found = impact_gain(time.integrator, tuple(parameters.values()), impact)
         if found > gain:

@@ -243,7 +243,7 @@ def push_nodes(where, load, free, stiffness, u, contact):
                 contact[i, c] += load[k, c]
 
 
-_ITERATIONS = 100  # linearisations of a problem
+_ITERATIONS = 300  # linearisations of a problem
 _TAG = 7700  # of messages between ranks with nodes of the same rows, distinct from those of ghosts
 
 
@@ -647,7 +647,7 @@ class RowSet:
             self._solve(groups, system, tolerances, size, pushes)
             return pushes, jacobian, system
         jacobian, at, rows, chosen = jacobian.copy(), x.copy(), None, np.empty(len(again), dtype=bool)
-        system, lift = system._replace(gradients=jacobian), np.broadcast_to(lift, len(self.source))
+        system, lift, pushed = system._replace(gradients=jacobian), np.broadcast_to(lift, len(self.source)), x.copy()
         for _ in range(_ITERATIONS):
             chosen[:] = False
             chosen[groups] = True
@@ -659,7 +659,8 @@ class RowSet:
                 linearise(fewer, system, x, at, self.values(at, fewer) - lift[fewer])
                 if walls is not None:
                     load = self.forces(jacobian, pushes.force, pushes.drag) * nodes.free
-                    system = system._replace(**walls.planes(at, x + load / nodes.stiffness[:, None])._asdict())
+                    pushed += 0.5 * (x + load / nodes.stiffness[:, None] - pushed)  # or walls may alternate
+                    system = system._replace(**walls.planes(at, pushed)._asdict())
             rows = fewer
             self._solve(groups, system, tolerances, size, pushes)
             settled = np.empty(len(groups), dtype=bool)

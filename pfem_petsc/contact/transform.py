@@ -161,8 +161,8 @@ class RowCoordinates:
         tolerance = PROJECTED * self.constraints.contact.size
         nodes = FreeNodes(x, k, self._start, self._part == 0.0, rows.free)
         with agreed(self.comm):
-            pushes, *_ = rows.project(nodes, tolerance)
-        u[here] += pushes.moves[rows.mine]
+            pushes, jacobian, _ = rows.project(nodes, tolerance)
+        u[here] += (rows.forces(jacobian, pushes.force) * rows.free / k[:, None])[rows.mine]
 
     def forward(self, w: np.ndarray) -> None:
         """Transform w to y (owned, 3), in place. Collective."""

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from helpers.bodies import HELD, MASSES, G, bodies, case_points, rows_of, upper
-from helpers.lattices import planes, two_lattices
+from helpers.lattices import planes, simulation, two_lattices
 from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
 
 from pfem_petsc import Case
+from pfem_petsc.errors import InputError
 
 ANGLE = 0.3
 SCHEMES = ["central_differences", "chung_lee", "hulbert_chung"]
@@ -130,3 +131,93 @@ def test_any_number_of_ranks(kind, integrator, comm, shared_tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-10
     names = "pair/faces/force", "impact_dissipation", "friction_dissipation", "centre_of_mass", "elastic_energy"
     assert_as_on_one_rank(history, case, comm, shared_tmp_path, *names, within=1e-9)
+
+
+BESIDE = {
+    "rough": planes([[0.0, 0.1, 1.0], [0.1, 1.0, -0.2]], [-0.001, -0.04], friction=0.3),
+    "static": planes([[0.0, 0.1, 1.0], [0.1, 1.0, -0.2]], [-0.001, -0.04], friction=0.2, static_friction=0.4),
+    "rebounding": planes([[0.0, 0.1, 1.0]], [-0.001], restitution=0.5),
+    "tied": planes([[0.0, 0.1, 1.0]], [-0.001], tied=True),
+    "sphere": [{"type": "sphere", "point": [0.1, 0.1, -1.003], "radius": 1.0}],
+    "rough sphere": [{"type": "sphere", "point": [0.1, 0.1, -1.003], "radius": 1.0, "friction": 0.2}],
+    "rough cylinder": [
+        {
+            "type": "cylinder",
+            "point": [0.1, 0.1, 0.1],
+            "axis": [1, 0, 0],
+            "radius": 0.15,
+            "side": "inside",
+            "friction": 0.2,
+        }
+    ],
+    "moving": planes([[0.0, 0.1, 1.0]], [-0.001], friction=0.3, velocity=[0.5, 0.0, 0.2]),
+    "rectangle": [
+        {"type": "rectangle", "point": [0.1, 0.1, -0.002], "normal": [0, 0, 1], "along": [1, 0, 0], "size": [0.5, 0.5]}
+        | {"friction": 0.2, "restitution": 0.3}
+    ],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("crowded", [False, True], ids=["single", "crowded"])
+@pytest.mark.parametrize("kind", BESIDE)
+def test_every_step_obeys_all_laws(kind, crowded, comm, tmp_path):
+    """Pairs and walls at the same nodes: no row is violated, none pulls, and drags obey Coulomb's law."""
+    case = two_lattices(tmp_path / "m.vtu", "central_differences", step=1e-4, end=0.01)
+    static = 0.35 if kind == "static" else 0.25
+    case["contact_pair"][0] |= {"friction": 0.25, "static_friction": static}
+    if crowded:
+        case["contact_pair"].append({**case["contact_pair"][0], "name": "across", "direction": [1.0, -0.4, 0.3]})
+    case["wall"] = BESIDE[kind]
+    run = simulation(case, comm, tmp_path)
+    stepper, links, contact, both = run.stepper, run.model.links, run.model.contact, 0
+    rows = links.rows
+    for step in run:
+        x = stepper.balance.predictor + stepper.solution.u
+        gaps, before = rows.values(rows.gather(x)), rows.gather(stepper.state.position)
+        pressed = links.force > 0.0
+        assert gaps.min() > -1e-12 and links.force.min() >= 0.0
+        assert np.abs(gaps[pressed]).max(initial=0.0) < 1e-12
+        if not contact.partial:
+            assert contact.gaps(x, stepper.balance.time).min() > -1e-12
+        slip = rows.slips(rows.gather(x) - before)
+        slip -= np.einsum("ri,ri->r", slip, links.two.normals)[:, None] * links.two.normals
+        size, drag = np.linalg.norm(slip, axis=1), np.linalg.norm(links.drag, axis=1)
+        assert (drag <= static * links.force * (1.0 + 1e-12) + 1e-15).all()
+        slides = pressed & (size > 1e-9)
+        against = -0.25 * (links.force / np.maximum(size, 1e-300))[:, None] * slip
+        np.testing.assert_allclose(links.drag[slides], against[slides], rtol=1e-4, atol=1e-9)
+        both += int(np.isin(stepper.solution.walls.nodes, links.pressed()).sum())
+        assert abs(step.row["energy_imbalance"]) < 1e-10
+    assert both > 0
+
+
+@pytest.mark.parametrize(
+    ("integrator", "tables", "message"),
+    [
+        ("newmark", {}, "contact_pair 'faces': friction needs an explicit integrator"),
+        (
+            "chung_lee",
+            {"contact": {"treatment": "stick"}},
+            "contact_pair 'faces': friction needs an explicit integrator",
+        ),
+        ("central_differences", {"static_friction": 0.1}, "static_friction must be no less than friction = 0.3"),
+        (
+            "central_differences",
+            {"mass": 2.0},
+            "wall 'floor' stops nodes of pairs .* must be without",
+        ),
+    ],
+)
+def test_refusals(integrator, tables, message, comm, tmp_path):
+    pair = {"friction": 0.3} | {key: value for key, value in tables.items() if key == "static_friction"}
+    floor = {"type": "plane", "name": "floor", "point": [0.0, 0.0, -1.0], "normal": [0.0, 0.0, 1.0]}
+    walls = [floor | {"mass": tables["mass"]}] if "mass" in tables else []
+    with pytest.raises(InputError, match=message):
+        rows_of(bodies(comm, integrator, pair=pair, wall=walls, contact=tables.get("contact", {})), comm, tmp_path)
+
+
+def test_statics_refuse_friction_of_pairs(comm, tmp_path):
+    case = bodies(comm, pair={"friction": 0.3}, static={"step": 1.0}, time=None, **HELD)
+    with pytest.raises(InputError, match="contact_pair 'faces': friction needs an explicit integrator"):
+        rows_of(case, comm, tmp_path)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pfem_petsc.contact.projection import Groups, RowPushes, System, project_groups
+from pfem_petsc.contact.projection import RUBS, Groups, RowPushes, System, project_groups
 
 
 def frames(normals):
@@ -113,3 +113,37 @@ def test_groups_as_by_another_method(seed):
     scale = max(1.0, np.abs(forces).max())
     np.testing.assert_allclose(pushes.force[:, None] * group.normals + pushes.drag, forces, atol=1e-7 * scale)
     np.testing.assert_allclose(pushes.moves, moves, atol=1e-7 * scale)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_supported_groups_obey_the_law(seed):
+    """Supports at some components, and more friction: what is found satisfies all conditions."""
+    group = Group(seed, most=0.8, fixed=0.3)
+    found, pushes = group.solve()
+    if found == (0, RUBS):
+        return  # a jam, or more friction than any position can balance
+    if found == (0, 0):
+        assert group.free.min() == 0.0  # supports leave no room
+        return
+    n, ends = group.normals, group.ends
+    usable = (n**2 * (group.free[ends[:, 0]] + group.free[ends[:, 1]])).sum(axis=1) > 1e-12
+    moved = pushes.moves[ends[:, 1]] - pushes.moves[ends[:, 0]]
+    gaps = group.values + np.einsum("ri,ri->r", n, moved)
+    slips = group.slips + moved
+    slips -= np.einsum("ri,ri->r", slips, n)[:, None] * n
+    size, drag = np.linalg.norm(slips, axis=1), np.linalg.norm(pushes.drag, axis=1)
+    scale = max(1.0, pushes.force.max())
+    assert gaps[usable].min(initial=0.0) > -1e-9 * scale and pushes.force.min() >= 0.0
+    assert np.abs(pushes.force * gaps).max() < 1e-8 * scale
+    assert (drag <= group.friction * pushes.force + 1e-12 * scale).all()
+    slides = (pushes.force > 0.0) & (size > 1e-6)
+    against = -(group.friction * pushes.force / np.maximum(size, 1e-300))[:, None] * slips
+    np.testing.assert_allclose(pushes.drag[slides], against[slides], atol=1e-6 * scale)
+    # the forces of pairs, and of nothing else at nodes without walls, move the nodes
+    push = np.zeros_like(pushes.moves)
+    force = pushes.force[:, None] * n + pushes.drag
+    np.add.at(push, ends[:, 1], force)
+    np.add.at(push, ends[:, 0], -force)
+    alone = group.plane < 0
+    expected = push * group.free / group.stiffness[:, None]
+    np.testing.assert_allclose(pushes.moves[alone], expected[alone], atol=1e-9 * scale)

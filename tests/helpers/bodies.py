@@ -68,7 +68,7 @@ def bodies(
         "output": {"fields_every": 0},
         **tables,
     }
-    return Case(case, mesh=mesh)
+    return Case({key: value for key, value in case.items() if value is not None}, mesh=mesh)
 
 
 HELD = {"support": [{"node_set": "lower", "fix": "xyz"}]}

@@ -479,6 +479,7 @@ class ExplicitContact(NodeWalls):
         super().__init__(case, nodes, mesh, fixed, parameters)
         self.ties = Ties(self, case.wall if parameters is None else parameters)
         self._unmoved = np.zeros((len(self.wall_of), 3))
+        self.pushes = np.zeros((2, len(self.walls), 3))  # known forces of walls on bars, and their moments
         self.plain = bool((self.surfaces.radii != OTHER).all()) and not (self.partial or self.ties.any)
         self._part = 1.0  # see :meth:`acting`
         self._room = np.empty(len(self.members) if self.any else 0, dtype=np.int64)
@@ -569,7 +570,7 @@ class ExplicitContact(NodeWalls):
                 tied, at = self.ties.nodes()
                 gives = stiffness[tied, None] * ~self.fixed[tied]
                 np.add.at(slope, at, gives[:, :, None] * np.eye(3))
-            return walls.force[free.at], self.of_walls(slope)[free.at]
+            return (walls.force + self.pushes[0])[free.at], self.of_walls(slope)[free.at]
 
         found = free.solve(forces, FIXED_POINT * self.size)
         if failure is not None:

@@ -25,7 +25,7 @@ could jump over another in a step, or has passed its axis, ends the run.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import acosh, asin, exp, inf, pi, sqrt, tan
+from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -40,6 +40,7 @@ from ..mesh.slab import slab_of, slab_range
 from ..output.units import engineering
 from ..parallel.agreement import agreed
 from ..parallel.natural import NaturalOrder
+from .bars_at_walls import BarsAtWalls, damping_of
 from .neighbours import Points, Regions, Segments, find_pairs, largest_change, make_regions, segment_distance
 from .rows import owner_starts, to_owners
 
@@ -425,28 +426,6 @@ def largest_move(x, last, drift):
     return np.sqrt(square) if np.isfinite(total) else np.inf
 
 
-def restitution_of(damping: float) -> float:
-    """Return the ratio of velocities after and before an impact on a spring and a damper that never pull.
-
-    Source: Schwager and Pöschel, Granular Matter 9 (2007), 465, in terms of the damping ratio.
-    """
-    if damping < 1.0:
-        angle = asin(damping)
-        return exp(-tan(angle) * (pi - 2.0 * angle))
-    if damping == 1.0:
-        return exp(-2.0)
-    return exp(-2.0 * damping / sqrt(damping * damping - 1.0) * acosh(damping))
-
-
-def damping_of(restitution: float) -> float:
-    """Return the damping ratio for :func:`restitution_of`, by bisection."""
-    low, high = 0.0, 1e3
-    for _ in range(100):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if restitution_of(middle) > restitution else (low, middle)
-    return 0.5 * (low + high) if restitution < 1.0 else 0.0
-
-
 def _numbered(ends: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distinct numbers (q,) of nodes among ``ends`` (m, 4), ascending, and the ends as places in them; most
     are in the range of this rank's ``own`` numbers, where they are marked instead of sorted."""
@@ -470,6 +449,9 @@ class SelfContact:
 
     Attributes
     ----------
+    chosen : (bars,) bool, local bars that touch others
+    room : sum of squared frequencies that the step leaves for contacts [1/s2]
+    at_walls : BarsAtWalls, of walls that bars can cross between their nodes, or None
     dissipated : energy that this rank's counted pairs have lost [J]
     sums : (6,) of the last forces, see :data:`ENERGY`
     deepest : largest overlap so far over the radius
@@ -494,7 +476,7 @@ class SelfContact:
                 chosen[:] = False
                 chosen[bars_of_group(model.case, mesh, "self_contact.bars", str(table.bars))] = True
         chosen &= mesh.bar_ids < mesh.n_bars - mesh.n_connectors
-        self._bars = np.arange(len(mesh.bars), dtype=np.int32)[mesh.counted]
+        self.chosen, self._bars = chosen, np.arange(len(mesh.bars), dtype=np.int32)[mesh.counted]
         self._bars = self._bars[chosen[self._bars]]
         self._radius = model.bars.radii() if table.radius is None else np.full(len(mesh.bars), float(table.radius))
         lengths = model.bars.mesh_lengths[self._bars]
@@ -506,7 +488,7 @@ class SelfContact:
         self._starts = owner_starts(mesh)
         self._numbers = np.concatenate([mesh.first_node + np.arange(mesh.n_owned), mesh.ghost_numbers])
         self._make_directory()
-        self._h, self._room = 0.0, 0.0
+        self._h, self.room = 0.0, 0.0
         self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
         self.sums = self._no_sums = np.zeros(6)
         self._way, self._limit, self._drift = 0.0, 0.0, np.zeros(3)
@@ -515,6 +497,8 @@ class SelfContact:
         self._exchange: GhostExchange | None = None
         self._near: tuple[Regions, float] | None = None
         self._empty()
+        made = BarsAtWalls(model, chosen)
+        self.at_walls = made if made.walls else None
 
     def _make_directory(self) -> None:
         """Send the ends, radius and stiffness of all bars to the ranks of their slabs."""
@@ -551,7 +535,7 @@ class SelfContact:
                 f"{source}: time.step = {h:g} s leaves no room for the stiffness of [self_contact] below the critical "
                 f"step of {critical:.6g} s; use at most {0.9 * critical:.6g} s"
             )
-        self._room = room / (h * h)
+        self.room = room / (h * h)
 
     def _refuse(self) -> None:
         """Refuse analyses that contact cannot serve."""
@@ -674,7 +658,7 @@ class SelfContact:
         pairs.stiffness[begin], pairs.drag[begin] = pairs.most[begin], inf
         if not self._h:
             return
-        room = self._mass[:, None] * np.array([0.5 * self._room, 0.5 / self._h])
+        room = self._mass[:, None] * np.array([0.5 * self.room, 0.5 / self._h])
         left = np.array(_PART) * np.maximum(room - load[:, :2], 0.0) / np.maximum(load[:, 2:], 1e-6)
         least = left[pairs.ends[begin]].min(axis=1, initial=inf)
         pairs.stiffness[begin] = np.minimum(pairs.most[begin], least[:, 0])
@@ -697,6 +681,13 @@ class SelfContact:
         return self.evaluate(x, f, step if step < np.inf else 0.0, commit)
 
     def evaluate(self, x: np.ndarray, f: np.ndarray, step: float, commit: bool) -> tuple[float, float]:
+        """Add the forces of :meth:`evaluate_bars`, and find those of walls between nodes; see there. Collective."""
+        stored, _ = self.evaluate_bars(x, f, step, commit)
+        if self.at_walls is not None and commit:
+            self.dissipated += self.at_walls.evaluate(x, step)
+        return stored + (0.0 if self.at_walls is None else self.at_walls.energy), self.dissipated
+
+    def evaluate_bars(self, x: np.ndarray, f: np.ndarray, step: float, commit: bool) -> tuple[float, float]:
         """Add the forces at positions ``x``, a ``step`` [s] after the last that were committed, to ``f``, both
         (local, 3); return the stored energy and all that is dissipated [J]. Collective.
 
@@ -811,6 +802,7 @@ class SelfContact:
         return {
             "pairs": self.comm.allreduce(len(self._table())),
             "deepest": self.comm.allreduce(self.deepest, op=MPI.MAX),
+            "last_step": 0.0 if self.at_walls is None else self.at_walls.last_step,
         }
 
     def orders(self, numbers: dict[str, Any]) -> dict[str, NaturalOrder]:
@@ -826,6 +818,8 @@ class SelfContact:
         Collective."""
         self.deepest, self.dissipated = float(numbers["deepest"]), dissipated
         self._take(arrays.get("self_contact.pairs", np.empty((0, WIDTH + 3))), x)
+        if self.at_walls is not None:
+            self.at_walls.resume(x, float(numbers["last_step"]))
 
     def take_over(self, earlier: SelfContact, x: np.ndarray) -> None:
         """Go on from the end of an earlier stage, at positions (owned, 3). Collective."""

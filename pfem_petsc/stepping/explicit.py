@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -77,15 +78,18 @@ class ExplicitStepper(Stepper):
         if inertia.damped:
             stiffness += balance.eta * inertia.damping
             load -= inertia.damping[:, None] * balance.v_hat
-        u = load / stiffness[:, None]
+        u, state.contact = load / stiffness[:, None], self.zero
+        between = None if model.self_contact is None else model.self_contact.at_walls
+        if between is not None:
+            state.contact, model.contact.pushes = between.force.copy(), between.sums
+            u += state.contact / stiffness[:, None]
         if supports.any:
             supports.put(u, supports.lacking(balance.predictor, balance.time))
-        state.contact = self.zero
         walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.size
         with self._faults(balance):
             pushes = model.links.explicit(balance, state, u, stiffness, tolerance)
             if pushes is not None:
-                state.contact = np.zeros_like(u)
+                state.contact = state.contact + np.zeros_like(u)
                 model.links.push(pushes, stiffness, u, state.contact)
         if model.contact.any:
             # also after a failure of links: with walls with mass this call is collective
@@ -96,6 +100,9 @@ class ExplicitStepper(Stepper):
                     if state.contact is self.zero:
                         state.contact = np.zeros_like(u)
                     state.contact[held] += force
+        if between is not None:
+            force, moment = between.sums
+            walls = replace(walls, force=walls.force + force, moment=walls.moment + moment)
         if supports.any:
             state.support = supports.part(stiffness[:, None] * u - load - state.contact)
         return Solution(u, state.f, walls, contacts=model.links.count_held(held))

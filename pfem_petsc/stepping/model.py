@@ -232,7 +232,8 @@ class Model:
         known = self.bars.springs, self.self_contact
         others = any(not any(family is one for one in known) for family in self.bars.families)
         changing = self.supports.inclined is not None or self.bars_vary or others or self.inertia.varies
-        return not changing and self.external.scheduled and self.contact.steady
+        between = self.self_contact is not None and self.self_contact.at_walls is not None
+        return not (changing or between) and self.external.scheduled and self.contact.steady
 
     def initial_velocity(self) -> np.ndarray:
         """Return initial velocities (owned, 3) [m/s]; later ``[initial]`` tables override earlier ones. Collective."""

@@ -15,7 +15,8 @@ Where the data are stored:
 - Arrays of the bars: data of the laws, thermal strains, rest lengths, history of the lagged preconditioner.
 - ``free_walls``: walls with mass, including their last increment. Forces of pairs and
   constraints, and which of them are closed: arrays of their rows; with rows that come and go, the rows themselves.
-- ``self_contact``: pairs of bars near each other with their memory, positions at the search, and the way since then.
+- ``self_contact``: pairs of bars that touch, with their stiffness and memory. Which others are near each other is found
+  again; results do not depend on when.
 - ``ranks``: works and energies. Recorder: energy at the start, largest energy, iterations since the last row.
   ``blow_up``: suspicious rows, energy input, energies of the first row. Contact log: contact times and impulses.
 - Attributes (plan): time step and linear solver.
@@ -59,7 +60,7 @@ if TYPE_CHECKING:
     from .stepping.plan import Plan
     from .stepping.stepper import Stepper
 
-STATE_VERSION = 8
+STATE_VERSION = 9
 """Changed with the meaning of what is saved."""
 
 _MEMORY = "memory."

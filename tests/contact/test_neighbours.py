@@ -2,8 +2,16 @@
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
-from pfem_petsc.contact.neighbours import Points, Segments, find_pairs
+from pfem_petsc.contact.neighbours import (
+    Points,
+    Segments,
+    find_pairs,
+    largest_change,
+    make_regions,
+    segment_distance,
+)
 
 
 def segments(ends, ids, margin):
@@ -80,3 +88,35 @@ def distances(one, two):
                 s = np.clip(np.nan_to_num(((q + t[:, None] * v - p) * u).sum(axis=1) / uu), 0.0, 1.0)
                 least = np.minimum(least, np.linalg.norm(p + s[:, None] * u - q - t[:, None] * v, axis=1))
     return least
+
+
+@pytest.mark.parametrize("local", [False, True])
+def test_changes_of_distances_are_bounded(local):
+    """No distance up to a reach changes by more than the bound, and none from beyond falls below it by more."""
+    random, comm, reach = np.random.default_rng(12), MPI.COMM_SELF, 0.6
+    for size, wide, amplitude in ((6.0, 6.0, 0.3), (20.0, 20.0, 4.0), (200.0, 3.0, 1.0)):
+        start = random.uniform(0.0, [size, wide, wide], (160, 3))
+        ends = np.column_stack([start, start + random.normal(size=(160, 3)) / 3.0]).reshape(-1, 3)
+        spin = np.linalg.qr(np.eye(3) + 0.3 * random.normal(size=(3, 3)))[0]
+        now = ends @ (spin * np.linalg.det(spin)) * 1.01
+        now += amplitude * np.sin(5.0 * ends[:, [1, 2, 0]] / size) + 0.01 * random.normal(size=ends.shape) + 5.0
+        longest = float(np.linalg.norm(ends[1::2] - ends[::2], axis=1).max())
+        near = (make_regions(comm, ends, 6.0 * longest), longest) if local else None
+        change = largest_change(comm, (ends, now), len(ends), reach, near)
+        before, after = (
+            np.array([segment_distance(x, pairs, 2 * i, 2 * i + 1)[0] for i in range(len(pairs) // 2)])
+            for pairs in [every_pair(len(start))]
+            for x in (ends, now)
+        )
+        close = before <= reach
+        assert np.abs(after - before)[close].max(initial=0.0) <= change
+        assert after[~close].min() >= reach - change
+        if local and size > 100.0:  # where the bound by all nodes would be larger
+            assert change < 0.6 * largest_change(comm, (ends, now), len(ends), reach)
+
+
+def every_pair(n):
+    """Segments (n (n - 1), 2) of all pairs of n, one after the other."""
+    first, second = np.triu_indices(n, 1)
+    both = np.column_stack([first, second]).reshape(-1)
+    return np.column_stack([2 * both, 2 * both + 1])

@@ -308,7 +308,9 @@ def test_a_restart_continues_to_the_bit(comm, shared_tmp_path):
         if comm.rank == 0:
             np.testing.assert_array_equal(x, y)
         for key in ("self_contact_energy", "self_contact_dissipation", "self_contact/force", "energy_imbalance"):
-            np.testing.assert_array_equal(column(whole, key)[-len(rows) :], column(rows, key))
+            # PT-Scotch may give the parts to other ranks the next time in a process, and sums over ranks are rounded
+            error = 0.0 if comm.size == 1 else 1e-14
+            np.testing.assert_allclose(column(rows, key), column(whole, key)[-len(rows) :], rtol=error, atol=error)
 
 
 @pytest.mark.parallel

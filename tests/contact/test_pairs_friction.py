@@ -7,7 +7,7 @@ from helpers.lattices import planes, simulation, two_lattices
 from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
 
 from pfem_petsc import Case
-from pfem_petsc.errors import InputError
+from pfem_petsc.errors import InputError, SimulationFailure
 
 ANGLE = 0.3
 SCHEMES = ["central_differences", "chung_lee", "hulbert_chung"]
@@ -221,3 +221,35 @@ def test_statics_refuse_friction_of_pairs(comm, tmp_path):
     case = bodies(comm, pair={"friction": 0.3}, static={"step": 1.0}, time=None, **HELD)
     with pytest.raises(InputError, match="contact_pair 'faces': friction needs an explicit integrator"):
         rows_of(case, comm, tmp_path)
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
+@pytest.mark.parametrize("friction", [0.3, 0.6, 1.5, 8.0])
+def test_guided_body_is_stopped_by_any_friction(integrator, friction, comm, tmp_path):
+    """Falling on a slope at 60 degrees, normal force and drag both push it up: their ratio is that of the law."""
+    normal, slope = np.sqrt(0.75), 0.5
+    guided = [{"node_set": "lower", "fix": "xyz"}, {"node_set": "upper", "fix": "xy"}]
+    pair = {"direction": [-normal, 0.0, slope], "gap": 0.00474, "friction": friction}
+    case = bodies(comm, integrator, gravity=(0.0, 0.0, 0.0), pair=pair, on={"upper": [0.0, 0.0, -0.1]}, support=guided)
+    rows, _ = rows_of(case, comm, tmp_path)
+    x, _, z = next(row["pair/faces/force"] for row in rows if row["pair/faces/force"][2] > 0.0)
+    assert x / z == pytest.approx((friction * slope - normal) / (slope + friction * normal), rel=1e-6)
+    assert rows[-1]["friction_dissipation"] > 0.0
+    assert abs(rows[-1]["energy_imbalance"]) < 1e-12
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
+def test_a_jam_ends_the_run(integrator, comm, shared_tmp_path):
+    """A body that moves pushes one that is guided at 60 degrees to the normal of their faces: beyond cot 60 = 0.577."""
+    guided = [{"node_set": "lower", "fix": "xyz", "velocity": [0.1, 0.0, 0.0]}, {"node_set": "upper", "fix": "xz"}]
+    for friction in (0.5, 0.7):
+        pair = {"direction": [np.sqrt(0.75), 0.5, 0.0], "gap": 0.0, "friction": friction}
+        case = bodies(comm, integrator, gravity=(0.0, 0.0, 0.0), pair=pair, support=guided, end=0.02)
+        if friction < 0.577:
+            rows, _ = rows_of(case, comm, shared_tmp_path, "free")
+            assert rows[-1]["friction_dissipation"] > 0.0
+            assert abs(rows[-1]["energy_imbalance"]) < 1e-12
+            continue
+        with pytest.raises(SimulationFailure, match=r"the friction of nodes .* on walls did not converge"):
+            rows_of(case, comm, shared_tmp_path, "jammed")

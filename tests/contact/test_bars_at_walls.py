@@ -13,11 +13,11 @@ ACROSS = [[-1.0, 0.0, 0.52], [1.0, 0.0, 0.52]]
 MASS = 0.2
 
 
-def falling(wall, points=ACROSS, velocity=(0.0, 0.0, -1.0), step=5e-4, end=0.1, **tables):
+def falling(wall, points=ACROSS, velocity=(0.0, 0.0, -1.0), step=2e-4, end=0.12, **tables):
     """A stiff bar that moves across a wall that is smaller than it."""
     return {
         "mesh": {"generator": "arrays", "points": points, "bars": [[0, 1]]},
-        "material": {"m": {"young_modulus": 1e6, "density": 1e3}},
+        "material": {"m": {"young_modulus": 1e7, "density": 1e3}},
         "section": {"s": {"area": 1e-4, "material": "m"}},
         "initial": {"velocity": list(velocity)},
         "wall": [{"name": "w", **wall}],
@@ -35,7 +35,7 @@ def test_bar_that_falls_on_a_sphere(integrator, restitution, comm, shared_tmp_pa
     case = falling({**BALL, "restitution": restitution})
     case["time"]["integrator"] = integrator
     rows, run = rows_of(case, comm, shared_tmp_path)
-    np.testing.assert_allclose(run.state.v[:, 2], restitution, rtol=4e-3)
+    np.testing.assert_allclose(run.state.v[:, 2], restitution, rtol=0.01)
     last = rows[-1]
     given = comm.allreduce(float(run.state.v[:, 2].sum())) * 0.5 * MASS + MASS
     np.testing.assert_allclose(last["wall/w/impulse"], [0.0, 0.0, given], atol=1e-12)
@@ -64,10 +64,10 @@ def test_wall_that_moves_works_on_the_bar(comm, shared_tmp_path):
 
 
 def test_bar_across_the_edge_of_a_box(comm, shared_tmp_path):
-    """A bar that falls across the edge of a box of triangles is pushed along the mean of the faces' normals, across it."""
+    """A bar that falls across the edge of a box of triangles is pushed across the edge and its axis."""
     file = write_surface(shared_tmp_path / "box.obj", *box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0)), comm)
-    points = [[0.52, 0.0, 0.5], [1.52, 0.0, -0.5]]
-    case = falling({"type": "surface", "file": file, "restitution": 1.0}, points, (-0.5, 0.0, -0.5), end=0.15)
+    points = [[0.51, 0.0, 0.51], [1.51, 0.0, -0.49]]
+    case = falling({"type": "surface", "file": file, "restitution": 1.0}, points, (-0.5, 0.0, -0.5))
     _, run = rows_of(case, comm, shared_tmp_path)
     assert comm.allreduce(float(run.state.v[:, 1].sum())) == pytest.approx(0.0, abs=1e-12)
     np.testing.assert_allclose(run.state.v[:, [0, 2]], 0.5, rtol=0.01)  # it was hit in its middle
@@ -79,8 +79,8 @@ def test_bar_rests_between_its_nodes(comm, shared_tmp_path):
     points = [[-1.0, 0.0, 0.5], [1.0, 0.0, 0.5]]
     case = falling(wall, points, (0.0, 0.0, 0.0), end=0.3, gravity={"acceleration": [0.0, 0.0, -10.0]})
     rows, run = rows_of(case, comm, shared_tmp_path)
-    assert np.mean([row["wall/w/force"][2] for row in rows[300:]]) == pytest.approx(MASS * 10.0, rel=0.02)
-    np.testing.assert_allclose(run.state.position[:, 2], 0.5 - MASS * 10.0 / 50.0, atol=0.02)
+    assert np.mean([row["wall/w/force"][2] for row in rows[500:]]) == pytest.approx(MASS * 10.0, rel=0.02)
+    np.testing.assert_allclose(run.state.position[:, 2], 0.5 - MASS * 10.0 / 500.0, atol=1e-4)
     del case["self_contact"]
     _, run = rows_of(case, comm, shared_tmp_path, "free")
     assert run.state.position[:, 2].max(initial=-1.0) < 0.1
@@ -89,13 +89,15 @@ def test_bar_rests_between_its_nodes(comm, shared_tmp_path):
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
 def test_on_any_rank_count_and_restarted(integrator, comm, shared_tmp_path):
-    wall = {**BALL, "friction": 0.3, "restitution": 0.4, "rotation": None}
+    wall = {**BALL, "friction": 0.3, "restitution": 0.4}
     wall["rotation"] = {"centre": [0.0, 0.0, 0.0], "axis": [1.0, 0.0, 0.0], "angular_velocity": 4.0}
     points = [[-1.0, 0.1, 0.52], [0.4, 0.1, 0.52], [1.2, 0.0, 0.53]]
-    case = falling(wall, points, (0.0, 0.3, -1.0), end=0.04)
+    case = falling(wall, points, (0.0, 0.3, -1.0), end=0.03)
     case["mesh"]["bars"] = [[0, 1], [1, 2]]
     case["time"]["integrator"] = integrator
+    if integrator == "chung_lee":  # which has no restitution beside friction
+        del case["wall"][0]["restitution"]
     case = Case.from_dict(case)
-    history = assert_restart_is_bitwise(case, comm, shared_tmp_path, 45, 52)
+    history = assert_restart_is_bitwise(case, comm, shared_tmp_path, 110, 125)
     names = "momentum", "kinetic_energy", "self_contact_dissipation", "wall/w/impulse", "wall/w/moment"
     assert_as_on_one_rank(history, case, comm, shared_tmp_path, *names)

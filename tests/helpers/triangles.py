@@ -43,3 +43,13 @@ def groove():
     """An open sheet: two rectangles that fall towards the line x = 0, z = 0 with the slope 1/2."""
     points = np.array([[x, y, abs(x) / 2] for x in (-2.0, 0.0, 2.0) for y in (-3.0, 3.0)])
     return points, np.array([[0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3]])
+
+
+def write_surface(file, points, corners, comm):
+    """Write a surface to an OBJ file, on rank 0; return its name. Collective."""
+    if comm.rank == 0:
+        rows = [f"v {x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
+        rows += ["f " + " ".join(str(k + 1) for k in corner) for corner in corners.tolist()]
+        file.write_text("\n".join(rows) + "\n")
+    comm.Barrier()
+    return str(file)

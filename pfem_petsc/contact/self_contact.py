@@ -45,7 +45,6 @@ from .rows import owner_starts, to_owners
 
 if TYPE_CHECKING:
     from ..integrators.base import Scheme
-    from ..mechanics.block_pattern import BlockPattern
     from ..stepping.model import Model
 
 _CROSSED = 0.1  # largest square of the sine of the angle from which bars touch in one point
@@ -462,7 +461,7 @@ def _numbered(ends: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 class SelfContact:
-    """Contact of bars with bars, an :class:`~pfem_petsc.mechanics.elements.ElementFamily`. Construction is collective.
+    """Contact of bars with bars, whose forces are added to those of bars in explicit steps. Construction is collective.
 
     Parameters
     ----------
@@ -843,15 +842,3 @@ class SelfContact:
         rows = to_owners(rows, range(2, 6), starts, comm)
         self._keys = rows[:, 0] * n_bars + rows[:, 1]
         self._touching = np.ascontiguousarray(rows[:, 6:]).view(np.float64)
-
-    # linear elements
-
-    def add_product(self, weight: float, u: np.ndarray, out: np.ndarray) -> None:
-        """Add nothing: the plan of explicit steps leaves room for the stiffness of contacts."""
-
-    def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
-        """Steps with discrete gradients are implicit."""
-        raise NotImplementedError
-
-    def add_tangents(self, weight: float, pattern: BlockPattern, values: np.ndarray) -> None:
-        """Add nothing, as :meth:`add_product`: what modes are found of has no bars that touch."""

@@ -46,14 +46,13 @@ from .rows import owner_starts, to_owners
 
 if TYPE_CHECKING:
     from ..integrators.base import Scheme
-    from ..mechanics.block_pattern import BlockPattern
     from ..stepping.model import Model
 
 _CROSSED = 0.1  # largest square of the sine of the angle from which bars touch in one point
 _STIFFNESS = 1.0  # of a pair, over the harmonic mean of E A/l of its bars
 _SHARE = 0.2  # of the mass of a pair over the square of the step, which its stiffness does not exceed
 _PART = 0.1, 0.5  # of the stiffness and damping that a node may still have, for what begins to touch it in a step
-_ROOM = 0.1  # least sum of squared frequencies that a step must leave for contacts, over its inverse square
+_ROOM = 0.6  # least sum of squared frequencies that a step must leave for contacts, over its inverse square
 _SKIN = 0.1, 0.5  # least and largest distance beyond the radii up to which pairs are listed, over the length of bars
 _STEPS = 20.0  # steps for which the skin should be sufficient, unless it is too large then
 _FEW, _MANY = 0.25, 3.0  # pairs for each bar in lists that are made with a larger or a smaller skin the next time
@@ -441,7 +440,7 @@ def _numbered(ends: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 class SelfContact:
-    """Contact of bars with bars, an :class:`~pfem_petsc.mechanics.elements.ElementFamily`. Construction is collective.
+    """Contact of bars with bars, whose forces are added to those of bars in explicit steps. Construction is collective.
 
     Parameters
     ----------
@@ -837,15 +836,3 @@ class SelfContact:
         rows = to_owners(rows, range(2, 6), starts, comm)
         self._keys = rows[:, 0] * n_bars + rows[:, 1]
         self._touching = np.ascontiguousarray(rows[:, 6:]).view(np.float64)
-
-    # linear elements
-
-    def add_product(self, weight: float, u: np.ndarray, out: np.ndarray) -> None:
-        """Add nothing: the plan of explicit steps leaves room for the stiffness of contacts."""
-
-    def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
-        """Steps with discrete gradients are implicit."""
-        raise NotImplementedError
-
-    def add_tangents(self, weight: float, pattern: BlockPattern, values: np.ndarray) -> None:
-        """Add nothing, as :meth:`add_product`: what modes are found of has no bars that touch."""

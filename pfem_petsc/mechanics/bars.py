@@ -22,6 +22,7 @@ from .chunk_laws import STRESS, densities_row, evaluate, first_class, flatten, l
 from .elements import (
     MEASURES,
     ElementFamily,
+    ForceElements,
     MatrixRows,
     add_step_forces,
     add_step_tangents,
@@ -377,6 +378,7 @@ class Bars:
     viscous : whether bars of the case have a viscous stress, the same on all ranks
     viscous_blocks : those of them on this rank
     families : other elements, whose forces and stiffness are added to those of the bars
+    touching : contact of bars with bars, whose forces alone are added; None without
     """
 
     def __init__(self, mesh: DistributedMesh, case: Case) -> None:
@@ -385,6 +387,7 @@ class Bars:
         self.mesh_lengths = np.empty(len(mesh.bars))
         bar_lengths(mesh.points, mesh.bars, self.mesh_lengths)
         self.families: list[ElementFamily] = []
+        self.touching: ForceElements | None = None
         self.rest_at_start = np.empty(0)
         self.step = 0.0
         self.internal = internal_variables(case.material)
@@ -556,7 +559,7 @@ class Bars:
             places, forces, self.reference, self.loops("full"), self.step, commit, energies
         )
         join_components(forces, f)
-        for family in self.families:
+        for family in [*self.families, *([] if self.touching is None else [self.touching])]:
             for name, energy in zip(family.energies, family.add_forces(x, f, commit), strict=True):
                 energies[BAR_ENERGIES.index(name)] += energy
         return StrainEnergy(tuple(energies.tolist()), failed, shortened, changed)

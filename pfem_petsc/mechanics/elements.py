@@ -78,10 +78,10 @@ def mean_ratio(measure: int, s0: float, s1: float) -> tuple[float, float]:
     return _green_ratio(s0, s1) if measure == GREEN else _logarithmic_ratio(s0, s1)
 
 
-class ElementFamily(Protocol):
-    """Elements besides the bars, such as springs to the ground: what :class:`~pfem_petsc.mechanics.bars.Bars` adds up.
+class ForceElements(Protocol):
+    """Elements besides the bars whose forces :class:`~pfem_petsc.mechanics.bars.Bars` adds up, such as bars that touch.
 
-    Stiffness is that at the positions of the last forces. Each rank adds what acts on the nodes that it owns.
+    Each rank adds what acts on the nodes that it owns.
 
     Attributes
     ----------
@@ -93,6 +93,11 @@ class ElementFamily(Protocol):
     def add_forces(self, x: np.ndarray, f: np.ndarray, commit: bool) -> tuple[float, ...]:
         """Add the internal forces at positions ``x`` to ``f``, both (local, 3); return the energies [J]. What elements
         remember is updated only if ``commit``."""
+
+
+class ElementFamily(ForceElements, Protocol):
+    """Elements with forces and stiffness, such as springs to the ground. The stiffness is that at the positions of the
+    last forces."""
 
     def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
         """Add the discrete gradient of a step from ``x0`` to ``x``, whose work is the change of the energy."""

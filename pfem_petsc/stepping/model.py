@@ -148,9 +148,7 @@ class Model:
             self.rest_lengths = RestLengths(case, self.bars)
         self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
         self.links = ConstraintSet(case, self.nodes, self.contact)
-        self.self_contact = SelfContact(self) if case.self_contact is not None else None
-        if self.self_contact is not None:
-            self.bars.families.append(self.self_contact)
+        self.self_contact = self.bars.touching = SelfContact(self) if case.self_contact is not None else None
         self.can_touch = self.contact.any or bool(self.links)
         if self.supports.inclined is not None:
             refuse_inclined(case.source, mesh, self.supports.inclined.nodes, self.contact, self.links)
@@ -229,8 +227,7 @@ class Model:
     def steady(self) -> bool:
         """Whether steps can be compiled ones: supports are along axes, bars and damping constant in time, loads
         depend on time alone, and walls are infinite planes, spheres or cylinders, without mass and not tied."""
-        known = self.bars.springs, self.self_contact
-        others = any(not any(family is one for one in known) for family in self.bars.families)
+        others = any(family is not self.bars.springs for family in self.bars.families)
         changing = self.supports.inclined is not None or self.bars_vary or others or self.inertia.varies
         between = self.self_contact is not None and self.self_contact.at_walls is not None
         return not (changing or between) and self.external.scheduled and self.contact.steady

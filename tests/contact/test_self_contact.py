@@ -191,19 +191,22 @@ def test_two_bars_exchange_their_velocities(angle, integrator, comm, shared_tmp_
         assert touching.sum() * 5e-5 == pytest.approx(np.pi * np.sqrt(mass / stiffness), rel=0.05)
 
 
+@pytest.mark.slow
 def test_energy_converges_with_the_square_of_the_step(tmp_path):
     lost = []
     for step in (4e-5, 1e-5, 2.5e-6):
-        rows, _ = rows_of(crossed(time={"step": step, "end": 8e-3}), MPI.COMM_SELF, tmp_path, f"{step}")
+        case = crossed(lift=0.0201, time={"step": step, "end": 1.8e-3})
+        rows, _ = rows_of(case, MPI.COMM_SELF, tmp_path, f"{step}")
         kinetic = column(rows, "kinetic_energy")
         lost.append(abs(kinetic[-1] / kinetic[0] - 1.0))
     assert lost[2] < 4e-6 and lost[1] < 1e-4 and lost[0] < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restitution", [0.9, 0.5, 0.2])
 def test_restitution(restitution, tmp_path):
     for step, accuracy in ((5e-5, 0.02), (5e-6, 2e-3)):
-        case = crossed(time={"step": step, "end": 8e-3}, self_contact={"restitution": restitution})
+        case = crossed(lift=0.0201, time={"step": step, "end": 3e-3}, self_contact={"restitution": restitution})
         rows, _ = rows_of(case, MPI.COMM_SELF, tmp_path, f"{step}")
         check_conservation(rows)
         kinetic = column(rows, "kinetic_energy")
@@ -214,6 +217,7 @@ def test_restitution(restitution, tmp_path):
         assert np.diff(lost).min() > -1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
 def test_chains(integrator, comm, shared_tmp_path):
@@ -230,6 +234,7 @@ def test_chains(integrator, comm, shared_tmp_path):
         np.testing.assert_allclose(x, y, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_numbers_do_not_matter(tmp_path):
     tables = {"time": {"step": 2e-5}, "self_contact": {"friction": 0.3, "restitution": 0.8}}
     points, bars, speed = chain_tables()
@@ -260,6 +265,7 @@ def sliding(comm, **tables):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_friction_stops_a_bar(comm, shared_tmp_path):
     case = sliding(comm, self_contact={"friction": 0.3, "restitution": 0.6})
@@ -274,6 +280,7 @@ def test_friction_stops_a_bar(comm, shared_tmp_path):
         np.testing.assert_allclose(x[4:, 2], 0.02, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_single_steps_are_those_of_calls(tmp_path):
     """The same steps in compiled calls and one by one, which a function of the user brings about."""
     made = []
@@ -291,6 +298,7 @@ def test_single_steps_are_those_of_calls(tmp_path):
         np.testing.assert_allclose(one, other, atol=1e-7 * np.abs(one).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_a_restart_continues_to_the_bit(comm, shared_tmp_path):
     tables = {"time": {"step": 2e-5, "end": 8e-3}, "self_contact": {"friction": 0.3, "restitution": 0.8}}

@@ -287,6 +287,59 @@ def guyed_mast(run):
     return history["support_force"][-1, 2]
 
 
+@number
+def lattice_crush(run):
+    """A plateau as of first yield, contact that carries on from there, and bars that do not overlap."""
+    history = run("lattice_crush")
+    strain = -5.0 * (history["time"] - 1e-4) / 0.04  # the plate moves from 0.25 mm above nodes moved by up to 0.25 mm
+    impulse = history["wall/plate/impulse"][:, 2]
+    stress = np.diff(impulse) / np.diff(history["time"]) / -1.6e-3
+    plateau = stress[(strain[1:] < -0.2) & (strain[1:] > -0.4)].mean()
+    assert stress[strain[1:] < -0.6].mean() > 1.25 * plateau
+    assert history["self_contact/overlap"].max() < 0.05 * np.sqrt(1.4731e-6 / np.pi)
+    assert history["self_contact/contacts"].max() > 200
+    work = history["contact_work"][-1]
+    assert history["kinetic_energy"][len(strain) // 10 :].max() < 0.03 * work
+    assert abs(history["energy_imbalance"]).max() < 1e-12 * work
+    return plateau
+
+
+@number
+def net_catch(run):
+    """Momentum of net and ball beside all impulses; ropes yield, and the ball is slower."""
+    history = run("net_catch", "time.end=0.3")
+    ball = 50.0 * history["wall/ball/velocity"]
+    weight = np.outer(history["time"], [0.0, 0.0, -50.0 * 9.81])
+    given = history["wall/ball/impulse"] + history["wall/ball/jump_impulse"]
+    own = ball - ball[0] - weight + given
+    net = history["momentum"] - given
+    net = net - sum(history[f"{name}_impulse"] for name in ("external", "support", "damping"))
+    size = np.abs(given).max()
+    assert size > 10.0
+    assert np.abs(net).max() < 1e-12 * size
+    assert abs(history["energy_imbalance"]).max() < 1e-9 * history["external_work"].max()
+    return np.abs(own + net).max() / size
+
+
+@number
+def truss_collision(run):
+    """Momentum to rounding; friction dissipates and takes little of the angular momentum, else nothing does."""
+    history = run("truss_collision", "time.end=8e-3")
+    energy = history["kinetic_energy"][0]
+    assert history["self_contact_dissipation"][-1] > 0.05 * energy
+    assert np.diff(history["self_contact_dissipation"]).min() > -1e-12 * energy
+    smooth = run("truss_collision", "self_contact.friction=0", "time.end=8e-3")
+    for each in (history, smooth):
+        assert each["self_contact/contacts"].max() > 20 and each["self_contact/contacts"][-1] == 0
+        assert abs(each["energy_imbalance"]).max() < 1e-12 * energy
+        assert np.abs(each["momentum"] - each["momentum"][0]).max() < 1e-12 * np.abs(each["momentum"][0]).max()
+    assert np.abs(smooth["self_contact_dissipation"]).max() < 1e-12 * energy
+    spins = [each["angular_momentum"] for each in (history, smooth)]
+    changes = [np.abs(spin - spin[0]).max() / np.abs(spin[0]).max() for spin in spins]
+    assert changes[0] < 0.01
+    return changes[1]
+
+
 @pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("name", built_in_cases())

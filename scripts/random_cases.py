@@ -2,10 +2,12 @@
 
     .venv/bin/python scripts/random_cases.py --seeds 0:1000 --jobs 2 --keep failing
     .venv/bin/python scripts/random_cases.py --staged --seeds 0:300 --jobs 2 --keep failing
+    .venv/bin/python scripts/random_cases.py --touching --seeds 0:300 --restart-every 2 --keep failing
     .venv/bin/python scripts/random_cases.py --cases failing/*.toml
 
 Cases are drawn over all documented keys and their combinations, one per seed; with `--staged` they have two to four
-stages, forms before and load cases after them. Each is run on one rank and on three, in
+stages, forms before and load cases after them, with `--touching` surfaces of triangles, walls that turn, pairs that rub
+and rebound, and bars that touch. Each is run on one rank and on three, in
 one process for many cases; every third one is also stopped in the middle and continued. Checks: status 0, 2 or 3, with
 a message unless it is 0; no node beyond a wall; finite results; energy balance and growth; dissipations; momentum;
 tables of members; a load case or combination as stages by hand; agreement between numbers of ranks to 1e-9; bitwise
@@ -55,7 +57,15 @@ def main() -> int:
     parser.add_argument("--restart-every", type=int, default=3, metavar="N", help="continue every N-th; 0: none")
     parser.add_argument("--schemes-every", type=int, default=0, metavar="N", help="both kinds of schemes; 0: none")
     parser.add_argument("--copies-every", type=int, default=0, metavar="N", help="moved, turned ... ones; 0: none")
-    parser.add_argument("--staged", action="store_true", help="cases of two to four stages, statics and motion")
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument(
+        "--staged", action="store_const", dest="kind", const="staged", default="single",
+        help="cases of two to four stages, statics and motion",
+    )  # fmt: skip
+    kinds.add_argument(
+        "--touching", action="store_const", dest="kind", const="touching",
+        help="cases with surfaces of triangles, walls that turn, rough pairs and bars that touch",
+    )  # fmt: skip
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes at a time (default: 1)")
     parser.add_argument("--patience", type=float, default=60.0, metavar="S", help="longest time of a case [s]")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="where the cases with a fault are put, as TOML files")
@@ -67,8 +77,10 @@ def main() -> int:
 
         seeds = json.loads(arguments.seeds)
         sources = {number: str(path) for number, path in enumerate(arguments.cases)}
-        work(arguments.worker, seeds, arguments.folder, arguments.restart_every, sources, arguments.staged)
+        work(arguments.worker, seeds, arguments.folder, arguments.restart_every, sources, arguments.kind)
         return 0
+    if arguments.kind == "touching" and arguments.copies_every:
+        parser.error("--copies-every: surfaces of triangles are in files, which are not copied")
     if arguments.cases:
         seeds = list(range(len(arguments.cases)))
     elif "," in arguments.seeds:
@@ -157,11 +169,10 @@ class Study:
             if not cause.startswith(LOOSE):
                 print(f"{self._name(seed)}: {cause}: {detail[:300]}", flush=True)
         if self.arguments.keep is not None and not self.arguments.cases and not cause.startswith(LOOSE):
-            from random_trusses.draw import draw_case
-            from random_trusses.draw_stages import draw_staged
+            from random_trusses.comparisons import DRAWN
             from random_trusses.running import case_text
 
-            table = (draw_staged if self.arguments.staged else draw_case)(seed)
+            table = DRAWN[self.arguments.kind](seed)
             self.arguments.keep.mkdir(parents=True, exist_ok=True)
             (self.arguments.keep / f"random-{seed}.toml").write_text(case_text(table))
 
@@ -195,7 +206,7 @@ class Study:
         """Run one worker process; if it ends early, return the case in progress and how it ended."""
         line = [sys.executable, __file__, "--worker", mode, "--seeds", json.dumps(seeds)]
         line += ["--folder", str(self.folder), "--restart-every", str(self.arguments.restart_every)]
-        line += ["--staged"] if self.arguments.staged else []
+        line += [] if self.arguments.kind == "single" else [f"--{self.arguments.kind}"]
         if self.arguments.cases:
             line += ["--cases", *map(str, self.arguments.cases)]
         if ranks > 1:

@@ -134,18 +134,20 @@ def _find(triangles, nodes, ways, tolerance, table, kept):
         if known[i] == _BEHIND:
             continue
         distance = _tangent(triangles, 0, x, math.inf, own, level)
-        on, worst = False, 0
+        on, there, worst = False, False, 0
         for k in range(3):
             gaps[k] = math.inf
             if offsets[i, k] > -math.inf:
-                gaps[k] = -offsets[i, k]
+                gaps[k], along = -offsets[i, k], 0.0
                 for c in range(3):
                     gaps[k] += normals[i, k, c] * x[c]
+                    along += normals[i, k, c] * own[0, 0, c]
                 on = on or abs(gaps[k]) <= tolerance
+                there = there or (along > _SAME and abs(offsets[i, k] - level[0, 0]) <= tolerance)
             worst = k if gaps[k] > gaps[worst] else worst
         if distance > tolerance and on:  # on the plane of a face, beside it
             offsets[i, :] = -math.inf
-        elif not distance < -tolerance:
+        elif there or not distance < -tolerance:  # else a plane found for the same position would take all slots
             continue
         changed = True
         offsets[i, worst] = -math.inf

@@ -20,7 +20,10 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pyvista as pv
 from mpi4py import MPI
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 from pfem_petsc import open_result
 from pfem_petsc.case.schema import Case
@@ -215,16 +218,33 @@ def _walls(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults
             row = rows.get(int(step))
             if moved is not None and row is None:
                 continue
-            shift = np.zeros(3) if moved is None else moved[row] - moved[0]
-            at = result.positions[i][members] - shift
+            at = _seen(wall, result.positions[i][members], history, row)
             depth = -_distances(wall, at)
             if wall.type == "rectangle":
-                depth[~_before_rectangle(wall, result, i, members, at, moved, rows)] = 0.0
+                depth[~_before_rectangle(wall, result, i, members, at, rows)] = 0.0
             if len(depth) and depth.max() > worst[0]:
                 worst = (float(depth.max()), f"snapshot {i} of {len(result.steps)}, node {members[depth.argmax()]}")
         if worst[0] > tolerance + _wilson(case, history, result):
             faults.append(("node beyond a wall", f"{wall.name} ({wall.type}) by {worst[0]:.3g} m in {worst[1]}"))
     return faults
+
+
+def _seen(wall: WallKeys, x: np.ndarray, history: dict[str, np.ndarray], row: int | None) -> np.ndarray:
+    """Return where positions (m, 3) at a row of the history are as seen from a wall, which then seems at rest."""
+    centre, turn = history.get(f"wall/{wall.name}/position"), wall.rotation
+    if centre is None:
+        return x
+    if turn is None:
+        return x - (centre[row] - centre[0])
+    time, angle = history["time"][row], (turn.angular_velocity or 0.0) * history["time"][row]
+    if turn.angles is not None:
+        rows, values = np.array(turn.angles).T
+        if turn.interpolation == "linear" or len(rows) == 1:
+            angle = float(np.interp(time, rows, values))
+        else:
+            angle = float(CubicSpline(rows, values, bc_type="clamped")(np.clip(time, rows[0], rows[-1])))
+    back = Rotation.from_rotvec(-angle * np.array(turn.axis) / np.linalg.norm(turn.axis))
+    return back.apply(x - centre[row]) + centre[0]  # about the wall's own centre, whose way is in the history
 
 
 def _members(case: Case, name: str | None) -> np.ndarray:
@@ -234,8 +254,14 @@ def _members(case: Case, name: str | None) -> np.ndarray:
 
 
 def _distances(wall: WallKeys, x: np.ndarray) -> np.ndarray:
-    """Distance (m,) of points from the surface, negative beyond it."""
+    """Distance (m,) of points from the surface, negative beyond it; zero for a surface beside which nodes can pass."""
     arm = x - np.array(wall.point)
+    if wall.type == "surface":
+        surface = pv.read(wall.file).triangulate()
+        if surface.n_open_edges or wall.side == "both":
+            return np.zeros(len(x))
+        distances = pv.PolyData(arm / wall.scale).compute_implicit_distance(surface)["implicit_distance"]
+        return wall.scale * np.asarray(distances) * (-1.0 if wall.flip else 1.0)
     if wall.type in ("plane", "rectangle"):
         return arm @ np.array(wall.normal) / np.linalg.norm(wall.normal)
     if wall.type == "cylinder":
@@ -251,16 +277,15 @@ def _before_rectangle(
     i: int,
     members: np.ndarray,
     at: np.ndarray,
-    moved: np.ndarray | None,
     rows: dict[int, int],
 ) -> np.ndarray:
     """Nodes that were before the rectangle in the last snapshot and well inside of its edges then and now."""
     if i == 0 or result.steps[i] - result.steps[i - 1] > 1:
         return np.zeros(len(at), dtype=bool)
     row = rows.get(int(result.steps[i - 1]))
-    if moved is not None and row is None:
+    if row is None and f"wall/{wall.name}/position" in result.history:
         return np.zeros(len(at), dtype=bool)
-    before = result.positions[i - 1][members] - (0.0 if moved is None else moved[row] - moved[0])
+    before = _seen(wall, result.positions[i - 1][members], result.history, row)
     normal = np.array(wall.normal) / np.linalg.norm(wall.normal)
     along = np.array(wall.along) - (np.array(wall.along) @ normal) * normal
     along /= np.linalg.norm(along)
@@ -291,7 +316,7 @@ def _energy(case: Case, history: dict[str, np.ndarray], warned: list[str], size:
     heat = history["plastic_heat"]
     if (np.diff(heat) < -1e-9 * scale).any() or heat.min() < -1e-9 * scale:
         faults.append(("plastic heat falls", f"{np.diff(heat).min() / scale:.3g} of the largest energy"))
-    kinds = ("damping", "friction", "impact", "damage", "rupture")
+    kinds = ("damping", "friction", "impact", "damage", "rupture", "self_contact")
     for name in (f"{kind}_dissipation" for kind in kinds):
         if name in history and history[name].min() < -1e-9 * scale:
             faults.append((f"{name} negative", f"{history[name].min() / scale:.3g} of the largest energy"))
@@ -398,7 +423,7 @@ def _gains(case: Case, history: dict[str, np.ndarray], warned: list[str], scale:
     if any("energy" in text or "amplifies" in text for text in warned):
         return []
     faults: Faults = []
-    moving = any(wall.velocity or wall.motion or wall.mass for wall in case.wall)
+    moving = any(wall.velocity or wall.motion or wall.mass or wall.rotation for wall in case.wall)
     put_in = history["kinetic_energy"][0] + history["elastic_energy"][0]
     put_in += np.abs(history["external_work"]).max() + np.abs(history["thermal_work"]).max()
     put_in += history["spring_energy"][0]

@@ -31,6 +31,7 @@ from pfem_petsc.stepping.plan import make_plan
 
 from .checks import Loaded, check_result, distance, energy_scale, stage_end
 from .draw import draw_case, generated, members_of
+from .draw_contact import draw_touching
 from .draw_stages import draw_staged
 from .running import case_text, clear, run_case, run_in_two_parts, steps_of
 
@@ -621,15 +622,17 @@ def amplification(text: str, whole: Path, folder: Path, source: str) -> float:
     return worst
 
 
-def work(
-    mode: str, seeds: Iterable[int], folder: Path, every_restart: int, sources: dict[int, str], staged: bool
-) -> None:
-    """Process the cases of a worker, of stages if they are ``staged``. Collective.
+DRAWN = {"single": draw_case, "staged": draw_staged, "touching": draw_touching}
+"""What draws the cases: of one analysis, of stages, and with contact of surfaces, turning walls, pairs and bars."""
+
+
+def work(mode: str, seeds: Iterable[int], folder: Path, every_restart: int, sources: dict[int, str], kind: str) -> None:
+    """Process the cases of a worker, of a ``kind`` in :data:`DRAWN`. Collective.
 
     ``mode``: "check" runs and checks, "run" only runs, "judge" compares the results of both and removes them, "schemes"
     compares explicit and implicit schemes, "copies" the copies of a case.
     """
-    comm, draw = MPI.COMM_WORLD, draw_staged if staged else draw_case
+    comm, draw = MPI.COMM_WORLD, DRAWN[kind]
     for seed in seeds:
         _tell(comm, "begin", seed, {})
         source = sources.get(seed, f"random-{seed}.toml")

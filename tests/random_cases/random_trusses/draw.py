@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import math
 import random
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -734,8 +735,11 @@ class Motion:
     end: float
 
 
-def draw_case(seed: int) -> dict[str, Any]:
-    """Return the case of a number as nested tables with the keys of a case file and plain numbers only."""
+def draw_case(seed: int, changes: Sequence[tuple[str, float | None, Callable[..., None]]] = ()) -> dict[str, Any]:
+    """Return the case of a number as nested tables with the keys of a case file and plain numbers only.
+
+    ``changes``: what is drawn besides, as :data:`CHANGES`, which is the default.
+    """
     chance = random.Random(f"truss {seed}")
     body = draw_body(chance)
     time = _time(chance, body)
@@ -760,7 +764,7 @@ def draw_case(seed: int) -> dict[str, Any]:
     case["time"] = time
     case["output"] = _output(chance, motion, case["node_set"])
     case |= _solver(chance, time)
-    for name, share, change in CHANGES:
+    for name, share, change in changes or CHANGES:
         own = random.Random(f"{name} {seed}")
         if share is None or own.random() <= share:
             change(own, case, body, motion)

@@ -5,6 +5,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, Truss
+from pfem_petsc.contact.bars_at_walls import damping_of, restitution_of
 from pfem_petsc.contact.neighbours import segment_distance
 from pfem_petsc.contact.self_contact import (
     DISSIPATED,
@@ -14,10 +15,8 @@ from pfem_petsc.contact.self_contact import (
     NodeArrays,
     PairArrays,
     PairLaw,
-    damping_of,
     evaluate_pairs,
     find_beginning,
-    restitution_of,
 )
 from pfem_petsc.errors import InputError, SimulationFailure
 

@@ -162,7 +162,7 @@ _GROUPS = (OF_RUN, OF_ANALYSES, ITERATIONS, COUNTS, ENERGIES, VECTORS, OF_WALLS,
 DECLARED = {
     column.name: column for column in (*(column for group in _GROUPS for column in group), STAGE, IMBALANCE, CHANGES)
 }
-"""All columns by the last part of their names."""
+"""All columns by the last part of their names, those of bars that touch by the whole."""
 
 
 def declared(name: str) -> Column:

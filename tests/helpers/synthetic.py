@@ -49,6 +49,8 @@ def lattice(n: int = 5) -> tuple[np.ndarray, np.ndarray]:
 class SyntheticCase(SimpleNamespace):
     """A case without stages."""
 
+    self_contact = None
+
     @property
     def every_wall(self):
         return self.wall

@@ -9,14 +9,11 @@ of their normals that does not change g along the axis.
 from __future__ import annotations
 
 from math import acosh, asin, exp, pi, sqrt, tan
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from .wall_motion import Poses
-
-if TYPE_CHECKING:
-    from ..stepping.model import Model
 
 _SHARE = 0.2  # of the lighter node's mass over the square of the step, and of what this leaves, that is the stiffness
 _CRITICAL = exp(-2.0)  # restitution of a damper with which nothing swings back; walls with less get it
@@ -62,7 +59,7 @@ class BarsAtWalls:
     sums : (2, walls, 3) forces of walls on this rank's counted bars [N], and their moments about the origin [N m]
     """
 
-    def __init__(self, model: Model, chosen: np.ndarray) -> None:
+    def __init__(self, model: Any, chosen: np.ndarray) -> None:
         contact, mesh = model.contact, model.mesh
         self._model, self._contact, self._mesh = model, contact, mesh
         closed = [getattr(wall, "closed", True) and not wall.partial for wall in contact.walls]

@@ -46,7 +46,6 @@ from .rows import owner_starts, to_owners
 
 if TYPE_CHECKING:
     from ..integrators.base import Scheme
-    from ..stepping.model import Model
 
 _CROSSED = 0.1  # largest square of the sine of the angle from which bars touch in one point
 _STIFFNESS = 1.0  # of a pair, over the harmonic mean of E A/l of its bars
@@ -464,7 +463,7 @@ class SelfContact:
 
     energies = ("self_contact_energy", "self_contact_dissipation")
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Any) -> None:
         self._model, self._mesh, self.comm = model, model.mesh, model.comm
         table, mesh, comm = model.case.self_contact, model.mesh, model.comm
         if model.case.time is None:

@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from ..contact.wall_motion import turns_about
 from ..contact.walls.base import WALLS, Surface, perpendicular, slab
 from ..errors import InputError
 from ..fields import STATUS
 from ..mechanics.bars import bar_shapes, mesh_of_cases, section_of_bars
+from ..mechanics.motion import rotation_of
 from ..output.units import MODE, POINT, Axis
 from ..registry import choices, lookup, nearest
 from .actions import Actions
@@ -113,16 +115,20 @@ class Motion:
         Those that a stage does not have are left out.
         """
         times = self.result.times[self.frames]
-        shifts, present = walls_at(self.result, times)
+        shifts, turns, present = walls_at(self.result, times)
         still = {surface.name: surface for surface in wall_surfaces(walls, self.bounds, self.note)}
         surfaces: dict[int, list[Surface]] = {frame: [] for frame in self.frames}
         for row, k in np.argwhere(present).tolist():
-            surface, shift = still.get(walls[k].name), shifts[row, k]
-            if walls[k].type == "plane":  # which is drawn beside the structure, wherever it is
+            surface, shift, turn = still.get(walls[k].name), shifts[row, k], turns[row, k]
+            turned = bool((turn != np.eye(3)).any())
+            if walls[k].type == "plane" and not turned:  # which is drawn beside the structure, wherever it is
                 normal = np.asarray(walls[k].normal) / np.linalg.norm(walls[k].normal)
                 shift = (shift @ normal) * normal
             if surface is not None:
-                moved = replace(surface, points=surface.points + shift) if shift.any() else surface
+                moved = replace(surface, points=surface.points + shift) if shift.any() and not turned else surface
+                if turned:
+                    centre = _place(walls[k])
+                    moved = replace(surface, points=(surface.points - centre) @ turn.T + centre + shift)
                 surfaces[self.frames[row]].append(moved)
         return surfaces
 
@@ -530,9 +536,9 @@ def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str]
     return drawn
 
 
-def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return displacements (times, walls, 3) [m] of a result's walls from where they are first given, and which of them
-    are there (times, walls) bool.
+def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return displacements (times, walls, 3) [m] of a result's walls from where they are first given, their rotations
+    (times, walls, 3, 3), and which of them are there (times, walls) bool.
 
     Positions are interpolated linearly between rows of the history. The end of a stage belongs to it, and not to the
     next one. A wall that a stage no longer has remains where it was.
@@ -540,6 +546,7 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
     walls, history = result.case.every_wall, result.history
     names = [wall.name for wall in walls]
     shifts, present = np.zeros((len(times), len(walls), 3)), np.zeros((len(times), len(walls)), dtype=bool)
+    turns = np.tile(np.eye(3), (*present.shape, 1, 1))
     when = np.asarray(history["time"], dtype=float)
     numbers = np.asarray(history["stage"]) if "stage" in history else np.zeros(len(when), dtype=int)
     stages = result.case.stages
@@ -548,6 +555,11 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
     for number, stage in enumerate(stages):
         reached = current >= number
         present[reached] = np.isin(names, [wall.name for wall in stage.wall])
+        since = np.asarray(times)[reached] - (begins[number - 1] if number else 0.0)
+        for wall in (wall for wall in stage.wall if wall.rotation is not None):
+            axis = np.array(wall.rotation.axis) / np.linalg.norm(wall.rotation.axis)
+            angles = rotation_of(wall).at(since)[:, 0, 0]
+            turns[reached, names.index(wall.name)] = turns_about(np.tile(axis, (len(angles), 1)), angles)
         for wall in stage.wall if number else ():
             k = names.index(wall.name)
             shifts[reached, k] = _place(wall) - _place(walls[k])
@@ -555,7 +567,7 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
         if f"wall/{name}/position" in history:
             places = np.asarray(history[f"wall/{name}/position"], dtype=float)
             shifts[:, k] = np.stack([np.interp(times, when, column - column[0]) for column in places.T], axis=1)
-    return shifts, present
+    return shifts, turns, present
 
 
 def _place(wall: Any) -> np.ndarray:

@@ -228,10 +228,12 @@ class Model:
     @property
     def steady(self) -> bool:
         """Whether steps can be compiled ones: supports are along axes, bars and damping constant in time, loads
-        depend on time alone, and walls are infinite planes, spheres or cylinders, without mass and not tied."""
+        depend on time alone, and walls are infinite, spheres, cylinders or surfaces of triangles, without mass and
+        not tied; beside pairs and constraints they are not triangles and do not turn."""
         known = self.bars.springs, self.self_contact
         others = any(not any(family is one for one in known) for family in self.bars.families)
         changing = self.supports.inclined is not None or self.bars_vary or others or self.inertia.varies
+        changing = changing or (bool(self.links) and self.contact.called.any())
         return not changing and self.external.scheduled and self.contact.steady
 
     def initial_velocity(self) -> np.ndarray:

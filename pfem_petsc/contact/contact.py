@@ -15,6 +15,7 @@ from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .explicit import ExplicitContact
 from .frames import MIN_VOLUME, NodalFrames, Planes, build_frames
 from .node_walls import WallForces
+from .surfaces import OTHER
 from .tied import FreshTies
 from .wall_motion import Poses
 
@@ -41,9 +42,11 @@ class Contact(ExplicitContact):
 
     @property
     def steady(self) -> bool:
-        """Whether compiled steps serve the walls: infinite flat ones, spheres and cylinders, at rest or with
-        prescribed motion, but not tied."""
-        return not self.any or (self.plain and not self.motion.bodies.any)
+        """Whether compiled steps serve the walls: infinite flat ones, spheres, cylinders and surfaces of triangles, at
+        rest or with prescribed motion, but not tied."""
+        triangles = np.isin(np.arange(len(self.walls)), self.surfaces_of_triangles)
+        known = bool(((self.at_rest.radii != OTHER) | triangles).all()) and not self.partial
+        return not self.any or (known and not self.ties.any and not self.motion.bodies.any)
 
     def record(self, walls: WallForces, time: float, h: float) -> FreshTies:
         """Record a step of ``h`` [s] whose positions at ``time`` have these forces; return the nodes that were tied.

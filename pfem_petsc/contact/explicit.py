@@ -23,7 +23,9 @@ from .tied import Ties
 
 if TYPE_CHECKING:
     from ..case.schema import Case
+    from ..integrators.base import Balance
     from ..mesh.distribution import DistributedMesh
+    from .wall_motion import Poses
     from .walls.base import WallKeys
 
 
@@ -466,6 +468,8 @@ class ExplicitContact(NodeWalls):
     ----------
     ties : Ties
     plain : infinite flat walls, spheres and cylinders without ties: compiled passes handle them alone
+    room : (owned,) int64, where compiled passes list the nodes beyond the former; (0,) without walls
+    called : (walls,) bool, other walls and those that turn; at_rest : Surfaces of all walls (walls,) if none turned
     """
 
     def __init__(
@@ -481,8 +485,10 @@ class ExplicitContact(NodeWalls):
         self._unmoved = np.zeros((len(self.wall_of), 3))
         self.pushes = np.zeros((2, len(self.walls), 3))  # known forces of walls on bars, and their moments
         self.plain = bool((self.surfaces.radii != OTHER).all()) and not (self.partial or self.ties.any)
+        self.called = self.surfaces.radii[self.first] == OTHER
+        self.at_rest = Surfaces.of(self.walls, np.zeros(len(self.walls), dtype=bool))
         self._part = 1.0  # see :meth:`acting`
-        self._room = np.empty(len(self.members) if self.any else 0, dtype=np.int64)
+        self.room = np.empty(len(self.members) if self.any else 0, dtype=np.int64)
 
     def explicit(
         self,
@@ -551,7 +557,7 @@ class ExplicitContact(NodeWalls):
             pushes[bodies.at] = bodies.displacements(np.inf) - bodies.unpushed()
             pushed = pushes[self.wall_of]
         sets, moved = (self.all_nodes, members), (self.wall_of, way, pushed)
-        return PressedWalls(surfaces, part, *sets, tolerance, self._room, *moved, friction, restitution, *memory)
+        return PressedWalls(surfaces, part, *sets, tolerance, self.room, *moved, friction, restitution, *memory)
 
     def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
         """Find the final positions of walls with mass in an explicit step. Collective."""
@@ -662,31 +668,69 @@ class ExplicitContact(NodeWalls):
     def _press(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool) -> tuple:
         """Return nodes (m,) near walls that are not tied to them, positions (m, 3), forces (m, 3), and the sums per
         wall."""
-        w, state, poses = len(self.wall_of), self.state, self.motion.poses(time)
-        before = poses if state is None else self._poses_before()
-        surfaces = self.surfaces.at(poses.shifts[self.wall_of])
-        walls = self.pressed_walls(surfaces, self._part, tolerance, self._unmoved)
+        poses = self.motion.poses(time)
+        walls = self.pressed_walls(self.surfaces.at(poses.shifts[self.wall_of]), self._part, tolerance, self._unmoved)
         self.forget_faces()
-        bounces = len(walls.restitution) > 0
-        others = (walls.surfaces.radii == OTHER).any()
-        marked = np.full(len(x) // NODE_BLOCK + 1, bounces)
-        reference = by_reference(walls)
-        nodes = walls.room[: find_penetrating(np.ascontiguousarray(x.T), reference, marked)].copy()
-        if others:
+        marked = np.full(len(x) // NODE_BLOCK + 1, len(walls.restitution) > 0)
+        nodes = walls.room[: find_penetrating(np.ascontiguousarray(x.T), by_reference(walls), marked)].copy()
+        if (walls.surfaces.radii == OTHER).any():
             nodes = np.union1d(nodes, np.flatnonzero(self.near(x, poses)))
         if self.ties.any:
             nodes = nodes[~self.ties.held[nodes]]
+        free = x[nodes]
+        try:
+            return self._press_some(nodes, free, stiffness[nodes], poses, walls, booked)
+        except SimulationFailure:
+            x[nodes] = free
+            raise
+
+    def press_some(
+        self,
+        some: tuple[np.ndarray, np.ndarray],
+        x: np.ndarray,
+        stiffness: np.ndarray,
+        balance: Balance,
+        tolerance: float,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, WallForces]:
+        """Press ``some`` nodes, those (f,) that compiled loops have found beyond walls, and those (s,) of others that
+        are beyond walls that these do not know, where :meth:`explicit` looks at all nodes.
+
+        ``x`` (owned, 3), ``stiffness`` (owned,) : of these nodes, see :meth:`explicit`; ``balance`` : of the step
+
+        Returns
+        -------
+        (nodes (m,), positions (m, 3) [m], forces (m, 3) [N], WallForces)
+        """
+        found, suspects = some
+        self._part, poses = balance.acting, self.motion.poses(balance.time)
+        walls = self.pressed_walls(self.surfaces.at(poses.shifts[self.wall_of]), self._part, tolerance, self._unmoved)
+        self.forget_faces()
+        nodes = np.union1d(found, suspects[self.near(x[suspects], poses, nodes=suspects)])
+        return self._press_some(nodes, x[nodes], stiffness[nodes], poses, walls)
+
+    def _press_some(
+        self,
+        nodes: np.ndarray,
+        free: np.ndarray,
+        stiffness: np.ndarray,
+        poses: Poses,
+        walls: PressedWalls,
+        booked: bool = True,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, WallForces]:
+        """As :meth:`_press` of nodes (m,) that are ``free`` to move to (m, 3), where a failure leaves what is found."""
+        w, state, reference, tolerance = len(self.wall_of), self.state, by_reference(walls), walls.tolerance
         if len(nodes) == 0:
             return nodes, np.empty((0, 3)), np.empty((0, 3)), self.nothing
-        free = at = x[nodes]
+        before = poses if state is None else self._poses_before()
+        bounces, others, at = len(walls.restitution) > 0, (walls.surfaces.radii == OTHER).any(), free
         start, drift = free if state is None else state.position[nodes], np.zeros_like(free)
         if bounces:
-            drift = (time - state.time) * state.memory["half_velocity"][nodes]
+            drift = (poses.time - state.time) * state.memory["half_velocity"][nodes]
         applies = self.applicable(nodes, free, poses)
         planes = np.empty((0, w, 3)), np.empty((0, w))
         ways = self.ways(start, before, poses)
         self.find_faces(nodes, free, poses, 0.0)
-        of_nodes = stiffness[nodes], self.fixed[nodes], applies, self.log.touching[nodes]
+        of_nodes = stiffness, self.fixed[nodes], applies, self.log.touching[nodes]
         for _ in range(_CURVED_ROUNDS):
             if others:
                 planes = self.planes(applies, at, poses, self.acting(nodes, free, poses, self._part), nodes)
@@ -706,7 +750,7 @@ class ExplicitContact(NodeWalls):
         else:
             failed, why = int(np.argmax(np.abs(places - at).max(axis=1))), ADRIFT
         if failed >= 0:
-            x[nodes] = places
+            free[:] = places
             raise SimulationFailure(self.placeless(nodes[failed], why, found.normals[failed], found.offsets[failed]))
         if bounces and booked:
             walls.rebound[nodes], walls.arrival[nodes] = memory

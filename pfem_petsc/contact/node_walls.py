@@ -242,7 +242,7 @@ def near_planes(x, normals, offsets, all_nodes, members, reach, near):
     return count
 
 
-_ZERO = np.zeros(1)
+_ZERO, _ALL = np.zeros(1), slice(None)
 TURN = 0.8
 """Cosine between normals in a step, below which forces act along that at the new position."""
 
@@ -367,25 +367,28 @@ class NodeWalls:
             return self._offsets
         return self._offsets + np.einsum("ij,ij->i", self.normals, self.motion.poses(time).shifts[self.wall_of])
 
-    def near(self, x: np.ndarray, poses: Poses, reach: np.ndarray = _ZERO) -> np.ndarray:
-        """Return (owned,) bool: nodes at positions (owned, 3) within ``reach``, (owned,) or (1,) [m], of a wall.
+    def near(
+        self, x: np.ndarray, poses: Poses, reach: np.ndarray = _ZERO, nodes: np.ndarray | slice = _ALL
+    ) -> np.ndarray:
+        """Return (m,) bool: nodes (m,) at positions (m, 3) within ``reach``, (m,) or (1,) [m], of a wall; default: all
+        owned nodes.
 
         With a reach of zero these are the nodes beyond a wall.
         """
-        near = np.zeros(len(x), dtype=bool)
+        near, every = np.zeros(len(x), dtype=bool), self.members[nodes]
         if self.flat.any():
             at = self.flat
             offsets = self._offsets[at] + np.einsum("ij,ij->i", self.normals[at], poses.shifts[self.wall_of[at]])
-            members = self.members if self.flat.all() else np.ascontiguousarray(self.members[:, at])
+            members = every if self.flat.all() else np.ascontiguousarray(every[:, at])
             near_planes(x, self.normals[at], offsets, self.all_nodes[at], members, reach, near)
         if self._faces:
-            start, earlier, slack = self._starts(slice(None), x, poses)
+            start, earlier, slack = self._starts(nodes, x, poses)
         for k, s in enumerate(self.first):
             if k in self._faces:
                 ways = earlier.rest(k, start), poses.rest(k, x)
-                near |= self._faces[k].near(*ways, reach, slack) & self.members[:, s]
+                near |= self._faces[k].near(*ways, reach, slack) & every[:, s]
             elif not self.flat[s]:
-                near |= (self.gap(k, x, poses) < reach) & self.members[:, s]
+                near |= (self.gap(k, x, poses) < reach) & every[:, s]
         return near
 
     def applicable(self, nodes: np.ndarray, x: np.ndarray, poses: Poses) -> np.ndarray:
@@ -428,12 +431,12 @@ class NodeWalls:
                 self.fixed[nodes[mine]] & ~self.motion.turning[k],
                 slack[mine],
             )
-            kept = np.zeros((self.mesh.n_owned, 9))
-            if self.state is not None:
-                kept = self.state.memory.setdefault(f"faces_{k}", kept)
+            memory = {} if self.state is None else self.state.memory
+            if (name := f"faces_{k}") not in memory:
+                memory[name] = np.zeros((self.mesh.n_owned, 9))
             slots = slice(self.first[k], self.first[k] + 3)
-            occupied = self.log.touching[:, slots] | self.log.closed[:, slots]
-            found |= faces.find(nodes[mine], ways, tolerance, (kept, occupied))
+            occupied = self.log.touching[nodes[mine], slots] | self.log.closed[nodes[mine], slots]
+            found |= faces.find(nodes[mine], ways, tolerance, (memory[name], occupied))
         return found
 
     def _starts(self, nodes: np.ndarray | slice, x: np.ndarray, poses: Poses) -> tuple[np.ndarray, Poses, np.ndarray]:

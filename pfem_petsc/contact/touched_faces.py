@@ -84,9 +84,9 @@ def _mark_near(triangles, starts, ends, reach, slack, near):
 
 
 @inlined
-def _put(i, normal, offset, table, kept):
-    """Give node i a plane, in the slot in which it touched it before, or else in one that is free: a node that touches
-    another face has hit it."""
+def _put(i, j, normal, offset, table, kept):
+    """Give node i, the j-th of some, a plane, in the slot in which it touched it before, or else in one that is free: a
+    node that touches another face has hit it."""
     _, normals, offsets = table
     before, occupied = kept
     best, slot = -1, 0
@@ -96,7 +96,7 @@ def _put(i, normal, offset, table, kept):
         along = 0.0
         for c in range(3):
             along += normal[c] * before[i, 3 * k + c]
-        value = 1 if not occupied[i, k] else (2 if along > _SAME else 0)
+        value = 1 if not occupied[j, k] else (2 if along > _SAME else 0)
         if value > best:
             best, slot = value, k
     offsets[i, slot] = offset
@@ -112,7 +112,7 @@ def _find(triangles, nodes, ways, tolerance, table, kept):
     ----------
     ways : starts and ends (m, 3), fixed (m, 3) bool, and by how much each may have been behind the surface (m,) [m]
     table : marks of nodes (owned,), their normals (owned, 3, 3) and offsets (owned, 3)
-    kept : normals (owned, 9) of the planes of earlier steps, and which of these they touch (owned, 3) bool
+    kept : normals (owned, 9) of the planes of earlier steps, and which of these they touch (m, 3) bool
     """
     starts, ends, fixed, slack = ways
     known, normals, offsets = table
@@ -129,7 +129,7 @@ def _find(triangles, nodes, ways, tolerance, table, kept):
                 _tangent(triangles, 0, x, math.inf, own, level)
             for k in range(3):
                 if level[0, k] > -math.inf:
-                    _put(i, own[0, k], level[0, k], table, kept)
+                    _put(i, j, own[0, k], level[0, k], table, kept)
             continue
         if known[i] == _BEHIND:
             continue
@@ -151,7 +151,7 @@ def _find(triangles, nodes, ways, tolerance, table, kept):
             continue
         changed = True
         offsets[i, worst] = -math.inf
-        _put(i, own[0, 0], level[0, 0], table, kept)
+        _put(i, j, own[0, 0], level[0, 0], table, kept)
     return changed
 
 

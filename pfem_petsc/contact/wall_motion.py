@@ -298,6 +298,24 @@ class WallMotion:
                 values[:, :, k] += motion.at(times)[:, :2]
         return values
 
+    def turns(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return angles (t, w) [rad] and :class:`Poses` (t, w, 12), the elements of the turns and shifts, of walls with
+        prescribed motion at times (t,) [s]."""
+        size, angles = (len(times), len(self._motions)), np.zeros((len(times), len(self._motions)))
+        for k, rotation in enumerate(self._rotations):
+            if rotation is not None:
+                angles[:, k] = rotation.at(times)[:, 0, 0]
+        turned = turns_about(np.tile(self._axes, (len(times), 1)), angles.ravel()).reshape(*size, 3, 3)
+        shifts = self.schedule(times)[:, 0] + self._centres - np.einsum("twij,wj->twi", turned, self._centres)
+        if len(self.held.turns):
+            turned = turned @ self.held.turns
+        return angles, np.concatenate([turned.reshape(*size, 9), shifts], axis=2)
+
+    @property
+    def pivots(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit axes of rotation and points of them at rest (w, 3) [m]; zero for walls that do not turn."""
+        return self._axes, self._centres
+
     def rates(self, time: float, ahead: bool = False) -> np.ndarray:
         """Return velocities (w, 3) [m/s] at a time [s], those of the centres of rotation of walls that turn; at the
         kinks of a linear table the left limit, or the right one if ``ahead``."""

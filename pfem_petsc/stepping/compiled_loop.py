@@ -16,11 +16,8 @@ from ..mechanics.layout import clear, join_components, split_components
 from ..mechanics.loads import LoadSchedule, set_forces
 from ..mechanics.records import record
 from ..mesh.exchange import Messages
-from .contact_phase import (
-    PUSHED,
-    ContactNodes,
-    WallArrays,
-)
+from .called_walls import CalledWalls
+from .contact_phase import PUSHED, ContactNodes, WallArrays
 from .impact import join_nodes
 from .impulses import SUPPORT, WALLS, ContactSums, record_forces
 from .phases import (
@@ -30,6 +27,7 @@ from .phases import (
     INERTIAL,
     INTERNAL,
     KINETIC,
+    LOST,
     SUPPORTS,
     GroundSprings,
     Motion,
@@ -51,10 +49,6 @@ from .phases import (
 
 SOLVE, CLOSE = range(2)
 """What a call of Python does: solve rows, or find the energy that they lose."""
-
-FAILED, LOST = -1, -2
-"""Results of calls: a failure of the simulation, any other error."""
-
 
 record(Messages)  # which stands below the compiled loops
 
@@ -120,14 +114,15 @@ class ImpulseArrays(NamedTuple):
 
 @record
 class Calls(NamedTuple):
-    """Functions that the loop calls: of MPI, one of Python, of a step and :data:`SOLVE` or :data:`CLOSE`, and one of a
-    step that adds the forces of bars that touch."""
+    """Functions that the loop calls: of MPI, one of Python, of a step and :data:`SOLVE` or :data:`CLOSE`, one of a
+    step that adds the forces of bars that touch, and one for :class:`~pfem_petsc.stepping.called_walls.CalledWalls`."""
 
     start_all: Any
     wait_all: Any
     reduce_all: Any
     python: Any
     touch: Any
+    walls: Any
 
 
 @record
@@ -199,6 +194,7 @@ class StepArrays(NamedTuple):
     bars: StepBars
     loads: LoadSchedule
     walls: WallArrays
+    called_walls: CalledWalls
     rows: FixedRows
     called: CalledRows
     sums: StepSums

@@ -4,7 +4,6 @@ stepper, and what the stepper takes from it."""
 from __future__ import annotations
 
 import ctypes
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numba
@@ -23,9 +22,10 @@ from ..mechanics.compiled import COMPILED
 from ..mechanics.records import References, by_reference
 from ..mesh.exchange import SIGNATURES, CFunction, mpi_functions
 from ..mesh.ordering import NODE_BLOCK
-from ..parallel.ending import is_alone
 from ..parallel.heap import return_freed_memory
 from ..tolerances import PROJECTED
+from .called_walls import close_on_called, press_called, work_of_turns
+from .callers import RowCaller, TouchCaller, WallCaller
 from .compiled_loop import (
     AGREE,
     BEGIN,
@@ -34,10 +34,8 @@ from .compiled_loop import (
     COLLAPSED,
     DONE,
     END,
-    FAILED,
     FORCES,
     IMPACTS,
-    LOST,
     LOST_BY_MPI,
     NEAR,
     PASSED,
@@ -46,7 +44,6 @@ from .compiled_loop import (
     RECORD,
     RECORDED,
     SEND,
-    SOLVE,
     TAKE,
     TURNED,
     UNSOLVED,
@@ -133,11 +130,15 @@ class CompiledSteps:
         self._motion = Motion(stepper.h, places, np.empty((3, n)), np.zeros((3, n)), forces, self._contact)
         self._nodes, self._held, self._walls = self._make_nodes(), self._make_held(), self._make_walls()
         self._springs, self._sums, self._at_rest = self._make_springs(), new_sums(), self._moving_supports(0, 0)
-        self._pressed, self._outcome = new_contact_nodes(n, len(model.contact.names)), np.zeros(10, dtype=np.int64)
+        rooms = n, len(model.contact.walls), len(model.contact.wall_of)
+        self._pressed, self._outcome = new_contact_nodes(*rooms), np.zeros(10, dtype=np.int64)
         self._stiffness = self._nodes.stiffness if model.links else np.empty(0)
         self._called = RowCaller(stepper, self._stiffness, self._u, self._contact)
-        self._toucher = TouchCaller(stepper)
-        calls = *_mpi(), self._called.function, self._toucher.function
+        self._toucher, self._wall_caller = (
+            TouchCaller(stepper),
+            WallCaller(stepper, self._nodes, self._pressed, self._contact),
+        )
+        calls = *_mpi(), self._called.function, self._toucher.function, self._wall_caller.function
         self._messages, self._calls = model.mesh.messages(), Calls(*calls)
         self._references, self._phases = References(), None
         self._energies, self._particles = np.zeros(len(BAR_ENERGIES)), np.empty(self.ledger.impulses.state.v.shape)
@@ -210,7 +211,9 @@ class CompiledSteps:
         called, walls = self._called.record.any, len(model.contact.walls) > 0
         several, springs, moves = model.comm.size > 1, len(self._springs.nodes) > 0, model.supports.moves
         touch, walls_move = walls or linked or called, model.contact.moving.any()
-        press = press_walls(*kind_of(self._walls.pressed)) if walls else None
+        press, close = press_walls(*kind_of(self._walls.pressed)) if walls else None, close_on_walls
+        if model.contact.called.any():
+            press, close = press_called, close_on_called
         chosen = {
             BEGIN: (
                 (place_supports, moves),
@@ -233,13 +236,14 @@ class CompiledSteps:
                 (react, held),
                 (join_pressing, touch),
             ),
-            IMPACTS: ((close_on_walls, walls), (close_on_rows, linked), (close_called, called)),
+            IMPACTS: ((close, walls), (close_on_rows, linked), (close_called, called)),
             BOOK: (
                 (book_springs, springs),
                 (correct_moving, moves),
                 (sum_rows, linked),
                 (push_particles, True),
                 (work_of_walls, walls_move),
+                (work_of_turns, model.contact.motion.turning.any()),
             ),
             AGREE: ((agree, several and (model.bars.can_break or called)),),
             END: ((put_state, True),),
@@ -298,8 +302,9 @@ class CompiledSteps:
         begin, impulses = state.step, ledger.impulses.state
         flags = np.zeros((count, len(log.releases)), dtype=bool)
         rows = model.links.export_rows(self._stiffness)
-        called = self._called.begin(begin, rows.totals)
+        called = self._called.begin_rows(begin, rows.totals)
         self._toucher.begin(begin)
+        self._wall_caller.begin(begin)
         contacts = self._contacts(rows, called)
         ledger.sums[_BROKEN] = stepper.ruptures.count
         half, walls = state.memory["half_velocity"], self._walls
@@ -316,6 +321,7 @@ class CompiledSteps:
             self._bars(),
             model.external.schedule(range(begin + 1, begin + 1 + count), stepper.h),
             walls,
+            self._wall_caller.schedule(self._times(begin, count)),
             rows,
             called,
             self._sums,
@@ -339,6 +345,7 @@ class CompiledSteps:
             self._phases = self._make_phases(types.void(numba.typeof(reference), types.int64), len(rows.force) > 0)
         contacts = Contacts(*run_compiled(reference, *self._phases, due, flags), *contacts[4:])
         self._toucher.end()
+        self._wall_caller.end()
         self._called.end()
         made = self._outcome.tolist()
         if made[LOST_BY_MPI]:
@@ -411,143 +418,13 @@ class CompiledSteps:
         if made[UNSOLVED] > 0:
             rows = self.model.links.rows
             return self._at_balance(rows.unsettled_message(int(rows.group_of_row[made[UNSOLVED] - 1])))
-        return self._at_balance(self._called.failure) if made[UNSOLVED] else None
+        failure = self._called.failure or self._wall_caller.failure
+        return self._at_balance(failure) if made[UNSOLVED] else None
 
     def _at_balance(self, text: object) -> SimulationFailure:
         """Return a failure of the balance for the next positions."""
         stepper = self.stepper
         return SimulationFailure(f"{stepper.when(stepper.scheme.balance(stepper.state, stepper.h))}: {text}")
-
-
-_CALL = types.int64(types.int64, types.int64)
-_HELD, _CHANGING = range(2)  # nodes of CalledRows, and the places of their numbers
-
-
-class RowCaller:
-    """Solves the rows that compiled loops cannot solve, when one asks for it: rows that turn, come and go, share nodes,
-    are on several ranks, or whose nodes walls stop too.
-
-    The loop calls once in each step, when the nodes have moved without rows, and again if rows have closed or opened,
-    when the velocities at their nodes are known.
-
-    Attributes
-    ----------
-    record : CalledRows
-    function : that the loop calls
-    failure : SimulationFailure of the last call of the loop, or None
-    """
-
-    def __init__(self, stepper: Stepper, stiffness: np.ndarray, u: np.ndarray, contact: np.ndarray) -> None:
-        self.stepper, self.links = stepper, stepper.model.links
-        self._stiffness, self._u, self._contact = stiffness, u, contact
-        self._tolerance = PROJECTED * stepper.model.size
-        self._begin, self._totals, self._error = 0, np.empty((0, 3)), None
-        self.failure: SimulationFailure | None = None
-        self._function = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(self._call)
-        self.function = CFunction(self._function, _CALL)
-        n = 0 if self.links.separate else len(u)
-        nodes, counts, loss = np.empty((2, n), dtype=np.int64), np.zeros(2, dtype=np.int64), np.zeros(2)
-        self.record = CalledRows(not self.links.separate, np.empty((n, 3)), u[:n], *nodes, counts, loss)
-        self._keep(_HELD, self.links.pressed())
-        if self.record.any:
-            stepper.balance = stepper.scheme.balance(stepper.state, stepper.h)
-
-    def _keep(self, which: int, nodes: np.ndarray) -> None:
-        if self.record.any:
-            room = self.record.held if which == _HELD else self.record.changing
-            self.record.counts[which] = len(nodes)
-            room[: len(nodes)] = nodes
-
-    def begin(self, step: int, totals: np.ndarray) -> CalledRows:
-        """Prepare calls in steps from one of a number on; forces on the last nodes of rows are written to ``totals``
-        (tables, 3) [N]."""
-        self._begin, self._totals, self.failure = step, totals, None
-        return self.record
-
-    def end(self) -> None:
-        """Raise what went wrong in a call, except a failure of the simulation."""
-        error, self._error = self._error, None
-        if error is not None:
-            raise error
-
-    def _call(self, step: int, what: int) -> int:
-        """Solve the rows of a step, or find the energy that they lose."""
-        try:
-            if what == SOLVE:
-                self._solve(self._begin + step + 1)
-            else:
-                self._close()
-        except BaseException as error:  # noqa: BLE001  # an exception cannot pass the compiled loop: end raises it
-            if what == SOLVE and isinstance(error, SimulationFailure) and not is_alone():
-                self.failure = error
-                return FAILED
-            self._error = error
-            return LOST
-        return 0
-
-    def _solve(self, step: int) -> None:
-        """Solve the rows of the balance at the end of a step of a number; if that fails, they have no forces."""
-        links, record = self.links, self.record
-        self._keep(_HELD, np.empty(0, dtype=np.int64))
-        self._keep(_CHANGING, np.empty(0, dtype=np.int64))
-        self._totals[:] = record.loss[:] = 0.0
-        stepper = self.stepper
-        stepper.state.time = step * stepper.h
-        stepper.balance = replace(stepper.balance, predictor=record.predictor, time=(step + 1) * stepper.h)
-        load = links.explicit(stepper.balance, stepper.state, self._u, self._stiffness, self._tolerance)
-        if load is not None:
-            links.push(load, self._stiffness, self._u, self._contact)
-        self._totals[:], record.loss[1] = links.totals(), links.friction
-        self._keep(_HELD, links.pressed())
-        two = links.two
-        changed = (links.force[two.at] > 0.0) != two.record.closed
-        if changed.any():
-            nodes = two.nodes[:, changed]
-            self._keep(_CHANGING, np.unique(nodes[nodes >= 0]))
-
-    def _close(self) -> None:
-        """Find the energy that rows lose, from velocities and accelerations of the state at their nodes."""
-        state = self.stepper.state
-        state.contact = self._contact
-        self.record.loss[0] = self.stepper.ledger.impacts.of_rows(state.position, (state.v, state.a), None)
-
-
-class TouchCaller:
-    """Adds the forces of bars that touch in compiled steps, when their loop asks for it.
-
-    Attributes
-    ----------
-    function : that the loop calls
-    energies : (2,) stored and dissipated in the last call [J]
-    """
-
-    def __init__(self, stepper: Stepper) -> None:
-        self._stepper, self._begin, self._error = stepper, 0, None
-        self.energies, n = np.zeros(2), len(stepper.state.x)
-        self._x, self._f = (room.T[:n] for room in stepper.model.bars.components)
-        self._function = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(self._call)
-        self.function = CFunction(self._function, _CALL)
-
-    def begin(self, step: int) -> None:
-        """Prepare calls in steps from one of a number on."""
-        self._begin = step
-
-    def end(self) -> None:
-        """Raise what went wrong in a call."""
-        error, self._error = self._error, None
-        if error is not None:
-            raise error
-
-    def _call(self, step: int, _: int) -> int:
-        stepper = self._stepper
-        try:
-            self.energies[:] = stepper.model.self_contact.evaluate(self._x, self._f, stepper.h, commit=True)
-        except SimulationFailure as failure:
-            made = self._begin + step + 1
-            self._error = SimulationFailure(f"{stepper.at(made, made * stepper.h)}: {failure}")
-        except BaseException as error:  # noqa: BLE001  # an exception cannot pass the compiled loop: end raises it
-            self._error = error
-        return 0 if self._error is None else LOST
 
 
 def _mpi() -> tuple[CFunction, ...]:

@@ -44,10 +44,10 @@ class WallArrays(NamedTuple):
 
 @record
 class ContactNodes(NamedTuple):
-    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the walls that
-    they are ``touching`` (n, w), their ``places`` (n, 3); ``failure`` (2,): the first of them without a place, or -1,
-    and why, and its planes, ``normals`` (w, 3) and ``offsets`` (w,); and the sums of each wall, ``force`` (w, 3),
-    ``contacts`` (w,) and ``moment`` (w, 3)."""
+    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the slots
+    of walls that they are ``touching`` (n, s), their ``places`` (n, 3); ``failure`` (2,): the first of them without a
+    place, or -1, and why, and its planes, ``normals`` (s, 3) and ``offsets`` (s,); and the sums of each wall, ``force``
+    (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
 
     nodes: np.ndarray
     touching: np.ndarray
@@ -60,13 +60,14 @@ class ContactNodes(NamedTuple):
     moment: np.ndarray
 
 
-def new_contact_nodes(n: int, w: int) -> ContactNodes:
-    """Return room for ``n`` nodes and ``w`` walls. Pages of memory that no node needs are not touched."""
+def new_contact_nodes(n: int, w: int, s: int) -> ContactNodes:
+    """Return room for ``n`` nodes and ``w`` walls with ``s`` slots. Pages of memory that no node needs are not
+    touched."""
     nodes = np.empty(n if w > 0 else 0, dtype=np.int64)
-    touching, places = np.empty((len(nodes), w), dtype=bool), np.empty((len(nodes), 3))
+    touching, places = np.empty((len(nodes), s), dtype=bool), np.empty((len(nodes), 3))
     force, contacts, moment = np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3))
     failure = np.full(2, -1, dtype=np.int64)
-    return ContactNodes(nodes, touching, places, failure, np.empty((w, 3)), np.empty(w), force, contacts, moment)
+    return ContactNodes(nodes, touching, places, failure, np.empty((s, 3)), np.empty(s), force, contacts, moment)
 
 
 @addressed
@@ -77,13 +78,14 @@ def place_walls(s, step):
     for surfaces, end in ((walls.level, step + 1), (pressed.surfaces, step + 2)):
         offsets, centres = surfaces.offsets, surfaces.centres
         for k in range(len(normals)):
-            offsets[k] = walls.at_rest.offsets[k]
+            offsets[k], way = walls.at_rest.offsets[k], motions[end, 0, pressed.wall_of[k]]
             for c in range(3):
-                offsets[k] += normals[k, c] * motions[end, 0, k, c]
-                centres[k, c] = walls.at_rest.centres[k, c] + motions[end, 0, k, c]
+                offsets[k] += normals[k, c] * way[c]
+                centres[k, c] = walls.at_rest.centres[k, c] + way[c]
     for k in range(len(normals)):
+        wall = pressed.wall_of[k]
         for c in range(3):
-            pressed.way[k, c] = motions[step + 2, 0, k, c] - motions[step + 1, 0, k, c]
+            pressed.way[k, c] = motions[step + 2, 0, wall, c] - motions[step + 1, 0, wall, c]
 
 
 @addressed
@@ -131,6 +133,45 @@ def _mark(marked, nodes, value):
         marked[i // NODE_BLOCK] = value
 
 
+@inlined
+def find_beyond(motion, walls, out, contacts):
+    """Clear the sums of walls, write the positions without them, and find the nodes that are beyond walls there, or
+    rebound; return their number."""
+    free, h, pressed = walls.free, motion.h, walls.pressed
+    for c in range(3):
+        there, where, speed = free[c], motion.x[c], motion.half[c]
+        for i in range(len(there)):
+            there[i] = where[i] + h * speed[i]
+    clear_rows(out.force)
+    clear_rows(out.moment)
+    for k in range(len(out.contacts)):
+        out.contacts[k] = 0
+    if len(pressed.restitution) > 0:
+        _mark(walls.marked, contacts.touched, np.bool_(True))
+        _mark(walls.marked, contacts.met, np.bool_(True))
+    m = find_penetrating(free, pressed, walls.marked)
+    if len(pressed.restitution) > 0:
+        _mark(walls.marked, contacts.touched, np.bool_(False))
+        _mark(walls.marked, contacts.met, np.bool_(False))
+    return m
+
+
+@inlined
+def note_contacts(m, walls, out, contacts):
+    """Take account of the contacts of ``m`` nodes."""
+    contacts.near = out.nodes[:m]
+    more, contacts.touched = compare_contacts(
+        walls.touched.touching,
+        contacts.touched,
+        contacts.near,
+        out.touching,
+        walls.present,
+        walls.releases,
+        walls.pressed.wall_of,
+    )
+    contacts.changes += more
+
+
 @cache
 def press_walls(curved: Any, rough: Any, several: Any) -> Any:
     """Make the phase that moves nodes beyond walls onto them, for walls of a kind, see
@@ -139,22 +180,7 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
     @addressed
     def press(s, step):
         nodes, motion, walls, out, contacts = s.nodes, s.motion, s.walls, s.pressed, s.contacts
-        free, h, pressed = walls.free, motion.h, walls.pressed
-        for c in range(3):
-            there, where, speed = free[c], motion.x[c], motion.half[c]
-            for i in range(len(there)):
-                there[i] = where[i] + h * speed[i]
-        clear_rows(out.force)
-        clear_rows(out.moment)
-        for k in range(len(out.contacts)):
-            out.contacts[k] = 0
-        if len(pressed.restitution) > 0:
-            _mark(walls.marked, contacts.touched, np.bool_(True))
-            _mark(walls.marked, contacts.met, np.bool_(True))
-        m = find_penetrating(free, pressed, walls.marked)
-        if len(pressed.restitution) > 0:
-            _mark(walls.marked, contacts.touched, np.bool_(False))
-            _mark(walls.marked, contacts.met, np.bool_(False))
+        free, pressed, m = walls.free, walls.pressed, find_beyond(motion, walls, out, contacts)
         if m > 0:
             found = pressed.room[:m]
             places, given = np.empty((m, 3)), _arrivals(found, nodes, motion, walls)
@@ -182,17 +208,7 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
                     out.offsets[k] = planes.offsets[failed, k]
                     for c in range(3):
                         out.normals[k, c] = planes.normals[failed, k, c]
-        contacts.near = out.nodes[:m]
-        more, contacts.touched = compare_contacts(
-            walls.touched.touching,
-            contacts.touched,
-            contacts.near,
-            out.touching,
-            walls.present,
-            walls.releases,
-            pressed.wall_of,
-        )
-        contacts.changes += more
+        note_contacts(m, walls, out, contacts)
 
     return press
 
@@ -273,23 +289,31 @@ def _free_rates(around, nodes, motion, moved, state):
 @addressed
 def close_on_walls(s, step):
     """Find the energy that nodes lose which close on walls, and which nodes are on walls."""
-    contacts, nodes, motion, walls = s.contacts, s.nodes, s.motion, s.walls
+    contacts, walls = s.contacts, s.walls
     if len(contacts.met) == 0 and len(contacts.touched) == 0:
         return
-    v, a = state = s.state.v, s.state.a
     around = join_nodes(contacts.met, contacts.touched, walls.present)
-    free_v, free_a = _free_rates(around, nodes, motion, (s.moving, step, s.held), state)
-    normals, gaps = wall_gaps(around, motion.x.T, walls.level)
+    normals, gaps = wall_gaps(around, s.motion.x.T, walls.level)
+    rates = np.zeros(normals.shape)
+    for j in range(len(rates) if len(walls.motions) > 0 else 0):
+        for k in range(rates.shape[1]):
+            for c in range(3):
+                rates[j, k, c] = walls.motions[step + 1, 1, k, c]
+    stop_on_walls(s, step, around, normals, gaps, rates)
+
+
+@inlined
+def stop_on_walls(s, step, around, normals, gaps, rates):
+    """Find the energy that nodes (m,) lose which close on walls with normals, distances and velocities of these."""
+    contacts, nodes, walls = s.contacts, s.nodes, s.walls
+    v, a = state = s.state.v, s.state.a
+    free_v, free_a = _free_rates(around, nodes, s.motion, (s.moving, step, s.held), state)
     for j in range(len(around)):
         i = around[j]
         for c in range(3):
             if walls.touched.fixed[i, c]:  # wall forces do not change prescribed components
                 free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
-    still, rates = np.zeros((gaps.shape[1], 3)), np.zeros(normals.shape)
-    for j in range(len(rates) if len(walls.motions) > 0 else 0):
-        for k in range(len(still)):
-            for c in range(3):
-                rates[j, k, c] = walls.motions[step + 1, 1, k, c]
+    still = np.zeros((gaps.shape[1], 3))
     approach = Approach(normals, gaps, free_v, free_a, rates, still)
     counted = np.ones(len(still), dtype=np.bool_)
     loss, contacts.met = stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))

@@ -226,11 +226,14 @@ class Model:
     @property
     def steady(self) -> bool:
         """Whether steps can be compiled ones: supports are along axes, bars and damping constant in time, loads
-        depend on time alone, and walls are infinite planes, spheres or cylinders, without mass and not tied."""
+        depend on time alone, and walls are infinite, spheres, cylinders or surfaces of triangles, without mass and
+        not tied, which bars do not touch between their nodes; beside pairs and constraints they are not triangles and
+        do not turn."""
         others = any(family is not self.bars.springs for family in self.bars.families)
-        changing = self.supports.inclined is not None or self.bars_vary or others or self.inertia.varies
         between = self.self_contact is not None and self.self_contact.at_walls is not None
-        return not (changing or between) and self.external.scheduled and self.contact.steady
+        changing = self.supports.inclined is not None or self.bars_vary or others or self.inertia.varies or between
+        changing = changing or (bool(self.links) and self.contact.called.any())
+        return not changing and self.external.scheduled and self.contact.steady
 
     def initial_velocity(self) -> np.ndarray:
         """Return initial velocities (owned, 3) [m/s]; later ``[initial]`` tables override earlier ones. Collective."""

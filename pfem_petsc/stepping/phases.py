@@ -25,6 +25,9 @@ KINETIC = len(WORKS)
 SUPPORTS, LOADS, DRAGS = range(3)
 """Rows of the forces in a balance."""
 
+FAILED, LOST = -1, -2
+"""Results of calls of Python: a failure of the simulation, any other error."""
+
 
 @record
 class Nodes(NamedTuple):

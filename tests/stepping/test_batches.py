@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.lattices import planes, two_lattices
+from helpers.triangles import ball
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, columns, open_result
@@ -346,6 +347,67 @@ def test_batches_with_pairs_and_walls(name, supported, comm, shared_tmp_path, mo
     assert np.abs(history["pair/faces/impulse"][-1]).max() > 0.01 and history["impact_dissipation"][-1] > 0.0
     assert np.abs(history["energy_imbalance"]).max() < 1e-11 * history["kinetic_energy"].max()
     compare(one, other, exact=False, same_order="moving" not in name)  # rounding of times
+
+
+TURNING = {"rotation": {"centre": [0.0, 0.01, 0.0], "axis": [0.2, 1.0, 0.0], "angular_velocity": 90.0}}
+ROCKS = {"type": "surface", "name": "rock", "file": "rock.obj", "scale": 0.011}
+ROCK = ROCKS | {"point": [0.009, 0.011, -0.0111]}
+CALLED = {
+    "a plane that turns": {"wall": [FLOOR | TURNING]},
+    "a rough roller that turns beside a wall": {
+        "wall": [
+            ROLLER | {"friction": 0.3, "rotation": TURNING["rotation"] | {"axis": [0.1, 1.0, 0.0]}, "node_set": "foot"},
+            SIDE | {"velocity": [-2.0, 0.0, 0.0]},
+        ],
+    },
+    "a plane that rocks, lifts and rebounds": {
+        "material": DAMPED,
+        "wall": [
+            FLOOR
+            | {"restitution": 0.6, "motion": [[0, 0, 0, 0], [3e-5, 1e-4, 0, 8e-4], [6e-5, 0, 0, 6e-4]]}
+            | {"rotation": TURNING["rotation"] | {"angles": [[0.0, 0.0], [4e-5, 0.01], [8e-5, -0.01]]}}
+        ],
+    },
+    "a rock": {"wall": [ROCK]},
+    "a rough rock that moves beside walls": {
+        "material": DAMPED,
+        "wall": [ROCK | {"friction": 0.2, "velocity": [3.0, 0.0, 5.0]}, FLOOR | {"point": [0, 0, -3e-4]}, SIDE],
+    },
+    "a rock that turns and rebounds": {
+        "wall": [ROCK | TURNING | {"restitution": 0.5}, ROCK | {"name": "other", "point": [0.0, 0.0, -0.0112]}],
+    },
+}
+del CALLED["a plane that rocks, lifts and rebounds"]["wall"][0]["rotation"]["angular_velocity"]
+
+
+@pytest.mark.slow
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", CALLED)
+def test_batches_with_walls_that_turn_and_surfaces_of_triangles(name, comm, shared_tmp_path):
+    if comm.rank == 0:
+        points, corners = ball(2)
+        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
+        lines += ["f " + " ".join(map(str, own)) for own in (corners + 1).tolist()]
+        (shared_tmp_path / "rock.obj").write_text("\n".join(lines))
+    comm.barrier()
+    tables = {name: value for name, value in CALLED[name].items() if name != "wall"}
+    walls = [
+        wall | ({"file": str(shared_tmp_path / "rock.obj")} if "file" in wall else {}) for wall in CALLED[name]["wall"]
+    ]
+    given = case(tables | {"wall": walls})
+    one, count = made(given, shared_tmp_path, "single", comm)
+    many, fewer = made(given, shared_tmp_path, "batches", comm)
+    assert count == round(given.time.end / given.time.step) and fewer < count / 4
+    history = compare(one, many)
+    np.testing.assert_array_equal(one.stepper.touching, many.stepper.touching)
+    assert np.abs(history["energy_imbalance"]).max() < 1e-11 * history["kinetic_energy"].max()
+    for wall in walls:
+        assert np.abs(history[f"wall/{wall['name']}/impulse"][-1]).max() > 1e-3
+    moves = any("velocity" in wall or "rotation" in wall for wall in walls)
+    assert (np.abs(history["contact_work"]).max() > 1e-6 * history["kinetic_energy"].max()) == moves
+    assert history["impact_dissipation"][-1] > 0.0 and history["active_contacts"].max() > 0
+    other = made(given, shared_tmp_path, "general", comm)[0]
+    compare(one, other, exact=False, same_order=False)
 
 
 MOVED = {"restitution": 0.3, "friction": 0.2, "motion": [[0, 0, 0, 0], [8e-6, 0, 0, 1e-4], [3e-5, 1e-4, 0, -1e-4]]}

@@ -1,0 +1,221 @@
+"""Functions of Python that compiled steps call for what their loops cannot do."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import types
+
+from ..errors import SimulationFailure
+from ..mesh.exchange import CFunction
+from ..parallel.ending import is_alone
+from ..tolerances import PROJECTED
+from .called_walls import FOUND, PRESSED, SUSPECTS, CalledWalls, new_called_walls
+from .compiled_loop import SOLVE, CalledRows
+from .phases import FAILED, LOST
+
+if TYPE_CHECKING:
+    from .contact_phase import ContactNodes
+    from .phases import Nodes
+    from .stepper import Stepper
+
+_CALL = types.int64(types.int64, types.int64)
+_HELD, _CHANGING = range(2)  # nodes of CalledRows, and the places of their numbers
+
+
+class Caller:
+    """Makes something of a step when a compiled loop asks for it.
+
+    Attributes
+    ----------
+    function : that the loop calls, with the number of a step of its own, and what to do
+    failure : SimulationFailure of the last call of the loop, if that goes on, or None
+    """
+
+    def __init__(self, stepper: Stepper) -> None:
+        self.stepper, self._begin = stepper, 0
+        self.failure: SimulationFailure | None = None
+        self._error: BaseException | None = None
+        self._function = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(self._call)
+        self.function = CFunction(self._function, _CALL)
+
+    def begin(self, step: int) -> None:
+        """Prepare calls in steps from one of a number on."""
+        self._begin, self.failure = step, None
+
+    def end(self) -> None:
+        """Raise what went wrong in a call, except :attr:`failure`."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def _call(self, step: int, what: int) -> int:
+        try:
+            self._make(self._begin + step + 1, what)
+        except BaseException as error:  # noqa: BLE001  # an exception cannot pass the compiled loop: end raises it
+            if isinstance(error, SimulationFailure) and self._goes_on(what):
+                self.failure = error
+                return FAILED
+            self._error = error
+            return LOST
+        return 0
+
+    def _make(self, step: int, what: int) -> None:
+        """Do something at the end of a step of a number."""
+        raise NotImplementedError
+
+    def _goes_on(self, what: int) -> bool:
+        """Return whether the loop goes on after a failure of the simulation."""
+        return False
+
+
+class RowCaller(Caller):
+    """Solves the rows that compiled loops cannot solve, when one asks for it: rows that turn, come and go, share nodes,
+    are on several ranks, or whose nodes walls stop too.
+
+    The loop calls once in each step, when the nodes have moved without rows, and again if rows have closed or opened,
+    when the velocities at their nodes are known.
+
+    Attributes
+    ----------
+    record : CalledRows
+    """
+
+    def __init__(self, stepper: Stepper, stiffness: np.ndarray, u: np.ndarray, contact: np.ndarray) -> None:
+        super().__init__(stepper)
+        self.links = stepper.model.links
+        self._stiffness, self._u, self._contact = stiffness, u, contact
+        self._tolerance = PROJECTED * stepper.model.size
+        self._totals = np.empty((0, 3))
+        n = 0 if self.links.separate else len(u)
+        nodes, counts, loss = np.empty((2, n), dtype=np.int64), np.zeros(2, dtype=np.int64), np.zeros(2)
+        self.record = CalledRows(not self.links.separate, np.empty((n, 3)), u[:n], *nodes, counts, loss)
+        self._keep(_HELD, self.links.pressed())
+        if self.record.any:
+            stepper.balance = stepper.scheme.balance(stepper.state, stepper.h)
+
+    def _keep(self, which: int, nodes: np.ndarray) -> None:
+        if self.record.any:
+            room = self.record.held if which == _HELD else self.record.changing
+            self.record.counts[which] = len(nodes)
+            room[: len(nodes)] = nodes
+
+    def begin_rows(self, step: int, totals: np.ndarray) -> CalledRows:
+        """Prepare calls in steps from one of a number on; forces on the last nodes of rows are written to ``totals``
+        (tables, 3) [N]."""
+        self.begin(step)
+        self._totals = totals
+        return self.record
+
+    def _make(self, step: int, what: int) -> None:
+        if what == SOLVE:
+            self._solve(step)
+        else:
+            self._close()
+
+    def _goes_on(self, what: int) -> bool:
+        return what == SOLVE and not is_alone()
+
+    def _solve(self, step: int) -> None:
+        """Solve the rows of the balance at the end of a step of a number; if that fails, they have no forces."""
+        links, record = self.links, self.record
+        self._keep(_HELD, np.empty(0, dtype=np.int64))
+        self._keep(_CHANGING, np.empty(0, dtype=np.int64))
+        self._totals[:] = record.loss[:] = 0.0
+        stepper = self.stepper
+        stepper.state.time = step * stepper.h
+        stepper.balance = replace(stepper.balance, predictor=record.predictor, time=(step + 1) * stepper.h)
+        load = links.explicit(stepper.balance, stepper.state, self._u, self._stiffness, self._tolerance)
+        if load is not None:
+            links.push(load, self._stiffness, self._u, self._contact)
+        self._totals[:], record.loss[1] = links.totals(), links.friction
+        self._keep(_HELD, links.pressed())
+        two = links.two
+        changed = (links.force[two.at] > 0.0) != two.record.closed
+        if changed.any():
+            nodes = two.nodes[:, changed]
+            self._keep(_CHANGING, np.unique(nodes[nodes >= 0]))
+
+    def _close(self) -> None:
+        """Find the energy that rows lose, from velocities and accelerations of the state at their nodes."""
+        state = self.stepper.state
+        state.contact = self._contact
+        self.record.loss[0] = self.stepper.ledger.impacts.of_rows(state.position, (state.v, state.a), None)
+
+
+class TouchCaller(Caller):
+    """Adds the forces of bars that touch in compiled steps.
+
+    Attributes
+    ----------
+    energies : (2,) stored and dissipated in the last call [J]
+    """
+
+    def __init__(self, stepper: Stepper) -> None:
+        super().__init__(stepper)
+        self.energies, n = np.zeros(2), len(stepper.state.x)
+        self._x, self._f = (room.T[:n] for room in stepper.model.bars.components)
+
+    def _make(self, step: int, what: int) -> None:
+        stepper = self.stepper
+        try:
+            self.energies[:] = stepper.model.self_contact.evaluate(self._x, self._f, stepper.h, commit=True)
+        except SimulationFailure as failure:
+            raise SimulationFailure(f"{stepper.at(step, step * stepper.h)}: {failure}") from failure
+
+
+class WallCaller(Caller):
+    """Presses nodes onto surfaces of triangles and walls that turn.
+
+    Parameters
+    ----------
+    nodes, pressed : of the loop, the latter receives the nodes that walls stop
+    contact : (owned, 3) contact forces of the loop [N]
+    """
+
+    def __init__(self, stepper: Stepper, nodes: Nodes, pressed: ContactNodes, contact: np.ndarray) -> None:
+        super().__init__(stepper)
+        self._walls, self._stiffness = stepper.model.contact, nodes.stiffness
+        self._pressed, self._contact = pressed, contact
+        self._record, self._found_at = new_called_walls(self._walls), -1
+        self._balance = stepper.scheme.balance(stepper.state, stepper.h)
+
+    def schedule(self, times: np.ndarray) -> CalledWalls:
+        """Return the walls in steps between times (t,) [s], and one more."""
+        record, walls, state = self._record, self._walls, self.stepper.state
+        if not walls.called.any():
+            return record
+        angles, poses = walls.motion.turns(times)
+        sums = self.stepper.solution.walls
+        record.torques[:] = walls.motion.torques(sums.force, sums.moment, state.time)
+        return record._replace(angles=angles, poses=poses)
+
+    def _make(self, step: int, what: int) -> None:
+        stepper, record, walls, out = self.stepper, self._record, self._walls, self._pressed
+        state, some = stepper.state, record.nodes[: record.counts[SUSPECTS]]
+        state.time = step * stepper.h
+        if what == PRESSED:
+            state.contact = self._contact
+            found, self._found_at = walls.room[: record.counts[FOUND]].copy(), step
+            tolerance = PROJECTED * stepper.model.size
+            balance = replace(self._balance, time=(step + 1) * stepper.h)
+            nodes, places, force, sums = walls.press_some(
+                (found, some), record.free, self._stiffness, balance, tolerance
+            )
+            m = len(nodes)
+            record.counts[FOUND], record.friction[0] = m, sums.friction
+            out.nodes[:m], out.places[:m], out.touching[:m], record.force[:m] = nodes, places, sums.touching, force
+            out.force[:], out.contacts[:], out.moment[:] = sums.force, sums.contacts, sums.moment
+            return
+        if self._found_at != step:
+            walls.forget_faces()
+        x, m = state.position[some], len(some)
+        every = np.ones((m, len(walls.wall_of)), dtype=bool)
+        record.normals[:m], record.gaps[:m] = walls.distances(every, x, walls.motion.poses(state.time), some)
+        record.rates[:m] = walls.rates(x, state.time, ahead=True)
+
+    def _goes_on(self, what: int) -> bool:
+        return what == PRESSED

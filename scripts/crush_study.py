@@ -27,7 +27,12 @@ from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.case.toml import built_in_path, read_text
 from pfem_petsc.post.crush import CrushTest, crush
 
-START, END = "<!-- table: scripts/crush_study.py {} -->\n", "<!-- end of {} -->"
+MARKS = {
+    "passages": ("<!-- table: scripts/crush_study.py passages -->\n", "<!-- end of passages -->"),
+    "curve": ("<!-- table: scripts/crush_study.py curve -->\n", "<!-- end of curve -->"),
+    "stiffness": ("<!-- table: scripts/crush_study.py stiffness -->\n", "<!-- end of stiffness -->"),
+    "shock": ("<!-- table: scripts/crush_study.py shock -->\n", "<!-- end of shock -->"),
+}
 SIDE, GAP = 0.04, 2.5e-4
 RADIUS = np.sqrt(1.4731e-6 / np.pi)
 SPEEDS = 50.0, 65.0, 80.0, 95.0, 110.0
@@ -280,7 +285,7 @@ def main() -> None:
         text = TABLES[name]()
         print(text, flush=True)
         if not which:
-            insert("contact_tables.md", START.format(name), END.format(name), text + "\n")
+            insert("contact_tables.md", *MARKS[name], text + "\n")
 
 
 if __name__ == "__main__":

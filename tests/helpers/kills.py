@@ -40,6 +40,10 @@ KINDS = {
     "explicit, snapshots beside the steps": Kind(
         "lattice_drop", ("mesh.cells=[10,10,10]", "time.step=5e-7", "time.end=3e-4", "output.fields_every=20")
     ),
+    "bars that touch": Kind(
+        "lattice_crush",
+        ("mesh.cells=[2,2,2]", "wall.plate.point=[0,0,0.02025]", "time.end=2.65e-3", "output.fields_every=400"),
+    ),
     "implicit contact": Kind(
         "rod_impact", ("time.integrator=newmark", "time.end=2.5", "mesh.elements=60", "output.fields_every=5")
     ),

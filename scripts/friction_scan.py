@@ -152,7 +152,9 @@ def error_of(integrator: str, parameters: dict, treatment: str, wall: dict) -> f
 def reason_of(error: InputError) -> str:
     """Return why a combination is refused: the message without the place that it names first."""
     return re.sub(
-        r"^case: (contact\.treatment = \"\w+\"( with time\.integrator = \"\w+\")?|(wall|contact_pair) '[^']*'): ", "", str(error)
+        r"^case: (contact\.treatment = \"\w+\"( with time\.integrator = \"\w+\")?|(wall|contact_pair) '[^']*'): ",
+        "",
+        str(error),
     )
 
 

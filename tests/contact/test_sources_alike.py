@@ -54,7 +54,9 @@ def assert_alike(cases, comm, folder, atol=1e-9, names=ENERGIES):
     scale = max(abs(row["kinetic_energy"]) for row in one)
     for name in names:
         expected = [row[name] for row in other]
-        np.testing.assert_allclose([row[name] for row in one], expected, rtol=0.0, atol=1e2 * atol * scale, err_msg=name)
+        np.testing.assert_allclose(
+            [row[name] for row in one], expected, rtol=0.0, atol=1e2 * atol * scale, err_msg=name
+        )
     assert max(row["active_contacts"] for row in one) > 0
     return one
 
@@ -74,9 +76,7 @@ def test_a_groove_is_two_planes(integrator, law, surface, comm, shared_tmp_path)
     if integrator == "bathe" and law == "bouncing":
         pytest.skip("the jumps of velocity are not known with bathe")
     walls = [surface(*groove())], planes(SLOPES, [0.0, 0.0])
-    cases = [
-        bar([{**wall, **LAWS[law]} for wall in own], integrator, VALLEY, [-3.0, 0.2, -1.7], 150) for own in walls
-    ]
+    cases = [bar([{**wall, **LAWS[law]} for wall in own], integrator, VALLEY, [-3.0, 0.2, -1.7], 150) for own in walls]
     rows = assert_alike(cases, comm, shared_tmp_path)
     assert (rows[-1]["friction_dissipation"] > 1e-3) == (law == "rough")
 
@@ -120,7 +120,13 @@ def test_the_top_of_a_box_is_a_plane(integrator, kind, surface, comm, shared_tmp
 def test_treatments_of_impact_are_those_of_a_plane(treatment, keys, surface, comm, shared_tmp_path):
     walls = surface(*box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0))), planes([[0.0, 0.0, 1.0]], [0.0])[0]
     cases = [
-        bar([{**wall, "velocity": [0.0, 0.1, 0.2], **keys}], "newmark", ABOVE, [0.3, 0.0, -1.0], contact={"treatment": t})
+        bar(
+            [{**wall, "velocity": [0.0, 0.1, 0.2], **keys}],
+            "newmark",
+            ABOVE,
+            [0.3, 0.0, -1.0],
+            contact={"treatment": t},
+        )
         for wall, t in zip(walls, 2 * [treatment], strict=True)
     ]
     assert_alike(cases, comm, shared_tmp_path)

@@ -138,7 +138,7 @@ class ImplicitStepper(Stepper):
         Raises
         ------
         NotConverged
-            On all ranks, if the smallest part does not converge.
+            On all ranks, if the smallest part does not converge, or any of a scheme that solves for the next position.
         """
         state, ticks = self.state, 2**_HALVINGS
         start, done = state.time, 0
@@ -153,6 +153,8 @@ class ImplicitStepper(Stepper):
                 self._make_substeps(place)
             except NotConverged as failure:
                 state.external = external
+                if self.scheme.solves_next_position:  # the nodes have left the place of this balance
+                    raise
                 if size == 1:
                     raise NotConverged(f"{failure} (the step was bisected {_HALVINGS} times)") from failure
                 # the failed solve has applied the temperatures and rest lengths of its end

@@ -168,6 +168,15 @@ def test_wedge_that_locks_itself(integrator, comm, shared_tmp_path):
         list(run)
 
 
+def test_wedge_that_locks_itself_with_consistent_mass(comm, shared_tmp_path):
+    """The explicit step has moved the nodes before its balance fails: it is not repeated with smaller parts."""
+    case = guided("central_differences", 0.6, {"velocity": [-0.1, 0.0, 0.0], "point": [0.0, 0.0, -0.0003]})
+    case["time"]["mass"] = "consistent"
+    run = simulation(case, comm, shared_tmp_path, "locks")
+    with pytest.raises(SimulationFailure, match=r"jams node 0: .*'slope'.* 0\.577 or more, and it is 0\.6;"):
+        list(run)
+
+
 PHASES = (np.arange(10) + 0.5) / 10.0
 FRAME = np.linalg.qr([[0.3, 2.0, 1.0], [-0.5, 0.5, 1.0], [0.8, 1.0, -1.0]])[0].T  # normal and tangents of a wall
 LATE = [  # schemes whose velocity at the end of a step is not that of its motion

@@ -136,6 +136,15 @@ def test_what_is_no_surface_is_refused(tmp_path, name):
     assert name in str(caught.value)
 
 
+@pytest.mark.parametrize("scale", [1e-300, 1e300])
+def test_sizes_whose_squares_are_no_numbers_are_refused(tmp_path, scale):
+    (tmp_path / "block.obj").write_bytes(FILES["quads.obj"])
+    with pytest.raises(
+        InputError, match=r"block.obj: the surface is 4e.300 m large.*correct the wall's scale = 1e.300"
+    ):
+        wall_of(tmp_path / "block.obj", scale=scale)
+
+
 def test_points_within_rounding_are_one(tmp_path):
     path = tmp_path / "near.stl"
     near = POINTS[CORNERS] + 3e-10 * np.random.default_rng(0).uniform(-1, 1, (12, 3, 3))

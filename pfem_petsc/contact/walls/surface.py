@@ -20,6 +20,9 @@ from .base import BaseWall, Surface, WallKeys
 SAME = 1e-9
 """Points closer than this fraction of the size of the surface are one, and triangles of less height are lines."""
 
+_SIZES = 1e-100, 1e100
+"""Sizes [m] between which products of lengths are numbers."""
+
 _THIN = 1e-6
 """Thickness of sheets that stop nodes from either side, as a fraction of their size, unless it is given."""
 
@@ -89,6 +92,12 @@ class Wall(BaseWall):
                 "restore it, or start a new run without the key digest"
             )
         self.points, self.corners, self._edges = checked(points, corners, f"{where}{path}")
+        size = parameters.scale * float(np.ptp(self.points, axis=0).max())
+        if not _SIZES[0] <= size <= _SIZES[1]:
+            raise InputError(
+                f"{where}{path}: the surface is {size:.3g} m large, whose square double precision cannot hold; correct "
+                f"the wall's scale = {parameters.scale!r}, metres per unit of length of the file"
+            )
         self.points = parameters.scale * self.points + np.array(parameters.point)
         if parameters.flip:
             self.corners = self.corners[:, ::-1].copy()

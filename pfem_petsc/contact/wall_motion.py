@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 
 _ITERATIONS = 200
+_LATEST = 8  # times whose poses are kept
 _FULL_MOVES = 20  # Newton's method converges after a few active sets, or else alternates between some of them
 
 Answer = tuple[np.ndarray, np.ndarray | None]
@@ -254,6 +255,7 @@ class WallMotion:
         n = len(walls)
         self.turning = np.array([wall.rotation is not None for wall in walls], dtype=bool)
         self.held = Poses(np.zeros((n, 3)), np.tile(np.eye(3), (n if self.turning.any() else 0, 1, 1)))
+        self._last: tuple[Poses, dict[float, Poses]] = self.held, {}
         self._axes, self._centres = np.zeros((2, n, 3))
         for k in np.flatnonzero(self.turning):
             axis = np.array(walls[k].rotation.axis)
@@ -277,7 +279,17 @@ class WallMotion:
         return displacements
 
     def poses(self, time: float) -> Poses:
-        """Return where walls are at a time [s]."""
+        """Return where walls are at a time [s], read-only."""
+        if self.bodies.any:  # which move as they are solved for
+            return self._poses(time)
+        if self._last[0] is not self.held or len(self._last[1]) > _LATEST:
+            self._last = self.held, {}
+        known = self._last[1]
+        if time not in known:
+            known[time] = self._poses(time)
+        return known[time]
+
+    def _poses(self, time: float) -> Poses:
         held, bodies = self.held, self.bodies
         shifts, turns = held.shifts + self._prescribed(self._motions, 0, time), held.turns
         shifts[bodies.at] = bodies.displacements(time)

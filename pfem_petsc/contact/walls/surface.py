@@ -143,9 +143,17 @@ class Wall(BaseWall):
         """Return (m,) bool: bars from ``starts`` to ``ends`` (m, 3) that are deep in a body, or pass through another
         surface with both ends away from it."""
         if self.closed and not self.triangles.limits[0, 0]:
-            parts = np.linspace(0.0, 1.0, 9)[1:-1, None, None]
-            inside = self.gaps((starts + parts * (ends - starts)).reshape(-1, 3)).reshape(len(parts), -1)
-            return inside.min(axis=0) < -_DEEP * self.width
+            deep, box, parts = _DEEP * self.width, self.triangles.boxes[1], np.linspace(0.0, 1.0, 9)[1:-1, None, None]
+            low, high = np.minimum(starts, ends), np.maximum(starts, ends)
+            across = ((low < box[3:]) & (high > box[:3])).all(axis=1)
+            at = np.flatnonzero(across)
+            # distances change by no more than the way
+            apart = self.gaps(starts[at]) + self.gaps(ends[at]) + 2.0 * deep
+            at = at[apart <= np.linalg.norm(ends[at] - starts[at], axis=1)]
+            inside = self.gaps((starts[at] + parts * (ends[at] - starts[at])).reshape(-1, 3)).reshape(len(parts), -1)
+            across[:] = False
+            across[at] = inside.min(axis=0) < -deep
+            return across
         apart = np.minimum(self.gaps(starts), self.gaps(ends)) > _APART * np.linalg.norm(ends - starts, axis=1)
         n = len(starts)
         free, normals, offsets = np.zeros((n, 3), dtype=bool), np.empty((n, 3, 3)), np.empty((2, n, 3))

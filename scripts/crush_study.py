@@ -123,7 +123,7 @@ def intersections(before: np.ndarray, after: np.ndarray) -> int:
     return int(met.sum())
 
 
-def count_passages(result: Any) -> tuple[int, float, int]:
+def count_passages(result: Any, radius: float = RADIUS) -> tuple[int, float, int]:
     """Return the passages, the least distance of two axes over the sum of their radii, and the pairs, of a result."""
     bars = result.bars
     first, second = np.triu_indices(len(bars), 1)
@@ -131,7 +131,7 @@ def count_passages(result: Any) -> tuple[int, float, int]:
     one, other = first[~share], second[~share]
     ends = np.hstack([bars[one], bars[other]])
     mesh = result.positions(0)
-    reach = np.minimum(2.0 * RADIUS, distances(*(mesh[ends[:, k]] for k in range(4))))
+    reach = np.minimum(2.0 * radius, distances(*(mesh[ends[:, k]] for k in range(4))))
     passages, least, last = 0, np.inf, mesh
     for i in range(1, len(result.times)):
         x = result.positions(i)
@@ -139,10 +139,10 @@ def count_passages(result: Any) -> tuple[int, float, int]:
         away = middle[one] - middle[other]
         longest = np.linalg.norm(x[bars[:, 1]] - x[bars[:, 0]], axis=1).max()
         way = 2.0 * np.linalg.norm(x - last, axis=1).max()
-        near = np.flatnonzero(np.einsum("mi,mi->m", away, away) < (longest + 2.0 * RADIUS + way) ** 2)
+        near = np.flatnonzero(np.einsum("mi,mi->m", away, away) < (longest + 2.0 * radius + way) ** 2)
         apart = distances(*(x[ends[near, k]] for k in range(4)))
         least = min(least, float((apart / reach[near]).min()))
-        close = near[apart < 2.0 * RADIUS + way]
+        close = near[apart < 2.0 * radius + way]
         passages += intersections(last[ends[close]], x[ends[close]])
         last = x
     return passages, least, len(ends)

@@ -140,7 +140,8 @@ def error_of(integrator: str, parameters: dict, treatment: str, wall: dict) -> f
                 if wall.get("type") == "pair":
                     v = v - stepper.state.v[nodes[2 * PHASES :: 2]]
                 else:
-                    v = v - motion.rates_at(x, stepper.state.time)[:, 0]
+                    wall_of = np.arange(PHASES) if "mass" in wall else 0  # each node has its own wall with mass
+                    v = v - motion.rates_at(x, stepper.state.time)[np.arange(PHASES), wall_of]
                     v = v @ motion.poses(stepper.state.time).turns[0] if motion.turning.any() else v
                 v -= (v @ n)[:, None] * n
                 largest = max(largest, np.linalg.norm(v - left * along, axis=1).max())

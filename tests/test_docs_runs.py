@@ -149,6 +149,7 @@ RESULTS = {
     "rod_impact": ("rod_impact", []),
     "rod_newmark": ("rod_impact", ["time.integrator=newmark"]),
     "pendulum": ("pendulum", []),
+    "guyed_mast": ("guyed_mast", []),
 }
 """Built-in case and changes of it, by the name of the folder."""
 
@@ -169,8 +170,12 @@ def results(tmp_path_factory):
     [
         (
             "rendering.md",
-            3,
-            {"ring_impact": ["render.mp4", "render.png", "frames/frame_0000.png"], "lattice_drop": ["render.html"]},
+            4,
+            {
+                "ring_impact": ["render.mp4", "render.png", "frames/frame_0000.png"],
+                "guyed_mast": ["render.png"],
+                "lattice_drop": ["render.html"],
+            },
         ),
         (
             "plotting.md",

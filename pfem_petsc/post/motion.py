@@ -556,7 +556,7 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
         reached = current >= number
         present[reached] = np.isin(names, [wall.name for wall in stage.wall])
         since = np.asarray(times)[reached] - (begins[number - 1] if number else 0.0)
-        for wall in (wall for wall in stage.wall if wall.rotation is not None):
+        for wall in (wall for wall in stage.wall if getattr(wall, "rotation", None) is not None):
             axis = np.array(wall.rotation.axis) / np.linalg.norm(wall.rotation.axis)
             angles = rotation_of(wall).at(since)[:, 0, 0]
             turns[reached, names.index(wall.name)] = turns_about(np.tile(axis, (len(angles), 1)), angles)

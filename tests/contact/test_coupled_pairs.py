@@ -98,7 +98,7 @@ def test_every_step_is_optimal(name, supported, comm, shared_tmp_path):
         alone = np.setdiff1d(np.arange(len(x)), held)
         np.testing.assert_allclose(state.contact[alone], push[alone], atol=1e-12)
         if len(held):
-            normals, _ = contact.planes(touching, x[held], contact.motion.displacements(balance.time))
+            normals, _ = contact.planes(touching, x[held], contact.motion.poses(balance.time))
             normals = np.where(touching[:, :, None], normals, 0.0)
             rest = (state.contact - push)[held]
             strengths = np.einsum("mwi,mi->mw", np.linalg.pinv(normals.transpose(0, 2, 1)), rest)

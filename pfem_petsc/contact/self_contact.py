@@ -819,10 +819,20 @@ class SelfContact:
         if self.at_walls is not None:
             self.at_walls.resume(x, float(numbers["last_step"]))
 
-    def take_over(self, earlier: SelfContact, x: np.ndarray) -> None:
-        """Go on from the end of an earlier stage, at positions (owned, 3). Collective."""
-        self.deepest, self.dissipated = earlier.deepest, earlier.dissipated
-        self._take(earlier._table(), x)
+    def overlap_at_start(self, earlier: SelfContact | None) -> float:
+        """Return the largest overlap [m] of bars at the start of a stage that other bars or radii of the stage before,
+        or no contact there, allowed; zero if these are the same. Collective."""
+        same = earlier is not None and np.array_equal(self._radius, earlier._radius)
+        same = same and np.array_equal(self.chosen, earlier.chosen)
+        least = 0.0 if same else float(self.sums[OVERLAP])
+        return self.comm.allreduce(least, op=MPI.MAX)
+
+    def take_over(self, earlier: SelfContact | None, x: np.ndarray) -> None:
+        """Go on from the end of an earlier stage, with contact of bars or not, at positions (owned, 3). Collective."""
+        table = np.empty((0, WIDTH + 3))
+        if earlier is not None:
+            self.deepest, self.dissipated, table = earlier.deepest, earlier.dissipated, earlier._table()
+        self._take(table, x)
 
     def _take(self, table: np.ndarray, x: np.ndarray) -> None:
         """Take pairs that touch (m, width + 3) from any ranks to those of their nodes. Collective."""

@@ -228,6 +228,14 @@ class Stages:
             ended.destroy()
         self.stepper = stepper
         stepper.start()
+        if model.self_contact is not None:
+            overlap = model.self_contact.overlap_at_start(old.model.self_contact)
+            if overlap > 0.0:
+                raise SimulationFailure(
+                    f"{where}: [self_contact]: bars that may touch now overlap by up to {overlap:.3g} m, which would "
+                    "add energy: give the table with the same bars and radius to the stages before, or reduce "
+                    "self_contact.radius"
+                )
         return handed
 
     def destroy(self) -> None:
@@ -279,7 +287,7 @@ def _hand_over(old: Stepper, new: Stepper) -> None:
     new.model.temperatures.hold(old.model.bars.heat)
     new.model.rest_lengths.hold(old.model.bars.rest)
     new.model.links.take_over(old.model.links)
-    if new.model.self_contact is not None and old.model.self_contact is not None:
+    if new.model.self_contact is not None:
         new.model.self_contact.take_over(old.model.self_contact, state.position)
     _hand_over_contact(old, new)
 

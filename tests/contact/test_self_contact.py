@@ -411,3 +411,19 @@ def test_contact_goes_over_to_the_next_stage(tmp_path):
     with pytest.raises(InputError, match=r"self_contact.* needs an explicit integrator"):
         case["stage"].append({"name": "still", "static": {}})
         Simulation(Case(case, mesh=mesh), MPI.COMM_SELF, output=tmp_path / "no")
+
+
+def test_stage_does_not_begin_with_overlaps_that_the_one_before_allowed(tmp_path):
+    """Bars 0.03 m apart approach at 2 m/s to 0.01 m, without contact; their radii are 0.01 m."""
+    case = crossed(time={"step": 1e-4, "end": 0.01}).to_dict()
+    mesh = Truss(np.array([[-0.5, 0, 0], [0.5, 0, 0], [0, -0.5, 0.03], [0, 0.5, 0.03]]), [[0, 1], [2, 3]])
+    case.pop("mesh")
+    time, table = case.pop("time"), case.pop("self_contact")
+    case["stage"] = [{"name": "one", "time": time}, {"name": "two", "time": time, "self_contact": table}]
+    with pytest.raises(SimulationFailure, match=r"stage 'two'.*: bars that may touch now overlap by up to 0\.01 m"):
+        rows_of(Case(case, mesh=mesh), MPI.COMM_SELF, tmp_path, "late")
+    case["stage"][0]["time"], case["stage"][1]["time"] = {**time, "end": 2e-3}, {**time, "end": 0.03}
+    rows, _ = rows_of(Case(case, mesh=mesh), MPI.COMM_SELF, tmp_path, "apart")
+    momentum = column(rows, "momentum")[:, 2]
+    np.testing.assert_allclose(momentum, momentum[0], rtol=1e-12)
+    assert column(rows, "self_contact/contacts").max() == 1 and abs(rows[-1]["energy_imbalance"]) < 1e-12

@@ -28,6 +28,7 @@ def falling(wall, points=ACROSS, velocity=(0.0, 0.0, -1.0), step=2e-4, end=0.12,
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
 @pytest.mark.parametrize("restitution", [1.0, 0.5, 0.2])
 def test_bar_that_falls_on_a_sphere(integrator, restitution, comm, shared_tmp_path):
@@ -63,6 +64,7 @@ def test_wall_that_moves_works_on_the_bar(comm, shared_tmp_path):
     assert abs(last["numerical_dissipation"]) < 2e-4
 
 
+@pytest.mark.slow
 def test_bar_across_the_edge_of_a_box(comm, shared_tmp_path):
     """A bar that falls across the edge of a box of triangles is pushed across the edge and its axis."""
     file = write_surface(shared_tmp_path / "box.obj", *box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0)), comm)
@@ -73,17 +75,18 @@ def test_bar_across_the_edge_of_a_box(comm, shared_tmp_path):
     np.testing.assert_allclose(run.state.v[:, [0, 2]], 0.5, rtol=0.01)  # it was hit in its middle
 
 
+@pytest.mark.slow
 def test_bar_rests_between_its_nodes(comm, shared_tmp_path):
     """Balanced on a cylinder, damped, it is pressed with its weight; without the table, it falls through."""
     wall = {"type": "cylinder", "point": [0.0, 0.0, 0.0], "axis": [0.0, 1.0, 0.0], "radius": 0.5}
     points = [[-1.0, 0.0, 0.5], [1.0, 0.0, 0.5]]
-    case = falling(wall, points, (0.0, 0.0, 0.0), end=0.3, gravity={"acceleration": [0.0, 0.0, -10.0]})
+    case = falling(wall, points, (0.0, 0.0, 0.0), gravity={"acceleration": [0.0, 0.0, -10.0]})
     rows, run = rows_of(case, comm, shared_tmp_path)
-    assert np.mean([row["wall/w/force"][2] for row in rows[500:]]) == pytest.approx(MASS * 10.0, rel=0.02)
+    assert np.mean([row["wall/w/force"][2] for row in rows[400:]]) == pytest.approx(MASS * 10.0, rel=0.02)
     np.testing.assert_allclose(run.state.position[:, 2], 0.5 - MASS * 10.0 / 500.0, atol=1e-4)
     del case["self_contact"]
     _, run = rows_of(case, comm, shared_tmp_path, "free")
-    assert run.state.position[:, 2].max(initial=-1.0) < 0.1
+    assert run.state.position[:, 2].max(initial=-1.0) < 0.5 - 0.07
 
 
 @pytest.mark.parallel
@@ -92,12 +95,12 @@ def test_on_any_rank_count_and_restarted(integrator, comm, shared_tmp_path):
     wall = {**BALL, "friction": 0.3, "restitution": 0.4}
     wall["rotation"] = {"centre": [0.0, 0.0, 0.0], "axis": [1.0, 0.0, 0.0], "angular_velocity": 4.0}
     points = [[-1.0, 0.1, 0.52], [0.4, 0.1, 0.52], [1.2, 0.0, 0.53]]
-    case = falling(wall, points, (0.0, 0.3, -1.0), end=0.03)
+    case = falling(wall, points, (0.0, 0.3, -1.0), step=4e-4, end=0.03)
     case["mesh"]["bars"] = [[0, 1], [1, 2]]
     case["time"]["integrator"] = integrator
     if integrator == "chung_lee":  # which has no restitution beside friction
         del case["wall"][0]["restitution"]
     case = Case.from_dict(case)
-    history = assert_restart_is_bitwise(case, comm, shared_tmp_path, 110, 125)
+    history = assert_restart_is_bitwise(case, comm, shared_tmp_path, 55, 63)
     names = "momentum", "kinetic_energy", "self_contact_dissipation", "wall/w/impulse", "wall/w/moment"
     assert_as_on_one_rank(history, case, comm, shared_tmp_path, *names)

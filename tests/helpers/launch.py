@@ -33,7 +33,7 @@ FEWER = 4
 """Factor on the stride for tests marked ``few_sets``."""
 
 
-PARTS = 5
+PARTS = 8
 """Of the slow tests; one part runs without ``--all-sets``."""
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from ..errors import InputError
 from ..files import check_contents, readable_whole
 from ..registry import nearest
-from .base import FileName, Finite, PositiveFloat, StrictModel, listed
+from .base import FileName, Finite, PositiveFloat, StrictModel, listed, refusal
 
 
 class Columns:
@@ -297,6 +297,21 @@ def digest_of(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except (OSError, ValueError) as error:
         raise _unreadable(path, error) from error
+
+
+def found_file(name: str, digest: str | None, folder: str | Path) -> dict[str, str]:
+    """Return the keys ``file``, with its folder, and ``digest`` of a table, which is that of its content by default.
+
+    Raises
+    ------
+    ValidationError
+        If the file cannot be read.
+    """
+    path = Path(folder, name).resolve()
+    try:
+        return {"file": str(path), "digest": digest_of(path) if digest is None else digest}
+    except InputError as error:
+        raise refusal((("file",), str(error), name)) from error
 
 
 def read_forces(path: Path, digest: str) -> Forces:

@@ -42,7 +42,7 @@ from .base import (
     refers,
     refusal,
 )
-from .files import digest_of, profile_of
+from .files import found_file, profile_of
 from .section_shapes import SHAPES, SIZES, CrossSection, cross_section
 
 Indices = Annotated[tuple[NonNegativeInt, ...], listed]
@@ -573,12 +573,7 @@ class LoadFile(StrictModel):
     @model_validator(mode="after")
     def _found(self, info: ValidationInfo) -> LoadFile:
         if info.context is not None:
-            path = Path(info.context.folder, self.file).resolve()
-            try:
-                digest = digest_of(path) if self.digest is None else self.digest
-            except InputError as error:
-                raise refusal((("file",), str(error), self.file)) from error
-            self._take(file=str(path), digest=digest)
+            self._take(**found_file(self.file, self.digest, info.context.folder))
         return self
 
 

@@ -89,7 +89,7 @@ class ExplicitStepper(Stepper):
         with self._faults(balance):
             pushes = model.links.explicit(balance, state, u, stiffness, tolerance)
             if pushes is not None:
-                state.contact = state.contact + np.zeros_like(u)
+                state.contact = state.contact.copy()
                 model.links.push(pushes, stiffness, u, state.contact)
         if model.contact.any:
             # also after a failure of links: with walls with mass this call is collective

@@ -302,8 +302,7 @@ class Restitution(Treatment):
         gone, force = self._held[left], self._force[left]
         walls = self._touched[gone].argmax(axis=1)
         contact, every = stepper.model.contact, np.arange(len(gone))
-        poses = contact.motion.poses(self._time), contact.motion.poses(state.time)
-        way = contact.ways(self._place[gone], *poses)[every, walls]
+        way = self._carried(gone, state.time)[every, walls]
         rate = contact.rates(state.position[gone], state.time)[every, walls]
         work = 0.5 * np.einsum("mi,mi->m", force, state.position[gone] - self._place[gone] - way)
         away = force / np.maximum(np.linalg.norm(force, axis=1), 1e-300)[:, None]
@@ -333,8 +332,7 @@ class Restitution(Treatment):
         The displacements without walls follow from the balance of the step.
         """
         contact, state = self.stepper.model.contact, self.stepper.state
-        poses = contact.motion.poses(self._time), contact.motion.poses(state.time)
-        way = contact.ways(self._place[nodes], *poses)
+        way = self._carried(nodes, state.time)
         moved, before, after = self._explicit_motion(nodes, state.position[nodes] - self._place[nodes])
         approach, before, after = (
             -np.einsum("mwi,mwi->mw", normals, array)
@@ -355,9 +353,15 @@ class Restitution(Treatment):
 
     def _moved(self, nodes: np.ndarray) -> np.ndarray:
         """Return displacements of nodes (m,) in this step relative to the walls (m, slots, 3) [m]."""
-        contact, state = self.stepper.model.contact, self.stepper.state
-        poses = contact.motion.poses(self._time), contact.motion.poses(state.time)
-        return (state.position[nodes] - self._place[nodes])[:, None, :] - contact.ways(self._place[nodes], *poses)
+        state = self.stepper.state
+        return (state.position[nodes] - self._place[nodes])[:, None, :] - self._carried(nodes, state.time)
+
+    def _carried(self, nodes: np.ndarray, time: float) -> np.ndarray:
+        """Return how far walls carry their points at nodes (m,) from the start of the step to a time [s], (m, slots, 3)
+        [m]."""
+        contact = self.stepper.model.contact
+        poses = contact.motion.poses(self._time), contact.motion.poses(time)
+        return contact.ways(self._place[nodes], *poses)
 
     def on_walls(self, applicable: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return nodes in contact with walls (m,), and their new velocities and accelerations (m, 3) [m/s], [m/s2]."""

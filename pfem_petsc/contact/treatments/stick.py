@@ -148,7 +148,6 @@ class Treatment(Restitution):
 
     def _moved_to_solution(self, nodes: np.ndarray) -> np.ndarray:
         """Return displacements of nodes (m,) to the position solved for, relative to the walls (m, w, 3) [m]."""
-        balance, contact = self.stepper.balance, self.stepper.model.contact
+        balance = self.stepper.balance
         moved = (balance.predictor + self.stepper.solution.u)[nodes] - self._place[nodes]
-        poses = contact.motion.poses(self._time), contact.motion.poses(balance.time)
-        return moved[:, None, :] - contact.ways(self._place[nodes], *poses)
+        return moved[:, None, :] - self._carried(nodes, balance.time)

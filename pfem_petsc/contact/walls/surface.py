@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, ValidationInfo, model_validator
 
-from ...case.base import FileName, PositiveFloat, Vector3, refusal
-from ...case.files import digest_of
+from ...case.base import FileName, PositiveFloat, Vector3
+from ...case.files import digest_of, found_file
 from ...errors import InputError
 from ...formats import read_triangles
 from ...mechanics.records import by_reference
@@ -60,12 +60,7 @@ class Parameters(WallKeys):
         if self.side == "both" and self.flip:
             raise ValueError('flip has no effect on a surface with side = "both"')
         if info.context is not None:
-            path = Path(info.context.folder, self.file).resolve()
-            try:
-                digest = digest_of(path) if self.digest is None else self.digest
-            except InputError as error:
-                raise refusal((("file",), str(error), self.file)) from error
-            self._take(file=str(path), digest=digest)
+            self._take(**found_file(self.file, self.digest, info.context.folder))
         return self
 
 

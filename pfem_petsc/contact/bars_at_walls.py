@@ -170,11 +170,15 @@ class BarsAtWalls:
         def gap(t: np.ndarray) -> np.ndarray:
             return gaps_of((1.0 - t)[:, None] * ends[:, 0] + t[:, None] * ends[:, 1])
 
-        if not len(ends):
-            return np.empty(0), np.empty(0)
         places = np.linspace(0.0, 1.0, _SAMPLES)
         sampled = np.stack([gap(np.full(len(ends), t)) for t in places])
-        best = sampled.argmin(axis=0)
+        # the distance changes along a bar by no more than the way
+        half = 0.5 * places[1] * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        near = np.flatnonzero(sampled.min(axis=0) <= half)
+        where, least = np.zeros(len(ends)), np.full(len(ends), np.inf)
+        if not len(near):
+            return where, least
+        ends, best = ends[near], sampled[:, near].argmin(axis=0)
         low, high = places[np.maximum(best - 1, 0)], places[np.minimum(best + 1, _SAMPLES - 1)]
         one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
         first, second = gap(one), gap(two)
@@ -189,7 +193,8 @@ class BarsAtWalls:
             first, second = np.where(left, fresh, second), np.where(left, first, fresh)
         t = 0.5 * (low + high)
         inside = (t > _BESIDE) & (t < 1.0 - _BESIDE)
-        return t, np.where(inside, gap(t), np.inf)
+        where[near], least[near] = t, np.where(inside, gap(t), np.inf)
+        return where, least
 
     def _normals(self, k: int, ends: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Return the derivatives (m, 3) of the least distances by the positions of the places ``t`` (m,)."""

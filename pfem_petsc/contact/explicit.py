@@ -737,10 +737,7 @@ class ExplicitContact(NodeWalls):
             memory = [
                 array[nodes] if bounces else np.empty((len(nodes), 0)) for array in (walls.rebound, walls.arrival)
             ]
-            sums, places = (
-                WallSums(*(np.zeros_like(getattr(self.nothing, name)) for name in WallForces.sums)),
-                free.copy(),
-            )
+            sums, places = WallSums(*(getattr(self.nothing, name).copy() for name in WallForces.sums)), free.copy()
             given = Arrivals(start, ways, drift, *of_nodes, *memory, *planes)
             failed, why, found, force, touching, friction = press_nodes(places, given, reference, sums, *kind_of(walls))
             settled = failed >= 0 or not others or np.abs(places - at).max() <= tolerance

@@ -21,12 +21,12 @@ _BEHIND = 2
 
 
 @inlined
-def _tangent(triangles, i, x, reach, normals, offsets):
+def _tangent(triangles, i, x, normals, offsets):
     """Write the plane through the place nearest to a position (3,) across the way there, as the i-th node's only one;
-    return the distance [m], infinite beyond ``reach``."""
-    distance, face, feature, px, py, pz = nearest(triangles, x[0], x[1], x[2], reach)
+    return the distance [m]."""
+    distance, face, feature, px, py, pz = nearest(triangles, x[0], x[1], x[2], math.inf)
     offsets[i, :] = -math.inf
-    if face < 0:
+    if face < 0:  # of a position that is no number
         return distance
     clearance, rounding = triangles.limits[0, 1], triangles.limits[0, 2]
     both = triangles.limits[0, 0] > 0.0
@@ -55,7 +55,7 @@ def tangent_planes(triangles, x, normals, offsets):
     """Write the plane nearest to positions (m, 3) into normals (m, 3, 3) and offsets (m, 3), of which the first has it;
     the others are -inf."""
     for i in range(len(x)):
-        _tangent(triangles, i, x[i], math.inf, normals, offsets)
+        _tangent(triangles, i, x[i], normals, offsets)
 
 
 @kernel
@@ -117,23 +117,23 @@ def _find(triangles, nodes, ways, tolerance, table, kept):
     starts, ends, fixed, slack = ways
     known, normals, offsets = table
     changed, both = False, triangles.limits[0, 0] > 0.0
-    own, level = np.zeros((1, 3, 3)), np.empty((1, 3))
+    own, level, gaps = np.zeros((1, 3, 3)), np.empty((1, 3)), np.empty(3)
     for j in range(len(nodes)):
-        i, x, gaps = nodes[j], ends[j], np.empty(3)
+        i, x = nodes[j], ends[j]
         if not known[i]:
             known[i], offsets[i, :], changed = 1, -math.inf, True
             if faces_at(triangles, starts[j], x, fixed[j], slack[j], own[0], level[0]) == 0 and tolerance > 0.0:
-                if not both and _tangent(triangles, 0, starts[j], math.inf, own, level) < -slack[j]:
+                if not both and _tangent(triangles, 0, starts[j], own, level) < -slack[j]:
                     known[i] = _BEHIND
                     continue
-                _tangent(triangles, 0, x, math.inf, own, level)
+                _tangent(triangles, 0, x, own, level)
             for k in range(3):
                 if level[0, k] > -math.inf:
                     _put(i, j, own[0, k], level[0, k], table, kept)
             continue
         if known[i] == _BEHIND:
             continue
-        distance = _tangent(triangles, 0, x, math.inf, own, level)
+        distance = _tangent(triangles, 0, x, own, level)
         on, there, worst = False, False, 0
         for k in range(3):
             gaps[k] = math.inf

@@ -54,7 +54,8 @@ _PART = 0.1, 0.5  # of the stiffness and damping that a node may still have, for
 _ROOM = 0.6  # least sum of squared frequencies that a step must leave for contacts, over its inverse square
 _SKIN = 0.1, 0.5  # least and largest distance beyond the radii up to which pairs are listed, over the length of bars
 _STEPS = 20.0  # steps for which the skin should be sufficient, unless it is too large then
-_FEW, _MANY = 0.25, 3.0  # pairs for each bar in lists that are made with a larger or a smaller skin the next time
+_FEW, _MANY = 0.1, 0.6  # pairs for each bar in lists that are made with a larger or a smaller skin the next time
+_WIDER = 1.05  # bound of the next displacements over the largest one
 _LEAST = 0.25  # distance in the mesh, over the sum of radii, below which bars cross there and do not touch
 _DEEP = 0.2  # overlap over the radius from which results are doubtful
 _TAG = 7800  # of messages between ranks with nodes of the same pairs
@@ -410,18 +411,47 @@ def measure_pairs(nodes, ends, bars, sizes):
 
 
 @kernel
-def largest_move(x, last, drift):
-    """Return a distance that no node at x (n or more, 3) is farther from last (3, n) + drift (3,) than; infinite for
-    positions that are not finite."""
-    square, total = 0.0, 0.0
+def largest_move(rows, last, drift, most):
+    """Return a distance that no node with the coordinates ``rows`` (3, n) is farther from last (3, n) + drift (3,)
+    than; infinite for positions that are not finite. ``most`` (3,): bounds of the components in the last call, which
+    are found anew where they are too small: comparisons are quicker than maxima."""
+    square = 0.0
     for c in range(3):
-        most = 0.0
-        for i in range(last.shape[1]):
-            d = x[i, c] - last[c, i] - drift[c]
-            total = add_freely(total, d)
-            most = max(most, abs(d))
-        square += most * most
-    return np.sqrt(square) if np.isfinite(total) else np.inf
+        row, before, shift, limit = rows[c], last[c], drift[c], most[c]
+        beyond = 0
+        for i in range(len(before)):
+            beyond += 0 if abs(row[i] - before[i] - shift) <= limit else 1
+        if beyond > 0:
+            largest, total = 0.0, 0.0
+            for i in range(len(before)):
+                d = row[i] - before[i] - shift
+                total = add_freely(total, d)
+                largest = max(largest, abs(d))
+            if not np.isfinite(total):
+                return np.inf
+            most[c] = _WIDER * largest
+        square += most[c] * most[c]
+    return np.sqrt(square)
+
+
+@kernel
+def read_nodes(rows, x, last, nodes):
+    """Write positions x (n or more, 3) and displacements since last (3, n) of some nodes (k,) to ``nodes`` (k, 6)."""
+    for k in range(len(rows)):
+        i = rows[k]
+        for c in range(3):
+            nodes[k, c], nodes[k, 3 + c] = x[i, c], x[i, c] - last[c, i]
+
+
+@kernel
+def add_to_nodes(local, own, force, f):
+    """Add forces (q, 3), of the nodes that are ``own`` (q,) bool, to those of the ``local`` (k,) nodes of f (n, 3)."""
+    k = 0
+    for i in range(len(own)):
+        if own[i]:
+            for c in range(3):
+                f[local[k], c] += force[i, c]
+            k += 1
 
 
 def _numbered(ends: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -489,7 +519,7 @@ class SelfContact:
         self._h, self.room = 0.0, 0.0
         self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
         self.sums = self._no_sums = np.zeros(6)
-        self._way, self._limit, self._drift = 0.0, 0.0, np.zeros(3)
+        self._way, self._limit, self._drift, self._most = 0.0, 0.0, np.zeros(3), np.zeros(3)
         self._reference = mesh.points[: mesh.n_owned].copy()
         self._last = self._reference.T.copy()
         self._exchange: GhostExchange | None = None
@@ -656,9 +686,11 @@ class SelfContact:
         pairs.stiffness[begin], pairs.drag[begin] = pairs.most[begin], inf
         if not self._h:
             return
-        room = self._mass[:, None] * np.array([0.5 * self.room, 0.5 / self._h])
-        left = np.array(_PART) * np.maximum(room - load[:, :2], 0.0) / np.maximum(load[:, 2:], 1e-6)
-        least = left[pairs.ends[begin]].min(axis=1, initial=inf)
+        ends = pairs.ends[begin]
+        room = self._mass[ends][:, :, None] * np.array([0.5 * self.room, 0.5 / self._h])
+        load = load[ends]
+        left = np.array(_PART) * np.maximum(room - load[:, :, :2], 0.0) / np.maximum(load[:, :, 2:], 1e-6)
+        least = left.min(axis=1, initial=inf)
         pairs.stiffness[begin] = np.minimum(pairs.most[begin], least[:, 0])
         pairs.drag[begin] = least[:, 1]
 
@@ -694,7 +726,10 @@ class SelfContact:
         SimulationFailure
             On all ranks, if a bar has passed through another, or may have.
         """
-        worst = np.array([largest_move(x, self._last, step * self._drift), float(self.stale), -self._asleep])
+        owned = self._last.shape[1]
+        rows = tuple(np.ascontiguousarray(x[:owned, c]) for c in range(3))
+        move = largest_move(rows, self._last, step * self._drift, self._most)
+        worst = np.array([move, float(self.stale), -self._asleep])
         if self.comm.size > 1:
             self.comm.Allreduce(MPI.IN_PLACE, worst, op=MPI.MAX)
         if not worst[0] < np.inf:  # of which other checks of the step tell
@@ -705,9 +740,9 @@ class SelfContact:
         if way < -worst[2] and self._asleep > 0.0:  # nothing touches, nor can; after a search, this is not known
             if commit:
                 self._way, self.sums = way, self._no_sums
-                self._last[:] = x[: self._last.shape[1]].T
+                np.stack(rows, out=self._last)
             return 0.0, self.dissipated
-        nodes = self._gather(lambda rows: np.hstack([x[rows], x[rows] - self._last[:, rows].T]), 6)
+        nodes = self._gather(lambda some: self._motion_of(some, x), 6)
         force, load, sums = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3)), np.zeros(6)
         law = PairLaw(self._friction, self._damping, float(step), way, way if commit else 2.0 * self._way - way)
         arrays, pairs, state = NodeArrays(nodes, self._inverse, force), self._pairs, self._state
@@ -727,14 +762,20 @@ class SelfContact:
             "bars {} and {} pass through each other, which the stiffness of [self_contact] did not prevent: reduce "
             "time.step, or use more elements, a larger self_contact.radius or lower velocities",
         )
-        f[self._local] += force[self._own]
+        add_to_nodes(self._local, self._own, force, f)
         total = self.dissipated + float(sums[DISSIPATED])
         if commit:
             self._memory, self._spare = self._spare, self._memory
             self._way, self.dissipated, self.sums = way, total, sums
             self.deepest = max(self.deepest, float(sums[DEPTH]))
-            self._last[:] = x[: self._last.shape[1]].T
+            np.stack(rows, out=self._last)
         return float(sums[ENERGY]), total
+
+    def _motion_of(self, some: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Return positions and displacements in the step (k, 6) of owned nodes (k,), see :class:`NodeArrays`."""
+        nodes = np.empty((len(some), 6))
+        read_nodes(some, x, self._last, nodes)
+        return nodes
 
     def _any(self, here: int) -> bool:
         """Return whether a number is not zero on some rank. Collective."""
@@ -769,7 +810,7 @@ class SelfContact:
         longest = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max(initial=0.0))
         longest = self.comm.allreduce(longest, op=MPI.MAX)
         self._near = make_regions(self.comm, self._reference, 6.0 * (longest + self._skin)), longest
-        self._limit, self.stale = way + 0.998 * (self._skin - move), False
+        self._limit, self.stale, self._most[:] = way + 0.998 * (self._skin - move), False, 0.0
 
     def of_row(self, name: str) -> float:
         """Return this rank's share of a value of the history: ``contacts``, ``overlap`` [m] or ``force`` [N], which are

@@ -361,7 +361,8 @@ def book_springs(s, step):
 def push_particles(s, step):
     """Advance the particles of the impulses by a step, with the forces of the balance, of walls and of rows."""
     forces, walls, links, u, h = s.sums.forces, s.pressed.force, s.rows.totals, s.particles, s.motion.h
-    first = WALLS + len(walls)
+    first, torques = WALLS + len(walls), s.called_walls.torques
+    turns = first + len(walls) + 2 * len(links)
     for k in range(len(u)):
         for c in range(3):
             if k < WALLS:
@@ -370,6 +371,8 @@ def push_particles(s, step):
                 load = walls[k - WALLS, c]
             elif k < first + len(links):
                 load = links[k - first, c]
+            elif turns <= k < turns + len(walls) and c == 0:
+                load = torques[k - turns]
             else:  # jumps, which need Python
                 load = 0.0
             u[k, c] = h * h * load

@@ -8,7 +8,8 @@ that
 
 holds to rounding with any scheme, including multistep schemes and bisected steps. If a treatment of impact changes the
 velocity, acceleration or scheme memory of nodes, the same changes, times the nodal masses, are applied to a particle
-without forces; its velocity is the impulse of the jumps. The forces of contact pairs cancel in the sum; their impulse
+without forces; its velocity is the impulse of the jumps. The moments of turning walls about their axes have particles
+likewise, whose first component is the angular impulse. The forces of contact pairs cancel in the sum; their impulse
 is that on the second nodes. Momentum that a jump of a pair removes from a supported node is transferred to the support,
 and so is the difference between prescribed velocities and those of the scheme.
 """
@@ -25,13 +26,15 @@ from ..mechanics.compiled import kernel
 from ..tolerances import RANK
 
 if TYPE_CHECKING:
+    from ..contact.node_walls import WallForces
     from .stepper import Stepper
 
 __all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "ContactSums", "Impulses", "NoImpulses", "record_forces"]
 
 SUPPORT, EXTERNAL, DAMPING, WALLS = 0, 1, 2, 3
 """Rows of the particles: three in the order of the totals of :class:`~pfem_petsc.stepping.ledger.Ledger`, then walls
-and pairs, then the jumps of walls and pairs."""
+and pairs, then the jumps of walls and pairs; then the moments of walls about their axes and those of jumps, if any wall
+turns."""
 
 IN_COLUMNS = (EXTERNAL, SUPPORT, DAMPING)
 """The first rows of the particles in the order of the columns of the history."""
@@ -116,7 +119,9 @@ class Impulses:
         self.n_walls = len(model.contact.names)
         self.n_links = len(model.links.columns)
         self.jumps = WALLS + self.n_walls + self.n_links
-        rows = self.jumps + self.n_walls + self.n_links
+        self.turns = self.jumps + self.n_walls + self.n_links
+        self._turning = self.n_walls if model.contact.motion.turning.any() else 0
+        rows = self.turns + 2 * self._turning
         self.state = State(*(np.zeros((rows, 3)) for _ in range(7)))
         self.force = np.zeros((rows, 3))
 
@@ -126,19 +131,27 @@ class Impulses:
         self.state.a = self.forces(totals, self.stepper.walls_at_start, self.stepper.links_at_start).copy()
         scheme.start(self.state, h)
 
-    def forces(self, totals: np.ndarray, walls: np.ndarray, links: np.ndarray) -> np.ndarray:
-        """Write totals (3, 3) and the forces of walls (walls, 3) and links (tables, 3) into :attr:`force` [N]."""
+    def forces(self, totals: np.ndarray, walls: WallForces, links: np.ndarray) -> np.ndarray:
+        """Write totals (3, 3), the forces of walls and links (tables, 3), and moments of walls that turn, into
+        :attr:`force` [N]."""
         self.force[:WALLS] = totals
-        self.force[WALLS : WALLS + self.n_walls] = walls
+        self.force[WALLS : WALLS + self.n_walls] = walls.force
         self.force[WALLS + self.n_walls : self.jumps] = links
+        if self._turning:
+            self.force[self.turns : self.turns + self._turning, 0] = self._torques(walls.force, walls.moment)
         return self.force
+
+    def _torques(self, force: np.ndarray, moment: np.ndarray) -> np.ndarray:
+        """Return the moments (walls,) of walls about their axes [N m], see
+        :meth:`~pfem_petsc.contact.wall_motion.WallMotion.torques`."""
+        return self.stepper.model.contact.motion.torques(force, moment, self.stepper.state.time)
 
     def step(self, totals: np.ndarray, part: float) -> None:
         """Add the forces of the last balance, after a substep of size ``part`` [s]; ``totals`` (3, 3) are support,
         external and damping force [N]."""
         stepper, state = self.stepper, self.state
-        walls = stepper.solution.walls.force
-        self._before = self._of_walls()
+        walls = stepper.solution.walls
+        self._before = self._of_walls(), self._of_turns()
         if stepper.step_changed:
             stepper.scheme.step_changed(state)
         balance = stepper.scheme.balance(state, part)
@@ -163,9 +176,16 @@ class Impulses:
         v = self.state.v
         return v[WALLS : WALLS + self.n_walls] + v[self.jumps : self.jumps + self.n_walls]
 
-    def mean_wall_forces(self) -> np.ndarray:
-        """Return the momentum that walls gave in the last step over its size, (walls, 3) [N]."""
-        return (self._of_walls() - self._before) / self.stepper.part
+    def _of_turns(self) -> np.ndarray:
+        """Return the angular impulses of walls about their axes, jumps included [N m s]; (0,) if none turns."""
+        first, n = self.turns, self._turning
+        return self.state.v[first : first + n, 0] + self.state.v[first + n : first + 2 * n, 0]
+
+    def mean_pushes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the momentum that walls gave in the last step over its size, (walls, 3) [N], and the angular momentum
+        about their axes, (walls,) [N m], or (0,) if none turns."""
+        part, (walls, turns) = self.stepper.part, self._before
+        return (self._of_walls() - walls) / part, (self._of_turns() - turns) / part
 
     def _add(self, particles: np.ndarray, nodes: np.ndarray, walls: np.ndarray, change: np.ndarray) -> None:
         mass = self.stepper.model.inertia.mass  # treatments that set velocities require lumped mass
@@ -173,7 +193,12 @@ class Impulses:
         first = self.jumps
         if self.n_walls:
             shares = _wall_shares(self.stepper, nodes, walls, momentum)
-            particles[first : first + self.n_walls] += self.stepper.model.contact.of_walls(shares.sum(axis=0))
+            given = self.stepper.model.contact.of_walls(shares.sum(axis=0))
+            particles[first : first + self.n_walls] += given
+            if self._turning:
+                arms = self.stepper.state.position[nodes][:, None, :]
+                moments = self.stepper.model.contact.of_walls(np.cross(arms, shares).sum(axis=0))
+                particles[self.turns + self._turning :, 0] += self._torques(given, moments)
             momentum = momentum - shares.sum(axis=1)
         table = self.links.tables(len(mass))[nodes]
         for k in range(self.n_links):
@@ -205,19 +230,25 @@ class NoImpulses(Impulses):
 
     def __init__(self, stepper: Stepper) -> None:
         super().__init__(stepper)
-        self._last = self._mean = stepper.solution.walls.force.copy()
+        self._last = self._mean = self._pushes()
 
     def start(self, totals: np.ndarray) -> None:
         """Nothing."""
 
     def step(self, totals: np.ndarray, part: float) -> None:
         """Take the forces of walls before and after the step."""
-        before, self._last = self._last, self.stepper.solution.walls.force.copy()
-        self._mean = 0.5 * (before + self._last)
+        before, self._last = self._last, self._pushes()
+        self._mean = 0.5 * (before[0] + self._last[0]), 0.5 * (before[1] + self._last[1])
+
+    def _pushes(self) -> tuple[np.ndarray, np.ndarray]:
+        walls = self.stepper.solution.walls
+        torques = self._torques(walls.force, walls.moment) if self._turning else np.zeros(0)
+        return walls.force.copy(), torques
 
     def jump(self) -> None:
         """Nothing."""
 
-    def mean_wall_forces(self) -> np.ndarray:
-        """Return the means of the forces of walls before and after the last step, (walls, 3) [N]."""
+    def mean_pushes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the means of forces and moments of walls before and after the last step, (walls, 3) [N] and (walls,)
+        [N m]."""
         return self._mean

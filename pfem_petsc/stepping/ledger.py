@@ -446,12 +446,7 @@ class Ledger:
         self._poses, self._displacements = contact.motion.poses(time), contact.motion.displacements(time)
         if not contact.moving.any():
             return
-        if contact.motion.turning.any():
-            walls = self.stepper.solution.walls
-            self._torques, self._angles = (
-                contact.motion.torques(walls.force, walls.moment, time),
-                contact.motion.angles(time),
-            )
+        self._angles = contact.motion.angles(time)
         bodies = contact.motion.bodies
         self._bodies_v, self._bodies_kinetic = bodies.state.v, bodies.kinetic
         self.sums[_AT["wall_kinetic_energy"]] = bodies.kinetic if self.model.comm.rank == 0 else 0.0
@@ -469,16 +464,16 @@ class Ledger:
         if not contact.moving.any():
             return 0.0, 0.0, 0.0, 0.0
         bodies, displacements, v = contact.motion.bodies, self._displacements, self._bodies_v
-        turned = (self._torques, self._angles) if contact.motion.turning.any() else None
+        angles = self._angles
         self._walls_before()
-        push, way = self.impulses.mean_wall_forces(), self._displacements - displacements
+        (push, torques), way = self.impulses.mean_pushes(), self._displacements - displacements
         fallen, moved = way[bodies.at], stepper.part * 0.5 * (v + self._bodies_v)
         way[bodies.at] = moved
         works = (push * way).sum(axis=1)
         given = float(works[bodies.at].sum())
         work = float(works.sum()) - given
-        if turned is not None:
-            work += 0.5 * float(((turned[0] + self._torques) * (self._angles - turned[1])).sum())
+        if len(torques):
+            work += float((torques * (self._angles - angles)).sum())
         if self.model.comm.rank:
             return work, given, 0.0, 0.0
         return work, given, float((bodies.weight * fallen).sum()), float((bodies.weight * (fallen - moved)).sum())

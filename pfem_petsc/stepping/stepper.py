@@ -220,7 +220,7 @@ class Stepper(ABC):
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
         and of the balance solved there by a scheme that solves for the next position; None after a restart
     velocity_solved : (owned, 3) velocity of that balance if there is damping, whose force depends on it [m/s]
-    walls_at_start, links_at_start : (walls, 3), (tables of links, 3) forces at the start [N]
+    walls_at_start, links_at_start : WallForces, and forces of tables of links (tables, 3) [N], at the start
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
         arrays with a row for each owned node, and for each local bar
     columns : names of attributes, numbers, that are columns of the history
@@ -280,7 +280,7 @@ class Stepper(ABC):
         self.totals_at_start: np.ndarray | None = None
         self.totals_solved: np.ndarray | None = None
         self.velocity_solved = self.zero
-        self.walls_at_start = np.zeros((len(model.contact.names), 3))
+        self.walls_at_start = model.contact.nothing
         self.links_at_start = model.links.totals()
         self.solution = Solution(self.zero, self.state.f, model.contact.nothing)
 
@@ -346,7 +346,7 @@ class Stepper(ABC):
             inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))
             state.support = supports.part(inertial - load - state.contact)
         self.totals_at_start = self.totals()
-        self.walls_at_start = self.solution.walls.force
+        self.walls_at_start = self.solution.walls
         self.links_at_start = model.links.totals()
         self.part = self.part_before_start
         self.scheme.start(state, self.part)

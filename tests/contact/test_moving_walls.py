@@ -75,6 +75,8 @@ def test_bar_that_falls_on_a_rising_plate(integrator, treatment, restitution, ga
         (("wilson", {"theta": 2.0}), "scheme", 1.0, "plane", "rod"),
         (("generalized_alpha", {}), "scheme", 0.0, "plate", "rod"),
         (("energy_momentum", {}), "conserving", 0.0, "sphere", "node"),
+        (("central_differences", {}), "scheme", 0.5, "triangles", "truss"),
+        (("generalized_alpha", {}), "stick", 0.0, "triangles", "node"),
     ],
 )
 def test_impact_seen_from_the_wall(scheme, treatment, restitution, wall, body):
@@ -83,6 +85,21 @@ def test_impact_seen_from_the_wall(scheme, treatment, restitution, wall, body):
     assert errors.work < 1e-12
     assert max(errors.balance, errors.momentum) < 1e-12
     assert errors.frames < 1e-11
+
+
+@pytest.mark.parametrize(
+    ("scheme", "treatment", "body"),
+    [
+        (("central_differences", {}), "stick", "rod"),
+        (("newmark", HALF), "stick", "node"),
+        (("energy_momentum", {}), "scheme", "truss"),  # whose forces are those between the ends of steps
+    ],
+)
+def test_impact_seen_from_a_wall_that_turns(scheme, treatment, body):
+    """About a centre so far away that it moves on a straight line: works are moments times angles then."""
+    errors = table.errors_of(scheme, treatment, 0.0, "turning", body)
+    assert errors.balance < 1e-12
+    assert max(errors.work, errors.momentum, errors.frames) < 2e-6
 
 
 @pytest.mark.parametrize(
@@ -111,7 +128,7 @@ def test_bar_that_a_plate_carries(integrator, treatment, comm, shared_tmp_path):
 )
 def test_corner_that_moves_on_any_number_of_ranks(integrator, treatment, restitution, comm, shared_tmp_path):
     """Nodes in a corner of walls of different velocities; stopped and continued to the bit; on all ranks as on one."""
-    case = table.case_of((integrator, {}), treatment, restitution, "plane", "truss", table.MOTION).to_dict()
+    case = table.case_of((integrator, {}), treatment, restitution, "plane", "truss", table.MOTION, shared_tmp_path).to_dict()
     other = np.array([-0.5, 0.2, 0.1])
     point = [-0.004, 0.0, 0.0]
     case["wall"].append(case["wall"][0] | {"name": "other", "point": point, "normal": [1.0, 0.2, 0.1]})

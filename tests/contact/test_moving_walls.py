@@ -128,7 +128,8 @@ def test_bar_that_a_plate_carries(integrator, treatment, comm, shared_tmp_path):
 )
 def test_corner_that_moves_on_any_number_of_ranks(integrator, treatment, restitution, comm, shared_tmp_path):
     """Nodes in a corner of walls of different velocities; stopped and continued to the bit; on all ranks as on one."""
-    case = table.case_of((integrator, {}), treatment, restitution, "plane", "truss", table.MOTION, shared_tmp_path).to_dict()
+    scheme = integrator, {}
+    case = table.case_of(scheme, treatment, restitution, "plane", "truss", table.MOTION, shared_tmp_path).to_dict()
     other = np.array([-0.5, 0.2, 0.1])
     point = [-0.004, 0.0, 0.0]
     case["wall"].append(case["wall"][0] | {"name": "other", "point": point, "normal": [1.0, 0.2, 0.1]})

@@ -5,8 +5,9 @@
 Bodies hit walls of constant velocity V, and walls with mass: every integrator, treatment and restitution 0, 1/2 and 1,
 at a plane, a rough plane, a sphere, a plate with mass, triangles and a plane that turns about a far centre, by a bar
 that falls flat, a rod that falls on its end and a lattice that tumbles. Each runs a second time as seen from the wall:
-the body has the velocity of the first run less V, and the wall rests. Both must have the same motion, impacts and dissipations, and the wall has done the work
-V . (impulse + jump_impulse) in the first. The errors of these are relative to the energy of the motion.
+the body has the velocity of the first run less V, and the wall rests. Both must have the same motion, impacts and
+dissipations, and the wall has done the work V . (impulse + jump_impulse) in the first. The errors of these are relative
+to the energy of the motion.
 """
 
 from __future__ import annotations

@@ -99,51 +99,87 @@ class Impacts:
     warned: bool
 
 
-def write_rods(file: Path, step: float, speed: float = SPEED) -> None:
-    """Write a mesh of all rods side by side, with tips three steps of flight and (k + 1/2)/14 of one before x = 0."""
+AGAINST = "plane", "triangles", "turning", "pair"
+"""What rods meet at x = 0: a plane, triangles, a plane that turns about its normal, and their mirror images."""
+
+
+def write_rods(file: Path, step: float, speed: float = SPEED, against: str = "plane") -> None:
+    """Write a mesh of all rods side by side, with tips three steps of flight and (k + 1/2)/14 of one before x = 0, and
+    of their mirror images for pairs."""
     x = np.linspace(-1.0, 0.0, ELEMENTS + 1)
     points = np.zeros((PHASES, ELEMENTS + 1, 3))
     points[:, :, 0] = x - speed * step * (3.0 + (np.arange(PHASES)[:, None] + 0.5) / PHASES)
     points[:, :, 1] = 0.2 * np.arange(PHASES)[:, None]
-    start = np.arange(ELEMENTS) + (ELEMENTS + 1) * np.arange(PHASES)[:, None]
+    if against == "pair":
+        points = np.concatenate([points, points * [-1.0, 1.0, 1.0]])
+    start = np.arange(ELEMENTS) + (ELEMENTS + 1) * np.arange(len(points))[:, None]
+    tips = (ELEMENTS + 1) * np.arange(1, len(points) + 1) - 1
     with h5py.File(file, "w") as mesh:
         mesh["points"] = points.reshape(-1, 3)
         mesh["bars"] = np.stack([start, start + 1], axis=2).reshape(-1, 2)
-        mesh["node_groups/tips"] = (ELEMENTS + 1) * np.arange(1, PHASES + 1) - 1
+        mesh["node_groups/tips"], mesh["node_groups/others"] = tips[:PHASES], tips[PHASES:]
+        mesh["node_groups/images"] = np.arange(PHASES * (ELEMENTS + 1), len(points) * (ELEMENTS + 1))
+
+
+def source_of(file: Path, against: str) -> dict:
+    """Return the tables of what the rods meet, whose mesh is in a file."""
+    if against == "pair":
+        pair = {"name": "pair", "first": "tips", "second": "others", "direction": [1.0, 0.0, 0.0]}
+        groups = {"others": {"group": "others"}, "images": {"group": "images"}}
+        return {"contact_pair": [pair], "node_set": groups}
+    wall = {"name": "wall", "type": "plane", "point": [0.0] * 3, "normal": [-1.0, 0.0, 0.0]}
+    if against == "triangles":
+        corners = [[0.0, y, z] for y, z in ((-9.0, -9.0), (-9.0, 9.0), (9.0, 9.0), (9.0, -9.0))]
+        face = file.with_name("face.obj")
+        face.write_text("".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in corners) + "f 1 2 3\nf 1 3 4\n")
+        wall = {"name": "wall", "type": "surface", "file": str(face)}
+    if against == "turning":
+        wall["rotation"] = {"centre": [0.0, 1.0, 0.5], "axis": [1.0, 0.0, 0.0], "angular_velocity": 0.7}
+    return {"wall": [wall | {"node_set": "tips"}]}
 
 
 def case_of(
-    file: Path, integrator: str, parameters: dict, treatment: str, mass: str, step: float, restitution: float = 0.0
+    file: Path,
+    scheme: tuple[str, dict],
+    treatment: str,
+    mass: str,
+    step: float,
+    restitution: float = 0.0,
+    against: str = "plane",
 ) -> Case:
     """Return the case of the rods."""
+    integrator, parameters = scheme
+    source = source_of(file, against)
+    met = next(iter(source))
+    source[met][0]["restitution"] = restitution
+    images = [{"node_set": "images", "velocity": [-SPEED, 0.0, 0.0]}]
     # motion along the axis only: a compressed rod would buckle within a few large steps due to rounding
     supports = [] if integrator in EXPLICIT else [{"node_set": "all", "fix": "yz"}]
-    wall = {"name": "wall", "type": "plane", "point": [0.0] * 3, "normal": [-1.0, 0.0, 0.0], "node_set": "tips"}
     return Case.from_dict(
         {
             "mesh": {"file": str(file)},
-            "node_set": {"tips": {"group": "tips"}, "all": {"all": True}},
+            "node_set": {"tips": {"group": "tips"}, "all": {"all": True}} | source.pop("node_set", {}),
             "support": supports,
             "material": {"m": {"young_modulus": 1.0, "density": 1.0}},
             "section": {"s": {"area": 1.0, "material": "m"}},
-            "initial": {"velocity": [SPEED, 0.0, 0.0]},
-            "wall": [wall | {"restitution": restitution}],
+            "initial": {"velocity": [SPEED, 0.0, 0.0], "on": images if against == "pair" else []},
             "contact": {"treatment": treatment},
             "time": {"integrator": integrator, "step": step, "end": 100.0, "mass": mass, **parameters},
             "solver": {"linear": "mumps", "rtol": 1e-10},
+            **source,
         }
     )
 
 
 def impacts(
-    integrator: str, parameters: dict, treatment: str, mass: str, step: float, restitution: float = 0.0
+    scheme: tuple[str, dict], treatment: str, mass: str, step: float, restitution: float = 0.0, against: str = "plane"
 ) -> Impacts | None:
     """Run all phases; ``step`` is relative to the explicit limit. None if the program refuses the combination."""
     h = step * LIMIT
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rods.h5"
-        write_rods(file, h)
-        model = Model(case_of(file, integrator, parameters, treatment, mass, h, restitution), MPI.COMM_SELF)
+        write_rods(file, h, against=against)
+        model = Model(case_of(file, scheme, treatment, mass, h, restitution, against), MPI.COMM_SELF)
         try:
             stepper = make_stepper(model, make_plan(model))
         except InputError:
@@ -154,17 +190,17 @@ def impacts(
 def _run(model: Model, stepper: Stepper, steps: int) -> Impacts:
     ids = model.mesh.node_ids[: model.mesh.n_owned]
     rod, order = ids // (ELEMENTS + 1), np.argsort(ids)
-    tips = order.reshape(PHASES, -1)[:, -1]
+    tips, n = order.reshape(-1, ELEMENTS + 1)[:PHASES, -1], len(ids) // (ELEMENTS + 1)
     bars = model.mesh.bars
     momentum = np.empty((len(ids), 3))
 
     def energy() -> np.ndarray:
         state = stepper.state
         model.inertia.mass_times(state.v, momentum)
-        total = np.bincount(rod, 0.5 * (momentum * state.v).sum(axis=1), PHASES)
+        total = np.bincount(rod, 0.5 * (momentum * state.v).sum(axis=1), n)
         length = np.linalg.norm(state.x[bars[:, 1]] - state.x[bars[:, 0]], axis=1)
         strain = length / model.bars.rest - 1.0  # the default measure
-        return total + np.bincount(rod[bars[:, 0]], 0.5 * model.bars.rest * strain**2, PHASES)
+        return (total + np.bincount(rod[bars[:, 0]], 0.5 * model.bars.rest * strain**2, n))[:PHASES]
 
     stepper.start()
     first = energy()
@@ -173,7 +209,7 @@ def _run(model: Model, stepper: Stepper, steps: int) -> Impacts:
     try:
         for _ in range(steps):
             stepper.step()
-            now = stepper.touching[tips, 0].copy()
+            now = stepper.touching[tips, 0].copy() if len(model.contact.walls) else stepper.state.contact[tips, 0] < 0.0
             releases += touching & ~now
             touching, last = now, energy() / first
             largest = np.fmax(largest, last)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _NONE = np.empty((0, 3))
 _ITERATIONS = 200
+_ROUNDED = 100.0  # moves of up to so many tolerances that do not get smaller are those of rounding
 _FULL_MOVES = 20  # Newton's method converges after a few active sets, or else alternates between some of them
 
 Answer = tuple[np.ndarray, np.ndarray | None]
@@ -302,7 +303,7 @@ class FreeWalls:
         inertial = np.zeros_like(masses) if balance.a_hat is None else masses * balance.a_hat
         weight = np.repeat(balance.alpha * masses, 3)
         u = ((self._load(0.0) - inertial) / (balance.alpha * masses)).ravel()
-        matrix, earlier = np.diag(weight), None
+        matrix, earlier, last = np.diag(weight), None, np.inf
 
         def evaluate(u: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
             self._move(u.reshape(-1, 3))
@@ -327,7 +328,9 @@ class FreeWalls:
                     matrix = matrix + np.outer(dr - matrix @ du, du) / size
             earlier = u, residual
             move = np.linalg.solve(matrix, -residual)
-            if np.abs(move).max(initial=0.0) <= tolerance:
+            before, last = last, float(np.abs(move).max())
+            rounded = last <= _ROUNDED * tolerance and (0.5 * before <= last or iteration > _FULL_MOVES)
+            if last <= tolerance or rounded:
                 break
             u = u + move
             force, slope, residual = evaluate(u)

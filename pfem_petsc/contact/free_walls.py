@@ -56,6 +56,7 @@ class FreeWalls:
     state : of the particles (f + t, 3); x of the first f are displacements [m]
     turns : (t, 3, 3) from rest to the state
     weight : (f, 3) [N], zero where gravity does not act
+    moves : how often the walls have been placed anew; none has moved while it is the same
     """
 
     def __init__(
@@ -104,6 +105,7 @@ class FreeWalls:
         self._times, self._ends = (0.0, 0.0), (self.state.x, self.state.x)  # of the step
         self._start, self._vectors = self.turns, np.zeros((len(self.turners), 3))  # turns at its start, and in it
         self._slopes = np.zeros_like(self.turns)  # of small rotations at its end by the unknowns
+        self.moves = int(self.any)
 
     def follow(self, earlier: Self) -> None:
         """Go on from the motion of the same walls in an earlier stage."""
@@ -111,6 +113,7 @@ class FreeWalls:
             setattr(self.state, name, getattr(earlier.state, name).copy())
         self._ends = self.state.x, self.state.x
         self.turns = self._start = earlier.turns.copy()
+        self.moves += 1
 
     def start(self, h: float) -> None:
         """Initialise the acceleration and the scheme's memory."""
@@ -144,10 +147,11 @@ class FreeWalls:
             self._times, self._ends = (self._times[0], end), (before, state.x.copy())
             self._vectors, _ = self._turn(state.x - before)
             self.turns = turns_by(self._vectors) @ self._start
+        self.moves += 1
 
     def _move(self, u: np.ndarray) -> None:
         """Move the walls to the increments (f + t, 3) of the step being solved [m]."""
-        self._u = u
+        self._u, self.moves = u, self.moves + 1
         self._ends = self._ends[0], self._balance.predictor + u
         self._vectors, self._slopes = self._turn(self._ends[1] - self._ends[0])
 
@@ -397,3 +401,4 @@ class FreeWalls:
             state.memory[name] = np.array(array, dtype=float).reshape(shape)
         for name in self._KEPT:
             setattr(self, name, np.array(kept["step"][name], dtype=float).reshape(np.shape(getattr(self, name))))
+        self.moves += 1

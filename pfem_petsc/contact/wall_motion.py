@@ -74,7 +74,7 @@ class WallMotion:
         rotates = np.array([wall.rotation is not None for wall in walls], dtype=bool)
         self.turning = rotates | np.array([wall.inertia is not None for wall in walls], dtype=bool)
         self.held = Poses(np.zeros((n, 3)), np.tile(np.eye(3), (n if self.turning.any() else 0, 1, 1)))
-        self._last: tuple[Poses, dict[float, Poses]] = self.held, {}
+        self._last: tuple[Poses, dict[tuple[float, int], Poses]] = self.held, {}
         self._axes, self._centres = np.zeros((2, n, 3))
         for k in np.flatnonzero(self.turning & ~rotates):
             self._centres[k] = centres[k] if walls[k].hinge is None else walls[k].hinge.centre
@@ -101,14 +101,12 @@ class WallMotion:
 
     def poses(self, time: float) -> Poses:
         """Return where walls are at a time [s], read-only."""
-        if self.bodies.any:  # which move as they are solved for
-            return self._poses(time)
         if self._last[0] is not self.held or len(self._last[1]) > _LATEST:
             self._last = self.held, {}
-        known = self._last[1]
-        if time not in known:
-            known[time] = self._poses(time)
-        return known[time]
+        known, key = self._last[1], (time, self.bodies.moves)  # they move as they are solved for
+        if key not in known:
+            known[key] = self._poses(time)
+        return known[key]
 
     def poses_without_contact(self, time: float) -> Poses:
         """Return where walls were at the end of the step being solved, at a time [s], if nodes did not push them."""

@@ -144,9 +144,10 @@ class FreeWalls:
         self.scheme.finish(state, self._balance, self._u, h)
         if not self.scheme.solves_next_position:
             state.time, before = end, self._ends[0]
-            self._times, self._ends = (self._times[0], end), (before, state.x.copy())
-            self._vectors, _ = self._turn(state.x - before)
-            self.turns = turns_by(self._vectors) @ self._start
+            vectors, _ = self._turn(state.x - before)
+            self.turns = turns_by(vectors) @ self._start
+            if self.scheme.solves_end:  # else contact holds at the end of the balance
+                self._times, self._ends, self._vectors = (self._times[0], end), (before, state.x.copy()), vectors
         self.moves += 1
 
     def _move(self, u: np.ndarray) -> None:
@@ -185,7 +186,7 @@ class FreeWalls:
 
     def displacements(self, time: float) -> np.ndarray:
         """Return displacements (f, 3) [m] at a time of the step being solved, or the last one [s]."""
-        return self._at(self._part(time))[: len(self.at)]
+        return (self.state.x if time == self.state.time else self._at(self._part(time)))[: len(self.at)]
 
     def _at(self, part: float) -> np.ndarray:
         before, after = self._ends
@@ -193,7 +194,7 @@ class FreeWalls:
 
     def turned(self, time: float) -> np.ndarray:
         """Return matrices (t, 3, 3) of the turns from rest at a time of the step being solved, or the last one [s]."""
-        return self._turned(self._part(time))
+        return self.turns if time == self.state.time else self._turned(self._part(time))
 
     def _turned(self, part: float) -> np.ndarray:
         return turns_by(part * self._vectors) @ self._start if part else self._start

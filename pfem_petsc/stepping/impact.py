@@ -268,7 +268,7 @@ class Impacts:
         rates, speeds = contact.rates(x[nodes], time, ahead=True), np.empty(gaps.shape)
         pulls = np.zeros((len(contact.names), 3))
         if free.any:
-            pulls[free.at] = free.weight / free.mass[:, None]
+            pulls[free.at] = np.where(free.hinged[:, None], 0.0, free.weight / free.mass[:, None])
             linear, angular = np.zeros((2, len(contact.names), 3))
             linear[free.at], angular[free.at] = free.changes(None if load is None else self._free_rates)
             unpushed = linear + np.cross(angular, contact.motion.arms(x[nodes], time))

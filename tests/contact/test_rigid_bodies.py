@@ -226,9 +226,14 @@ def tumbling(integrator, **keys):
 
 @pytest.mark.slow
 @pytest.mark.parallel
-@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark", "hinged"])
 def test_bodies_on_any_rank_count(integrator, comm, shared_tmp_path):
-    case = Case.from_dict(tumbling(integrator, friction=0.3))
+    case = tumbling("central_differences" if integrator == "hinged" else integrator, friction=0.3)
+    if integrator == "hinged":
+        case["gravity"] = {"acceleration": [0.0, 0.0, -10.0]}
+        hinge = {"hinge": {"centre": [0.5, 0.0, 0.1], "axis": [0.0, 1.0, 0.0]}, "gravity": True}
+        case["wall"][0] |= {**hinge, "velocity": None, "angular_velocity": [0.0, 0.2, 0.0]}
+    case = Case.from_dict(case)
     allowed = 1e-9 if integrator == "newmark" else 1e-14 if comm.size > 1 else 0.0
     history = assert_restart_is_bitwise(case, comm, shared_tmp_path, 5, 9, allowed=allowed)
     names = "momentum", "wall_kinetic_energy", "friction_dissipation", "wall/w/rotation", "wall/w/angular_momentum"
@@ -252,6 +257,16 @@ def test_momenta_are_shared_by_tumbling_bodies(kind, comm, shared_tmp_path):
         rates = motion.rates_at(x, run.state.time)[:, 0]
         assert run.model.contact.log.touching.all()
         np.testing.assert_allclose(run.state.v, rates, atol=5e-3)
+
+
+@pytest.mark.slow
+def test_contact_holds_where_wilson_solves(comm, shared_tmp_path):
+    """The check at the end of a run finds nodes on bodies at t + theta h."""
+    rows, run = rows_of(tumbling("wilson", tied=True), comm, shared_tmp_path)
+    x, time = run.stepper.held_by_contact()
+    assert time > run.state.time
+    assert np.abs(run.model.contact.gaps(x, time)).max(initial=0.0) < 1e-9
+    assert rows[-1]["wall/w/contacts"] == 2
 
 
 @pytest.mark.slow

@@ -151,6 +151,12 @@ OF_WALLS = (
 )
 MOTION = (Column("position", "m", 3, stages=LASTING), Column("velocity", "m/s", 3))
 """Of walls that move."""
+OF_BODIES = (
+    Column("rotation", "rad", 3, stages=LASTING),  # by angles up to pi
+    Column("angular_velocity", "rad/s", 3),
+    *(column for column in VECTORS if column.name == "angular_momentum"),
+)
+"""Of walls with inertia."""
 OF_PAIRS = tuple(column for column in OF_WALLS if column.name in ("force", "impulse", "jump_impulse"))
 PROBED = (*MOTION, Column("acceleration", "m/s²", 3), Column("reaction", "N", 3))
 """Of each node of a probe."""
@@ -158,7 +164,7 @@ OF_BARS = (Column("strain"), Column("stress", "Pa"), Column("axial_force", "N"))
 """Of each bar of a probe of bars."""
 OF_MODES = (Column("frequency", "Hz"), Column("eigenvalue", "1/s²"))
 
-_GROUPS = (OF_RUN, OF_ANALYSES, ITERATIONS, COUNTS, ENERGIES, VECTORS, OF_WALLS, PROBED, OF_BARS, OF_MODES)
+_GROUPS = (OF_RUN, OF_ANALYSES, ITERATIONS, COUNTS, ENERGIES, VECTORS, OF_WALLS, OF_BODIES, PROBED, OF_BARS, OF_MODES)
 DECLARED = {
     column.name: column for column in (*(column for group in _GROUPS for column in group), STAGE, IMBALANCE, CHANGES)
 }

@@ -232,6 +232,8 @@ NumberOrRows = _or_rows(Finite, Table2)
 """a number, or rows [t, value] with increasing times"""
 VectorOrRows = _or_rows(Vector3, Table4)
 """a vector [x, y, z], or rows [t, x, y, z] with increasing times"""
+Inertia = _or_rows(Vector3, Annotated[tuple[Vector3, Vector3, Vector3], listed])
+"""three principal moments [Ix, Iy, Iz], or the three rows of a matrix"""
 
 
 def _rows(given: tuple[Any, tuple[str, ...]], info: ValidationInfo) -> list[list[float]]:

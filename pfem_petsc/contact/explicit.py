@@ -18,6 +18,7 @@ from ..tolerances import FIXED_POINT, PROJECTED, RANK
 from .friction import Rubbing, add_friction, jam
 from .node_walls import TURN, NodeWalls, WallForces
 from .projection import project
+from .rotations import across
 from .surfaces import OTHER, Surfaces, is_round, tangent
 from .tied import Ties
 
@@ -554,7 +555,7 @@ class ExplicitContact(NodeWalls):
         bodies = self.motion.bodies
         if bodies.any:
             pushes = np.zeros((len(self.walls), 3))
-            pushes[bodies.at] = bodies.displacements(np.inf) - bodies.unpushed()
+            pushes[bodies.at] = bodies.displacements(np.inf) - bodies.unpushed()[0]
             pushed = pushes[self.wall_of]
         sets, moved = (self.all_nodes, members), (self.wall_of, way, pushed)
         return PressedWalls(surfaces, part, *sets, tolerance, self.room, *moved, friction, restitution, *memory)
@@ -570,19 +571,24 @@ class ExplicitContact(NodeWalls):
                 nodes, correction, _, walls = self.project(x, stiffness, time, tolerance, booked=False)
             except SimulationFailure as met:  # raised once all ranks have left the iteration
                 failure = failure or met
-                return np.zeros((len(free.at), 3)), np.zeros((len(free.at), 3, 3))
-            slope = self._slope(nodes, x[nodes], correction, stiffness[nodes], walls, time)
-            if self.ties.any:
-                tied, at = self.ties.nodes()
-                gives = stiffness[tied, None] * ~self.fixed[tied]
-                np.add.at(slope, at, gives[:, :, None] * np.eye(3))
-            return (walls.force + self.pushes[0])[free.at], self.of_walls(slope)[free.at]
+                return np.zeros((2, len(free.at), 3)), np.zeros((len(free.at), 6, 6))
+            slopes = self._slope(nodes, x[nodes], correction, stiffness[nodes], walls, time)
+            pushes = np.stack([walls.force, walls.moment])
+            return (pushes + self.pushes)[:, free.at], self._by_twists(slopes, nodes, walls.places)
 
         found = free.solve(forces, FIXED_POINT * self.size)
         if failure is not None:
             raise failure
         if not found:
             raise SimulationFailure(self.unsettled_message())
+
+    def _set_rebounds(self, memory: list[np.ndarray], planes: Any, relative: np.ndarray) -> None:
+        """Set the memory (m, slots) of nodes that hit walls with inertia; ``relative`` (m, slots, 3): their ways beside
+        those of the walls without contact [m]."""
+        bodies, (rebound, arrival) = self.motion.bodies, memory
+        fresh = np.isin(self.wall_of, bodies.at[bodies.turners]) & ((arrival != 0.0) | (rebound > 0.0))
+        approach = -np.einsum("mwi,mwi->mw", planes.normals, relative)
+        np.copyto(rebound, impact_square(approach, arrival, planes.pull), where=fresh)
 
     def unsettled_message(self) -> str:
         """Return the message about walls with mass for which no position balances the forces on them."""
@@ -602,24 +608,27 @@ class ExplicitContact(NodeWalls):
         walls: WallForces,
         time: float,
     ) -> np.ndarray:
-        """Return the derivatives (slots, 3, 3) [N/m] of the walls' forces on untied nodes by the walls' positions.
+        """Return the derivatives (m, slots, 3, 3) [N/m] of the walls' forces on nodes by the walls' positions.
 
         Nodes (m,) at ``free`` (m, 3) without walls are moved by ``correction`` (m, 3) [m]. The normal force of a node
         that slips drags it by mu times itself against the slip, which turns with the wall; one that sticks follows the
         wall in all directions. Exact for nodes at one wall.
         """
-        touching = walls.touching
+        touching, tied = walls.touching, np.zeros(len(nodes), dtype=bool)
         poses = self.motion.poses(time)
         acting = self.acting(nodes, free, poses, self._part)
         normals, _ = self.planes(touching, walls.places, poses, acting, nodes)
         if self.ties.any:
-            touching = touching & ~self.ties.held[nodes][:, None]
+            tied = self.ties.held[nodes]
+            touching = touching & ~tied[:, None]
         held = touching[:, :, None] & ~self.fixed[nodes][:, None, :]
         active = np.where(held, normals, 0.0)
         inverse = np.linalg.pinv(active, rcond=RANK) if len(nodes) else np.zeros((0, 3, len(self.wall_of)))
         weight = stiffness[:, None] * (inverse * inverse).sum(axis=1)  # the diagonal of k (N N^T)^-1
         weight = np.where(touching, weight, 0.0)
-        slope = np.einsum("mw,mwi,mwj->wij", weight, normals, normals)
+        slope = np.einsum("mw,mwi,mwj->mwij", weight, normals, normals)
+        gives = stiffness[:, None, None] * (walls.touching & tied[:, None])[:, :, None] * ~self.fixed[nodes][:, None, :]
+        slope += gives[:, :, :, None] * np.eye(3)
         if not self.has_friction:
             return slope
         start = self.state.position[nodes]
@@ -629,13 +638,25 @@ class ExplicitContact(NodeWalls):
         slips = size > PROJECTED * self.size
         slip /= np.where(slips, size, np.inf)[:, :, None]
         rough = np.where(touching, self.friction, 0.0)
-        slope -= np.einsum("mw,mwi,mwj->wij", rough * weight, slip, normals)
+        slope -= np.einsum("mw,mwi,mwj->mwij", rough * weight, slip, normals)
         drag = rough * np.maximum(np.einsum("mwi,mi->mw", normals, correction), 0.0)  # over k
         turning = np.where(slips, drag / np.where(slips, size + drag, 1.0), self.static_friction > 0.0)
         sideways = (
             np.eye(3) - normals[:, :, :, None] * normals[:, :, None, :] - slip[:, :, :, None] * slip[:, :, None, :]
         )
-        return slope + np.einsum("mw,mwi,mwij->wij", stiffness[:, None] * turning, held.astype(float), sideways)
+        return slope + np.einsum("mw,mwi,mwij->mwij", stiffness[:, None] * turning, held.astype(float), sideways)
+
+    def _by_twists(self, slopes: np.ndarray, nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Return the derivatives (f, 6, 6) of forces of walls with mass, and their moments about the centres, by
+        displacements and small rotations of these from the ``slopes`` of :meth:`_slope` of nodes (m,) at ``places``."""
+        bodies, start = self.motion.bodies, places if self.state is None else self.state.position[nodes]
+        acts, result = start + self._part * (places - start), np.zeros((len(self.motion.bodies.at), 6, 6))
+        for i, k in enumerate(bodies.at):
+            each = slopes[:, self.wall_of == k].sum(axis=1)
+            lever, turned = (across(at - bodies.pivots(part)[i]) for at, part in ((acts, self._part), (places, 1.0)))
+            whole = np.concatenate([each, -each @ turned], axis=2)
+            result[i] = np.concatenate([whole, lever @ whole], axis=1).sum(axis=0)
+        return result
 
     def project(
         self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool = True
@@ -750,5 +771,8 @@ class ExplicitContact(NodeWalls):
             free[:] = places
             raise SimulationFailure(self.placeless(nodes[failed], why, found.normals[failed], found.offsets[failed]))
         if bounces and booked:
+            if len(self.motion.bodies.turners):
+                unpushed = self.ways(start, before, self.motion.poses_without_contact(poses.time))
+                self._set_rebounds(memory, found, (free - start)[:, None, :] - unpushed)
             walls.rebound[nodes], walls.arrival[nodes] = memory
         return nodes, places, force, WallForces(*sums, nodes, touching, places, friction)

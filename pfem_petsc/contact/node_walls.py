@@ -260,6 +260,7 @@ class NodeWalls:
     members : (owned, slots) bool, nodes that a wall can stop
     flat : (slots,) bool, planes that never turn; normals : (slots, 3) of these, zero for the others
     surfaces : Surfaces of the walls at rest
+    centres : (walls, 3) points at rest whose positions are recorded, of walls with inertia the centres of mass [m]
     log : ContactLog
     restitution, friction, static_friction : (slots,); has_friction : whether any wall has friction
     size : length that tolerances are relative to [m], see :mod:`~pfem_petsc.tolerances`
@@ -284,7 +285,10 @@ class NodeWalls:
         self.any = bool(walls)
         with agreed(mesh.comm):
             self.walls = [made_wall(wall, mesh.points[: mesh.n_owned]) for wall in walls]
-        self.motion = WallMotion(walls, case.holds("wall"))
+        own = [wall.centre_of_mass for wall in walls]
+        self.centres = np.array([wall.centre if at is None else at for wall, at in zip(self.walls, own, strict=True)])
+        self.centres = self.centres.reshape(-1, 3)
+        self.motion = WallMotion(walls, self.centres, case.holds("wall"))
         self.moving = self.motion.moving
         faces = np.array([wall.faces for wall in self.walls], dtype=np.int64)
         self.wall_of, self.first = np.repeat(np.arange(len(walls)), faces), np.cumsum(faces) - faces
@@ -312,8 +316,7 @@ class NodeWalls:
         self._faces = {k: TouchedFaces(wall, mesh.n_owned) for k, wall in enumerate(self.walls) if wall.faces > 1}
         ends = np.stack([-mesh.points.min(axis=0, initial=np.inf), mesh.points.max(axis=0, initial=-np.inf)])
         mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
-        centres = np.array([wall.centre for wall in self.walls])
-        coordinates = float(np.abs(ends).max()), float(np.abs(centres).max(initial=0.0))
+        coordinates = float(np.abs(ends).max()), float(np.abs(self.centres).max(initial=0.0))
         self.size = resolvable(float(ends.sum(axis=0).max()), *coordinates)
 
     @cached_property
@@ -326,9 +329,9 @@ class NodeWalls:
         return np.add.reduceat(sums, self.first, axis=0) if len(self.first) < len(sums) else sums
 
     def positions(self, time: float) -> np.ndarray:
-        """Return the positions of the walls' centres (walls, 3) [m]."""
+        """Return the positions of the walls' centres, of mass for walls with inertia (walls, 3) [m]."""
         poses = self.motion.poses(time)
-        return np.array([poses.reached(k, wall.centre) for k, wall in enumerate(self.walls)]).reshape(-1, 3)
+        return poses.carried(np.arange(len(self.walls)), self.centres)
 
     def velocities(self, time: float) -> np.ndarray:
         """Return the velocities of the walls' centres (walls, 3) [m/s]."""

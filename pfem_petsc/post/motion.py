@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..contact.wall_motion import turns_about
+from ..contact.rotations import turns_about, turns_by, vectors_of
 from ..contact.walls.base import WALLS, Surface, perpendicular, slab
 from ..errors import InputError
 from ..fields import STATUS
@@ -567,11 +567,22 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
         if f"wall/{name}/position" in history:
             places = np.asarray(history[f"wall/{name}/position"], dtype=float)
             shifts[:, k] = np.stack([np.interp(times, when, column - column[0]) for column in places.T], axis=1)
+        if f"wall/{name}/rotation" in history:
+            rows = turns_by(np.asarray(history[f"wall/{name}/rotation"], dtype=float))
+            last = np.clip(np.searchsorted(when, times, side="right") - 1, 0, max(len(when) - 2, 0))
+            after = np.minimum(last + 1, len(when) - 1)
+            span = when[after] - when[last]
+            part = np.clip((times - when[last]) / np.where(span > 0.0, span, 1.0), 0.0, 1.0)
+            way = vectors_of(rows[after] @ rows[last].swapaxes(1, 2))
+            turns[:, k] = turns_by(part[:, None] * way) @ rows[last]
     return shifts, turns, present
 
 
 def _place(wall: Any) -> np.ndarray:
-    """A point that the keys of a wall give (3,) [m]; zero for a type that is unknown, which is not drawn."""
+    """The point of a wall at rest whose position is recorded (3,) [m]; zero for a type that is unknown, which is not
+    drawn."""
+    if getattr(wall, "centre_of_mass", None) is not None:
+        return np.asarray(wall.centre_of_mass, dtype=float)
     if wall.type not in choices(WALLS):
         return np.zeros(3)
     return np.asarray(lookup(WALLS, wall.type, "wall.type").Wall(wall).centre, dtype=float)

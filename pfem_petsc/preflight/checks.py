@@ -390,8 +390,9 @@ def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
     ahead = 1e-6 * model.length / fastest if fastest > 0.0 else 1e-9
     now, then = contact.gaps(points, 0.0), contact.gaps(points + ahead * v, ahead)
     bodies = contact.motion.bodies  # not moving yet: displacements of nodes relative to these walls
-    for k, speed in zip(bodies.at, bodies.state.v, strict=True):
-        seen = contact.gap(k, points + ahead * (v - speed), contact.motion.poses(0.0))
+    rates = contact.motion.rates_at(points, 0.0) if bodies.any else np.empty((len(points), len(contact.names), 3))
+    for k in bodies.at:
+        seen = contact.gap(k, points + ahead * (v - rates[:, k]), contact.motion.poses(0.0))
         then[:, k] = np.where(contact.members[:, contact.first[k]], seen, np.inf)
     with np.errstate(invalid="ignore"):
         rate = np.nanmin((then - now) / ahead, axis=0, initial=np.inf)

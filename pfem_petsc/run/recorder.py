@@ -19,6 +19,7 @@ from ..columns import (
     LASTING,
     MOTION,
     OF_BARS,
+    OF_BODIES,
     OF_PAIRS,
     OF_RUN,
     OF_WALLS,
@@ -180,6 +181,8 @@ class Recorder:
         found = {column.name: column.dtype for column in wanted if column.exists(model)}
         for name, moves in zip(contact.names, contact.moving, strict=True):
             found |= {f"wall/{name}/{one.name}": one.dtype for one in (*OF_WALLS, *(MOTION if moves else ()))}
+        for name in self._bodies:
+            found |= {f"wall/{name}/{one.name}": one.dtype for one in OF_BODIES}
         for table in model.links.columns:
             found |= {f"{table}/{one.name}": one.dtype for one in OF_PAIRS}
         for name, ids in self.probe_bars.items():
@@ -187,6 +190,13 @@ class Recorder:
         for name, ids in self.probe_nodes.items():
             found |= {f"probe/{name}/{one.name}": np.dtype((float, (len(ids), 3))) for one in PROBED}
         return found
+
+    @property
+    def _bodies(self) -> list[str]:
+        """The walls with inertia."""
+        contact = self.model.contact
+        bodies = contact.motion.bodies
+        return [contact.names[k] for k in bodies.at[bodies.turners]]
 
     def _place(self) -> None:
         """Find where the sums of a share are in a row."""
@@ -204,6 +214,7 @@ class Recorder:
         self._contact_times = layout.indices(wall + "contact_time" for wall in walls)
         moving = [wall + one.name for wall, moves in zip(walls, contact.moving, strict=True) if moves for one in MOTION]
         self._motion = layout.indices(moving)
+        self._turning = layout.indices(f"wall/{name}/{one.name}" for name in self._bodies for one in OF_BODIES)
         self._energies = layout.indices(one.name for one in _ADDED)
         self._bars = layout.indices(BAR_ENERGIES)
         self._parts = [
@@ -240,6 +251,8 @@ class Recorder:
         for vector, time in zip(vectors, instants.time.tolist() if len(self._motion) else [], strict=False):
             motion = np.hstack([contact.positions(time), contact.velocities(time)])
             vector[self._motion] = motion[contact.moving].ravel()
+            if len(self._turning):
+                vector[self._turning] = contact.motion.bodies.rotation.ravel()
         if self.rest is not None:
             own, vectors = vectors, np.repeat(self.rest[None], len(vectors), axis=0)
             vectors[:, self._at] = own

@@ -313,8 +313,7 @@ def _hand_over_contact(old: Stepper, new: Stepper) -> None:
         force[walls_to] = old.solution.walls.force[walls_from]
         new.solution.walls = dataclasses.replace(contact.nothing, force=force)
     if new.model.case.holds("wall"):
-        bodies, earlier = contact.motion.bodies, before.motion.bodies
-        bodies.state.x, bodies.state.v = earlier.state.x.copy(), earlier.state.v.copy()
+        contact.motion.bodies.follow(before.motion.bodies)
     _hand_over_ties(old, new, dict(pairs))
 
 

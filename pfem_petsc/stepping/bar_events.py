@@ -95,6 +95,7 @@ def _speed_of_case(case: Case, length: float) -> float:
     """Return an upper bound on the initial relative speed [m/s] of bodies and walls of a case; ``length`` of the truss
     [m]."""
     found = [float(np.linalg.norm(wall.velocity)) for wall in case.wall if wall.velocity is not None]
+    found += [float(np.linalg.norm(wall.angular_velocity)) * length for wall in case.wall if wall.angular_velocity]
     for start in case.initial:
         turning = float(np.linalg.norm(start.angular_velocity)) * length
         found.append(float(np.linalg.norm(start.velocity)) + turning)

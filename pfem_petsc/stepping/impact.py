@@ -268,12 +268,11 @@ class Impacts:
         rates, speeds = contact.rates(x[nodes], time, ahead=True), np.empty(gaps.shape)
         pulls = np.zeros((len(contact.names), 3))
         if free.any:
-            free_fall, unpushed = free.weight / free.mass[:, None], np.zeros((len(contact.names), 3))
-            pulls[free.at], unpushed[free.at] = free_fall, self._free_rates - free.state.v
-            if load is None:  # the motion without contact
-                balance = self.stepper.balance
-                unpushed[free.at] = balance.eta / balance.alpha * (free_fall - free.balanced)
-            rates = rates + unpushed[contact.wall_of]
+            pulls[free.at] = np.where(free.hinged[:, None], 0.0, free.weight / free.mass[:, None])
+            linear, angular = np.zeros((2, len(contact.names), 3))
+            linear[free.at], angular[free.at] = free.changes(None if load is None else self._free_rates)
+            unpushed = linear + np.cross(angular, contact.motion.arms(x[nodes], time))
+            rates = rates + unpushed[:, contact.wall_of]
             self._free_rates = free.state.v
         approach = Approach(normals, gaps, free_v, free_a, np.ascontiguousarray(rates), pulls[contact.wall_of])
         touched = Touched(log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.slack)
@@ -281,7 +280,7 @@ class Impacts:
         if contact.ties.any:
             loss += self._tied(nodes, normals, speeds, free_v, rates)
         if free.any:
-            loss += self._on_free_walls(nodes, normals, speeds)
+            loss += self._on_free_walls(nodes, x[nodes], normals, speeds)
         return loss
 
     def _tied(
@@ -296,26 +295,30 @@ class Impacts:
         energy = 0.5 * self.model.inertia.mass[nodes, None] * (across * across).sum(axis=2)
         return float(energy[caught].sum())
 
-    def _on_free_walls(self, nodes: np.ndarray, normals: np.ndarray, speeds: np.ndarray) -> float:
-        """Return the loss of nodes that close on a wall of mass M together. Collective.
+    def _on_free_walls(self, nodes: np.ndarray, x: np.ndarray, normals: np.ndarray, speeds: np.ndarray) -> float:
+        """Return the loss of nodes at x (m, 3) that close on a wall with mass together. Collective.
 
-        It is sum m s^2/2 - (sum m s n)^2/(2 (M + sum m)).
+        With the motions g = (n, r x n) of the wall that the nodes stop, and its inertia A, it is sum m s^2/2 -
+        b A'^-1 b/2, where b = sum m s g and A' = A + sum m g g^T.
         """
         contact, free = self.model.contact, self.model.contact.motion.bodies
-        mass = self.model.inertia.mass[nodes, None]
-        at = contact.first[free.at]
-        keeps = 1.0 - contact.restitution[at] ** 2
-        sums = np.zeros((len(free.at), 5))
-        s = speeds[:, at]
-        closing = np.where(s > 0.0, mass, 0.0)
-        sums[:, 0] = 0.5 * (closing * s * s).sum(axis=0)
-        sums[:, 1] = closing.sum(axis=0)
-        sums[:, 2:] = np.einsum("mw,mwi->wi", closing * s, normals[:, at])
+        mass = self.model.inertia.mass[nodes]
+        sums = np.zeros((len(free.at), 7, 7))
+        for i, (k, pivot) in enumerate(zip(free.at, free.pivots(0.0), strict=True)):
+            s, normal = speeds[:, contact.wall_of == k], normals[:, contact.wall_of == k]
+            lever = np.cross((x - pivot)[:, None, :], normal)
+            stopped = np.concatenate([s[:, :, None], normal, lever], axis=2)
+            sums[i] = np.einsum("mw,mwi,mwj->ij", np.where(s > 0.0, mass[:, None], 0.0), stopped, stopped)
         self.model.comm.Allreduce(MPI.IN_PLACE, sums)
         if self.model.comm.rank:
             return 0.0
-        given = 0.5 * (sums[:, 2:] ** 2).sum(axis=1) / (free.mass + sums[:, 1])
-        return float((keeps * (sums[:, 0] - given)).sum())
+        loss = 0.0
+        for i, restitution in enumerate(contact.restitution[contact.first[free.at]]):
+            motions, inertia = free.inertias(i)
+            given = motions @ sums[i, 1:, 0]
+            kept = given @ np.linalg.solve(inertia + motions @ sums[i, 1:, 1:] @ motions.T, given)
+            loss += 0.5 * (1.0 - restitution**2) * float(sums[i, 0, 0] - kept)
+        return loss
 
     def of_rows(self, x: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> float:
         """Return the loss of closing rows over two nodes whose second nodes this rank owns, with the reduced mass."""

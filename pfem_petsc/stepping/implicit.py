@@ -280,7 +280,8 @@ class ImplicitStepper(Stepper):
 
         def forces() -> tuple[np.ndarray, None]:
             found.append(self._solve(balance, found[-1].u if found else guess))
-            return found[-1].walls.force[bodies.at], None
+            walls = found[-1].walls
+            return np.stack([walls.force, walls.moment])[:, bodies.at], None
 
         if not bodies.solve(forces, ON_BOUND * self.model.size):
             raise NotConverged(f"{self.when(balance)}: {self.model.contact.unsettled_message()}")

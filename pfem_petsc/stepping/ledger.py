@@ -448,7 +448,7 @@ class Ledger:
             return
         self._angles = contact.motion.angles(time)
         bodies = contact.motion.bodies
-        self._bodies_v, self._bodies_kinetic = bodies.state.v, bodies.kinetic
+        self._bodies = bodies.motion
         self.sums[_AT["wall_kinetic_energy"]] = bodies.kinetic if self.model.comm.rank == 0 else 0.0
 
     def _work_of_walls(self) -> tuple[float, float, float, float]:
@@ -458,17 +458,17 @@ class Ledger:
         Walls do work by all the momentum that they give in the step, by forces and by velocity jumps: the mean force
         times the displacement of the wall, and the mean moment about its axis times the angle by which it turns. A wall
         with mass is a particle of the same scheme, so its kinetic energy changes by that momentum, and by that of its
-        weight, times the mean of its velocities before and after.
+        weight, times the mean of its velocities before and after; of its rotation, see
+        :meth:`~pfem_petsc.contact.free_walls.FreeWalls.works`.
         """
         stepper, contact = self.stepper, self.model.contact
         if not contact.moving.any():
             return 0.0, 0.0, 0.0, 0.0
-        bodies, displacements, v = contact.motion.bodies, self._displacements, self._bodies_v
+        bodies, displacements, before = contact.motion.bodies, self._displacements, self._bodies
         angles = self._angles
         self._walls_before()
         (push, torques), way = self.impulses.mean_pushes(), self._displacements - displacements
-        fallen, moved = way[bodies.at], stepper.part * 0.5 * (v + self._bodies_v)
-        way[bodies.at] = moved
+        way[bodies.at] = stepper.part * 0.5 * (before.velocity + self._bodies.velocity)
         works = (push * way).sum(axis=1)
         given = float(works[bodies.at].sum())
         work = float(works.sum()) - given
@@ -476,7 +476,8 @@ class Ledger:
             work += float((torques * (self._angles - angles)).sum())
         if self.model.comm.rank:
             return work, given, 0.0, 0.0
-        return work, given, float((bodies.weight * fallen).sum()), float((bodies.weight * (fallen - moved)).sum())
+        turning, weight, lost = bodies.works(before, self._bodies, stepper.part)
+        return work, given + turning, weight, lost
 
     def _before_jump(self, after: Moment) -> tuple[Moment, float]:
         """Return the end of the step before velocity jumps, and the energy of the jumps [J], a work of contact."""

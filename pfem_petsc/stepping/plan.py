@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
+from ..contact.free_walls import FreeWalls
 from ..contact.impact_gains import warn_of_gain
 from ..contact.treatments.base import Restitution, Treatment
-from ..contact.wall_motion import FreeWalls
 from ..errors import InputError
 from ..integrators.base import Scheme
 from ..mechanics.bars import viscous_rate
@@ -454,7 +454,8 @@ def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) ->
                 f"{model.case.source}: gravity.acceleration: walls with gravity = true need a constant gravity, "
                 "not rows over time"
             )
-        model.contact.motion.bodies = FreeWalls(walls, plan.scheme, model.comm, tuple(model.external.gravity))
+        gravity, centres = tuple(model.external.gravity), model.contact.centres
+        model.contact.motion.bodies = FreeWalls(walls, plan.scheme, model.comm, gravity, centres)
     explicit = plan.linear is None
     model.links.check(model.case.contact.treatment, explicit, model.size)
     for k, wall in enumerate(walls):

@@ -9,13 +9,16 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from ...case.base import Finite, PositiveFloat, StrictModel, SurfaceKeys, Vector3, WallParameters, listed
+from ...case.base import Finite, Inertia, PositiveFloat, StrictModel, SurfaceKeys, Vector3, WallParameters, listed
 from ...errors import InputError, raised
 from ...registry import added_file, lookup
 from ..plugins import checked
 
 WALLS = "pfem_petsc.contact.walls"
 """The package of the walls."""
+
+_ALIKE = 1e-6
+"""Relative difference up to which numbers of a file count as equal."""
 
 Row2 = Annotated[tuple[Finite, Finite], listed]
 Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
@@ -58,6 +61,20 @@ class Rotation(StrictModel):
         return increasing(rows)
 
 
+class Hinge(StrictModel):
+    """An axis fixed in space about which a wall with inertia turns freely."""
+
+    centre: Vector3
+    """a point of the axis [m]"""
+    axis: Vector3
+    """direction of the axis, of any nonzero length"""
+
+    @field_validator("axis")
+    @classmethod
+    def _has_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        return direction(value, "the direction of the axis of the hinge")
+
+
 class WallKeys(SurfaceKeys, WallParameters):
     """Keys that all wall types share."""
 
@@ -66,7 +83,17 @@ class WallKeys(SurfaceKeys, WallParameters):
     rotation: Rotation | None = None
     """rotation of the wall about an axis, as prescribed; beside ``velocity``, ``motion`` or ``mass``, which move it"""
     mass: PositiveFloat | None = None
-    """mass [kg] of a wall that moves under the contact forces; they do not turn it"""
+    """mass [kg] of a wall that moves under the contact forces; they turn it if it has ``inertia``"""
+    inertia: Inertia | None = None
+    """moments of inertia [kg m2] of a wall with mass that turns under the contact forces, about the centre of mass:
+    [Ix, Iy, Iz] for principal axes along those of space at rest, or the rows of the symmetric matrix"""
+    centre_of_mass: Vector3 | None = None
+    """centre of mass of a wall with inertia, at rest [m]; default: the centre of a sphere or rectangle, the point of a
+    plane or cylinder"""
+    angular_velocity: Vector3 | None = None
+    """initial angular velocity [rad/s] of a wall with inertia, by the right-hand rule"""
+    hinge: Hinge | None = None
+    """axis about which alone a wall with inertia turns"""
     gravity: bool = False
     """true: gravity acts on a wall with mass, as on the truss"""
     motion: Annotated[tuple[Row4, ...], listed] | None = None
@@ -96,9 +123,43 @@ class WallKeys(SurfaceKeys, WallParameters):
             raise ValueError("gravity = true needs the wall's mass [kg]")
         if self.mass is not None and self.motion is not None:
             raise ValueError("expected at most one of the keys mass, motion")
+        self._turns_one_way()
         if self.tied and (self.friction or self.static_friction or self.restitution):
             raise ValueError("a tied wall cannot have friction or restitution: nodes neither slip nor leave")
         return self
+
+    def _turns_one_way(self) -> None:
+        if self.inertia is None:
+            for key in ("centre_of_mass", "angular_velocity", "hinge"):
+                if getattr(self, key) is not None:
+                    raise ValueError(f"{key} is that of a wall with inertia [kg m2], which this wall has not")
+            return
+        if self.mass is None:
+            raise ValueError("inertia needs the wall's mass [kg]")
+        if self.rotation is not None:
+            raise ValueError("expected at most one of the keys inertia, rotation")
+        tensor = self.tensor
+        moments = np.linalg.eigvalsh(tensor)
+        if np.abs(tensor - tensor.T).max() > _ALIKE * np.abs(tensor).max():
+            raise ValueError(f"inertia is not symmetric: {tensor.tolist()}")
+        if moments[0] <= 0.0 or moments[2] > (1.0 + _ALIKE) * (moments[0] + moments[1]):
+            raise ValueError(
+                f"inertia has the principal moments {', '.join(f'{moment:.4g}' for moment in moments)} kg m2, which no "
+                "body has: they must be positive, and none larger than the sum of the others"
+            )
+        if self.hinge is None:
+            return
+        if self.velocity is not None:
+            raise ValueError("expected at most one of the keys hinge, velocity")
+        spin, axis = (np.array(each or (0.0, 0.0, 0.0)) for each in (self.angular_velocity, self.hinge.axis))
+        if np.linalg.norm(np.cross(spin, axis)) > _ALIKE * np.linalg.norm(spin) * np.linalg.norm(axis):
+            raise ValueError("angular_velocity must be along the axis of the hinge")
+
+    @property
+    def tensor(self) -> np.ndarray:
+        """The matrix (3, 3) of :attr:`inertia` [kg m2]."""
+        given = np.array(self.inertia)
+        return np.diag(given) if given.ndim == 1 else given
 
 
 class BaseWall(ABC):

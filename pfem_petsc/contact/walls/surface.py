@@ -59,6 +59,8 @@ class Parameters(WallKeys):
             raise ValueError('thickness is that of a surface with side = "both"')
         if self.side == "both" and self.flip:
             raise ValueError('flip has no effect on a surface with side = "both"')
+        if self.inertia is not None and self.centre_of_mass is None:
+            raise ValueError("inertia of a surface of triangles needs its centre_of_mass [m]")
         if info.context is not None:
             self._take(**found_file(self.file, self.digest, info.context.folder))
         return self

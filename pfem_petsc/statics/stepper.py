@@ -254,6 +254,8 @@ class StaticStepper(ImplicitStepper):
         are found.
         """
         model, state, walls = self.model, self.state, self.solution.walls
+        if model.self_contact is not None:  # whose stiffness is not part of that of bars
+            return -1
         direct, bars = self._choice.krylov == "preonly", model.bars.state_stiffness(state.x)
         check = Stability(model, largest=LARGEST_WITH_MUMPS if direct else LARGEST)
         try:
@@ -609,6 +611,8 @@ def make_stepper(model: Model) -> StaticStepper:
     case = model.case
     parameters, choice = case.static.parameters, _linear(model)
     stepper = lookup(METHODS, case.static.method, "static.method").make_stepper(model, parameters, choice)
+    if model.self_contact is not None:
+        model.self_contact.begin_implicit(stepper.scheme)
     points = getattr(parameters, "max_points", None)
     words = ", ".join(f"{key} = {value}" for key, value in parameters.model_dump(exclude_none=True).items())
     stepper.plan = Plan(
@@ -633,9 +637,12 @@ def _linear(model: Model) -> LinearChoice:
     if request == "auto":
         smooth = all(law_of(material).smooth for material in model.case.material.values())
         most = _DIRECT_UP_TO if smooth else _DIRECT_YIELDING_UP_TO
-        multigrid = "multigrid" if solver.operator != "assembled" and fills_block(model.mesh) else "gamg"
+        free = solver.operator != "assembled" and model.self_contact is None
+        multigrid = "multigrid" if free and fills_block(model.mesh) else "gamg"
         request = "mumps" if unknowns <= most and solver.operator != "matrix_free" else multigrid
-    choice = choose_linear(request, solver.operator, Demand(unknowns, np.inf))
+    touch = model.self_contact
+    operator, symmetric = (solver.operator, True) if touch is None else (touch.operator(), touch.symmetric)
+    choice = choose_linear(request, operator, Demand(unknowns, np.inf, symmetric))
     if solver.linear == "auto":
         choice = replace(choice, why=choice.why.removesuffix(" (asked for)"))
     return choice

@@ -773,6 +773,13 @@ class SelfContact:
             "soft for this time.step: a smaller one (time.safety) makes them stiffer"
         ]
 
+    def hint(self) -> str:
+        """Return what to add to the message about a solve that did not converge. Collective."""
+        depth = self.comm.allreduce(float(self.sums[DEPTH]), op=MPI.MAX)
+        if self.between:
+            return ". Bars {} and {} would have passed through each other in an iteration".format(*self.between)
+        return f". Bars overlap by {100.0 * depth:.0f} % of a radius" if depth > _DEEP else ""
+
     # pairs
 
     def _search(self, x: np.ndarray, move: float) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..contact.self_contact import CONTACTS
 from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..mechanics.materials.base import law_name, law_of
@@ -336,9 +337,10 @@ class StaticStepper(ImplicitStepper):
 
     def solve(self, balance: Balance) -> Solution:
         """See :meth:`~pfem_petsc.stepping.stepper.Stepper.solve`; jumps of an increment are found. Collective."""
-        begun = self._solved
+        begun, touch = self._solved, self.model.self_contact
         solution = super().solve(balance)
-        looks = self.finds_jumps and balance.time > self.state.time
+        # what friction of bars loses depends on the steps that are made
+        looks = self.finds_jumps and balance.time > self.state.time and (touch is None or touch.symmetric)
         self._jumps = self._jumps_to(balance, solution, begun) if looks else []
         return solution
 
@@ -387,7 +389,7 @@ class StaticStepper(ImplicitStepper):
         """Warn of the jumps of the last increment."""
         for jump in self._jumps:
             follow = "[time] follows the motion"
-            if not self.model.can_touch:
+            if not self.model.touches:
                 follow = f'static.method = "arc_length" or "displacement" follows the path in between, and {follow}'
             self.message(
                 f"step {self.number + 1}: {jump}: it is beyond a limit point or a bifurcation, and at rest again after "
@@ -397,7 +399,8 @@ class StaticStepper(ImplicitStepper):
     def _untouched(self) -> bool:
         """Return whether contact is possible and nothing is in contact at the start of the increment. Collective."""
         model = self.model
-        return model.can_touch and not model.comm.allreduce(int(self.state.contact.any()), op=MPI.MAX)
+        touched = self.state.contact.any() or (model.self_contact is not None and model.self_contact.sums[CONTACTS] > 0)
+        return model.touches and not model.comm.allreduce(int(touched), op=MPI.MAX)
 
     def resume(self) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
@@ -505,7 +508,7 @@ class StaticStepper(ImplicitStepper):
         model, smallest = self.model, self.limits.smallest
         free = free_motions(model, self.state)
         cause = "part of the truss is a mechanism" if free else self._limit_point(2.0 * smallest)
-        if model.can_touch:
+        if model.touches:
             cause += ", or part of the truss is a mechanism"
             others = "static.stabilise, or supports that move the truss instead of loads, pass a limit point"
             if model.contact.any and model.contact.symmetric:
@@ -527,7 +530,7 @@ class StaticStepper(ImplicitStepper):
         plastic mechanisms.
         """
         model, state = self.model, self.state
-        if model.can_touch:
+        if model.touches:
             return "it may be a limit point, which is not examined where contact is possible"
         stability = Stability(model, largest=LARGEST)
         if stability.refusal is not None:

@@ -336,9 +336,8 @@ class ImplicitStepper(Stepper):
                 exact = self._choice.krylov == "preonly"
                 remedy = self.remedy if exact else f'{self.remedy}, or set solver.linear = "mumps"'
                 text = self.newton.failure_message(w, report, remedy)
-                if model.self_contact is not None and model.self_contact.between:
-                    one, other = model.self_contact.between
-                    text += f" Bars {one} and {other} would have passed through each other in an iteration"
+                if model.self_contact is not None:
+                    text += model.self_contact.hint()
                 raise NotConverged(f"{self.when(balance)}: {text}")
             bounds.project(w, near_bound)
             u = problem.increment(w).copy()

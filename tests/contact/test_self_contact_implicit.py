@@ -180,6 +180,19 @@ def rows_of(case, comm, folder, name, **options):
     return rows, x
 
 
+def check_restart(whole, again, comm):
+    """Compare positions and the last rows to the bit, on several ranks to rounding: MUMPS adds up in the order in which
+    messages arrive."""
+    (rows, x), (others, y) = whole, again
+    assert 0 < len(others) < len(rows)
+    error = 0.0 if comm.size == 1 else 1e-12
+    if comm.rank == 0:
+        np.testing.assert_allclose(y, x, rtol=0.0, atol=error)
+    for key in ("self_contact_energy", "self_contact_dissipation", "elastic_energy"):
+        one, other = column(rows, key)[-len(others) :], column(others, key)
+        np.testing.assert_allclose(other, one, rtol=error, atol=error * np.abs(one).max())
+
+
 def column(rows, name):
     return np.array([row[name] for row in rows])
 
@@ -238,18 +251,14 @@ def test_a_restart_continues_to_the_bit(kind, comm, shared_tmp_path):
     tables = {"time": {"integrator": "energy_momentum", "step": 5e-5, "end": 8e-3}}
     if kind == "rough":
         tables = {"time": NEWMARK | {"step": 5e-5, "end": 8e-3}, "self_contact": {"friction": 0.3, "restitution": 0.8}}
-    whole, x = rows_of(chains(**tables), comm, shared_tmp_path, "whole")
-    touching = column(whole, "self_contact/contacts")
+    whole = rows_of(chains(**tables), comm, shared_tmp_path, "whole")
+    touching = column(whole[0], "self_contact/contacts")
     for step in (int(np.argmax(touching > 0)) + 3, int(np.argmax(touching)) + 1):
         part = tables | {"output": {"checkpoint_every": step, "history_every": 1, "fields_every": 0}}
         ends = part["time"] | {"end": (step + 0.5) * 5e-5}
         rows_of(chains(**part | {"time": ends}), comm, shared_tmp_path, f"part{step}")
-        rows, y = rows_of(chains(**part), comm, shared_tmp_path, f"part{step}", restart=True)
-        if comm.rank == 0:
-            np.testing.assert_array_equal(x, y)
-        error = 0.0 if comm.size == 1 else 1e-13
-        for key in ("self_contact_energy", "self_contact_dissipation", "kinetic_energy"):
-            np.testing.assert_allclose(column(rows, key), column(whole, key)[-len(rows) :], rtol=error, atol=error)
+        again = rows_of(chains(**part), comm, shared_tmp_path, f"part{step}", restart=True)
+            check_restart(whole, again, comm)
 
 
 HALF, INNER, LOWERED, TENSION = 0.5, 0.1, 0.05, 1e4
@@ -360,17 +369,14 @@ def test_a_bar_sticks_and_slides_by_coulombs_law(comm, shared_tmp_path):
 
 @pytest.mark.parallel
 def test_static_restart_continues_to_the_bit(comm, shared_tmp_path):
-    whole, x = rows_of(pulled(0.02), comm, shared_tmp_path, "whole")
+    whole = rows_of(pulled(0.02), comm, shared_tmp_path, "whole")
     part = {"output": {"checkpoint_every": 7, "history_every": 1, "fields_every": 0}}
     with Simulation(pulled(0.02, **part), comm, output=shared_tmp_path / "part") as simulation:
         for step in simulation:
             if step.step == 8:
                 break
-    rows, y = rows_of(pulled(0.02, **part), comm, shared_tmp_path, "part", restart=True)
-    assert 0 < len(rows) < len(whole)
-    if comm.rank == 0:
-        np.testing.assert_array_equal(x, y)
-    assert rows[-1]["self_contact_dissipation"] == pytest.approx(whole[-1]["self_contact_dissipation"], rel=1e-13)
+    again = rows_of(pulled(0.02, **part), comm, shared_tmp_path, "part", restart=True)
+    check_restart(whole, again, comm)
 
 
 def crushed(contact):

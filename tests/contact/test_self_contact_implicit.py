@@ -258,7 +258,7 @@ def test_a_restart_continues_to_the_bit(kind, comm, shared_tmp_path):
         ends = part["time"] | {"end": (step + 0.5) * 5e-5}
         rows_of(chains(**part | {"time": ends}), comm, shared_tmp_path, f"part{step}")
         again = rows_of(chains(**part), comm, shared_tmp_path, f"part{step}", restart=True)
-            check_restart(whole, again, comm)
+        check_restart(whole, again, comm)
 
 
 HALF, INNER, LOWERED, TENSION = 0.5, 0.1, 0.05, 1e4

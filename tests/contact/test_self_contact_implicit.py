@@ -318,13 +318,15 @@ def test_crossed_cables_press_on_each_other(comm, shared_tmp_path):
         np.testing.assert_allclose(x[[1, 2], 2], -sag, rtol=1e-9)
 
 
+PULLED = [[-0.3, -0.2, 0], [-0.3, 0.2, 0], [0.3, -0.2, 0], [0.3, 0.2, 0], [-0.5, 0, 0.02], [0.5, 0, 0.02]]
+
+
 def pulled(way, **tables):
     """A bar across two held ones, on which loads press it with 500 N each; then its end is pulled along it."""
-    points = [[-0.3, -0.2, 0], [-0.3, 0.2, 0], [0.3, -0.2, 0], [0.3, 0.2, 0], [-0.5, 0, 0.02], [0.5, 0, 0.02]]
     sets = {"base": [0, 1, 2, 3], "bar": [4, 5], "end": [4]}
     motion = {"motion": [[1.0, 0.0, 0.0, 0.0], [2.0, way, 0.0, 0.0]], "interpolation": "linear"}
     return case_of(
-        points,
+        PULLED,
         [[0, 1], [2, 3], [4, 5]],
         **{
             "node_set": {name: {"indices": indices} for name, indices in sets.items()},
@@ -475,3 +477,65 @@ def test_other_static_methods_are_refused(method, tmp_path):
     static = {"method": method, "end": 1.0}
     with pytest.raises(InputError, match=rf'does not serve static.method = "{method}" in implicit or static steps'):
         Simulation(cables(static=static), MPI.COMM_SELF, output=tmp_path)
+
+
+def turn_by(axis, angle):
+    """Matrix of a turn (3, 3)."""
+    axis = np.asarray(axis) / np.linalg.norm(axis)
+    cross = np.cross(np.eye(3), axis)
+    return np.eye(3) - np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+
+
+TURN = turn_by([1.0, 2.0, -0.5], 0.7)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_bars_between_walls_in_any_direction(friction, comm, shared_tmp_path):
+    """A bar falls on another that lies on a wall, whose bounds and the forces of bars are solved for at once."""
+    found = []
+    for name, turn in (("straight", np.eye(3)), ("oblique", TURN)):
+        points = np.array([[-0.5, 0, 0], [0.5, 0, 0], [-0.1, -0.5, 0.0202], [0.2, 0.5, 0.0202]])
+        wall = {"name": "floor", "type": "plane", "point": [0.0, 0.0, 0.0], "normal": (turn @ [0.0, 0.0, 1.0]).tolist()}
+        case = crossed(
+            node_set={"upper": {"indices": [2, 3]}},
+            initial={"on": [{"node_set": "upper", "velocity": (turn @ [0.3, 0.0, -2.0]).tolist()}]},
+            wall=[wall],
+            self_contact={"friction": friction},
+            time=NEWMARK | {"step": 1e-4, "end": 2e-3},
+        ).to_dict()
+        case.pop("mesh")
+        case = Case(case, mesh=Truss(points @ turn.T, [[0, 1], [2, 3]]))
+        rows, x = rows_of(case, comm, shared_tmp_path, name)
+        assert column(rows, "self_contact/contacts").max() == 1 and column(rows, "wall/floor/contacts").max() == 2
+        assert column(rows, "newton_iterations").max() <= 8
+        found.append((rows, None if x is None else x @ turn))
+    (rows, x), (others, y) = found
+    if comm.rank == 0:
+        np.testing.assert_allclose(y, x, atol=1e-10)
+        assert np.abs(x[2:, 2] - 0.0202).max() > 1e-4
+    for key in ("kinetic_energy", "self_contact_energy", "self_contact/force"):
+        values = column(rows, key)
+        np.testing.assert_allclose(column(others, key), values, atol=1e-7 * values.max())
+
+
+@pytest.mark.parallel
+def test_supports_in_any_direction(comm, shared_tmp_path):
+    """Also along none of the axes, whose rows and columns the derivatives do not have."""
+    reactions = []
+    for name, turn in (("straight", np.eye(3)), ("oblique", TURN)):
+        case = pulled(0.004).to_dict()
+        points = np.array(PULLED)
+        case.pop("mesh")
+        frame = [(turn @ axis).tolist() for axis in np.eye(3)[:2]]
+        across, end = case["support"][1:]
+        case["support"][1:] = [across | {"frame": frame}, end | {"frame": frame}]
+        case["load"][0]["force"] = (turn @ [0.0, 0.0, -500.0]).tolist()
+        end["motion"] = [[1.0, 0.0, 0.0, 0.0], [2.0, *(turn @ [0.004, 0.0, 0.0])]]
+        case["support"][2]["motion"] = end["motion"]
+        rows, _ = rows_of(
+            Case(case, mesh=Truss(points @ turn.T, [[0, 1], [2, 3], [4, 5]])), comm, shared_tmp_path, name
+        )
+        reactions.append(np.ravel(rows[-1]["probe/end/reaction"]) @ turn)
+        assert column(rows, "newton_iterations").max() <= 6
+    np.testing.assert_allclose(reactions[1], reactions[0], rtol=1e-6, atol=1e-6)

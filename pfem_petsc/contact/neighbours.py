@@ -577,8 +577,9 @@ def _meet(boxes, ends, which, first, count, box, one, other, near):
 
 
 @inlined
-def _clip(value):
-    return min(max(value, 0.0), 1.0)
+def clip(value):
+    """Return a number from 0 to 1; one within may be complex."""
+    return 0.0 if value.real < 0.0 else 1.0 if value.real > 1.0 else value
 
 
 @inlined
@@ -601,23 +602,23 @@ def _closest(at, points, a, b):
         ab += u * v
         ar += u * w
         br += v * w
-    if aa <= 0.0:
-        return 0.0, _clip(br / bb) if bb > 0.0 else 0.0
-    if bb <= 0.0:
-        return _clip(-ar / aa), 0.0
+    if aa.real <= 0.0:
+        return 0.0, clip(br / bb) if bb.real > 0.0 else 0.0
+    if bb.real <= 0.0:
+        return clip(-ar / aa), 0.0
     across = aa * bb - ab * ab
-    s = _clip((ab * br - ar * bb) / across) if across > 1e-14 * aa * bb else 0.0
+    s = clip((ab * br - ar * bb) / across) if across.real > 1e-14 * (aa * bb).real else 0.0
     t = (ab * s + br) / bb
-    if t < 0.0:
-        return _clip(-ar / aa), 0.0
-    if t > 1.0:
-        return _clip((ab - ar) / aa), 1.0
+    if t.real < 0.0:
+        return clip(-ar / aa), 0.0
+    if t.real > 1.0:
+        return clip((ab - ar) / aa), 1.0
     return s, t
 
 
 @inlined
 def segment_distance(at, points, a, b):
-    """Return the distance of segments ``a`` and ``b`` [m], and where they are closest."""
+    """Return the distance of segments ``a`` and ``b`` [m], and where they are closest; positions may be complex."""
     s, t = _closest(at, points, a, b)
     square = 0.0
     for c in range(3):

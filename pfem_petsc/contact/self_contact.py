@@ -41,11 +41,12 @@ from ..output.units import engineering
 from ..parallel.agreement import agreed
 from ..parallel.natural import NaturalOrder
 from .bars_at_walls import BarsAtWalls, damping_of
-from .neighbours import Points, Regions, Segments, find_pairs, largest_change, make_regions, segment_distance
+from .neighbours import Points, Regions, Segments, clip, find_pairs, largest_change, make_regions, segment_distance
 from .rows import owner_starts, to_owners
 
 if TYPE_CHECKING:
     from ..integrators.base import Scheme
+    from ..solvers.problem import StepProblem
 
 _CROSSED = 0.1  # largest square of the sine of the angle from which bars touch in one point
 _STIFFNESS = 1.0  # of a pair, over the harmonic mean of E A/l of its bars
@@ -55,6 +56,9 @@ _ROOM = 0.6  # least sum of squared frequencies that a step must leave for conta
 _SKIN = 0.1, 0.5  # least and largest distance beyond the radii up to which pairs are listed, over the length of bars
 _STEPS = 20.0  # steps for which the skin should be sufficient, unless it is too large then
 _FEW, _MANY = 0.1, 0.6  # pairs for each bar in lists that are made with a larger or a smaller skin the next time
+_CLOSER = 0.2  # of the distance of a pair, up to which an iteration may reduce it
+_TINY = 1e-30  # imaginary part of a position [m], whose square vanishes beside one
+_STILL = 1e-10  # change of squared distances in a step, over that of the radii, below which energies are rounding
 _WIDER = 1.05  # bound of the next displacements over the largest one
 _LEAST = 0.25  # distance in the mesh, over the sum of radii, below which bars cross there and do not touch
 _DEEP = 0.2  # overlap over the radius from which results are doubtful
@@ -113,13 +117,15 @@ class Rooms(NamedTuple):
 
 class PairLaw(NamedTuple):
     """Coulomb's coefficient of friction; damping ratio; the step [s]; the way of the nodes so far, and that from which
-    they have come to where pairs may sleep [m], the same unless forces are only tried."""
+    they have come to where pairs may sleep [m], the same unless forces are only tried; how many steps later than the
+    mean velocity of the step that of the damper is."""
 
     friction: float
     damping: float
     step: float
     way: float
     base: float
+    lead: float = 0.5
 
 
 ENERGY, DISSIPATED, CONTACTS, OVERLAP, FORCE, DEPTH = range(6)
@@ -157,7 +163,7 @@ def _foot(x, node, one, two):
         d = x[two, c] - x[one, c]
         along += d * (x[node, c] - x[one, c])
         square += d * d
-    return min(max(along / square, 0.0), 1.0) if square > 0.0 else 0.0
+    return clip(along / square) if square.real > 0.0 else 0.0
 
 
 @inlined
@@ -174,12 +180,11 @@ def _repel(pairs, p, x, s, t, rooms):
         uv += u[c] * v[c]
         for i in range(4):
             g[i, c] = 0.0
-    sine = max(1.0 - uv * uv / (uu * vv), 0.0) if uu * vv > 0.0 else 0.0
-    q = min(sine / pairs.crossed[p], 1.0)
+    q = clip((1.0 - uv * uv / (uu * vv)) / pairs.crossed[p]) if (uu * vv).real > 0.0 else 0.0
     m = q * q * q * (10.0 - q * (15.0 - 6.0 * q))
     energy = push = at = other = 0.0
     excess = 0.0  # of the energy where bars cross over that where they are parallel
-    for j in range(5 if m < 1.0 else 1):
+    for j in range(5 if m.real < 1.0 else 1):
         weight = m if j == 0 else 0.5 * (1.0 - m)
         if j == 1:
             s, t = 0.0, _foot(x, ends[p, 0], ends[p, 2], ends[p, 3])
@@ -191,7 +196,7 @@ def _repel(pairs, p, x, s, t, rooms):
             s, t = _foot(x, ends[p, 3], ends[p, 0], ends[p, 1]), 1.0
         d = _point_way(x, ends, p, s, t, 0, way)
         overlap = reach - d
-        if not overlap > 0.0:
+        if not overlap.real > 0.0:
             continue
         excess += 0.5 * k * overlap * overlap * (1.0 if j == 0 else -0.5)
         if weight == 0.0:
@@ -201,9 +206,9 @@ def _repel(pairs, p, x, s, t, rooms):
         push += force
         at += force * s
         other += force * t
-        if d > 0.0:
+        if d.real > 0.0:
             _gradient(g, s, t, force / d, way)
-    if 0.0 < q < 1.0:
+    if 0.0 < q.real < 1.0:
         slope = excess * 30.0 * q * q * (1.0 - q) * (1.0 - q) / pairs.crossed[p] * -2.0 * uv / (uu * vv)
         for c in range(3):
             of_u, of_v = slope * (v[c] - uv / uu * u[c]), slope * (u[c] - uv / vv * v[c])
@@ -217,11 +222,14 @@ def _repel(pairs, p, x, s, t, rooms):
 @inlined
 def _damp(pairs, p, law, push, closing, mobility):
     """Return the normal force of spring and damper, which pulls never [N]; ``closing`` is the change of the distance in
-    the step. The velocity is that at the end of the step, half a step later, by the force itself."""
-    if law.damping <= 0.0 or law.step <= 0.0 or mobility <= 0.0:
+    the step. The velocity is that at the end of an explicit step, half a step later, by the force itself."""
+    if law.damping <= 0.0 or law.step <= 0.0 or mobility.real <= 0.0:
         return push
-    drag = min(2.0 * law.damping * np.sqrt(pairs.stiffness[p] / mobility), pairs.drag[p])
-    return max((push - drag * closing / law.step) / (1.0 + 0.5 * drag * law.step * mobility), 0.0)
+    drag = 2.0 * law.damping * np.sqrt(pairs.stiffness[p] / mobility)
+    if drag.real > pairs.drag[p]:
+        drag = pairs.drag[p]
+    total = (push - drag * closing / law.step) / (1.0 + law.lead * drag * law.step * mobility)
+    return total if total.real > 0.0 else 0.0
 
 
 @inlined
@@ -237,11 +245,11 @@ def _slide(old, new, p, k, most, rooms):
     for c in range(3):  # turned into the plane across the normal
         new[p, SPRING + c] = old[p, SPRING + c] - dot * normal[c]
         left += new[p, SPRING + c] * new[p, SPRING + c]
-    turned = np.sqrt(before / left) if left > 0.0 else 0.0
+    turned = np.sqrt(before / left) if left.real > 0.0 else 0.0
     for c in range(3):
         trial = turned * new[p, SPRING + c] + way[c] - along * normal[c]
         square += trial * trial
-    factor = most / np.sqrt(square) if square > most * most else 1.0
+    factor = most / np.sqrt(square) if square.real > (most * most).real else 1.0
     for c in range(3):
         start = turned * new[p, SPRING + c]
         trial = start + way[c] - along * normal[c]
@@ -309,6 +317,200 @@ def find_beginning(pairs, state, memory, nodes, law, load):
     return beginning, failed, asleep
 
 
+@inlined
+def _evaluate_pair(pairs, p, nodes, old, new, law, rooms):
+    """Write the gradient of the energy of a pair with its friction and damping, and its memory; return the energies of
+    normal force and friction, the energy lost, the normal force, -1 for a pair that does not touch, the overlap, and 1
+    plus the cosine of the turn of the normal, 1 for a pair that begins to touch, 0 where the axes meet.
+
+    Positions may be complex, whose imaginary parts then are derivatives.
+    """
+    x, ends, k, reach = nodes.x, pairs.ends, pairs.stiffness[p], pairs.reach[p]
+    g, way, normal = rooms.g, rooms.way, rooms.normal
+    d, s, t = segment_distance(x, ends.reshape(-1, 2), 2 * p, 2 * p + 1)
+    energy = push = at = other = lost = held = turn = closing = 0.0 * d
+    if d.real < reach:
+        energy, push, at, other = _repel(pairs, p, x, s, t, rooms)
+    if push.real <= 0.0:  # what spring and damper held is lost
+        _point_way(x, ends, p, s, t, 3, way)
+        for c in range(3):
+            lost += 0.5 * k * old[p, SPRING + c] * old[p, SPRING + c]
+            lost -= 0.5 * old[p, VISCOUS] * way[c] * old[p, NORMAL + c]
+            for i in range(4):
+                g[i, c] = 0.0
+        return energy, held, lost, push - 1.0, reach - d, turn
+    s, t = at / push, other / push
+    _point_way(x, ends, p, s, t, 3, way)
+    apart = _point_way(x, ends, p, s, t, 0, normal)
+    for c in range(3):
+        normal[c] = normal[c] / apart if apart.real > 0.0 else 0.0
+        turn += normal[c] * old[p, NORMAL + c]
+        closing += normal[c] * way[c]
+    turn = turn + 1.0 if apart.real > 0.0 else 0.0 * turn
+    mobility = (1.0 - s) ** 2 * nodes.inverse[ends[p, 0]] + s**2 * nodes.inverse[ends[p, 1]]
+    mobility += (1.0 - t) ** 2 * nodes.inverse[ends[p, 2]] + t**2 * nodes.inverse[ends[p, 3]]
+    total = _damp(pairs, p, law, push, closing, mobility)
+    lost -= 0.5 * (old[p, VISCOUS] + total - push) * closing
+    if total != push:
+        _gradient(g, s, t, total - push, normal)
+    for c in range(3):
+        new[p, SPRING + c] = 0.0
+    if law.friction > 0.0:
+        held, rubbed = _slide(old, new, p, k, law.friction * total / k, rooms)
+        lost += rubbed
+        for c in range(3):
+            way[c] = -new[p, SPRING + c]
+        _gradient(g, s, t, k, way)
+    new[p, VISCOUS], new[p, FIRST], new[p, SECOND] = total - push, s, t
+    for c in range(3):
+        new[p, NORMAL + c] = normal[c]
+    return energy, held, lost, total, reach - d, turn
+
+
+@inlined
+def _energy_before(pairs, p, nodes, part, place, rooms):
+    """Write the gradient of the energy of a pair a ``part`` of the step before its end, with the ``place`` (4, 6) of
+    its nodes; return the energy."""
+    for i in range(4):
+        for c in range(3):
+            rooms.g[i, c] = 0.0
+            place[i, c] = nodes.x[i, c] - part * nodes.x[i, 3 + c]
+    d, s, t = segment_distance(place, pairs.ends.reshape(-1, 2), 2 * p, 2 * p + 1)
+    energy = 0.0 * d
+    if d.real < pairs.reach[p]:
+        energy = _repel(pairs, p, place, s, t, rooms)[0]
+    return energy
+
+
+@inlined
+def _step_gradient(pairs, nodes, place, rooms):
+    """Write the discrete gradient of the energy of a pair alone, whose work in the step is the change of the energy.
+
+    It is the gradient in the middle of the step and a correction along those of the squared distances of its four
+    ends (Gonzalez, 1996): forces along the lines between them, which keep momentum and angular momentum.
+    """
+    g = rooms.g
+    missing = _energy_before(pairs, 0, nodes, 0.0, place, rooms) - _energy_before(pairs, 0, nodes, 1.0, place, rooms)
+    _energy_before(pairs, 0, nodes, 0.5, place, rooms)
+    square = 0.0 * missing
+    for i in range(4):
+        for c in range(3):
+            missing -= g[i, c] * nodes.x[i, 3 + c]
+        for j in range(i):
+            change = 0.0 * missing
+            for c in range(3):
+                change += (place[i, c] - place[j, c]) * (nodes.x[i, 3 + c] - nodes.x[j, 3 + c])
+            square += change * change
+    if square.real > (_STILL * pairs.reach[0] ** 2) ** 2:
+        for i in range(4):
+            for j in range(i):
+                change = 0.0 * missing
+                for c in range(3):
+                    change += (place[i, c] - place[j, c]) * (nodes.x[i, 3 + c] - nodes.x[j, 3 + c])
+                for c in range(3):
+                    part = missing / square * change * (place[i, c] - place[j, c])
+                    g[i, c] += part
+                    g[j, c] -= part
+
+
+@inlined
+def _take_pair(pairs, p, nodes, place, inverse):
+    """Return a pair and its nodes alone, with room for their positions (4, 6) and inverse masses (4,)."""
+    ends = np.arange(4).reshape(1, 4)
+    for i in range(4):
+        inverse[i] = nodes.inverse[pairs.ends[p, i]]
+        for c in range(6):
+            place[i, c] = nodes.x[pairs.ends[p, i], c]
+    one = slice(p, p + 1)
+    sizes = pairs.reach[one], pairs.crossed[one], pairs.most[one], pairs.counted[one]
+    alone = PairArrays(ends, *sizes, pairs.stiffness[one], pairs.drag[one], pairs.wake[one])
+    return alone, NodeArrays(place, inverse, nodes.force)
+
+
+@kernel
+def add_step_gradients(pairs, state, nodes):
+    """Add the discrete gradients of a step of the pairs that touch to the forces of the nodes.
+
+    ``pairs``: PairArrays; ``state`` (m,); ``nodes``: NodeArrays at the end of the step, see :func:`_step_gradient`.
+    """
+    rooms = Rooms(np.zeros((4, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    place, other, inverse = np.zeros((4, 6)), np.zeros((4, 6)), np.zeros(4)
+    for p in range(len(pairs.ends)):
+        if state[p] == APART:
+            continue
+        pair, own = _take_pair(pairs, p, nodes, place, inverse)
+        _step_gradient(pair, own, other, rooms)
+        for i in range(4):
+            for c in range(3):
+                nodes.force[pairs.ends[p, i], c] += rooms.g[i, c]
+
+
+@kernel
+def differentiate_pairs(pairs, chosen, old, nodes, law, whole, blocks):
+    """Write the derivatives (k, 12, 12) of the forces of ``chosen`` (k,) pairs by the positions of their ends, those of
+    discrete gradients if ``whole``; the other arguments as for :func:`evaluate_pairs`.
+
+    The force is evaluated at positions with a tiny imaginary part, that of which is the derivative to rounding, as
+    nothing is subtracted (Squire and Trapp, 1998): of everything that depends on the positions, such as where bars
+    touch, blends, and the slip.
+    """
+    zero = np.zeros(3, np.complex128)
+    rooms = Rooms(np.zeros((4, 3), np.complex128), zero, zero.copy(), zero.copy(), zero.copy())
+    place, other, inverse = np.zeros((4, 6), np.complex128), np.zeros((4, 6), np.complex128), np.zeros(4)
+    new = np.zeros((1, old.shape[1]), np.complex128)
+    for k in range(len(chosen)):
+        p = chosen[k]
+        pair, own = _take_pair(pairs, p, nodes, place, inverse)
+        for column in range(12):
+            i, c = column // 3, column % 3
+            place[i, c] += 1j * _TINY
+            place[i, 3 + c] += 1j * _TINY
+            if whole:
+                _step_gradient(pair, own, other, rooms)
+            else:
+                _evaluate_pair(pair, 0, own, old[p : p + 1], new, law, rooms)
+            for row in range(12):
+                blocks[k, row, column] = rooms.g[row // 3, row % 3].imag / _TINY
+            place[i, c] = place[i, c].real
+            place[i, 3 + c] = place[i, 3 + c].real
+
+
+@kernel
+def free_part(pairs, x, way):
+    """Return the largest part of the ways (q, 3) of nodes from ``x`` (q, 3) on which no pair comes closer than
+    :data:`_CLOSER` of its distance there, or of its reach, and 1 plus the pair that limits it, or 0.
+
+    Distances change by at most the largest relative way (conservative advancement; Li et al., 2021).
+    """
+    segments, place, ends = np.arange(4).reshape(2, 2), np.zeros((4, 3)), pairs.ends
+    part, limiting = 1.0, 0
+    for p in range(len(ends)):
+        most = 0.0
+        for i in range(2):
+            for j in range(2, 4):
+                square = 0.0
+                for c in range(3):
+                    square += (way[ends[p, j], c] - way[ends[p, i], c]) ** 2
+                most = max(most, np.sqrt(square))
+        at, least = 0.0, -1.0
+        while True:
+            for i in range(4):
+                for c in range(3):
+                    place[i, c] = x[ends[p, i], c] + at * way[ends[p, i], c]
+            d, _, _ = segment_distance(place, segments, 0, 1)
+            if least < 0.0:
+                least = _CLOSER * min(d, pairs.reach[p])
+                if not least > 0.0:
+                    break
+            elif d < least:
+                part, limiting = at, 1 + p
+                break
+            if d - 0.5 * least >= (part - at) * most:
+                break
+            at += (d - 0.5 * least) / most
+    return part, limiting
+
+
 @kernel
 def evaluate_pairs(pairs, state, old, new, nodes, law, out):
     """Compute forces and sums of the pairs that touch, and their memory ``new`` (m, width) from the ``old`` one.
@@ -317,65 +519,29 @@ def evaluate_pairs(pairs, state, old, new, nodes, law, out):
     added; ``law``: PairLaw; ``out`` (6,): sums from :data:`ENERGY` on. Returns 1 plus the pair that has passed through
     itself, or 0.
     """
-    x, ends, failed = nodes.x, pairs.ends, 0
-    segments = ends.reshape(-1, 2)
+    ends, failed = pairs.ends, 0
     rooms = Rooms(np.zeros((4, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    g, way, normal = rooms.g, rooms.way, rooms.normal
     for p in range(len(ends)):
         if state[p] == APART:
             continue
-        d, s, t = segment_distance(x, segments, 2 * p, 2 * p + 1)
-        k, reach = pairs.stiffness[p], pairs.reach[p]
-        energy = push = at = other = lost = 0.0
-        if d < reach:
-            energy, push, at, other = _repel(pairs, p, x, s, t, rooms)
-        if push > 0.0:
-            s, t = at / push, other / push
-        _point_way(x, ends, p, s, t, 3, way)
-        if push <= 0.0:  # what spring and damper held is lost
-            for c in range(3):
-                lost += 0.5 * k * old[p, SPRING + c] * old[p, SPRING + c]
-                lost -= 0.5 * old[p, VISCOUS] * way[c] * old[p, NORMAL + c]
+        energy, held, lost, total, overlap, turn = _evaluate_pair(pairs, p, nodes, old, new, law, rooms)
+        if pairs.counted[p]:
+            out[DISSIPATED] += lost
+        if total < 0.0:
             state[p] = APART
-            if pairs.counted[p]:
-                out[DISSIPATED] += lost
             continue
-        apart = _point_way(x, ends, p, s, t, 0, normal)
-        turn = closing = held = 0.0
-        for c in range(3):
-            normal[c] = normal[c] / apart if apart > 0.0 else 0.0
-            turn += normal[c] * old[p, NORMAL + c]
-            closing += normal[c] * way[c]
-        if apart <= 0.0 or (state[p] == TOUCHING and turn < 0.0):
+        if not turn > 0.0 or (state[p] == TOUCHING and turn < 1.0):
             failed = 1 + p
-        mobility = (1.0 - s) ** 2 * nodes.inverse[ends[p, 0]] + s**2 * nodes.inverse[ends[p, 1]]
-        mobility += (1.0 - t) ** 2 * nodes.inverse[ends[p, 2]] + t**2 * nodes.inverse[ends[p, 3]]
-        total = _damp(pairs, p, law, push, closing, mobility)
-        lost -= 0.5 * (old[p, VISCOUS] + total - push) * closing
-        if total != push:
-            _gradient(g, s, t, total - push, normal)
-        for c in range(3):
-            new[p, SPRING + c] = 0.0
-        if law.friction > 0.0:
-            held, rubbed = _slide(old, new, p, k, law.friction * total / k, rooms)
-            lost += rubbed
-            for c in range(3):
-                way[c] = -new[p, SPRING + c]
-            _gradient(g, s, t, k, way)
         state[p] = TOUCHING
-        new[p, VISCOUS], new[p, FIRST], new[p, SECOND] = total - push, s, t
-        for c in range(3):
-            new[p, NORMAL + c] = normal[c]
         for i in range(4):
             for c in range(3):
-                nodes.force[ends[p, i], c] += g[i, c]
+                nodes.force[ends[p, i], c] += rooms.g[i, c]
         if pairs.counted[p]:
             out[ENERGY] += energy + held
-            out[DISSIPATED] += lost
             out[CONTACTS] += 1.0
-            out[OVERLAP] = max(out[OVERLAP], reach - d)
-            out[FORCE] = max(out[FORCE], np.sqrt(total * total + 2.0 * k * held))
-            out[DEPTH] = max(out[DEPTH], 2.0 * (reach - d) / reach)
+            out[OVERLAP] = max(out[OVERLAP], overlap)
+            out[FORCE] = max(out[FORCE], np.sqrt(total * total + 2.0 * pairs.stiffness[p] * held))
+            out[DEPTH] = max(out[DEPTH], 2.0 * overlap / pairs.reach[p])
     return failed
 
 
@@ -469,7 +635,7 @@ def _numbered(ends: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 class SelfContact:
-    """Contact of bars with bars, whose forces are added to those of bars in explicit steps. Construction is collective.
+    """Contact of bars with bars, whose forces are added to those of bars. Construction is collective.
 
     Parameters
     ----------
@@ -484,6 +650,8 @@ class SelfContact:
     sums : (6,) of the last forces, see :data:`ENERGY`
     deepest : largest overlap so far over the radius
     stale : whether bars have left the model since the last search
+    implicit : whether steps solve equations
+    between : the last bars that would have passed through each other in an iteration of such a step, empty for none
 
     Raises
     ------
@@ -496,8 +664,8 @@ class SelfContact:
     def __init__(self, model: Any) -> None:
         self._model, self._mesh, self.comm = model, model.mesh, model.comm
         table, mesh, comm = model.case.self_contact, model.mesh, model.comm
-        if model.case.time is None:
-            self._refuse()
+        if model.case.time is None and model.case.static is None:
+            raise InputError(f"{model.case.source}: [self_contact] needs steps: [time], or [static]")
         with agreed(comm):
             chosen = np.ones(len(mesh.bars), dtype=bool)
             if table.bars is not None:
@@ -516,7 +684,8 @@ class SelfContact:
         self._starts = owner_starts(mesh)
         self._numbers = np.concatenate([mesh.first_node + np.arange(mesh.n_owned), mesh.ghost_numbers])
         self._make_directory()
-        self._h, self.room = 0.0, 0.0
+        self._h, self.room, self.implicit, self._steps = 0.0, 0.0, False, "time.step"
+        self.between: tuple[int, ...] = ()
         self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
         self.sums = self._no_sums = np.zeros(6)
         self._way, self._limit, self._drift, self._most = 0.0, 0.0, np.zeros(3), np.zeros(3)
@@ -550,7 +719,8 @@ class SelfContact:
         """
         source, self._h = self._model.case.source, h
         if not scheme.explicit:
-            self._refuse()
+            self.begin_implicit(scheme)
+            return
         if self._model.inertia.redistribution is not None or self._model.inertia.consistent:
             raise InputError(
                 f'{source}: [self_contact] needs time.mass = "lumped", and no contact.treatment = "mass_redistribution"'
@@ -565,12 +735,56 @@ class SelfContact:
             )
         self.room = room / (h * h)
 
-    def _refuse(self) -> None:
-        """Refuse analyses that contact cannot serve."""
+    def begin_implicit(self, scheme: Scheme) -> None:
+        """Take a scheme whose steps solve equations; stiffness is not limited then. Collective.
+
+        Raises
+        ------
+        InputError
+            For what such steps do not serve.
+        """
+        case, self._h, self.implicit = self._model.case, 0.0, True
+        self._steps = "time.step" if scheme.inertial else "static.step"
+        explicit = 'use an explicit integrator, such as time.integrator = "central_differences"'
+        if case.static is not None and case.static.method != "newton":
+            self._refuse(f'static.method = "{case.static.method}"', 'use "newton"')
+        if case.modes is not None:
+            self._refuse("[modes]", "whose stiffness has no contact; give the table in the stages before only")
+        if self.at_walls is not None:
+            names = ", ".join(repr(self._model.contact.names[k]) for k in self.at_walls.walls)
+            self._refuse(f"walls {names}, which bars touch between their nodes,", explicit)
+        if self._model.links:
+            self._refuse("[[contact_pair]] or [[constraint]]", explicit)
+        if scheme.discrete_gradient and not self.symmetric:
+            self._refuse(
+                f'time.integrator = "{case.time.integrator}"',
+                "whose energy is conserved, with friction or restitution; use another one, or remove these",
+            )
+
+    def _refuse(self, what: str, remedy: str) -> None:
+        """Refuse what contact cannot serve."""
         raise InputError(
-            f"{self._model.case.source}: [self_contact] needs an explicit integrator, such as time.integrator = "
-            '"central_differences"; use one, or give the table in the stages with one only'
+            f"{self._model.case.source}: [self_contact] does not serve {what} in implicit or static steps; {remedy}"
         )
+
+    def operator(self) -> str:
+        """Return ``solver.operator``: the matrix has the pairs that touch in its pattern.
+
+        Raises
+        ------
+        InputError
+            If the case asks for another one.
+        """
+        source, asked = self._model.case.source, self._model.case.solver
+        if asked.operator == "matrix_free" or asked.linear == "multigrid":
+            key = 'operator = "matrix_free"' if asked.operator == "matrix_free" else 'linear = "multigrid"'
+            raise InputError(f'{source}: solver.{key}: [self_contact] needs a matrix; use "auto"')
+        return "assembled"
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the derivative of the forces is symmetric: without friction and damping."""
+        return not self._friction and not self._damping
 
     def text(self) -> str:
         """Return what can touch, for the user before a run. Collective."""
@@ -586,6 +800,13 @@ class SelfContact:
             f"[self_contact]: bars have overlapped by up to {100.0 * deepest:.0f} % of a radius, as contacts must be "
             "soft for this time.step: a smaller one (time.safety) makes them stiffer"
         ]
+
+    def hint(self) -> str:
+        """Return what to add to the message about a solve that did not converge. Collective."""
+        depth = self.comm.allreduce(float(self.sums[DEPTH]), op=MPI.MAX)
+        if self.between:
+            return ". Bars {} and {} would have passed through each other in an iteration".format(*self.between)
+        return f". Bars overlap by {100.0 * depth:.0f} % of a radius" if depth > _DEEP else ""
 
     # pairs
 
@@ -649,6 +870,7 @@ class SelfContact:
             ids, ends, sizes = rows[:, :2], rows[:, 2:6], np.ascontiguousarray(rows[:, 6:]).view(np.float64)
         numbers, ends = _numbered(ends, starts[comm.rank : comm.rank + 2])
         self._own = own = (numbers >= starts[comm.rank]) & (numbers < starts[comm.rank + 1])
+        self._at = numbers
         self._local = (numbers[own] - starts[comm.rank]).astype(np.int64)
         if self._exchange is not None:
             self._exchange.close()
@@ -679,13 +901,13 @@ class SelfContact:
         """Give pairs that begin to touch their stiffness and largest damping, with what the nodes (q, 3) carry, see
         :func:`find_beginning`. Collective."""
         pairs, begin = self._pairs, np.flatnonzero(state == BEGINNING)
+        pairs.stiffness[begin], pairs.drag[begin] = pairs.most[begin], inf
+        if not self._h:
+            return
         if self.comm.size > 1:
             owned = np.zeros((self._mesh.n_owned, 3))
             owned[self._local] = load[self._own]
             load = self._gather(owned.__getitem__, 3)
-        pairs.stiffness[begin], pairs.drag[begin] = pairs.most[begin], inf
-        if not self._h:
-            return
         ends = pairs.ends[begin]
         room = self._mass[ends][:, :, None] * np.array([0.5 * self.room, 0.5 / self._h])
         load = load[ends]
@@ -721,61 +943,149 @@ class SelfContact:
         """Add the forces at positions ``x``, a ``step`` [s] after the last that were committed, to ``f``, both
         (local, 3); return the stored energy and all that is dissipated [J]. Collective.
 
+        Forces that are not a number stand for bars of a trial that have passed through each other.
+
         Raises
         ------
         SimulationFailure
             On all ranks, if a bar has passed through another, or may have.
         """
-        owned = self._last.shape[1]
-        rows = tuple(np.ascontiguousarray(x[:owned, c]) for c in range(3))
-        move = largest_move(rows, self._last, step * self._drift, self._most)
-        worst = np.array([move, float(self.stale), -self._asleep])
-        if self.comm.size > 1:
-            self.comm.Allreduce(MPI.IN_PLACE, worst, op=MPI.MAX)
-        if not worst[0] < np.inf:  # of which other checks of the step tell
+        found = self._look(x, step, commit)
+        if found is None:
             return float(self.sums[ENERGY]), self.dissipated
-        way = self._way + 2.0 * float(worst[0])
-        if worst[1] or way >= self._limit:
-            self._renew(x, step, way, 2.0 * float(worst[0]))
-        if way < -worst[2] and self._asleep > 0.0:  # nothing touches, nor can; after a search, this is not known
+        arrays, state, law = found
+        if state is None:
             if commit:
-                self._way, self.sums = way, self._no_sums
-                np.stack(rows, out=self._last)
+                self._way, self.sums = law.way, self._no_sums
+                np.stack(self._components(x), out=self._last)
             return 0.0, self.dissipated
-        nodes = self._gather(lambda some: self._motion_of(some, x), 6)
-        force, load, sums = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3)), np.zeros(6)
-        law = PairLaw(self._friction, self._damping, float(step), way, way if commit else 2.0 * self._way - way)
-        arrays, pairs, state = NodeArrays(nodes, self._inverse, force), self._pairs, self._state
-        if not commit:
-            state = state.copy()
-        begin, far, self._asleep = find_beginning(pairs, state, self._memory, arrays, law, load)
-        if self._any(begin + far):
+        sums = np.zeros(6)
+        passed = evaluate_pairs(self._pairs, state, self._memory, self._spare, arrays, law, sums)
+        if self.implicit and not commit:
+            arrays.force[:] = np.nan if passed else arrays.force
+        else:
             self._report(
-                far,
-                "bars {} and {}, which are about to touch, move by more than half the sum of their radii relative to "
-                "each other in a step, so that contact may miss them: reduce time.step",
+                passed,
+                "bars {} and {} pass through each other, which the stiffness of [self_contact] did not prevent: reduce "
+                f"{self._steps}, or use more elements, a larger self_contact.radius or lower velocities",
             )
-            self._stiffen(state, load)
-        passed = evaluate_pairs(pairs, state, self._memory, self._spare, arrays, law, sums)
-        self._report(
-            passed,
-            "bars {} and {} pass through each other, which the stiffness of [self_contact] did not prevent: reduce "
-            "time.step, or use more elements, a larger self_contact.radius or lower velocities",
-        )
-        add_to_nodes(self._local, self._own, force, f)
+        add_to_nodes(self._local, self._own, arrays.force, f)
         total = self.dissipated + float(sums[DISSIPATED])
         if commit:
             self._memory, self._spare = self._spare, self._memory
-            self._way, self.dissipated, self.sums = way, total, sums
+            self._way, self.dissipated, self.sums = law.way, total, sums
             self.deepest = max(self.deepest, float(sums[DEPTH]))
-            np.stack(rows, out=self._last)
+            np.stack(self._components(x), out=self._last)
         return float(sums[ENERGY]), total
+
+    def _components(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the components of positions (local, 3) of owned nodes, three arrays."""
+        return tuple(np.ascontiguousarray(x[: self._last.shape[1], c]) for c in range(3))
 
     def _motion_of(self, some: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Return positions and displacements in the step (k, 6) of owned nodes (k,), see :class:`NodeArrays`."""
         nodes = np.empty((len(some), 6))
         read_nodes(some, x, self._last, nodes)
         return nodes
+
+    def _look(self, x: np.ndarray, step: float, commit: bool) -> tuple[NodeArrays, np.ndarray | None, PairLaw] | None:
+        """Return the nodes of pairs at positions (local, 3), states of the pairs, with those that begin to touch, and
+        the law; no states if nothing touches, nor can, and None for positions that are not finite, of which other
+        checks of the step tell. Collective."""
+        if self.implicit:  # trials are far from each other
+            self._most[:] = 0.0
+        move = largest_move(self._components(x), self._last, step * self._drift, self._most)
+        worst = np.array([move, float(self.stale), -self._asleep])
+        if self.comm.size > 1:
+            self.comm.Allreduce(MPI.IN_PLACE, worst, op=MPI.MAX)
+        if not worst[0] < np.inf:
+            return None
+        way = self._way + 2.0 * float(worst[0])
+        if worst[1] or way >= self._limit:
+            self._renew(x, step, way, 2.0 * float(worst[0]))
+        lead = 0.0 if self.implicit else 0.5
+        law = PairLaw(self._friction, self._damping, float(step), way, way if commit else 2.0 * self._way - way, lead)
+        asleep = way < -worst[2] and self._asleep > 0.0  # after a search, this is not known
+        nodes = x if asleep else self._gather(lambda some: self._motion_of(some, x), 6)
+        arrays, state = NodeArrays(nodes, self._inverse, np.zeros((len(nodes), 3))), self._state
+        if asleep:
+            return arrays, None, law
+        state, load = state if commit else state.copy(), np.zeros((len(nodes), 3))
+        begin, far, self._asleep = find_beginning(self._pairs, state, self._memory, arrays, law, load)
+        if self._any(begin + far):
+            if not self.implicit:
+                self._report(
+                    far,
+                    "bars {} and {}, which are about to touch, move by more than half the sum of their radii relative "
+                    "to each other in a step, so that contact may miss them: reduce time.step",
+                )
+            self._stiffen(state, load)
+        return arrays, state, law
+
+    # steps that solve equations
+
+    def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
+        """Add the discrete gradient of a step from the positions ``x0`` of the last commit to ``x``, see
+        :func:`_step_gradient`, to ``f``, all (local, 3). Collective."""
+        arrays, state, _ = self._look(x, self._model.bars.step, False) or (None, None, None)
+        if state is not None:
+            add_step_gradients(self._pairs, state, arrays)
+            add_to_nodes(self._local, self._own, arrays.force, f)
+
+    def linearise(self, problem: StepProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what the pairs that touch add to the Hessian of a problem at its positions: owned nodes (k,), PETSc's
+        numbers of others (k,), and blocks (k, 3, 3). Collective."""
+        balance, step = problem.balance, self._model.bars.step
+        arrays, state, law = self._look(problem.x, step if step < np.inf else 0.0, False) or (None, None, None)
+        if state is None:
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
+        chosen = np.flatnonzero((self._state == TOUCHING) | (state != APART))
+        ends, blocks = self._pairs.ends[chosen], np.empty((len(chosen), 12, 12))
+        differentiate_pairs(self._pairs, chosen, self._memory, arrays, law, balance.discrete_gradient, blocks)
+        if self.symmetric and not balance.discrete_gradient:
+            blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
+        left, right = self._gather(self._coordinates(problem), 18).reshape(-1, 2, 3, 3).transpose(1, 0, 2, 3)
+        blocks = balance.weight * blocks.reshape(-1, 4, 3, 4, 3).transpose(0, 1, 3, 2, 4)
+        blocks = left[ends][:, :, None] @ blocks @ right[ends][:, None]
+        rows, columns = np.repeat(ends, 4, axis=1).ravel(), np.tile(ends, 4).ravel()
+        own, numbers = self._own[rows], self._at
+        rows, columns = numbers[rows[own]] - self._mesh.first_node, numbers[columns[own]]
+        return rows, columns, blocks.reshape(-1, 3, 3)[own]
+
+    def _coordinates(self, problem: StepProblem) -> Callable[[np.ndarray], np.ndarray]:
+        """Return what gives owned nodes (k,) the matrices (k, 18) by which the rows and the columns of their Hessian
+        are multiplied: of frames and supports."""
+        supports, turns = self._model.supports, problem.transform.turns()
+
+        def of(rows: np.ndarray) -> np.ndarray:
+            free = np.eye(3) * ~supports.fixed[rows][:, None]
+            if supports.inclined is not None:
+                every = np.tile(np.eye(3), (self._mesh.n_owned, 1, 1))
+                every[supports.inclined.nodes] = supports.inclined.free
+                free = free @ every[rows]
+            left = right = free
+            if turns is not None:
+                place, *both = turns
+                turned = np.flatnonzero(place[rows] >= 0)
+                left, right = free.copy(), free.copy()
+                left[turned] = free[turned] @ both[0][place[rows[turned]]]
+                right[turned] = both[1][place[rows[turned]]] @ free[turned]
+            return np.stack([left, right], axis=1).reshape(-1, 18)
+
+        return of
+
+    def free_part(self, start: np.ndarray, end: np.ndarray) -> float:
+        """Return the part of the way from positions ``start`` to ``end``, both (local, 3), on which no bar passes
+        through another, see :func:`free_part`; 1 for all of it. Collective."""
+        found = self._look(end, self._model.bars.step if self._model.bars.step < np.inf else 0.0, False)
+        if found is None or found[1] is None:
+            return 1.0
+        x = self._gather(lambda rows: start[rows], 3)
+        part, limiting = free_part(self._pairs, x, found[0].x[:, :3] - x)
+        parts = self.comm.allgather((part, tuple(self.ids[limiting - 1].tolist()) if limiting else ()))
+        part, between = min(parts)
+        self.between = between or self.between
+        return part
 
     def _any(self, here: int) -> bool:
         """Return whether a number is not zero on some rank. Collective."""

@@ -507,6 +507,10 @@ class Bars:
         return next((family for family in self.families if isinstance(family, Springs)), None)
 
     @property
+    def _all_families(self) -> list[ForceElements]:
+        return [*self.families, *([] if self.touching is None else [self.touching])]
+
+    @property
     def slackens(self) -> bool:
         """Whether bars of the case can be slack, the same on all ranks."""
         return "slack" in self.internal
@@ -559,7 +563,7 @@ class Bars:
             places, forces, self.reference, self.loops("full"), self.step, commit, energies
         )
         join_components(forces, f)
-        for family in [*self.families, *([] if self.touching is None else [self.touching])]:
+        for family in self._all_families:
             for name, energy in zip(family.energies, family.add_forces(x, f, commit), strict=True):
                 energies[BAR_ENERGIES.index(name)] += energy
         return StrainEnergy(tuple(energies.tolist()), failed, shortened, changed)
@@ -693,7 +697,7 @@ class Bars:
         coefficients = np.empty((2, len(self.ends)))
         self._step_coefficients(x0, x, coefficients)
         add_step_forces(x0, x, self.ends, coefficients, f)
-        for family in self.families:
+        for family in self._all_families:
             family.add_step_forces(x0, x, f)
 
     def lengths(self, x: np.ndarray) -> np.ndarray:

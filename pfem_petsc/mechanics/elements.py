@@ -94,13 +94,13 @@ class ForceElements(Protocol):
         """Add the internal forces at positions ``x`` to ``f``, both (local, 3); return the energies [J]. What elements
         remember is updated only if ``commit``."""
 
+    def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
+        """Add the discrete gradient of a step from ``x0`` to ``x``, whose work is the change of the energy."""
+
 
 class ElementFamily(ForceElements, Protocol):
     """Elements with forces and stiffness, such as springs to the ground. The stiffness is that at the positions of the
     last forces."""
-
-    def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
-        """Add the discrete gradient of a step from ``x0`` to ``x``, whose work is the change of the energy."""
 
     def add_product(self, weight: float, u: np.ndarray, out: np.ndarray) -> None:
         """Add ``weight`` times the stiffness times ``u`` to ``out``, with a row for each owned node at least."""

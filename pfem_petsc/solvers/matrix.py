@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mechanics.block_pattern import BlockPattern
@@ -132,21 +133,15 @@ class HessianMatrix:
 
     def __init__(self, mesh: DistributedMesh, supports: Supports | None = None, symmetric: bool = True) -> None:
         self.mesh = mesh
-        self.pattern = BlockPattern(mesh)
-        pointers, columns = self.pattern.scalar_rows()
-        self.values = np.zeros(len(columns), dtype=np.float64)
         local, total = 3 * mesh.n_owned, 3 * mesh.n_nodes
         self.mat = PETSc.Mat().create(comm=mesh.comm)
         self.mat.setSizes(((local, total), (local, total)), bsize=3)
         self.mat.setType(PETSc.Mat.Type.AIJ)
         # setPreallocationCOO is available in petsc4py since PETSc 3.19; it sets values without index searches
         self._by_coordinates = hasattr(self.mat, "setPreallocationCOO")
-        if self._by_coordinates:
-            rows = np.repeat(3 * mesh.first_node + np.arange(local, dtype=PETSc.IntType), np.diff(pointers))
-            self.mat.setPreallocationCOO(rows, columns)
-        else:
-            self._pointers, self._columns = pointers, columns
-            self.mat.setPreallocationCSR((pointers, columns))
+        self._touching: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # owned nodes, keys, blocks
+        self._coupled, self._problem = np.empty(0, dtype=np.int64), None
+        self._allocate()
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         self.bounded = self.mat
         self._chain: list[tuple[object, PETSc.Mat, PETSc.Mat]] = []  # coordinates, T, and the product with T
@@ -162,6 +157,34 @@ class HessianMatrix:
             nodes, self._free = with_ghosts(mesh, self._inclined.nodes, self._inclined.free)
             self._place = np.full(mesh.n_local, -1, dtype=np.int32)  # of a node among these
             self._place[nodes] = np.arange(len(nodes), dtype=np.int32)
+
+    def _allocate(self) -> None:
+        """Give the matrix the pattern of bars, and of the nodes of bars that touch."""
+        self.pattern = BlockPattern(self.mesh, self._coupled)
+        self.__dict__.pop("local_columns", None)
+        pointers, columns = self.pattern.scalar_rows()
+        self.values = np.zeros(len(columns), dtype=np.float64)
+        if self._by_coordinates:
+            first, local = 3 * self.mesh.first_node, 3 * self.mesh.n_owned
+            rows = np.repeat(first + np.arange(local, dtype=PETSc.IntType), np.diff(pointers))
+            self.mat.setPreallocationCOO(rows, columns)
+        else:
+            self._pointers, self._columns = pointers, columns
+            self.mat.setPreallocationCSR((pointers, columns))
+
+    def _couple_bars(self, problem: StepProblem) -> None:
+        """Take what bars that touch add at the positions of a problem; the pattern grows as long as the problem is the
+        same. Collective."""
+        touch = problem.model.self_contact
+        if touch is None or not problem.balance.weight:
+            return
+        nodes, columns, blocks = touch.linearise(problem)
+        keys = self.pattern.keys_of(nodes, columns)
+        coupled = np.unique(keys if problem is not self._problem else np.append(self._coupled, keys))
+        self._touching, self._problem = (nodes, keys, blocks), problem
+        if self.mesh.comm.allreduce(not np.array_equal(coupled, self._coupled), op=MPI.LOR):
+            self._coupled = coupled
+            self._allocate()
 
     @cached_property
     def local_columns(self) -> np.ndarray:
@@ -201,6 +224,7 @@ class HessianMatrix:
     def update(self, problem: StepProblem, w: np.ndarray) -> None:
         """Assemble the Hessian of a problem at ``w``. Collective."""
         problem.place(problem.increment(w))
+        self._couple_bars(problem)
         self.fill(lambda values: self.add(problem, values))
         if problem.transform.bounded:
             self._change_coordinates(problem.transform)
@@ -235,6 +259,9 @@ class HessianMatrix:
                     family.add_tangents(balance.weight, self.pattern, values)
         self._turn(problem.transform, values)
         self.constrain(problem.scale, values)
+        if problem is self._problem and self._touching is not None:
+            nodes, keys, blocks = self._touching
+            self.pattern.add_blocks(nodes, blocks, values, keys)
 
     def _change_coordinates(self, transform: Transform) -> None:
         """Compute ``bounded`` from ``mat``. Collective."""
@@ -313,5 +340,6 @@ def local_columns(mesh: DistributedMesh, columns: np.ndarray) -> np.ndarray:
     outside = (local < 0) | (local >= mesh.n_owned)
     order = np.argsort(mesh.ghost_numbers, kind="stable")
     found = np.searchsorted(mesh.ghost_numbers[order], columns[outside])
-    local[outside] = mesh.n_owned + order[found] if len(order) else 0
+    # blocks of nodes that are not even ghosts are those of bars that touch, which come later: zero until then
+    local[outside] = mesh.n_owned + order[np.minimum(found, len(order) - 1)] if len(order) else 0
     return local.astype(np.int32)

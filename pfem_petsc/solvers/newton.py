@@ -153,7 +153,10 @@ class NewtonSolver:
     problem : the current problem
     forcing : of its linear solves
     lagged : preconditioner of all solvers, None if PETSc builds one from the operator
+    limits : whether steps are shortened so that no bar passes through another
     """
+
+    limits = False
 
     def __init__(
         self,
@@ -180,7 +183,7 @@ class NewtonSolver:
         self._ours: dict[tuple[bool, bool], Preconditioning] = {}
         self.forcing = Forcing()
         self._previous = self._longest = np.inf
-        self._full = self._forces = False
+        self._full = self._forces = self._limited = False
         self._place = np.zeros((mesh.n_owned, 3))  # the last iterate of full steps
 
     def solve(
@@ -336,6 +339,8 @@ class NewtonSolver:
         snes.setJacobian(lambda *arguments: this()._hessian(*arguments), matrix, matrix)
         snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=self.max_newton)
         snes.setConvergenceTest(lambda *arguments: this()._converged(*arguments))
+        if self.limits:
+            snes.setLineSearchPreCheck(lambda *arguments: this()._limit(*arguments))
         defaults: dict[str, str | float] = {"snes_linesearch_type": _CAREFUL if careful else "basic"}
         if contact:
             # PETSc's default of 1e-8 is absolute: a node that close to its bound would be fixed there, off the bound
@@ -376,6 +381,18 @@ class NewtonSolver:
         array = u.getArray(readonly=True).reshape(self.mesh.n_owned, 3)
         self.hessian.update(self.problem, array)
 
+    def _limit(self, u: PETSc.Vec, step: PETSc.Vec) -> bool:
+        """Shorten a step in which bars would pass through each other; return whether it was."""
+        start, way = (each.getArray(readonly=True).reshape(self._place.shape) for each in (u, step))
+        end = start - way
+        if self._bounds is not None:
+            end = np.clip(end, *self._bounds)
+        part = self.problem.free_part(start, end)
+        self._limited = part < 1.0
+        if self._limited:
+            step.scale(part)
+        return self._limited
+
     def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int:
         _, step, norm = norms
         previous, self._previous = self._previous, norm
@@ -392,7 +409,10 @@ class NewtonSolver:
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if iteration and (self._rounded(norm, 1.0) or (norm > 0.5 * previous and self._rounded(norm, STAGNATION))):
             return PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE
-        if self._full:
+        if self._limited:
+            self._longest, self._limited = np.inf, False
+            self._place[:] = snes.getSolution().getArray(readonly=True).reshape(self._place.shape)
+        elif self._full:
             if not step < self._longest:
                 return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
             place = snes.getSolution().getArray(readonly=True).reshape(self._place.shape)

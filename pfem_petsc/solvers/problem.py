@@ -110,6 +110,16 @@ class StepProblem:
             self.model.bars.forces(self.x, self.f, commit=False)
         self._evaluated[:] = self.x
 
+    def free_part(self, w: np.ndarray, end: np.ndarray) -> float:
+        """Return the part of the way from w to ``end``, both (owned, 3), on which no bar passes another. Collective."""
+        touch = self.model.self_contact
+        if touch is None:
+            return 1.0
+        self.place(self.increment(w))
+        start = self.x.copy()
+        self.place(self.increment(end))
+        return touch.free_part(start, self.x)
+
     def residual(self, w: np.ndarray, g: np.ndarray) -> None:
         """Write g(w) (owned, 3) [N]. Collective."""
         self.imbalance(self.increment(w), g)

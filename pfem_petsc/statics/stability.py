@@ -325,7 +325,7 @@ _MOVES = 0.3  # of the largest displacement of a motion, above which a node is n
 
 def names_motions(model: Model) -> bool:
     """Whether motions are looked at: in models without walls and links, of at most 30,000 unknowns."""
-    return not model.can_touch and 3 * model.mesh.n_nodes <= LARGEST
+    return not model.touches and 3 * model.mesh.n_nodes <= LARGEST
 
 
 def free_motions(model: Model, state: State) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..contact.self_contact import CONTACTS
 from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..mechanics.materials.base import law_name, law_of
@@ -254,6 +255,8 @@ class StaticStepper(ImplicitStepper):
         are found.
         """
         model, state, walls = self.model, self.state, self.solution.walls
+        if model.self_contact is not None:  # whose stiffness is not part of that of bars
+            return -1
         direct, bars = self._choice.krylov == "preonly", model.bars.state_stiffness(state.x)
         check = Stability(model, largest=LARGEST_WITH_MUMPS if direct else LARGEST)
         try:
@@ -334,9 +337,10 @@ class StaticStepper(ImplicitStepper):
 
     def solve(self, balance: Balance) -> Solution:
         """See :meth:`~pfem_petsc.stepping.stepper.Stepper.solve`; jumps of an increment are found. Collective."""
-        begun = self._solved
+        begun, touch = self._solved, self.model.self_contact
         solution = super().solve(balance)
-        looks = self.finds_jumps and balance.time > self.state.time
+        # what friction of bars loses depends on the steps that are made
+        looks = self.finds_jumps and balance.time > self.state.time and (touch is None or touch.symmetric)
         self._jumps = self._jumps_to(balance, solution, begun) if looks else []
         return solution
 
@@ -385,7 +389,7 @@ class StaticStepper(ImplicitStepper):
         """Warn of the jumps of the last increment."""
         for jump in self._jumps:
             follow = "[time] follows the motion"
-            if not self.model.can_touch:
+            if not self.model.touches:
                 follow = f'static.method = "arc_length" or "displacement" follows the path in between, and {follow}'
             self.message(
                 f"step {self.number + 1}: {jump}: it is beyond a limit point or a bifurcation, and at rest again after "
@@ -395,7 +399,8 @@ class StaticStepper(ImplicitStepper):
     def _untouched(self) -> bool:
         """Return whether contact is possible and nothing is in contact at the start of the increment. Collective."""
         model = self.model
-        return model.can_touch and not model.comm.allreduce(int(self.state.contact.any()), op=MPI.MAX)
+        touched = self.state.contact.any() or (model.self_contact is not None and model.self_contact.sums[CONTACTS] > 0)
+        return model.touches and not model.comm.allreduce(int(touched), op=MPI.MAX)
 
     def resume(self) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
@@ -503,7 +508,7 @@ class StaticStepper(ImplicitStepper):
         model, smallest = self.model, self.limits.smallest
         free = free_motions(model, self.state)
         cause = "part of the truss is a mechanism" if free else self._limit_point(2.0 * smallest)
-        if model.can_touch:
+        if model.touches:
             cause += ", or part of the truss is a mechanism"
             others = "static.stabilise, or supports that move the truss instead of loads, pass a limit point"
             if model.contact.any and model.contact.symmetric:
@@ -525,7 +530,7 @@ class StaticStepper(ImplicitStepper):
         plastic mechanisms.
         """
         model, state = self.model, self.state
-        if model.can_touch:
+        if model.touches:
             return "it may be a limit point, which is not examined where contact is possible"
         stability = Stability(model, largest=LARGEST)
         if stability.refusal is not None:
@@ -609,6 +614,8 @@ def make_stepper(model: Model) -> StaticStepper:
     case = model.case
     parameters, choice = case.static.parameters, _linear(model)
     stepper = lookup(METHODS, case.static.method, "static.method").make_stepper(model, parameters, choice)
+    if model.self_contact is not None:
+        model.self_contact.begin_implicit(stepper.scheme)
     points = getattr(parameters, "max_points", None)
     words = ", ".join(f"{key} = {value}" for key, value in parameters.model_dump(exclude_none=True).items())
     stepper.plan = Plan(
@@ -633,9 +640,12 @@ def _linear(model: Model) -> LinearChoice:
     if request == "auto":
         smooth = all(law_of(material).smooth for material in model.case.material.values())
         most = _DIRECT_UP_TO if smooth else _DIRECT_YIELDING_UP_TO
-        multigrid = "multigrid" if solver.operator != "assembled" and fills_block(model.mesh) else "gamg"
+        free = solver.operator != "assembled" and model.self_contact is None
+        multigrid = "multigrid" if free and fills_block(model.mesh) else "gamg"
         request = "mumps" if unknowns <= most and solver.operator != "matrix_free" else multigrid
-    choice = choose_linear(request, solver.operator, Demand(unknowns, np.inf))
+    touch = model.self_contact
+    operator, symmetric = (solver.operator, True) if touch is None else (touch.operator(), touch.symmetric)
+    choice = choose_linear(request, operator, Demand(unknowns, np.inf, symmetric))
     if solver.linear == "auto":
         choice = replace(choice, why=choice.why.removesuffix(" (asked for)"))
     return choice

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from .model import Model
 
 
+_APPROACHES = 5  # guesses, of which only supports move bars through others in the last
 _HALVINGS = 10  # most halvings of a step: to 1/1024
 
 
@@ -185,7 +186,10 @@ class ImplicitStepper(Stepper):
     def _make_solvers(self) -> None:
         """Create matrices and solvers for the supports as they are. Collective."""
         model, choice = self.model, self._choice
-        symmetric = self.scheme.symmetric and model.contact.symmetric
+        touch = model.self_contact
+        if touch is not None and not touch.symmetric:
+            choice = unsymmetric(choice)
+        symmetric = self.scheme.symmetric and model.contact.symmetric and (touch is None or touch.symmetric)
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)
         else:
@@ -199,6 +203,7 @@ class ImplicitStepper(Stepper):
         most = model.case.solver.max_newton
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.size, self.lagged)
         self.newton.forcing = self.forcing  # which outlasts these solvers
+        self.newton.limits = touch is not None
         self._couple_rows()
         self.newton.prepare(model.can_touch)
         self._mass: MassSolver | None = None
@@ -294,6 +299,8 @@ class ImplicitStepper(Stepper):
             model.change_bars(balance.time)
         if model.bars.viscous and balance.weight and self.scheme.inertial and not balance.discrete_gradient:
             self._set_rates(balance)
+        if model.self_contact is not None:
+            guess = self._free_way(balance, guess)
         scale = self._force_scale()
         # an explicit scheme's balance is a well-conditioned linear system, and its residual would act as an impulse
         rtol = model.case.solver.rtol * (1.0 if balance.weight else _MASS_RTOL)
@@ -330,6 +337,8 @@ class ImplicitStepper(Stepper):
                 exact = self._choice.krylov == "preonly"
                 remedy = self.remedy if exact else f'{self.remedy}, or set solver.linear = "mumps"'
                 text = self.newton.failure_message(w, report, remedy)
+                if model.self_contact is not None:
+                    text += model.self_contact.hint()
                 raise NotConverged(f"{self.when(balance)}: {text}")
             bounds.project(w, near_bound)
             u = problem.increment(w).copy()
@@ -351,6 +360,29 @@ class ImplicitStepper(Stepper):
         if self.accuracy:
             self.resolution.note(model, problem.x, scale, report.norm, tolerance)
         return Solution(u, internal, walls, newton, linear, held)
+
+    def _free_way(self, balance: Balance, guess: np.ndarray) -> np.ndarray:
+        """Return a guess (owned, 3) on the way to which no bar passes through another. Collective.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks, if supports move bars through others.
+        """
+        start, supports, touch = self.state.x, self.model.supports, self.model.self_contact
+        back = self.state.position - balance.predictor
+        lacking, touch.between = supports.lacking(balance.predictor, balance.time), ()
+        for _ in range(_APPROACHES):
+            part = touch.free_part(start, self.with_ghosts(balance.predictor + guess))
+            if part == 1.0:
+                return guess
+            guess = back + part * (guess - back)
+            supports.put(guess, lacking)
+        one, other = touch.between
+        raise NotConverged(
+            f"{self.when(balance)}: supports would move bars {one} and {other} through each other; {self.remedy}",
+            "supports move bars through each other",
+        )
 
     def _force_scale(self) -> float:
         """Return the largest 2-norm [N] of momentum per part of a step, loads and internal forces. Collective."""

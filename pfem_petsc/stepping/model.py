@@ -212,6 +212,11 @@ class Model:
             self.contact.motion.held = start.walls
 
     @property
+    def touches(self) -> bool:
+        """Whether nodes can touch walls or each other, or bars can touch bars."""
+        return self.can_touch or self.self_contact is not None
+
+    @property
     def bars_vary(self) -> bool:
         """Whether temperatures or rest lengths of bars change over time."""
         return self.temperatures.varying or self.rest_lengths.varying

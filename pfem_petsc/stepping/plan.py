@@ -331,8 +331,10 @@ def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoi
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
     try:
         block = solver.linear == "auto" and fills_block(model.mesh)
-        demand = Demand(unknowns, over, scheme.symmetric, steps, impact, block)
-        choice = choose_linear(solver.linear, solver.operator, demand)
+        touch = model.self_contact
+        symmetric = scheme.symmetric and (touch is None or touch.symmetric)
+        demand = Demand(unknowns, over, symmetric, steps, impact, block)
+        choice = choose_linear(solver.linear, solver.operator if touch is None else touch.operator(), demand)
     except InputError as error:
         raise InputError(f"{case.source}: {error}") from error
     if choice.preconditioner == "multigrid" and (model.links or not model.contact.symmetric):

@@ -363,7 +363,6 @@ def test_chosen_bars_and_radius(tmp_path):
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
-        ({"time": {"integrator": "newmark"}}, "needs an explicit integrator"),
         ({"time": {"mass": "consistent"}}, "needs time.mass"),
         ({"time": {"step": 7e-4}}, "leaves no room for the stiffness"),
         ({"self_contact": {"restitution": 0.0}}, "restitution"),

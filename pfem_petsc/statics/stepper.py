@@ -506,7 +506,7 @@ class StaticStepper(ImplicitStepper):
         if model.can_touch:
             cause += ", or part of the truss is a mechanism"
             others = "static.stabilise, or supports that move the truss instead of loads, pass a limit point"
-            if model.contact.any and model.contact.symmetric:
+            if model.contact.any and not model.contact.has_friction:
                 others = f"walls without friction do not hold nodes along them: add supports; {others}"
             elif model.contact.any:
                 cause += ", or the friction of walls does not hold it"

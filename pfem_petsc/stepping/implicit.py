@@ -185,7 +185,7 @@ class ImplicitStepper(Stepper):
     def _make_solvers(self) -> None:
         """Create matrices and solvers for the supports as they are. Collective."""
         model, choice = self.model, self._choice
-        symmetric = self.scheme.symmetric and model.contact.symmetric
+        symmetric = self.scheme.symmetric and model.links.symmetric
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)
         else:
@@ -195,7 +195,7 @@ class ImplicitStepper(Stepper):
             self.lagged = LaggedPreconditioner(
                 model, choice.preconditioner, symmetric, self.scheme.symmetric, choice.matrix_free
             )
-        bounded = choice if model.contact.symmetric else unsymmetric(choice)
+        bounded = choice if model.links.symmetric else unsymmetric(choice)
         most = model.case.solver.max_newton
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.size, self.lagged)
         self.newton.forcing = self.forcing  # which outlasts these solvers

@@ -76,7 +76,7 @@ class RowCoordinates:
             return
         rows, owned = self.rows, self.rows.mesh.n_owned
         data = np.zeros((owned, 21))
-        data[:, [0, 4, 8, 12, 16, 20]] = 1.0
+        data[:, [3, 7, 11, 12, 16, 20]] = 1.0
         if frames is not None:
             data[frames.nodes, 3:12] = frames.inverse.reshape(-1, 9)
             data[frames.nodes, 12:] = frames.basis.reshape(-1, 9)
@@ -290,6 +290,12 @@ class RowCoordinates:
                 ends = rows.ends[blocked[0]]
                 nodes = ", ".join(map(str, rows.numbers[ends[ends >= 0]]))
                 table, _, name = self.constraints.columns[rows.source[blocked[0]]].partition("/")
+                if not self._eliminated[rows.group_of_row[blocked[0]]]:
+                    raise NotConverged(
+                        f"nodes {nodes} of {table} {name!r} rub, and walls stop each of them, or further pairs connect "
+                        "them in a ring, which implicit steps cannot solve: name the nodes that walls stop with "
+                        "'node_set', remove friction, or use an explicit integrator"
+                    )
                 raise NotConverged(
                     f"walls and other constraints bound all directions in which nodes {nodes} can satisfy {table} "
                     f"{name!r}; use an explicit integrator"

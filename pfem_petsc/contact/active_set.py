@@ -19,6 +19,7 @@ from .frames import MIN_VOLUME, NodalFrames
 from .friction import StepFriction
 from .node_walls import WallForces, held_by_supports
 from .projection import project
+from .relative import RowPlanes
 from .transform import RowCoordinates, Transform
 from .wall_motion import Poses
 
@@ -240,7 +241,8 @@ class ActiveSet:
         SimulationFailure
             On all ranks, if the walls and supports of a node are infeasible together.
         """
-        contact, time, rows, y = self.contact, self.balance.time, None, x
+        contact, time, y = self.contact, self.balance.time, x
+        rows = RowPlanes.none(self.friction.slots - len(contact.wall_of))
         relative = next((link.relative for link in links), None)
         if relative is not None:
             stopped = np.zeros(len(x), dtype=bool)

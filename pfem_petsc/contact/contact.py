@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
 
 
+_NO_ROWS = RowPlanes.none(0)
+
+
 class Contact(ExplicitContact):
     """All walls of a case and this rank's nodes, in explicit and implicit steps."""
 
@@ -60,7 +63,7 @@ class Contact(ExplicitContact):
         time: float,
         least: float = MIN_VOLUME,
         part: float = 1.0,
-        rows: RowPlanes | None = None,
+        rows: RowPlanes = _NO_ROWS,
     ) -> NodalFrames:
         """Build coordinates and bounds of candidates from their planes at positions (owned, 3). Collective.
 
@@ -75,7 +78,7 @@ class Contact(ExplicitContact):
         if rank is None:
             rank = np.einsum("iwk,ik->iw", normals, at) - offsets
         tolerance, walls = ON_BOUND * self.size, offsets.shape[1]
-        if rows is not None:
+        if rows.offsets.shape[1]:
             normals, offsets, rank, at = rows.beside(nodes, (normals, offsets, rank, at))
         frames = build_frames(nodes, Planes(self.fixed[nodes], normals, offsets, rank, at), tolerance, least)
         with agreed(self.mesh.comm):

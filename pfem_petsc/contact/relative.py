@@ -31,6 +31,12 @@ class RowPlanes(NamedTuple):
     normals: np.ndarray
     offsets: np.ndarray
 
+    @classmethod
+    def none(cls, tables: int) -> RowPlanes:
+        """Return the planes of no rows."""
+        vectors = np.empty((0, 3))
+        return cls(np.empty(0, dtype=np.int64), vectors, np.empty((0, tables, 3)), np.empty((0, tables)))
+
     def beside(self, nodes: np.ndarray, walls: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
         """Append the slots of tables to ``walls``, the normals, offsets and ranks (k, w) and places (k, 3) of nodes
         (k,), ascending, which include those of the rows."""

@@ -292,9 +292,10 @@ class RowCoordinates:
                 table, _, name = self.constraints.columns[rows.source[blocked[0]]].partition("/")
                 if not self._eliminated[rows.group_of_row[blocked[0]]]:
                     raise NotConverged(
-                        f"nodes {nodes} of {table} {name!r} rub, and walls stop each of them, or further pairs connect "
-                        "them in a ring, which implicit steps cannot solve: name the nodes that walls stop with "
-                        "'node_set', remove friction, or use an explicit integrator"
+                        f"nodes {nodes} of {table} {name!r} meet where there is friction, and walls stop each of them, "
+                        "supports prescribe different components of them, or pairs connect them in a ring, which "
+                        "implicit steps cannot solve: name the nodes that walls stop with 'node_set', remove friction, "
+                        "or use an explicit integrator"
                     )
                 raise NotConverged(
                     f"walls and other constraints bound all directions in which nodes {nodes} can satisfy {table} "

@@ -662,12 +662,7 @@ def _check(model: Model) -> None:
                 f"{source}: wall {wall.name!r}: mass: a wall with mass moves over time; remove mass, or give the wall "
                 "a motion"
             )
-    for pair in case.contact_pair:
-        if pair.friction_coefficients[1]:
-            raise InputError(
-                f"{source}: contact_pair {pair.name!r}: friction needs an explicit integrator; use [time] with one, or "
-                "remove friction"
-            )
+    model.links.check("scheme", False, model.size)
     for name, material in case.material.items():
         law = law_of(material)
         if law.rate and not law.static_limit:

@@ -33,9 +33,9 @@ class Contact(ExplicitContact):
 
     @property
     def special(self) -> np.ndarray:
-        """(slots,) bool: of walls other than plain planes with prescribed displacements: curved, turning, with mass
-        or restitution, or tied."""
-        special = ~self.flat | (self.restitution > 0.0) | self.ties.tying
+        """(slots,) bool: of walls other than plain planes with prescribed displacements: curved, turning, with mass,
+        friction or restitution, or tied."""
+        special = ~self.flat | (self.restitution > 0.0) | (self.static_friction > 0.0) | self.ties.tying
         special |= np.isin(self.wall_of, self.motion.bodies.at)
         return special
 

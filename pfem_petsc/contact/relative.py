@@ -52,7 +52,8 @@ class RowPlanes(NamedTuple):
 
 
 class RelativeCoordinates:
-    """Coordinates y of nodes in groups of rows that rub or whose nodes rough walls stop. Construction is collective.
+    """Coordinates y of nodes in groups of rows that rub, or whose nodes meet walls other than plain planes.
+    Construction is collective.
 
     y is x, except at the carriers: there it is the sum of weights times positions of a row. Rows of several tables over
     the same nodes share one carrier. A node that a wall stops is no carrier, nor is one whose supports prescribe more
@@ -69,7 +70,7 @@ class RelativeCoordinates:
 
     def __init__(self, constraints: ConstraintSet) -> None:
         self.rows = rows = constraints.rows
-        self.groups = constraints.rubbing_groups()
+        self.groups = constraints.relative_groups()
         comm = rows.mesh.comm
         self.anywhere = bool(comm.allreduce(bool(self.groups.any()), op=MPI.LOR))
         coefficients = np.zeros((len(constraints.names), 2))
@@ -161,15 +162,15 @@ class RelativeCoordinates:
         """Return (m,) bool: which of owned nodes (m,) are carriers."""
         return np.isin(nodes, self.nodes)
 
-    def transforms(self, basis: np.ndarray, inverse: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    def transforms(self, inverse: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return unknowns (g, u) of groups alike, and T (g, u, u).
 
-        T maps coordinates w of the nodes' frames, with bases (n, 3, 3) and their inverses, to the same at nodes without
-        a relative coordinate, and to positions at carriers. Prescribed components do not move others: bounds account
-        for their motion.
+        T maps coordinates w of the nodes' frames, with the inverses (n, 3, 3) of their bases, to the same at nodes
+        without a relative coordinate, and to positions at carriers. Prescribed components do not move others: bounds
+        account for their motion.
         """
         rows, found = self.rows, []
-        basis, fixed = basis.copy(), rows.free.ravel() == 0.0
+        basis, fixed = np.linalg.inv(inverse), rows.free.ravel() == 0.0
         basis[self.carrier[self.carrier >= 0]] = np.eye(3)
         for nodes, blocks in self._blocks:
             g, q = nodes.shape

@@ -55,8 +55,7 @@ class RowCoordinates:
         self.varies = constraints.walled or relative.anywhere or self._any(not self.rows.fixed.all())
         self._start, self._part = np.empty((n, 3)), 1.0
         points = self.rows.gather(self.rows.mesh.points[: self.rows.mesh.n_owned])
-        none = np.tile(np.eye(3), (n, 1, 1))
-        self._place(self.rows.gradients(points), (none, none), np.ones((n, 3), dtype=bool))
+        self._place(self.rows.gradients(points), np.tile(np.eye(3), (n, 1, 1)), np.ones((n, 3), dtype=bool))
 
     def _any(self, flag: bool) -> bool:
         """Whether a flag is set on any rank. Collective."""
@@ -75,29 +74,27 @@ class RowCoordinates:
         if not self.varies:
             return
         rows, owned = self.rows, self.rows.mesh.n_owned
-        data = np.zeros((owned, 21))
-        data[:, [3, 7, 11, 12, 16, 20]] = 1.0
+        data = np.zeros((owned, 12))
+        data[:, [0, 4, 8]] = 1.0
         if frames is not None:
-            data[frames.nodes, 3:12] = frames.inverse.reshape(-1, 9)
-            data[frames.nodes, 12:] = frames.basis.reshape(-1, 9)
-            data[frames.nodes, :3] = np.isfinite(frames.lower) | np.isfinite(frames.upper)
+            data[frames.nodes, :9] = frames.inverse.reshape(-1, 9)
+            data[frames.nodes, 9:] = np.isfinite(frames.lower) | np.isfinite(frames.upper)
         data = rows.gather(data)
         self._part = balance.acting
         self._start = rows.gather(state.position) if self._part < 1.0 else self._start
         jacobian = rows.gradients(self._acting(rows.gather(x)))
-        inverse, basis = data[:, 3:].reshape(-1, 2, 3, 3).swapaxes(0, 1)
-        self._place(jacobian, (inverse, basis), data[:, :3] == 0.0)
+        self._place(jacobian, data[:, :9].reshape(-1, 3, 3), data[:, 9:] == 0.0)
 
     def _acting(self, x: np.ndarray) -> np.ndarray:
         """Places (n, 3) where the forces of the balance act, for nodes that move to (n, 3)."""
         return x if self._part == 1.0 else self._start + self._part * (x - self._start)
 
-    def _place(self, jacobian: np.ndarray, frames: tuple[np.ndarray, np.ndarray], room: np.ndarray) -> None:
-        """Choose the pivots. ``jacobian`` (r, k, 3) by x; of the nodes: inverses and bases (n, 3, 3) of their frames,
+    def _place(self, jacobian: np.ndarray, inverse: np.ndarray, room: np.ndarray) -> None:
+        """Choose the pivots. ``jacobian`` (r, k, 3) by x; of the nodes: ``inverse`` (n, 3, 3) of their frames' bases,
         and ``room`` (n, 3) bool: coordinates that no wall bounds."""
         from scipy.sparse import csr_matrix
 
-        rows, (inverse, basis) = self.rows, frames
+        rows = self.rows
         self.jacobian = jacobian
         some = (rows.ends >= 0)[:, :, None]
         turned = np.einsum("rkji,rkj->rki", inverse[rows.ends], jacobian)
@@ -123,7 +120,7 @@ class RowCoordinates:
         self._backward: list[tuple[np.ndarray, np.ndarray]] = []  # of relative groups: unknowns (g, u), T^-1 (g, u, u)
         if self.relative is not None:
             placed |= self.relative.carrier >= 0
-            blocks = self.relative.transforms(basis, inverse)
+            blocks = self.relative.transforms(inverse)
             self._blocks += blocks
             self._backward = [(unknowns, np.linalg.inv(transform)) for unknowns, transform in blocks]
         self._deferred = np.flatnonzero(~placed & rows.usable(jacobian))
@@ -292,10 +289,11 @@ class RowCoordinates:
                 table, _, name = self.constraints.columns[rows.source[blocked[0]]].partition("/")
                 if not self._eliminated[rows.group_of_row[blocked[0]]]:
                     raise NotConverged(
-                        f"nodes {nodes} of {table} {name!r} meet where there is friction, and walls stop each of them, "
-                        "supports prescribe different components of them, or pairs connect them in a ring, which "
-                        "implicit steps cannot solve: name the nodes that walls stop with 'node_set', remove friction, "
-                        "or use an explicit integrator"
+                        f"none of the nodes {nodes} of {table} {name!r} can move freely relative to the others, as "
+                        "implicit steps need it beside friction and beside walls that are curved, turn, tie or have "
+                        "mass: walls stop each of them, supports prescribe different components of them, or pairs "
+                        "connect them in a ring; name the nodes that walls stop with 'node_set', or use an explicit "
+                        "integrator"
                     )
                 raise NotConverged(
                     f"walls and other constraints bound all directions in which nodes {nodes} can satisfy {table} "

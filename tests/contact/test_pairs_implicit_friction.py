@@ -427,10 +427,16 @@ def test_lattices_turned_in_space(solver, comm, tmp_path):
     np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-10)
 
 
+FLOOR = planes([[0.0, 0.1, 1.0]], [-0.001], node_set="left")[0]
+BALL = {"type": "sphere", "point": [0.05, 0.1, -1.003], "radius": 1.0, "node_set": "left"}
 BESIDE = {
     "nothing": [],
     "rough": planes([[0.0, 0.1, 1.0], [0.1, 1.0, -0.2]], [-0.001, -0.04], friction=0.3, node_set="left"),
     "smooth": planes([[0.0, 0.1, 1.0]], [-0.001], node_set="right"),
+    "sphere": [BALL | {"friction": 0.3}],
+    "tied": [FLOOR | {"tied": True}],
+    "moving": [FLOOR | {"velocity": [0.5, 0.0, 0.2], "friction": 0.3}],
+    "mass": [FLOOR | {"mass": 0.01, "friction": 0.3}],
 }
 
 
@@ -488,9 +494,7 @@ def test_refusals(tables, message, comm, tmp_path):
 @pytest.mark.parallel
 def test_nodes_that_nothing_else_may_hold(comm, shared_tmp_path):
     """Walls on both sides of a pair, supports of different components and rings of pairs end the run with a message."""
-    message = (
-        r"nodes .* meet where there is friction, and walls stop each of them, supports prescribe different .* ring"
-    )
+    message = r"none of the nodes .* of pair .* can move freely .* walls stop each of them, supports .* in a ring"
     sides = planes([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], [0.0, -0.01])
     mixed = [{"node_set": "lower", "fix": "x"}, {"node_set": "upper", "fix": "y"}]
     cases = [

@@ -15,11 +15,10 @@ from ..errors import NotConverged
 from ..integrators.base import Balance, State
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .contact import Candidates, expected_candidates
-from .frames import MIN_VOLUME, NodalFrames
+from .frames import MIN_VOLUME, NodalFrames, RowPlanes
 from .friction import StepFriction
 from .node_walls import WallForces, held_by_supports
 from .projection import project
-from .relative import RowPlanes
 from .transform import RowCoordinates, Transform
 from .wall_motion import Poses
 

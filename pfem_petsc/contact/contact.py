@@ -13,9 +13,8 @@ from ..integrators.base import Balance, State
 from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .explicit import ExplicitContact
-from .frames import MIN_VOLUME, NodalFrames, Planes, build_frames
+from .frames import MIN_VOLUME, NodalFrames, Planes, RowPlanes, build_frames
 from .node_walls import WallForces
-from .relative import RowPlanes
 from .surfaces import OTHER
 from .tied import FreshTies
 from .wall_motion import Poses

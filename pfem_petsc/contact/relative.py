@@ -8,47 +8,15 @@ weights. Bounds, sticking and slipping of a row are then those of a node at a pl
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
+from .frames import RowPlanes
+
 if TYPE_CHECKING:
-    from .constraint_set import ConstraintSet
-
-
-class RowPlanes(NamedTuple):
-    """Rows as planes n . y >= d of owned nodes (m,), ascending, with one slot for each table (t,).
-
-    Attributes
-    ----------
-    nodes : (m,) owned local indices; places : (m, 3) y at these [m]
-    normals, offsets : (m, t, 3), (m, t) [m]; offsets -inf where a table has no row
-    """
-
-    nodes: np.ndarray
-    places: np.ndarray
-    normals: np.ndarray
-    offsets: np.ndarray
-
-    @classmethod
-    def none(cls, tables: int) -> RowPlanes:
-        """Return the planes of no rows."""
-        vectors = np.empty((0, 3))
-        return cls(np.empty(0, dtype=np.int64), vectors, np.empty((0, tables, 3)), np.empty((0, tables)))
-
-    def beside(self, nodes: np.ndarray, walls: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-        """Append the slots of tables to ``walls``, the normals, offsets and ranks (k, w) and places (k, 3) of nodes
-        (k,), ascending, which include those of the rows."""
-        normals, offsets, rank, places = walls
-        at, tables = np.searchsorted(nodes, self.nodes), self.offsets.shape[1]
-        own = np.zeros((len(nodes), tables, 3)), np.full((len(nodes), tables), -np.inf), np.zeros((len(nodes), tables))
-        own[0][at], own[1][at] = self.normals, self.offsets
-        own[2][at] = np.einsum("mti,mi->mt", self.normals, self.places) - self.offsets
-        places = places.copy()
-        places[at] = self.places
-        every = (np.concatenate(pair, axis=1) for pair in zip((normals, offsets, rank), own, strict=True))
-        return *every, places
+    from .rows import RowSet
 
 
 class RelativeCoordinates:
@@ -59,21 +27,25 @@ class RelativeCoordinates:
     the same nodes share one carrier. A node that a wall stops is no carrier, nor is one whose supports prescribe more
     components than those of the other nodes of the row. Rows for which no node is left have no carrier.
 
+    Parameters
+    ----------
+    rows : RowSet
+    groups : (groups,) bool, those to which this applies
+    tables : number of tables of rows in the model
+
     Attributes
     ----------
-    rows : RowSet; groups : (groups,) bool, those to which this applies
     anywhere : whether there are any on any rank
     friction, static : (tables,) coefficients of friction
     carrier : (r,) node of each row among those of the rows, -1 for none
     nodes, at : (m,) owned carriers, ascending, and a row of each
     """
 
-    def __init__(self, constraints: ConstraintSet) -> None:
-        self.rows = rows = constraints.rows
-        self.groups = constraints.relative_groups()
+    def __init__(self, rows: RowSet, groups: np.ndarray, tables: int) -> None:
+        self.rows, self.groups = rows, groups
         comm = rows.mesh.comm
         self.anywhere = bool(comm.allreduce(bool(self.groups.any()), op=MPI.LOR))
-        coefficients = np.zeros((len(constraints.names), 2))
+        coefficients = np.zeros((tables, 2))
         coefficients[rows.source] = rows.friction
         comm.Allreduce(MPI.IN_PLACE, coefficients, op=MPI.MAX)
         self.friction, self.static = coefficients.T.copy()

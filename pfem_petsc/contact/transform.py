@@ -49,7 +49,7 @@ class RowCoordinates:
         self.constraints, self.rows = constraints, constraints.rows
         self.comm = self.rows.mesh.comm
         n = len(self.rows.numbers)
-        relative = RelativeCoordinates(constraints)
+        relative = RelativeCoordinates(self.rows, constraints.relative_groups(), len(constraints.names))
         self.relative = relative if relative.anywhere else None
         self._eliminated = ~relative.groups
         self.varies = constraints.walled or relative.anywhere or self._any(not self.rows.fixed.all())

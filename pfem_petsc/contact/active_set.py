@@ -15,7 +15,7 @@ from ..errors import NotConverged
 from ..integrators.base import Balance, State
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .contact import Candidates, expected_candidates
-from .frames import MIN_VOLUME, NodalFrames
+from .frames import MIN_VOLUME, NodalFrames, RowPlanes
 from .friction import StepFriction
 from .node_walls import WallForces, held_by_supports
 from .projection import project
@@ -93,8 +93,8 @@ def broken_walls(
     known = place < len(candidates.nodes)
     known[known] = candidates.nodes[place[known]] == beyond[known]
     # walls with their own bound are satisfied to rounding of the coordinates; supports override walls
-    place = place[known]
-    broken[known] &= (frames.rows[place] < 0) | frames.shared[place]
+    place, walls = place[known], broken.shape[1]
+    broken[known] &= (frames.rows[place, :walls] < 0) | frames.shared[place, :walls]
     broken &= ~contact.ties.held[beyond][:, None]
     broken &= ~held_by_supports(contact.fixed[beyond][:, None, :], normals)
     met = broken.any(axis=1)
@@ -161,7 +161,8 @@ class Trial:
 
     Attributes
     ----------
-    candidates : nodes near walls; frames : their frames; links : that may close; transform : built from both
+    candidates : nodes near walls, and carriers of rows; frames : their frames; links : that may close
+    transform : built from both
     tied : of tied nodes, indices among the frames (k,), walls (k,) and positions (k, 3) [m]
     """
 
@@ -181,7 +182,7 @@ class Outcome:
     settled : whether all rows are satisfied
     candidates, links : for the next solve
     trial : the trial that was solved
-    normal_forces : (m, walls) on the candidates of the trial [N]; pull : (m, 3) force that walls must balance there [N]
+    normal_forces : (m, slots) on the candidates of the trial [N]; pull : (m, 3) force that walls must balance there [N]
     """
 
     settled: bool
@@ -224,7 +225,8 @@ class ActiveSet:
         self.balance = balance
         self._iterations = self._link_iterations = 0
         self._poses = self.contact.motion.poses(balance.time)
-        self.friction = StepFriction(model.contact, model.inertia, model.nodal_stiffness, state, balance)
+        relative = next((link.relative for link in links), None)
+        self.friction = StepFriction(model.contact, model.inertia, model.nodal_stiffness, state, balance, relative)
         self.candidates = expected_candidates(model.contact, state, balance, held, self._poses)
         move, slack = (balance.time - state.time) * state.v, BEYOND * model.size
         self._all_links = tuple(links)
@@ -238,14 +240,22 @@ class ActiveSet:
         SimulationFailure
             On all ranks, if the walls and supports of a node are infeasible together.
         """
-        contact, time = self.contact, self.balance.time
-        frames, tied = NodalFrames(candidates.nodes, len(contact.wall_of)), contact.ties.nobody
+        contact, time, y = self.contact, self.balance.time, x
+        rows = RowPlanes.none(self.friction.slots - len(contact.wall_of))
+        relative = next((link.relative for link in links), None)
+        if relative is not None:
+            stopped = np.zeros(len(x), dtype=bool)
+            stopped[candidates.nodes] = candidates.applicable.any(axis=1)
+            relative.choose(stopped, x)
+            self.friction.relate(relative)
+            rows, y, candidates = relative.planes(x), relative.positions(x), candidates.beside(relative.nodes)
+        frames, tied = NodalFrames(candidates.nodes, self.friction.slots), contact.ties.nobody
         if candidates.anywhere:
             least = MIN_VOLUME if self._iterations < _PATIENCE else _SMALL_VOLUME
             untied = candidates.without(contact.ties.held)
-            frames = contact.frames(untied, x, time, least, self.balance.acting)
+            frames = contact.frames(untied, x, time, least, self.balance.acting, rows)
             tied = contact.ties.pin(frames, x, time)
-            self.friction.apply(frames, x)
+            self.friction.apply(frames, y)
         met = frames if candidates.anywhere else None
         for link in links:
             link.place(met, self.balance, self.state, x)
@@ -259,10 +269,11 @@ class ActiveSet:
         u, frames, fixed = u.copy(), trial.frames, self.contact.fixed
         for link in trial.links:
             link.feasible(self.balance.predictor, u, self.model.inertia.mass if stiffness is None else stiffness)
-        at = frames.nodes
+        at, walls = frames.nodes, len(self.contact.wall_of)
         x = self.balance.predictor[at] + u[at]
-        moved, multipliers = x.copy(), np.zeros(frames.offsets.shape)
-        project(moved, fixed[at], frames.normals, frames.offsets, PROJECTED * self.model.size, multipliers)
+        normals, offsets = (np.ascontiguousarray(array[:, :walls]) for array in (frames.normals, frames.offsets))
+        moved, multipliers = x.copy(), np.zeros(offsets.shape)
+        project(moved, fixed[at], normals, offsets, PROJECTED * self.model.size, multipliers)
         u[at] += moved - x
         tied, _, places = trial.tied
         nodes = at[tied]
@@ -299,6 +310,10 @@ class ActiveSet:
         shape = (self.model.mesh.n_owned, 3)
         lower, upper = np.full(shape, -np.inf), np.full(shape, np.inf)
         base = np.einsum("nij,nj->ni", frames.basis, self.balance.predictor[at])
+        relative = trial.transform.relative
+        if relative is not None:  # prescribed motions of other nodes move their planes
+            carried, y = relative.carried(at), relative.positions(self.balance.predictor + guess)
+            base[carried] = (np.einsum("nij,nj->ni", frames.basis, y[at]) - w[at])[carried]
         lower[at] = frames.lower - base
         upper[at] = frames.upper - base
         for link in trial.links:
@@ -323,28 +338,31 @@ class ActiveSet:
             On all ranks, if the number of solves exceeds its limit.
         """
         contact, frames, candidates = self.contact, trial.frames, trial.candidates
-        x, at = self.balance.predictor + u, trial.candidates.nodes
-        slack = ON_BOUND * self.model.size
+        x, at, walls = self.balance.predictor + u, trial.candidates.nodes, len(contact.wall_of)
+        slack, relative = ON_BOUND * self.model.size, trial.transform.relative
         settled, links, g = self._check_links(trial, bounds, w, x, g, noise, slack)
-        normal_forces, pull = np.zeros((len(at), len(contact.wall_of))), np.where(contact.fixed[at], 0.0, g[at])
-        if not contact.any:
+        if relative is not None:
+            g = relative.forces(g)
+        normal_forces, pull = np.zeros(frames.rows.shape), np.where(contact.fixed[at], 0.0, g[at])
+        if not contact.any and not candidates.anywhere:
             return Outcome(settled, candidates, links, trial, normal_forces, pull)
         if candidates.anywhere:
             turned = np.einsum("nji,nj->ni", frames.inverse, g[at])
             normal_forces = contact.strengths(frames, turned, bounds.active(at, w, turned, noise))
         joined, broken = broken_walls(contact, self._poses, candidates, frames, x, slack)
         if candidates.anywhere:
-            normal_forces = self.friction.check(frames, x[at], pull, normal_forces, noise, tolerance)
+            y = trial.transform.positions(x)[at]
+            normal_forces = self.friction.check(frames, y, pull, normal_forces, noise, tolerance)
         left = np.union1d(joined, self.friction.unsettled)
         unsettled = is_misaligned(frames, normal_forces)
-        part = self.balance.acting
-        unsettled = unsettled or is_off_surface(contact, self._poses, frames, normal_forces, x, slack, part)
+        by_walls, part = normal_forces[:, :walls], self.balance.acting
+        unsettled = unsettled or is_off_surface(contact, self._poses, frames, by_walls, x, slack, part)
         if self.model.comm.allreduce(int(unsettled or len(left) > 0), op=MPI.MAX):
             self._iterations += 1
             if self._iterations >= _ITERATIONS:
                 raise NotConverged(self._why(left, x))
             rank = PROJECTED * self.model.size
-            candidates = candidates.join(contact, self._poses, joined, broken, x, normal_forces, rank)
+            candidates = candidates.join(contact, self._poses, joined, broken, x, by_walls, rank)
             settled = False
         return Outcome(settled, candidates, links, trial, normal_forces, pull)
 
@@ -382,19 +400,25 @@ class ActiveSet:
 
     def forces(self, outcome: Outcome, u: np.ndarray) -> tuple[np.ndarray, WallForces, np.ndarray]:
         """Return contact forces (owned, 3) [N], sums per wall, and the owned nodes in contact, at the solution."""
-        total = np.zeros_like(u)
+        total, x = np.zeros_like(u), self.balance.predictor + u
+        frames, walls, relative = outcome.trial.frames, len(self.contact.wall_of), outcome.trial.transform.relative
+        at, dissipated = frames.nodes, np.zeros(self.friction.slots)
+        if outcome.trial.candidates.anywhere:
+            y = outcome.trial.transform.positions(x)[at]
+            dissipated = self.friction.dissipated(at, y)
         for rows in self._all_links:
             if not outcome.links:
                 rows.constraints.release()
+            elif relative is not None:
+                rows.set_forces(at, outcome.normal_forces[:, walls:], self.friction.drag[:, walls:])
+            rows.constraints.friction = float(dissipated[walls:].sum())
             rows.constraints.add_forces(total)
         held = np.zeros(len(u), dtype=bool)
         if not outcome.trial.candidates.anywhere:
             return total, self.contact.nothing, held
-        frames = outcome.trial.frames
-        at, x = frames.nodes, (self.balance.predictor + u)[frames.nodes]
-        force = outcome.normal_forces[:, :, None] * frames.normals
-        friction = self.friction.add(force, at, x)
-        touching = outcome.normal_forces > 0.0
+        x = x[at]
+        force = outcome.normal_forces[:, :walls, None] * frames.normals[:, :walls] + self.friction.drag[:, :walls]
+        touching, friction = outcome.normal_forces[:, :walls] > 0.0, float(dissipated[:walls].sum())
         tied, owners, _ = outcome.trial.tied
         owners = self.contact.first[owners]
         force[tied, owners] = outcome.pull[tied]

@@ -215,6 +215,20 @@ class ConstraintSet:
     def __bool__(self) -> bool:
         return bool(self.columns)
 
+    @property
+    def symmetric(self) -> bool:
+        """Whether the Hessian of an implicit step with walls and rows is symmetric; friction makes it unsymmetric."""
+        return not (self.contact.has_friction or self.rows.rubs)
+
+    def relative_groups(self) -> np.ndarray:
+        """Return (groups,) bool: groups of rows that implicit steps solve in relative coordinates, because a row has
+        friction, or a wall other than a plain plane may stop a node. Collective."""
+        rows, contact = self.rows, self.contact
+        found = np.zeros(len(rows.groups.starts) - 1, dtype=bool)
+        found[rows.group_of_row[rows.friction[:, 1] > 0.0]] = True
+        found[rows.group_of_node[(rows.gather(contact.members & contact.special) > 0.0).any(axis=1)]] = True
+        return found
+
     def release(self) -> None:
         """Set all forces to zero."""
         self.force, self.jacobian = np.zeros(len(self.rows.source)), self.rows.fixed_jacobian
@@ -454,11 +468,13 @@ class ConstraintSet:
                 f"{self.source}: contact_pair: node {node} is in several pairs, or a wall stops it as well, which "
                 'needs contact.treatment = "scheme"'
             )
-        special, kind = walls.special, "flat, without mass, friction and restitution, and not tied"
+        special, kind = walls.restitution > 0.0, "without restitution"
         if explicit:
             open_ones = [k for k in walls.surfaces_of_triangles if not walls.walls[k].closed]
             special = np.isin(walls.wall_of, [*walls.motion.bodies.at, *open_ones])
             kind = "without mass, and a surface of triangles must be closed"
+        else:
+            self._check_relative()
         special = special & self._walls.meets
         if special.any():
             raise InputError(
@@ -488,6 +504,19 @@ class ConstraintSet:
             raise InputError(
                 f"{self.source}: constraint {self.names[table]!r}: nodes {', '.join(numbers)} start {-depth:.6g} m "
                 "beyond it; correct its keys, or move the mesh"
+            )
+
+    def _check_relative(self) -> None:
+        """Refuse rows that would need relative coordinates and can have none. Collective."""
+        rows = self.rows
+        other = ~rows.fixed | ~rows.weights.any(axis=1)
+        other &= self.relative_groups()[rows.group_of_row]
+        tables = np.flatnonzero(self.mesh.comm.allreduce(np.bincount(rows.source[other], minlength=len(self.names))))
+        if len(tables):
+            raise InputError(
+                f"{self.source}: constraint {self.names[tables[0]]!r} is on nodes that rub, or that a wall stops which "
+                "is curved, turns, ties or rebounds, or has mass or friction: it then requires an explicit integrator; "
+                "use one, or give the wall or the contact_pair other nodes"
             )
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from ..integrators.base import Balance, State
 from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .explicit import ExplicitContact
-from .frames import MIN_VOLUME, NodalFrames, Planes, build_frames
+from .frames import MIN_VOLUME, NodalFrames, Planes, RowPlanes, build_frames
 from .node_walls import WallForces
 from .surfaces import OTHER
 from .tied import FreshTies
@@ -22,6 +22,9 @@ from .wall_motion import Poses
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
+
+
+_NO_ROWS = RowPlanes.none(0)
 
 
 class Contact(ExplicitContact):
@@ -34,11 +37,6 @@ class Contact(ExplicitContact):
         special = ~self.flat | (self.restitution > 0.0) | (self.static_friction > 0.0) | self.ties.tying
         special |= np.isin(self.wall_of, self.motion.bodies.at)
         return special
-
-    @property
-    def symmetric(self) -> bool:
-        """Whether the Hessian of a step with these walls is symmetric; friction makes it unsymmetric."""
-        return not self.has_friction
 
     @property
     def steady(self) -> bool:
@@ -58,11 +56,18 @@ class Contact(ExplicitContact):
         return self.ties.take(walls.nodes, walls.touching, walls.places, time)
 
     def frames(
-        self, candidates: Candidates, x: np.ndarray, time: float, least: float = MIN_VOLUME, part: float = 1.0
+        self,
+        candidates: Candidates,
+        x: np.ndarray,
+        time: float,
+        least: float = MIN_VOLUME,
+        part: float = 1.0,
+        rows: RowPlanes = _NO_ROWS,
     ) -> NodalFrames:
         """Build coordinates and bounds of candidates from their planes at positions (owned, 3). Collective.
 
-        ``least``: see :func:`~pfem_petsc.contact.frames.build_frames`; ``part``: see :meth:`acting`.
+        ``least``: see :func:`~pfem_petsc.contact.frames.build_frames`; ``part``: see :meth:`acting`; ``rows``: further
+        planes of some of the candidates.
         """
         nodes, rank = candidates.nodes, candidates.priority
         at, poses = x[nodes], self.motion.poses(time)
@@ -71,16 +76,19 @@ class Contact(ExplicitContact):
         normals, offsets = self.planes(candidates.applicable, at, poses, acting, nodes)
         if rank is None:
             rank = np.einsum("iwk,ik->iw", normals, at) - offsets
-        tolerance = ON_BOUND * self.size
+        tolerance, walls = ON_BOUND * self.size, offsets.shape[1]
+        if rows.offsets.shape[1]:
+            normals, offsets, rank, at = rows.beside(nodes, (normals, offsets, rank, at))
         frames = build_frames(nodes, Planes(self.fixed[nodes], normals, offsets, rank, at), tolerance, least)
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction
-                raise SimulationFailure(self.infeasible_message(nodes[node], offsets[node]))
+                raise SimulationFailure(self.infeasible_message(nodes[node], offsets[node, :walls]))
         return frames
 
     def strengths(self, frames: NodalFrames, residual: np.ndarray, active: np.ndarray) -> np.ndarray:
-        """Return normal forces (m, slots) [N] of an implicit step from its residual on the active bounds.
+        """Return normal forces (m, slots) [N] of an implicit step from its residual on the active bounds, also in the
+        slots of tables of rows that the frames have.
 
         Parameters
         ----------
@@ -91,7 +99,7 @@ class Contact(ExplicitContact):
         strengths = np.zeros(frames.rows.shape)
         every = np.arange(len(frames.nodes))
         left = np.where(active != 0, residual, 0.0)
-        for k in range(len(self.wall_of)):
+        for k in range(frames.rows.shape[1]):
             row = frames.rows[:, k]
             sign = frames.signs[:, k]
             safe = np.maximum(row, 0)
@@ -153,6 +161,17 @@ class Candidates:
         held[normal_forces] = -largest_rank * (1.0 + strengths[normal_forces] / largest)
         priority[place] = held
         return Candidates(nodes, applicable, priority)
+
+    def beside(self, nodes: np.ndarray) -> Candidates:
+        """Return the candidates and further nodes (k,) that no wall stops, for rows; there are some anywhere."""
+        every = np.union1d(self.nodes, nodes)
+        at, shape = np.searchsorted(every, self.nodes), (len(every), self.applicable.shape[1])
+        applicable, priority = np.zeros(shape, dtype=bool), None
+        applicable[at] = self.applicable
+        if self.priority is not None:
+            priority = np.zeros(shape)
+            priority[at] = self.priority
+        return Candidates(every, applicable, priority)
 
     def without(self, held: np.ndarray) -> Candidates:
         """Return the candidates with no applicable walls at tied nodes, ``held`` (owned,) bool."""

@@ -1,5 +1,5 @@
 """Coulomb friction of nodes at walls: the local problem of a node, nodes that friction jams, and which nodes of an
-implicit step stick or slip.
+implicit step stick or slip, at walls or in the relative coordinates of rows.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from mpi4py import MPI
 
 from ..integrators.base import Balance, State
 from ..mechanics.compiled import NEEDED, kernel
@@ -20,6 +21,7 @@ from .sweeps import Pushes, RubbingRows, settle_friction
 if TYPE_CHECKING:
     from ..mechanics.mass import Inertia
     from .node_walls import NodeWalls
+    from .relative import RelativeCoordinates
 
 
 class Rubbing(NamedTuple):
@@ -217,7 +219,9 @@ _SOFTER, _LEAST = 0.1, 1e-4
 
 
 class StepFriction:
-    """Friction in one implicit step.
+    """Friction in one implicit step, at the slots of walls and, behind them, of tables of rows.
+
+    Positions are those of nodes, at carriers of rows relative ones: see :mod:`~pfem_petsc.contact.relative`.
 
     Parameters
     ----------
@@ -226,25 +230,41 @@ class StepFriction:
     stiffness : (owned,) of the bars at each node [N/m]
     state : at the start of the step
     balance : of the step
+    relative : coordinates of rows with friction; None if the case has none
 
     Attributes
     ----------
-    drag : (m, walls, 3) friction forces on the nodes of the frames, after :meth:`check` [N]
+    slots : of walls and tables
+    drag : (m, slots, 3) friction forces on the nodes of the frames, after :meth:`check` [N]
     unsettled : owned nodes whose solution violated the law in :meth:`check`
     """
 
     def __init__(
-        self, contact: NodeWalls, inertia: Inertia, stiffness: np.ndarray, state: State, balance: Balance
+        self,
+        contact: NodeWalls,
+        inertia: Inertia,
+        stiffness: np.ndarray,
+        state: State,
+        balance: Balance,
+        relative: RelativeCoordinates | None = None,
     ) -> None:
         self.contact, self.comm = contact, contact.mesh.comm
         self.state = state
         self._poses = contact.motion.poses(state.time), contact.motion.poses(balance.time)
-        self._inertial = balance.alpha * inertia.mass + balance.eta * inertia.damping
-        self._stiffness = self._inertial + balance.weight * stiffness
-        owned, walls = self.contact.members.shape
-        owned *= self.contact.has_friction  # without friction no node sticks or slips
+        inertial = balance.alpha * inertia.mass + balance.eta * inertia.damping
+        self._nodal = inertial, inertial + balance.weight * stiffness
+        self._inertial, self._stiffness = self._nodal
+        self._start, self._reaction = state.position, state.contact
+        self._friction, self._static = contact.friction, contact.static_friction
+        self._carried = np.full(len(state.position), -1)  # the row that each owned node carries, -1 for none
+        if relative is not None:
+            self._friction = np.append(self._friction, relative.friction)
+            self._static = np.append(self._static, relative.static)
+        self.slots = walls = len(self._static)
+        self._rubs = bool(self._static.any())
+        owned = len(contact.members) * self._rubs  # without friction no node sticks or slips
         self._guessed = np.zeros(owned, dtype=bool)
-        self._sticks = np.full(owned, -1)  # the wall that a node sticks to, -1 for none
+        self._sticks = np.full(owned, -1)  # the slot of what a node sticks to, -1 for none
         self._directions = np.zeros((owned, walls, 3))  # d a of slipping nodes
         self._slips = np.zeros(owned, dtype=bool)  # known to slip along their direction
         self._forces = np.zeros((owned, 3))  # friction force on each node in its last local solution
@@ -255,26 +275,43 @@ class StepFriction:
         self.drag = np.zeros((0, walls, 3))
         self.unsettled = np.empty(0, dtype=np.int64)
 
-    def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
-        """Add friction to the forces (m, walls, 3) on nodes (m,) at (m, 3) [N]; return the energy dissipated [J]."""
-        force += self.drag
-        slip = (x - self.state.position[nodes])[:, None, :] - self._ways(nodes)
-        return -float((self.drag * slip).sum())
+    def relate(self, relative: RelativeCoordinates) -> None:
+        """Take the carriers of rows in the next solves; nodes that carry other rows than before begin anew.
+        Collective."""
+        carried = np.full_like(self._carried, -1)
+        carried[relative.nodes] = relative.at
+        changed = carried != self._carried
+        if not self.comm.allreduce(int(changed.any()), op=MPI.MAX):
+            return
+        self._carried = carried
+        if self._rubs:
+            self._guessed[changed] = self._slips[changed] = self._failed[changed] = False
+            self._sticks[changed], self._directions[changed] = -1, 0.0
+        self._inertial, self._stiffness = (relative.stiffness(nodal) for nodal in self._nodal)
+        self._start = relative.positions(self.state.position)
+        self._reaction = relative.forces(self.state.contact)
+
+    def dissipated(self, nodes: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Return the energy that friction dissipates in each slot, on nodes (m,) of the frames at (m, 3) [J]."""
+        slip = (x - self._start[nodes])[:, None, :] - self._ways(nodes)
+        return -(self.drag * slip).sum(axis=(0, 2))
 
     def _ways(self, nodes: np.ndarray) -> np.ndarray:
         """Return how far walls carry nodes (k,) that stick to them in the step, (k, slots, 3) [m]."""
-        return self.contact.ways(self.state.position[nodes], *self._poses)
+        ways = np.zeros((len(nodes), self.slots, 3))
+        ways[:, : len(self.contact.wall_of)] = self.contact.ways(self.state.position[nodes], *self._poses)
+        return ways
 
     def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
         """Fix the sticking nodes of the frames and apply friction to the slipping ones, at a guess (owned, 3)."""
-        if not self.contact.has_friction:
+        if not self._rubs:
             return
         nodes = frames.nodes
         has_friction = self._has_friction(frames)
         fresh = has_friction & ~self._guessed[nodes]
         if fresh.any():
             at = np.flatnonzero(fresh)
-            reaction = self.state.contact[nodes[at]]
+            reaction = self._reaction[nodes[at]]
             none = np.zeros(len(at), dtype=bool)
             own = self._local(frames, at, x[nodes[at]], reaction, none)
             self._forces[nodes[at]] = own.drag.sum(axis=1)
@@ -293,18 +330,18 @@ class StepFriction:
         noise: float,
         tolerance: float,
     ) -> np.ndarray:
-        """Find the nodes that violate the law; return normal forces (m, walls) of all nodes of the frames [N].
+        """Find the nodes that violate the law; return normal forces (m, slots) of all nodes of the frames [N].
 
         Parameters
         ----------
         x, reaction : (m, 3) positions and forces by walls of the frames' nodes [m], [N]
-        strengths : (m, walls) normal forces without friction; used for nodes at frictionless walls only
+        strengths : (m, slots) normal forces without friction; used for nodes at frictionless walls only
         noise : force below which a force counts as zero [N]
         tolerance : of the forces [N]
         """
         nodes, contact = frames.nodes, self.contact
         self.drag = np.zeros((*strengths.shape, 3))
-        if not contact.has_friction:
+        if not self._rubs:
             return strengths
         strengths = strengths.copy()
         at = np.flatnonzero(self._has_friction(frames))
@@ -359,7 +396,7 @@ class StepFriction:
 
     def _has_friction(self, frames: NodalFrames) -> np.ndarray:
         """Return (m,) bool: frames with a wall that has friction."""
-        return ((frames.rows >= 0) & (self.contact.static_friction > 0.0)).any(axis=1)
+        return ((frames.rows >= 0) & (self._static > 0.0)).any(axis=1)
 
     def _local(
         self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray
@@ -367,39 +404,38 @@ class StepFriction:
         """Solve the local problems of some nodes of the frames."""
         nodes, contact = frames.nodes[at], self.contact
         planes = contact.fixed[nodes], frames.normals[at], frames.offsets[at]
-        rough = contact.friction, contact.static_friction
-        rubbing = Rubbing(self.state.position[nodes], self._ways(nodes), *planes, *rough, self._stiffness[nodes])
+        rough = self._friction, self._static
+        rubbing = Rubbing(self._start[nodes], self._ways(nodes), *planes, *rough, self._stiffness[nodes])
         return solve_locally(rubbing, x, reaction, slipping, contact.size)
 
     def _may_stick(
         self, nodes: np.ndarray, slipping: np.ndarray, x: np.ndarray, normal_forces: np.ndarray, normals: np.ndarray
     ) -> np.ndarray:
         """Return (k, w) bool: walls whose static coefficient may stop slipping nodes, which is tried once."""
-        contact = self.contact
         slip = self._slip(nodes, x, normals)
         # if the rest of the truss moves along, inertia alone resists
-        needed = contact.friction * normal_forces + self._inertial[nodes, None] * np.linalg.norm(slip, axis=2)
-        may = (contact.static_friction > contact.friction) & (needed <= contact.static_friction * normal_forces)
+        needed = self._friction * normal_forces + self._inertial[nodes, None] * np.linalg.norm(slip, axis=2)
+        may = (self._static > self._friction) & (needed <= self._static * normal_forces)
         return may & (normal_forces > 0.0) & (slipping & ~self._failed[nodes])[:, None]
 
     def _slip(self, nodes: np.ndarray, x: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return the slip of nodes at (k, 3) on their walls (k, w, 3) [m]."""
-        slip = x[:, None, :] - self.state.position[nodes][:, None, :] - self._ways(nodes)
+        slip = x[:, None, :] - self._start[nodes][:, None, :] - self._ways(nodes)
         return slip - np.einsum("kwi,kwi->kw", slip, normals)[:, :, None] * normals
 
     def _decide(
         self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, slipping: np.ndarray, own: LocalSolution
     ) -> None:
         """Decide which nodes stick or slip in the next solve, from positions x and the solutions of local problems."""
-        nodes, contact = frames.nodes[at], self.contact
+        nodes = frames.nodes[at]
         moved, normal_forces, drag, stiffness = own
         slip = self._slip(nodes, moved, frames.normals[at])
         size = np.linalg.norm(drag, axis=2)
         # a normal force within rounding neither sticks nor causes friction
         least = 1e-9 * normal_forces.max(axis=1, initial=0.0)
-        rubbing = (normal_forces > least[:, None]) & (contact.static_friction > 0.0)
+        rubbing = (normal_forces > least[:, None]) & (self._static > 0.0)
         needed = np.linalg.norm(drag - stiffness[:, None, None] * slip, axis=2)
-        limit = np.where(slipping[:, None], contact.friction, contact.static_friction) * normal_forces
+        limit = np.where(slipping[:, None], self._friction, self._static) * normal_forces
         slips = rubbing & (needed > (1.0 + 1e-13) * limit)
         was = self._sticks[nodes] >= 0
         forwards = np.einsum("kwi,kwi->kw", self._slip(nodes, x, frames.normals[at]), self._directions[nodes])
@@ -411,14 +447,14 @@ class StepFriction:
         self._slips[nodes] = ~infeasible & ~was & (forwards > 0.0).any(axis=1)
         self._failed[nodes] |= was & ~infeasible
         self._sticks[nodes] = np.where(infeasible, holds.argmax(axis=1), -1)
-        self._directions[nodes] = unit * np.maximum(contact.friction * normal_forces, 1e-300)[:, :, None]
+        self._directions[nodes] = unit * np.maximum(self._friction * normal_forces, 1e-300)[:, :, None]
 
     def _hold(self, frames: NodalFrames, at: np.ndarray) -> None:
         """Fix sticking nodes at zero slip."""
         nodes = frames.nodes[at]
         wall = self._sticks[nodes]
         row = frames.rows[at, wall]
-        place = self.state.position[nodes] + self._ways(nodes)[np.arange(len(at)), wall]
+        place = self._start[nodes] + self._ways(nodes)[np.arange(len(at)), wall]
         n = frames.normals[at, wall]
         place += (frames.offsets[at, wall] - np.einsum("ki,ki->k", n, place))[:, None] * n
         held = np.einsum("kij,kj->ki", frames.basis[at], place)
@@ -432,7 +468,7 @@ class StepFriction:
 
     def _slide(self, frames: NodalFrames, at: np.ndarray) -> Sliding:
         nodes = frames.nodes[at]
-        friction = np.where((self._directions[nodes] != 0.0).any(axis=2), self.contact.friction, 0.0)
+        friction = np.where((self._directions[nodes] != 0.0).any(axis=2), self._friction, 0.0)
         friction = np.where(frames.rows[at] >= 0, friction, 0.0)
         for k in range(1, friction.shape[1]):
             # where walls share a bound, one takes the force
@@ -452,7 +488,7 @@ class StepFriction:
             frames.signs[at],
             friction,
             frames.normals[at],
-            self.state.position[nodes][:, None, :] + self._ways(nodes),
+            self._start[nodes][:, None, :] + self._ways(nodes),
             start,
             np.where(slips, self._stiffness[nodes], 0.0),
         )

@@ -266,6 +266,7 @@ class FreeNodes(NamedTuple):
     start : (n, 3) positions at the start of the step, needed by rows that rub or push as there; None if none does
     at_start : whether rows push along their gradients at the start of the step, else at its end
     free : (n, 3) 1.0 where a component may move, else 0.0
+    rub : whether rows with friction rub
     """
 
     x: np.ndarray
@@ -273,6 +274,7 @@ class FreeNodes(NamedTuple):
     start: np.ndarray | None
     at_start: bool
     free: np.ndarray
+    rub: bool = True
 
 
 class WallsOfNodes(NamedTuple):
@@ -440,6 +442,15 @@ class RowSet:
             found.append(Alike(rows, own, np.where(self.ends[rows] < 0, -1, place[self.ends[rows]])))
         return found
 
+    def alike_of(self, which: np.ndarray) -> list[Alike]:
+        """Return some of the groups, (groups,) bool, collected by shape."""
+        found = []
+        for each in self.alike:
+            some = which[self.group_of_row[each.rows[:, 0]]]
+            if some.any():
+                found.append(Alike(each.rows[some], each.nodes[some], each.ends[some]))
+        return found
+
     def gather(self, values: np.ndarray) -> np.ndarray:
         """Return float64 values (n, ...) at the nodes from those at owned nodes (owned, ...). Collective."""
         shape = values.shape[1:]
@@ -548,9 +559,13 @@ class RowSet:
         self, jacobian: np.ndarray, values: np.ndarray, nodes: FreeNodes, planes: Planes | None = None
     ) -> System:
         """Return rows (r,) with gradients (r, k, 3) for :meth:`solve`."""
-        slips = self.slips(nodes.x - nodes.start) if self.rubs else np.zeros((len(values), 3))
+        slips, friction = np.zeros((len(values), 3)), self.friction
+        if self.rubs and nodes.rub:
+            slips = self.slips(nodes.x - nodes.start)
+        elif self.rubs:
+            friction = np.zeros_like(friction)
         some = self._no_planes if planes is None else planes
-        rubbing = self.weights, self.friction, slips, some.wall_friction, some.wall_slips
+        rubbing = self.weights, friction, slips, some.wall_friction, some.wall_slips
         return System(self.ends, jacobian, values, nodes.stiffness, nodes.free, *some[:3], *rubbing)
 
     def gather_of(self, at: np.ndarray, of_nodes: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

@@ -1,11 +1,11 @@
 """The transform of an implicit solve, u = T w, makes each row of contact a bound on one unknown: by frames of nodes at
-walls, then by elimination within the groups of rows that share nodes.
+walls, then within the groups of rows that share nodes, by elimination or, where there is friction, by frames of
+relative coordinates.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +18,7 @@ from ..parallel.agreement import agreed
 from ..tolerances import FREE_PART, PROJECTED
 from .constraint_set import ConstraintSet
 from .frames import NodalFrames
+from .relative import RelativeCoordinates
 from .rows import FreeNodes
 
 if TYPE_CHECKING:
@@ -41,13 +42,17 @@ class RowCoordinates:
     Attributes
     ----------
     varies : whether T changes from solve to solve
+    relative : coordinates of rows in groups with friction, whose bounds are those of frames; None without any
     """
 
     def __init__(self, constraints: ConstraintSet) -> None:
         self.constraints, self.rows = constraints, constraints.rows
         self.comm = self.rows.mesh.comm
         n = len(self.rows.numbers)
-        self.varies = constraints.walled or self._any(not self.rows.fixed.all())
+        relative = RelativeCoordinates(self.rows, constraints.relative_groups(), len(constraints.names))
+        self.relative = relative if relative.anywhere else None
+        self._eliminated = ~relative.groups
+        self.varies = constraints.walled or relative.anywhere or self._any(not self.rows.fixed.all())
         self._start, self._part = np.empty((n, 3)), 1.0
         points = self.rows.gather(self.rows.mesh.points[: self.rows.mesh.n_owned])
         self._place(self.rows.gradients(points), np.tile(np.eye(3), (n, 1, 1)), np.ones((n, 3), dtype=bool))
@@ -101,7 +106,7 @@ class RowCoordinates:
         self._turns = np.tile(np.eye(3), (len(rows.numbers), 1, 1))  # of the nodes: y = R z
         self._blocks: list[tuple[np.ndarray, np.ndarray]] = []  # of groups alike: unknowns (g, u), T (g, u, u)
         self._solved: list[tuple[np.ndarray, np.ndarray]] = []  # rows (g, p) with pivots, and J_P^-1 (g, p, p)
-        for groups in rows.alike:
+        for groups in rows.alike_of(self._eliminated):
             unknowns = (3 * groups.nodes[:, :, None] + np.arange(3)).reshape(len(groups.nodes), -1)
             dense = groups.dense(self._turned[groups.rows])
             largest = np.maximum(np.abs(dense).max(axis=2, keepdims=True), np.sqrt(FREE_PART))
@@ -111,8 +116,14 @@ class RowCoordinates:
             for k in np.unique(count):
                 part = np.flatnonzero(count == k)
                 self._transform(groups.rows[part], unknowns[part], dense[part], row[part, :k], column[part, :k])
-        self._placed = np.flatnonzero(self._pivot >= 0)
-        self._deferred = np.flatnonzero((self._pivot < 0) & rows.usable(jacobian))
+        self._placed, placed = np.flatnonzero(self._pivot >= 0), self._pivot >= 0
+        self._backward: list[tuple[np.ndarray, np.ndarray]] = []  # of relative groups: unknowns (g, u), T^-1 (g, u, u)
+        if self.relative is not None:
+            placed |= self.relative.carrier >= 0
+            blocks = self.relative.transforms(inverse)
+            self._blocks += blocks
+            self._backward = [(unknowns, np.linalg.inv(transform)) for unknowns, transform in blocks]
+        self._deferred = np.flatnonzero(~placed & rows.usable(jacobian))
         # T has entries for all pairs of unknowns of a group, so that its pattern never changes
         entries = [np.empty((3, 0))]
         for unknowns, transform in self._blocks:
@@ -159,7 +170,7 @@ class RowCoordinates:
         rows, here = self.rows, self.rows.here
         k, x = rows.gather(stiffness), rows.gather(predictor + u)
         tolerance = PROJECTED * self.constraints.contact.size
-        nodes = FreeNodes(x, k, self._start, self._part == 0.0, rows.free)
+        nodes = FreeNodes(x, k, self._start, self._part == 0.0, rows.free, rub=False)
         with agreed(self.comm):
             pushes, jacobian, _ = rows.project(nodes, tolerance)
         u[here] += (rows.forces(jacobian, pushes.force) * rows.free / k[:, None])[rows.mine]
@@ -177,23 +188,27 @@ class RowCoordinates:
         along = rows.along(self._turned, every.reshape(-1, 3)) / self._scale
         every = self._unturned(every)
         every[self._pivot[self._placed]] = along[self._placed]
+        for unknowns, transform in self._backward:
+            every[unknowns] = np.einsum("guv,gv->gu", transform, every[unknowns])
         self._write(y, every)
 
     def adjoint(self, g: np.ndarray) -> None:
         """Transform a gradient with respect to y to that with respect to w (owned, 3), in place. Collective."""
         self._write(g, self._matrix.T @ self._all(g))
 
-    def diagonal(self, blocks: BlocksOf, diagonal: np.ndarray) -> None:
-        """Replace the diagonal (owned, 3) of H, with diagonal blocks ``blocks``, by that of T^T H T. Collective."""
+    def blocks(self, blocks: BlocksOf) -> tuple[np.ndarray, np.ndarray]:
+        """Return the owned nodes (m,) of rows and the diagonal blocks (m, 3, 3) of T^T H T there, from the diagonal
+        ``blocks`` of H. Collective."""
         rows = self.rows
         full = np.zeros((rows.mesh.n_owned, 3, 3))
         full[rows.here] = blocks(rows.here)
-        full, every = rows.gather(full), np.zeros(3 * len(rows.numbers))
+        full = rows.gather(full)
+        every = full.copy()
         for unknowns, transform in self._blocks:
-            parts = transform.reshape(len(unknowns), -1, 3, unknowns.shape[1])
-            at = full[unknowns[:, ::3] // 3]
-            every[unknowns] = np.einsum("gnij,gnij->gj", parts, np.einsum("gnik,gnkj->gnij", at, parts))
-        self._write(diagonal, every)
+            nodes = unknowns[:, ::3] // 3
+            parts = transform.reshape(*nodes.shape, 3, nodes.shape[1], 3)
+            every[nodes] = np.einsum("gniaj,gniak->gajk", parts, np.einsum("gnil,gnlak->gniak", full[nodes], parts))
+        return rows.here, every[rows.mine]
 
     def matrix(self) -> PETSc.Mat:
         """Return T, preallocated for all states; the caller destroys it. Collective."""
@@ -248,6 +263,14 @@ class RowCoordinates:
             pressed = (on[self._pivot[rows]] > 0.0) & (force > noise)
             self.constraints.force[rows] = np.where(pressed, force, 0.0)
 
+    def set_forces(self, nodes: np.ndarray, normal: np.ndarray, drag: np.ndarray) -> None:
+        """Set the forces of rows with relative coordinates from those of nodes (m,) in the slots of tables, (m, t) and
+        (m, t, 3) [N]. Collective."""
+        constraints, relative = self.constraints, self.relative
+        force, drags = relative.of_rows(normal, drag, nodes)
+        some = relative.carrier >= 0
+        constraints.force[some], constraints.drag[some] = force[some], drags[some]
+
     def satisfied(self, x: np.ndarray, slack: float) -> bool:
         """Return whether positions (owned, 3) satisfy the rows that were bounds, to ``slack`` [m]. Collective.
 
@@ -264,6 +287,14 @@ class RowCoordinates:
                 ends = rows.ends[blocked[0]]
                 nodes = ", ".join(map(str, rows.numbers[ends[ends >= 0]]))
                 table, _, name = self.constraints.columns[rows.source[blocked[0]]].partition("/")
+                if not self._eliminated[rows.group_of_row[blocked[0]]]:
+                    raise NotConverged(
+                        f"none of the nodes {nodes} of {table} {name!r} can move freely relative to the others, as "
+                        "implicit steps need it beside friction and beside walls that are curved, turn, tie or have "
+                        "mass: walls stop each of them, supports prescribe different components of them, or pairs "
+                        "connect them in a ring; name the nodes that walls stop with 'node_set', or use an explicit "
+                        "integrator"
+                    )
                 raise NotConverged(
                     f"walls and other constraints bound all directions in which nodes {nodes} can satisfy {table} "
                     f"{name!r}; use an explicit integrator"
@@ -322,12 +353,13 @@ def _pivots(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
 
 
 class Transform:
-    """Coordinates of a solve. Construction is collective.
+    """Coordinates of a solve, u = F^-1 T w: F of the frames of nodes at walls, T of rows, with the frames of relative
+    coordinates. Its residual is M T^T F^-T g, with the maps M of friction. Construction is collective.
 
     Parameters
     ----------
     mesh : DistributedMesh
-    frames : of nodes near walls; None if no rank has any
+    frames : of nodes near walls and of carriers of rows; None if no rank has any
     links : coordinates of the rows over several nodes that may close in the step: one or none
 
     Attributes
@@ -335,8 +367,10 @@ class Transform:
     links : tuple of these
     frames : of owned nodes whose coordinates are not those of x
     sliding : friction forces on slipping nodes; has no nodes without friction
+    relative : relative coordinates of rows; None if there are none
     identity : whether w equals u and the residual is unchanged
     bounded : whether the solve has bounds
+    slides : whether any node slips
     """
 
     def __init__(
@@ -344,6 +378,7 @@ class Transform:
     ) -> None:
         self.mesh = mesh
         self.links = tuple(links)
+        self.relative = next((link.relative for link in self.links), None)
         walls = 0 if frames is None else frames.rows.shape[1]
         own = frames is not None and (frames.oblique or len(frames.sliding.nodes) > 0)
         self._oblique = frames is not None and mesh.comm.allreduce(int(own)) > 0
@@ -352,19 +387,26 @@ class Transform:
         # frames along the axes change no coordinates
         self.frames = frames if self._oblique else NodalFrames(np.empty(0, dtype=np.int64), walls)
         self.sliding = self.frames.sliding
+        self.slides = self._oblique and mesh.comm.allreduce(int(len(self.sliding.nodes) > 0)) > 0
+        carried = np.zeros(len(self.frames.nodes), dtype=bool)
+        if self.relative is not None:
+            carried = self.relative.carried(self.frames.nodes)
+        self._direct = np.flatnonzero(~carried)  # frames of x
+        self._nodes = self.frames.nodes[self._direct]
+        self._basis, self._back = self.frames.basis[self._direct], self.frames.inverse[self._direct]
         if self._oblique:
             self._share_frames()
 
-    @cached_property
+    @property
     def nodewise(self) -> bool:
-        """Whether w differs from u by frames of nodes only, and the Hessian is symmetric. Collective at first use."""
-        return not self.links and not self.mesh.comm.allreduce(int(len(self.sliding.nodes) > 0))
+        """Whether w differs from u by frames of nodes only, and the Hessian is symmetric."""
+        return not self.links and not self.slides
 
     def _share_frames(self) -> None:
-        mesh, frames = self.mesh, self.frames
+        mesh, nodes = self.mesh, self._nodes
         inverse = np.zeros((mesh.n_local, 10))
-        inverse[frames.nodes, 0] = 1.0
-        inverse[frames.nodes, 1:] = frames.inverse.reshape(-1, 9)
+        inverse[nodes, 0] = 1.0
+        inverse[nodes, 1:] = self._back.reshape(-1, 9)
         mesh.update_ghosts(inverse)
         turned = np.flatnonzero(inverse[:, 0] > 0.0)
         self._frame_of = np.full(mesh.n_local, -1, dtype=np.int32)
@@ -377,34 +419,42 @@ class Transform:
             return
         for link in reversed(self.links):
             link.forward(w)
-        at = self.frames.nodes
-        w[at] = np.einsum("nij,nj->ni", self.frames.inverse, w[at])
+        w[self._nodes] = np.einsum("nij,nj->ni", self._back, w[self._nodes])
 
     def inverse(self, u: np.ndarray) -> None:
         """Transform u (owned, 3) to w, in place. Collective."""
         if self.identity:
             return
-        at = self.frames.nodes
-        u[at] = np.einsum("nij,nj->ni", self.frames.basis, u[at])
+        u[self._nodes] = np.einsum("nij,nj->ni", self._basis, u[self._nodes])
         for link in self.links:
             link.inverse(u)
+
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """Return the positions (owned, 3) of nodes, relative ones of carriers, at x (owned, 3) [m]. Collective."""
+        return x if self.relative is None else self.relative.positions(x)
+
+    def _adjoint(self, g: np.ndarray) -> None:
+        """Compute T^T F^-T g (owned, 3) in place. Collective."""
+        g[self._nodes] = np.einsum("nji,nj->ni", self._back, g[self._nodes])
+        for link in self.links:
+            link.adjoint(g)
 
     def residual(self, predictor: np.ndarray, u: np.ndarray, g: np.ndarray) -> None:
         """Transform the residual force (owned, 3) at predictor + u to the residual of w, in place. Collective."""
         if self.identity:
             return
-        at, slipping = self.frames.nodes, self.sliding.nodes
-        g[at] = np.einsum("nji,nj->ni", self.frames.inverse, g[at])
-        g[slipping] = self.sliding.couple(predictor[slipping] + u[slipping], g[slipping])
-        for link in self.links:
-            link.adjoint(g)
+        self._adjoint(g)
+        if self.slides:
+            slipping = self.sliding.nodes
+            if self.relative is None:
+                x = predictor[slipping] + u[slipping]
+            else:
+                x = self.relative.positions(predictor + u)[slipping]
+            g[slipping] = self.sliding.couple(x, g[slipping])
 
     def left(self) -> np.ndarray:
-        """Matrices (m, 3, 3) that map the residual force at framed nodes to the residual, at the last evaluation."""
-        left = self.frames.inverse.transpose(0, 2, 1).copy()
-        at = self.sliding.at
-        left[at] = self.sliding.maps @ left[at]
-        return left
+        """Maps M (s, 3, 3) of slipping nodes at the last evaluation of the residual."""
+        return self.sliding.maps.copy()
 
     def linear(self, left: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
         """Transform H u (local, 3), in place, to the derivative of the residual along u (local, 3). Collective.
@@ -413,29 +463,42 @@ class Transform:
         """
         if self.identity:
             return
-        at, slipping = self.frames.nodes, self.sliding.nodes
-        out[slipping] += np.einsum("nij,nj->ni", self.sliding.stiffness, u[slipping])
-        out[at] = np.einsum("nij,nj->ni", left, out[at])
-        for link in self.links:
-            link.adjoint(out)
+        self._adjoint(out)
+        if self.slides:
+            sliding, y = self.sliding, self.positions(u[: self.mesh.n_owned])[self.sliding.nodes]
+            out[sliding.nodes] += np.einsum("nji,njk,nk->ni", sliding.inverse, sliding.stiffness, y)
+            out[sliding.nodes] = np.einsum("nij,nj->ni", left, out[sliding.nodes])
 
     def diagonal(self, left: np.ndarray, blocks: BlocksOf, diagonal: np.ndarray) -> None:
         """Replace the diagonal (owned, 3) of H by that of the derivative of the residual. Collective."""
         nodes = self.frames.nodes
-        full = blocks(nodes)
-        full[self.sliding.at] += self.sliding.stiffness
-        diagonal[nodes] = np.einsum("nij,njk,nki->ni", left, full, self.frames.inverse)
+        full = np.zeros((len(diagonal), 3, 3))
+        full[nodes] = self._in_frames(nodes, blocks(nodes))
         for link in self.links:
-            link.diagonal(lambda some: self._in_frames(some, blocks(some)), diagonal)
+            others, own = link.blocks(lambda some: self._in_frames(some, blocks(some)))
+            full[others], nodes = own, np.union1d(nodes, others)
+        at = self.sliding.nodes
+        full[at] = left @ (full[at] + self.slip_blocks())
+        diagonal[nodes] = np.einsum("nii->ni", full[nodes])
+
+    def slip_blocks(self) -> np.ndarray:
+        """Return what the turning of slips adds to the diagonal blocks (s, 3, 3) of slipping nodes, before M."""
+        sliding = self.sliding
+        return np.einsum("nji,njk,nkl->nil", sliding.inverse, sliding.stiffness, sliding.inverse)
 
     def _in_frames(self, nodes: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-        _, at, place = np.intersect1d(nodes, self.frames.nodes, return_indices=True)
-        inverse = self.frames.inverse[place]
+        _, at, place = np.intersect1d(nodes, self._nodes, return_indices=True)
+        inverse = self._back[place]
         blocks[at] = inverse.transpose(0, 2, 1) @ blocks[at] @ inverse
         return blocks
 
     def turns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Matrices that transform the blocks of a Hessian to frame coordinates, without those of rows over several
-        nodes: place of each node (local,) among the frames, -1 for none; :meth:`left`; and inverses (turned, 3, 3) of
-        these and of ghosts. None if no node has a frame."""
-        return (self._frame_of, self.left(), self._inverse) if self._oblique else None
+        """Matrices that transform the blocks of a Hessian to coordinates of the frames of x: place of each node
+        (local,) among these, -1 for none; those on the left (m, 3, 3), with M where no rows follow; and inverses
+        (turned, 3, 3) of these and of ghosts. None if no node has a frame."""
+        if not self._oblique:
+            return None
+        left = self.frames.inverse.transpose(0, 2, 1).copy()
+        if self.relative is None:
+            left[self.sliding.at] = self.sliding.maps @ left[self.sliding.at]
+        return self._frame_of, left[self._direct], self._inverse

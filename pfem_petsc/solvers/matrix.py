@@ -128,7 +128,7 @@ class HessianMatrix:
     Attributes
     ----------
     mat : PETSc matrix
-    bounded : the matrix of steps with bounds: ``mat``, or T^T mat T with coordinates of links
+    bounded : the matrix of steps with bounds: ``mat``, or M T^T mat T with coordinates of links
     """
 
     def __init__(self, mesh: DistributedMesh, supports: Supports | None = None, symmetric: bool = True) -> None:
@@ -144,7 +144,8 @@ class HessianMatrix:
         self._allocate()
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         self.bounded = self.mat
-        self._chain: list[tuple[object, PETSc.Mat, PETSc.Mat]] = []  # coordinates, T, and the product with T
+        self._chain: list[tuple[object, PETSc.Mat, PETSc.Mat]] = []  # coordinates, T, and T^T mat T
+        self._maps: PETSc.Mat | None = None  # M of nodes that slip in relative coordinates
         self._symmetric = symmetric
         self.any_fixed = supports is not None and supports.any
         self._inclined: Directions | None = None
@@ -213,12 +214,17 @@ class HessianMatrix:
             self.bounded = self.bounded.ptap(matrix)
             self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
             self._chain.append((link, matrix, self.bounded))
+            if link.relative is not None:
+                self._maps = block_diagonal(self.mesh)
+                self.bounded = self._maps.matMult(self.bounded)
+                self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, False)
 
     def _turn(self, transform: Transform, values: np.ndarray) -> None:
         """Transform the values to frame coordinates, without those of rows over several nodes."""
         turns = transform.turns()
         if turns is not None:
-            self.pattern.add_blocks(transform.sliding.nodes, transform.sliding.stiffness, values)
+            if transform.relative is None:
+                self.pattern.add_blocks(transform.sliding.nodes, transform.sliding.stiffness, values)
             turn_blocks(self.pattern.ptr, self.local_columns, *turns, values)
 
     def update(self, problem: StepProblem, w: np.ndarray) -> None:
@@ -274,6 +280,20 @@ class HessianMatrix:
             else:
                 last.copy(product, PETSc.Mat.Structure.DIFFERENT)
             last = product
+        if self._maps is not None:
+            self._let_slide(transform, last)
+
+    def _let_slide(self, transform: Transform, product: PETSc.Mat) -> None:
+        """Compute ``bounded`` from T^T mat T: add the turning of slips, and multiply by M. Collective."""
+        if transform.relative is None or not transform.slides:
+            product.copy(self.bounded, PETSc.Mat.Structure.DIFFERENT)
+            return
+        nodes = transform.sliding.nodes
+        add_diagonal(product, self.mesh, nodes, transform.slip_blocks(), PETSc.InsertMode.ADD_VALUES)
+        maps = np.tile(np.eye(3), (self.mesh.n_owned, 1, 1))
+        maps[nodes] = transform.left()
+        add_diagonal(self._maps, self.mesh, np.arange(self.mesh.n_owned), maps, PETSc.InsertMode.INSERT_VALUES)
+        self._maps.matMult(product, self.bounded)
 
     def fill_held(self, problem: StepProblem, held: np.ndarray, stored: np.ndarray | None) -> PETSc.Mat:
         """Assemble as :meth:`add`, in the coordinates of the problem; rows and columns of components (local nodes, 3)
@@ -322,6 +342,10 @@ class HessianMatrix:
         _constrain_columns(p.ptr, self.local_columns, p.diagonal, held, values)
 
     def _free_chain(self) -> None:
+        if self._maps is not None:
+            self.bounded.destroy()
+            self._maps.destroy()
+            self._maps = None
         for _, matrix, product in self._chain:
             product.destroy()
             matrix.destroy()
@@ -332,6 +356,27 @@ class HessianMatrix:
         """Free the PETSc matrices."""
         self._free_chain()
         self.mat.destroy()
+
+
+def block_diagonal(mesh: DistributedMesh) -> PETSc.Mat:
+    """Return an identity with entries for the diagonal blocks of all nodes; the caller destroys it. Collective."""
+    size, first = (3 * mesh.n_owned, 3 * mesh.n_nodes), 3 * mesh.first_node
+    columns = first + np.repeat(np.arange(3 * mesh.n_owned).reshape(-1, 1, 3), 3, axis=1).ravel()
+    pointers = 3 * np.arange(3 * mesh.n_owned + 1)
+    matrix = PETSc.Mat().create(comm=mesh.comm)
+    matrix.setSizes((size, size), bsize=3)
+    matrix.setType(PETSc.Mat.Type.AIJ)
+    values = np.tile(np.eye(3), (mesh.n_owned, 1, 1)).ravel()
+    matrix.setPreallocationCSR((pointers.astype(PETSc.IntType), columns.astype(PETSc.IntType), values))
+    return matrix
+
+
+def add_diagonal(matrix: PETSc.Mat, mesh: DistributedMesh, nodes: np.ndarray, blocks: np.ndarray, how: int) -> None:
+    """Set or add the diagonal blocks (m, 3, 3) of owned nodes (m,) in a matrix with entries for them. Collective."""
+    for at, block in zip(3 * (mesh.first_node + nodes), blocks, strict=True):
+        rows = np.arange(at, at + 3, dtype=PETSc.IntType)
+        matrix.setValues(rows, rows, block, how)
+    matrix.assemble()
 
 
 def local_columns(mesh: DistributedMesh, columns: np.ndarray) -> np.ndarray:

@@ -511,7 +511,7 @@ class StaticStepper(ImplicitStepper):
         if model.touches:
             cause += ", or part of the truss is a mechanism"
             others = "static.stabilise, or supports that move the truss instead of loads, pass a limit point"
-            if model.contact.any and model.contact.symmetric:
+            if model.contact.any and not model.contact.has_friction:
                 others = f"walls without friction do not hold nodes along them: add supports; {others}"
             elif model.contact.any:
                 cause += ", or the friction of walls does not hold it"
@@ -672,12 +672,7 @@ def _check(model: Model) -> None:
                 f"{source}: wall {wall.name!r}: mass: a wall with mass moves over time; remove mass, or give the wall "
                 "a motion"
             )
-    for pair in case.contact_pair:
-        if pair.friction_coefficients[1]:
-            raise InputError(
-                f"{source}: contact_pair {pair.name!r}: friction needs an explicit integrator; use [time] with one, or "
-                "remove friction"
-            )
+    model.links.check("scheme", False, model.size)
     for name, material in case.material.items():
         law = law_of(material)
         if law.rate and not law.static_limit:

@@ -189,7 +189,7 @@ class ImplicitStepper(Stepper):
         touch = model.self_contact
         if touch is not None and not touch.symmetric:
             choice = unsymmetric(choice)
-        symmetric = self.scheme.symmetric and model.contact.symmetric and (touch is None or touch.symmetric)
+        symmetric = self.scheme.symmetric and model.links.symmetric and (touch is None or touch.symmetric)
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)
         else:
@@ -199,7 +199,7 @@ class ImplicitStepper(Stepper):
             self.lagged = LaggedPreconditioner(
                 model, choice.preconditioner, symmetric, self.scheme.symmetric, choice.matrix_free
             )
-        bounded = choice if model.contact.symmetric else unsymmetric(choice)
+        bounded = choice if model.links.symmetric else unsymmetric(choice)
         most = model.case.solver.max_newton
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.size, self.lagged)
         self.newton.forcing = self.forcing  # which outlasts these solvers

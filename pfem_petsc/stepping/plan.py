@@ -337,9 +337,9 @@ def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoi
         choice = choose_linear(solver.linear, solver.operator if touch is None else touch.operator(), demand)
     except InputError as error:
         raise InputError(f"{case.source}: {error}") from error
-    if choice.preconditioner == "multigrid" and (model.links or not model.contact.symmetric):
+    if choice.preconditioner == "multigrid" and (model.links or not model.links.symmetric):
         choice = replace(choice, why=f"{choice.why}; Jacobi where links may close or nodes slip")
-    if not model.contact.symmetric and choice.krylov == "cg":
+    if not model.links.symmetric and choice.krylov == "cg":
         return replace(choice, why=f"{choice.why}; GMRES near walls with friction")
     return choice
 
@@ -470,11 +470,8 @@ def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) ->
             raise InputError(f"{key}: restitution of a wall with mass needs central_differences")
     for pair in model.case.contact_pair:
         key = f"{model.case.source}: contact_pair {pair.name!r}"
-        if pair.friction_coefficients[1] and not (explicit and treatment is None):
-            raise InputError(
-                f'{key}: friction needs an explicit integrator and contact.treatment = "scheme"; use them, or remove '
-                "friction"
-            )
+        if pair.friction_coefficients[1] and treatment is not None:
+            raise InputError(f'{key}: friction needs contact.treatment = "scheme"; use it, or remove friction')
         model.links.rebounds |= _check_surface(model, plan, treatment, pair, key)
         if pair.restitution and not (model.links.rebounds or (model.links.alone and not model.links.dynamic)):
             raise InputError(

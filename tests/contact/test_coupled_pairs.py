@@ -143,15 +143,14 @@ def test_no_room(heavy, comm, shared_tmp_path):
         ({"integrator": "newmark", "one": True, "treatment": "stick"}, "a wall stops it as well, which needs contact"),
         ({"treatment": "stick"}, "is in several pairs, or a wall stops it as well, which needs contact.treatment"),
         (
-            {"friction": 0.2, "integrator": "newmark"},
-            "wall 'wall1' stops nodes of pairs or constraints: such a wall must be flat, without mass, friction",
+            {"restitution": 0.2, "integrator": "newmark"},
+            "wall 'wall1' stops nodes of pairs or constraints: such a wall must be without restitution",
         ),
         ({"mass": 2.0}, "such a wall must be without mass"),
-        ({"tied": True, "integrator": "newmark"}, "and not tied"),
     ],
 )
 def test_refusals(change, message, comm, shared_tmp_path):
-    keys = {name: value for name, value in change.items() if name in ("friction", "mass", "tied")}
+    keys = {name: value for name, value in change.items() if name in ("restitution", "mass")}
     walls = planes([[0.0, 0.0, 1.0]], [-0.01], **keys)
     case = crowded(walls, shared_tmp_path / "m.vtu", change.get("integrator", "central_differences"))
     if change.get("one"):

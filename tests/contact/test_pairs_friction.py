@@ -1,4 +1,4 @@
-"""Bodies that rub on each other: closed forms of sliding and sticking, momentum, energy, ranks and restarts."""
+"""Bodies that rub on each other in explicit steps: sliding and sticking, momentum, energy, ranks and restarts."""
 
 import numpy as np
 import pytest
@@ -195,11 +195,10 @@ def test_every_step_obeys_all_laws(kind, crowded, comm, tmp_path):
 @pytest.mark.parametrize(
     ("integrator", "tables", "message"),
     [
-        ("newmark", {}, "contact_pair 'faces': friction needs an explicit integrator"),
         (
             "chung_lee",
             {"contact": {"treatment": "stick"}},
-            "contact_pair 'faces': friction needs an explicit integrator",
+            "contact_pair 'faces': friction needs contact.treatment = \"scheme\"",
         ),
         ("central_differences", {"static_friction": 0.1}, "static_friction must be no less than friction = 0.3"),
         (
@@ -215,12 +214,6 @@ def test_refusals(integrator, tables, message, comm, tmp_path):
     walls = [floor | {"mass": tables["mass"]}] if "mass" in tables else []
     with pytest.raises(InputError, match=message):
         rows_of(bodies(comm, integrator, pair=pair, wall=walls, contact=tables.get("contact", {})), comm, tmp_path)
-
-
-def test_statics_refuse_friction_of_pairs(comm, tmp_path):
-    case = bodies(comm, pair={"friction": 0.3}, static={"step": 1.0}, time=None, **HELD)
-    with pytest.raises(InputError, match="contact_pair 'faces': friction needs an explicit integrator"):
-        rows_of(case, comm, tmp_path)
 
 
 @pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])

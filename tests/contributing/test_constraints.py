@@ -116,7 +116,7 @@ def test_chain_of_tethers_hangs_at_rest(integrator, mass, examples, comm, shared
         ((tether("tip", "other", 0.2), "contact.treatment=stick"), r"constraints need contact.treatment = \"scheme\""),
         (
             (tether("tip", "other", 0.2), 'wall=[{type="sphere", point=[0, 0, 9], radius=1.0, side="outside"}]'),
-            r"wall 'wall1' stops nodes of pairs or constraints",
+            r"constraint 'rope' is on nodes that rub, or that a wall stops which is curved",
         ),
     ],
 )

@@ -235,12 +235,12 @@ def draw_inclined(chance: random.Random, case: dict[str, Any], body: Body, motio
 
 
 def draw_rubbing_pairs(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
-    """Let pairs rub in explicit steps, and rebound, and the walls beside them as well."""
+    """Let pairs rub, and in explicit steps rebound, and the walls beside them as well."""
     time, smooth, leaps = case["time"], True, False
     scheme = case.get("contact", {}).get("treatment", "scheme") == "scheme"
     explicit = time["integrator"] in EXPLICIT and time.get("mass") != "consistent" and scheme
     for pair in case.get("contact_pair", ()):
-        if explicit and chance.random() < 0.7:
+        if scheme and chance.random() < 0.7:
             pair["friction"], smooth = chance.choice((0.1, 0.3, 0.6)), False
             if chance.random() < 0.3:
                 pair["static_friction"] = pair["friction"] * chance.uniform(1.0, 2.0)
@@ -250,7 +250,7 @@ def draw_rubbing_pairs(chance: random.Random, case: dict[str, Any], body: Body, 
             leaps or (jumps and time["integrator"] not in ("noh_bathe", "central_differences"))
         ):
             pair["restitution"] = chance.choice((0.3, 0.8, 1.0))
-    for wall in case.get("wall", ()) if case.get("contact_pair") and explicit else ():
+    for wall in case.get("wall", ()) if case.get("contact_pair") and scheme else ():
         if "mass" not in wall and not wall.get("tied"):
             wall |= {"friction": chance.choice((0.0, 0.2, 0.5))} if "friction" not in wall else {}
             wall |= {"restitution": chance.choice((0.0, 0.6))} if leaps and "restitution" not in wall else {}

@@ -50,7 +50,7 @@ def _treatment(case: dict[str, Any]) -> str:
 
 def draw_surface(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
     """Replace walls by surfaces of triangles in the path of the body."""
-    if _treatment(case) == "mass_redistribution" or (case.get("contact_pair") and not _lumped_explicit(case)):
+    if _treatment(case) == "mass_redistribution" or (case.get("contact_pair") and _treatment(case) != "scheme"):
         return  # for planes alone
     for k, wall in enumerate(case.get("wall", ())):
         if chance.random() < 0.25:
@@ -112,7 +112,7 @@ def _shape(
 
 def draw_turn(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
     """Turn walls about axes near the body and far from it, so that they move about as fast as the body."""
-    if _treatment(case) == "mass_redistribution" or (case.get("contact_pair") and not _lumped_explicit(case)):
+    if _treatment(case) == "mass_redistribution" or (case.get("contact_pair") and _treatment(case) != "scheme"):
         return
     for wall in case.get("wall", ()):
         if chance.random() < 0.4 or wall.get("adjust"):
@@ -137,19 +137,24 @@ def draw_turn(chance: random.Random, case: dict[str, Any], body: Body, motion: M
 
 
 def draw_rough_pair(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
-    """Give pairs friction and restitution, and their walls too where steps are explicit."""
-    explicit, scheme = _lumped_explicit(case), case["time"]["integrator"]
+    """Give pairs and their walls friction, and restitution where steps are explicit."""
+    rubs, scheme = _treatment(case) == "scheme", case["time"]["integrator"]
     for pair in case.get("contact_pair", ()):
-        if explicit and _treatment(case) == "scheme" and chance.random() < 0.7:
+        if rubs and chance.random() < 0.7:
             pair["friction"] = 10 ** chance.uniform(-1.3, 0.3)
             if chance.random() < 0.4:
                 pair["static_friction"] = pair["friction"] * chance.uniform(1.0, 1.6)
         if scheme == "central_differences" and "mass" not in case["time"] and chance.random() < 0.6:
             pair["restitution"] = chance.choice((0.3, 1.0, chance.random()))
-        for wall in case.get("wall", ()) if explicit and _treatment(case) == "scheme" else ():
+        for wall in case.get("wall", ()) if rubs else ():
             if not wall.get("tied") and "friction" not in wall and chance.random() < 0.5:
                 wall["friction"] = 10 ** chance.uniform(-1.3, 0.3)
-            if scheme == "central_differences" and not wall.get("tied") and chance.random() < 0.3:
+            if (
+                scheme == "central_differences"
+                and _lumped_explicit(case)
+                and not wall.get("tied")
+                and chance.random() < 0.3
+            ):
                 wall["restitution"] = chance.random()
 
 

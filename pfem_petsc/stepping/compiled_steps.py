@@ -414,7 +414,7 @@ class CompiledSteps:
         infeasible, why = pressed.failure.tolist()
         if infeasible >= 0:
             node = pressed.nodes[infeasible]
-            return self._at_balance(self.model.contact.placeless(node, why, pressed.normals, pressed.offsets))
+            return self._at_balance(self.model.contact.placeless(node, why, pressed.normals, pressed.gaps))
         if made[UNSOLVED] > 0:
             rows = self.model.links.rows
             return self._at_balance(rows.unsettled_message(int(rows.group_of_row[made[UNSOLVED] - 1])))

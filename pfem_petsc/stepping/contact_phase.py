@@ -46,7 +46,7 @@ class WallArrays(NamedTuple):
 class ContactNodes(NamedTuple):
     """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the slots
     of walls that they are ``touching`` (n, s), their ``places`` (n, 3); ``failure`` (2,): the first of them without a
-    place, or -1, and why, and its planes, ``normals`` (s, 3) and ``offsets`` (s,); and the sums of each wall, ``force``
+    place, or -1, and why, and its planes, ``normals`` (s, 3) and ``gaps`` (s,); and the sums of each wall, ``force``
     (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
 
     nodes: np.ndarray
@@ -54,7 +54,7 @@ class ContactNodes(NamedTuple):
     places: np.ndarray
     failure: np.ndarray
     normals: np.ndarray
-    offsets: np.ndarray
+    gaps: np.ndarray
     force: np.ndarray
     contacts: np.ndarray
     moment: np.ndarray
@@ -103,6 +103,7 @@ def work_of_walls(s, step):
 @inlined
 def _arrivals(found, nodes, motion, walls):
     """Return what pressing needs of nodes (m,)."""
+    free = np.empty((len(found), 3))
     pressed, touched, h = walls.pressed, walls.touched, motion.h
     m, w = len(found), len(pressed.way)
     bounces = w if len(pressed.restitution) > 0 else 0
@@ -113,7 +114,8 @@ def _arrivals(found, nodes, motion, walls):
         i = found[j]
         stiffness[j] = nodes.stiffness[i]
         for c in range(3):
-            start[j, c], drift[j, c] = motion.x[c, i], h * motion.half[c, i] - motion.u[c, i]
+            free[j, c], start[j, c] = walls.free[c, i], motion.x[c, i]
+            drift[j, c] = h * motion.half[c, i] - motion.u[c, i]
             fixed[j, c] = touched.fixed[i, c]
         for k in range(w):
             applies[j, k] = pressed.all_nodes[k] or pressed.members[i, k]
@@ -123,7 +125,7 @@ def _arrivals(found, nodes, motion, walls):
         for k in range(bounces):
             rebound[j, k], arrival[j, k] = pressed.rebound[i, k], pressed.arrival[i, k]
     none = np.empty((0, w, 3)), np.empty((0, w))
-    return Arrivals(start, ways, drift, stiffness, fixed, applies, touching, rebound, arrival, *none)
+    return Arrivals(free, start, ways, drift, stiffness, fixed, applies, touching, rebound, arrival, *none)
 
 
 @inlined
@@ -182,30 +184,28 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
         nodes, motion, walls, out, contacts = s.nodes, s.motion, s.walls, s.pressed, s.contacts
         free, pressed, m = walls.free, walls.pressed, find_beyond(motion, walls, out, contacts)
         if m > 0:
-            found = pressed.room[:m]
-            places, given = np.empty((m, 3)), _arrivals(found, nodes, motion, walls)
-            for j in range(m):
-                for c in range(3):
-                    places[j, c] = free[c, found[j]]
-            sums = WallSums(out.force, out.contacts, out.moment)
-            failed, why, planes, total, touching, contacts.friction = press_nodes(
-                places, given, pressed, sums, curved, rough, several
+            given, sums = (
+                _arrivals(pressed.room[:m], nodes, motion, walls),
+                WallSums(out.force, out.contacts, out.moment),
+            )
+            failed, why, planes, found, total, touching, contacts.friction = press_nodes(
+                given, pressed, sums, curved, rough, several
             )
             for j in range(m):
-                i = found[j]
+                i = pressed.room[j]
                 out.nodes[j] = i
                 for c in range(3):
-                    displace(c, i, places[j, c] - free[c, i], nodes, motion, s.sums)
+                    displace(c, i, found.x[j, c] - free[c, i], nodes, motion, s.sums)
                     motion.contact[i, c] += total[j, c]  # rows may press there too
-                    out.places[j, c] = places[j, c]
+                    out.places[j, c] = found.x[j, c]
                 for k in range(given.rebound.shape[1]):
                     pressed.rebound[i, k], pressed.arrival[i, k] = given.rebound[j, k], given.arrival[j, k]
                 for k in range(touching.shape[1]):
                     out.touching[j, k] = touching[j, k]
             if failed >= 0:
                 out.failure[0], out.failure[1] = failed, why
-                for k in range(len(out.offsets)):
-                    out.offsets[k] = planes.offsets[failed, k]
+                for k in range(len(out.gaps)):
+                    out.gaps[k] = planes.gaps[failed, k]
                     for c in range(3):
                         out.normals[k, c] = planes.normals[failed, k, c]
         note_contacts(m, walls, out, contacts)

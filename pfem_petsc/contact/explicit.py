@@ -172,6 +172,15 @@ def _list_penetrating(free, first, last, walls, returning, m):
 
 
 @inlined
+def _read(walls):
+    """Return the fields of :class:`PressedWalls` as a tuple: loops that read those of a record are slower."""
+    at = walls.surfaces
+    surfaces = Surfaces(at.normals, at.offsets, at.centres, at.axes, at.radii)
+    sets = walls.all_nodes, walls.members, walls.tolerance, walls.room, walls.wall_of, walls.way, walls.pushed
+    return PressedWalls(surfaces, walls.part, *sets, walls.friction, walls.restitution, walls.rebound, walls.arrival)
+
+
+@inlined
 def impact_square(approach: Any, arrival: Any, pull: Any) -> Any:
     """Return the part of I^2 [m2] that is known in the step of the impact, zero for nodes that do not approach.
 
@@ -324,13 +333,13 @@ def planes_of(at, pushed, given, walls):
     """Return the :class:`~pfem_petsc.contact.projection.Planes` at positions ``at`` (m, 3) of nodes that would move to
     ``pushed`` (m, 3) without walls, and the pulls (m, w) [m] of forces towards walls with restitution; ``given``:
     :class:`Arrivals`, ``walls``: :class:`PressedWalls`."""
-    (m, w), n = given.applies.shape, 0
+    (m, w), n, read = given.applies.shape, 0, _read(walls)
     for k in range(w):
-        n = m if walls.friction[1, k] > 0.0 else n
+        n = m if read.friction[1, k] > 0.0 else n
     planes = Planes(np.empty((m, w, 3)), np.empty((m, w)), np.empty((n, w, 2)), np.empty((n, w, 3)))
     pulls = np.empty((m, w))
     for j in range(m):
-        _set_planes(j, at, pushed, walls, given, planes, pulls)
+        _set_planes(j, at, pushed, read, given, planes, pulls)
     return planes, pulls
 
 
@@ -357,8 +366,10 @@ def press_nodes(given, walls, sums, curved, rough, several):
     normals, found, of_nodes = planes.normals, new_pressed(m, w), (given.free, given.fixed, given.stiffness)
     found.x[:] = given.free
     without = Planes(normals, planes.gaps, np.empty((0, w, 2)), np.empty((0, w, 3)))
-    failed, why = _press_all(NodesAtPlanes(*of_nodes, without), found, walls, given, pulls, curved, several)
-    _remember(found, planes, pulls, walls, given)
+    failed, why = -1, 0
+    if rough is None or curved is not None or len(walls.restitution) > 0:
+        failed, why = _press_all(NodesAtPlanes(*of_nodes, without), found, walls, given, pulls, curved, several)
+        _remember(found, planes, pulls, walls, given)
     if rough is not None:  # noqa: SIM102 - what is not needed is not compiled
         if failed < 0:
             failed, why = _press_all(NodesAtPlanes(*of_nodes, planes), found, walls, given, pulls, curved, several)

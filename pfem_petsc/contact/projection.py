@@ -215,18 +215,6 @@ def _add_planes(at, i, n, planes, room):
 
 
 @inlined
-def _value(a, rows, moves):
-    """Return a row after displacements of its nodes."""
-    value = rows.values[a]
-    for k in range(rows.ends.shape[1]):
-        i = rows.ends[a, k]
-        if i >= 0:
-            for c in range(3):
-                value += rows.gradients[a, k, c] * moves[i, c]
-    return value
-
-
-@inlined
 def _push(a, force, rows, moves):
     """Displace the nodes of a row by a force."""
     for k in range(rows.ends.shape[1]):
@@ -241,9 +229,6 @@ def _solve_several(n, rows, tolerances, pushes):
     """Find the normal forces of rows, and the displacements by these; return whether there are such forces."""
     gram, width = np.zeros((n, n)), rows.ends.shape[1]
     for a in range(n):
-        for d in range(width):
-            for c in range(3 if rows.ends[a, d] >= 0 else 0):
-                pushes.moves[rows.ends[a, d], c] = 0.0
         for b in range(a, n):
             for d in range(width):
                 i = rows.ends[a, d]
@@ -263,41 +248,56 @@ def _solve_several(n, rows, tolerances, pushes):
 
 
 @inlined
-def _solve_rows(n, rows, tolerances, size, pushes, several):
+def _solve_rows(n, rows, tolerances, size, pushes):
     """Find the forces of rows, and the displacements of their nodes, which are zero before, with friction.
 
     A row violated by at most the first of the ``tolerances`` counts as satisfied, or by at most the second where there
-    is no solution otherwise; ``size``: largest coordinate [m]; ``several``: ``NEEDED``, or None if there is a row
-    without friction at most. Returns :data:`INFEASIBLE`, :data:`JAMMED`, or 0.
+    is no solution otherwise; ``size``: largest coordinate [m]. Returns :data:`INFEASIBLE`, :data:`JAMMED`, or 0.
     """
     normal, drag, moves = pushes
-    broken, first = 0, 0
+    broken = False
     for a in range(n):
         normal[a] = drag[a, 0] = drag[a, 1] = drag[a, 2] = 0.0
-        if not rows.values[a] >= 0.0:
-            broken, first = broken + 1, a
-    if broken == 0:
+        broken = broken or not rows.values[a] >= 0.0
+    if not broken:
         return 0
-    alone = broken == 1
-    if alone:  # the common case: a single violated row whose solution satisfies all others
+    if n == 1:
         gives = 0.0
         for k in range(rows.ends.shape[1]):
-            i = rows.ends[first, k]
-            if i >= 0:
-                for c in range(3):
-                    gives += rows.gradients[first, k, c] * rows.gradients[first, k, c] * rows.soft[i, c]
-        normal[first] = -rows.values[first] / gives
-        _push(first, normal[first], rows, moves)
-        alone = normal[first] < math.inf
-        for a in range(n if n > 1 else 0):
-            alone = alone and (a == first or _value(a, rows, moves) >= -tolerances[1])
-        if alone and rows.friction[first, 1] == 0.0:
-            return 0
-    if several is not None:
-        if not alone and not _solve_several(n, rows, tolerances, pushes):
-            return INFEASIBLE
-        return 0 if settle_friction(n, rows, size, pushes) else JAMMED
-    return 0
+            i = rows.ends[0, k]
+            for c in range(3 if i >= 0 else 0):
+                gives += rows.gradients[0, k, c] * rows.gradients[0, k, c] * rows.soft[i, c]
+        normal[0] = -rows.values[0] / gives
+        _push(0, normal[0], rows, moves)
+    if (n == 1 and not normal[0] < math.inf) or (n > 1 and not _solve_several(n, rows, tolerances, pushes)):
+        return INFEASIBLE
+    return 0 if settle_friction(n, rows, size, pushes) else JAMMED
+
+
+@inlined
+def _press_single(j, nodes, tolerance, found):
+    """Move the j-th node, which is ``found`` where it is free to move, onto the only plane that it is beyond, if it has
+    no friction and all others remain satisfied; return whether that is so."""
+    (normals, gaps, friction, _), broken, first, square = nodes.planes, 0, 0, 0.0
+    for k in range(gaps.shape[1]):
+        if gaps[j, k] < 0.0:
+            broken, first = broken + 1, k
+    if broken != 1 or (len(friction) > 0 and friction[j, first, 1] > 0.0):
+        return broken == 0
+    for c in range(3):
+        square += 0.0 if nodes.fixed[j, c] else normals[j, first, c] * normals[j, first, c]
+    if not square > FREE_PART:
+        return False
+    push, alone = -gaps[j, first] / square, True
+    for c in range(3):
+        found.x[j, c] += 0.0 if nodes.fixed[j, c] else push * normals[j, first, c]
+    for k in range(gaps.shape[1] if gaps.shape[1] > 1 else 0):
+        gap = gaps[j, k]
+        for c in range(3):
+            gap += normals[j, k, c] * (found.x[j, c] - nodes.free[j, c])
+        alone = alone and (k == first or gap >= -tolerance)
+    found.normal[j, first] = push * nodes.stiffness[j]
+    return alone
 
 
 @kernel
@@ -322,24 +322,29 @@ def press(which, nodes, tolerance, found, several):
     w, failed, reason = nodes.planes.gaps.shape[1], -1, 0
     room = new_room(w, 1, np.empty((1, 3)), np.empty((1, 3)))
     rows, pushes, slot = room
-    for j in range(which[0], which[1]):
+    first, last = which
+    found.x[first:last], found.normal[first:last], found.drag[first:last] = nodes.free[first:last], 0.0, 0.0
+    for j in range(first, last):
+        if _press_single(j, nodes, tolerance, found) or several is None:
+            continue
         size = 0.0
         for c in range(3):
             rows.soft[0, c] = 0.0 if nodes.fixed[j, c] else 1.0 / nodes.stiffness[j]
-            found.x[j, c], pushes.moves[0, c] = nodes.free[j, c], 0.0
+            pushes.moves[0, c] = 0.0
             size += abs(nodes.free[j, c])
-        for k in range(w):
-            found.normal[j, k] = found.drag[j, k, 0] = found.drag[j, k, 1] = found.drag[j, k, 2] = 0.0
         n = _add_planes(j, 0, 0, nodes.planes, room)
-        why = _solve_rows(n, rows, (0.0, tolerance), size, pushes, several)
+        why = _solve_rows(n, rows, (0.0, tolerance), size, pushes)
         if why > 0 and failed < 0:
             failed, reason = j, why
-        for a in range(n if why != INFEASIBLE else 0):
+        solved = why != INFEASIBLE
+        for k in range(w):
+            found.normal[j, k] = 0.0
+        for a in range(n if solved else 0):
             found.normal[j, slot[a]] = pushes.normal[a]
             for c in range(3):
                 found.drag[j, slot[a], c] = pushes.drag[a, c]
-        for c in range(3 if why != INFEASIBLE else 0):
-            found.x[j, c] += pushes.moves[0, c]
+        for c in range(3):
+            found.x[j, c] = nodes.free[j, c] + (pushes.moves[0, c] if solved else 0.0)
     return failed, reason
 
 
@@ -479,7 +484,7 @@ def project_groups(which, groups, system, tolerances, size, pushes):
             i = groups.nodes[q]
             if system.plane[i] >= 0:
                 n = _add_planes(system.plane[i], i, n, system.planes, room)
-        why = _solve_rows(n, room.rows, (tolerances[g], tolerances[g]), size, room.pushes, NEEDED)
+        why = _solve_rows(n, room.rows, (tolerances[g], tolerances[g]), size, room.pushes)
         if why != 0:
             return g, why
         for a in range(count):

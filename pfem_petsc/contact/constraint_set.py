@@ -167,9 +167,12 @@ class ConstraintSet:
     rebounds : whether restitution is a bound on the next position, for schemes that solve for the next position
     two : TwoNodeRows
     alone : whether all rows of the model are over two nodes that no other row and no wall stops, with fixed directions
-    separate : whether moreover no ranks share rows, so that a pass over rows solves them, see :meth:`export_rows`
+    separate : whether all are over two nodes with fixed directions, stay, are stopped by no walls, and are on one rank
+        each, so that compiled steps solve them, see :meth:`export_rows`
     walled : whether walls can stop any node of the model's rows
     """
+
+    _KEPT = "force", "drag", "rebound", "arrival"
 
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], contact: Contact) -> None:
         self.source, self.contact, self.mesh = case.source, contact, contact.mesh
@@ -196,8 +199,8 @@ class ConstraintSet:
         self._turning = self.mesh.comm.allreduce(not rows.fixed.all(), op=MPI.LOR)
         self.walled = self._walls.everywhere
         self.alone = not self.walled and self.mesh.comm.allreduce(self.two.every, op=MPI.LAND)
-        own = rows.partners.alone and not self.dynamic
-        self.separate = self.alone and self.mesh.comm.allreduce(own, op=MPI.LAND)
+        own = rows.partners.alone and not self.dynamic and not self.walled and len(self.two.at) == len(rows.source)
+        self.separate = self.mesh.comm.allreduce(own, op=MPI.LAND)
         self._x = np.empty((len(rows.numbers), 3))
         self._exported: FixedRows | None = None  # for nodes of the stiffness
         self._exported_for = np.empty(0)
@@ -358,28 +361,26 @@ class ConstraintSet:
         """Correct increments by the forces of :meth:`explicit`, and add these to ``contact``, (owned, 3) both."""
         push_nodes(self.rows.where, load, self.rows.free, stiffness, u, contact)
 
-    def export_rows(self, stiffness: np.ndarray) -> FixedRows:
+    def export_rows(self, stiffness: np.ndarray, tolerance: float) -> FixedRows:
         """Return :attr:`separate` rows with their present forces for compiled steps; none if they are not.
 
         ``stiffness`` (owned,) is the force for a displacement of a node [N/m], the same array as long as its values
-        stay the same.
+        stay the same; ``tolerance`` : see :meth:`explicit`.
         """
         if self._exported is None or stiffness is not self._exported_for:
-            self._exported, self._exported_for = self.two.arrays(stiffness, self.separate), stiffness
+            two = self.two if self.separate else TwoNodeRows(RowSet([], self.mesh, self.contact.fixed))
+            self._exported, self._exported_for = two.arrays(stiffness, tolerance, len(self.names)), stiffness
         rows = self._exported
-        if self.separate:
-            rows.force[:], rows.closed[:], rows.drag[:] = self.force, self.two.record.closed, self.drag
-            if self.rows.rebounds:
-                rows.rebound[:], rows.arrival[:] = self.rebound, self.arrival
+        for name in self._KEPT if self.separate else ():
+            getattr(rows, name)[:] = getattr(self, name)
+        rows.closed[:] = self.two.record.closed[: len(rows.closed)]
         return rows
 
     def import_rows(self, rows: FixedRows) -> None:
         """Take the forces after the last of the steps from rows that were exported."""
-        if self.separate:
-            self.force, self.drag = rows.force.copy(), rows.drag.copy()
-            if self.rows.rebounds:
-                self.rebound, self.arrival = rows.rebound.copy(), rows.arrival.copy()
-            self.two.record.closed[:] = rows.closed
+        for name in self._KEPT if self.separate else ():
+            setattr(self, name, getattr(rows, name).copy())
+        self.two.record.closed[: len(rows.closed)] = rows.closed
 
     def pressed(self) -> np.ndarray:
         """Return the owned nodes (m,), ascending, on which rows press."""

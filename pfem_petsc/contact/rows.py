@@ -590,18 +590,16 @@ class RowSet:
 
     def _solve(self, which: np.ndarray, system: System, tolerances: np.ndarray, size: float, pushes: RowPushes) -> None:
         group, why = project_groups(which, self.groups, system, tolerances, size, pushes)
-        if group >= 0 and why == JAMMED:
-            raise SimulationFailure(self.unsettled_message(group))
         if group >= 0:
-            raise SimulationFailure(
-                f"no positions of nodes {self._shown(group)} satisfy their contact pairs, constraints, walls and "
-                "supports"
-            )
+            raise SimulationFailure(self.unsolved(group, why))
 
-    def unsettled_message(self, group: int) -> str:
-        """Return the message about a group without a solution of its friction."""
+    def unsolved(self, group: int, why: int) -> str:
+        """Return the message about a group without a solution."""
+        shown = self._shown(group)
+        if why != JAMMED:
+            return f"no positions of nodes {shown} satisfy their contact pairs, constraints, walls and supports"
         return (
-            f"the friction of nodes {self._shown(group)} in contact pairs and on walls did not converge: they may be "
+            f"the friction of nodes {shown} in contact pairs and on walls did not converge: they may be "
             "jammed between walls and supports; reduce the friction, free the nodes, or reduce time.step"
         )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..columns import HEAD
 from ..contact.explicit import Arrivals, PressedWalls, WallSums, find_penetrating, press_nodes
-from ..contact.fixed_rows import close_rows, new_single_row, pressed_nodes, rebound_of_row, rub_row
+from ..contact.fixed_rows import close_rows, pressed_nodes, solve_fixed
 from ..contact.node_walls import compare_contacts
 from ..contact.surfaces import Surfaces, wall_gaps
 from ..mechanics.compiled import addressed, inlined
@@ -20,6 +20,9 @@ from .impact import Approach, Touched, join_nodes, stop_nodes, unpressed
 from .phases import clear_rows, displace, put_rates, rates_of
 
 PUSHED = HEAD.first("contact_work")
+
+REASONS = 3
+"""A group of rows without a solution is told as its number times this, plus why."""
 
 
 @record
@@ -215,50 +218,25 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
 
 @addressed
 def project_on_rows(s, step):
-    """Separate the nodes of :class:`~pfem_petsc.contact.fixed_rows.FixedRows`; find rows with a force, and those whose
-    force begins or ends with respect to ``rows.closed``."""
+    """Move the nodes of :class:`~pfem_petsc.contact.fixed_rows.FixedRows` to where these may be."""
     rows, nodes, motion, contacts = s.rows, s.nodes, s.motion, s.contacts
-    where, normals, force, h = rows.where, rows.normals, rows.force, motion.h
-    count, changed, rubs, rebounds = 0, 0, len(rows.friction) > 0, len(rows.rebound) > 0
-    single, slip, stiffness = new_single_row(), np.empty(3), np.empty(2)
-    s.called.loss[1] = 0.0
-    for p in range(len(force)):
-        i, j, apart = where[0, p], where[1, p], 0.0
+    h, size = motion.h, 0.0
+    for k in range(len(rows.nodes)):
+        i = rows.nodes[k]
         for c in range(3):
-            there, here = motion.x[c, j] + h * motion.half[c, j], motion.x[c, i] + h * motion.half[c, i]
-            apart += normals[p, c] * (there - here)
-        short = rows.least[p] - apart
-        if rebounds:
-            gap, pull = -rows.least[p], 0.0
-            for c in range(3):
-                gap += normals[p, c] * (motion.x[c, j] - motion.x[c, i])
-                pull -= normals[p, c] * (motion.u[c, j] - motion.u[c, i])
-            short += rebound_of_row(p, rows, gap, -short - gap, pull)
-        presses = short > 0.0 and rows.soft[p] > 0.0
-        force[p] = short / rows.soft[p] if presses else 0.0
-        changed += 1 if presses != rows.closed[p] else 0
-        if rubs:
-            size = 0.0
-            for c in range(3):
-                rows.drag[p, c], slip[c] = 0.0, h * (motion.half[c, j] - motion.half[c, i])
-                size += abs(motion.x[c, i]) + abs(motion.x[c, j])
-            if presses and rows.friction[p, 1] > 0.0:
-                stiffness[0], stiffness[1] = nodes.stiffness[i], nodes.stiffness[j]
-                found, work = rub_row(p, rows, short, stiffness, slip, size, single)
-                s.called.loss[1] += work
-                if not found and s.course.unsolved == 0:
-                    s.course.unsolved = 1 + p
-        if not presses:
-            continue
-        count += 1
-        for end in range(2):
-            node = where[end, p]
-            for c in range(3):
-                part = force[p] * normals[p, c] + rows.drag[p, c] if rubs else force[p] * normals[p, c]
-                part = part if end == 1 else -part
-                motion.contact[node, c] += part
-                displace(c, node, part * rows.free[end, p, c] / nodes.stiffness[node], nodes, motion, s.sums)
-    contacts.rows, contacts.altered, contacts.others = count, changed, pressed_nodes(rows, count)
+            rows.start[k, c], rows.x[k, c] = motion.x[c, i], motion.x[c, i] + h * motion.half[c, i]
+            rows.pushed[k, c] = motion.u[c, i]
+            size = max(size, abs(rows.x[k, c]))
+    failed, why, contacts.rows, contacts.altered, s.called.loss[1] = solve_fixed(rows, size)
+    if failed >= 0 and s.course.unsolved == 0:
+        s.course.unsolved = REASONS * failed + why
+    contacts.others = pressed_nodes(rows, contacts.rows)
+    for k in range(len(rows.nodes) if contacts.rows > 0 else 0):
+        i = rows.nodes[k]
+        for c in range(3):
+            motion.contact[i, c] += rows.load[k, c]
+            if rows.moves[k, c] != 0.0:
+                displace(c, i, rows.moves[k, c], nodes, motion, s.sums)
 
 
 @addressed
@@ -267,10 +245,9 @@ def sum_rows(s, step):
     :func:`~pfem_petsc.contact.rows.last_forces` does."""
     rows = s.rows
     clear_rows(rows.totals)
-    for k in range(len(rows.totals) if s.contacts.rows > 0 else 0):
-        for p in range(rows.table_starts[k], rows.table_starts[k + 1]):
-            for c in range(3):
-                rows.totals[k, c] += rows.force[p] * rows.normals[p, c] + rows.drag[p, c]
+    for p in range(len(rows.force) if s.contacts.rows > 0 else 0):
+        for c in range(3):
+            rows.totals[rows.source[p], c] += rows.force[p] * rows.normals[p, c] + rows.drag[p, c]
 
 
 @inlined
@@ -336,14 +313,14 @@ def close_on_rows(s, step):
     for end in range(2):
         around = np.empty(count, dtype=np.int64)
         for m in range(count):
-            around[m] = rows.where[end, at[m]]
+            around[m] = rows.nodes[rows.ends[end, at[m]]]
         free_v, free_a = _free_rates(around, nodes, motion, (s.moving, step, s.held), state)
         for m in range(count):
             i = around[m]
             ends[end, m, 9] = nodes.mass[i]
             for c in range(3):
                 # rows do not change prescribed components
-                fixed = rows.free[end, at[m], c] == 0.0
+                fixed = rows.system.free[rows.ends[end, at[m]], c] == 0.0
                 ends[end, m, c] = motion.x[c, i]
                 ends[end, m, 3 + c] = v[i, c] if fixed else free_v[m, c]
                 ends[end, m, 6 + c] = a[i, c] if fixed else free_a[m, c]

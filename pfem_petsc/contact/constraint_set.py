@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
 from ..integrators.base import Balance, State
+from ..mechanics.records import by_reference
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of, slab_range
 from ..parallel.agreement import agreed, agreed_call
@@ -17,16 +17,17 @@ from ..parallel.natural import NaturalOrder
 from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, ExpectedNodes, SetPart
-from .explicit import impact_square, rebound_way
+from .explicit import Arrivals, impact_square, planes_of, rebound_lift
 from .fixed_rows import FixedRows, TwoNodeRows
-from .rows import FreeNodes, Planes, RowSet, WallsOfNodes, free_positions, last_forces, push_nodes
+from .projection import Planes
+from .rows import FreeNodes, RowSet, WallsOfNodes, free_positions, last_forces, push_nodes
+from .surfaces import OTHER
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..case.tables import ContactPair
     from ..mesh.distribution import DistributedMesh
     from .contact import Contact
-    from .wall_motion import Poses
 
 PACKAGE = "pfem_petsc.contact.constraints"
 
@@ -60,22 +61,6 @@ class PairRows(Constraint):
         return np.tile(np.stack([-self.normal, self.normal]), (len(x), 1, 1))
 
 
-class _WallStep(NamedTuple):
-    """A step in which walls may stop nodes (n,) of rows: the part of the way where forces act, its end [s]; at the
-    nodes: positions without contact and at the start of the step (n, 3) [m], walls that apply (n, w) bool; and of
-    walls with restitution displacements without forces (n, 3) [m], and the memory of the last step (n, w), see
-    :class:`~pfem_petsc.contact.explicit.Arrivals`."""
-
-    part: float
-    time: float
-    x: np.ndarray
-    start: np.ndarray
-    applies: np.ndarray
-    drift: np.ndarray
-    rebound: np.ndarray
-    arrival: np.ndarray
-
-
 class _WallsAtRows:
     """The walls that can stop nodes of rows, in explicit steps.
 
@@ -98,14 +83,11 @@ class _WallsAtRows:
         self.rubs = bool((contact.static_friction > 0.0)[meets].any())
         self.curved, self.ties = not contact.flat[meets].all(), bool(contact.ties.tying[meets].any())
         self._places = np.where(met, np.cumsum(met) - 1, -1)
-        self._normals = np.tile(contact.normals, (len(self.nodes), 1, 1))
-        coefficients = np.stack([contact.friction, contact.static_friction], axis=1)
-        self._friction = np.tile(coefficients, (len(self.nodes) if self.rubs else 0, 1, 1))
 
     @property
     def rebounds(self) -> bool:
-        """Whether restitution of a wall that meets rows is a bound on the next position."""
-        return self._contact.rebounds and bool((self._contact.restitution > 0.0)[self.meets].any())
+        """Whether walls meet rows and restitution is a bound on the next position."""
+        return self._contact.rebounds and self.everywhere
 
     def held(self, at: np.ndarray, time: float) -> np.ndarray:
         """Return whether owned nodes (k,) are tied, as 1.0 or 0.0, and where to (k, 4)."""
@@ -129,35 +111,44 @@ class _WallsAtRows:
             applies[~own] &= flags[-1 - where[~own]] > 0.0
         return applies
 
-    def planes(self, step: _WallStep, at: np.ndarray, pushed: np.ndarray) -> Planes:
-        """Return the planes of nodes at positions (n, 3), which rows alone push to positions (n, 3)."""
-        contact, nodes, x = self._contact, self.nodes, step.x[self.nodes]
-        poses, normals = contact.motion.poses(step.time), self._normals
-        if self.curved:
-            normals, offsets = self._tangents(step, at[nodes], poses)
-        else:
-            offsets = contact.plane_offsets(step.time)
-        # bits must not depend on how many nodes this rank has, as those of a product of matrices do
-        gaps = sum(x[:, c, None] * normals[:, :, c] for c in range(3)) - offsets
-        slips = np.empty((len(self._friction), len(contact.wall_of), 3))
-        if self.rubs:
-            start = step.start[nodes]
-            slips = (x - start)[:, None, :] - contact.ways(start, contact.motion.poses(contact.state.time), poses)
-        if len(step.rebound):
-            free = (pushed - step.start - step.drift)[nodes]
-            pull = -sum(free[:, c, None] * normals[:, :, c] for c in range(3))
-            rebounds = step.rebound[nodes]
-            ways = rebound_way(contact.restitution, rebounds, step.arrival[nodes], pull)
-            gaps -= np.where(rebounds > 0.0, np.maximum(ways - 0.5 * pull, 0.0), 0.0)
-        gaps = np.where(step.applies[nodes], gaps, np.inf)
-        return Planes(self._places, normals, gaps, self._friction, slips)
+    def stopping(
+        self,
+        x: np.ndarray,
+        starts: tuple[np.ndarray | None, np.ndarray],
+        applies: np.ndarray,
+        memory: np.ndarray,
+        balance: Balance,
+    ) -> WallsOfNodes:
+        """Return the walls in a step.
 
-    def _tangents(self, step: _WallStep, at: np.ndarray, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-        """Return tangent planes (m, w, 3), (m, w) at positions (m, 3); curved walls push along the normals where the
-        forces of the balance act, see :meth:`~pfem_petsc.contact.node_walls.NodeWalls.acting`."""
-        contact = self._contact
-        acting = contact.acting_from(step.start[self.nodes], step.x[self.nodes], poses, step.part)
-        return contact.planes(np.ones((len(at), len(contact.wall_of)), dtype=bool), at, poses, acting)
+        Parameters
+        ----------
+        x : (n, 3) positions of the nodes without contact [m]
+        starts : those at the start of the step, None if nothing needs them, and displacements without forces (n, 3)
+        applies : (n, w) bool, walls that can stop each
+        memory : (2, n, w) of walls with restitution, see :class:`~pfem_petsc.contact.explicit.Arrivals`, else (2, n, 0)
+        balance : of the step
+        """
+        contact, at, poses = self._contact, self.nodes, self._contact.motion.poses(balance.time)
+        free, (start, drift), none = x[at], starts, np.empty((0, len(contact.wall_of)))
+        walls = contact.walls_at(poses, balance.acting, 0.0)
+        reference, before = by_reference(walls), free if start is None else start[at]
+        ways = np.zeros((len(at), len(contact.wall_of), 3))
+        if start is not None:
+            ways = contact.ways(before, contact.motion.poses(contact.state.time), poses)
+        others = (walls.surfaces.radii == OTHER).any()
+        acting = contact.acting_from(before, free, poses, balance.acting) if others and balance.acting < 1.0 else None
+        of_nodes = np.empty(0), none[:, :0] > 0.0, applies[at], none > 0.0
+        given = Arrivals(free, before, ways, drift[at], *of_nodes, *memory[:, at], none[:, :, None], none)
+
+        def planes(place: np.ndarray, pushed: np.ndarray) -> Planes:
+            there = given
+            if others:
+                normals, offsets = contact.planes(applies[at], place[at], poses, acting)
+                there = given._replace(normals=normals, offsets=offsets)
+            return planes_of(place[at], pushed[at], there, reference)[0]
+
+        return WallsOfNodes(self._places, planes, (memory[0] > 0.0).any(axis=1) | self.curved)
 
 
 class ConstraintSet:
@@ -176,9 +167,12 @@ class ConstraintSet:
     rebounds : whether restitution is a bound on the next position, for schemes that solve for the next position
     two : TwoNodeRows
     alone : whether all rows of the model are over two nodes that no other row and no wall stops, with fixed directions
-    separate : whether moreover no ranks share rows, so that a pass over rows solves them, see :meth:`export_rows`
+    separate : whether all are over two nodes with fixed directions, stay, are stopped by no walls, and are on one rank
+        each, so that compiled steps solve them, see :meth:`export_rows`
     walled : whether walls can stop any node of the model's rows
     """
+
+    _KEPT = "force", "drag", "rebound", "arrival"
 
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], contact: Contact) -> None:
         self.source, self.contact, self.mesh = case.source, contact, contact.mesh
@@ -205,8 +199,8 @@ class ConstraintSet:
         self._turning = self.mesh.comm.allreduce(not rows.fixed.all(), op=MPI.LOR)
         self.walled = self._walls.everywhere
         self.alone = not self.walled and self.mesh.comm.allreduce(self.two.every, op=MPI.LAND)
-        own = rows.partners.alone and not self.dynamic
-        self.separate = self.alone and self.mesh.comm.allreduce(own, op=MPI.LAND)
+        own = rows.partners.alone and not self.dynamic and not self.walled and len(self.two.at) == len(rows.source)
+        self.separate = self.mesh.comm.allreduce(own, op=MPI.LAND)
         self._x = np.empty((len(rows.numbers), 3))
         self._exported: FixedRows | None = None  # for nodes of the stiffness
         self._exported_for = np.empty(0)
@@ -328,9 +322,7 @@ class ConstraintSet:
                 tied = held[:, :1] > 0.0
                 free, applies = np.where(tied, 0.0, free), applies & ~tied
                 x[:] = np.where(tied & (rows.free > 0.0), held[:, 1:], x)
-            step = _WallStep(balance.acting, balance.time, x, start, applies, drift, *memory)
-            varying = (memory[0] > 0.0).any(axis=1) if walls.rebounds else np.zeros(len(x), dtype=bool)
-            stopping = WallsOfNodes(partial(walls.planes, step), varying | walls.curved)
+            stopping = walls.stopping(x, (start, drift), applies, memory, balance)
         nodes = FreeNodes(x, rows.spread(stiffness, far[:, 3]), start, balance.acting < 1.0, free)
         moved = rows.along(rows.fixed_jacobian, x - start) if self.rebounds else np.empty(0)
         pull = rows.along(rows.fixed_jacobian, drift) - moved if self.rebounds else moved
@@ -363,48 +355,46 @@ class ConstraintSet:
             parts.append(lambda at: walls.held(at, balance.time))
         if walls.rebounds:
             parts.append(walls.memory)
+        none = np.empty((2, len(self._x), 0))
         if not parts:
-            return None, None, np.empty((0, 4)), np.empty((2, 0, 0))
+            return None, none[0], none[0], none
         table = self.rows.collect(lambda at: np.column_stack([part(at) for part in parts]))
         widths = np.cumsum([3 * starts, 3 * rebounds, 4 * walls.ties])
         start, drift, held, memory = np.split(table, widths, axis=1)
-        memory = np.stack(np.split(memory, 2, axis=1)) if walls.rebounds else np.empty((2, 0, 0))
-        return start, drift, held, memory
+        memory = np.stack(np.split(memory, 2, axis=1)) if walls.rebounds else none
+        return start if starts else None, drift, held, memory
 
     def _lift(self, pull: np.ndarray) -> np.ndarray | float:
         """Return by how much bounds of rows (r,) are above zero [m], with ``pull`` (r,) of forces [m], because they
         rebound."""
         if not self.rebounds or not self.rebound.any():
             return 0.0
-        ways = rebound_way(self.rows.restitution, self.rebound, self.arrival, pull)
-        return np.where(self.rebound > 0.0, np.maximum(ways - 0.5 * pull, 0.0), 0.0)
+        return rebound_lift(self.rows.restitution, self.rebound, self.arrival, pull)
 
     def push(self, load: np.ndarray, stiffness: np.ndarray, u: np.ndarray, contact: np.ndarray) -> None:
         """Correct increments by the forces of :meth:`explicit`, and add these to ``contact``, (owned, 3) both."""
         push_nodes(self.rows.where, load, self.rows.free, stiffness, u, contact)
 
-    def export_rows(self, stiffness: np.ndarray) -> FixedRows:
+    def export_rows(self, stiffness: np.ndarray, tolerance: float) -> FixedRows:
         """Return :attr:`separate` rows with their present forces for compiled steps; none if they are not.
 
         ``stiffness`` (owned,) is the force for a displacement of a node [N/m], the same array as long as its values
-        stay the same.
+        stay the same; ``tolerance`` : see :meth:`explicit`.
         """
         if self._exported is None or stiffness is not self._exported_for:
-            self._exported, self._exported_for = self.two.arrays(stiffness, self.separate), stiffness
+            two = self.two if self.separate else TwoNodeRows(RowSet([], self.mesh, self.contact.fixed))
+            self._exported, self._exported_for = two.arrays(stiffness, tolerance, len(self.names)), stiffness
         rows = self._exported
-        if self.separate:
-            rows.force[:], rows.closed[:], rows.drag[:] = self.force, self.two.record.closed, self.drag
-            if self.rows.rebounds:
-                rows.rebound[:], rows.arrival[:] = self.rebound, self.arrival
+        for name in self._KEPT if self.separate else ():
+            getattr(rows, name)[:] = getattr(self, name)
+        rows.closed[:] = self.two.record.closed[: len(rows.closed)]
         return rows
 
     def import_rows(self, rows: FixedRows) -> None:
         """Take the forces after the last of the steps from rows that were exported."""
-        if self.separate:
-            self.force, self.drag = rows.force.copy(), rows.drag.copy()
-            if self.rows.rebounds:
-                self.rebound, self.arrival = rows.rebound.copy(), rows.arrival.copy()
-            self.two.record.closed[:] = rows.closed
+        for name in self._KEPT if self.separate else ():
+            setattr(self, name, getattr(rows, name).copy())
+        self.two.record.closed[: len(rows.closed)] = rows.closed
 
     def pressed(self) -> np.ndarray:
         """Return the owned nodes (m,), ascending, on which rows press."""
@@ -559,7 +549,8 @@ class ConstraintSet:
             coefficients = np.tile(np.stack([contact.friction, contact.static_friction], axis=1), (len(every), 1, 1))
             slips = relative + fast * _sliding(v[:, None, :] - rates, normals, still)
         with agreed(self.mesh.comm):
-            system = rows.system(self.jacobian, values, nodes, Planes(place, normals, gaps, coefficients, slips))
+            planes = Planes(normals, gaps, coefficients, slips)
+            system = rows.system(self.jacobian, values, nodes, (place, planes))
             if rubs:
                 squares = np.maximum((rows.weights**2).sum(axis=1, keepdims=True), 1e-300)
                 along = np.einsum("rk,rki->ri", rows.weights, self.jacobian) / squares

@@ -15,9 +15,9 @@ from ..mechanics.compiled import NEEDED, inlined, kernel
 from ..mechanics.records import by_reference, record
 from ..mesh.ordering import NODE_BLOCK
 from ..tolerances import FIXED_POINT, PROJECTED, RANK
-from .friction import Rubbing, add_friction, jam
+from .friction import jam
 from .node_walls import TURN, NodeWalls, WallForces
-from .projection import project
+from .projection import INFEASIBLE, JAMMED, NodesAtPlanes, Planes, new_pressed, press
 from .rotations import across
 from .surfaces import OTHER, Surfaces, is_round, tangent
 from .tied import Ties
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from .walls.base import WallKeys
 
 
-INFEASIBLE, ADRIFT, JAMMED = range(1, 4)
-"""Why the place of a node is not found: no position satisfies its walls, the planes of round walls do not settle, or
-its friction has no solution."""
+ADRIFT = 3
+"""Why the place of a node is not found, beside the reasons of a problem at planes: those of round walls do not
+settle."""
 
 _CURVED_ROUNDS = 100  # projections of a step until tangent planes and positions agree
 _LEAST_PART, _LARGEST_PART = 0.02, 8.0  # of the way to the next position whose planes are tried
@@ -53,7 +53,7 @@ class PressedWalls(NamedTuple):
     room : (n,) int64, workspace
     wall_of : (w,) the wall of each slot
     way : (w, 3) displacements in the step [m] of walls that do not turn; pushed : how far nodes push them (w, 3) [m]
-    friction : (2, w) coefficients of dynamic and static friction; (2, 0) if all are zero
+    friction : (2, w) coefficients of dynamic and static friction
     restitution : (w,) coefficients, (0,) if all are zero
     rebound, arrival : (n, w) memory of the last step of nodes that hit walls; (0, w) without restitution
     """
@@ -78,6 +78,7 @@ class Arrivals(NamedTuple):
 
     Attributes
     ----------
+    free : (m, 3) positions at its end without walls [m]
     start : (m, 3) positions at its start [m]
     ways : (m, w, 3) how far walls carry their points from there [m]
     drift : (m, 3) how far they would move without forces [m]
@@ -90,6 +91,7 @@ class Arrivals(NamedTuple):
     normals, offsets : (m, w, 3), (m, w) tangent planes of walls of other shapes; (0, w, 3), (0, w) without such walls
     """
 
+    free: np.ndarray
     start: np.ndarray
     ways: np.ndarray
     drift: np.ndarray
@@ -171,295 +173,231 @@ def _list_penetrating(free, first, last, walls, returning, m):
 
 
 @inlined
-def _directions(free, walls, given):
-    """Return the directions (m, w, 3) of :meth:`~pfem_petsc.contact.node_walls.NodeWalls.acting` of nodes at (m, 3)."""
-    surfaces, ways, part, start = walls.surfaces, given.ways, walls.part, given.start
-    m, w = len(free), len(surfaces.radii)
-    directions = np.zeros((m, w, 3))
-    for j in range(m):
-        x, y, z = free[j, 0], free[j, 1], free[j, 2]
-        for k in range(w):
-            if not is_round(surfaces.radii[k]):
-                continue
-            bx, by, bz = start[j, 0] + ways[j, k, 0], start[j, 1] + ways[j, k, 1], start[j, 2] + ways[j, k, 2]
-            there = bx + part * (x - bx), by + part * (y - by), bz + part * (z - bz)
-            nx, ny, nz, _ = tangent(k, surfaces, there[0], there[1], there[2])
-            ex, ey, ez, _ = tangent(k, surfaces, x, y, z)
-            if nx * ex + ny * ey + nz * ez > TURN:
-                directions[j, k, 0], directions[j, k, 1], directions[j, k, 2] = nx, ny, nz
-    return directions
-
-
-class _Planes(NamedTuple):
-    """Tangent planes at nodes (m,): see :class:`~pfem_petsc.contact.friction.Rubbing`; ``directions`` (m, w, 3) in
-    which round walls push, zero for normals, (0, w, 3) for none; ``pull`` (m, w) by forces, towards the walls [m]."""
-
-    normals: np.ndarray
-    offsets: np.ndarray
-    directions: np.ndarray
-    pull: np.ndarray
+def _read(walls):
+    """Return the fields of :class:`PressedWalls` as a tuple: loops that read those of a record are slower."""
+    at = walls.surfaces
+    surfaces = Surfaces(at.normals, at.offsets, at.centres, at.axes, at.radii)
+    sets = walls.all_nodes, walls.members, walls.tolerance, walls.room, walls.wall_of, walls.way, walls.pushed
+    return PressedWalls(surfaces, walls.part, *sets, walls.friction, walls.restitution, walls.rebound, walls.arrival)
 
 
 @inlined
-def _set_planes(j, at, free, walls, given, planes):
-    """Set the planes of the j-th node at positions ``at`` (m, 3); it is ``free`` (m, 3) to move there."""
-    surfaces, restitution, rebound, arrival = walls.surfaces, walls.restitution, given.rebound, given.arrival
-    normals, offsets, directions, pull = planes
-    start, drift, every = given.start, given.drift, surfaces.normals
-    x, y, z = at[j, 0], at[j, 1], at[j, 2]
-    for k in range(offsets.shape[1]):
-        radius = surfaces.radii[k]
-        if radius == 0.0:
-            nx, ny, nz, offset = every[k, 0], every[k, 1], every[k, 2], surfaces.offsets[k]
-        elif radius == OTHER:
-            nx, ny, nz = given.normals[j, k, 0], given.normals[j, k, 1], given.normals[j, k, 2]
-            offset = given.offsets[j, k]
-        else:
-            nx, ny, nz, gap = tangent(k, surfaces, x, y, z)
-            if len(directions) > 0:
-                dx, dy, dz = directions[j, k, 0], directions[j, k, 1], directions[j, k, 2]
-                if dx != 0.0 or dy != 0.0 or dz != 0.0:
-                    nx, ny, nz = dx, dy, dz
-            offset = nx * x + ny * y + nz * z - gap
-        normals[j, k, 0], normals[j, k, 1], normals[j, k, 2] = nx, ny, nz
-        offsets[j, k] = offset if given.applies[j, k] else -math.inf
-        if len(restitution) > 0:
-            q = 0.0
-            for c in range(3):
-                q -= normals[j, k, c] * (free[j, c] - start[j, c] - drift[j, c])
-            pull[j, k] = q
-            if rebound[j, k] > 0.0:
-                whole = max(rebound[j, k] + q * arrival[j, k] + 0.25 * q * q, 0.0)
-                offsets[j, k] += max(restitution[k] * math.sqrt(whole) - 0.5 * q, 0.0)
-
-
-@inlined
-def _meets_round(j, x, strengths, walls, given):
-    """Return whether a round wall pushes the j-th node to its position (m, 3), or would stop it there."""
-    surfaces, bounces = walls.surfaces, len(walls.restitution) > 0
-    for k in range(strengths.shape[1]):
-        if is_round(surfaces.radii[k]) and given.applies[j, k]:
-            _, _, _, gap = tangent(k, surfaces, x[j, 0], x[j, 1], x[j, 2])
-            if strengths[j, k] > 0.0 or gap < 0.0 or (bounces and given.rebound[j, k] > 0.0):
-                return True
-    return False
-
-
-@inlined
-def _settle_on_round(j, x, free, strengths, walls, given, planes):
-    """Move the j-th node, projected to x (m, 3), until tangent planes and positions agree; return ``INFEASIBLE``,
-    ``ADRIFT``, or 0."""
-    at = np.empty(3)
-    for c in range(3):
-        at[c] = free[j, c]
-    fixed, normals, offsets = given.fixed[j : j + 1], planes.normals[j : j + 1], planes.offsets[j : j + 1]
-    for _ in range(_CURVED_ROUNDS):
-        change = 0.0
-        for c in range(3):
-            change = max(change, abs(x[j, c] - at[c]))
-            at[c] = x[j, c]
-        if change <= walls.tolerance or not _meets_round(j, x, strengths, walls, given):
-            return 0
-        _set_planes(j, x, free, walls, given, planes)
-        for c in range(3):
-            x[j, c] = free[j, c]
-        if project(x[j : j + 1], fixed, normals, offsets, walls.tolerance, strengths[j : j + 1]) >= 0:
-            return INFEASIBLE
-    return ADRIFT
-
-
-@inlined
-def _rub_on_round(j, x, free, drag, strengths, walls, given, planes):
-    """Repeat the friction of the j-th node, at x (m, 3), with the planes of other positions until it stays at the
-    position of its planes; return whether it was found. Positions are those of Aitken's relaxation: in large steps, the
-    positions of friction alone alternate or creep."""
-    normals, offsets, stiffness = planes.normals[j : j + 1], planes.offsets[j : j + 1], given.stiffness[j : j + 1]
-    rough = walls.friction[0], walls.friction[1]
-    before, ways, fixed = given.start[j : j + 1], given.ways[j : j + 1], given.fixed[j : j + 1]
-    rubbing = Rubbing(before, ways, fixed, normals, offsets, *rough, stiffness)
-    at, last, part, near = np.empty(3), np.zeros(3), 1.0, False
-    earlier, distances = np.empty((offsets.shape[1], 3)), np.empty(offsets.shape[1])
-    for c in range(3):
-        at[c] = x[j, c]
-    for _ in range(_CURVED_ROUNDS):
-        if not _meets_round(j, x, strengths, walls, given):
-            return True
-        for k in range(len(distances)):
-            distances[k] = offsets[0, k]
-            for c in range(3):
-                earlier[k, c] = normals[0, k, c]
-        _set_planes(j, x, free, walls, given, planes)
-        turn, apart = 0.0, 0.0
-        for k in range(len(distances)):
-            for c in range(3):
-                turn = max(turn, abs(normals[0, k, c] - earlier[k, c]))
-            if distances[k] > -math.inf:
-                apart = max(apart, abs(offsets[0, k] - distances[k]))
-        if turn <= 1e-14 and apart <= walls.tolerance:
-            return True
-        along = square = largest = 0.0
-        for c in range(3):
-            change = x[j, c] - at[c] - last[c]
-            along -= last[c] * change
-            square += change * change
-            last[c] += change
-            largest = max(largest, abs(last[c]))
-        if largest > 0.0 and largest <= walls.tolerance:
-            if near:  # the rest is rounding
-                return True
-            near = True
-        if along > 0.0:
-            part = min(max(part * along / square, _LEAST_PART), _LARGEST_PART)
-        elif along < 0.0:
-            part = 0.5
-        for c in range(3):
-            at[c] += part * last[c]
-            x[j, c] = at[c]
-        _set_planes(j, x, free, walls, given, planes)
-        for c in range(3):
-            x[j, c] = free[j, c]
-        project(x[j : j + 1], rubbing.fixed, normals, offsets, walls.tolerance, strengths[j : j + 1])
-        for k in range(len(distances)):
-            strengths[j, k] *= stiffness[0]
-        if add_friction(rubbing, x[j : j + 1], strengths[j : j + 1], drag[j : j + 1]) >= 0:
-            return False
-    return False
-
-
-def kind_of(walls: PressedWalls) -> tuple[Any, Any, Any]:
-    """Return whether any walls are curved, whether any are rough, and whether there are several: ``NEEDED`` or None."""
-    radii = walls.surfaces.radii
-    return tuple(
-        NEEDED if kind else None for kind in (is_round(radii).any(), walls.friction.shape[1] > 0, len(radii) > 1)
-    )
-
-
-@kernel
-def press_nodes(places, given, walls, sums, curved, rough, several):
-    """Project nodes at ``places`` (m, 3) [m], in place, onto :class:`PressedWalls`, with friction and restitution,
-    and add the forces of the walls to ``sums``, see :class:`WallSums`; ``given``: :class:`Arrivals`;
-    ``curved``, ``rough``, ``several``: see :func:`kind_of`.
-
-    Each node is solved for by itself: its bits do not depend on the others. Returns the index of the first node
-    without a place, or -1, and why; the planes at the nodes, with offset -inf where a wall does not apply; the
-    total force (m, 3) [N]; walls that they touch (m, w); and the energy that friction dissipates [J].
-    """
-    wall_of, pushed, tolerance, restitution = walls.wall_of, walls.pushed, walls.tolerance, walls.restitution
-    force, contacts, moment = sums.force, sums.contacts, sums.moment
-    start, ways, stiffness, fixed = given.start, given.ways, given.stiffness, given.fixed
-    m, w = given.applies.shape
-    bounces = len(restitution) > 0
-    free = places.copy()
-    directions = np.empty((0, w, 3))
-    if curved is not None:  # noqa: SIM102 - what is not needed is not compiled
-        if walls.part < 1.0:
-            directions = _directions(free, walls, given)
-    planes = _Planes(np.empty((m, w, 3)), np.empty((m, w)), directions, np.empty((m if bounces else 0, w)))
-    normals, pull = planes.normals, planes.pull
-    for j in range(m):
-        _set_planes(j, free, free, walls, given, planes)
-    strengths = np.zeros((m, w))
-    failed, why = project(places, fixed, normals, planes.offsets, tolerance, strengths, several), 0
-    if failed >= 0:
-        why = INFEASIBLE
-    if curved is not None:
-        for j in range(m):
-            wrong = _settle_on_round(j, places, free, strengths, walls, given, planes)
-            if wrong > 0 and (failed < 0 or wrong < why or (wrong == why and j < failed)):
-                failed, why = j, wrong
-    smooth, stopped = np.empty((m if bounces else 0, 3)), np.empty((m if bounces else 0, w), dtype=np.bool_)
-    for j in range(len(stopped)):
-        for c in range(3):
-            smooth[j, c] = places[j, c]
-        for k in range(w):
-            stopped[j, k] = strengths[j, k] > 0.0
-    for j in range(m):
-        for k in range(w):
-            strengths[j, k] *= stiffness[j]
-    drag = np.zeros((m, w, 3))
-    if rough is not None:
-        rubbing = Rubbing(start, ways, fixed, normals, planes.offsets, walls.friction[0], walls.friction[1], stiffness)
-        unsettled = add_friction(rubbing, places, strengths, drag)
-        if curved is not None:
-            for j in range(m if failed < 0 else 0):
-                if not _rub_on_round(j, places, free, drag, strengths, walls, given, planes):
-                    unsettled = min(unsettled, j) if unsettled >= 0 else j
-        if unsettled >= 0 and failed < 0:
-            failed, why = unsettled, JAMMED
-    for j in range(m if bounces else 0):
-        for k in range(w):
-            fresh = stopped[j, k] and not given.touching[j, k] and restitution[k] > 0.0
-            approach = arrived = 0.0
-            for c in range(3):
-                approach -= normals[j, k, c] * (free[j, c] - start[j, c] - (ways[j, k, c] - pushed[k, c]))
-                arrived -= normals[j, k, c] * (smooth[j, c] - start[j, c] - ways[j, k, c])
-            square = max(approach * approach - pull[j, k] * (approach - arrived), 0.0)
-            given.rebound[j, k] = square if fresh and approach > 0.0 else 0.0
-            given.arrival[j, k] = arrived if fresh else 0.0
-    total = np.zeros((m, 3))
-    touching = np.zeros((m, w), dtype=np.bool_)
-    dissipated = 0.0
-    arm = np.empty(3)
-    for j in range(m):
-        for c in range(3):  # where the forces of the balance act
-            arm[c] = start[j, c] + walls.part * (places[j, c] - start[j, c])
-        x, y, z = arm
-        for k in range(w):
-            strength = strengths[j, k]
-            if strength == 0.0:
-                continue
-            fx, fy, fz = strength * normals[j, k, 0], strength * normals[j, k, 1], strength * normals[j, k, 2]
-            if rough is not None:
-                fx += drag[j, k, 0]
-                fy += drag[j, k, 1]
-                fz += drag[j, k, 2]
-                for c in range(3):
-                    dissipated -= drag[j, k, c] * (places[j, c] - start[j, c] - ways[j, k, c])
-            total[j, 0] += fx
-            total[j, 1] += fy
-            total[j, 2] += fz
-            wall = wall_of[k]
-            force[wall, 0] += fx
-            force[wall, 1] += fy
-            force[wall, 2] += fz
-            moment[wall, 0] += y * fz - z * fy
-            moment[wall, 1] += z * fx - x * fz
-            moment[wall, 2] += x * fy - y * fx
-            touching[j, k] = True
-            contacts[wall] += 1
-            for earlier in range(k):  # a node in several slots of a wall counts once
-                if wall_of[earlier] == wall and touching[j, earlier]:
-                    contacts[wall] -= 1
-                    break
-    return failed, why, planes, total, touching, dissipated
-
-
-def impact_square(approach: np.ndarray, arrival: np.ndarray, pull: np.ndarray) -> np.ndarray:
+def impact_square(approach: Any, arrival: Any, pull: Any) -> Any:
     """Return the part of I^2 [m2] that is known in the step of the impact, zero for nodes that do not approach.
 
     Parameters
     ----------
-    approach : a, displacement towards the wall without contact [m]
+    approach : a, displacement towards the wall without contact [m]; a number or an array, like the others
     arrival : d, distance to the wall [m]
     pull : p, contribution of forces to the approach [m]
     """
-    square = approach * approach - pull * (approach - arrival)
-    return np.where(approach > 0.0, np.maximum(square, 0.0), 0.0)
+    return (approach > 0.0) * np.maximum(approach * approach - pull * (approach - arrival), 0.0)
 
 
-def rebound_way(
-    restitution: np.ndarray | float, square: np.ndarray, arrival: np.ndarray, pull: np.ndarray
-) -> np.ndarray:
+@inlined
+def rebound_way(restitution: Any, square: Any, arrival: Any, pull: Any) -> Any:
     """Return w + q/2, the rebound velocity times the step [m]; 0 where ``square`` is 0.
 
     Parameters
     ----------
-    restitution : e
+    restitution : e; a number or an array, like the others
     square, arrival : of the step of the impact, see :func:`impact_square`
     pull : q, towards the wall, by the forces at the position of impact [m]
     """
-    whole = np.maximum(square + pull * arrival + 0.25 * pull * pull, 0.0)
-    return np.where(square > 0.0, restitution * np.sqrt(whole), 0.0)
+    return (square > 0.0) * restitution * np.sqrt(np.maximum(square + pull * arrival + 0.25 * pull * pull, 0.0))
+
+
+@inlined
+def rebound_lift(restitution: Any, square: Any, arrival: Any, pull: Any) -> Any:
+    """Return w [m], by which a node is off the wall after the step that follows the impact; see :func:`rebound_way`."""
+    return (square > 0.0) * np.maximum(rebound_way(restitution, square, arrival, pull) - 0.5 * pull, 0.0)
+
+
+@inlined
+def _acting(j, k, normal, walls, given):
+    """Return the direction in which a round wall pushes the j-th node, see
+    :meth:`~pfem_petsc.contact.node_walls.NodeWalls.acting`; ``normal`` is the one where it ends."""
+    surfaces, part, start, ways, free = walls.surfaces, walls.part, given.start, given.ways, given.free
+    bx, by, bz = start[j, 0] + ways[j, k, 0], start[j, 1] + ways[j, k, 1], start[j, 2] + ways[j, k, 2]
+    there = bx + part * (free[j, 0] - bx), by + part * (free[j, 1] - by), bz + part * (free[j, 2] - bz)
+    nx, ny, nz, _ = tangent(k, surfaces, there[0], there[1], there[2])
+    ex, ey, ez, _ = tangent(k, surfaces, free[j, 0], free[j, 1], free[j, 2])
+    return (nx, ny, nz) if part < 1.0 and nx * ex + ny * ey + nz * ez > TURN else normal
+
+
+@inlined
+def _set_planes(j, at, pushed, walls, given, planes, pulls):
+    """Set the planes of the j-th node at positions ``at`` (m, 3), and the ``pulls`` (m, w) of forces towards walls with
+    restitution [m], by which it would move to ``pushed`` (m, 3) without walls."""
+    surfaces, restitution, start, free = walls.surfaces, walls.restitution, given.start, given.free
+    x, y, z = at[j, 0], at[j, 1], at[j, 2]
+    for k in range(planes.gaps.shape[1]):
+        if surfaces.radii[k] == OTHER:
+            n, gap = (given.normals[j, k, 0], given.normals[j, k, 1], given.normals[j, k, 2]), -given.offsets[j, k]
+            gap += n[0] * x + n[1] * y + n[2] * z
+        else:
+            nx, ny, nz, gap = tangent(k, surfaces, x, y, z)
+            n = (nx, ny, nz)
+            if surfaces.radii[k] != 0.0:
+                n = _acting(j, k, n, walls, given)
+        gap += n[0] * (free[j, 0] - x) + n[1] * (free[j, 1] - y) + n[2] * (free[j, 2] - z)
+        planes.normals[j, k, 0], planes.normals[j, k, 1], planes.normals[j, k, 2] = n
+        if len(restitution) > 0:
+            pull = 0.0
+            for c in range(3):
+                pull -= planes.normals[j, k, c] * (pushed[j, c] - start[j, c] - given.drift[j, c])
+            pulls[j, k] = pull
+            gap -= rebound_lift(restitution[k], given.rebound[j, k], given.arrival[j, k], pull)
+        planes.gaps[j, k] = gap if given.applies[j, k] else math.inf
+        if len(planes.friction) > 0:
+            planes.friction[j, k, 0], planes.friction[j, k, 1] = walls.friction[0, k], walls.friction[1, k]
+            for c in range(3):
+                planes.slips[j, k, c] = free[j, c] - start[j, c] - given.ways[j, k, c]
+
+
+@inlined
+def _meets_round(j, found, walls, given):
+    """Return whether a round wall pushes the j-th node to its position, or would stop it there."""
+    surfaces, bounces = walls.surfaces, len(walls.restitution) > 0
+    for k in range(found.normal.shape[1]):
+        if is_round(surfaces.radii[k]) and given.applies[j, k]:
+            _, _, _, gap = tangent(k, surfaces, found.x[j, 0], found.x[j, 1], found.x[j, 2])
+            if found.normal[j, k] > 0.0 or gap < 0.0 or (bounces and given.rebound[j, k] > 0.0):
+                return True
+    return False
+
+
+@inlined
+def _settle(j, at, nodes, found, walls, given, pulls):
+    """Press the j-th of :class:`NodesAtPlanes` again, whose planes were those at ``at`` (3,), until planes of round
+    walls and position agree. Returns why it has no place, or 0.
+
+    With friction, the positions of planes are those of Aitken's relaxation: in large steps, those of friction alone
+    alternate or creep.
+    """
+    x, last, part, rubs = found.x[j], np.zeros(3), 1.0, len(nodes.planes.friction) > 0
+    for _ in range(_CURVED_ROUNDS):
+        if not _meets_round(j, found, walls, given):
+            return 0
+        along = square = largest = 0.0
+        for c in range(3):
+            change = x[c] - at[c] - last[c]
+            along -= last[c] * change
+            square += change * change
+            last[c] += change
+            largest = max(largest, abs(last[c]))
+        if largest <= walls.tolerance:
+            return 0
+        if rubs and along != 0.0:
+            part = min(max(part * along / square, _LEAST_PART), _LARGEST_PART) if along > 0.0 else 0.5
+        for c in range(3):
+            at[c] += part * last[c]
+            x[c] = at[c]
+        _set_planes(j, found.x, given.free, walls, given, nodes.planes, pulls)
+        _, why = press((j, j + 1), nodes, walls.tolerance, found, NEEDED)
+        if why > 0:
+            return why
+    return JAMMED if rubs else ADRIFT
+
+
+@kernel
+def _press_all(nodes, found, walls, given, pulls, curved, several):
+    """Press :class:`NodesAtPlanes` whose planes are those where they are in ``found``; return the first without a
+    place, or -1, and why."""
+    at = found.x.copy()
+    failed, why = press((0, len(at)), nodes, walls.tolerance, found, several)
+    if curved is not None:
+        for j in range(len(at)):
+            wrong = why if j == failed else _settle(j, at[j], nodes, found, walls, given, pulls)
+            if wrong > 0 and (failed < 0 or j < failed):
+                failed, why = j, wrong
+    return failed, why
+
+
+@inlined
+def _remember(found, planes, pulls, walls, given):
+    """Set the memory of nodes at walls with restitution that they now hit."""
+    for j in range(len(found.x)):
+        for k in range(len(walls.restitution)):
+            fresh = found.normal[j, k] > 0.0 and not given.touching[j, k] and walls.restitution[k] > 0.0
+            approach = arrived = 0.0
+            for c in range(3):
+                way = given.start[j, c] + given.ways[j, k, c]
+                approach -= planes.normals[j, k, c] * (given.free[j, c] - way + walls.pushed[k, c])
+                arrived -= planes.normals[j, k, c] * (found.x[j, c] - way)
+            given.rebound[j, k] = impact_square(approach, arrived, pulls[j, k]) if fresh else 0.0
+            given.arrival[j, k] = arrived if fresh else 0.0
+
+
+@kernel
+def planes_of(at, pushed, given, walls):
+    """Return the :class:`~pfem_petsc.contact.projection.Planes` at positions ``at`` (m, 3) of nodes that would move to
+    ``pushed`` (m, 3) without walls, and the pulls (m, w) [m] of forces towards walls with restitution; ``given``:
+    :class:`Arrivals`, ``walls``: :class:`PressedWalls`."""
+    (m, w), n, read = given.applies.shape, 0, _read(walls)
+    for k in range(w):
+        n = m if read.friction[1, k] > 0.0 else n
+    planes = Planes(np.empty((m, w, 3)), np.empty((m, w)), np.empty((n, w, 2)), np.empty((n, w, 3)))
+    pulls = np.empty((m, w))
+    for j in range(m):
+        _set_planes(j, at, pushed, read, given, planes, pulls)
+    return planes, pulls
+
+
+def kind_of(walls: PressedWalls) -> tuple[Any, Any, Any]:
+    """Return whether any walls are curved, whether any are rough, and whether these or several are: ``NEEDED`` or
+    None."""
+    curved, rough = is_round(walls.surfaces.radii).any(), walls.friction.any()
+    return tuple(NEEDED if kind else None for kind in (curved, rough, rough or walls.friction.shape[1] > 1))
+
+
+@kernel
+def press_nodes(given, walls, sums, curved, rough, several):
+    """Project nodes onto :class:`PressedWalls`, with friction and restitution, and add the forces of the walls to
+    ``sums``, see :class:`WallSums`; ``given``: :class:`Arrivals`; ``curved``, ``rough``, ``several``: see
+    :func:`kind_of`.
+
+    Each node is solved for by itself: its bits do not depend on the others. Returns the index of the first node
+    without a place, or -1, and why; the planes at the nodes; their positions and forces, see
+    :class:`~pfem_petsc.contact.projection.Pressed`; the total force (m, 3) [N]; walls that they touch (m, w); and the
+    energy that friction dissipates [J].
+    """
+    (m, w), start, ways, wall_of = given.applies.shape, given.start, given.ways, walls.wall_of
+    planes, pulls = planes_of(given.free, given.free, given, walls)
+    normals, found, of_nodes = planes.normals, new_pressed(m, w), (given.free, given.fixed, given.stiffness)
+    found.x[:] = given.free
+    without = Planes(normals, planes.gaps, np.empty((0, w, 2)), np.empty((0, w, 3)))
+    failed, why = -1, 0
+    if rough is None or curved is not None or len(walls.restitution) > 0:
+        failed, why = _press_all(NodesAtPlanes(*of_nodes, without), found, walls, given, pulls, curved, several)
+        _remember(found, planes, pulls, walls, given)
+    if rough is not None:  # noqa: SIM102 - what is not needed is not compiled
+        if failed < 0:
+            failed, why = _press_all(NodesAtPlanes(*of_nodes, planes), found, walls, given, pulls, curved, several)
+    total, touching, arm, dissipated = np.zeros((m, 3)), np.zeros((m, w), dtype=np.bool_), np.empty(3), 0.0
+    drag = found.drag
+    for j in range(m):
+        for c in range(3):  # where the forces of the balance act
+            arm[c] = start[j, c] + walls.part * (found.x[j, c] - start[j, c])
+        for k in range(w):
+            strength, wall = found.normal[j, k], wall_of[k]
+            if strength == 0.0:
+                continue
+            touching[j, k] = True
+            sums.contacts[wall] += 1
+            for earlier in range(k):  # a node in several slots of a wall counts once
+                if wall_of[earlier] == wall and touching[j, earlier]:
+                    sums.contacts[wall] -= 1
+                    break
+            for c in range(3):
+                force = strength * normals[j, k, c] + drag[j, k, c]
+                dissipated -= drag[j, k, c] * (found.x[j, c] - start[j, c] - ways[j, k, c])
+                total[j, c] += force
+                sums.force[wall, c] += force
+                one, other = (c + 1) % 3, (c + 2) % 3
+                sums.moment[wall, one] += arm[other] * force
+                sums.moment[wall, other] -= arm[one] * force
+    return failed, why, planes, found, total, touching, dissipated
 
 
 class ExplicitContact(NodeWalls):
@@ -524,11 +462,11 @@ class ExplicitContact(NodeWalls):
         u[nodes] += correction
         return nodes, force, walls
 
-    def placeless(self, node: int, why: int, normals: np.ndarray, offsets: np.ndarray) -> str:
-        """Return the message about an owned node whose place :func:`press_nodes` did not find; its planes (w, 3),
-        (w,)."""
+    def placeless(self, node: int, why: int, normals: np.ndarray, gaps: np.ndarray) -> str:
+        """Return the message about an owned node whose place :func:`press_nodes` did not find; its planes, normals
+        (w, 3) and gaps (w,)."""
         if why == INFEASIBLE:
-            return self.infeasible_message(node, offsets)
+            return self.infeasible_message(node, -gaps)
         if why == JAMMED:
             return self.unsettled_friction(node, normals)
         return (
@@ -544,10 +482,14 @@ class ExplicitContact(NodeWalls):
             f"the friction of node {self.mesh.node_ids[node]} on its walls did not converge; reduce time.step"
         )
 
+    def walls_at(self, poses: Poses, part: float, tolerance: float) -> PressedWalls:
+        """Return the walls at the end of a step that is not compiled."""
+        return self.pressed_walls(self.surfaces.at(poses.shifts[self.wall_of]), part, tolerance, self._unmoved)
+
     def pressed_walls(self, surfaces: Surfaces, part: float, tolerance: float, way: np.ndarray) -> PressedWalls:
         """Return walls for compiled passes, see :class:`PressedWalls`."""
         members = self.members
-        friction = np.array([self.friction, self.static_friction]) if self.has_friction else np.empty((2, 0))
+        friction = np.array([self.friction, self.static_friction])
         memory = 2 * [np.empty((0, len(self.wall_of)))]
         if self.rebounds:
             memory = [self.state.memory.setdefault(name, np.zeros(members.shape)) for name in ("rebound", "arrival")]
@@ -582,13 +524,14 @@ class ExplicitContact(NodeWalls):
         if not found:
             raise SimulationFailure(self.unsettled_message())
 
-    def _set_rebounds(self, memory: list[np.ndarray], planes: Any, relative: np.ndarray) -> None:
-        """Set the memory (m, slots) of nodes that hit walls with inertia; ``relative`` (m, slots, 3): their ways beside
-        those of the walls without contact [m]."""
-        bodies, (rebound, arrival) = self.motion.bodies, memory
+    def _set_rebounds(self, given: Arrivals, normals: np.ndarray, unpushed: np.ndarray) -> None:
+        """Set the memory of nodes that hit walls with inertia, at planes with normals (m, slots, 3); ``unpushed``
+        (m, slots, 3): the ways of the walls without contact [m]."""
+        bodies, rebound, arrival, way = self.motion.bodies, given.rebound, given.arrival, given.free - given.start
         fresh = np.isin(self.wall_of, bodies.at[bodies.turners]) & ((arrival != 0.0) | (rebound > 0.0))
-        approach = -np.einsum("mwi,mwi->mw", planes.normals, relative)
-        np.copyto(rebound, impact_square(approach, arrival, planes.pull), where=fresh)
+        approach = -np.einsum("mwi,mwi->mw", normals, way[:, None, :] - unpushed)
+        pull = -np.einsum("mwi,mi->mw", normals, way - given.drift)
+        np.copyto(rebound, impact_square(approach, arrival, pull), where=fresh)
 
     def unsettled_message(self) -> str:
         """Return the message about walls with mass for which no position balances the forces on them."""
@@ -690,7 +633,7 @@ class ExplicitContact(NodeWalls):
         """Return nodes (m,) near walls that are not tied to them, positions (m, 3), forces (m, 3), and the sums per
         wall."""
         poses = self.motion.poses(time)
-        walls = self.pressed_walls(self.surfaces.at(poses.shifts[self.wall_of]), self._part, tolerance, self._unmoved)
+        walls = self.walls_at(poses, self._part, tolerance)
         self.forget_faces()
         marked = np.full(len(x) // NODE_BLOCK + 1, len(walls.restitution) > 0)
         nodes = walls.room[: find_penetrating(np.ascontiguousarray(x.T), by_reference(walls), marked)].copy()
@@ -724,7 +667,7 @@ class ExplicitContact(NodeWalls):
         """
         found, suspects = some
         self._part, poses = balance.acting, self.motion.poses(balance.time)
-        walls = self.pressed_walls(self.surfaces.at(poses.shifts[self.wall_of]), self._part, tolerance, self._unmoved)
+        walls = self.walls_at(poses, self._part, tolerance)
         self.forget_faces()
         nodes = np.union1d(found, suspects[self.near(x[suspects], poses, nodes=suspects)])
         return self._press_some(nodes, x[nodes], stiffness[nodes], poses, walls)
@@ -758,9 +701,10 @@ class ExplicitContact(NodeWalls):
             memory = [
                 array[nodes] if bounces else np.empty((len(nodes), 0)) for array in (walls.rebound, walls.arrival)
             ]
-            sums, places = WallSums(*(getattr(self.nothing, name).copy() for name in WallForces.sums)), free.copy()
-            given = Arrivals(start, ways, drift, *of_nodes, *memory, *planes)
-            failed, why, found, force, touching, friction = press_nodes(places, given, reference, sums, *kind_of(walls))
+            sums = WallSums(*(getattr(self.nothing, name).copy() for name in WallForces.sums))
+            given = Arrivals(free, start, ways, drift, *of_nodes, *memory, *planes)
+            pressed = press_nodes(given, reference, sums, *kind_of(walls))
+            failed, why, found, (places, *_), force, touching, friction = pressed
             settled = failed >= 0 or not others or np.abs(places - at).max() <= tolerance
             if settled and not self.find_faces(nodes, places, poses, tolerance):
                 break
@@ -769,10 +713,10 @@ class ExplicitContact(NodeWalls):
             failed, why = int(np.argmax(np.abs(places - at).max(axis=1))), ADRIFT
         if failed >= 0:
             free[:] = places
-            raise SimulationFailure(self.placeless(nodes[failed], why, found.normals[failed], found.offsets[failed]))
+            raise SimulationFailure(self.placeless(nodes[failed], why, found.normals[failed], found.gaps[failed]))
         if bounces and booked:
             if len(self.motion.bodies.turners):
                 unpushed = self.ways(start, before, self.motion.poses_without_contact(poses.time))
-                self._set_rebounds(memory, found, (free - start)[:, None, :] - unpushed)
+                self._set_rebounds(given, found.normals, unpushed)
             walls.rebound[nodes], walls.arrival[nodes] = memory
         return nodes, places, force, WallForces(*sums, nodes, touching, places, friction)

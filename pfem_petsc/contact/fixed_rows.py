@@ -2,56 +2,61 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from ..mechanics.compiled import inlined, kernel
 from ..mechanics.records import record
-from ..tolerances import FREE_PART
-from .rows import RowSet
-from .sweeps import Pushes, RubbingRows, settle_friction
+from .explicit import impact_square, rebound_lift
+from .projection import Groups, RowPushes, System, project_groups
+from .rows import FreeNodes, RowSet, find_broken, pair_values
 
 
 @record
 class FixedRows(NamedTuple):
-    """Rows over two nodes with fixed directions, n . (x_2 - x_1) >= least (p rows), in the order of the row set.
+    """Rows over two nodes with fixed directions, n . (x_2 - x_1) >= least (p rows), in the order of the row set, and
+    their nodes (n,), which are all on this rank.
 
     Attributes
     ----------
-    table_starts : (tables + 1,) the first row of each table
-    nodes, of : (2 p,) all nodes, ascending; their rows
-    where : (2, p) local indices of the nodes, else -1 minus the row among those of other ranks
+    nodes, order : (n,) local indices of the nodes, and these in ascending order
+    source, ends : (p,) table of each row; (2, p) its nodes
     normals, least : (p, 3) unit directions; (p,) bounds [m]
-    soft : (p,) displacement by which a unit force separates the nodes [m/N], zero if supports hold both
-    free : (2, p, 3) 0.0 where supports prescribe a component
     along : (2, p) squared lengths of the free parts of the directions
-    totals : (tables, 3) room for the forces on the second nodes of each table [N]
-    force, closed : (p,) forces [N]; bool, rows that have closed and not opened since; both are overwritten
-    restitution : (p,) coefficients; friction : (p, 2) of dynamic and static friction, (0, 2) without
-    drag : (p, 3) friction forces on the second nodes [N]
-    rebound, arrival : (p,) memory of rows that have closed, see :class:`~pfem_petsc.contact.explicit.Arrivals`; (0,)
-        without restitution
+    force, drag : (p,) forces and (p, 3) friction forces on the second nodes [N]; overwritten, like all that follow
+    closed : (p,) bool, rows that have closed and not opened since
+    restitution : (p,) coefficients
+    rebound, arrival : (p,) memory of rows that have closed, see :class:`~pfem_petsc.contact.explicit.Arrivals`
+    totals : (tables, 3) forces on the second nodes of each table [N]
+    groups, system : see :mod:`~pfem_petsc.contact.projection`, the latter at ``x``
+    tolerance : a row among several that is violated by at most this counts as satisfied [m]
+    start, x, pushed : (n, 3) positions at the start of a step and without rows at its end, displacements by forces [m]
+    moves, load : (n, 3) displacements [m] and forces [N] by rows
     """
 
-    table_starts: np.ndarray
     nodes: np.ndarray
-    of: np.ndarray
-    where: np.ndarray
+    order: np.ndarray
+    source: np.ndarray
+    ends: np.ndarray
     normals: np.ndarray
     least: np.ndarray
-    soft: np.ndarray
-    free: np.ndarray
     along: np.ndarray
-    totals: np.ndarray
     force: np.ndarray
+    drag: np.ndarray
     closed: np.ndarray
     restitution: np.ndarray
-    friction: np.ndarray
-    drag: np.ndarray
     rebound: np.ndarray
     arrival: np.ndarray
+    totals: np.ndarray
+    groups: Groups
+    system: System
+    tolerance: float
+    start: np.ndarray
+    x: np.ndarray
+    pushed: np.ndarray
+    moves: np.ndarray
+    load: np.ndarray
 
 
 class ClosingRows(NamedTuple):
@@ -98,34 +103,20 @@ class TwoNodeRows:
         changing = np.zeros(p), np.zeros(p, dtype=bool)
         self.record = ClosingRows(self.normals, self.least, self.along, *changing, rows.restitution[self.at])
 
-    def arrays(self, stiffness: np.ndarray, some: bool) -> FixedRows:
-        """Return the rows, or none unless ``some``, for compiled steps, without forces.
+    def arrays(self, stiffness: np.ndarray, tolerance: float, tables: int) -> FixedRows:
+        """Return the rows for compiled steps, without forces, which are all of the set.
 
-        ``stiffness`` (owned,) is the force for a displacement of a node [N/m]; both nodes of all rows must be on this
-        rank.
+        ``stiffness`` (owned,) is the force for a displacement of a node [N/m]; all nodes must be on this rank.
+        ``tolerance`` : see :class:`FixedRows`; ``tables`` : number of tables of the case
         """
-        p = len(self.at) if some else 0
-        where, along, tables = self.nodes[:, :p].copy(), self.along[:, :p].copy(), len(self.rows.sources)
-        order = np.argsort(where.ravel(), kind="stable")
-        soft = 1.0 / stiffness[where] * along if p else along
+        rows, p, vectors = self.rows, len(self.at), np.zeros((6, len(self.rows.numbers), 3))
+        nodes = FreeNodes(vectors[0], stiffness[rows.where], vectors[0], at_start=False, free=rows.free)
+        system, (force, rebound, arrival) = rows.system(rows.fixed_jacobian, np.empty(p), nodes), np.zeros((3, p))
+        fixed = rows.source, self.ends, self.normals, self.least, self.along
+        forces = force, np.zeros((p, 3)), np.zeros(p, dtype=bool), self.record.restitution, rebound, arrival
+        totals = np.zeros((tables, 3))
         return FixedRows(
-            table_starts=np.searchsorted(self.rows.source[self.at][:p], np.arange(tables + 1)),
-            nodes=where.ravel()[order],
-            of=order % max(p, 1),
-            where=where,
-            normals=self.normals[:p],
-            least=self.least[:p],
-            soft=np.where(along[0] + along[1] > FREE_PART, soft[0] + soft[1], 0.0),
-            free=self._free[:, :p].copy(),
-            along=along,
-            totals=np.zeros((tables, 3)),
-            force=np.zeros(p),
-            closed=np.zeros(p, dtype=bool),
-            restitution=self.record.restitution[:p].copy(),
-            friction=self.rows.friction[self.at][: p if self.rows.rubs else 0].copy(),
-            drag=np.zeros((p, 3)),
-            rebound=np.zeros(p if self.rows.rebounds else 0),
-            arrival=np.zeros(p if self.rows.rebounds else 0),
+            rows.where, np.argsort(rows.where), *fixed, *forces, totals, rows.groups, system, tolerance, *vectors[1:]
         )
 
     def gather(self, values: np.ndarray) -> np.ndarray:
@@ -161,72 +152,60 @@ class TwoNodeRows:
         return 1.0 / np.maximum(gives, 1e-300)
 
 
-class SingleRow(NamedTuple):
-    """Room for a row that rubs: RubbingRows and Pushes of one, between two nodes."""
-
-    rows: RubbingRows
-    pushes: Pushes
-
-
-@inlined
-def new_single_row():
-    """Return room for a row."""
-    ends, weights = np.empty((1, 2), dtype=np.int64), np.empty((1, 2))
-    ends[0, 0], ends[0, 1], weights[0, 0], weights[0, 1] = 0, 1, -1.0, 1.0
-    vectors, normals, slips = np.empty((1, 2, 3)), np.empty((1, 3)), np.empty((1, 3))
-    of_row = np.empty(1), slips, np.empty((1, 2)), np.empty((2, 3)), np.empty((1, 2))
-    rows = RubbingRows(ends, weights, vectors, normals, *of_row)
-    return SingleRow(rows, Pushes(np.empty(1), np.empty((1, 3)), np.empty((2, 3))))
-
-
-@inlined
-def rub_row(p, rows, short, stiffness, slip, size, single):
-    """Find the force and drag of a row that presses; ``short``: its gap without force, negated [m]; ``stiffness`` and
-    ``slip``: of its nodes (2,), and how far they move apart (3,); ``size``: largest coordinate [m]; ``single``:
-    SingleRow. Returns whether they were found, and the energy that friction dissipates [J]."""
-    one, pushes = single
-    force = short / rows.soft[p]
-    one.values[0], pushes.normal[0] = -short, force
-    for k in range(2):
-        one.friction[0, k] = rows.friction[p, k]
-        for c in range(3):
-            one.soft[k, c] = rows.free[k, p, c] / stiffness[k]
-            one.gradients[0, k, c] = one.weights[0, k] * rows.normals[p, c] * rows.free[k, p, c]
-            pushes.moves[k, c] = force * one.gradients[0, k, c] * one.soft[k, c]
-    for c in range(3):
-        one.normals[0, c], one.slips[0, c] = rows.normals[p, c], slip[c]
-    found, work = settle_friction(1, one, size, pushes), 0.0
-    rows.force[p] = pushes.normal[0]
-    for c in range(3):
-        rows.drag[p, c] = pushes.drag[0, c]
-        work -= rows.drag[p, c] * (slip[c] + pushes.moves[1, c] - pushes.moves[0, c])
-    return found, work
-
-
-@inlined
-def rebound_of_row(p, rows, gap, change, pull):
-    """Return by how much the bound of a row is above zero [m] as it rebounds, and set its memory if it now closes, at a
-    ``gap`` that would ``change`` in the step, of that by ``pull`` of forces that close it [m]; see
-    :func:`~pfem_petsc.contact.explicit.impact_square`."""
-    lift, e = 0.0, rows.restitution[p]
-    if rows.rebound[p] > 0.0:
-        whole = max(rows.rebound[p] + pull * rows.arrival[p] + 0.25 * pull * pull, 0.0)
-        lift = max(e * math.sqrt(whole) - 0.5 * pull, 0.0)
-    fresh = gap + change < lift and rows.soft[p] > 0.0 and e > 0.0 and rows.force[p] == 0.0
-    rows.rebound[p] = max(change * change + pull * (change + gap), 0.0) if fresh and change < 0.0 else 0.0
-    rows.arrival[p] = gap if fresh else 0.0
-    return lift
-
-
 @kernel
+def solve_fixed(rows, size):
+    """Find the forces of :class:`FixedRows` that would be at ``x``, the displacements of their nodes, and the memory of
+    those that close; ``size``: largest coordinate [m].
+
+    Returns the first group of rows without a solution, or -1, and why, see
+    :func:`~pfem_petsc.contact.projection.project_groups`; numbers of rows with a force, and of those whose force begins
+    or ends with respect to ``closed``; and the energy that friction dissipates [J].
+    """
+    system, force, drag, p = rows.system, rows.force, rows.drag, len(rows.force)
+    pulls, gaps, before = np.empty(p), np.empty(p), force > 0.0
+    pair_values(rows.ends, rows.normals, rows.least, rows.x, system.values)
+    force[:], drag[:], rows.moves[:], rows.load[:] = 0.0, 0.0, 0.0, 0.0
+    for r in range(p):
+        i, j, change, pulls[r] = rows.ends[0, r], rows.ends[1, r], 0.0, 0.0
+        for c in range(3):
+            system.slips[r, c] = rows.x[j, c] - rows.start[j, c] - (rows.x[i, c] - rows.start[i, c])
+            change += rows.normals[r, c] * system.slips[r, c]
+            pulls[r] -= rows.normals[r, c] * (rows.pushed[j, c] - rows.pushed[i, c])
+        gaps[r] = system.values[r] - change
+        system.values[r] -= rebound_lift(rows.restitution[r], rows.rebound[r], rows.arrival[r], pulls[r])
+    tolerances, failed, why = np.full(len(rows.groups.starts) - 1, rows.tolerance), -1, 0
+    if find_broken(rows.groups, system, rows.x, tolerances) > 0:
+        which, pushes = np.flatnonzero(tolerances >= 0.0), RowPushes(force, drag, rows.moves)
+        failed, why = project_groups(which, rows.groups, system, tolerances, size, pushes)
+    count, altered, work = 0, 0, 0.0
+    for r in range(p):
+        i, j, change, presses = rows.ends[0, r], rows.ends[1, r], 0.0, force[r] > 0.0
+        count, altered = count + presses, altered + (presses != rows.closed[r])
+        for c in range(3 if presses else 0):
+            change += rows.normals[r, c] * system.slips[r, c]
+            part = force[r] * rows.normals[r, c] + drag[r, c]
+            rows.load[i, c] -= part
+            rows.load[j, c] += part
+            work -= drag[r, c] * (system.slips[r, c] + rows.moves[j, c] - rows.moves[i, c])
+        fresh = presses and not before[r] and rows.restitution[r] > 0.0
+        rows.rebound[r] = impact_square(-change, gaps[r], pulls[r]) if fresh else 0.0
+        rows.arrival[r] = gaps[r] if fresh else 0.0
+    return failed, why, count, altered, work
+
+
+@inlined
 def pressed_nodes(rows, pressing):
     """Return the nodes (m,), ascending, of ``pressing`` rows, which are all that have a force."""
-    nodes, count = np.empty(2 * pressing, dtype=np.int64), 0
-    for k in range(len(rows.of) if pressing > 0 else 0):
-        if rows.force[rows.of[k]] > 0.0:
+    nodes, count = np.empty(min(2 * pressing, len(rows.nodes)), dtype=np.int64), 0
+    pushed = np.zeros(len(rows.nodes) if pressing > 0 else 0, dtype=np.bool_)
+    for r in range(len(rows.force) if pressing > 0 else 0):
+        for k in range(2):
+            pushed[rows.ends[k, r]] |= rows.force[r] > 0.0
+    for k in rows.order[: len(pushed)]:
+        if pushed[k]:
             nodes[count] = rows.nodes[k]
             count += 1
-    return nodes
+    return nodes[:count].copy()
 
 
 @kernel

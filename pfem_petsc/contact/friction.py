@@ -1,22 +1,19 @@
-"""Coulomb friction of nodes at walls: the local problem of a node, nodes that friction jams, and which nodes of an
-implicit step stick or slip, at walls or in the relative coordinates of rows.
+"""Coulomb friction of nodes at walls: the local problem of a node in an implicit step, nodes that friction jams, and
+which nodes stick or slip, at walls or in the relative coordinates of rows.
 """
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
 from ..integrators.base import Balance, State
-from ..mechanics.compiled import NEEDED, kernel
 from ..tolerances import FREE_PART, ON_BOUND, PROJECTED
 from .frames import NodalFrames, Sliding
 from .node_walls import free_squares
-from .projection import project
-from .sweeps import Pushes, RubbingRows, settle_friction
+from .projection import NodesAtPlanes, Planes, pressed
 
 if TYPE_CHECKING:
     from ..mechanics.mass import Inertia
@@ -45,98 +42,12 @@ class Rubbing(NamedTuple):
     static: np.ndarray
     stiffness: np.ndarray
 
-    def of(self, some: np.ndarray, static: np.ndarray) -> Rubbing:
-        """Return some of the nodes (k,), with other static coefficients."""
-        nodes = {
-            name: getattr(self, name)[some] for name in ("before", "ways", "fixed", "normals", "offsets", "stiffness")
-        }
-        return self._replace(static=static, **nodes)
-
-    def apply(self, some: np.ndarray, static: np.ndarray, x: np.ndarray, normal: np.ndarray, drag: np.ndarray) -> None:
-        """See :func:`add_friction`, for some of the nodes (k,)."""
-        part = x[some], normal[some], drag[some]
-        add_friction(self.of(some, static), *part)
-        x[some], normal[some], drag[some] = part
-
-
-@kernel
-def add_friction(rubbing, x, normal_forces, drag):
-    """Apply friction forces to the nodes in contact with walls that have friction, see
-    :mod:`~pfem_petsc.contact.sweeps`; each node is solved for by itself.
-
-    Parameters
-    ----------
-    rubbing : Rubbing
-    x : (m, 3) positions under the normal forces alone, changed in place [m]
-    normal_forces : (m, w) normal forces [N], changed in place
-    drag : (m, w, 3) friction forces, output [N]
-
-    Returns
-    -------
-    int
-        First node whose sweeps did not converge, or -1.
-    """
-    before, ways, fixed, normals, offsets, dynamic, static, stiffness = rubbing
-    m, w = offsets.shape
-    vectors, numbers = np.empty((4, w, 3)), np.empty((3, w))
-    rows = RubbingRows(
-        np.zeros((w, 1), np.int64),
-        np.ones((w, 1)),
-        np.empty((w, 1, 3)),
-        vectors[0],
-        numbers[0],
-        vectors[1],
-        np.empty((w, 2)),
-        np.empty((1, 3)),
-        np.empty((w, 2)),
-    )
-    pushes = Pushes(numbers[1], vectors[2], np.empty((1, 3)))
-    slot = np.empty(w, np.int64)
-    unsettled = -1
-    for i in range(m):
-        pressed, n = False, 0
-        for k in range(w):
-            for c in range(3):
-                drag[i, k, c] = 0.0
-            pressed = pressed or (normal_forces[i, k] > 0.0 and static[k] > 0.0)
-        if not pressed:
-            continue
-        for c in range(3):
-            rows.soft[0, c], pushes.moves[0, c] = 0.0 if fixed[i, c] else 1.0 / stiffness[i], 0.0
-        for k in range(w):
-            if offsets[i, k] == -math.inf:
-                continue
-            length = 0.0
-            for c in range(3):
-                rows.normals[n, c] = normals[i, k, c]
-                rows.gradients[n, 0, c] = 0.0 if fixed[i, c] else normals[i, k, c]
-                length += rows.gradients[n, 0, c] * rows.gradients[n, 0, c]
-            if length < 1e-12:
-                continue
-            for c in range(3):
-                pushes.moves[0, c] += normal_forces[i, k] * rows.gradients[n, 0, c] * rows.soft[0, c]
-            rows.friction[n, 0], rows.friction[n, 1] = dynamic[k], static[k]
-            pushes.normal[n], slot[n] = normal_forces[i, k], k
-            n += 1
-        size = 0.0
-        for c in range(3):
-            x[i, c] -= pushes.moves[0, c]  # where the node is without forces
-            size += abs(x[i, c])
-        for a in range(n):
-            k = slot[a]
-            rows.values[a] = -offsets[i, k]
-            for c in range(3):
-                rows.values[a] += rows.normals[a, c] * x[i, c]
-                rows.slips[a, c] = x[i, c] - before[i, c] - ways[i, k, c]
-        if not settle_friction(n, rows, size, pushes) and unsettled < 0:
-            unsettled = i
-        for c in range(3):
-            x[i, c] += pushes.moves[0, c]
-        for a in range(n):
-            normal_forces[i, slot[a]] = pushes.normal[a]
-            for c in range(3):
-                drag[i, slot[a], c] = pushes.drag[a, c]
-    return unsettled
+    def at(self, x: np.ndarray, static: np.ndarray) -> NodesAtPlanes:
+        """Return the nodes at positions (m, 3) without the walls, with static coefficients (m, w)."""
+        gaps = np.einsum("mwi,mi->mw", self.normals, x) - self.offsets
+        friction = np.stack([np.broadcast_to(self.dynamic, static.shape), static], axis=-1)
+        planes = Planes(self.normals, gaps, friction, (x - self.before)[:, None, :] - self.ways)
+        return NodesAtPlanes(x, self.fixed, self.stiffness, planes)
 
 
 def jam(contact: NodeWalls, node: int, normals: np.ndarray) -> str:
@@ -199,14 +110,10 @@ def solve_locally(
     slipping : (k,) bool
     size : length that tolerances are relative to [m]
     """
-    fixed, normals, offsets, stiffness = rubbing.fixed, rubbing.normals, rubbing.offsets, rubbing.stiffness
-    moved = x - np.where(fixed, 0.0, reaction) / stiffness[:, None]
-    normal_forces, drag = np.zeros(offsets.shape), np.zeros(normals.shape)
-    project(moved, fixed, normals, offsets, PROJECTED * size, normal_forces, NEEDED if normals.shape[1] > 1 else None)
-    normal_forces *= stiffness[:, None]
-    for group, static in ((slipping, rubbing.dynamic), (~slipping, rubbing.static)):
-        rubbing.apply(np.flatnonzero(group), static, moved, normal_forces, drag)
-    return LocalSolution(moved, normal_forces, drag, stiffness)
+    stiffness = rubbing.stiffness
+    free = x - np.where(rubbing.fixed, 0.0, reaction) / stiffness[:, None]
+    static = np.where(slipping[:, None], rubbing.dynamic, rubbing.static)
+    return LocalSolution(*pressed(rubbing.at(free, static), PROJECTED * size), stiffness)
 
 
 # Weight of the known direction relative to the one solved for, multiplied by ten after each failure. 0.01 saves a fifth

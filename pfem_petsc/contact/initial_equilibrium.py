@@ -17,16 +17,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mechanics.compiled import NEEDED
 from ..tolerances import ON_BOUND
-from .friction import Rubbing
 from .node_walls import WallForces
-from .projection import project
+from .projection import NodesAtPlanes, Planes, pressed
 
 if TYPE_CHECKING:
     from ..integrators.base import State
     from ..mechanics.mass import Inertia
     from .constraint_set import ConstraintSet
+    from .projection import Pressed
 
 Speeds = tuple[np.ndarray, np.ndarray]
 """Velocities of nodes (m, 3) and of walls there (m, w, 3) [m/s]."""
@@ -88,8 +87,6 @@ def start_at_rest(
     held[nodes] = resting
 
     hold = np.zeros((len(nodes), 3))  # free components of the walls' forces
-    strengths = np.zeros(resting.shape)
-    drag = np.zeros(normals.shape)
     between = np.zeros_like(load)  # likewise for the links
     for _ in range(_ROUNDS if inertia.consistent else 1):
         apart = state.a - between / (share * mass[:, None])
@@ -98,15 +95,14 @@ def start_at_rest(
         # links first, as in a step: they account for the walls
         between = links.rest(apart, share * mass, closed, held, still)
         free = apart[nodes] + between[nodes] / weight[:, None]
-        moved = free.copy()
-        project(moved, fixed, normals, planes, 0.0, strengths, NEEDED if normals.shape[1] > 1 else None)
+        gaps, n = np.einsum("mwi,mi->mw", normals, free) - planes, normals.shape[1]
+        smooth = NodesAtPlanes(free, fixed, weight, Planes(normals, gaps, np.empty((0, n, 2)), np.empty((0, n, 3))))
+        found = pressed(smooth, 0.0)
         if contact.has_friction:
-            strengths *= weight[:, None]
-            rough = contact.friction, contact.static_friction
-            rubbing = Rubbing(v[nodes], accelerations, fixed, normals, planes, *rough, weight)
-            _apply_friction(rubbing, (v[nodes], rates), still, moved, strengths, drag)
-            strengths /= weight[:, None]
-        before, hold = hold, weight[:, None] * (moved - free)
+            slips = _slips(smooth, found, (v[nodes], rates), accelerations, still)
+            rough = np.tile(np.stack([contact.friction, contact.static_friction], axis=1), (len(nodes), 1, 1))
+            found = pressed(smooth._replace(planes=Planes(normals, gaps, rough, slips)), 0.0)
+        before, hold = hold, weight[:, None] * (found.x - free)
         sizes = [np.abs(part).max(initial=0.0) for part in (hold - before, between - earlier, hold, between)]
         last_hold, last_between, *largest = np.max(comm.allgather(sizes), axis=0)
         if max(last_hold, last_between) <= 1e-13 * max(largest):
@@ -116,31 +112,25 @@ def start_at_rest(
         state.a = accelerate(total)
     if max(largest) == 0.0:
         return None
-    strengths *= weight[:, None]
-    force = strengths[:, :, None] * normals + drag
+    force = found.normal[:, :, None] * normals + found.drag
     state.contact = np.zeros_like(load)
     state.contact[nodes] = force.sum(axis=1)
     links.add_forces(state.contact)
-    return contact.sums(nodes, force, (x[nodes], x[nodes]), strengths > 0.0)
+    return contact.sums(nodes, force, (x[nodes], x[nodes]), found.normal > 0.0)
 
 
-def _apply_friction(
-    rubbing: Rubbing, speeds: Speeds, slack: float, a: np.ndarray, normal_forces: np.ndarray, drag: np.ndarray
-) -> None:
-    """Apply friction at the start: update accelerations (m, 3), normal (m, w) and friction (m, w, 3) forces in place.
-
-    For nodes that slide, the velocity determines the direction of slip; for the others it is that of their acceleration
-    relative to the wall. ``rubbing`` has accelerations in place of positions; those of nodes are relative to zero.
-    """
+def _slips(
+    smooth: NodesAtPlanes, found: Pressed, speeds: Speeds, accelerations: np.ndarray, still: float
+) -> np.ndarray:
+    """Return the slips (m, w, 3) of nodes on walls with ``accelerations`` (m, w, 3): along the velocity of those that
+    slide, else along their acceleration; ``found``: their forces without friction."""
     v, rates = speeds
     away = v[:, None, :] - rates
-    away -= np.einsum("mwi,mwi->mw", away, rubbing.normals)[:, :, None] * rubbing.normals
-    slides = ((np.linalg.norm(away, axis=2) > slack) & (normal_forces > 0.0)).any(axis=1)
-    weight = rubbing.stiffness[:, None]
-    largest = max(float(np.abs(a).max(initial=0.0)), float((normal_forces / weight).max(initial=0.0)))
-    for group in (slides, ~slides):
-        part = np.flatnonzero(group)
-        fast = np.linalg.norm(v[part], axis=1).max(initial=0.0) + np.abs(rates[part]).max(initial=0.0)
-        factor = _FAST * largest / fast if group is slides and fast > 0.0 else 0.0
-        along = rubbing._replace(before=-factor * v, ways=factor * rates if factor else rubbing.ways)
-        along.apply(part, rubbing.static, a, normal_forces, drag)
+    across = away - np.einsum("mwi,mwi->mw", away, smooth.planes.normals)[:, :, None] * smooth.planes.normals
+    slides = ((np.linalg.norm(across, axis=2) > still) & (found.normal > 0.0)).any(axis=1)
+    pushes = found.normal / smooth.stiffness[:, None]
+    largest = max(float(np.abs(found.x).max(initial=0.0)), float(pushes.max(initial=0.0)))
+    fast = np.linalg.norm(v[slides], axis=1).max(initial=0.0) + np.abs(rates[slides]).max(initial=0.0)
+    factor = _FAST * largest / fast if fast > 0.0 else 0.0
+    apart = smooth.free[:, None, :]
+    return np.where(slides[:, None, None], apart + factor * away, apart - accelerations)

@@ -1,5 +1,5 @@
-"""Exact solutions of small contact problems: the nearest feasible point of a node, and that of the nodes of rows that
-share nodes, both by one solver of complementarity problems.
+"""Exact solutions of small contact problems with friction: of a node at planes, and of the nodes of rows that share
+nodes, with the planes at these, both as rows of a group.
 """
 
 from __future__ import annotations
@@ -123,8 +123,240 @@ def find_multipliers(matrix, values, tolerance, z):
     return False
 
 
+class Planes(NamedTuple):
+    """Planes (w,) at nodes (m,).
+
+    Attributes
+    ----------
+    normals : (m, w, 3) unit normals, towards the allowed side
+    gaps : (m, w) distances of the nodes without contact from the planes [m], infinite where none applies
+    friction, slips : (m, w, 2), (m, w, 3) see :class:`~pfem_petsc.contact.sweeps.RubbingRows`; (0, w, 2), (0, w, 3)
+        without friction
+    """
+
+    normals: np.ndarray
+    gaps: np.ndarray
+    friction: np.ndarray
+    slips: np.ndarray
+
+
+class NodesAtPlanes(NamedTuple):
+    """Nodes (m,): positions ``free`` (m, 3) without contact [m], ``fixed`` (m, 3) bool, components that supports
+    prescribe, ``stiffness`` (m,), force for a displacement [N/m], and ``planes``, see :class:`Planes`."""
+
+    free: np.ndarray
+    fixed: np.ndarray
+    stiffness: np.ndarray
+    planes: Planes
+
+
+class Pressed(NamedTuple):
+    """Results for nodes (m,) at planes (w,): positions ``x`` (m, 3) [m], ``normal`` forces (m, w) and ``drag``
+    (m, w, 3) by friction [N]."""
+
+    x: np.ndarray
+    normal: np.ndarray
+    drag: np.ndarray
+
+
+class Room(NamedTuple):
+    """Room for the rows of a group: RubbingRows, Pushes, and which row or plane each is, ``slot`` (r,)."""
+
+    rows: RubbingRows
+    pushes: Pushes
+    slot: np.ndarray
+
+
+INFEASIBLE, JAMMED = 1, 2
+"""Why a problem has no solution: no positions satisfy its rows, or its friction has none."""
+
+
+@inlined
+def new_room(size, width, soft, moves):
+    """Return room for rows over ``width`` nodes each; ``soft``, ``moves``: (n, 3) of nodes."""
+    vectors, numbers = np.zeros((3, size, 3)), np.zeros((2, size))
+    ends, weights, gradients = np.full((size, width), -1), np.zeros((size, width)), np.zeros((size, width, 3))
+    friction, gives = np.zeros((size, 2)), np.empty((size, 2))
+    rows = RubbingRows(ends, weights, gradients, vectors[0], numbers[0], vectors[1], friction, soft, gives)
+    return Room(rows, Pushes(numbers[1], vectors[2], moves), np.empty(size, np.int64))
+
+
+@inlined
+def new_pressed(m, w):
+    """Return room for the results of nodes (m,) at planes (w,)."""
+    return Pressed(np.empty((m, 3)), np.empty((m, w)), np.empty((m, w, 3)))
+
+
+@inlined
+def _add_planes(at, i, n, planes, room):
+    """Add the planes of node ``at`` to ``n`` rows, in which it is the i-th node, if it can move along their normals;
+    return how many there are then."""
+    rows = room.rows
+    for w in range(planes.gaps.shape[1]):
+        if not planes.gaps[at, w] < math.inf:
+            continue
+        square = 0.0
+        for c in range(3):
+            rows.normals[n, c] = planes.normals[at, w, c]
+            rows.gradients[n, 0, c] = planes.normals[at, w, c] if rows.soft[i, c] > 0.0 else 0.0
+            square += rows.gradients[n, 0, c] * rows.gradients[n, 0, c]
+        if not square > FREE_PART:
+            continue
+        rows.values[n], rows.weights[n, 0], room.slot[n] = planes.gaps[at, w], 1.0, w
+        rows.friction[n, 0] = rows.friction[n, 1] = 0.0
+        for k in range(rows.ends.shape[1]):
+            rows.ends[n, k] = i if k == 0 else -1
+        if len(planes.friction) > 0:
+            rows.friction[n, 0], rows.friction[n, 1] = planes.friction[at, w, 0], planes.friction[at, w, 1]
+            for c in range(3):
+                rows.slips[n, c] = planes.slips[at, w, c]
+        n += 1
+    return n
+
+
+@inlined
+def _push(a, force, rows, moves):
+    """Displace the nodes of a row by a force."""
+    for k in range(rows.ends.shape[1]):
+        i = rows.ends[a, k]
+        if i >= 0:
+            for c in range(3):
+                moves[i, c] += force * rows.gradients[a, k, c] * rows.soft[i, c]
+
+
 @kernel
-def project(x, fixed, normals, offsets, tolerance, multipliers, several=NEEDED):
+def _solve_several(n, rows, tolerances, pushes):
+    """Find the normal forces of rows, and the displacements by these; return whether there are such forces."""
+    gram, width = np.zeros((n, n)), rows.ends.shape[1]
+    for a in range(n):
+        for b in range(a, n):
+            for d in range(width):
+                i = rows.ends[a, d]
+                for e in range(width if i >= 0 else 0):
+                    if rows.ends[b, e] == i:
+                        for c in range(3):
+                            gram[a, b] += rows.gradients[a, d, c] * rows.gradients[b, e, c] * rows.soft[i, c]
+            gram[b, a] = gram[a, b]
+    values, normal = rows.values[:n], pushes.normal
+    # planes through one point may lie beyond each other by rounding for ever, unless that is tolerated
+    found = find_multipliers(gram, values, tolerances[0], normal)
+    if not found and tolerances[0] < tolerances[1]:
+        found = find_multipliers(gram, values, tolerances[1], normal)
+    for a in range(n if found else 0):
+        _push(a, normal[a], rows, pushes.moves)
+    return found
+
+
+@inlined
+def _solve_rows(n, rows, tolerances, size, pushes):
+    """Find the forces of rows, and the displacements of their nodes, which are zero before, with friction.
+
+    A row violated by at most the first of the ``tolerances`` counts as satisfied, or by at most the second where there
+    is no solution otherwise; ``size``: largest coordinate [m]. Returns :data:`INFEASIBLE`, :data:`JAMMED`, or 0.
+    """
+    normal, drag, moves = pushes
+    broken = False
+    for a in range(n):
+        normal[a] = drag[a, 0] = drag[a, 1] = drag[a, 2] = 0.0
+        broken = broken or not rows.values[a] >= 0.0
+    if not broken:
+        return 0
+    if n == 1:
+        gives = 0.0
+        for k in range(rows.ends.shape[1]):
+            i = rows.ends[0, k]
+            for c in range(3 if i >= 0 else 0):
+                gives += rows.gradients[0, k, c] * rows.gradients[0, k, c] * rows.soft[i, c]
+        normal[0] = -rows.values[0] / gives
+        _push(0, normal[0], rows, moves)
+    if (n == 1 and not normal[0] < math.inf) or (n > 1 and not _solve_several(n, rows, tolerances, pushes)):
+        return INFEASIBLE
+    return 0 if settle_friction(n, rows, size, pushes) else JAMMED
+
+
+@inlined
+def _press_single(j, nodes, tolerance, found):
+    """Move the j-th node, which is ``found`` where it is free to move, onto the only plane that it is beyond, if it has
+    no friction and all others remain satisfied; return whether that is so."""
+    (normals, gaps, friction, _), broken, first, square = nodes.planes, 0, 0, 0.0
+    for k in range(gaps.shape[1]):
+        if gaps[j, k] < 0.0:
+            broken, first = broken + 1, k
+    if broken != 1 or (len(friction) > 0 and friction[j, first, 1] > 0.0):
+        return broken == 0
+    for c in range(3):
+        square += 0.0 if nodes.fixed[j, c] else normals[j, first, c] * normals[j, first, c]
+    if not square > FREE_PART:
+        return False
+    push, alone = -gaps[j, first] / square, True
+    for c in range(3):
+        found.x[j, c] += 0.0 if nodes.fixed[j, c] else push * normals[j, first, c]
+    for k in range(gaps.shape[1] if gaps.shape[1] > 1 else 0):
+        gap = gaps[j, k]
+        for c in range(3):
+            gap += normals[j, k, c] * (found.x[j, c] - nodes.free[j, c])
+        alone = alone and (k == first or gap >= -tolerance)
+    found.normal[j, first] = push * nodes.stiffness[j]
+    return alone
+
+
+@kernel
+def press(which, nodes, tolerance, found, several):
+    """Move :class:`NodesAtPlanes` to the nearest positions that satisfy all planes, and from there by friction.
+
+    Each node is solved for by itself: its bits do not depend on the others.
+
+    Parameters
+    ----------
+    which : (2,) the first of some nodes that are next to each other, and the end of these
+    nodes : NodesAtPlanes
+    tolerance : a plane violated by at most this counts as satisfied [m]
+    found : Pressed, written for these nodes; those with infeasible planes are not moved
+    several : ``NEEDED``, or None if there is a single plane, without friction
+
+    Returns
+    -------
+    node, why : int
+        First of the nodes without a solution, or -1; :data:`INFEASIBLE` or :data:`JAMMED`.
+    """
+    w, failed, reason = nodes.planes.gaps.shape[1], -1, 0
+    room = new_room(w, 1, np.empty((1, 3)), np.empty((1, 3)))
+    rows, pushes, slot = room
+    first, last = which
+    found.x[first:last], found.normal[first:last], found.drag[first:last] = nodes.free[first:last], 0.0, 0.0
+    for j in range(first, last):
+        if _press_single(j, nodes, tolerance, found) or several is None:
+            continue
+        size = 0.0
+        for c in range(3):
+            rows.soft[0, c] = 0.0 if nodes.fixed[j, c] else 1.0 / nodes.stiffness[j]
+            pushes.moves[0, c] = 0.0
+            size += abs(nodes.free[j, c])
+        n = _add_planes(j, 0, 0, nodes.planes, room)
+        why = _solve_rows(n, rows, (0.0, tolerance), size, pushes)
+        if why > 0 and failed < 0:
+            failed, reason = j, why
+        solved = why != INFEASIBLE
+        for k in range(w):
+            found.normal[j, k] = 0.0
+        for a in range(n if solved else 0):
+            found.normal[j, slot[a]] = pushes.normal[a]
+            for c in range(3):
+                found.drag[j, slot[a], c] = pushes.drag[a, c]
+        for c in range(3):
+            found.x[j, c] = nodes.free[j, c] + (pushes.moves[0, c] if solved else 0.0)
+    return failed, reason
+
+
+def pressed(nodes: NodesAtPlanes, tolerance: float) -> Pressed:
+    """Return all nodes pressed, see :func:`press`."""
+    found = new_pressed(*nodes.planes.gaps.shape)
+    press((0, len(nodes.free)), nodes, tolerance, found, NEEDED)
+    return found
+
+
+@kernel
+def project(x, fixed, normals, offsets, tolerance, multipliers):
     """Move nodes to the nearest position that satisfies all planes.
 
     Parameters
@@ -134,7 +366,6 @@ def project(x, fixed, normals, offsets, tolerance, multipliers, several=NEEDED):
     normals : (m, w, 3) unit normals; offsets : (m, w) [m], -inf for a plane that does not apply
     tolerance : a plane violated by at most this counts as satisfied [m]
     multipliers : (m, w) output [m]: the node moves by the sum of multipliers times normals (free components)
-    several : ``NEEDED``, or None if w is 1
 
     Returns
     -------
@@ -142,64 +373,15 @@ def project(x, fixed, normals, offsets, tolerance, multipliers, several=NEEDED):
         First node with infeasible planes, or -1.
     """
     m, w = offsets.shape
-    free = np.zeros((w, 3))
-    gap = np.zeros(w)
-    usable = np.zeros(w, dtype=np.bool_)
-    move = np.zeros(3)
-    infeasible = -1
-    for i in range(m):
-        count, first, n = 0, 0, 0
+    gaps = np.empty((m, w))
+    for j in range(m):
         for k in range(w):
-            multipliers[i, k] = 0.0
-            g = -offsets[i, k]
-            length = 0.0
+            gaps[j, k] = -offsets[j, k]
             for c in range(3):
-                g += normals[i, k, c] * x[i, c]
-                free[k, c] = 0.0 if fixed[i, c] else normals[i, k, c]
-                length += free[k, c] * free[k, c]
-            gap[k] = g
-            usable[k] = length > FREE_PART and g < math.inf
-            n += usable[k]
-            if usable[k] and g < 0.0:
-                first = k
-                count += 1
-        if count == 0:
-            continue
-        alone = False
-        if count == 1:  # the common case: a single violated plane whose projection satisfies all others
-            square = free[first, 0] * free[first, 0] + free[first, 1] * free[first, 1] + free[first, 2] * free[first, 2]
-            multipliers[i, first] = -gap[first] / square
-            alone = True
-            for c in range(3):
-                move[c] = multipliers[i, first] * free[first, c]
-            for k in range(w):
-                g = gap[k] + free[k, 0] * move[0] + free[k, 1] * move[1] + free[k, 2] * move[2]
-                alone = alone and (k == first or not usable[k] or g >= -tolerance)
-        if several is not None:  # noqa: SIM102 - what is not needed is not compiled
-            if not alone:
-                planes, values, z = np.flatnonzero(usable), np.empty(n), np.zeros(n)
-                gram = np.empty((n, n))
-                for a in range(n):
-                    values[a] = gap[planes[a]]
-                    for b in range(n):
-                        gram[a, b] = 0.0
-                        for c in range(3):
-                            gram[a, b] += free[planes[a], c] * free[planes[b], c]
-                # planes through one point may lie beyond each other by rounding for ever, unless that is tolerated
-                if not find_multipliers(gram, values, 0.0, z) and not find_multipliers(gram, values, tolerance, z):
-                    multipliers[i, first] = 0.0
-                    if infeasible < 0:
-                        infeasible = i
-                    continue
-                move[:] = 0.0
-                multipliers[i, first] = 0.0
-                for a in range(n):
-                    multipliers[i, planes[a]] = z[a]
-                    for c in range(3):
-                        move[c] += z[a] * free[planes[a], c]
-        for c in range(3):
-            x[i, c] += move[c]
-    return infeasible
+                gaps[j, k] += normals[j, k, c] * x[j, c]
+    planes = Planes(normals, gaps, np.empty((0, w, 2)), np.empty((0, w, 3)))
+    nodes, found = NodesAtPlanes(x.copy(), fixed, np.ones(m), planes), Pressed(x, multipliers, np.empty((m, w, 3)))
+    return press((0, m), nodes, tolerance, found, NEEDED)[0]
 
 
 class Groups(NamedTuple):
@@ -218,26 +400,21 @@ class System(NamedTuple):
     ----------
     ends, gradients : (r, k), (r, k, 3) nodes of each row, -1 for none, and its gradient there
     values : (r,) rows [m], infinite for rows that do not apply
-    stiffness, free : (n,), (n, 3) of nodes: force for a displacement [N/m]; 0.0 where supports prescribe a component
-    plane : (n,) index of each node among those at walls, -1 for none
-    normals, gaps : (m, w, 3), (m, w) of walls at these nodes: distances [m], infinite where a wall does not apply
     weights, friction, slips : (r, k), (r, 2), (r, 3) of rows, see :class:`~pfem_petsc.contact.sweeps.RubbingRows`
-    wall_friction, wall_slips : (m, w, 2), (m, w, 3), likewise; (0, w, 2), (0, w, 3) without friction
+    stiffness, free : (n,), (n, 3) of nodes: force for a displacement [N/m]; 0.0 where supports prescribe a component
+    plane : (n,) index of each node among those at walls (m,), -1 for none; planes : Planes of walls at these
     """
 
     ends: np.ndarray
     gradients: np.ndarray
     values: np.ndarray
-    stiffness: np.ndarray
-    free: np.ndarray
-    plane: np.ndarray
-    normals: np.ndarray
-    gaps: np.ndarray
     weights: np.ndarray
     friction: np.ndarray
     slips: np.ndarray
-    wall_friction: np.ndarray
-    wall_slips: np.ndarray
+    stiffness: np.ndarray
+    free: np.ndarray
+    plane: np.ndarray
+    planes: Planes
 
 
 class RowPushes(NamedTuple):
@@ -248,76 +425,14 @@ class RowPushes(NamedTuple):
     moves: np.ndarray
 
 
-RUBS = 1
-"""Why a group has no solution: its friction, and not its rows."""
-
-
 @inlined
-def _solve_single(group, groups, system, tolerance, pushes):
-    """Solve a group of one row, if its walls remain satisfied and it does not rub; return whether they do."""
-    ends, gradients, stiffness, free, gaps = system.ends, system.gradients, system.stiffness, system.free, system.gaps
-    r, square, soft, width = groups.rows[groups.starts[group]], 0.0, 0.0, ends.shape[1]
-    force, moves = pushes.force, pushes.moves
-    for k in range(width):
-        i = ends[r, k]
-        if i >= 0:
-            along = 0.0
-            for c in range(3):
-                part = gradients[r, k, c] * free[i, c]
-                along += part * part
-            square += along
-            soft += 1.0 / stiffness[i] * along
-    force[r] = -system.values[r] / soft if system.values[r] < 0.0 and square > FREE_PART else 0.0
-    if not force[r] < math.inf or (force[r] > 0.0 and system.friction[r, 1] > 0.0):
-        return False
-    for k in range(width):
-        i = ends[r, k]
-        if i >= 0:
-            push = force[r] / stiffness[i]
-            for c in range(3):
-                moves[i, c] = push * (gradients[r, k, c] * free[i, c])
-    for q in range(groups.node_starts[group], groups.node_starts[group + 1] if gaps.shape[1] > 0 else 0):
-        i = groups.nodes[q]
-        at = system.plane[i]
-        for w in range(gaps.shape[1] if at >= 0 else 0):
-            gap, square = gaps[at, w], 0.0
-            least = gap
-            for c in range(3):
-                part = system.normals[at, w, c] * free[i, c]
-                square += part * part
-                gap += part * moves[i, c]
-            if not (least == math.inf or square <= FREE_PART or min(least, gap) >= -tolerance):
-                return False
-    return True
-
-
-@inlined
-def _gather_group(group, groups, system, soft):
-    """Return the rows of a group that can press, with those of its walls, as :class:`RubbingRows`; the number of each
-    among the rows of the system, or -1 (n,); and whether any rubs."""
-    ends, gradients, values, _, free, plane, normals, gaps, weights, friction, slips, wall_friction, wall_slips = system
-    begin, end = groups.starts[group], groups.starts[group + 1]
-    first, last = groups.node_starts[group], groups.node_starts[group + 1]
-    width, walls, size, n, rubs = ends.shape[1], gaps.shape[1], end - begin, 0, False
-    for q in range(first, last if walls > 0 else first):
-        size += walls if plane[groups.nodes[q]] >= 0 else 0
-    rows = RubbingRows(
-        np.full((size, width), -1),
-        np.zeros((size, width)),
-        np.zeros((size, width, 3)),
-        np.zeros((size, 3)),
-        np.empty(size),
-        np.zeros((size, 3)),
-        np.zeros((size, 2)),
-        soft,
-        np.empty((size, 2)),
-    )
-    row = np.full(size, -1)
-    for q in range(begin, end):
+def _add_rows(group, groups, system, room):
+    """Begin the room with those rows of a group that can press; return how many there are."""
+    ends, gradients, values, weights, friction, slips, _, free, _, _ = system
+    rows, n = room.rows, 0
+    for q in range(groups.starts[group], groups.starts[group + 1]):
         r, square = groups.rows[q], 0.0
-        if not values[r] < math.inf and values[r] == values[r]:
-            continue
-        for k in range(width):
+        for k in range(ends.shape[1]):
             i = ends[r, k]
             rows.ends[n, k], rows.weights[n, k] = i, weights[r, k]
             for c in range(3):
@@ -325,35 +440,13 @@ def _gather_group(group, groups, system, soft):
                 square += rows.gradients[n, k, c] * rows.gradients[n, k, c]
                 if weights[r, k] != 0.0:
                     rows.normals[n, c] = gradients[r, k, c] / weights[r, k]
-        if square > FREE_PART:
-            rows.values[n], row[n] = values[r], r
+        if square > FREE_PART and values[r] != math.inf:
+            rows.values[n], room.slot[n] = values[r], r
+            rows.friction[n, 0], rows.friction[n, 1] = friction[r, 0], friction[r, 1]
             for c in range(3):
                 rows.slips[n, c] = slips[r, c]
-            rows.friction[n, 0], rows.friction[n, 1] = friction[r, 0], friction[r, 1]
-            rubs = rubs or friction[r, 1] > 0.0
             n += 1
-    for q in range(first, last if walls > 0 else first):
-        i = groups.nodes[q]
-        at = plane[i]
-        for w in range(walls if at >= 0 else 0):
-            if not gaps[at, w] < math.inf:
-                continue
-            square = 0.0
-            for k in range(width):
-                rows.ends[n, k] = i if k == 0 else -1
-            row[n], rows.values[n], rows.weights[n, 0] = -1, gaps[at, w], 1.0
-            for c in range(3):
-                rows.normals[n, c] = normals[at, w, c]
-                rows.gradients[n, 0, c] = normals[at, w, c] * free[i, c]
-                square += rows.gradients[n, 0, c] * rows.gradients[n, 0, c]
-            if len(wall_friction) > 0:
-                rows.friction[n, 0], rows.friction[n, 1] = wall_friction[at, w, 0], wall_friction[at, w, 1]
-                for c in range(3):
-                    rows.slips[n, c] = wall_slips[at, w, c]
-            if square > FREE_PART:
-                rubs = rubs or rows.friction[n, 1] > 0.0
-                n += 1
-    return rows, row[:n], rubs
+    return n
 
 
 @kernel
@@ -371,50 +464,32 @@ def project_groups(which, groups, system, tolerances, size, pushes):
     Returns
     -------
     group, why : int
-        First of the groups without a solution, or -1; :data:`RUBS`, or 0 if its rows are infeasible.
+        First of the groups without a solution, or -1; :data:`INFEASIBLE` or :data:`JAMMED`.
     """
-    stiffness, free, width = system.stiffness, system.free, system.ends.shape[1]
-    soft = np.empty(free.shape)
-    for group in which:
-        begin, end = groups.starts[group], groups.starts[group + 1]
-        for q in range(begin, end):
+    most, walls = 0, system.planes.gaps.shape[1]
+    for g in which:
+        at_walls = walls * (groups.node_starts[g + 1] - groups.node_starts[g])
+        most = max(most, groups.starts[g + 1] - groups.starts[g] + at_walls)
+    room = new_room(most, system.ends.shape[1], np.empty(system.free.shape), pushes.moves)
+    for g in which:
+        for q in range(groups.starts[g], groups.starts[g + 1]):
             r = groups.rows[q]
             pushes.force[r] = pushes.drag[r, 0] = pushes.drag[r, 1] = pushes.drag[r, 2] = 0.0
-        if end - begin == 1 and _solve_single(group, groups, system, tolerances[group], pushes):
-            continue
-        for q in range(groups.node_starts[group], groups.node_starts[group + 1]):
+        for q in range(groups.node_starts[g], groups.node_starts[g + 1]):
             i = groups.nodes[q]
             for c in range(3):
-                soft[i, c], pushes.moves[i, c] = free[i, c] / stiffness[i], 0.0
-        rows, row, rubs = _gather_group(group, groups, system, soft)
-        n = len(row)
-        gram = np.zeros((n, n))
-        for a in range(n):
-            for b in range(a, n):
-                s = 0.0
-                for d in range(width):
-                    i = rows.ends[a, d]
-                    if i < 0:
-                        continue
-                    for e in range(width):
-                        if rows.ends[b, e] == i:
-                            for c in range(3):
-                                s += rows.gradients[a, d, c] * rows.gradients[b, e, c] / stiffness[i]
-                gram[a, b] = gram[b, a] = s
-        z, drag = np.zeros(n), np.zeros((n, 3))
-        if not find_multipliers(gram, rows.values[:n], tolerances[group], z):
-            return group, 0
-        for a in range(n):
-            for k in range(width):
-                i = rows.ends[a, k]
-                if i >= 0:
-                    for c in range(3):
-                        pushes.moves[i, c] += z[a] * rows.gradients[a, k, c] / stiffness[i]
-        if rubs and not settle_friction(n, rows, size, Pushes(z, drag, pushes.moves)):
-            return group, RUBS
-        for a in range(n):
-            if row[a] >= 0:
-                pushes.force[row[a]] = z[a]
-                for c in range(3):
-                    pushes.drag[row[a], c] = drag[a, c]
+                room.rows.soft[i, c], pushes.moves[i, c] = system.free[i, c] / system.stiffness[i], 0.0
+        count = n = _add_rows(g, groups, system, room)
+        for q in range(groups.node_starts[g], groups.node_starts[g + 1] if walls > 0 else 0):
+            i = groups.nodes[q]
+            if system.plane[i] >= 0:
+                n = _add_planes(system.plane[i], i, n, system.planes, room)
+        why = _solve_rows(n, room.rows, (tolerances[g], tolerances[g]), size, room.pushes)
+        if why != 0:
+            return g, why
+        for a in range(count):
+            r = room.slot[a]
+            pushes.force[r] = room.pushes.normal[a]
+            for c in range(3):
+                pushes.drag[r, c] = room.pushes.drag[a, c]
     return -1, 0

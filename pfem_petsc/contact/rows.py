@@ -21,7 +21,7 @@ from ..parallel.natural import NaturalOrder
 from ..tolerances import FREE_PART
 from .constraints.base import Constraint
 from .plugins import checked
-from .projection import RUBS, Groups, RowPushes, System, project_groups
+from .projection import JAMMED, Groups, Planes, RowPushes, System, project_groups
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -115,18 +115,18 @@ def pair_values(ends, normals, least, x, values):
 
 
 @kernel
-def find_broken(groups, values, plane, gaps, x, tolerances):
+def find_broken(groups, system, x, tolerances):
     """Find groups with a row below its bound or a node beyond a wall; return their number.
 
     Parameters
     ----------
     groups : Groups
-    values : (r,) rows; plane, gaps : see :class:`~pfem_petsc.contact.projection.System`; x : (n, 3) positions
+    system : System; x : (n, 3) positions
     tolerances : (groups,) in: a row among several that is violated by at most this counts as satisfied; out: the same,
         or the rounding of the group's positions, of the groups found, and -1 of the others
     """
     starts, rows, node_starts, nodes = groups
-    count = 0
+    count, values, gaps = 0, system.values, system.planes.gaps
     for g in range(len(starts) - 1):
         least = tolerances[g] if starts[g + 1] - starts[g] > 1 else 0.0
         broken = False
@@ -134,7 +134,7 @@ def find_broken(groups, values, plane, gaps, x, tolerances):
             broken = broken or not values[rows[q]] >= -least
         if gaps.shape[1] > 0:
             for q in range(node_starts[g], node_starts[g + 1]):
-                at = plane[nodes[q]]
+                at = system.plane[nodes[q]]
                 for w in range(gaps.shape[1] if at >= 0 else 0):
                     broken = broken or gaps[at, w] < 0.0
         if not broken:
@@ -247,16 +247,6 @@ _ITERATIONS = 300  # linearisations of a problem
 _TAG = 7700  # of messages between ranks with nodes of the same rows, distinct from those of ghosts
 
 
-class Planes(NamedTuple):
-    """Walls at nodes, see :class:`~pfem_petsc.contact.projection.System`."""
-
-    plane: np.ndarray
-    normals: np.ndarray
-    gaps: np.ndarray
-    wall_friction: np.ndarray
-    wall_slips: np.ndarray
-
-
 class FreeNodes(NamedTuple):
     """Nodes (n,) of rows in a step without the rows.
 
@@ -278,9 +268,10 @@ class FreeNodes(NamedTuple):
 
 
 class WallsOfNodes(NamedTuple):
-    """Walls that stop nodes of rows: ``planes`` at positions (n, 3), if rows alone move the nodes to others (n, 3), and
-    the nodes (n,) bool for which they differ from place to place."""
+    """Walls that stop nodes of rows: ``planes`` at positions (n, 3), if rows alone move the nodes to others (n, 3); the
+    index ``plane`` (n,) of each node there, -1 for none; and those for which they are ``varying`` (n,) with places."""
 
+    plane: np.ndarray
     planes: Callable[[np.ndarray, np.ndarray], Planes]
     varying: np.ndarray
 
@@ -337,8 +328,8 @@ class RowSet:
         self._away = np.flatnonzero(~self.mine)
         self._far = -1 - self.where[self._away]
         self.free = 1.0 - self.gather(fixed)
-        nowhere = np.full(len(self.numbers), -1), np.empty((0, 0, 3)), np.empty((0, 0))
-        self._no_planes = Planes(*nowhere, np.empty((0, 0, 2)), np.empty((0, 0, 3)))
+        nowhere = Planes(np.empty((0, 0, 3)), np.empty((0, 0)), np.empty((0, 0, 2)), np.empty((0, 0, 3)))
+        self._no_planes = np.full(len(self.numbers), -1), nowhere
         self.friction = np.array([source.friction for source in sources]).reshape(-1, 2)[self.source]
         self.restitution = np.array([source.restitution for source in sources], dtype=float)[self.source]
         self.rubs = any(source.friction[1] > 0.0 for source in sources)
@@ -556,17 +547,20 @@ class RowSet:
         return self.along(jacobian**2, self.free) > FREE_PART
 
     def system(
-        self, jacobian: np.ndarray, values: np.ndarray, nodes: FreeNodes, planes: Planes | None = None
+        self,
+        jacobian: np.ndarray,
+        values: np.ndarray,
+        nodes: FreeNodes,
+        planes: tuple[np.ndarray, Planes] | None = None,
     ) -> System:
-        """Return rows (r,) with gradients (r, k, 3) for :meth:`solve`."""
+        """Return rows (r,) with gradients (r, k, 3), and ``planes`` of walls, for :meth:`solve`."""
         slips, friction = np.zeros((len(values), 3)), self.friction
         if self.rubs and nodes.rub:
             slips = self.slips(nodes.x - nodes.start)
         elif self.rubs:
             friction = np.zeros_like(friction)
-        some = self._no_planes if planes is None else planes
-        rubbing = self.weights, friction, slips, some.wall_friction, some.wall_slips
-        return System(self.ends, jacobian, values, nodes.stiffness, nodes.free, *some[:3], *rubbing)
+        rubbing = self.weights, friction, slips, nodes.stiffness, nodes.free
+        return System(self.ends, jacobian, values, *rubbing, *(self._no_planes if planes is None else planes))
 
     def gather_of(self, at: np.ndarray, of_nodes: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return values (2, m, n) at the first two nodes of rows ``at`` (m,); ``of_nodes`` gives (k, n) at owned nodes.
@@ -605,24 +599,22 @@ class RowSet:
         """Return the groups (g,) with rows below their bounds or nodes at (n, 3) beyond walls, and the tolerances of
         all groups."""
         tolerances = np.full(len(self.groups.starts) - 1, tolerance)
-        if not find_broken(self.groups, system.values, system.plane, system.gaps, x, tolerances):
+        if not find_broken(self.groups, system, x, tolerances):
             return np.empty(0, dtype=np.int64), tolerances
         return np.flatnonzero(~(tolerances < 0.0)), tolerances
 
     def _solve(self, which: np.ndarray, system: System, tolerances: np.ndarray, size: float, pushes: RowPushes) -> None:
         group, why = project_groups(which, self.groups, system, tolerances, size, pushes)
-        if group >= 0 and why == RUBS:
-            raise SimulationFailure(self.unsettled_message(group))
         if group >= 0:
-            raise SimulationFailure(
-                f"no positions of nodes {self._shown(group)} satisfy their contact pairs, constraints, walls and "
-                "supports"
-            )
+            raise SimulationFailure(self.unsolved(group, why))
 
-    def unsettled_message(self, group: int) -> str:
-        """Return the message about a group without a solution of its friction."""
+    def unsolved(self, group: int, why: int) -> str:
+        """Return the message about a group without a solution."""
+        shown = self._shown(group)
+        if why != JAMMED:
+            return f"no positions of nodes {shown} satisfy their contact pairs, constraints, walls and supports"
         return (
-            f"the friction of nodes {self._shown(group)} in contact pairs and on walls did not converge: they may be "
+            f"the friction of nodes {shown} in contact pairs and on walls did not converge: they may be "
             "jammed between walls and supports; reduce the friction, free the nodes, or reduce time.step"
         )
 
@@ -649,7 +641,7 @@ class RowSet:
             On ranks with rows that are infeasible.
         """
         x, jacobian, pushes = nodes.x, self.fixed_jacobian, self._no_pushes()
-        planes = None if walls is None else walls.planes(x, x)
+        planes = None if walls is None else (walls.plane, walls.planes(x, x))
         system = self.system(jacobian, self.values(x) - lift, nodes, planes)
         groups, tolerances = self._broken(system, x, tolerance)
         if len(groups) == 0:
@@ -675,7 +667,7 @@ class RowSet:
                 if walls is not None:
                     load = self.forces(jacobian, pushes.force, pushes.drag) * nodes.free
                     pushed += 0.5 * (x + load / nodes.stiffness[:, None] - pushed)  # or walls may alternate
-                    system = system._replace(**walls.planes(at, pushed)._asdict())
+                    system = system._replace(planes=walls.planes(at, pushed))
             rows = fewer
             self._solve(groups, system, tolerances, size, pushes)
             settled = np.empty(len(groups), dtype=bool)

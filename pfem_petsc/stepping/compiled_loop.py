@@ -157,7 +157,7 @@ class Course(NamedTuple):
     """How a step goes on, which compiled steps assign: whether increments and energies are needed; what
     :func:`~pfem_petsc.mechanics.internal_forces.internal_forces` returns; the number of shares of rows that are
     written; whether a condition holds here, and after :func:`agree` on any rank; the error code of MPI; and what a call
-    of Python returned, or 1 plus the number of a row without a solution."""
+    of Python returned, or which group of rows has no solution, and why."""
 
     keeps: bool
     needs_energies: bool

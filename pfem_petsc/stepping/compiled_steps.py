@@ -13,7 +13,7 @@ from numba import types
 
 from ..columns import BAR_ENERGIES, HEAD, Share, at_state, fill_at_state
 from ..contact.explicit import kind_of
-from ..contact.fixed_rows import FixedRows
+from ..contact.fixed_rows import FixedRows, pressed_nodes
 from ..contact.node_walls import NOTED, WallForces
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
@@ -73,6 +73,7 @@ from .compiled_loop import (
     touch_bars,
 )
 from .contact_phase import (
+    REASONS,
     WallArrays,
     close_on_rows,
     close_on_walls,
@@ -200,7 +201,7 @@ class CompiledSteps:
     def _contacts(self, rows: FixedRows, called: CalledRows) -> Contacts:
         """Return the contacts before the first step."""
         log, met, friction = self.model.contact.log, self.ledger.impacts.met, float(self.ledger.friction_ahead)
-        others = np.concatenate([called.held[: called.counts[0]], rows.nodes[rows.force[rows.of] > 0.0]])
+        others = np.concatenate([called.held[: called.counts[0]], pressed_nodes(rows, int((rows.force > 0.0).sum()))])
         nodes = log.last, others, np.concatenate([log.last, others])
         return Contacts(log.last, met, log.changes, friction, *nodes, 0, 0, 0.0)
 
@@ -301,7 +302,7 @@ class CompiledSteps:
         shares = np.zeros((len(steps) + (0 if due[-1] else 1), self._width))
         begin, impulses = state.step, ledger.impulses.state
         flags = np.zeros((count, len(log.releases)), dtype=bool)
-        rows = model.links.export_rows(self._stiffness)
+        rows = model.links.export_rows(self._stiffness, PROJECTED * model.size)
         called = self._called.begin_rows(begin, rows.totals)
         self._toucher.begin(begin)
         self._wall_caller.begin(begin)
@@ -414,10 +415,9 @@ class CompiledSteps:
         infeasible, why = pressed.failure.tolist()
         if infeasible >= 0:
             node = pressed.nodes[infeasible]
-            return self._at_balance(self.model.contact.placeless(node, why, pressed.normals, pressed.offsets))
+            return self._at_balance(self.model.contact.placeless(node, why, pressed.normals, pressed.gaps))
         if made[UNSOLVED] > 0:
-            rows = self.model.links.rows
-            return self._at_balance(rows.unsettled_message(int(rows.group_of_row[made[UNSOLVED] - 1])))
+            return self._at_balance(self.model.links.rows.unsolved(*divmod(made[UNSOLVED], REASONS)))
         failure = self._called.failure or self._wall_caller.failure
         return self._at_balance(failure) if made[UNSOLVED] else None
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..columns import HEAD
 from ..contact.explicit import Arrivals, PressedWalls, WallSums, find_penetrating, press_nodes
-from ..contact.fixed_rows import close_rows, new_single_row, pressed_nodes, rebound_of_row, rub_row
+from ..contact.fixed_rows import close_rows, pressed_nodes, solve_fixed
 from ..contact.node_walls import compare_contacts
 from ..contact.surfaces import Surfaces, wall_gaps
 from ..mechanics.compiled import addressed, inlined
@@ -20,6 +20,9 @@ from .impact import Approach, Touched, join_nodes, stop_nodes, unpressed
 from .phases import clear_rows, displace, put_rates, rates_of
 
 PUSHED = HEAD.first("contact_work")
+
+REASONS = 3
+"""A group of rows without a solution is told as its number times this, plus why."""
 
 
 @record
@@ -46,7 +49,7 @@ class WallArrays(NamedTuple):
 class ContactNodes(NamedTuple):
     """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the slots
     of walls that they are ``touching`` (n, s), their ``places`` (n, 3); ``failure`` (2,): the first of them without a
-    place, or -1, and why, and its planes, ``normals`` (s, 3) and ``offsets`` (s,); and the sums of each wall, ``force``
+    place, or -1, and why, and its planes, ``normals`` (s, 3) and ``gaps`` (s,); and the sums of each wall, ``force``
     (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
 
     nodes: np.ndarray
@@ -54,7 +57,7 @@ class ContactNodes(NamedTuple):
     places: np.ndarray
     failure: np.ndarray
     normals: np.ndarray
-    offsets: np.ndarray
+    gaps: np.ndarray
     force: np.ndarray
     contacts: np.ndarray
     moment: np.ndarray
@@ -103,6 +106,7 @@ def work_of_walls(s, step):
 @inlined
 def _arrivals(found, nodes, motion, walls):
     """Return what pressing needs of nodes (m,)."""
+    free = np.empty((len(found), 3))
     pressed, touched, h = walls.pressed, walls.touched, motion.h
     m, w = len(found), len(pressed.way)
     bounces = w if len(pressed.restitution) > 0 else 0
@@ -113,7 +117,8 @@ def _arrivals(found, nodes, motion, walls):
         i = found[j]
         stiffness[j] = nodes.stiffness[i]
         for c in range(3):
-            start[j, c], drift[j, c] = motion.x[c, i], h * motion.half[c, i] - motion.u[c, i]
+            free[j, c], start[j, c] = walls.free[c, i], motion.x[c, i]
+            drift[j, c] = h * motion.half[c, i] - motion.u[c, i]
             fixed[j, c] = touched.fixed[i, c]
         for k in range(w):
             applies[j, k] = pressed.all_nodes[k] or pressed.members[i, k]
@@ -123,7 +128,7 @@ def _arrivals(found, nodes, motion, walls):
         for k in range(bounces):
             rebound[j, k], arrival[j, k] = pressed.rebound[i, k], pressed.arrival[i, k]
     none = np.empty((0, w, 3)), np.empty((0, w))
-    return Arrivals(start, ways, drift, stiffness, fixed, applies, touching, rebound, arrival, *none)
+    return Arrivals(free, start, ways, drift, stiffness, fixed, applies, touching, rebound, arrival, *none)
 
 
 @inlined
@@ -182,30 +187,28 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
         nodes, motion, walls, out, contacts = s.nodes, s.motion, s.walls, s.pressed, s.contacts
         free, pressed, m = walls.free, walls.pressed, find_beyond(motion, walls, out, contacts)
         if m > 0:
-            found = pressed.room[:m]
-            places, given = np.empty((m, 3)), _arrivals(found, nodes, motion, walls)
-            for j in range(m):
-                for c in range(3):
-                    places[j, c] = free[c, found[j]]
-            sums = WallSums(out.force, out.contacts, out.moment)
-            failed, why, planes, total, touching, contacts.friction = press_nodes(
-                places, given, pressed, sums, curved, rough, several
+            given, sums = (
+                _arrivals(pressed.room[:m], nodes, motion, walls),
+                WallSums(out.force, out.contacts, out.moment),
+            )
+            failed, why, planes, found, total, touching, contacts.friction = press_nodes(
+                given, pressed, sums, curved, rough, several
             )
             for j in range(m):
-                i = found[j]
+                i = pressed.room[j]
                 out.nodes[j] = i
                 for c in range(3):
-                    displace(c, i, places[j, c] - free[c, i], nodes, motion, s.sums)
+                    displace(c, i, found.x[j, c] - free[c, i], nodes, motion, s.sums)
                     motion.contact[i, c] += total[j, c]  # rows may press there too
-                    out.places[j, c] = places[j, c]
+                    out.places[j, c] = found.x[j, c]
                 for k in range(given.rebound.shape[1]):
                     pressed.rebound[i, k], pressed.arrival[i, k] = given.rebound[j, k], given.arrival[j, k]
                 for k in range(touching.shape[1]):
                     out.touching[j, k] = touching[j, k]
             if failed >= 0:
                 out.failure[0], out.failure[1] = failed, why
-                for k in range(len(out.offsets)):
-                    out.offsets[k] = planes.offsets[failed, k]
+                for k in range(len(out.gaps)):
+                    out.gaps[k] = planes.gaps[failed, k]
                     for c in range(3):
                         out.normals[k, c] = planes.normals[failed, k, c]
         note_contacts(m, walls, out, contacts)
@@ -215,50 +218,25 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
 
 @addressed
 def project_on_rows(s, step):
-    """Separate the nodes of :class:`~pfem_petsc.contact.fixed_rows.FixedRows`; find rows with a force, and those whose
-    force begins or ends with respect to ``rows.closed``."""
+    """Move the nodes of :class:`~pfem_petsc.contact.fixed_rows.FixedRows` to where these may be."""
     rows, nodes, motion, contacts = s.rows, s.nodes, s.motion, s.contacts
-    where, normals, force, h = rows.where, rows.normals, rows.force, motion.h
-    count, changed, rubs, rebounds = 0, 0, len(rows.friction) > 0, len(rows.rebound) > 0
-    single, slip, stiffness = new_single_row(), np.empty(3), np.empty(2)
-    s.called.loss[1] = 0.0
-    for p in range(len(force)):
-        i, j, apart = where[0, p], where[1, p], 0.0
+    h, size = motion.h, 0.0
+    for k in range(len(rows.nodes)):
+        i = rows.nodes[k]
         for c in range(3):
-            there, here = motion.x[c, j] + h * motion.half[c, j], motion.x[c, i] + h * motion.half[c, i]
-            apart += normals[p, c] * (there - here)
-        short = rows.least[p] - apart
-        if rebounds:
-            gap, pull = -rows.least[p], 0.0
-            for c in range(3):
-                gap += normals[p, c] * (motion.x[c, j] - motion.x[c, i])
-                pull -= normals[p, c] * (motion.u[c, j] - motion.u[c, i])
-            short += rebound_of_row(p, rows, gap, -short - gap, pull)
-        presses = short > 0.0 and rows.soft[p] > 0.0
-        force[p] = short / rows.soft[p] if presses else 0.0
-        changed += 1 if presses != rows.closed[p] else 0
-        if rubs:
-            size = 0.0
-            for c in range(3):
-                rows.drag[p, c], slip[c] = 0.0, h * (motion.half[c, j] - motion.half[c, i])
-                size += abs(motion.x[c, i]) + abs(motion.x[c, j])
-            if presses and rows.friction[p, 1] > 0.0:
-                stiffness[0], stiffness[1] = nodes.stiffness[i], nodes.stiffness[j]
-                found, work = rub_row(p, rows, short, stiffness, slip, size, single)
-                s.called.loss[1] += work
-                if not found and s.course.unsolved == 0:
-                    s.course.unsolved = 1 + p
-        if not presses:
-            continue
-        count += 1
-        for end in range(2):
-            node = where[end, p]
-            for c in range(3):
-                part = force[p] * normals[p, c] + rows.drag[p, c] if rubs else force[p] * normals[p, c]
-                part = part if end == 1 else -part
-                motion.contact[node, c] += part
-                displace(c, node, part * rows.free[end, p, c] / nodes.stiffness[node], nodes, motion, s.sums)
-    contacts.rows, contacts.altered, contacts.others = count, changed, pressed_nodes(rows, count)
+            rows.start[k, c], rows.x[k, c] = motion.x[c, i], motion.x[c, i] + h * motion.half[c, i]
+            rows.pushed[k, c] = motion.u[c, i]
+            size = max(size, abs(rows.x[k, c]))
+    failed, why, contacts.rows, contacts.altered, s.called.loss[1] = solve_fixed(rows, size)
+    if failed >= 0 and s.course.unsolved == 0:
+        s.course.unsolved = REASONS * failed + why
+    contacts.others = pressed_nodes(rows, contacts.rows)
+    for k in range(len(rows.nodes) if contacts.rows > 0 else 0):
+        i = rows.nodes[k]
+        for c in range(3):
+            motion.contact[i, c] += rows.load[k, c]
+            if rows.moves[k, c] != 0.0:
+                displace(c, i, rows.moves[k, c], nodes, motion, s.sums)
 
 
 @addressed
@@ -267,10 +245,9 @@ def sum_rows(s, step):
     :func:`~pfem_petsc.contact.rows.last_forces` does."""
     rows = s.rows
     clear_rows(rows.totals)
-    for k in range(len(rows.totals) if s.contacts.rows > 0 else 0):
-        for p in range(rows.table_starts[k], rows.table_starts[k + 1]):
-            for c in range(3):
-                rows.totals[k, c] += rows.force[p] * rows.normals[p, c] + rows.drag[p, c]
+    for p in range(len(rows.force) if s.contacts.rows > 0 else 0):
+        for c in range(3):
+            rows.totals[rows.source[p], c] += rows.force[p] * rows.normals[p, c] + rows.drag[p, c]
 
 
 @inlined
@@ -336,14 +313,14 @@ def close_on_rows(s, step):
     for end in range(2):
         around = np.empty(count, dtype=np.int64)
         for m in range(count):
-            around[m] = rows.where[end, at[m]]
+            around[m] = rows.nodes[rows.ends[end, at[m]]]
         free_v, free_a = _free_rates(around, nodes, motion, (s.moving, step, s.held), state)
         for m in range(count):
             i = around[m]
             ends[end, m, 9] = nodes.mass[i]
             for c in range(3):
                 # rows do not change prescribed components
-                fixed = rows.free[end, at[m], c] == 0.0
+                fixed = rows.system.free[rows.ends[end, at[m]], c] == 0.0
                 ends[end, m, c] = motion.x[c, i]
                 ends[end, m, 3 + c] = v[i, c] if fixed else free_v[m, c]
                 ends[end, m, 6 + c] = a[i, c] if fixed else free_a[m, c]

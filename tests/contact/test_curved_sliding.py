@@ -161,16 +161,17 @@ def test_friction_on_a_sphere_in_large_steps(side, friction):
     zero = np.zeros((1, 3))
     walls = PressedWalls(
         *(Surfaces(zero, np.zeros(1), zero, zero, np.array([side])), 0.0, np.ones(1, dtype=bool)),
-        *(np.ones((m, 1), dtype=bool), 1e-13, np.empty(m, dtype=np.int64), zero, zero),
+        *(np.ones((m, 1), dtype=bool), 1e-13, np.empty(m, dtype=np.int64), np.zeros(1, dtype=np.int64), zero, zero),
         *(np.full((2, 1), friction), np.empty(0), np.empty((0, 1)), np.empty((0, 1))),
     )
     no = np.zeros((m, 1), dtype=bool)
     given = Arrivals(
-        *(start, np.zeros((m, 3)), np.full(m, stiffness), np.zeros((m, 3), dtype=bool), ~no, no),
+        *(free, start, np.zeros((m, 1, 3)), np.zeros((m, 3)), np.full(m, stiffness)),
+        *(np.zeros((m, 3), dtype=bool), ~no, no),
         *(np.empty((m, 0)), np.empty((m, 0)), np.empty((0, 1, 3)), np.empty((0, 1))),
     )
-    x, sums = free.copy(), WallSums(np.zeros((1, 3)), np.zeros(1, dtype=np.int64), np.zeros((1, 3)))
-    failed, _, _, force, _, dissipated = press_nodes(x, given, walls, sums, *kind_of(walls))
+    sums = WallSums(np.zeros((1, 3)), np.zeros(1, dtype=np.int64), np.zeros((1, 3)))
+    failed, _, _, (x, *_), force, _, dissipated = press_nodes(given, walls, sums, *kind_of(walls))
     assert m > 60 and turned.sum() > 20 and failed < 0
     np.testing.assert_allclose(np.linalg.norm(x, axis=1), 1.0, atol=1e-12)
     np.testing.assert_allclose(force, stiffness * (x - free), atol=1e-12)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pfem_petsc.contact.projection import RUBS, Groups, RowPushes, System, project_groups
+from pfem_petsc.contact.projection import INFEASIBLE, JAMMED, Groups, Planes, RowPushes, System, project_groups
 
 
 def frames(normals):
@@ -74,9 +74,9 @@ class Group:
         both = lambda mu: np.stack([mu, static * mu], axis=-1)  # noqa: E731
         weights = np.tile([-1.0, 1.0], (r, 1))
         system = System(
-            *(self.ends, gradients, self.values, self.stiffness, self.free),
-            *(self.plane, self.wall_normals, self.gaps, weights),
-            *(both(self.friction), self.slips, both(self.wall_friction), self.wall_slips),
+            *(self.ends, gradients, self.values, weights, both(self.friction), self.slips),
+            *(self.stiffness, self.free, self.plane),
+            Planes(self.wall_normals, self.gaps, both(self.wall_friction), self.wall_slips),
         )
         pushes = RowPushes(np.zeros(r), np.zeros((r, 3)), np.zeros((n, 3)))
         found = project_groups(np.array([0]), groups, system, np.full(1, 1e-13), 1.0, pushes)
@@ -120,9 +120,9 @@ def test_supported_groups_obey_the_law(seed):
     """Supports at some components, and more friction: what is found satisfies all conditions."""
     group = Group(seed, most=0.8, fixed=0.3)
     found, pushes = group.solve()
-    if found == (0, RUBS):
+    if found == (0, JAMMED):
         return  # a jam, or more friction than any position can balance
-    if found == (0, 0):
+    if found == (0, INFEASIBLE):
         assert group.free.min() == 0.0  # supports leave no room
         return
     n, ends = group.normals, group.ends

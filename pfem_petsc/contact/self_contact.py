@@ -57,6 +57,7 @@ _SKIN = 0.1, 0.5  # least and largest distance beyond the radii up to which pair
 _STEPS = 20.0  # steps for which the skin should be sufficient, unless it is too large then
 _FEW, _MANY = 0.25, 3.0  # pairs for each bar in lists that are made with a larger or a smaller skin the next time
 _CLOSER = 0.2  # of the distance of a pair, up to which an iteration may reduce it
+_ADVANCES = 100  # parts of the way of a pair in an iteration, at the end of which the rest is left for the next
 _TINY = 1e-30  # imaginary part of a position [m], whose square vanishes beside one
 _STILL = (
     1e-10  # change of squared distances in a step, over that of the radii, below which energies are those of rounding
@@ -493,22 +494,22 @@ def free_part(pairs, x, way):
                 for c in range(3):
                     square += (way[ends[p, j], c] - way[ends[p, i], c]) ** 2
                 most = max(most, np.sqrt(square))
-        at, least = 0.0, -1.0
-        while True:
+        at, least, free = 0.0, -1.0, False
+        for _ in range(_ADVANCES):
             for i in range(4):
                 for c in range(3):
                     place[i, c] = x[ends[p, i], c] + at * way[ends[p, i], c]
             d, _, _ = segment_distance(place, segments, 0, 1)
             if least < 0.0:
                 least = _CLOSER * min(d, pairs.reach[p])
-                if not least > 0.0:
-                    break
             elif d < least:
-                part, limiting = at, 1 + p
                 break
-            if d - 0.5 * least >= (part - at) * most:
+            free = d - 0.5 * least >= (part - at) * most
+            if free:
                 break
             at += (d - 0.5 * least) / most
+        if not free:
+            part, limiting = at, 1 + p
     return part, limiting
 
 

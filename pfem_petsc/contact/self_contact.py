@@ -19,7 +19,13 @@ get at most :data:`_PART` of what the step and the others leave. The stiffness i
 Pairs closer than R in the mesh keep their distance there instead of R, and do not touch below :data:`_LEAST` of it.
 
 Bars are searched with a skin. Pairs are evaluated when the ways of the nodes since then allow them to touch; a bar that
-could jump over another in a step, or has passed its axis, ends the run.
+could jump over another in an explicit step, or has passed its axis, ends the run.
+
+Steps that solve equations try positions from the last ones that were committed, with forces and memory as at the end of
+the step. The derivative of the force is that of the same code, for complex positions. The way from one iteration to
+the next is shortened where a pair would come too close (:func:`free_part`), so that positions are always those of a
+motion in which no bar passes another. k is E A/l there, whatever the step. Matrices have the pairs that touch in their
+pattern, which begins anew with each problem and grows with its iterations.
 """
 
 from __future__ import annotations

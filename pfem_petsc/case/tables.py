@@ -658,7 +658,7 @@ class ContactPair(SurfaceKeys):
 
 
 class SelfContact(StrictModel):
-    """Bars that cannot pass through each other, as capsules; explicit integrators."""
+    """Bars that cannot pass through each other, as capsules."""
 
     bars: BarGroup | None = None
     """bar group of the mesh, or bars with a value of a field, as in a section; default: every bar"""

@@ -19,7 +19,13 @@ get at most :data:`_PART` of what the step and the others leave. The stiffness i
 Pairs closer than R in the mesh keep their distance there instead of R, and do not touch below :data:`_LEAST` of it.
 
 Bars are searched with a skin. Pairs are evaluated when the ways of the nodes since then allow them to touch; a bar that
-could jump over another in a step, or has passed its axis, ends the run.
+could jump over another in an explicit step, or has passed its axis, ends the run.
+
+Steps that solve equations try positions from the last ones that were committed, with forces and memory as at the end of
+the step. The derivative of the force is that of the same code, for complex positions. The way from one iteration to
+the next is shortened where a pair would come too close (:func:`free_part`), so that positions are always those of a
+motion in which no bar passes another. k is E A/l there, whatever the step. Matrices have the pairs that touch in their
+pattern, which begins anew with each problem and grows with its iterations.
 """
 
 from __future__ import annotations
@@ -57,6 +63,7 @@ _SKIN = 0.1, 0.5  # least and largest distance beyond the radii up to which pair
 _STEPS = 20.0  # steps for which the skin should be sufficient, unless it is too large then
 _FEW, _MANY = 0.1, 0.6  # pairs for each bar in lists that are made with a larger or a smaller skin the next time
 _CLOSER = 0.2  # of the distance of a pair, up to which an iteration may reduce it
+_ADVANCES = 100  # parts of the way of a pair in an iteration, at the end of which the rest is left for the next
 _TINY = 1e-30  # imaginary part of a position [m], whose square vanishes beside one
 _STILL = 1e-10  # change of squared distances in a step, over that of the radii, below which energies are rounding
 _WIDER = 1.05  # bound of the next displacements over the largest one
@@ -317,54 +324,74 @@ def find_beginning(pairs, state, memory, nodes, law, load):
     return beginning, failed, asleep
 
 
-@inlined
-def _evaluate_pair(pairs, p, nodes, old, new, law, rooms):
-    """Write the gradient of the energy of a pair with its friction and damping, and its memory; return the energies of
-    normal force and friction, the energy lost, the normal force, -1 for a pair that does not touch, the overlap, and 1
-    plus the cosine of the turn of the normal, 1 for a pair that begins to touch, 0 where the axes meet.
+@kernel
+def evaluate_pairs(pairs, state, old, new, nodes, law, out):
+    """Compute forces and sums of the pairs that touch, and their memory ``new`` (m, width) from the ``old`` one.
 
-    Positions may be complex, whose imaginary parts then are derivatives.
+    ``pairs``: PairArrays; ``state`` (m,), which is changed; ``nodes``: NodeArrays, to whose forces those of pairs are
+    added; ``law``: PairLaw; ``out`` (6,): sums from :data:`ENERGY` on. Returns 1 plus the pair that has passed through
+    itself, or 0. Positions, forces, new memory and sums may be complex, with derivatives as imaginary parts.
     """
-    x, ends, k, reach = nodes.x, pairs.ends, pairs.stiffness[p], pairs.reach[p]
+    x, ends, failed, kind = nodes.x, pairs.ends, 0, nodes.force.dtype
+    segments = ends.reshape(-1, 2)
+    rooms = Rooms(np.zeros((4, 3), kind), np.zeros(3, kind), np.zeros(3, kind), np.zeros(3, kind), np.zeros(3, kind))
     g, way, normal = rooms.g, rooms.way, rooms.normal
-    d, s, t = segment_distance(x, ends.reshape(-1, 2), 2 * p, 2 * p + 1)
-    energy = push = at = other = lost = held = turn = closing = 0.0 * d
-    if d.real < reach:
-        energy, push, at, other = _repel(pairs, p, x, s, t, rooms)
-    if push.real <= 0.0:  # what spring and damper held is lost
+    for p in range(len(ends)):
+        if state[p] == APART:
+            continue
+        d, s, t = segment_distance(x, segments, 2 * p, 2 * p + 1)
+        k, reach = pairs.stiffness[p], pairs.reach[p]
+        energy = push = at = other = lost = 0.0
+        if d.real < reach:
+            energy, push, at, other = _repel(pairs, p, x, s, t, rooms)
+        if push.real > 0.0:
+            s, t = at / push, other / push
         _point_way(x, ends, p, s, t, 3, way)
+        if push.real <= 0.0:  # what spring and damper held is lost
+            for c in range(3):
+                lost += 0.5 * k * old[p, SPRING + c] * old[p, SPRING + c]
+                lost -= 0.5 * old[p, VISCOUS] * way[c] * old[p, NORMAL + c]
+            state[p] = APART
+            if pairs.counted[p]:
+                out[DISSIPATED] += lost
+            continue
+        apart = _point_way(x, ends, p, s, t, 0, normal)
+        turn = closing = held = 0.0
         for c in range(3):
-            lost += 0.5 * k * old[p, SPRING + c] * old[p, SPRING + c]
-            lost -= 0.5 * old[p, VISCOUS] * way[c] * old[p, NORMAL + c]
-            for i in range(4):
-                g[i, c] = 0.0
-        return energy, held, lost, push - 1.0, reach - d, turn
-    s, t = at / push, other / push
-    _point_way(x, ends, p, s, t, 3, way)
-    apart = _point_way(x, ends, p, s, t, 0, normal)
-    for c in range(3):
-        normal[c] = normal[c] / apart if apart.real > 0.0 else 0.0
-        turn += normal[c] * old[p, NORMAL + c]
-        closing += normal[c] * way[c]
-    turn = turn + 1.0 if apart.real > 0.0 else 0.0 * turn
-    mobility = (1.0 - s) ** 2 * nodes.inverse[ends[p, 0]] + s**2 * nodes.inverse[ends[p, 1]]
-    mobility += (1.0 - t) ** 2 * nodes.inverse[ends[p, 2]] + t**2 * nodes.inverse[ends[p, 3]]
-    total = _damp(pairs, p, law, push, closing, mobility)
-    lost -= 0.5 * (old[p, VISCOUS] + total - push) * closing
-    if total != push:
-        _gradient(g, s, t, total - push, normal)
-    for c in range(3):
-        new[p, SPRING + c] = 0.0
-    if law.friction > 0.0:
-        held, rubbed = _slide(old, new, p, k, law.friction * total / k, rooms)
-        lost += rubbed
+            normal[c] = normal[c] / apart if apart.real > 0.0 else 0.0
+            turn += normal[c] * old[p, NORMAL + c]
+            closing += normal[c] * way[c]
+        if apart.real <= 0.0 or (state[p] == TOUCHING and turn.real < 0.0):
+            failed = 1 + p
+        mobility = (1.0 - s) ** 2 * nodes.inverse[ends[p, 0]] + s**2 * nodes.inverse[ends[p, 1]]
+        mobility += (1.0 - t) ** 2 * nodes.inverse[ends[p, 2]] + t**2 * nodes.inverse[ends[p, 3]]
+        total = _damp(pairs, p, law, push, closing, mobility)
+        lost -= 0.5 * (old[p, VISCOUS] + total - push) * closing
+        if total != push:
+            _gradient(g, s, t, total - push, normal)
         for c in range(3):
-            way[c] = -new[p, SPRING + c]
-        _gradient(g, s, t, k, way)
-    new[p, VISCOUS], new[p, FIRST], new[p, SECOND] = total - push, s, t
-    for c in range(3):
-        new[p, NORMAL + c] = normal[c]
-    return energy, held, lost, total, reach - d, turn
+            new[p, SPRING + c] = 0.0
+        if law.friction > 0.0:
+            held, rubbed = _slide(old, new, p, k, law.friction * total / k, rooms)
+            lost += rubbed
+            for c in range(3):
+                way[c] = -new[p, SPRING + c]
+            _gradient(g, s, t, k, way)
+        state[p] = TOUCHING
+        new[p, VISCOUS], new[p, FIRST], new[p, SECOND] = total - push, s, t
+        for c in range(3):
+            new[p, NORMAL + c] = normal[c]
+        for i in range(4):
+            for c in range(3):
+                nodes.force[ends[p, i], c] += g[i, c]
+        if pairs.counted[p]:
+            out[ENERGY] += energy + held
+            out[DISSIPATED] += lost
+            out[CONTACTS] += 1.0
+            out[OVERLAP] = max(out[OVERLAP].real, reach - d.real)
+            out[FORCE] = max(out[FORCE].real, np.sqrt((total * total + 2.0 * k * held).real))
+            out[DEPTH] = max(out[DEPTH].real, 2.0 * (reach - d.real) / reach)
+    return failed
 
 
 @inlined
@@ -414,17 +441,15 @@ def _step_gradient(pairs, nodes, place, rooms):
 
 
 @inlined
-def _take_pair(pairs, p, nodes, place, inverse):
-    """Return a pair and its nodes alone, with room for their positions (4, 6) and inverse masses (4,)."""
-    ends = np.arange(4).reshape(1, 4)
+def _take_pair(pairs, p, nodes, own):
+    """Return a pair alone, and copy its nodes to ``own``, of four nodes, without forces."""
+    ends, one = np.arange(4).reshape(1, 4), slice(p, p + 1)
     for i in range(4):
-        inverse[i] = nodes.inverse[pairs.ends[p, i]]
+        own.inverse[i] = nodes.inverse[pairs.ends[p, i]]
         for c in range(6):
-            place[i, c] = nodes.x[pairs.ends[p, i], c]
-    one = slice(p, p + 1)
+            own.x[i, c] = nodes.x[pairs.ends[p, i], c]
     sizes = pairs.reach[one], pairs.crossed[one], pairs.most[one], pairs.counted[one]
-    alone = PairArrays(ends, *sizes, pairs.stiffness[one], pairs.drag[one], pairs.wake[one])
-    return alone, NodeArrays(place, inverse, nodes.force)
+    return PairArrays(ends, *sizes, pairs.stiffness[one], pairs.drag[one], pairs.wake[one])
 
 
 @kernel
@@ -432,14 +457,15 @@ def add_step_gradients(pairs, state, nodes):
     """Add the discrete gradients of a step of the pairs that touch to the forces of the nodes.
 
     ``pairs``: PairArrays; ``state`` (m,); ``nodes``: NodeArrays at the end of the step, see :func:`_step_gradient`.
+    Positions and forces may be complex, with derivatives as imaginary parts.
     """
-    rooms = Rooms(np.zeros((4, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    place, other, inverse = np.zeros((4, 6)), np.zeros((4, 6)), np.zeros(4)
+    kind = nodes.force.dtype
+    rooms = Rooms(np.zeros((4, 3), kind), np.zeros(3, kind), np.zeros(3, kind), np.zeros(3, kind), np.zeros(3, kind))
+    own, place = NodeArrays(np.zeros((4, 6), kind), np.zeros(4), np.zeros((4, 3), kind)), np.zeros((4, 6), kind)
     for p in range(len(pairs.ends)):
         if state[p] == APART:
             continue
-        pair, own = _take_pair(pairs, p, nodes, place, inverse)
-        _step_gradient(pair, own, other, rooms)
+        _step_gradient(_take_pair(pairs, p, nodes, own), own, place, rooms)
         for i in range(4):
             for c in range(3):
                 nodes.force[pairs.ends[p, i], c] += rooms.g[i, c]
@@ -454,25 +480,21 @@ def differentiate_pairs(pairs, chosen, old, nodes, law, whole, blocks):
     nothing is subtracted (Squire and Trapp, 1998): of everything that depends on the positions, such as where bars
     touch, blends, and the slip.
     """
-    zero = np.zeros(3, np.complex128)
-    rooms = Rooms(np.zeros((4, 3), np.complex128), zero, zero.copy(), zero.copy(), zero.copy())
-    place, other, inverse = np.zeros((4, 6), np.complex128), np.zeros((4, 6), np.complex128), np.zeros(4)
-    new = np.zeros((1, old.shape[1]), np.complex128)
+    new, out, state = np.zeros((1, old.shape[1]), np.complex128), np.zeros(6, np.complex128), np.zeros(1, np.uint8)
+    own = NodeArrays(np.zeros((4, 6), np.complex128), np.zeros(4), np.zeros((4, 3), np.complex128))
     for k in range(len(chosen)):
         p = chosen[k]
-        pair, own = _take_pair(pairs, p, nodes, place, inverse)
         for column in range(12):
-            i, c = column // 3, column % 3
-            place[i, c] += 1j * _TINY
-            place[i, 3 + c] += 1j * _TINY
+            pair = _take_pair(pairs, p, nodes, own)
+            own.x[column // 3, column % 3] += 1j * _TINY
+            own.x[column // 3, 3 + column % 3] += 1j * _TINY
+            state[0], own.force[:] = TOUCHING, 0.0
             if whole:
-                _step_gradient(pair, own, other, rooms)
+                add_step_gradients(pair, state, own)
             else:
-                _evaluate_pair(pair, 0, own, old[p : p + 1], new, law, rooms)
+                evaluate_pairs(pair, state, old[p : p + 1], new, own, law, out)
             for row in range(12):
-                blocks[k, row, column] = rooms.g[row // 3, row % 3].imag / _TINY
-            place[i, c] = place[i, c].real
-            place[i, 3 + c] = place[i, 3 + c].real
+                blocks[k, row, column] = own.force[row // 3, row % 3].imag / _TINY
 
 
 @kernel
@@ -492,57 +514,23 @@ def free_part(pairs, x, way):
                 for c in range(3):
                     square += (way[ends[p, j], c] - way[ends[p, i], c]) ** 2
                 most = max(most, np.sqrt(square))
-        at, least = 0.0, -1.0
-        while True:
+        at, least, free = 0.0, -1.0, False
+        for _ in range(_ADVANCES):
             for i in range(4):
                 for c in range(3):
                     place[i, c] = x[ends[p, i], c] + at * way[ends[p, i], c]
             d, _, _ = segment_distance(place, segments, 0, 1)
             if least < 0.0:
                 least = _CLOSER * min(d, pairs.reach[p])
-                if not least > 0.0:
-                    break
             elif d < least:
-                part, limiting = at, 1 + p
                 break
-            if d - 0.5 * least >= (part - at) * most:
+            free = d - 0.5 * least >= (part - at) * most
+            if free:
                 break
             at += (d - 0.5 * least) / most
+        if not free:
+            part, limiting = at, 1 + p
     return part, limiting
-
-
-@kernel
-def evaluate_pairs(pairs, state, old, new, nodes, law, out):
-    """Compute forces and sums of the pairs that touch, and their memory ``new`` (m, width) from the ``old`` one.
-
-    ``pairs``: PairArrays; ``state`` (m,), which is changed; ``nodes``: NodeArrays, to whose forces those of pairs are
-    added; ``law``: PairLaw; ``out`` (6,): sums from :data:`ENERGY` on. Returns 1 plus the pair that has passed through
-    itself, or 0.
-    """
-    ends, failed = pairs.ends, 0
-    rooms = Rooms(np.zeros((4, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    for p in range(len(ends)):
-        if state[p] == APART:
-            continue
-        energy, held, lost, total, overlap, turn = _evaluate_pair(pairs, p, nodes, old, new, law, rooms)
-        if pairs.counted[p]:
-            out[DISSIPATED] += lost
-        if total < 0.0:
-            state[p] = APART
-            continue
-        if not turn > 0.0 or (state[p] == TOUCHING and turn < 1.0):
-            failed = 1 + p
-        state[p] = TOUCHING
-        for i in range(4):
-            for c in range(3):
-                nodes.force[ends[p, i], c] += rooms.g[i, c]
-        if pairs.counted[p]:
-            out[ENERGY] += energy + held
-            out[CONTACTS] += 1.0
-            out[OVERLAP] = max(out[OVERLAP], overlap)
-            out[FORCE] = max(out[FORCE], np.sqrt(total * total + 2.0 * pairs.stiffness[p] * held))
-            out[DEPTH] = max(out[DEPTH], 2.0 * overlap / pairs.reach[p])
-    return failed
 
 
 @kernel

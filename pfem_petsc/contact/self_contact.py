@@ -737,7 +737,7 @@ class SelfContact:
         if case.static is not None and case.static.method != "newton":
             self._refuse(f'static.method = "{case.static.method}"', 'use "newton"')
         if case.modes is not None:
-            self._refuse("[modes]", "whose stiffness has no contact; give the table in the stages before only")
+            self._refuse("[modes]", "their stiffness has no contact: give the table to the stages before only")
         if self.at_walls is not None:
             names = ", ".join(repr(self._model.contact.names[k]) for k in self.at_walls.walls)
             self._refuse(f"walls {names}, which bars touch between their nodes,", explicit)
@@ -746,7 +746,7 @@ class SelfContact:
         if scheme.discrete_gradient and not self.symmetric:
             self._refuse(
                 f'time.integrator = "{case.time.integrator}"',
-                "whose energy is conserved, with friction or restitution; use another one, or remove these",
+                "it conserves energy: use another one, or remove friction and restitution",
             )
 
     def _refuse(self, what: str, remedy: str) -> None:

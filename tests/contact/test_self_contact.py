@@ -407,8 +407,16 @@ def test_contact_goes_over_to_the_next_stage(tmp_path):
     assert np.abs(column(rows, "energy_imbalance")).max() < 1e-12
     lost = column(rows, "self_contact_dissipation")
     assert np.diff(lost).min() > -1e-9 and lost[-1] == pytest.approx(0.5 * 1000.0 * AREA * 0.3**2, rel=0.02)
-    with pytest.raises(InputError, match=r"self_contact.* needs an explicit integrator"):
-        case["stage"].append({"name": "still", "static": {}})
+    # and rest on each other in equilibrium, held by friction
+    case["stage"].append({"name": "still", "static": {"method": "newton"}})
+    rows, y = rows_of(Case(case, mesh=mesh), MPI.COMM_SELF, tmp_path, "still")
+    np.testing.assert_allclose(y, x, atol=1e-5)
+    load = 1000.0 * AREA * 10.0 * (0.3 + y[4, 0] + 0.5) / 0.6  # of the contact that is nearer to the middle of the bar
+    stiffness = 2.0 * 2e9 * AREA / 1.4
+    assert rows[-1]["self_contact/overlap"] == pytest.approx(load / stiffness, rel=1e-4)
+    assert rows[-1]["self_contact/contacts"] == 2
+    case["stage"][-1]["static"] = {"method": "arc_length"}
+    with pytest.raises(InputError, match=r"\[self_contact\] does not serve static.method"):
         Simulation(Case(case, mesh=mesh), MPI.COMM_SELF, output=tmp_path / "no")
 
 

@@ -480,6 +480,11 @@ def test_other_static_methods_are_refused(method, tmp_path):
         Simulation(cables(static=static), MPI.COMM_SELF, output=tmp_path)
 
 
+def test_modes_of_states_with_contact_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"does not serve \[modes\] in implicit or static steps; their stiffness"):
+        Simulation(cables(modes={"count": 1}), MPI.COMM_SELF, output=tmp_path)
+
+
 def turn_by(axis, angle):
     """Matrix of a turn (3, 3)."""
     axis = np.asarray(axis) / np.linalg.norm(axis)

@@ -318,7 +318,7 @@ def test_guided_nodes_slip_on_a_floor_beside_pairs(operator, comm, shared_tmp_pa
         end=0.02,
     )
     rows, run = rows_of(case, comm, shared_tmp_path)
-    x = run.gather(run.state.position)[:3] - case_points()[:3]
+    x = comm.bcast(run.gather(run.state.position))[:3] - case_points()[:3]
     np.testing.assert_allclose(x[:, 0], 0.2 * 0.02, rtol=0.0, atol=1e-15)
     gained = rows[-1]["momentum"] - rows[0]["momentum"]
     names = "external_impulse", "support_impulse", "wall/floor/impulse"

@@ -544,7 +544,7 @@ class ConstraintSet:
         nodes = FreeNodes(every, hard, np.zeros_like(every), at_start=False, free=rows.free)
         rubs = rows.rubs or self._walls.rubs
         if rubs:  # along the velocity where nodes slide, else along the acceleration
-            v, rates = rows.gather(state.v), contact.motion.rates(state.time, ahead=True)
+            v, rates = rows.gather(state.v), contact.rates(x, state.time, ahead=True)
             fast = 1e16 * largest / max(np.abs(v).max(initial=0.0), np.abs(rates).max(initial=0.0), still)
             coefficients = np.tile(np.stack([contact.friction, contact.static_friction], axis=1), (len(every), 1, 1))
             slips = relative + fast * _sliding(v[:, None, :] - rates, normals, still)

@@ -579,6 +579,6 @@ class NodeWalls:
         touched = dict.fromkeys(self.names[k] for k in self.wall_of[offsets > -np.inf])
         return (
             f"no position of node {self.mesh.node_ids[node]} satisfies all walls "
-            f"({', '.join(touched)}) and its supports: they are infeasible together; move the "
+            f"({', '.join(touched) or 'and contact pairs'}) and its supports: they are infeasible together; move the "
             "walls apart, or free the node"
         )

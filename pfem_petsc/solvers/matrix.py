@@ -289,9 +289,14 @@ class HessianMatrix:
             product.copy(self.bounded, PETSc.Mat.Structure.DIFFERENT)
             return
         nodes = transform.sliding.nodes
-        add_diagonal(product, self.mesh, nodes, transform.slip_blocks(), PETSc.InsertMode.ADD_VALUES)
+        turning, left = transform.slip_blocks(), transform.left()
+        if self.any_fixed:  # whose rows and columns remain those of the identity
+            held = self._fixed[nodes] > 0.0
+            turning[held[:, :, None] | held[:, None, :]] = 0.0
+            left = np.where(held[:, :, None], np.eye(3), left)
+        add_diagonal(product, self.mesh, nodes, turning, PETSc.InsertMode.ADD_VALUES)
         maps = np.tile(np.eye(3), (self.mesh.n_owned, 1, 1))
-        maps[nodes] = transform.left()
+        maps[nodes] = left
         add_diagonal(self._maps, self.mesh, np.arange(self.mesh.n_owned), maps, PETSc.InsertMode.INSERT_VALUES)
         self._maps.matMult(product, self.bounded)
 

@@ -302,6 +302,34 @@ def test_held_nodes_and_a_floor_with_friction(integrator, parameters, axis, comm
         assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-13
 
 
+@pytest.mark.parallel
+@pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
+def test_guided_nodes_slip_on_a_floor_beside_pairs(operator, comm, shared_tmp_path):
+    """Supports drag the lower body in one direction, while the other one rubs on it: what they prescribe is exact."""
+    wall = planes([[0.0, 0.0, 1.0]], [0.0], friction=0.1, name="floor")
+    case = bodies(
+        comm,
+        "newmark",
+        pair={"friction": 0.4},
+        on={"upper": [0.0, 0.5, 0.0], "lower": [0.2, 0.0, 0.0]},
+        wall=wall,
+        support=[{"node_set": "lower", "fix": "x", "velocity": [0.2, 0.0, 0.0]}],
+        solver=ACCURATE | {"operator": operator},
+        end=0.02,
+    )
+    rows, run = rows_of(case, comm, shared_tmp_path)
+    x = comm.bcast(run.gather(run.state.position))[:3] - case_points()[:3]
+    np.testing.assert_allclose(x[:, 0], 0.2 * 0.02, rtol=0.0, atol=1e-15)
+    gained = rows[-1]["momentum"] - rows[0]["momentum"]
+    names = "external_impulse", "support_impulse", "wall/floor/impulse"
+    given = sum(rows[-1][name] - rows[0][name] for name in names)
+    np.testing.assert_allclose(gained, given, rtol=0.0, atol=1e-10 * np.abs(given).max())
+    force = rows[-1]["wall/floor/force"]
+    assert np.hypot(force[0], force[1]) == pytest.approx(0.1 * force[2], rel=1e-9)
+    assert force[0] < 0.0 and force[1] < 0.0 and x[:, 1].min() > 0.0
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-13
+
+
 def tower(comm, frictions, integrator, pushed, ring=(), **tables):
     """Four nodes above each other, each but the lowest with a bar to a node of its own that it takes along."""
     z = 0.01 * np.arange(4)

@@ -142,6 +142,7 @@ def draw_rough_pair(chance: random.Random, case: dict[str, Any], body: Body, mot
     for pair in case.get("contact_pair", ()):
         if rubs and chance.random() < 0.7:
             pair["friction"] = 10 ** chance.uniform(-1.3, 0.3)
+            pair.pop("static_friction", None)
             if chance.random() < 0.4:
                 pair["static_friction"] = pair["friction"] * chance.uniform(1.0, 1.6)
         if scheme == "central_differences" and "mass" not in case["time"] and chance.random() < 0.6:

@@ -1,5 +1,5 @@
-"""Adds to cases of :mod:`draw` the contact of surfaces of triangles, of walls that turn, of pairs that rub and rebound,
-and of bars with bars.
+"""Adds to cases of :mod:`draw` the contact of surfaces of triangles, of walls that turn, also freely, of pairs that rub
+and rebound, and of bars with bars.
 
 Surfaces are closed and open, convex or not, of one face to some dozens, and are placed so that every node is in front
 of them. What the documentation excludes is not drawn.
@@ -115,7 +115,7 @@ def draw_turn(chance: random.Random, case: dict[str, Any], body: Body, motion: M
     if _treatment(case) == "mass_redistribution" or (case.get("contact_pair") and _treatment(case) != "scheme"):
         return
     for wall in case.get("wall", ()):
-        if chance.random() < 0.4 or wall.get("adjust"):
+        if chance.random() < 0.4 or wall.get("adjust") or "inertia" in wall:
             continue
         arm = body.size * chance.choice((chance.uniform(0.1, 2.0), 50.0))
         turn = {
@@ -134,6 +134,29 @@ def draw_turn(chance: random.Random, case: dict[str, Any], body: Body, motion: M
             if chance.random() < 0.3:
                 turn["interpolation"] = "linear"
         wall["rotation"] = turn
+
+
+def draw_inertia(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
+    """Let walls with mass turn freely, or about a hinge."""
+    for wall in case.get("wall", ()):
+        if "mass" not in wall:
+            continue
+        width = body.size * chance.uniform(0.2, 1.0)
+        squares = width * width * np.array([chance.uniform(0.2, 1.0) for _ in range(3)])
+        moments = wall["mass"] / 12.0 * (squares.sum() - squares)  # of a box with these edges
+        wall["inertia"] = moments
+        if chance.random() < 0.4:
+            axes = np.linalg.qr(np.array([vector(chance, 1.0) for _ in range(3)]))[0]
+            matrix = axes @ np.diag(moments) @ axes.T
+            wall["inertia"] = 0.5 * (matrix + matrix.T)
+        if wall["type"] == "surface" or chance.random() < 0.3:
+            wall["centre_of_mass"] = np.array(wall["point"]) + vector(chance, 0.3 * width)
+        axis = vector(chance, chance.uniform(0.5, 3.0))
+        if "velocity" not in wall and chance.random() < 0.3:
+            wall["hinge"] = {"centre": np.array(wall["point"]) + vector(chance, 0.5 * width), "axis": axis}
+        if chance.random() < 0.5:
+            rate = chance.uniform(-0.5, 0.5) * motion.speed / body.size
+            wall["angular_velocity"] = rate * axis / np.linalg.norm(axis)
 
 
 def draw_rough_pair(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
@@ -161,15 +184,26 @@ def draw_rough_pair(chance: random.Random, case: dict[str, Any], body: Body, mot
 
 def draw_bars_touch(chance: random.Random, case: dict[str, Any], body: Body, motion: Motion) -> None:
     """Let bars touch, and shoot a bar at the body from behind."""
-    if not _lumped_explicit(case) or _treatment(case) == "mass_redistribution":
+    explicit, scheme = case["time"]["integrator"] in EXPLICIT, case["time"]["integrator"]
+    if "mass" in case["time"] or _treatment(case) == "mass_redistribution":
         return
-    if case["time"]["step"] != "auto":  # keep clear of the critical step
+    if not explicit and (case.get("contact_pair") or case.get("constraint")):
+        return
+    if not explicit and any(wall["type"] not in ("plane", "rectangle") for wall in case.get("wall", ())):
+        return  # which bars could cross between their nodes
+    if not explicit:
+        solver = case.setdefault("solver", {})
+        solver["operator"] = chance.choice(("auto", "assembled"))
+        if solver.get("linear") == "multigrid":
+            solver["linear"] = "auto"
+    elif case["time"]["step"] != "auto":  # keep clear of the critical step
         case["time"]["step"] *= 0.6
         case["time"]["end"] *= 0.6
     table: dict[str, Any] = {}
-    if chance.random() < 0.5:
+    lossy = scheme != "energy_momentum"
+    if lossy and chance.random() < 0.5:
         table["friction"] = 10 ** chance.uniform(-1.3, 0.0)
-    if chance.random() < 0.5:
+    if lossy and chance.random() < 0.5:
         table["restitution"] = chance.choice((1.0, chance.uniform(0.3, 1.0)))
     if chance.random() < 0.5:
         table["radius"] = body.length * chance.uniform(0.01, 0.08)
@@ -209,6 +243,7 @@ def _shoot(chance: random.Random, case: dict[str, Any], body: Body, motion: Moti
 
 CONTACT = (
     ("surface", 0.6, draw_surface),
+    ("inertia", 0.7, draw_inertia),
     ("turn", 0.5, draw_turn),
     ("rough pair", 0.9, draw_rough_pair),
     ("bars touch", 0.5, draw_bars_touch),

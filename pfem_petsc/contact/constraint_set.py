@@ -19,6 +19,7 @@ from ..tolerances import BEYOND, ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, ExpectedNodes, SetPart
 from .explicit import Arrivals, impact_square, planes_of, rebound_lift
 from .fixed_rows import FixedRows, TwoNodeRows
+from .friction import FAST, planes_at_rest, sliding
 from .projection import Planes
 from .rows import FreeNodes, RowSet, WallsOfNodes, free_positions, last_forces, push_nodes
 from .surfaces import OTHER
@@ -533,28 +534,19 @@ class ConstraintSet:
         if not self:
             return change
         rests = rows.gather(on_walls) > 0.0
-        every, hard = rows.gather(a), rows.gather(mass)
-        normals, _ = contact.planes(rests, x := rows.gather(state.position), contact.motion.poses(state.time))
-        relative = every[:, None, :] - contact.motion.accelerations_at(x, state.time)[:, contact.wall_of]
-        gaps = np.where(rests, np.einsum("nwi,nwi->nw", normals, relative), np.inf)
+        x, v, every, hard = (rows.gather(values) for values in (state.position, state.v, a, mass))
         values = rows.along(self.jacobian, every) + closed
         largest = self.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)
         place = np.where(rests.any(axis=1), np.arange(len(every)), -1)
-        coefficients, slips = np.empty((0, len(contact.walls), 2)), np.empty((0, len(contact.walls), 3))
         nodes = FreeNodes(every, hard, np.zeros_like(every), at_start=False, free=rows.free)
-        rubs = rows.rubs or self._walls.rubs
-        if rubs:  # along the velocity where nodes slide, else along the acceleration
-            v, rates = rows.gather(state.v), contact.rates(x, state.time, ahead=True)
-            fast = 1e16 * largest / max(np.abs(v).max(initial=0.0), np.abs(rates).max(initial=0.0), still)
-            coefficients = np.tile(np.stack([contact.friction, contact.static_friction], axis=1), (len(every), 1, 1))
-            slips = relative + fast * _sliding(v[:, None, :] - rates, normals, still)
         with agreed(self.mesh.comm):
-            planes = Planes(normals, gaps, coefficients, slips)
+            planes = planes_at_rest(contact, rests, (x, v, every), still)
             system = rows.system(self.jacobian, values, nodes, (place, planes))
-            if rubs:
+            if rows.rubs:
                 squares = np.maximum((rows.weights**2).sum(axis=1, keepdims=True), 1e-300)
                 along = np.einsum("rk,rki->ri", rows.weights, self.jacobian) / squares
-                system = system._replace(slips=system.slips + fast * _sliding(rows.slips(v), along, still))
+                fast = FAST * largest / max(np.abs(v).max(initial=0.0), still)
+                system = system._replace(slips=system.slips + fast * sliding(rows.slips(v), along, still))
             pushes = rows.solve(system, 1e-13 * largest, largest)
         self.force, self.drag = pushes.force, pushes.drag
         change[rows.here] = (rows.forces(self.jacobian, self.force, self.drag) * rows.free)[rows.mine]
@@ -608,12 +600,6 @@ class ConstraintSet:
         nodal = self.mesh.node_order
         own = {name: v if order is nodal else order.to_slab(v) for name, (order, v) in arrays.items()}
         self.load_state(own)
-
-
-def _sliding(rates: np.ndarray, normals: np.ndarray, still: float) -> np.ndarray:
-    """Return the parts of velocities (..., 3) across unit vectors (..., 3), zero where they are at most ``still``."""
-    across = rates - np.einsum("...i,...i->...", rates, normals)[..., None] * normals
-    return np.where(np.linalg.norm(across, axis=-1, keepdims=True) > still, across, 0.0)
 
 
 def _source(file: str, parameters: ConstraintKeys, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> Constraint:

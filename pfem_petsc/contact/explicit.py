@@ -358,7 +358,7 @@ def press_nodes(given, walls, sums, curved, rough, several):
     :func:`kind_of`.
 
     Each node is solved for by itself: its bits do not depend on the others. Returns the index of the first node
-    without a place, or -1, and why; the planes at the nodes; their positions and forces, see
+    without a place, or -1, and why; the positions and forces of the nodes, see
     :class:`~pfem_petsc.contact.projection.Pressed`; the total force (m, 3) [N]; walls that they touch (m, w); and the
     energy that friction dissipates [J].
     """
@@ -397,7 +397,7 @@ def press_nodes(given, walls, sums, curved, rough, several):
                 one, other = (c + 1) % 3, (c + 2) % 3
                 sums.moment[wall, one] += arm[other] * force
                 sums.moment[wall, other] -= arm[one] * force
-    return failed, why, planes, found, total, touching, dissipated
+    return failed, why, found, total, touching, dissipated
 
 
 class ExplicitContact(NodeWalls):
@@ -462,13 +462,15 @@ class ExplicitContact(NodeWalls):
         u[nodes] += correction
         return nodes, force, walls
 
-    def placeless(self, node: int, why: int, normals: np.ndarray, gaps: np.ndarray) -> str:
-        """Return the message about an owned node whose place :func:`press_nodes` did not find; its planes, normals
-        (w, 3) and gaps (w,)."""
+    def placeless(self, node: int, why: int, x: np.ndarray, time: float) -> str:
+        """Return the message about an owned node whose place near x (3,) at a time [s] :func:`press_nodes` did not
+        find."""
+        poses, at = self.motion.poses(time), np.array([node])
+        normals, offsets = self.planes(self.applicable(at, x[None], poses), x[None], poses, nodes=at)
         if why == INFEASIBLE:
-            return self.infeasible_message(node, -gaps)
+            return self.infeasible_message(node, offsets[0])
         if why == JAMMED:
-            return self.unsettled_friction(node, normals)
+            return self.unsettled_friction(node, normals[0])
         return (
             f"the position of node {self.mesh.node_ids[node]} on curved walls did not converge in {_CURVED_ROUNDS} "
             "iterations: walls and supports may be infeasible together; move the walls apart, free the node, or "
@@ -704,7 +706,7 @@ class ExplicitContact(NodeWalls):
             sums = WallSums(*(getattr(self.nothing, name).copy() for name in WallForces.sums))
             given = Arrivals(free, start, ways, drift, *of_nodes, *memory, *planes)
             pressed = press_nodes(given, reference, sums, *kind_of(walls))
-            failed, why, found, (places, *_), force, touching, friction = pressed
+            failed, why, (places, *_), force, touching, friction = pressed
             settled = failed >= 0 or not others or np.abs(places - at).max() <= tolerance
             if settled and not self.find_faces(nodes, places, poses, tolerance):
                 break
@@ -713,7 +715,7 @@ class ExplicitContact(NodeWalls):
             failed, why = int(np.argmax(np.abs(places - at).max(axis=1))), ADRIFT
         if failed >= 0:
             free[:] = places
-            raise SimulationFailure(self.placeless(nodes[failed], why, found.normals[failed], found.gaps[failed]))
+            raise SimulationFailure(self.placeless(nodes[failed], why, places[failed], poses.time))
         if bounces and booked:
             if len(self.motion.bodies.turners):
                 unpushed = self.ways(start, before, self.motion.poses_without_contact(poses.time))

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from .relative import RelativeCoordinates
 
 
+FAST = 1e16
+"""Weight of velocities relative to accelerations in the direction of slip of nodes at rest on walls."""
+
+
 class Rubbing(NamedTuple):
     """Nodes (m,) at slots (w,) of walls with friction in a step.
 
@@ -48,6 +52,35 @@ class Rubbing(NamedTuple):
         friction = np.stack([np.broadcast_to(self.dynamic, static.shape), static], axis=-1)
         planes = Planes(self.normals, gaps, friction, (x - self.before)[:, None, :] - self.ways)
         return NodesAtPlanes(x, self.fixed, self.stiffness, planes)
+
+
+def planes_at_rest(
+    contact: NodeWalls, rests: np.ndarray, motion: tuple[np.ndarray, np.ndarray, np.ndarray], still: float
+) -> Planes:
+    """Return the planes that bound the accelerations of nodes (n,) at rest on walls, with slips along their velocity
+    where they slide, else along their acceleration.
+
+    Parameters
+    ----------
+    contact : NodeWalls, at the time of its state
+    rests : (n, w) bool, walls that each rests on
+    motion : positions, velocities and accelerations (n, 3)
+    still : velocity that counts as none [m/s]
+    """
+    (x, v, a), time = motion, contact.state.time
+    normals, _ = contact.planes(rests, x, contact.motion.poses(time))
+    rates = contact.rates(x, time, ahead=True)
+    relative = a[:, None, :] - contact.motion.accelerations_at(x, time)[:, contact.wall_of]
+    gaps = np.where(rests, np.einsum("nwi,nwi->nw", normals, relative), np.inf)
+    fast = FAST * np.abs(a).max(initial=0.0) / max(np.abs(v).max(initial=0.0), np.abs(rates).max(initial=0.0), still)
+    friction = np.tile(np.stack([contact.friction, contact.static_friction], axis=1), (len(x), 1, 1))
+    return Planes(normals, gaps, friction, relative + fast * sliding(v[:, None, :] - rates, normals, still))
+
+
+def sliding(rates: np.ndarray, normals: np.ndarray, still: float) -> np.ndarray:
+    """Return the parts of velocities (..., 3) across unit vectors (..., 3), zero where they are at most ``still``."""
+    across = rates - np.einsum("...i,...i->...", rates, normals)[..., None] * normals
+    return np.where(np.linalg.norm(across, axis=-1, keepdims=True) > still, across, 0.0)
 
 
 def jam(contact: NodeWalls, node: int, normals: np.ndarray) -> str:

@@ -18,20 +18,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..tolerances import ON_BOUND
+from .friction import planes_at_rest
 from .node_walls import WallForces
-from .projection import NodesAtPlanes, Planes, pressed
+from .projection import NodesAtPlanes, pressed
 
 if TYPE_CHECKING:
     from ..integrators.base import State
     from ..mechanics.mass import Inertia
     from .constraint_set import ConstraintSet
-    from .projection import Pressed
-
-Speeds = tuple[np.ndarray, np.ndarray]
-"""Velocities of nodes (m, 3) and of walls there (m, w, 3) [m/s]."""
 
 _ROUNDS = 60  # each at least halves the error
-_FAST = 1e16  # weight of velocities relative to accelerations in the direction of slip
 
 
 def start_at_rest(
@@ -76,10 +72,7 @@ def start_at_rest(
     resting[:, partial[contact.wall_of]] = False  # the plane of a partial wall extends beyond the wall
     resting[:, np.isin(contact.wall_of, contact.motion.bodies.at)] = False  # walls with mass are not fixed
     kept = resting.any(axis=1)
-    nodes, normals, rates, resting = nodes[kept], normals[kept], rates[kept], resting[kept]
-    accelerations = contact.motion.accelerations_at(x[nodes], state.time)[:, contact.wall_of]
-    planes = np.where(resting, np.einsum("mwi,mwi->mw", normals, accelerations), -np.inf)
-    fixed = contact.fixed[nodes]
+    nodes, resting = nodes[kept], resting[kept]
     share = 0.5 if inertia.consistent else 1.0
     weight = share * mass[nodes]
     closed = links.resting(x, v, slack, still)
@@ -95,13 +88,8 @@ def start_at_rest(
         # links first, as in a step: they account for the walls
         between = links.rest(apart, share * mass, closed, held, still)
         free = apart[nodes] + between[nodes] / weight[:, None]
-        gaps, n = np.einsum("mwi,mi->mw", normals, free) - planes, normals.shape[1]
-        smooth = NodesAtPlanes(free, fixed, weight, Planes(normals, gaps, np.empty((0, n, 2)), np.empty((0, n, 3))))
-        found = pressed(smooth, 0.0)
-        if contact.has_friction:
-            slips = _slips(smooth, found, (v[nodes], rates), accelerations, still)
-            rough = np.tile(np.stack([contact.friction, contact.static_friction], axis=1), (len(nodes), 1, 1))
-            found = pressed(smooth._replace(planes=Planes(normals, gaps, rough, slips)), 0.0)
+        planes = planes_at_rest(contact, resting, (x[nodes], v[nodes], free), still)
+        found = pressed(NodesAtPlanes(free, contact.fixed[nodes], weight, planes), 0.0)
         before, hold = hold, weight[:, None] * (found.x - free)
         sizes = [np.abs(part).max(initial=0.0) for part in (hold - before, between - earlier, hold, between)]
         last_hold, last_between, *largest = np.max(comm.allgather(sizes), axis=0)
@@ -112,25 +100,8 @@ def start_at_rest(
         state.a = accelerate(total)
     if max(largest) == 0.0:
         return None
-    force = found.normal[:, :, None] * normals + found.drag
+    force = found.normal[:, :, None] * planes.normals + found.drag
     state.contact = np.zeros_like(load)
     state.contact[nodes] = force.sum(axis=1)
     links.add_forces(state.contact)
     return contact.sums(nodes, force, (x[nodes], x[nodes]), found.normal > 0.0)
-
-
-def _slips(
-    smooth: NodesAtPlanes, found: Pressed, speeds: Speeds, accelerations: np.ndarray, still: float
-) -> np.ndarray:
-    """Return the slips (m, w, 3) of nodes on walls with ``accelerations`` (m, w, 3): along the velocity of those that
-    slide, else along their acceleration; ``found``: their forces without friction."""
-    v, rates = speeds
-    away = v[:, None, :] - rates
-    across = away - np.einsum("mwi,mwi->mw", away, smooth.planes.normals)[:, :, None] * smooth.planes.normals
-    slides = ((np.linalg.norm(across, axis=2) > still) & (found.normal > 0.0)).any(axis=1)
-    pushes = found.normal / smooth.stiffness[:, None]
-    largest = max(float(np.abs(found.x).max(initial=0.0)), float(pushes.max(initial=0.0)))
-    fast = np.linalg.norm(v[slides], axis=1).max(initial=0.0) + np.abs(rates[slides]).max(initial=0.0)
-    factor = _FAST * largest / fast if fast > 0.0 else 0.0
-    apart = smooth.free[:, None, :]
-    return np.where(slides[:, None, None], apart + factor * away, apart - accelerations)

@@ -364,12 +364,6 @@ class NodeWalls:
         """Return distances (m,) [m] of positions (m, 3) from wall k."""
         return self.walls[k].gaps(poses.rest(k, x))
 
-    def plane_offsets(self, time: float) -> np.ndarray:
-        """Return offsets (slots,) [m] of the planes n . x = d of flat walls at a time [s]."""
-        if not self.moving.any():
-            return self._offsets
-        return self._offsets + np.einsum("ij,ij->i", self.normals, self.motion.poses(time).shifts[self.wall_of])
-
     def near(
         self, x: np.ndarray, poses: Poses, reach: np.ndarray = _ZERO, nodes: np.ndarray | slice = _ALL
     ) -> np.ndarray:

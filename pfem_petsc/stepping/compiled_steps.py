@@ -414,8 +414,9 @@ class CompiledSteps:
             return SimulationFailure(stepper.collapse(max(made[COLLAPSED], made[TURNED])))
         infeasible, why = pressed.failure.tolist()
         if infeasible >= 0:
-            node = pressed.nodes[infeasible]
-            return self._at_balance(self.model.contact.placeless(node, why, pressed.normals, pressed.gaps))
+            node, place = pressed.nodes[infeasible], pressed.places[infeasible]
+            time = stepper.scheme.balance(stepper.state, stepper.h).time
+            return self._at_balance(self.model.contact.placeless(node, why, place, time))
         if made[UNSOLVED] > 0:
             return self._at_balance(self.model.links.rows.unsolved(*divmod(made[UNSOLVED], REASONS)))
         failure = self._called.failure or self._wall_caller.failure

@@ -49,15 +49,13 @@ class WallArrays(NamedTuple):
 class ContactNodes(NamedTuple):
     """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the slots
     of walls that they are ``touching`` (n, s), their ``places`` (n, 3); ``failure`` (2,): the first of them without a
-    place, or -1, and why, and its planes, ``normals`` (s, 3) and ``gaps`` (s,); and the sums of each wall, ``force``
+    place, or -1, and why; and the sums of each wall, ``force``
     (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
 
     nodes: np.ndarray
     touching: np.ndarray
     places: np.ndarray
     failure: np.ndarray
-    normals: np.ndarray
-    gaps: np.ndarray
     force: np.ndarray
     contacts: np.ndarray
     moment: np.ndarray
@@ -70,7 +68,7 @@ def new_contact_nodes(n: int, w: int, s: int) -> ContactNodes:
     touching, places = np.empty((len(nodes), s), dtype=bool), np.empty((len(nodes), 3))
     force, contacts, moment = np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3))
     failure = np.full(2, -1, dtype=np.int64)
-    return ContactNodes(nodes, touching, places, failure, np.empty((s, 3)), np.empty(s), force, contacts, moment)
+    return ContactNodes(nodes, touching, places, failure, force, contacts, moment)
 
 
 @addressed
@@ -191,7 +189,7 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
                 _arrivals(pressed.room[:m], nodes, motion, walls),
                 WallSums(out.force, out.contacts, out.moment),
             )
-            failed, why, planes, found, total, touching, contacts.friction = press_nodes(
+            failed, why, found, total, touching, contacts.friction = press_nodes(
                 given, pressed, sums, curved, rough, several
             )
             for j in range(m):
@@ -207,10 +205,6 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
                     out.touching[j, k] = touching[j, k]
             if failed >= 0:
                 out.failure[0], out.failure[1] = failed, why
-                for k in range(len(out.gaps)):
-                    out.gaps[k] = planes.gaps[failed, k]
-                    for c in range(3):
-                        out.normals[k, c] = planes.normals[failed, k, c]
         note_contacts(m, walls, out, contacts)
 
     return press

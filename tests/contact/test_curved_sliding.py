@@ -171,7 +171,7 @@ def test_friction_on_a_sphere_in_large_steps(side, friction):
         *(np.empty((m, 0)), np.empty((m, 0)), np.empty((0, 1, 3)), np.empty((0, 1))),
     )
     sums = WallSums(np.zeros((1, 3)), np.zeros(1, dtype=np.int64), np.zeros((1, 3)))
-    failed, _, _, (x, *_), force, _, dissipated = press_nodes(given, walls, sums, *kind_of(walls))
+    failed, _, (x, *_), force, _, dissipated = press_nodes(given, walls, sums, *kind_of(walls))
     assert m > 60 and turned.sum() > 20 and failed < 0
     np.testing.assert_allclose(np.linalg.norm(x, axis=1), 1.0, atol=1e-12)
     np.testing.assert_allclose(force, stiffness * (x - free), atol=1e-12)
@@ -192,7 +192,8 @@ def test_friction_on_a_sphere_in_large_steps(side, friction):
 @pytest.mark.slow
 def test_friction_that_is_not_found_is_told(tmp_path):
     """A node that a step throws far into the edge of a rough bowl and a rough floor: which node, step and time."""
-    start, free = np.array([-0.89323743, 0.29823369, -0.29926374]), np.array([-1.14142704, 0.23835193, -0.37258924])
+    start = np.array([0.5038536020178621, -0.7592935699532672, -0.29994349529666003])
+    free = np.array([1.1895945211209882, -1.4418835246329729, -0.3976981328859728])
     walls = [
         {"name": "bowl", "type": "sphere", "point": [0.0, 0.0, 0.0], "radius": 1.0, "side": "inside"},
         {"name": "floor", "type": "plane", "point": [0.0, 0.0, -0.3], "normal": [0.0, 0.0, 1.0]},
@@ -203,7 +204,7 @@ def test_friction_that_is_not_found_is_told(tmp_path):
         "material": {"m": {"young_modulus": 1e-3, "density": 1000.0}},
         "section": {"s": {"area": 1e-3, "material": "m"}},
         "initial": {"velocity": ((free - start) / 1e-2).tolist()},
-        "wall": [wall | {"node_set": "first", "friction": 0.8} for wall in walls],
+        "wall": [wall | {"node_set": "first", "friction": 1.5} for wall in walls],
         "time": {"integrator": "central_differences", "step": 1e-2, "end": 0.05},
         "output": {"fields_every": 0},
     }

@@ -719,6 +719,6 @@ class ExplicitContact(NodeWalls):
         if bounces and booked:
             if len(self.motion.bodies.turners):
                 unpushed = self.ways(start, before, self.motion.poses_without_contact(poses.time))
-                self._set_rebounds(given, found.normals, unpushed)
+                self._set_rebounds(given, planes_of(places, free, given, reference)[0].normals, unpushed)
             walls.rebound[nodes], walls.arrival[nodes] = memory
         return nodes, places, force, WallForces(*sums, nodes, touching, places, friction)

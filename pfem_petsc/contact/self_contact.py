@@ -51,8 +51,10 @@ from .neighbours import Points, Regions, Segments, clip, find_pairs, largest_cha
 from .rows import owner_starts, to_owners
 
 if TYPE_CHECKING:
-    from ..integrators.base import Scheme
-    from ..solvers.problem import StepProblem
+    from ..integrators.base import Balance, Scheme
+
+Turns = tuple[np.ndarray, np.ndarray, np.ndarray] | None
+"""See :meth:`~pfem_petsc.contact.transform.Transform.turns`."""
 
 _CROSSED = 0.1  # largest square of the sine of the angle from which bars touch in one point
 _STIFFNESS = 1.0  # of a pair, over the harmonic mean of E A/l of its bars
@@ -1020,11 +1022,11 @@ class SelfContact:
             add_step_gradients(self._pairs, state, arrays)
             add_to_nodes(self._local, self._own, arrays.force, f)
 
-    def linearise(self, problem: StepProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what the pairs that touch add to the Hessian of a problem at its positions: owned nodes (k,), PETSc's
-        numbers of others (k,), and blocks (k, 3, 3). Collective."""
-        balance, step = problem.balance, self._model.bars.step
-        arrays, state, law = self._look(problem.x, step if step < np.inf else 0.0, False) or (None, None, None)
+    def linearise(self, x: np.ndarray, balance: Balance, turns: Turns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what the pairs that touch add to the Hessian of a balance at positions (local, 3), in coordinates with
+        these ``turns``: owned nodes (k,), PETSc's numbers of others (k,), and blocks (k, 3, 3). Collective."""
+        step = self._model.bars.step
+        arrays, state, law = self._look(x, step if step < np.inf else 0.0, False) or (None, None, None)
         if state is None:
             return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
         chosen = np.flatnonzero((self._state == TOUCHING) | (state != APART))
@@ -1032,7 +1034,7 @@ class SelfContact:
         differentiate_pairs(self._pairs, chosen, self._memory, arrays, law, balance.discrete_gradient, blocks)
         if self.symmetric and not balance.discrete_gradient:
             blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
-        left, right = self._gather(self._coordinates(problem), 18).reshape(-1, 2, 3, 3).transpose(1, 0, 2, 3)
+        left, right = self._gather(self._coordinates(turns), 18).reshape(-1, 2, 3, 3).transpose(1, 0, 2, 3)
         blocks = balance.weight * blocks.reshape(-1, 4, 3, 4, 3).transpose(0, 1, 3, 2, 4)
         blocks = left[ends][:, :, None] @ blocks @ right[ends][:, None]
         rows, columns = np.repeat(ends, 4, axis=1).ravel(), np.tile(ends, 4).ravel()
@@ -1040,10 +1042,10 @@ class SelfContact:
         rows, columns = numbers[rows[own]] - self._mesh.first_node, numbers[columns[own]]
         return rows, columns, blocks.reshape(-1, 3, 3)[own]
 
-    def _coordinates(self, problem: StepProblem) -> Callable[[np.ndarray], np.ndarray]:
+    def _coordinates(self, turns: Turns) -> Callable[[np.ndarray], np.ndarray]:
         """Return what gives owned nodes (k,) the matrices (k, 18) by which the rows and the columns of their Hessian
         are multiplied: of frames and supports."""
-        supports, turns = self._model.supports, problem.transform.turns()
+        supports = self._model.supports
 
         def of(rows: np.ndarray) -> np.ndarray:
             free = np.eye(3) * ~supports.fixed[rows][:, None]

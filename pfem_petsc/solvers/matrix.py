@@ -179,7 +179,7 @@ class HessianMatrix:
         touch = problem.model.self_contact
         if touch is None or not problem.balance.weight:
             return
-        nodes, columns, blocks = touch.linearise(problem)
+        nodes, columns, blocks = touch.linearise(problem.x, problem.balance, problem.transform.turns())
         keys = self.pattern.keys_of(nodes, columns)
         coupled = np.unique(keys if problem is not self._problem else np.append(self._coupled, keys))
         self._touching, self._problem = (nodes, keys, blocks), problem

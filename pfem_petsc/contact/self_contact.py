@@ -137,6 +137,8 @@ class PairLaw(NamedTuple):
     lead: float = 0.5
 
 
+Look = tuple[NodeArrays | None, np.ndarray | None, PairLaw]
+
 ENERGY, DISSIPATED, CONTACTS, OVERLAP, FORCE, DEPTH = range(6)
 """Sums over the counted pairs: stored energy, and that dissipated in the step [J]; how many touch. Largest overlap [m],
 force [N], and overlap over the radius."""
@@ -947,7 +949,7 @@ class SelfContact:
         if state is None:
             if commit:
                 self._way, self.sums = law.way, self._no_sums
-                np.stack(self._components(x), out=self._last)
+                self._take_last(x)
             return 0.0, self.dissipated
         sums = np.zeros(6)
         passed = evaluate_pairs(self._pairs, state, self._memory, self._spare, arrays, law, sums)
@@ -965,12 +967,17 @@ class SelfContact:
             self._memory, self._spare = self._spare, self._memory
             self._way, self.dissipated, self.sums = law.way, total, sums
             self.deepest = max(self.deepest, float(sums[DEPTH]))
-            np.stack(self._components(x), out=self._last)
+            self._take_last(x)
         return float(sums[ENERGY]), total
 
     def _components(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the components of positions (local, 3) of owned nodes, three arrays."""
         return tuple(np.ascontiguousarray(x[: self._last.shape[1], c]) for c in range(3))
+
+    def _take_last(self, x: np.ndarray) -> None:
+        """Take the positions (local, 3) of a step, whose components compiled steps have one after the other."""
+        for last, row in zip(self._last, x.T, strict=True):
+            last[:] = row[: len(last)]
 
     def _motion_of(self, some: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Return positions and displacements in the step (k, 6) of owned nodes (k,), see :class:`NodeArrays`."""
@@ -978,9 +985,9 @@ class SelfContact:
         read_nodes(some, x, self._last, nodes)
         return nodes
 
-    def _look(self, x: np.ndarray, step: float, commit: bool) -> tuple[NodeArrays, np.ndarray | None, PairLaw] | None:
+    def _look(self, x: np.ndarray, step: float, commit: bool) -> Look | None:
         """Return the nodes of pairs at positions (local, 3), states of the pairs, with those that begin to touch, and
-        the law; no states if nothing touches, nor can, and None for positions that are not finite, of which other
+        the law; only the latter if nothing touches, nor can, and None for positions that are not finite, of which other
         checks of the step tell. Collective."""
         if self.implicit:  # trials are far from each other
             self._most[:] = 0.0
@@ -995,12 +1002,11 @@ class SelfContact:
             self._renew(x, step, way, 2.0 * float(worst[0]))
         lead = 0.0 if self.implicit else 0.5
         law = PairLaw(self._friction, self._damping, float(step), way, way if commit else 2.0 * self._way - way, lead)
-        asleep = way < -worst[2] and self._asleep > 0.0  # after a search, this is not known
-        nodes = x if asleep else self._gather(lambda some: self._motion_of(some, x), 6)
-        arrays, state = NodeArrays(nodes, self._inverse, np.zeros((len(nodes), 3))), self._state
-        if asleep:
-            return arrays, None, law
-        state, load = state if commit else state.copy(), np.zeros((len(nodes), 3))
+        if way < -worst[2] and self._asleep > 0.0:  # after a search, this is not known
+            return None, None, law
+        nodes = self._gather(lambda some: self._motion_of(some, x), 6)
+        arrays, load = NodeArrays(nodes, self._inverse, np.zeros((len(nodes), 3))), np.zeros((len(nodes), 3))
+        state = self._state if commit else self._state.copy()
         begin, far, self._asleep = find_beginning(self._pairs, state, self._memory, arrays, law, load)
         if self._any(begin + far):
             if not self.implicit:

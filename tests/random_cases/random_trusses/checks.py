@@ -234,6 +234,9 @@ def _seen(wall: WallKeys, x: np.ndarray, history: dict[str, np.ndarray], row: in
     centre, turn = history.get(f"wall/{wall.name}/position"), wall.rotation
     if centre is None:
         return x
+    if wall.inertia is not None:
+        free = Rotation.from_rotvec(-history[f"wall/{wall.name}/rotation"][row])
+        return free.apply(x - centre[row]) + centre[0]
     if turn is None:
         return x - (centre[row] - centre[0])
     time, angle = history["time"][row], (turn.angular_velocity or 0.0) * history["time"][row]

@@ -997,8 +997,8 @@ class SelfContact:
             self.comm.Allreduce(MPI.IN_PLACE, worst, op=MPI.MAX)
         if not worst[0] < np.inf:
             return None
-        way = self._way + 2.0 * float(worst[0])
-        if worst[1] or way >= self._limit:
+        way, self.stale = self._way + 2.0 * float(worst[0]), bool(worst[1])  # on all ranks
+        if self.stale or way >= self._limit:
             self._renew(x, step, way, 2.0 * float(worst[0]))
         lead = 0.0 if self.implicit else 0.5
         law = PairLaw(self._friction, self._damping, float(step), way, way if commit else 2.0 * self._way - way, lead)

@@ -227,11 +227,16 @@ class HessianMatrix:
                 self.pattern.add_blocks(transform.sliding.nodes, transform.sliding.stiffness, values)
             turn_blocks(self.pattern.ptr, self.local_columns, *turns, values)
 
+    def assemble(self, problem: StepProblem) -> PETSc.Mat:
+        """Assemble the Hessian of a problem at its positions, ghosts included, in coordinates of frames; return it.
+        Collective."""
+        self._couple_bars(problem)
+        return self.fill(lambda values: self.add(problem, values))
+
     def update(self, problem: StepProblem, w: np.ndarray) -> None:
         """Assemble the Hessian of a problem at ``w``. Collective."""
         problem.place(problem.increment(w))
-        self._couple_bars(problem)
-        self.fill(lambda values: self.add(problem, values))
+        self.assemble(problem)
         if problem.transform.bounded:
             self._change_coordinates(problem.transform)
 

@@ -174,8 +174,8 @@ class WithEquations:
                 made = HessianMatrix(stepper.model.mesh, stepper.model.supports)
                 self._stiffness = stepper, stepper.support_changes, made
             matrix = self._stiffness[2]
-            matrix.update(problem, positions - problem.balance.predictor)
-            return matrix.mat
+            problem.place(positions - problem.balance.predictor)
+            return matrix.assemble(problem)
 
     @contextmanager
     def _problem(self, x: Any, at: float | None) -> Iterator[tuple[float, np.ndarray, StepProblem]]:

@@ -434,3 +434,22 @@ def test_stage_does_not_begin_with_overlaps_that_the_one_before_allowed(tmp_path
     momentum = column(rows, "momentum")[:, 2]
     np.testing.assert_allclose(momentum, momentum[0], rtol=1e-12)
     assert column(rows, "self_contact/contacts").max() == 1 and abs(rows[-1]["energy_imbalance"]) < 1e-12
+
+
+@pytest.mark.parallel
+def test_bars_that_break_on_some_ranks_only(comm, shared_tmp_path):
+    """A bar of octets torn apart: lists are made again on all ranks, and the balances close."""
+    case = {
+        "mesh": {"generator": "lattice", "kind": "octet", "cells": [6, 1, 1], "pitch": 0.1},
+        "node_set": {"right": {"box": [[0.31, -1.0, -1.0], [1.0, 1.0, 1.0]]}},
+        "material": {"m": {"young_modulus": 1e9, "density": 1e3, "rupture": {"strain": 2e-3}}},
+        "section": {"s": {"area": 1e-5, "material": "m"}},
+        "initial": {"on": [{"node_set": "right", "velocity": [10.0, 0.0, 0.0]}]},
+        "self_contact": {},
+        "time": {"integrator": "central_differences", "step": "auto", "end": 2e-4},
+    }
+    rows, _ = rows_of(Case(case), comm, shared_tmp_path, "torn")
+    assert rows[-1]["broken_bars"] > 0
+    momentum = column(rows, "momentum")[:, 0]
+    np.testing.assert_allclose(momentum, momentum[0], rtol=1e-12)
+    assert np.abs(column(rows, "energy_imbalance")).max() < 1e-12 * rows[0]["kinetic_energy"]

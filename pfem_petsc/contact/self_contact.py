@@ -921,8 +921,13 @@ class SelfContact:
 
     def add_forces(self, x: np.ndarray, f: np.ndarray, commit: bool) -> tuple[float, float]:
         """Add the forces at positions ``x`` to ``f``, see :meth:`evaluate`, in a step of the bars."""
+        return self.evaluate(x, f, self._step, commit)
+
+    @property
+    def _step(self) -> float:
+        """The step of the bars [s], zero where no time passes."""
         step = self._model.bars.step
-        return self.evaluate(x, f, step if step < np.inf else 0.0, commit)
+        return step if step < np.inf else 0.0
 
     def evaluate(self, x: np.ndarray, f: np.ndarray, step: float, commit: bool) -> tuple[float, float]:
         """Add the forces of :meth:`evaluate_bars`, and find those of walls between nodes; see there. Collective."""
@@ -1023,7 +1028,7 @@ class SelfContact:
     def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
         """Add the discrete gradient of a step from the positions ``x0`` of the last commit to ``x``, see
         :func:`_step_gradient`, to ``f``, all (local, 3). Collective."""
-        arrays, state, _ = self._look(x, self._model.bars.step, False) or (None, None, None)
+        arrays, state, _ = self._look(x, self._step, False) or (None, None, None)
         if state is not None:
             add_step_gradients(self._pairs, state, arrays)
             add_to_nodes(self._local, self._own, arrays.force, f)
@@ -1031,8 +1036,7 @@ class SelfContact:
     def linearise(self, x: np.ndarray, balance: Balance, turns: Turns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what the pairs that touch add to the Hessian of a balance at positions (local, 3), in coordinates with
         these ``turns``: owned nodes (k,), PETSc's numbers of others (k,), and blocks (k, 3, 3). Collective."""
-        step = self._model.bars.step
-        arrays, state, law = self._look(x, step if step < np.inf else 0.0, False) or (None, None, None)
+        arrays, state, law = self._look(x, self._step, False) or (None, None, None)
         if state is None:
             return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
         chosen = np.flatnonzero((self._state == TOUCHING) | (state != APART))
@@ -1073,7 +1077,7 @@ class SelfContact:
     def free_part(self, start: np.ndarray, end: np.ndarray) -> float:
         """Return the part of the way from positions ``start`` to ``end``, both (local, 3), on which no bar passes
         through another, see :func:`free_part`; 1 for all of it. Collective."""
-        found = self._look(end, self._model.bars.step if self._model.bars.step < np.inf else 0.0, False)
+        found = self._look(end, self._step, False)
         if found is None or found[1] is None:
             return 1.0
         x = self._gather(lambda rows: start[rows], 3)

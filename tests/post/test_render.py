@@ -126,7 +126,7 @@ def test_walls_are_drawn_in_the_stages_that_have_them(tmp_path):
     with Simulation(Case.from_dict(data), output=tmp_path / "result", quiet=True) as simulation:
         simulation.run()
     result = open_result(tmp_path / "result")
-    assert walls_at(result, result.times)[1].ravel().tolist() == [True] * 3 + [False] * 2
+    assert walls_at(result, result.times)[2].ravel().tolist() == [True] * 3 + [False] * 2
     files = render(tmp_path / "result", tmp_path / "frames", size=SMALL, video="none", poster=False, note=silent)
     inks = [len(inked(drawing(file))[0]) for file in files]
     assert min(inks[:3]) > 1.5 * max(inks[3:])

@@ -640,7 +640,9 @@ class Stepper(ABC):
         self.balance = self.scheme.balance(state, self.part)
         if self.prescribed.moving:
             self.prescribed.prescribe(self.balance)
-        model.inertia.change(sum(weight * time for weight, time in self.balance.loads))
+        # exactly the end, at which a continued run takes the damping of the state it starts from
+        mean = sum(weight * time for weight, time in self.balance.loads)
+        model.inertia.change(end if self.scheme.balance_at_endpoints else mean)
         model.contact.motion.bodies.begin(state.time, self.part)
         state.external = self.load_of(self.balance)
         if self.scheme.inertial:

@@ -5,7 +5,7 @@ import pytest
 from helpers.runs import run
 from mpi4py import MPI
 
-from pfem_petsc import Case
+from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 
 DENSITY, RATE, END = 500.0, 8.0, 0.4
@@ -13,9 +13,9 @@ EXPLICIT = ["central_differences", "chung_lee", "hulbert_chung", "souza_moura"]
 IMPLICIT = ["newmark", "wilson", "houbolt", "generalized_alpha", "energy_momentum"]
 
 
-def case(scheme, mass="lumped", table=((0.0, 1.0), (0.2, 0.0)), **tables):
+def case(scheme, mass="lumped", table=((0.0, 1.0), (0.2, 0.0)), time_step=1e-3, **tables):
     parameters = {"beta": 0.25, "gamma": 0.5} if scheme == "newmark" else {}
-    time = {"integrator": scheme, "step": 1e-3, "end": END, "mass": mass, **parameters}
+    time = {"integrator": scheme, "step": time_step, "end": END, "mass": mass, **parameters}
     return Case.from_dict(
         {
             "mesh": {"generator": "rod", "length": 2.0, "elements": 2},
@@ -44,6 +44,18 @@ def test_decay(scheme, mass, tmp_path):
     np.testing.assert_allclose(history["damping_dissipation"], kinetic[0] - kinetic, atol=0.02 * kinetic[0])
     np.testing.assert_allclose(momentum - momentum[0], history["damping_impulse"], atol=1e-11)
     assert np.abs(history["energy_imbalance"]).max() < 1e-11 * kinetic[0]
+
+
+@pytest.mark.parametrize("scheme", ["central_differences", "newmark", "bathe"])
+def test_factor_of_the_state_from_which_a_run_continues(scheme):
+    """To the bit that at the exact end of each step, of times that no sum of steps reaches."""
+    factors, step = [], 0.008047780619187745
+    with Simulation(case(scheme, time_step=step), quiet=True) as simulation:
+        inertia = simulation.model.inertia
+        simulation.on_step(lambda done: factors.append((done.time, inertia.factor)))
+        simulation.run()
+    times, found = np.array(factors).T
+    np.testing.assert_array_equal(found, np.interp(times, [0.0, 0.2], [1.0, 0.0]))
 
 
 def test_refusals():

@@ -187,8 +187,6 @@ class ImplicitStepper(Stepper):
         """Create matrices and solvers for the supports as they are. Collective."""
         model, choice = self.model, self._choice
         touch = model.self_contact
-        if touch is not None and not touch.symmetric:
-            choice = unsymmetric(choice)
         symmetric = self.scheme.symmetric and model.links.symmetric and (touch is None or touch.symmetric)
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)

@@ -1,10 +1,7 @@
-"""The active set of contact in an implicit step: bounded solves until all rows of walls and links hold, with Coulomb
-friction.
-"""
+"""The active set of contact in an implicit step: bounded solves until walls and rows hold, with Coulomb friction."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Lower and upper bounds that the rows of walls and links place on the unknowns.
+    """Lower and upper bounds that walls and rows place on the unknowns.
 
     Attributes
     ----------
@@ -161,15 +158,14 @@ class Trial:
 
     Attributes
     ----------
-    candidates : nodes near walls, and carriers of rows; frames : their frames; links : that may close
-    transform : built from both
+    candidates : nodes near walls, and carriers of rows; frames : their frames
+    transform : built from these, and from the rows that may close
     tied : of tied nodes, indices among the frames (k,), walls (k,) and positions (k, 3) [m]
     """
 
     candidates: Candidates
     frames: NodalFrames
     tied: tuple[np.ndarray, np.ndarray, np.ndarray]
-    links: tuple[RowCoordinates, ...]
     transform: Transform
 
 
@@ -180,14 +176,14 @@ class Outcome:
     Attributes
     ----------
     settled : whether all rows are satisfied
-    candidates, links : for the next solve
+    candidates, rows : for the next solve
     trial : the trial that was solved
     normal_forces : (m, slots) on the candidates of the trial [N]; pull : (m, 3) force that walls must balance there [N]
     """
 
     settled: bool
     candidates: Candidates
-    links: tuple[RowCoordinates, ...]
+    rows: RowCoordinates | None
     trial: Trial
     normal_forces: np.ndarray
     pull: np.ndarray
@@ -202,12 +198,12 @@ class ActiveSet:
     state : at the start of the step
     balance : of the step
     held : (owned,) bool, nodes in contact with walls in the last step
-    links : coordinates of all links of the case
+    rows : coordinates of the rows over several nodes; None if the case has none
     remedy : what the user can do against steps that are too large
 
     Attributes
     ----------
-    candidates, links : of the first solve
+    candidates, rows : of the first solve; no rows if none may close
     """
 
     def __init__(
@@ -216,24 +212,24 @@ class ActiveSet:
         state: State,
         balance: Balance,
         held: np.ndarray,
-        links: Sequence[RowCoordinates] = (),
+        rows: RowCoordinates | None = None,
         remedy: str = "reduce time.step",
     ) -> None:
         self.contact, self._remedy = model.contact, remedy
         self.model = model
         self.state = state
         self.balance = balance
-        self._iterations = self._link_iterations = 0
+        self._iterations = self._row_iterations = 0
         self._poses = self.contact.motion.poses(balance.time)
-        relative = next((link.relative for link in links), None)
+        relative = None if rows is None else rows.relative
         self.friction = StepFriction(model.contact, model.inertia, model.nodal_stiffness, state, balance, relative)
         self.candidates = expected_candidates(model.contact, state, balance, held, self._poses)
         move, slack = (balance.time - state.time) * state.v, BEYOND * model.size
-        self._all_links = tuple(links)
-        self.links = tuple(link for link in links if link.reached(state, move, slack))
+        self._all_rows = rows
+        self.rows = rows if rows is not None and rows.reached(state, move, slack) else None
 
-    def place(self, candidates: Candidates, links: Sequence[RowCoordinates], x: np.ndarray) -> Trial:
-        """Build the coordinates of candidates and links at positions (owned, 3). Collective.
+    def place(self, candidates: Candidates, coupled: RowCoordinates | None, x: np.ndarray) -> Trial:
+        """Build the coordinates of candidates and rows at positions (owned, 3). Collective.
 
         Raises
         ------
@@ -242,7 +238,7 @@ class ActiveSet:
         """
         contact, time, y = self.contact, self.balance.time, x
         rows = RowPlanes.none(self.friction.slots - len(contact.wall_of))
-        relative = next((link.relative for link in links), None)
+        relative = None if coupled is None else coupled.relative
         if relative is not None:
             stopped = np.zeros(len(x), dtype=bool)
             stopped[candidates.nodes] = candidates.applicable.any(axis=1)
@@ -257,18 +253,19 @@ class ActiveSet:
             tied = contact.ties.pin(frames, x, time)
             self.friction.apply(frames, y)
         met = frames if candidates.anywhere else None
-        for link in links:
-            link.place(met, self.balance, self.state, x)
-        return Trial(candidates, frames, tied, tuple(links), Transform(self.model.mesh, met, links))
+        if coupled is not None:
+            coupled.place(met, self.balance, self.state, x)
+        return Trial(candidates, frames, tied, Transform(self.model.mesh, met, coupled))
 
     def feasible(self, trial: Trial, u: np.ndarray, stiffness: np.ndarray | None = None) -> np.ndarray:
-        """Return the increment (owned, 3) nearest to a guess that satisfies the frames' planes and links. Collective.
+        """Return the increment (owned, 3) nearest to a guess that satisfies the frames' planes and rows. Collective.
 
-        ``stiffness`` (owned,): weights of the nodes of links in the distance [N/m]; default: their masses.
+        ``stiffness`` (owned,): weights of the nodes of rows in the distance [N/m]; default: their masses.
         """
         u, frames, fixed = u.copy(), trial.frames, self.contact.fixed
-        for link in trial.links:
-            link.feasible(self.balance.predictor, u, self.model.inertia.mass if stiffness is None else stiffness)
+        stiffness = self.model.inertia.mass if stiffness is None else stiffness
+        if trial.transform.rows is not None:
+            trial.transform.rows.feasible(self.balance.predictor, u, stiffness)
         at, walls = frames.nodes, len(self.contact.wall_of)
         x = self.balance.predictor[at] + u[at]
         normals, offsets = (np.ascontiguousarray(array[:, :walls]) for array in (frames.normals, frames.offsets))
@@ -300,30 +297,26 @@ class ActiveSet:
         return trial.candidates.anywhere and self.friction.relax()
 
     def bounds(self, trial: Trial, guess: np.ndarray, w: np.ndarray) -> Bounds:
-        """Return bounds on w (owned, 3): those of the frames minus B predictor, and those of links. Collective.
+        """Return bounds on w (owned, 3): those of the frames and of rows. Collective.
 
         ``guess``, ``w`` (owned, 3): a guess of u with the prescribed components at their new values, and its w.
         """
         if not trial.transform.bounded:
             return Bounds()
-        frames, at = trial.frames, trial.frames.nodes
-        shape = (self.model.mesh.n_owned, 3)
-        lower, upper = np.full(shape, -np.inf), np.full(shape, np.inf)
-        base = np.einsum("nij,nj->ni", frames.basis, self.balance.predictor[at])
-        relative = trial.transform.relative
-        if relative is not None:  # prescribed motions of other nodes move their planes
-            carried, y = relative.carried(at), relative.positions(self.balance.predictor + guess)
-            base[carried] = (np.einsum("nij,nj->ni", frames.basis, y[at]) - w[at])[carried]
-        lower[at] = frames.lower - base
-        upper[at] = frames.upper - base
-        for link in trial.links:
-            link.bound(self.balance.predictor + guess, w, lower)
+        frames, at, x = trial.frames, trial.frames.nodes, self.balance.predictor + guess
+        lower, upper = np.full(w.shape, -np.inf), np.full(w.shape, np.inf)
+        base, rows = np.einsum("nij,nj->ni", frames.basis, self.balance.predictor[at]), trial.transform.rows
+        if rows is not None:  # where prescribed motions move bounds instead of other unknowns
+            base = np.einsum("nij,nj->ni", frames.basis, trial.transform.positions(x)[at]) - w[at]
+        lower[at], upper[at] = frames.lower - base, frames.upper - base
+        if rows is not None:
+            rows.bound(x, w, lower)
         return Bounds((lower, upper))
 
     def check(
         self, trial: Trial, bounds: Bounds, w: np.ndarray, u: np.ndarray, g: np.ndarray, noise: float, tolerance: float
     ) -> Outcome:
-        """Check whether the solution satisfies all walls and links, and prepare the next solve if not. Collective.
+        """Check whether the solution satisfies all walls and rows, and prepare the next solve if not. Collective.
 
         Parameters
         ----------
@@ -340,12 +333,12 @@ class ActiveSet:
         contact, frames, candidates = self.contact, trial.frames, trial.candidates
         x, at, walls = self.balance.predictor + u, trial.candidates.nodes, len(contact.wall_of)
         slack, relative = ON_BOUND * self.model.size, trial.transform.relative
-        settled, links, g = self._check_links(trial, bounds, w, x, g, noise, slack)
+        settled, rows, g = self._check_rows(trial, bounds, w, x, g, noise, slack)
         if relative is not None:
             g = relative.forces(g)
         normal_forces, pull = np.zeros(frames.rows.shape), np.where(contact.fixed[at], 0.0, g[at])
         if not contact.any and not candidates.anywhere:
-            return Outcome(settled, candidates, links, trial, normal_forces, pull)
+            return Outcome(settled, candidates, rows, trial, normal_forces, pull)
         if candidates.anywhere:
             turned = np.einsum("nji,nj->ni", frames.inverse, g[at])
             normal_forces = contact.strengths(frames, turned, bounds.active(at, w, turned, noise))
@@ -364,7 +357,7 @@ class ActiveSet:
             rank = PROJECTED * self.model.size
             candidates = candidates.join(contact, self._poses, joined, broken, x, by_walls, rank)
             settled = False
-        return Outcome(settled, candidates, links, trial, normal_forces, pull)
+        return Outcome(settled, candidates, rows, trial, normal_forces, pull)
 
     def _why(self, left: np.ndarray, x: np.ndarray) -> str:
         """Return why the solves of nodes (k,) at (owned, 3) do not converge, and the remedy. Collective."""
@@ -379,24 +372,24 @@ class ActiveSet:
             f"{f' (nodes {shown})' if shown else ''}; {self._remedy}"
         )
 
-    def _check_links(
+    def _check_rows(
         self, trial: Trial, bounds: Bounds, w: np.ndarray, x: np.ndarray, g: np.ndarray, noise: float, slack: float
-    ) -> tuple[bool, tuple[RowCoordinates, ...], np.ndarray]:
+    ) -> tuple[bool, RowCoordinates | None, np.ndarray]:
         """Return whether rows over several nodes are satisfied at positions (owned, 3), those of the next solve, and
         part of the residual force that walls must balance. Collective."""
-        if not trial.links:
-            unexpected = tuple(rows for rows in self._all_links if rows.broken(x, slack))
-            return not unexpected, unexpected, g
-        (rows,), at = trial.links, trial.frames.nodes
-        turned, g = g.copy(), g.copy()
-        turned[at] = np.einsum("nji,nj->ni", trial.frames.inverse, g[at])
-        rows.solve_forces(w, turned, bounds.arrays[0], noise)
+        rows = trial.transform.rows
+        if rows is None:
+            broken = self._all_rows is not None and self._all_rows.broken(x, slack)
+            return not broken, self._all_rows if broken else None, g
+        own, g = g.copy(), g.copy()
+        trial.transform.adjoint(own)
+        rows.solve_forces(w, own, bounds.arrays[0], noise)
         rows.constraints.add_forces(g, -1.0)
         satisfied = rows.satisfied(x, slack)
-        self._link_iterations += not satisfied
-        if self._link_iterations >= _ITERATIONS:
+        self._row_iterations += not satisfied
+        if self._row_iterations >= _ITERATIONS:
             raise NotConverged(f"constraints and positions did not agree in {_ITERATIONS} solves; {self._remedy}")
-        return satisfied, trial.links, g
+        return satisfied, rows, g
 
     def forces(self, outcome: Outcome, u: np.ndarray) -> tuple[np.ndarray, WallForces, np.ndarray]:
         """Return contact forces (owned, 3) [N], sums per wall, and the owned nodes in contact, at the solution."""
@@ -406,13 +399,14 @@ class ActiveSet:
         if outcome.trial.candidates.anywhere:
             y = outcome.trial.transform.positions(x)[at]
             dissipated = self.friction.dissipated(at, y)
-        for rows in self._all_links:
-            if not outcome.links:
-                rows.constraints.release()
+        if self._all_rows is not None:
+            constraints = self._all_rows.constraints
+            if outcome.rows is None:
+                constraints.release()
             elif relative is not None:
-                rows.set_forces(at, outcome.normal_forces[:, walls:], self.friction.drag[:, walls:])
-            rows.constraints.friction = float(dissipated[walls:].sum())
-            rows.constraints.add_forces(total)
+                outcome.rows.set_forces(at, outcome.normal_forces[:, walls:], self.friction.drag[:, walls:])
+            constraints.friction = float(dissipated[walls:].sum())
+            constraints.add_forces(total)
         held = np.zeros(len(u), dtype=bool)
         if not outcome.trial.candidates.anywhere:
             return total, self.contact.nothing, held

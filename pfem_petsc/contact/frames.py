@@ -5,7 +5,6 @@ of slipping nodes.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,72 +14,71 @@ from ..mechanics.compiled import kernel
 _SINGULAR = 1e-6  # determinant of I - C below which a wedge is jammed
 
 
-@dataclass
-class Sliding:
-    """Slipping nodes of a rank.
+class SlipForces(NamedTuple):
+    """Friction of slipping nodes (m,) at walls (w,).
 
     Attributes
     ----------
-    nodes, at : (m,) owned local indices, and indices among the frames
     known : (m, 3) known part of the friction forces [N]
-    inverse : (m, 3, 3) of the frames' bases
-    rows, signs : (m, w) of the frames
     friction : (m, w) coefficients, zero where a wall exerts no friction
-    normals, origins : (m, w, 3) normals of the walls; positions of the node without slip [m]
+    origins : (m, w, 3) positions of the node without slip [m]
     start : (m, w, 3) a d [N]
     weight : (m,) b [N/m]
-    maps : (m, 3, 3) (I - C)^-1 at the last evaluation
-    stiffness : (m, 3, 3) derivative of friction with respect to the node's position x, at the last evaluation [N/m]
     """
 
-    nodes: np.ndarray
-    at: np.ndarray
     known: np.ndarray
-    inverse: np.ndarray
-    rows: np.ndarray
-    signs: np.ndarray
     friction: np.ndarray
-    normals: np.ndarray
     origins: np.ndarray
     start: np.ndarray
     weight: np.ndarray
 
-    def __post_init__(self) -> None:
-        self.maps = np.tile(np.eye(3), (len(self.nodes), 1, 1))
-        self.stiffness = np.zeros((len(self.nodes), 3, 3))
 
-    @classmethod
-    def none(cls, walls: int) -> Sliding:
-        """Return an instance without slipping nodes."""
-        zeros, rows = np.zeros((0, walls, 3)), np.zeros((0, walls), dtype=np.int8)
-        nodes, matrices = np.empty(0, dtype=np.int64), np.zeros((0, 3, 3))
-        signs, known = np.zeros((0, walls)), np.zeros((0, 3))
-        return cls(nodes, nodes, known, matrices, rows, signs, signs, zeros, zeros, zeros, np.zeros(0))
+class Sliding:
+    """Slipping nodes of a rank.
+
+    Parameters
+    ----------
+    frames : NodalFrames
+    at : (m,) indices of the nodes among the frames
+    forces : SlipForces
+
+    Attributes
+    ----------
+    nodes : (m,) owned local indices
+    inverse : (m, 3, 3) of the frames' bases
+    maps : (m, 3, 3) (I - C)^-1 at the last evaluation
+    stiffness : (m, 3, 3) derivative of friction with respect to the node's position x, at the last evaluation [N/m]
+    """
+
+    def __init__(self, frames: NodalFrames, at: np.ndarray, forces: SlipForces) -> None:
+        self.nodes, self.at, self.inverse, self.forces = frames.nodes[at], at, frames.inverse[at], forces
+        self._walls = frames.rows[at], frames.signs[at], frames.normals[at]
+        self.maps, self.stiffness = np.tile(np.eye(3), (len(at), 1, 1)), np.zeros((len(at), 3, 3))
 
     def couple(self, x: np.ndarray, g: np.ndarray) -> np.ndarray:
         """Return the residual (m, 3) with friction from the one without, in frame coordinates, at positions (m, 3)."""
-        way = self.start + self.weight[:, None, None] * (x[:, None, :] - self.origins)
-        way -= np.einsum("mwi,mwi->mw", way, self.normals)[:, :, None] * self.normals
+        (rows, signs, normals), (known, friction, origins, start, weight) = self._walls, self.forces
+        way = start + weight[:, None, None] * (x[:, None, :] - origins)
+        way -= np.einsum("mwi,mwi->mw", way, normals)[:, :, None] * normals
         size = np.maximum(np.linalg.norm(way, axis=2), 1e-300)
         directions = way / size[:, :, None]
         every = np.arange(len(self.nodes))
         coupling = np.zeros((len(self.nodes), 3, 3))
         turned = np.einsum("mji,mwj->mwi", self.inverse, directions)
-        for k in range(self.rows.shape[1]):
-            row = np.maximum(self.rows[:, k], 0)
-            factor = self.friction[:, k] * self.signs[:, k]
-            coupling[every, :, row] += factor[:, None] * turned[:, k]
+        for k in range(rows.shape[1]):
+            factor = friction[:, k] * signs[:, k]
+            coupling[every, :, np.maximum(rows[:, k], 0)] += factor[:, None] * turned[:, k]
         system = np.eye(3) - coupling
         jammed = np.abs(np.linalg.det(system)) < _SINGULAR
         system[jammed] = np.eye(3)
         self.maps = np.linalg.inv(system)
-        g = np.einsum("mij,mj->mi", self.maps, g - np.einsum("mji,mj->mi", self.inverse, self.known))
+        g = np.einsum("mij,mj->mi", self.maps, g - np.einsum("mji,mj->mi", self.inverse, known))
         # the change of friction as the direction of slip turns
         self.stiffness[:] = 0.0
-        for k in range(self.rows.shape[1]):
-            normal_forces = np.maximum(self.signs[:, k] * g[every, np.maximum(self.rows[:, k], 0)], 0.0)
-            factor = self.friction[:, k] * normal_forces * self.weight / size[:, k]
-            n, d = self.normals[:, k], directions[:, k]
+        for k in range(rows.shape[1]):
+            normal_forces = np.maximum(signs[:, k] * g[every, np.maximum(rows[:, k], 0)], 0.0)
+            factor = friction[:, k] * normal_forces * weight / size[:, k]
+            n, d = normals[:, k], directions[:, k]
             across = np.eye(3) - n[:, :, None] * n[:, None, :] - d[:, :, None] * d[:, None, :]
             self.stiffness += factor[:, None, None] * across
         return g
@@ -126,7 +124,8 @@ class NodalFrames:
         self.offsets = np.full((m, walls), -np.inf)
         self.oblique = False
         self.contradiction = -1
-        self.sliding = Sliding.none(walls)
+        none, vectors = np.zeros((0, walls)), np.zeros((0, walls, 3))
+        self.sliding = Sliding(self, nodes[:0], SlipForces(np.zeros((0, 3)), none, vectors, vectors, np.zeros(0)))
 
     def pin(self, at: np.ndarray, values: np.ndarray, which: np.ndarray) -> None:
         """Fix the coordinates ``which`` (k, 3) bool of the frames ``at`` (k,) at values (k, 3) [m]."""

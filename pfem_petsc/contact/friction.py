@@ -4,16 +4,16 @@ which nodes stick or slip, at walls or in the relative coordinates of rows.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
 from ..integrators.base import Balance, State
 from ..tolerances import FREE_PART, ON_BOUND, PROJECTED
-from .frames import NodalFrames, Sliding
+from .frames import NodalFrames, Sliding, SlipForces
 from .node_walls import free_squares
-from .projection import NodesAtPlanes, Planes, pressed
+from .projection import NodesAtPlanes, Planes, Pressed, pressed
 
 if TYPE_CHECKING:
     from ..mechanics.mass import Inertia
@@ -23,35 +23,6 @@ if TYPE_CHECKING:
 
 FAST = 1e16
 """Weight of velocities relative to accelerations in the direction of slip of nodes at rest on walls."""
-
-
-class Rubbing(NamedTuple):
-    """Nodes (m,) at slots (w,) of walls with friction in a step.
-
-    Attributes
-    ----------
-    before, ways : (m, 3), (m, w, 3) positions of the nodes at its start, and how far walls carry them from there [m]
-    fixed : (m, 3) bool, components that supports prescribe
-    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; -inf where a wall does not apply
-    dynamic, static : (w,) coefficients of friction
-    stiffness : (m,) force for a displacement of a node [N/m]
-    """
-
-    before: np.ndarray
-    ways: np.ndarray
-    fixed: np.ndarray
-    normals: np.ndarray
-    offsets: np.ndarray
-    dynamic: np.ndarray
-    static: np.ndarray
-    stiffness: np.ndarray
-
-    def at(self, x: np.ndarray, static: np.ndarray) -> NodesAtPlanes:
-        """Return the nodes at positions (m, 3) without the walls, with static coefficients (m, w)."""
-        gaps = np.einsum("mwi,mi->mw", self.normals, x) - self.offsets
-        friction = np.stack([np.broadcast_to(self.dynamic, static.shape), static], axis=-1)
-        planes = Planes(self.normals, gaps, friction, (x - self.before)[:, None, :] - self.ways)
-        return NodesAtPlanes(x, self.fixed, self.stiffness, planes)
 
 
 def planes_at_rest(
@@ -107,46 +78,6 @@ def jam(contact: NodeWalls, node: int, normals: np.ndarray) -> str:
         f"is {contact.static_friction[wall]:.3g}; reduce the friction, free the node, or name the nodes that the wall "
         "stops with 'node_set'"
     )
-
-
-class LocalSolution(NamedTuple):
-    """Solutions of the local problems of k nodes at w walls.
-
-    Attributes
-    ----------
-    moved : (k, 3) positions [m]
-    normal_forces, drag : (k, w), (k, w, 3) normal and friction forces [N]
-    stiffness : (k,) K of each node [N/m]
-    """
-
-    moved: np.ndarray
-    normal_forces: np.ndarray
-    drag: np.ndarray
-    stiffness: np.ndarray
-
-    def of(self, some: np.ndarray) -> LocalSolution:
-        """Return the solutions of some of the nodes."""
-        return LocalSolution(*(each[some] for each in self))
-
-
-def solve_locally(
-    rubbing: Rubbing, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray, size: float
-) -> LocalSolution:
-    """Solve the local problems of nodes (k,) at tangent planes.
-
-    Slipping nodes use the dynamic coefficient only; whether they stick is determined by a trial.
-
-    Parameters
-    ----------
-    rubbing : Rubbing
-    x, reaction : (k, 3) positions [m] and forces by walls [N]
-    slipping : (k,) bool
-    size : length that tolerances are relative to [m]
-    """
-    stiffness = rubbing.stiffness
-    free = x - np.where(rubbing.fixed, 0.0, reaction) / stiffness[:, None]
-    static = np.where(slipping[:, None], rubbing.dynamic, rubbing.static)
-    return LocalSolution(*pressed(rubbing.at(free, static), PROJECTED * size), stiffness)
 
 
 # Weight of the known direction relative to the one solved for, multiplied by ten after each failure. 0.01 saves a fifth
@@ -287,7 +218,8 @@ class StepFriction:
         at = np.flatnonzero(self._has_friction(frames))
         slipping = self._sticks[nodes[at]] < 0
         own = self._local(frames, at, x[at], reaction[at], slipping)
-        moved, normal_forces, drag, stiffness = own
+        moved, normal_forces, drag = own
+        stiffness = self._stiffness[nodes[at]]
         self._forces[nodes[at]] = drag.sum(axis=1)
         before = self._sticks.copy(), self._slips.copy()
         apart = stiffness * np.linalg.norm(moved - x[at], axis=1)
@@ -296,7 +228,7 @@ class StepFriction:
         kept = apart <= np.maximum(max(tolerance, 2.0 * noise), floor)
         wrong = np.flatnonzero(~kept)
         if len(wrong):
-            self._decide(frames, at[wrong], x[at[wrong]], slipping[wrong], own.of(wrong))
+            self._decide(frames, at[wrong], x[at[wrong]], slipping[wrong], Pressed(*(each[wrong] for each in own)))
         may = self._may_stick(nodes[at], slipping & kept, x[at], normal_forces, frames.normals[at])
         trying = may.any(axis=1)
         self._sticks[nodes[at[trying]]] = may[trying].argmax(axis=1)
@@ -340,13 +272,18 @@ class StepFriction:
 
     def _local(
         self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray
-    ) -> LocalSolution:
-        """Solve the local problems of some nodes of the frames."""
+    ) -> Pressed:
+        """Solve the local problems of some of the frames' nodes, at (k, 3) with forces by walls (k, 3), at tangent
+        planes. Slipping nodes (k,) use the dynamic coefficient only; whether they stick is determined by a trial."""
         nodes, contact = frames.nodes[at], self.contact
-        planes = contact.fixed[nodes], frames.normals[at], frames.offsets[at]
-        rough = self._friction, self._static
-        rubbing = Rubbing(self._start[nodes], self._ways(nodes), *planes, *rough, self._stiffness[nodes])
-        return solve_locally(rubbing, x, reaction, slipping, contact.size)
+        fixed, stiffness, normals = contact.fixed[nodes], self._stiffness[nodes], frames.normals[at]
+        free = x - np.where(fixed, 0.0, reaction) / stiffness[:, None]
+        gaps = np.einsum("mwi,mi->mw", normals, free) - frames.offsets[at]
+        static = np.where(slipping[:, None], self._friction, self._static)
+        friction = np.stack([np.broadcast_to(self._friction, static.shape), static], axis=-1)
+        slips = (free - self._start[nodes])[:, None, :] - self._ways(nodes)
+        planes = Planes(normals, gaps, friction, slips)
+        return pressed(NodesAtPlanes(free, fixed, stiffness, planes), PROJECTED * contact.size)
 
     def _may_stick(
         self, nodes: np.ndarray, slipping: np.ndarray, x: np.ndarray, normal_forces: np.ndarray, normals: np.ndarray
@@ -363,18 +300,16 @@ class StepFriction:
         slip = x[:, None, :] - self._start[nodes][:, None, :] - self._ways(nodes)
         return slip - np.einsum("kwi,kwi->kw", slip, normals)[:, :, None] * normals
 
-    def _decide(
-        self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, slipping: np.ndarray, own: LocalSolution
-    ) -> None:
+    def _decide(self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, slipping: np.ndarray, own: Pressed) -> None:
         """Decide which nodes stick or slip in the next solve, from positions x and the solutions of local problems."""
         nodes = frames.nodes[at]
-        moved, normal_forces, drag, stiffness = own
+        moved, normal_forces, drag = own
         slip = self._slip(nodes, moved, frames.normals[at])
         size = np.linalg.norm(drag, axis=2)
         # a normal force within rounding neither sticks nor causes friction
         least = 1e-9 * normal_forces.max(axis=1, initial=0.0)
         rubbing = (normal_forces > least[:, None]) & (self._static > 0.0)
-        needed = np.linalg.norm(drag - stiffness[:, None, None] * slip, axis=2)
+        needed = np.linalg.norm(drag - self._stiffness[nodes, None, None] * slip, axis=2)
         limit = np.where(slipping[:, None], self._friction, self._static) * normal_forces
         slips = rubbing & (needed > (1.0 + 1e-13) * limit)
         was = self._sticks[nodes] >= 0
@@ -419,16 +354,6 @@ class StepFriction:
         if self._lagged:
             known, friction = self._forces[nodes], np.zeros_like(friction)
         start = np.where(slips[:, None, None], self._firmness, 1.0) * self._directions[nodes]
-        return Sliding(
-            nodes,
-            at,
-            known,
-            frames.inverse[at],
-            frames.rows[at],
-            frames.signs[at],
-            friction,
-            frames.normals[at],
-            self._start[nodes][:, None, :] + self._ways(nodes),
-            start,
-            np.where(slips, self._stiffness[nodes], 0.0),
-        )
+        origins = self._start[nodes][:, None, :] + self._ways(nodes)
+        weight = np.where(slips, self._stiffness[nodes], 0.0)
+        return Sliding(frames, at, SlipForces(known, friction, origins, start, weight))

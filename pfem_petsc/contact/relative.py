@@ -1,5 +1,5 @@
-"""Relative coordinates of implicit steps: the position of one node of a row is replaced by the sum of weights times
-positions of all its nodes, in which the row is a wall at that node.
+"""Pivots of groups of rows, and relative coordinates of implicit steps: the position of one node of a row is replaced
+by the sum of weights times positions of all its nodes, in which the row is a wall at that node.
 
 The transposed map turns forces: what presses on the relative coordinate acts on all nodes of the row, times their
 weights. Bounds, sticking and slipping of a row are then those of a node at a plane wall at rest
@@ -16,7 +16,44 @@ from mpi4py import MPI
 from .frames import RowPlanes
 
 if TYPE_CHECKING:
-    from .rows import RowSet
+    from .rows import Alike, RowSet
+
+_LEAST = 0.05  # of a pivot below which a row is deferred
+
+
+def pivots(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Choose pivots of matrices (g, p, q, d), with d components at each node, by elimination, largest part of a row at
+    a node first.
+
+    The coordinates of that node are reflected such that the part has one component. Coordinates without entries are not
+    changed. Returns rows and columns (g, p) of the pivots, how many (g,) there are, and the reflections (g, q, d, d).
+    """
+    (g, p, q, d), left, every = matrices.shape, matrices.copy(), np.arange(len(matrices))
+    rows, columns = np.zeros((2, g, p), dtype=np.int64)
+    count, going, turns = np.zeros(g, dtype=np.int64), np.ones(g, dtype=bool), np.tile(np.eye(d), (g, q, 1, 1))
+    for k in range(p):
+        size = np.sqrt(np.einsum("gpqi,gpqi->gpq", left, left))
+        at, node = np.divmod(size.reshape(g, -1).argmax(axis=1), q)
+        going &= size[every, at, node] > _LEAST
+        if not going.any():
+            break
+        some = np.flatnonzero(going)
+        at, node, each = at[some], node[some], np.arange(len(some))
+        mirror = -left[some, at, node] / size[some, at, node][:, None]
+        slot = np.abs(mirror).argmax(axis=1)
+        mirror[each, slot] += 1.0
+        square = np.einsum("mi,mi->m", mirror, mirror)
+        factor = np.divide(2.0, square, out=np.zeros_like(square), where=square > 0.0)
+        turn = np.eye(d) - factor[:, None, None] * mirror[:, :, None] * mirror[:, None, :]
+        turns[some, node] = turns[some, node] @ turn
+        left[some, :, node] = left[some, :, node] @ turn
+        rows[some, k], columns[some, k] = at, d * node + slot
+        count[some] += 1
+        factors = left[some, :, node, slot] / left[some, at, node, slot][:, None]
+        left[some] -= factors[:, :, None, None] * left[some, at][:, None]
+        left[some, at] = 0.0
+        left[some, :, node, slot] = 0.0
+    return rows, columns, count, turns
 
 
 class RelativeCoordinates:
@@ -50,6 +87,11 @@ class RelativeCoordinates:
         comm.Allreduce(MPI.IN_PLACE, coefficients, op=MPI.MAX)
         self.friction, self.static = coefficients.T.copy()
         self._may = self._supported()
+        # the first row over the same nodes, with whose carrier the first ones of other tables have a slot as well
+        nodes = np.column_stack([rows.ends, rows.weights])
+        _, first, same = np.unique(nodes, axis=0, return_index=True, return_inverse=True)
+        self._first, self._slot = first[same.ravel()], np.zeros(len(rows.source), dtype=bool)
+        self._slot[np.unique(np.column_stack([self._first, rows.source]), axis=0, return_index=True)[1]] = True
         self._take(np.full(len(rows.source), -1))
 
     def _supported(self) -> np.ndarray:
@@ -61,7 +103,7 @@ class RelativeCoordinates:
         return part & (free | ~needed).all(axis=2) & self.groups[rows.group_of_row][:, None]
 
     def choose(self, stopped: np.ndarray, x: np.ndarray) -> None:
-        """Choose the carriers for a solve. Collective.
+        """Choose the carriers for a solve, by elimination. Collective.
 
         Parameters
         ----------
@@ -70,41 +112,17 @@ class RelativeCoordinates:
         """
         rows = self.rows
         every = rows.gather(np.column_stack([stopped, x]))
-        may = self._may & (every[:, 0] == 0.0)[rows.ends]
-        carrier, values = np.full(len(rows.source), -1), None
-        width = may.shape[1]
+        may = self._may & (every[:, 0] == 0.0)[rows.ends] & (self._first == np.arange(len(self._first)))[:, None]
+        carrier, values = np.full(len(rows.source), -1), rows.values(every[:, 1:])
         for groups in rows.alike_of(self.groups):
-            if groups.rows.shape[1] == 1:
-                some = groups.rows[may[groups.rows[:, 0]].any(axis=1), 0]
-                carrier[some] = rows.ends[some, width - 1 - may[some, ::-1].argmax(axis=1)]
-                continue
-            values = rows.values(every[:, 1:]) if values is None else values
-            for several in groups.rows:
-                self._share_out(several, may, values, carrier)
-        self._take(carrier)
-
-    def _share_out(self, several: np.ndarray, may: np.ndarray, values: np.ndarray, carrier: np.ndarray) -> None:
-        """Give the rows (p,) of a group their carriers: in turn one that has a node which no other row needs."""
-        rows = self.rows
-        alike: dict[tuple, list[int]] = {}
-        for row in several:
-            same = alike.setdefault((*rows.ends[row], *rows.weights[row]), [])
-            if rows.source[row] in rows.source[same]:  # a table has one slot
-                same = alike[int(row),] = []
-            same.append(int(row))
-        left = list(alike.values())
-        while left:
-            needed = np.concatenate([rows.ends[some[0]][rows.weights[some[0]] != 0.0] for some in left])
-            number, count = np.unique(needed, return_counts=True)
-            alone = number[count == 1]
-            for some in left:
-                free = np.flatnonzero(may[some[0]] & np.isin(rows.ends[some[0]], alone))
-                if len(free):
-                    carrier[some] = rows.ends[some[0], free[-1]]
-                    break
-            else:  # the row that is farthest from being closed goes without
-                some = max(left, key=lambda some: values[some].min())
-            left.remove(some)
+            order = np.argsort(values[groups.rows], axis=1, kind="stable")
+            matrix = groups.dense(np.where(may, rows.weights, 0.0)[groups.rows])
+            matrix /= np.maximum(np.abs(matrix).max(axis=2, keepdims=True), 1e-300)
+            matrix = np.take_along_axis(matrix, order[:, :, None], axis=1)
+            row, column, count, _ = pivots(matrix[:, :, ::-1, None])
+            at, k = np.nonzero(np.arange(row.shape[1]) < count[:, None])
+            carrier[groups.rows[at, order[at, row[at, k]]]] = groups.nodes[at, -1 - column[at, k]]
+        self._take(np.where(self._slot, carrier[self._first], -1))
 
     def _take(self, carrier: np.ndarray) -> None:
         rows = self.rows
@@ -116,43 +134,15 @@ class RelativeCoordinates:
         self.at = placed[own][first]
         self._placed = placed[own]
         self._place = np.searchsorted(self.nodes, local[own])
-        self._blocks: list[tuple[np.ndarray, np.ndarray]] = []  # of groups alike: nodes (g, q), x by y (g, q, q)
-        for groups in rows.alike_of(self.groups):
-            g, q = groups.nodes.shape
-            weights = np.tile(np.eye(q), (g, 1, 1))
-            group, row = np.nonzero(carrier[groups.rows] >= 0)
-            at = groups.rows[group, row]
-            where = (groups.nodes[group] == carrier[at][:, None]).argmax(axis=1)
-            weights[group, where] = 0.0
-            for end in range(rows.ends.shape[1]):
-                some = groups.ends[group, row, end] >= 0
-                place = groups.ends[group, row, end][some]
-                weights[group[some], where[some], place] = rows.weights[at[some], end]
-            self._blocks.append((groups.nodes, np.linalg.inv(weights)))
+        self._inverse = [(groups.nodes, np.linalg.inv(self.weights(groups))) for groups in rows.alike_of(self.groups)]
 
-    def carried(self, nodes: np.ndarray) -> np.ndarray:
-        """Return (m,) bool: which of owned nodes (m,) are carriers."""
-        return np.isin(nodes, self.nodes)
-
-    def transforms(self, inverse: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return unknowns (g, u) of groups alike, and T (g, u, u).
-
-        T maps coordinates w of the nodes' frames, with the inverses (n, 3, 3) of their bases, to the same at nodes
-        without a relative coordinate, and to positions at carriers. Prescribed components do not move others: bounds
-        account for their motion.
-        """
-        rows, found = self.rows, []
-        basis, fixed = np.linalg.inv(inverse), rows.free.ravel() == 0.0
-        basis[self.carrier[self.carrier >= 0]] = np.eye(3)
-        for nodes, blocks in self._blocks:
-            g, q = nodes.shape
-            unknowns = (3 * nodes[:, :, None] + np.arange(3)).reshape(g, 3 * q)
-            matrix = np.einsum("gab,gaij,gbjk->gaibk", blocks, basis[nodes], inverse[nodes]).reshape(g, 3 * q, 3 * q)
-            at, column = np.nonzero(fixed[unknowns])
-            matrix[at, :, column] = 0.0
-            matrix[at, column, column] = 1.0
-            found.append((unknowns, matrix))
-        return found
+    def weights(self, groups: Alike) -> np.ndarray:
+        """Return y by x (g, q, q) of groups alike."""
+        weights = np.tile(np.eye(groups.nodes.shape[1]), (len(groups.nodes), 1, 1))
+        group, row = np.nonzero(self.carrier[groups.rows] >= 0)
+        where = groups.nodes[group] == self.carrier[groups.rows[group, row]][:, None]
+        weights[group, where.argmax(axis=1)] = groups.dense(self.rows.weights[groups.rows])[group, row]
+        return weights
 
     def positions(self, x: np.ndarray) -> np.ndarray:
         """Return y (owned, 3) of positions x (owned, 3) [m]. Collective."""
@@ -164,8 +154,8 @@ class RelativeCoordinates:
         """Return the forces (owned, 3) on y of forces g (owned, 3) on x [N]. Collective."""
         every, g = self.rows.gather(g), g.copy()
         turned = every.copy()
-        for nodes, blocks in self._blocks:
-            turned[nodes] = np.einsum("gab,gai->gbi", blocks, every[nodes])
+        for nodes, inverse in self._inverse:
+            turned[nodes] = np.einsum("gab,gai->gbi", inverse, every[nodes])
         g[self.rows.here] = turned[self.rows.mine]
         return g
 

@@ -285,12 +285,12 @@ class Alike:
     nodes: np.ndarray
     ends: np.ndarray
 
-    def dense(self, gradients: np.ndarray) -> np.ndarray:
-        """Return gradients (g, p, 3 q) from those of rows (g, p, k, 3)."""
-        dense = np.zeros((*self.rows.shape, self.nodes.shape[1], 3))
+    def dense(self, values: np.ndarray) -> np.ndarray:
+        """Return values (g, p, q, ...) at the nodes of groups from those at the nodes of rows (g, p, k, ...)."""
+        dense = np.zeros((*self.rows.shape, self.nodes.shape[1], *values.shape[3:]))
         group, row, end = np.nonzero(self.ends >= 0)
-        dense[group, row, self.ends[group, row, end]] = gradients[group, row, end]
-        return dense.reshape(*self.rows.shape, -1)
+        dense[group, row, self.ends[group, row, end]] = values[group, row, end]
+        return dense
 
 
 class RowSet:

@@ -114,6 +114,18 @@ class DistributedMesh:
         """Fill the ghost rows of ``array`` (n_local, k) float64, C-contiguous, with the owners' values. Collective."""
         self._exchange.update(array)
 
+    def with_ghosts(self, nodes: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the place (local,) int32 of each node among those with matrices, ghosts included, -1 for none, and
+        these matrices (k, 3, 3), from those (m, 3, 3) of owned nodes (m,), ascending. Collective."""
+        shared = np.zeros((self.n_local, 10))
+        shared[nodes, 0] = 1.0
+        shared[nodes, 1:] = matrices.reshape(-1, 9)
+        self.update_ghosts(shared)
+        every = np.flatnonzero(shared[:, 0])
+        place = np.full(self.n_local, -1, dtype=np.int32)
+        place[every] = np.arange(len(every), dtype=np.int32)
+        return place, np.ascontiguousarray(shared[every, 1:]).reshape(-1, 3, 3)
+
     def messages(self) -> Messages:
         """Return the messages that update ghosts of positions, for compiled loops."""
         return self._exchange.messages()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from .matrix_free import MatrixFreeHessian
 from .multigrid import GridMultigrid
 
 if TYPE_CHECKING:
+    from ..contact.transform import RowCoordinates
     from ..stepping.model import Model
     from .problem import StepProblem
 
@@ -54,9 +55,9 @@ class AssembledPreconditioner:
         self._inner: PETSc.PC | None = None
         self._new_inner(self.matrix.mat)  # reports invalid PETSc options before the first step
 
-    def couple(self, links: Iterable) -> None:
-        """Set the coordinates of links for steps with bounds. Collective."""
-        self.matrix.couple(links)
+    def couple(self, rows: RowCoordinates | None) -> None:
+        """Set the coordinates of rows for steps with bounds. Collective."""
+        self.matrix.couple(rows)
 
     def make(self, problem: StepProblem, held: np.ndarray) -> None:
         """Set up at the positions of a problem; ``held`` (local, 3): nonzero for active unknowns, ghosts not yet up to

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ from ..mechanics.block_pattern import BlockPattern
 from ..mechanics.compiled import kernel
 
 if TYPE_CHECKING:
-    from ..contact.transform import Transform
+    from ..contact.transform import RowCoordinates, Transform
     from ..mechanics.bars import Bars
     from ..mechanics.mass import Inertia
     from ..mechanics.supports import Directions, Supports
@@ -54,17 +54,6 @@ def turn_blocks(ptr, local_columns, place, left, right, values):
             for i in range(3):
                 for j in range(3):
                     values[at + i * width + j] = block[i, j]
-
-
-def with_ghosts(mesh: DistributedMesh, nodes: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the local nodes that have matrices (m, 3, 3), ghosts included, and these, from those of owned nodes.
-    Collective."""
-    shared = np.zeros((mesh.n_local, 10))
-    shared[nodes, 0] = 1.0
-    shared[nodes, 1:] = matrices.reshape(-1, 9)
-    mesh.update_ghosts(shared)
-    every = np.flatnonzero(shared[:, 0])
-    return every, np.ascontiguousarray(shared[every, 1:]).reshape(-1, 3, 3)
 
 
 @kernel
@@ -128,7 +117,7 @@ class HessianMatrix:
     Attributes
     ----------
     mat : PETSc matrix
-    bounded : the matrix of steps with bounds: ``mat``, or M T^T mat T with coordinates of links
+    bounded : the matrix of steps with bounds: ``mat``, or M B^-T mat B^-1 with coordinates of rows
     """
 
     def __init__(self, mesh: DistributedMesh, supports: Supports | None = None, symmetric: bool = True) -> None:
@@ -144,8 +133,8 @@ class HessianMatrix:
         self._allocate()
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         self.bounded = self.mat
-        self._chain: list[tuple[object, PETSc.Mat, PETSc.Mat]] = []  # coordinates, T, and T^T mat T
-        self._maps: PETSc.Mat | None = None  # M of nodes that slip in relative coordinates
+        self._rows: RowCoordinates | None = None
+        self._made: list[PETSc.Mat] = []  # of these: B^-1, B^-T mat B^-1, then M and the product of both, if rows rub
         self._symmetric = symmetric
         self.any_fixed = supports is not None and supports.any
         self._inclined: Directions | None = None
@@ -155,9 +144,7 @@ class HessianMatrix:
             mesh.update_ghosts(self._fixed)
             self._inclined = supports.inclined
         if self._inclined is not None:
-            nodes, self._free = with_ghosts(mesh, self._inclined.nodes, self._inclined.free)
-            self._place = np.full(mesh.n_local, -1, dtype=np.int32)  # of a node among these
-            self._place[nodes] = np.arange(len(nodes), dtype=np.int32)
+            self._place, self._free = mesh.with_ghosts(self._inclined.nodes, self._inclined.free)
 
     def _allocate(self) -> None:
         """Give the matrix the pattern of bars, and of the nodes of bars that touch."""
@@ -203,24 +190,23 @@ class HessianMatrix:
             self.mat.assemble()
         return self.mat
 
-    def couple(self, links: Iterable) -> None:
-        """Set the coordinates of links (``contact.transform.RowCoordinates``) for steps with bounds, instead of those
-        set before. Collective."""
-        self._free_chain()
-        for link in links:
-            matrix = link.matrix()
-            if not self._chain:
-                self.fill(lambda values: None)
-            self.bounded = self.bounded.ptap(matrix)
-            self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
-            self._chain.append((link, matrix, self.bounded))
-            if link.relative is not None:
-                self._maps = block_diagonal(self.mesh)
-                self.bounded = self._maps.matMult(self.bounded)
-                self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, False)
+    def couple(self, rows: RowCoordinates | None) -> None:
+        """Set the coordinates of rows for steps with bounds, instead of those set before. Collective."""
+        self._free_made()
+        self._rows = rows
+        if rows is None:
+            return
+        inverse = rows.matrix()
+        self.fill(lambda values: None)
+        self._made = [inverse, self.mat.ptap(inverse)]
+        if rows.relative is not None:
+            maps = block_diagonal(self.mesh)
+            self._made += [maps, maps.matMult(self._made[1])]
+        self.bounded = self._made[-1]
+        self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric and rows.relative is None)
 
     def _turn(self, transform: Transform, values: np.ndarray) -> None:
-        """Transform the values to frame coordinates, without those of rows over several nodes."""
+        """Transform the values to the coordinates of frames of nodes without rows."""
         turns = transform.turns()
         if turns is not None:
             if transform.relative is None:
@@ -246,7 +232,7 @@ class HessianMatrix:
         self.fill(lambda values: self.add(problem, values, bars))
 
     def add(self, problem: StepProblem, values: np.ndarray, stored: np.ndarray | None = None) -> None:
-        """Add dg/dw of a problem at its positions, ghosts included, without the coordinates of links. Collective.
+        """Add dg/dw of a problem at its positions, ghosts included, without the coordinates of rows. Collective.
 
         With ``stored`` (5, b) the stiffness of the bars is computed from these data, see ``Bars.linearise``.
         """
@@ -276,23 +262,22 @@ class HessianMatrix:
 
     def _change_coordinates(self, transform: Transform) -> None:
         """Compute ``bounded`` from ``mat``. Collective."""
-        last = self.mat
-        for link, matrix, product in self._chain:
-            if link in transform.links:
-                if link.varies:
-                    link.refresh(matrix)
-                last.ptap(matrix, product)
-            else:
-                last.copy(product, PETSc.Mat.Structure.DIFFERENT)
-            last = product
-        if self._maps is not None:
-            self._let_slide(transform, last)
-
-    def _let_slide(self, transform: Transform, product: PETSc.Mat) -> None:
-        """Compute ``bounded`` from T^T mat T: add the turning of slips, and multiply by M. Collective."""
-        if transform.relative is None or not transform.slides:
-            product.copy(self.bounded, PETSc.Mat.Structure.DIFFERENT)
+        if self._rows is None:
             return
+        inverse, product, *maps = self._made
+        if transform.rows is None:
+            self.mat.copy(self.bounded, PETSc.Mat.Structure.DIFFERENT)
+            return
+        if self._rows.varies:
+            self._rows.refresh(inverse)
+        self.mat.ptap(inverse, product)
+        if maps and transform.slides:
+            self._let_slide(transform, product, maps[0])
+        elif maps:
+            product.copy(self.bounded, PETSc.Mat.Structure.DIFFERENT)
+
+    def _let_slide(self, transform: Transform, product: PETSc.Mat, maps: PETSc.Mat) -> None:
+        """Compute ``bounded`` from B^-T mat B^-1: add the turning of slips, and multiply by M. Collective."""
         nodes = transform.sliding.nodes
         turning, left = transform.slip_blocks(), transform.left()
         if self.any_fixed:  # whose rows and columns remain those of the identity
@@ -300,10 +285,10 @@ class HessianMatrix:
             turning[held[:, :, None] | held[:, None, :]] = 0.0
             left = np.where(held[:, :, None], np.eye(3), left)
         add_diagonal(product, self.mesh, nodes, turning, PETSc.InsertMode.ADD_VALUES)
-        maps = np.tile(np.eye(3), (self.mesh.n_owned, 1, 1))
-        maps[nodes] = left
-        add_diagonal(self._maps, self.mesh, np.arange(self.mesh.n_owned), maps, PETSc.InsertMode.INSERT_VALUES)
-        self._maps.matMult(product, self.bounded)
+        every = np.tile(np.eye(3), (self.mesh.n_owned, 1, 1))
+        every[nodes] = left
+        add_diagonal(maps, self.mesh, np.arange(self.mesh.n_owned), every, PETSc.InsertMode.INSERT_VALUES)
+        maps.matMult(product, self.bounded)
 
     def fill_held(self, problem: StepProblem, held: np.ndarray, stored: np.ndarray | None) -> PETSc.Mat:
         """Assemble as :meth:`add`, in the coordinates of the problem; rows and columns of components (local nodes, 3)
@@ -311,11 +296,11 @@ class HessianMatrix:
 
         def add(values: np.ndarray) -> None:
             self.add(problem, values, stored)
-            if held.any() and not problem.transform.links:
+            if held.any() and problem.transform.rows is None:
                 self.hold(held, problem.scale, values)
 
         self.fill(add)
-        if not problem.transform.links:
+        if problem.transform.rows is None:
             return self.mat
         self._change_coordinates(problem.transform)
         rows = np.flatnonzero(held[: self.mesh.n_owned]) + 3 * self.mesh.first_node
@@ -351,20 +336,15 @@ class HessianMatrix:
         _constrain_rows(p.ptr, p.diagonal, held, scale, values)
         _constrain_columns(p.ptr, self.local_columns, p.diagonal, held, values)
 
-    def _free_chain(self) -> None:
-        if self._maps is not None:
-            self.bounded.destroy()
-            self._maps.destroy()
-            self._maps = None
-        for _, matrix, product in self._chain:
-            product.destroy()
+    def _free_made(self) -> None:
+        for matrix in reversed(self._made):
             matrix.destroy()
-        self._chain.clear()
+        self._made.clear()
         self.bounded = self.mat
 
     def destroy(self) -> None:
         """Free the PETSc matrices."""
-        self._free_chain()
+        self._free_made()
         self.mat.destroy()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import atexit
 import itertools
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,7 @@ from ..mechanics.mass import consistent_product
 from ..mechanics.products import BarProducts
 
 if TYPE_CHECKING:
+    from ..contact.transform import RowCoordinates
     from ..mesh.distribution import DistributedMesh
     from ..stepping.model import Model
     from .problem import StepProblem
@@ -374,8 +375,8 @@ class MatrixFreeHessian:
             total[np.searchsorted(nodes, some)] += extra
         return nodes, total
 
-    def couple(self, links: Iterable) -> None:
-        """Do nothing: coordinates of links are applied with the bars."""
+    def couple(self, rows: RowCoordinates | None) -> None:
+        """Do nothing: coordinates of rows are applied with the bars."""
 
     def destroy(self) -> None:
         """Free the PETSc matrices."""

@@ -12,7 +12,6 @@ from ..mechanics.compiled import kernel
 from ..mesh.exchange import Router
 from .background_grid import BackgroundGrid, Summands, arrange, assemble, interpolate, neighbours, restrict, stabilise
 from .linear import reproducible_products
-from .matrix import with_ghosts
 from .matrix_free import MatrixFreeHessian, full_blocks
 
 if TYPE_CHECKING:
@@ -158,8 +157,8 @@ class GridMultigrid:
         self._left = self._right.duplicate()
         self._new_solver(None)  # reports invalid PETSc options before the first step
 
-    def couple(self, links: object) -> None:
-        """Do nothing: with coordinates of links the diagonal is the preconditioner."""
+    def couple(self, rows: object) -> None:
+        """Do nothing: with coordinates of rows the diagonal is the preconditioner."""
 
     def make(self, problem: StepProblem, held: np.ndarray) -> None:
         """Set up at the positions of a problem; ``held`` (local, 3) nonzero for active unknowns, ghosts not yet up to
@@ -188,7 +187,8 @@ class GridMultigrid:
         invert(blocks)
         self._inverse = blocks
         self._special, self._turned = at, kept @ basis
-        self._make_coarse(problem, *with_ghosts(self.mesh, at, to_x @ basis))
+        place, turned = self.mesh.with_ghosts(at, to_x @ basis)
+        self._make_coarse(problem, np.flatnonzero(place >= 0), turned)
 
     def _free_parts(self, active: np.ndarray, framed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the owned nodes with prescribed or active components or frames (k,), ascending, and the projections

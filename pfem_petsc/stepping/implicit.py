@@ -187,8 +187,6 @@ class ImplicitStepper(Stepper):
         """Create matrices and solvers for the supports as they are. Collective."""
         model, choice = self.model, self._choice
         touch = model.self_contact
-        if touch is not None and not touch.symmetric:
-            choice = unsymmetric(choice)
         symmetric = self.scheme.symmetric and model.links.symmetric and (touch is None or touch.symmetric)
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)
@@ -210,11 +208,11 @@ class ImplicitStepper(Stepper):
 
     def _couple_rows(self) -> None:
         """Give matrices and solvers the coordinates of the rows that there are. Collective."""
-        self.links = [RowCoordinates(self.model.links)] if self.model.links else []
+        self.rows = RowCoordinates(self.model.links) if self.model.links else None
         self.newton.forget_bounded()
-        self.hessian.couple(self.links)
+        self.hessian.couple(self.rows)
         if self.lagged is not None:
-            self.lagged.inner.couple(self.links)
+            self.lagged.inner.couple(self.rows)
 
     def supports_changed(self) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
@@ -307,15 +305,15 @@ class ImplicitStepper(Stepper):
         tolerance = self.accuracy * max(rtol * scale, model.case.solver.atol or 0.0)
         ends = self._tolerance(tolerance)
         model.links.expect(state, balance)
-        if self.links and self.links[0].rows is not model.links.rows:
+        if self.rows is not None and self.rows.rows is not model.links.rows:
             self._couple_rows()
-        active_set = ActiveSet(model, self.state, balance, self.held, self.links, self.remedy)
-        candidates, links = self._candidates(active_set, balance), active_set.links
+        active_set = ActiveSet(model, self.state, balance, self.held, self.rows, self.remedy)
+        candidates, rows = self._candidates(active_set, balance), active_set.rows
         newton = linear = 0
         near_bound = 2.0 * zero_tolerance(model.size)
         while True:
             try:
-                trial = active_set.place(candidates, links, balance.predictor + guess)
+                trial = active_set.place(candidates, rows, balance.predictor + guess)
             except SimulationFailure as failure:
                 raise SimulationFailure(f"{self.when(balance)}: {failure}") from failure
             problem = StepProblem(model, state, balance, state.external, trial.transform)
@@ -350,7 +348,7 @@ class ImplicitStepper(Stepper):
                 raise NotConverged(f"{self.when(balance)}: {failure}") from failure
             if outcome.settled:
                 break
-            candidates, links, guess = outcome.candidates, outcome.links, u
+            candidates, rows, guess = outcome.candidates, outcome.rows, u
         if not trial.candidates.anywhere and not model.supports.any and model.bars.springs is None:
             self._keep_momentum(problem, u, g)
         state.contact, walls, self.held = active_set.forces(outcome, u)

@@ -6,7 +6,7 @@ from helpers.lattices import SCHEMES, planes, simulation, tumbling
 from helpers.twins import KEYS, SOFTENING
 from mpi4py import MPI
 
-from pfem_petsc.contact.frames import Sliding
+from pfem_petsc.contact.frames import NodalFrames, Sliding, SlipForces
 
 pytestmark = pytest.mark.parallel
 
@@ -51,7 +51,7 @@ def largest_error(case, comm, folder, solves=8):
     solve, rough = newton.solve, any("friction" in wall for wall in case["wall"])
 
     def compare(problem, w, *others):
-        slips = not rough or (problem.transform.sliding.weight > 0.0).any()
+        slips = not rough or (problem.transform.sliding.forces.weight > 0.0).any()
         if len(errors) < solves and any(comm.allgather(bool(slips))):
             at, way = w + 1e-6 * random.normal(size=w.shape), random.normal(size=w.shape)
             run.model.supports.clear(way)
@@ -111,11 +111,10 @@ def test_derivative_of_friction_along_surfaces_that_turn():
     normals /= np.linalg.norm(normals, axis=2)[:, :, None]
     basis = np.concatenate([normals, np.cross(normals[:, :1], normals[:, 1:])], axis=1)
     vectors = rng.normal(size=(2, m, w, 3))
-    zero, nodes = np.zeros((m, 3)), np.arange(m)
-    rows, signs = np.tile(np.arange(w, dtype=np.int8), (m, 1)), np.ones((m, w))
-    friction = np.tile([0.3, 0.2], (m, 1))
-    inverse = np.linalg.inv(basis)
-    sliding = Sliding(nodes, nodes, zero, inverse, rows, signs, friction, normals, *vectors, np.full(m, 2.0))
+    frames, inverse = NodalFrames(np.arange(m), w), np.linalg.inv(basis)
+    frames.inverse, frames.normals, frames.rows[:] = inverse, normals, np.arange(w)
+    forces = SlipForces(np.zeros((m, 3)), np.tile([0.3, 0.2], (m, 1)), *vectors, np.full(m, 2.0))
+    sliding = Sliding(frames, np.arange(m), forces)
     stiffness, x, way = rng.normal(size=(m, 3, 3)), rng.normal(size=(m, 3)), rng.normal(size=(m, 3))
     push = normals.sum(axis=1)  # towards all walls
 

@@ -456,7 +456,7 @@ def clip(value):
 
 
 @inlined
-def _closest(u, v, w):
+def closest(u, v, w):
     """Return the parameters from 0 to 1 of the closest points of segments along ``u`` and ``v``, with the way ``w``
     from the start of the second to that of the first.
 
@@ -482,7 +482,7 @@ def segment_distance(at, points, a, b):
     """Return the distance of segments ``a`` and ``b`` [m], and where they are closest; positions may be complex."""
     first, second = vector(at, points[a, 0]), vector(at, points[b, 0])
     u, v, w = minus(vector(at, points[a, 1]), first), minus(vector(at, points[b, 1]), second), minus(first, second)
-    s, t = _closest(u, v, w)
+    s, t = closest(u, v, w)
     way = minus(along(second, t, v), along(first, s, u))
     return np.sqrt(dot(way, way)), s, t
 

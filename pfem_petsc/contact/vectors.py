@@ -24,6 +24,12 @@ def along(a, s, b):
 
 
 @inlined
+def times(s, a):
+    """Return s a."""
+    return s * a[0], s * a[1], s * a[2]
+
+
+@inlined
 def dot(a, b):
     """Return the scalar product, without conjugation."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -36,7 +42,12 @@ def cross(a, b):
 
 
 @inlined
+def put(x, i, a):
+    """Write a to the first three columns of row i."""
+    x[i, 0], x[i, 1], x[i, 2] = a
+
+
+@inlined
 def add_to(x, i, s, a):
     """Add s a to the first three columns of row i."""
-    for c in range(3):
-        x[i, c] += s * a[c]
+    put(x, i, along(vector(x, i), s, a))

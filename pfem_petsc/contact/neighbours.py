@@ -165,17 +165,17 @@ def largest_change(
     near : regions of the positions before, and the length of the longest bar [m]
     """
     start, now = (np.asarray(x) for x in motion)
-    sums = comm.allreduce(_sum_motion(start, now)) / n_nodes
-    moments = comm.allreduce(_moments(start, now, sums))
+    means = comm.allreduce(_moments(start, now, np.zeros((2, 3)))[0]).reshape(2, 3) / n_nodes
+    moments = comm.allreduce(_moments(start, now, means)[1:])
     if not np.isfinite(moments).all():
         return np.inf
-    gradient = np.linalg.pinv(moments[0], rcond=1e-9, hermitian=True) @ moments[1]
+    gradient = np.linalg.pinv(moments[:, :3], rcond=1e-9, hermitian=True) @ moments[:, 3:]
     regions, longest = near or (None, 0.0)
     most = np.full((int(np.prod(regions.count)) if near else 0, 6), -np.inf)
     ends = np.full(6, -np.inf)
-    _ranges(start, now, sums, gradient, regions.of if near else np.empty(0, np.int64), most, ends)
+    _ranges(start, now, means, gradient, regions.of if near else np.empty(0, np.int64), most, ends)
     comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
-    square = _farthest(start, now, sums, gradient, 0.5 * (ends[:3] - ends[3:]))
+    square = _farthest(start, now, means, gradient, 0.5 * (ends[:3] - ends[3:]))
     rest = 2.0 * np.sqrt(comm.allreduce(square, op=MPI.MAX))
     stretch = float(np.abs(np.linalg.svd(np.eye(3) + gradient, compute_uv=False) - 1.0).max())
     if near:
@@ -198,36 +198,25 @@ def _largest_range(most: np.ndarray) -> float:
 
 
 @kernel
-def _sum_motion(start, now):
-    """Return the sums of positions and displacements (2, 3) of nodes."""
-    sums = np.zeros((2, 3))
-    for i in range(len(start)):
-        for c in range(3):
-            sums[0, c] += start[i, c]
-            sums[1, c] += now[i, c] - start[i, c]
-    return sums
-
-
-@kernel
 def _moments(start, now, means):
-    """Return the products of positions with positions and with displacements (2, 3, 3), about their means (2, 3)."""
-    moments = np.zeros((2, 3, 3))
+    """Return the sums (4, 6) of the products of 1 and the positions of nodes with their positions and displacements,
+    less ``means`` (2, 3) of these."""
+    moments = np.zeros((4, 6))
     for i in range(len(start)):
-        for c in range(3):
-            at = start[i, c] - means[0, c]
-            for d in range(3):
-                moments[0, c, d] += at * (start[i, d] - means[0, d])
-                moments[1, c, d] += at * (now[i, d] - start[i, d] - means[1, d])
+        at = minus(vector(start, i), means[0])
+        moved = minus(minus(vector(now, i), vector(start, i)), means[1])
+        rows, columns = (1.0, at[0], at[1], at[2]), (at[0], at[1], at[2], moved[0], moved[1], moved[2])
+        for c in range(4):
+            for d in range(6):
+                moments[c, d] += rows[c] * columns[d]
     return moments
 
 
 @inlined
-def _rest_of(start, now, means, gradient, i, c):
-    """Return a component of the displacement of a node beyond an affine map."""
-    rest = now[i, c] - start[i, c] - means[1, c]
-    for d in range(3):
-        rest -= (start[i, d] - means[0, d]) * gradient[d, c]
-    return rest
+def _rest_of(start, now, means, gradient, i):
+    """Return the displacement of a node beyond an affine map."""
+    at, moved = minus(vector(start, i), means[0]), minus(minus(vector(now, i), vector(start, i)), means[1])
+    return minus(moved, (dot(at, gradient[:, 0]), dot(at, gradient[:, 1]), dot(at, gradient[:, 2])))
 
 
 @kernel
@@ -235,12 +224,12 @@ def _ranges(start, now, means, gradient, regions, most, ends):
     """Write the largest displacements beyond an affine map, in positive and negative directions, of all nodes, ``ends``
     (6,), and of the regions, ``most`` (k, 6)."""
     for i in range(len(start)):
+        rest = _rest_of(start, now, means, gradient, i)
         for c in range(3):
-            rest = _rest_of(start, now, means, gradient, i, c)
-            ends[c], ends[3 + c] = max(ends[c], rest), max(ends[3 + c], -rest)
+            ends[c], ends[3 + c] = max(ends[c], rest[c]), max(ends[3 + c], -rest[c])
             if len(regions) > 0:
                 k = regions[i]
-                most[k, c], most[k, 3 + c] = max(most[k, c], rest), max(most[k, 3 + c], -rest)
+                most[k, c], most[k, 3 + c] = max(most[k, c], rest[c]), max(most[k, 3 + c], -rest[c])
 
 
 @kernel
@@ -248,11 +237,8 @@ def _farthest(start, now, means, gradient, centre):
     """Return the square of the largest distance of displacements beyond an affine map from a ``centre`` (3,)."""
     farthest = 0.0
     for i in range(len(start)):
-        square = 0.0
-        for c in range(3):
-            rest = _rest_of(start, now, means, gradient, i, c) - centre[c]
-            square += rest * rest
-        farthest = max(farthest, square)
+        rest = minus(_rest_of(start, now, means, gradient, i), centre)
+        farthest = max(farthest, dot(rest, rest))
     return farthest
 
 

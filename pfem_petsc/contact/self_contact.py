@@ -516,12 +516,15 @@ def largest_move(rows, last, drift, most):
 
 
 @kernel
-def read_nodes(rows, x, last, nodes):
-    """Write positions x (n or more, 3) and displacements since last (3, n) of some nodes (k,) to ``nodes`` (k, 6)."""
+def read_nodes(rows, x, last):
+    """Return positions x (n or more, 3) and displacements since last (3, n) of some nodes (k,), see
+    :class:`NodeArrays`."""
+    nodes = np.empty((len(rows), 6))
     for k in range(len(rows)):
-        i = rows[k]
-        for c in range(3):
-            nodes[k, c], nodes[k, 3 + c] = x[i, c], x[i, c] - last[c, i]
+        at = vector(x, rows[k])
+        put(nodes, k, at)
+        put(nodes[:, 3:], k, minus(at, vector(last.T, rows[k])))
+    return nodes
 
 
 @kernel
@@ -530,8 +533,7 @@ def add_to_nodes(local, own, force, f):
     k = 0
     for i in range(len(own)):
         if own[i]:
-            for c in range(3):
-                f[local[k], c] += force[i, c]
+            add_to(f, local[k], 1.0, vector(force, i))
             k += 1
 
 
@@ -660,27 +662,26 @@ class SelfContact:
         """
         case, self._h, self.implicit = self._model.case, 0.0, True
         self._steps = "time.step" if scheme.inertial else "static.step"
+        static = "newton" if case.static is None else case.static.method
+        scheme_name = "" if case.time is None else case.time.integrator
+        walls = [] if self.at_walls is None else [repr(self._model.contact.names[k]) for k in self.at_walls.walls]
         explicit = 'use an explicit integrator, such as time.integrator = "central_differences"'
-        if case.static is not None and case.static.method != "newton":
-            self._refuse(f'static.method = "{case.static.method}"', 'use "newton"')
-        if case.modes is not None:
-            self._refuse("[modes]", "their stiffness has no contact: give the table to the stages before only")
-        if self.at_walls is not None:
-            names = ", ".join(repr(self._model.contact.names[k]) for k in self.at_walls.walls)
-            self._refuse(f"walls {names}, which bars touch between their nodes,", explicit)
-        if self._model.links:
-            self._refuse("[[contact_pair]] or [[constraint]]", explicit)
-        if scheme.discrete_gradient and not self.symmetric:
-            self._refuse(
-                f'time.integrator = "{case.time.integrator}"',
-                "it conserves energy: use another one, or remove friction and restitution",
-            )
-
-    def _refuse(self, what: str, remedy: str) -> None:
-        """Refuse what contact cannot serve."""
-        raise InputError(
-            f"{self._model.case.source}: [self_contact] does not serve {what} in implicit or static steps; {remedy}"
-        )
+        conserves = "it conserves energy: use another one, or remove friction and restitution"
+        for applies, what, remedy in (
+            (static != "newton", f'static.method = "{static}"', 'use "newton"'),
+            (
+                case.modes is not None,
+                "[modes]",
+                "their stiffness has no contact: give the table to the stages before only",
+            ),
+            (walls, f"walls {', '.join(walls)}, which bars touch between their nodes,", explicit),
+            (self._model.links, "[[contact_pair]] or [[constraint]]", explicit),
+            (scheme.discrete_gradient and not self.symmetric, f'time.integrator = "{scheme_name}"', conserves),
+        ):
+            if applies:
+                raise InputError(
+                    f"{case.source}: [self_contact] does not serve {what} in implicit or static steps; {remedy}"
+                )
 
     def operator(self) -> str:
         """Return ``solver.operator``: the matrix has the pairs that touch in its pattern.
@@ -877,7 +878,7 @@ class SelfContact:
         if state is None:
             if commit:
                 self._way, self.sums = law.way, self._no_sums
-                self._take_last(x)
+                self._last[:] = x[: self._last.shape[1]].T
             return 0.0, self.dissipated
         sums = np.zeros(6)
         passed = evaluate_pairs(self._pairs, state, self._memory, self._spare, arrays, law, sums)
@@ -895,23 +896,8 @@ class SelfContact:
             self._memory, self._spare = self._spare, self._memory
             self._way, self.dissipated, self.sums = law.way, total, sums
             self.deepest = max(self.deepest, float(sums[DEPTH]))
-            self._take_last(x)
+            self._last[:] = x[: self._last.shape[1]].T
         return float(sums[ENERGY]), total
-
-    def _components(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the components of positions (local, 3) of owned nodes, three arrays."""
-        return tuple(np.ascontiguousarray(x[: self._last.shape[1], c]) for c in range(3))
-
-    def _take_last(self, x: np.ndarray) -> None:
-        """Take the positions (local, 3) of a step, whose components compiled steps have one after the other."""
-        for last, row in zip(self._last, x.T, strict=True):
-            last[:] = row[: len(last)]
-
-    def _motion_of(self, some: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return positions and displacements in the step (k, 6) of owned nodes (k,), see :class:`NodeArrays`."""
-        nodes = np.empty((len(some), 6))
-        read_nodes(some, x, self._last, nodes)
-        return nodes
 
     def _look(self, x: np.ndarray, step: float, commit: bool) -> Look | None:
         """Return the nodes of pairs at positions (local, 3), states of the pairs, with those that begin to touch, and
@@ -919,7 +905,8 @@ class SelfContact:
         checks of the step tell. Collective."""
         if self.implicit:  # trials are far from each other
             self._most[:] = 0.0
-        move = largest_move(self._components(x), self._last, step * self._drift, self._most)
+        rows = tuple(np.ascontiguousarray(x[: self._last.shape[1], c]) for c in range(3))
+        move = largest_move(rows, self._last, step * self._drift, self._most)
         worst = np.array([move, float(self.stale), -self._asleep])
         if self.comm.size > 1:
             self.comm.Allreduce(MPI.IN_PLACE, worst, op=MPI.MAX)
@@ -932,7 +919,7 @@ class SelfContact:
         law = PairLaw(self._friction, self._damping, float(step), way, way if commit else 2.0 * self._way - way, lead)
         if way < -worst[2] and self._asleep > 0.0:  # after a search, this is not known
             return None, None, law
-        nodes = self._gather(lambda some: self._motion_of(some, x), 6)
+        nodes = self._gather(lambda some: read_nodes(some, x, self._last), 6)
         arrays, load = NodeArrays(nodes, self._inverse, np.zeros((len(nodes), 3))), np.zeros((len(nodes), 3))
         state = self._state if commit else self._state.copy()
         begin, far, self._asleep = find_beginning(self._pairs, state, self._memory, arrays, law, load)

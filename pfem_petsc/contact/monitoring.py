@@ -50,9 +50,9 @@ def check_positions(model: Model, x: np.ndarray, time: float, where: str) -> Non
     if carried:
         raise SimulationFailure(_told(where, node, depth, contact.names[wall], count))
     case = model.case
-    others = "another contact.treatment or time.integrator"
-    if case.contact.treatment != "scheme":
-        others = f'contact.treatment = "scheme" instead of "{case.contact.treatment}"'
+    treatment = case.contact.treatment
+    others = f'contact.treatment = "scheme" instead of "{treatment}"'
+    others = others if treatment != "scheme" else "another contact.treatment or time.integrator"
     raise SimulationFailure(
         f"{where}: node {node} is {depth:.3g} m beyond wall {contact.names[wall]!r} "
         f"({count} node{'s' if count > 1 else ''} in all), which contact did not prevent: results since it "
@@ -302,7 +302,11 @@ class CrossingBars:
         long, because too many bars are in one place."""
         if self._last is None:  # in the mesh, no bar does
             self._last = _Search(Crossing(0, 0, (-1, -1)), 0.0, self._model.mesh.points, self._intact())
-        change = self._largest_change(x)
+        comm, last, owned = self._model.comm, self._last, self._model.mesh.n_owned
+        motion = last.x[:owned], x[:owned]
+        change = largest_change(comm, motion, self._model.mesh.n_nodes, self._thick + last.gap)
+        if comm.allreduce(bool((self._intact() != last.intact).any()), op=MPI.LOR):
+            change = np.inf
         if change > 0.0 and change >= 0.998 * self._last.gap:
             with returning_freed_memory():
                 found, gap = self._search(x)
@@ -314,15 +318,6 @@ class CrossingBars:
         if not self._model.bars.can_break:
             return np.empty(0, dtype=bool)
         return self._model.bars.status()[self._bars] != STATUS.index("broken")
-
-    def _largest_change(self, x: np.ndarray) -> float:
-        """Return by how much the distance of any two bars may have changed since the last search, relative to the sum
-        of their radii [m]; infinite if bars broke. Collective."""
-        comm, last, mesh = self._model.comm, self._last, self._model.mesh
-        own = slice(mesh.n_owned)
-        change = largest_change(comm, (last.x[own], x[own]), mesh.n_nodes, self._thick + last.gap)
-        broken = comm.allreduce(bool((self._intact() != last.intact).any()), op=MPI.LOR)
-        return np.inf if broken else change
 
     def _count(self, pairs: np.ndarray) -> Crossing:
         """Return the number of pairs and bars from the pairs (m, 2) that this rank has found. Collective."""

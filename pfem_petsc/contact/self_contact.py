@@ -47,8 +47,19 @@ from ..output.units import engineering
 from ..parallel.agreement import agreed
 from ..parallel.natural import NaturalOrder
 from .bars_at_walls import BarsAtWalls, damping_of
-from .neighbours import Points, Regions, Segments, clip, find_pairs, largest_change, make_regions, segment_distance
+from .neighbours import (
+    Points,
+    Regions,
+    Segments,
+    clip,
+    closest,
+    find_pairs,
+    largest_change,
+    make_regions,
+    segment_distance,
+)
 from .rows import owner_starts, to_owners
+from .vectors import add_to, along, dot, minus, put, times, vector
 
 if TYPE_CHECKING:
     from ..integrators.base import Balance, Scheme
@@ -113,17 +124,6 @@ class NodeArrays(NamedTuple):
     force: np.ndarray
 
 
-class Rooms(NamedTuple):
-    """Room for a pair: gradient of the energy ``g`` (4, 3) [N]; both axes ``u``, ``v``, a ``way`` between them and the
-    ``normal`` (3,)."""
-
-    g: np.ndarray
-    u: np.ndarray
-    v: np.ndarray
-    way: np.ndarray
-    normal: np.ndarray
-
-
 class PairLaw(NamedTuple):
     """Coulomb's coefficient of friction; damping ratio; the step [s]; the way of the nodes so far, and that from which
     they have come to where pairs may sleep [m], the same unless forces are only tried; how many steps later than the
@@ -145,67 +145,44 @@ force [N], and overlap over the radius."""
 
 
 @inlined
-def _gradient(g, s, t, push, way):
-    """Add the gradient of the energy by a force ``push`` between points of the bars, along the unit vector ``way``."""
-    for c in range(3):
-        g[0, c] += (1.0 - s) * push * way[c]
-        g[1, c] += s * push * way[c]
-        g[2, c] -= (1.0 - t) * push * way[c]
-        g[3, c] -= t * push * way[c]
+def _gradient(g, s, t, force):
+    """Add the gradient (4, 3) of the energy by a ``force`` between points of the bars."""
+    add_to(g, 0, 1.0 - s, force)
+    add_to(g, 1, s, force)
+    add_to(g, 2, t - 1.0, force)
+    add_to(g, 3, -t, force)
 
 
 @inlined
-def _point_way(x, ends, p, s, t, first, way):
-    """Write the difference of points of both bars, or of their displacements (``first`` 3), and return its length."""
-    square = 0.0
-    for c in range(3):
-        a = (1.0 - s) * x[ends[p, 0], first + c] + s * x[ends[p, 1], first + c]
-        b = (1.0 - t) * x[ends[p, 2], first + c] + t * x[ends[p, 3], first + c]
-        way[c] = b - a
-        square += way[c] * way[c]
-    return np.sqrt(square)
+def _way(x, ends, s, t):
+    """Return the way from a point of the first bar to one of the second, or the difference of their displacements."""
+    first, second = vector(x, ends[0]), vector(x, ends[2])
+    first = along(first, s, minus(vector(x, ends[1]), first))
+    return minus(along(second, t, minus(vector(x, ends[3]), second)), first)
 
 
 @inlined
-def _foot(x, node, one, two):
-    """Return the parameter from 0 to 1 of the point of a bar that is closest to a node."""
-    along, square = 0.0, 0.0
-    for c in range(3):
-        d = x[two, c] - x[one, c]
-        along += d * (x[node, c] - x[one, c])
-        square += d * d
-    return clip(along / square) if square.real > 0.0 else 0.0
-
-
-@inlined
-def _repel(pairs, p, x, s, t, rooms):
-    """Write the gradient of the energy of a pair that touches at ``s`` and ``t``; return the energy, the sum of the
-    forces, and their mean points."""
-    g, u, v, way = rooms.g, rooms.u, rooms.v, rooms.way
-    ends, k, reach = pairs.ends, pairs.stiffness[p], pairs.reach[p]
-    uu = vv = uv = 0.0
-    for c in range(3):
-        u[c], v[c] = x[ends[p, 1], c] - x[ends[p, 0], c], x[ends[p, 3], c] - x[ends[p, 2], c]
-        uu += u[c] * u[c]
-        vv += v[c] * v[c]
-        uv += u[c] * v[c]
-        for i in range(4):
-            g[i, c] = 0.0
+def _repel(pairs, p, x, s, t, g):
+    """Write the gradient ``g`` (4, 3) of the energy of a pair that touches at ``s`` and ``t``; return the energy, the
+    sum of the forces, and their mean points."""
+    ends, k, reach = pairs.ends[p], pairs.stiffness[p], pairs.reach[p]
+    u, v = minus(vector(x, ends[1]), vector(x, ends[0])), minus(vector(x, ends[3]), vector(x, ends[2]))
+    uu, vv, uv = dot(u, u), dot(v, v), dot(u, v)
     q = clip((1.0 - uv * uv / (uu * vv)) / pairs.crossed[p]) if (uu * vv).real > 0.0 else 0.0
     m = q * q * q * (10.0 - q * (15.0 - 6.0 * q))
     energy = push = at = other = 0.0
     excess = 0.0  # of the energy where bars cross over that where they are parallel
+    g[:] = 0.0
     for j in range(5 if m.real < 1.0 else 1):
         weight = m if j == 0 else 0.5 * (1.0 - m)
-        if j == 1:
-            s, t = 0.0, _foot(x, ends[p, 0], ends[p, 2], ends[p, 3])
-        elif j == 2:
-            s, t = 1.0, _foot(x, ends[p, 1], ends[p, 2], ends[p, 3])
-        elif j == 3:
-            s, t = _foot(x, ends[p, 2], ends[p, 0], ends[p, 1]), 0.0
-        elif j == 4:
-            s, t = _foot(x, ends[p, 3], ends[p, 0], ends[p, 1]), 1.0
-        d = _point_way(x, ends, p, s, t, 0, way)
+        if j == 1 or j == 2:
+            s = j - 1.0
+            t = closest((0.0, 0.0, 0.0), v, minus(vector(x, ends[j - 1]), vector(x, ends[2])))[1]
+        elif j > 2:
+            t = j - 3.0
+            s = closest((0.0, 0.0, 0.0), u, minus(vector(x, ends[j - 1]), vector(x, ends[0])))[1]
+        way = _way(x, ends, s, t)
+        d = np.sqrt(dot(way, way))
         overlap = reach - d
         if not overlap.real > 0.0:
             continue
@@ -218,15 +195,12 @@ def _repel(pairs, p, x, s, t, rooms):
         at += force * s
         other += force * t
         if d.real > 0.0:
-            _gradient(g, s, t, force / d, way)
+            _gradient(g, s, t, times(force / d, way))
     if 0.0 < q.real < 1.0:
         slope = excess * 30.0 * q * q * (1.0 - q) * (1.0 - q) / pairs.crossed[p] * -2.0 * uv / (uu * vv)
-        for c in range(3):
-            of_u, of_v = slope * (v[c] - uv / uu * u[c]), slope * (u[c] - uv / vv * v[c])
-            g[0, c] -= of_u
-            g[1, c] += of_u
-            g[2, c] -= of_v
-            g[3, c] += of_v
+        for i in range(2):
+            add_to(g, i, slope * (2.0 * i - 1.0), along(v, -uv / uu, u))
+            add_to(g, 2 + i, slope * (2.0 * i - 1.0), along(u, -uv / vv, v))
     return energy, push, at, other
 
 
@@ -244,44 +218,25 @@ def _damp(pairs, p, law, push, closing, mobility):
 
 
 @inlined
-def _slide(old, new, p, k, most, rooms):
-    """Advance the elastic slip of a pair, at ``most`` as given [m], by the way of its points; return the energy stored,
+def _slide(spring, k, most, way, normal):
+    """Return the elastic slip of a pair, at ``most`` as given [m], after a ``way`` of its points; the energy stored,
     and that dissipated."""
-    way, normal = rooms.way, rooms.normal
-    along = dot = before = left = square = energy = lost = 0.0
-    for c in range(3):
-        along += way[c] * normal[c]
-        dot += old[p, SPRING + c] * normal[c]
-        before += old[p, SPRING + c] * old[p, SPRING + c]
-    for c in range(3):  # turned into the plane across the normal
-        new[p, SPRING + c] = old[p, SPRING + c] - dot * normal[c]
-        left += new[p, SPRING + c] * new[p, SPRING + c]
-    turned = np.sqrt(before / left) if left.real > 0.0 else 0.0
-    for c in range(3):
-        trial = turned * new[p, SPRING + c] + way[c] - along * normal[c]
-        square += trial * trial
-    factor = most / np.sqrt(square) if square.real > (most * most).real else 1.0
-    for c in range(3):
-        start = turned * new[p, SPRING + c]
-        trial = start + way[c] - along * normal[c]
-        end = factor * trial
-        lost += 0.5 * k * (start + end) * (trial - end)
-        energy += 0.5 * k * end * end
-        new[p, SPRING + c] = end
-    return energy, lost
+    flat = along(spring, -dot(spring, normal), normal)
+    left = dot(flat, flat)  # turned into the plane across the normal
+    start = times(np.sqrt(dot(spring, spring) / left) if left.real > 0.0 else 0.0, flat)
+    trial = along(along(start, 1.0, way), -dot(way, normal), normal)
+    square = dot(trial, trial)
+    end = times(most / np.sqrt(square) if square.real > (most * most).real else 1.0, trial)
+    return end, 0.5 * k * dot(end, end), 0.5 * k * dot(along(start, 1.0, end), minus(trial, end))
 
 
 @inlined
-def _farthest_move(x, ends, p):
-    """Return the square of the largest relative displacement of ends of both bars in the step."""
+def _farthest_move(x, ends):
+    """Return the square of the largest difference of the displacements of ends of both bars."""
     farthest = 0.0
-    for i in range(2):
-        for j in range(2, 4):
-            square = 0.0
-            for c in range(3):
-                moved = x[ends[p, j], 3 + c] - x[ends[p, i], 3 + c]
-                square += moved * moved
-            farthest = max(farthest, square)
+    for i in range(4):
+        moved = minus(vector(x, ends[2 + i % 2]), vector(x, ends[i // 2]))
+        farthest = max(farthest, dot(moved, moved))
     return farthest
 
 
@@ -304,7 +259,7 @@ def find_beginning(pairs, state, memory, nodes, law, load):
                 asleep = min(asleep, pairs.wake[p])
                 continue
             d, s, t = segment_distance(x, segments, 2 * p, 2 * p + 1)
-            farthest = _farthest_move(x, ends, p)
+            farthest = _farthest_move(x[:, 3:], ends[p])
             if farthest > 0.25 * pairs.reach[p] ** 2 and d < pairs.reach[p] + np.sqrt(farthest):
                 failed = 1 + p
             if not d < pairs.reach[p]:
@@ -313,8 +268,7 @@ def find_beginning(pairs, state, memory, nodes, law, load):
                 continue
             beginning += 1
             state[p], pairs.wake[p] = BEGINNING, 0.0
-            for c in range(memory.shape[1]):
-                memory[p, c] = 0.0
+            memory[p, :] = 0.0
             memory[p, FIRST], memory[p, SECOND] = s, t
         asleep = 0.0
         for i in range(4):
@@ -336,58 +290,48 @@ def evaluate_pairs(pairs, state, old, new, nodes, law, out):
     added; ``law``: PairLaw; ``out`` (6,): sums from :data:`ENERGY` on. Returns 1 plus the pair that has passed through
     itself, or 0. Positions, forces, new memory and sums may be complex, with derivatives as imaginary parts.
     """
-    x, ends, failed, kind = nodes.x, pairs.ends, 0, nodes.force.dtype
-    segments = ends.reshape(-1, 2)
-    rooms = Rooms(np.zeros((4, 3), kind), np.zeros(3, kind), np.zeros(3, kind), np.zeros(3, kind), np.zeros(3, kind))
-    g, way, normal = rooms.g, rooms.way, rooms.normal
-    for p in range(len(ends)):
+    x, failed, g, segments = nodes.x, 0, np.zeros((4, 3), nodes.force.dtype), pairs.ends.reshape(-1, 2)
+    for p in range(len(pairs.ends)):
         if state[p] == APART:
             continue
+        ends = pairs.ends[p]
         d, s, t = segment_distance(x, segments, 2 * p, 2 * p + 1)
         k, reach = pairs.stiffness[p], pairs.reach[p]
         energy = push = at = other = lost = 0.0
         if d.real < reach:
-            energy, push, at, other = _repel(pairs, p, x, s, t, rooms)
+            energy, push, at, other = _repel(pairs, p, x, s, t, g)
         if push.real > 0.0:
             s, t = at / push, other / push
-        _point_way(x, ends, p, s, t, 3, way)
+        way, before = _way(x[:, 3:], ends, s, t), vector(old[:, NORMAL:], p)
         if push.real <= 0.0:  # what spring and damper held is lost
-            for c in range(3):
-                lost += 0.5 * k * old[p, SPRING + c] * old[p, SPRING + c]
-                lost -= 0.5 * old[p, VISCOUS] * way[c] * old[p, NORMAL + c]
+            spring = vector(old[:, SPRING:], p)
+            lost = 0.5 * k * dot(spring, spring) - 0.5 * old[p, VISCOUS] * dot(way, before)
             state[p] = APART
             if pairs.counted[p]:
                 out[DISSIPATED] += lost
             continue
-        apart = _point_way(x, ends, p, s, t, 0, normal)
-        turn = closing = held = 0.0
-        for c in range(3):
-            normal[c] = normal[c] / apart if apart.real > 0.0 else 0.0
-            turn += normal[c] * old[p, NORMAL + c]
-            closing += normal[c] * way[c]
-        if apart.real <= 0.0 or (state[p] == TOUCHING and turn.real < 0.0):
+        between = _way(x, ends, s, t)
+        apart, held = np.sqrt(dot(between, between)), 0.0
+        normal = times(1.0 / apart if apart.real > 0.0 else 0.0, between)
+        closing, end = dot(normal, way), times(0.0, normal)
+        if apart.real <= 0.0 or (state[p] == TOUCHING and dot(normal, before).real < 0.0):
             failed = 1 + p
-        mobility = (1.0 - s) ** 2 * nodes.inverse[ends[p, 0]] + s**2 * nodes.inverse[ends[p, 1]]
-        mobility += (1.0 - t) ** 2 * nodes.inverse[ends[p, 2]] + t**2 * nodes.inverse[ends[p, 3]]
+        mobility = (1.0 - s) ** 2 * nodes.inverse[ends[0]] + s**2 * nodes.inverse[ends[1]]
+        mobility += (1.0 - t) ** 2 * nodes.inverse[ends[2]] + t**2 * nodes.inverse[ends[3]]
         total = _damp(pairs, p, law, push, closing, mobility)
         lost -= 0.5 * (old[p, VISCOUS] + total - push) * closing
         if total != push:
-            _gradient(g, s, t, total - push, normal)
-        for c in range(3):
-            new[p, SPRING + c] = 0.0
+            _gradient(g, s, t, times(total - push, normal))
         if law.friction > 0.0:
-            held, rubbed = _slide(old, new, p, k, law.friction * total / k, rooms)
+            end, held, rubbed = _slide(vector(old[:, SPRING:], p), k, law.friction * total / k, way, normal)
             lost += rubbed
-            for c in range(3):
-                way[c] = -new[p, SPRING + c]
-            _gradient(g, s, t, k, way)
+            _gradient(g, s, t, times(-k, end))
         state[p] = TOUCHING
         new[p, VISCOUS], new[p, FIRST], new[p, SECOND] = total - push, s, t
-        for c in range(3):
-            new[p, NORMAL + c] = normal[c]
+        put(new[:, NORMAL:], p, normal)
+        put(new[:, SPRING:], p, end)
         for i in range(4):
-            for c in range(3):
-                nodes.force[ends[p, i], c] += g[i, c]
+            add_to(nodes.force, ends[i], 1.0, vector(g, i))
         if pairs.counted[p]:
             out[ENERGY] += energy + held
             out[DISSIPATED] += lost
@@ -399,49 +343,44 @@ def evaluate_pairs(pairs, state, old, new, nodes, law, out):
 
 
 @inlined
-def _energy_before(pairs, p, nodes, part, place, rooms):
-    """Write the gradient of the energy of a pair a ``part`` of the step before its end, with the ``place`` (4, 6) of
-    its nodes; return the energy."""
+def _energy_before(pair, nodes, part, place, g):
+    """Write the gradient of the energy of a pair alone, a ``part`` of the step before its end, with the ``place``
+    (4, 3) of its nodes; return the energy."""
+    g[:] = 0.0
     for i in range(4):
-        for c in range(3):
-            rooms.g[i, c] = 0.0
-            place[i, c] = nodes.x[i, c] - part * nodes.x[i, 3 + c]
-    d, s, t = segment_distance(place, pairs.ends.reshape(-1, 2), 2 * p, 2 * p + 1)
-    energy = 0.0 * d
-    if d.real < pairs.reach[p]:
-        energy = _repel(pairs, p, place, s, t, rooms)[0]
-    return energy
+        put(place, i, along(vector(nodes.x, i), -part, vector(nodes.x[:, 3:], i)))
+    d, s, t = segment_distance(place, pair.ends.reshape(-1, 2), 0, 1)
+    return _repel(pair, 0, place, s, t, g)[0] if d.real < pair.reach[0] else 0.0 * d
 
 
 @inlined
-def _step_gradient(pairs, nodes, place, rooms):
+def _change(place, x, i, j):
+    """Return half of the change of the squared distance of two ends, with the middle of their ways as ``place``, and
+    the way between them there."""
+    between = minus(vector(place, i), vector(place, j))
+    return dot(between, minus(vector(x[:, 3:], i), vector(x[:, 3:], j))), between
+
+
+@inlined
+def _step_gradient(pair, nodes, place, g):
     """Write the discrete gradient of the energy of a pair alone, whose work in the step is the change of the energy.
 
     It is the gradient in the middle of the step and a correction along those of the squared distances of its four
     ends (Gonzalez, 1996): forces along the lines between them, which keep momentum and angular momentum.
     """
-    g = rooms.g
-    missing = _energy_before(pairs, 0, nodes, 0.0, place, rooms) - _energy_before(pairs, 0, nodes, 1.0, place, rooms)
-    _energy_before(pairs, 0, nodes, 0.5, place, rooms)
+    missing = _energy_before(pair, nodes, 0.0, place, g) - _energy_before(pair, nodes, 1.0, place, g)
+    _energy_before(pair, nodes, 0.5, place, g)
     square = 0.0 * missing
     for i in range(4):
-        for c in range(3):
-            missing -= g[i, c] * nodes.x[i, 3 + c]
+        missing -= dot(vector(g, i), vector(nodes.x[:, 3:], i))
         for j in range(i):
-            change = 0.0 * missing
-            for c in range(3):
-                change += (place[i, c] - place[j, c]) * (nodes.x[i, 3 + c] - nodes.x[j, 3 + c])
-            square += change * change
-    if square.real > (_STILL * pairs.reach[0] ** 2) ** 2:
+            square += _change(place, nodes.x, i, j)[0] ** 2
+    if square.real > (_STILL * pair.reach[0] ** 2) ** 2:
         for i in range(4):
             for j in range(i):
-                change = 0.0 * missing
-                for c in range(3):
-                    change += (place[i, c] - place[j, c]) * (nodes.x[i, 3 + c] - nodes.x[j, 3 + c])
-                for c in range(3):
-                    part = missing / square * change * (place[i, c] - place[j, c])
-                    g[i, c] += part
-                    g[j, c] -= part
+                change, between = _change(place, nodes.x, i, j)
+                add_to(g, i, missing / square * change, between)
+                add_to(g, j, -missing / square * change, between)
 
 
 @inlined
@@ -450,8 +389,7 @@ def _take_pair(pairs, p, nodes, own):
     ends, one = np.arange(4).reshape(1, 4), slice(p, p + 1)
     for i in range(4):
         own.inverse[i] = nodes.inverse[pairs.ends[p, i]]
-        for c in range(6):
-            own.x[i, c] = nodes.x[pairs.ends[p, i], c]
+        own.x[i, :] = nodes.x[pairs.ends[p, i]]
     sizes = pairs.reach[one], pairs.crossed[one], pairs.most[one], pairs.counted[one]
     return PairArrays(ends, *sizes, pairs.stiffness[one], pairs.drag[one], pairs.wake[one])
 
@@ -464,15 +402,14 @@ def add_step_gradients(pairs, state, nodes):
     Positions and forces may be complex, with derivatives as imaginary parts.
     """
     kind = nodes.force.dtype
-    rooms = Rooms(np.zeros((4, 3), kind), np.zeros(3, kind), np.zeros(3, kind), np.zeros(3, kind), np.zeros(3, kind))
-    own, place = NodeArrays(np.zeros((4, 6), kind), np.zeros(4), np.zeros((4, 3), kind)), np.zeros((4, 6), kind)
+    own = NodeArrays(np.zeros((4, 6), kind), np.zeros(4), np.zeros((4, 3), kind))
+    place, g = np.zeros((4, 3), kind), np.zeros((4, 3), kind)
     for p in range(len(pairs.ends)):
         if state[p] == APART:
             continue
-        _step_gradient(_take_pair(pairs, p, nodes, own), own, place, rooms)
+        _step_gradient(_take_pair(pairs, p, nodes, own), own, place, g)
         for i in range(4):
-            for c in range(3):
-                nodes.force[pairs.ends[p, i], c] += rooms.g[i, c]
+            add_to(nodes.force, pairs.ends[p, i], 1.0, vector(g, i))
 
 
 @kernel
@@ -508,21 +445,13 @@ def free_part(pairs, x, way):
 
     Distances change by at most the largest relative way (conservative advancement; Li et al., 2021).
     """
-    segments, place, ends = np.arange(4).reshape(2, 2), np.zeros((4, 3)), pairs.ends
-    part, limiting = 1.0, 0
-    for p in range(len(ends)):
-        most = 0.0
-        for i in range(2):
-            for j in range(2, 4):
-                square = 0.0
-                for c in range(3):
-                    square += (way[ends[p, j], c] - way[ends[p, i], c]) ** 2
-                most = max(most, np.sqrt(square))
-        at, least, free = 0.0, -1.0, False
+    segments, place, part, limiting = np.arange(4).reshape(2, 2), np.zeros((4, 3)), 1.0, 0
+    for p in range(len(pairs.ends)):
+        ends, at, least, free = pairs.ends[p], 0.0, -1.0, False
+        most = np.sqrt(_farthest_move(way, ends))
         for _ in range(_ADVANCES):
             for i in range(4):
-                for c in range(3):
-                    place[i, c] = x[ends[p, i], c] + at * way[ends[p, i], c]
+                put(place, i, along(vector(x, ends[i]), at, vector(way, ends[i])))
             d, _, _ = segment_distance(place, segments, 0, 1)
             if least < 0.0:
                 least = _CLOSER * min(d, pairs.reach[p])
@@ -548,19 +477,13 @@ def measure_pairs(nodes, ends, bars, sizes):
     segments = ends.reshape(-1, 2)
     for p in range(len(ends)):
         apart, _, _ = segment_distance(nodes, segments, 2 * p, 2 * p + 1)
-        radii = bars[p, 0] + bars[p, 2]
-        shorter = np.inf
-        flexible = 0.0
+        radii, shorter, flexible, light = bars[p, 0] + bars[p, 2], np.inf, 0.0, 0.0
         for i in range(2):
-            square = 0.0
-            for c in range(3):
-                way = nodes[ends[p, 2 * i + 1], c] - nodes[ends[p, 2 * i], c]
-                square += way * way
-            shorter = min(shorter, square)
+            a, b = ends[p, 2 * i], ends[p, 2 * i + 1]
+            way = minus(vector(nodes, b), vector(nodes, a))
+            shorter = min(shorter, dot(way, way))
             flexible += 1.0 / bars[p, 2 * i + 1]
-        light = 0.0
-        for i in range(2):
-            light += 1.0 / min(nodes[ends[p, 2 * i], 3], nodes[ends[p, 2 * i + 1], 3])
+            light += 1.0 / min(nodes[a, 3], nodes[b, 3])
         reach = min(radii, apart)
         sizes[0, p] = reach if reach > _LEAST * radii else 0.0
         sizes[1, p] = min(_CROSSED, reach * reach / shorter)
@@ -593,12 +516,15 @@ def largest_move(rows, last, drift, most):
 
 
 @kernel
-def read_nodes(rows, x, last, nodes):
-    """Write positions x (n or more, 3) and displacements since last (3, n) of some nodes (k,) to ``nodes`` (k, 6)."""
+def read_nodes(rows, x, last):
+    """Return positions x (n or more, 3) and displacements since last (3, n) of some nodes (k,), see
+    :class:`NodeArrays`."""
+    nodes = np.empty((len(rows), 6))
     for k in range(len(rows)):
-        i = rows[k]
-        for c in range(3):
-            nodes[k, c], nodes[k, 3 + c] = x[i, c], x[i, c] - last[c, i]
+        at = vector(x, rows[k])
+        put(nodes, k, at)
+        put(nodes[:, 3:], k, minus(at, vector(last.T, rows[k])))
+    return nodes
 
 
 @kernel
@@ -607,8 +533,7 @@ def add_to_nodes(local, own, force, f):
     k = 0
     for i in range(len(own)):
         if own[i]:
-            for c in range(3):
-                f[local[k], c] += force[i, c]
+            add_to(f, local[k], 1.0, vector(force, i))
             k += 1
 
 
@@ -737,27 +662,26 @@ class SelfContact:
         """
         case, self._h, self.implicit = self._model.case, 0.0, True
         self._steps = "time.step" if scheme.inertial else "static.step"
+        static = "newton" if case.static is None else case.static.method
+        scheme_name = "" if case.time is None else case.time.integrator
+        walls = [] if self.at_walls is None else [repr(self._model.contact.names[k]) for k in self.at_walls.walls]
         explicit = 'use an explicit integrator, such as time.integrator = "central_differences"'
-        if case.static is not None and case.static.method != "newton":
-            self._refuse(f'static.method = "{case.static.method}"', 'use "newton"')
-        if case.modes is not None:
-            self._refuse("[modes]", "their stiffness has no contact: give the table to the stages before only")
-        if self.at_walls is not None:
-            names = ", ".join(repr(self._model.contact.names[k]) for k in self.at_walls.walls)
-            self._refuse(f"walls {names}, which bars touch between their nodes,", explicit)
-        if self._model.links:
-            self._refuse("[[contact_pair]] or [[constraint]]", explicit)
-        if scheme.discrete_gradient and not self.symmetric:
-            self._refuse(
-                f'time.integrator = "{case.time.integrator}"',
-                "it conserves energy: use another one, or remove friction and restitution",
-            )
-
-    def _refuse(self, what: str, remedy: str) -> None:
-        """Refuse what contact cannot serve."""
-        raise InputError(
-            f"{self._model.case.source}: [self_contact] does not serve {what} in implicit or static steps; {remedy}"
-        )
+        conserves = "it conserves energy: use another one, or remove friction and restitution"
+        for applies, what, remedy in (
+            (static != "newton", f'static.method = "{static}"', 'use "newton"'),
+            (
+                case.modes is not None,
+                "[modes]",
+                "their stiffness has no contact: give the table to the stages before only",
+            ),
+            (walls, f"walls {', '.join(walls)}, which bars touch between their nodes,", explicit),
+            (self._model.links, "[[contact_pair]] or [[constraint]]", explicit),
+            (scheme.discrete_gradient and not self.symmetric, f'time.integrator = "{scheme_name}"', conserves),
+        ):
+            if applies:
+                raise InputError(
+                    f"{case.source}: [self_contact] does not serve {what} in implicit or static steps; {remedy}"
+                )
 
     def operator(self) -> str:
         """Return ``solver.operator``: the matrix has the pairs that touch in its pattern.
@@ -954,7 +878,7 @@ class SelfContact:
         if state is None:
             if commit:
                 self._way, self.sums = law.way, self._no_sums
-                self._take_last(x)
+                self._last[:] = x[: self._last.shape[1]].T
             return 0.0, self.dissipated
         sums = np.zeros(6)
         passed = evaluate_pairs(self._pairs, state, self._memory, self._spare, arrays, law, sums)
@@ -972,23 +896,8 @@ class SelfContact:
             self._memory, self._spare = self._spare, self._memory
             self._way, self.dissipated, self.sums = law.way, total, sums
             self.deepest = max(self.deepest, float(sums[DEPTH]))
-            self._take_last(x)
+            self._last[:] = x[: self._last.shape[1]].T
         return float(sums[ENERGY]), total
-
-    def _components(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the components of positions (local, 3) of owned nodes, three arrays."""
-        return tuple(np.ascontiguousarray(x[: self._last.shape[1], c]) for c in range(3))
-
-    def _take_last(self, x: np.ndarray) -> None:
-        """Take the positions (local, 3) of a step, whose components compiled steps have one after the other."""
-        for last, row in zip(self._last, x.T, strict=True):
-            last[:] = row[: len(last)]
-
-    def _motion_of(self, some: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return positions and displacements in the step (k, 6) of owned nodes (k,), see :class:`NodeArrays`."""
-        nodes = np.empty((len(some), 6))
-        read_nodes(some, x, self._last, nodes)
-        return nodes
 
     def _look(self, x: np.ndarray, step: float, commit: bool) -> Look | None:
         """Return the nodes of pairs at positions (local, 3), states of the pairs, with those that begin to touch, and
@@ -996,7 +905,8 @@ class SelfContact:
         checks of the step tell. Collective."""
         if self.implicit:  # trials are far from each other
             self._most[:] = 0.0
-        move = largest_move(self._components(x), self._last, step * self._drift, self._most)
+        rows = tuple(np.ascontiguousarray(x[: self._last.shape[1], c]) for c in range(3))
+        move = largest_move(rows, self._last, step * self._drift, self._most)
         worst = np.array([move, float(self.stale), -self._asleep])
         if self.comm.size > 1:
             self.comm.Allreduce(MPI.IN_PLACE, worst, op=MPI.MAX)
@@ -1009,7 +919,7 @@ class SelfContact:
         law = PairLaw(self._friction, self._damping, float(step), way, way if commit else 2.0 * self._way - way, lead)
         if way < -worst[2] and self._asleep > 0.0:  # after a search, this is not known
             return None, None, law
-        nodes = self._gather(lambda some: self._motion_of(some, x), 6)
+        nodes = self._gather(lambda some: read_nodes(some, x, self._last), 6)
         arrays, load = NodeArrays(nodes, self._inverse, np.zeros((len(nodes), 3))), np.zeros((len(nodes), 3))
         state = self._state if commit else self._state.copy()
         begin, far, self._asleep = find_beginning(self._pairs, state, self._memory, arrays, law, load)

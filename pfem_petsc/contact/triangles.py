@@ -18,6 +18,7 @@ import numpy as np
 from ..mechanics.compiled import inlined, kernel
 from ..mechanics.records import record
 from .projection import project
+from .vectors import along, dot, minus, put, times, vector
 
 ROUNDING = 1e-13
 """Distances below this fraction of the largest coordinate count as zero where planes meet."""
@@ -128,54 +129,60 @@ def surface(triangles, k):
 
 
 @inlined
-def _arm(points, normals, x, y, z):
-    """Return the vector from the nearest place of a triangle (3, 3) to a point, and what that lies on: 0 the face, 1 to
-    3 an edge, 4 to 6 a corner (C. Ericson, Real-Time Collision Detection, 2005, section 5.1.5)."""
-    ux, uy, uz = points[1, 0] - points[0, 0], points[1, 1] - points[0, 1], points[1, 2] - points[0, 2]
-    vx, vy, vz = points[2, 0] - points[0, 0], points[2, 1] - points[0, 1], points[2, 2] - points[0, 2]
-    x, y, z = x - points[0, 0], y - points[0, 1], z - points[0, 2]
-    uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
-    along_u, along_v = x * ux + y * uy + z * uz, x * vx + y * vy + z * vz
-    if along_u <= 0.0 and along_v <= 0.0:
-        return x, y, z, 4
-    if along_u >= uu and along_v - uv <= along_u - uu:
-        return x - ux, y - uy, z - uz, 5
-    if along_v >= vv and along_u - uv <= along_v - vv:
-        return x - vx, y - vy, z - vz, 6
-    # areas opposite the corners, times 2 |u x v|
-    third = uu * along_v - uv * along_u
-    second = vv * along_u - uv * along_v
-    if third <= 0.0 and along_u >= 0.0 and along_u <= uu:
-        part = along_u / uu
-        return x - part * ux, y - part * uy, z - part * uz, 1
-    if second <= 0.0 and along_v >= 0.0 and along_v <= vv:
-        part = along_v / vv
-        return x - part * vx, y - part * vy, z - part * vz, 3
+def _arm(points, normals, place):
+    """Return the vector from the nearest place of a triangle (3, 3) to another place, and what that lies on: 0 the
+    face, 1 to 3 an edge, 4 to 6 a corner (C. Ericson, Real-Time Collision Detection, 2005, section 5.1.5)."""
+    first = vector(points, 0)
+    u, v, w = minus(vector(points, 1), first), minus(vector(points, 2), first), minus(place, first)
+    uu, uv, vv, wu, wv = dot(u, u), dot(u, v), dot(v, v), dot(w, u), dot(w, v)
+    if wu <= 0.0 and wv <= 0.0:
+        return w, 4
+    if wu >= uu and wv - uv <= wu - uu:
+        return minus(w, u), 5
+    if wv >= vv and wu - uv <= wv - vv:
+        return minus(w, v), 6
+    second, third = vv * wu - uv * wv, uu * wv - uv * wu  # areas opposite the corners, times 2 |u x v|
+    if third <= 0.0 and wu >= 0.0 and wu <= uu:
+        return along(w, -wu / uu, u), 1
+    if second <= 0.0 and wv >= 0.0 and wv <= vv:
+        return along(w, -wv / vv, v), 3
     if uu * vv - uv * uv - second - third <= 0.0:
-        part = (along_v - uv - along_u + uu) / (uu + vv - 2.0 * uv)
-        x, y, z = x - ux - part * (vx - ux), y - uy - part * (vy - uy), z - uz - part * (vz - uz)
-        return x, y, z, 2
-    nx, ny, nz = normals[0, 0], normals[0, 1], normals[0, 2]
-    gap = x * nx + y * ny + z * nz
-    return gap * nx, gap * ny, gap * nz, 0
+        return along(minus(w, u), -(wv - uv - wu + uu) / (uu + vv - 2.0 * uv), minus(v, u)), 2
+    n = vector(normals, 0)
+    return times(dot(w, n), n), 0
 
 
 @inlined
-def _away(box, x, y, z):
-    """Return the squared distance of a point from a box (6,)."""
-    x = max(box[0] - x, x - box[3], 0.0)
-    y = max(box[1] - y, y - box[4], 0.0)
-    z = max(box[2] - z, z - box[5], 0.0)
+def _away(box, low, high):
+    """Return the squared distance of two boxes, the second from its lower to its upper corner."""
+    x, y = max(box[0] - high[0], low[0] - box[3], 0.0), max(box[1] - high[1], low[1] - box[4], 0.0)
+    z = max(box[2] - high[2], low[2] - box[5], 0.0)
     return x * x + y * y + z * z
 
 
 @inlined
-def _after(k):
-    """Return the box of the tree that follows box k and all that it has; 1 after the last."""
-    k += 1
-    while k & 1 == 0:
-        k >>= 1
-    return k
+def _next_leaf(triangles, k, low, high, square):
+    """Return the leaf of the tree after leaf ``k``, or the first if that is 0, whose squared distance from a box is at
+    most as given; 0 after the last."""
+    leaves, begun = len(triangles.boxes) >> 1, k > 0
+    while True:
+        k += 1
+        while k & 1 == 0:  # to what follows a box and all that it has
+            k >>= 1
+        if begun and k == 1:
+            return 0
+        begun = True
+        while _away(triangles.boxes[k], low, high) <= square:
+            if k >= leaves:
+                return k
+            k *= 2
+
+
+@inlined
+def _of_leaf(triangles, k):
+    """Return the range of the triangles of a leaf."""
+    n, leaves = len(triangles.points), len(triangles.boxes) >> 1
+    return range(n * (k - leaves) // leaves, n * (k - leaves + 1) // leaves)
 
 
 @inlined
@@ -185,85 +192,60 @@ def nearest(triangles, x, y, z, reach):
 
     The distance is infinite, and the face -1, for a point that is farther away than ``reach`` [m].
     """
-    points, normals, boxes = triangles.points, triangles.normals, triangles.boxes
-    n, leaves = len(points), len(boxes) >> 1
-    best, face, feature = reach * reach, -1, 0
-    ax, ay, az = math.inf, 0.0, 0.0
-    k, descends = 1, True
-    if _away(boxes[1], x, y, z) <= best:
-        while k < leaves:  # the leaf that is likely to have it comes first, so that the others are far
-            k *= 2
-            k += _away(boxes[k + 1], x, y, z) < _away(boxes[k], x, y, z)
-        while True:
-            if _away(boxes[k], x, y, z) <= best:
-                if k < leaves:
-                    k *= 2
-                    continue
-                for j in range(n * (k - leaves) // leaves, n * (k - leaves + 1) // leaves):
-                    bx, by, bz, part = _arm(points[j], normals[j], x, y, z)
-                    square = bx * bx + by * by + bz * bz
-                    if square < best or (square == best and (face < 0 or j < face)):
-                        best, face, feature = square, j, part
-                        ax, ay, az = bx, by, bz
-            if descends:
-                descends = False
-                k = 1
-                continue
-            k = _after(k)
-            if k == 1:
-                break
+    points, normals, boxes, place = triangles.points, triangles.normals, triangles.boxes, (x, y, z)
+    best, face, feature, arm = reach * reach, -1, 0, (math.inf, 0.0, 0.0)
+    leaf, descends = 1, True
+    if _away(boxes[1], place, place) <= best:
+        while leaf < len(boxes) >> 1:  # the leaf that is likely to have it comes first, so that the others are far
+            leaf *= 2
+            leaf += _away(boxes[leaf + 1], place, place) < _away(boxes[leaf], place, place)
+        while leaf > 0:
+            for j in _of_leaf(triangles, leaf):
+                found, part = _arm(points[j], normals[j], place)
+                square = dot(found, found)
+                if square < best or (square == best and (face < 0 or j < face)):
+                    best, face, feature, arm = square, j, part, found
+            leaf = _next_leaf(triangles, 0 if descends else leaf, place, place, best)
+            descends = False
     if face < 0:
         return math.inf, face, feature, x, y, z
-    m = normals[face, feature]
-    side = 1.0 if m[0] * ax + m[1] * ay + m[2] * az >= 0.0 else -1.0
-    return side * math.sqrt(best), face, feature, x - ax, y - ay, z - az
+    side = 1.0 if dot(vector(normals[face], feature), arm) >= 0.0 else -1.0
+    return side * math.sqrt(best), face, feature, x - arm[0], y - arm[1], z - arm[2]
 
 
 @inlined
 def _gap(triangles, face, place):
     """Return the distance of a place (3,) from the plane of a face [m]."""
-    points, normals = triangles.points[face], triangles.normals[face]
-    gap = 0.0
-    for c in range(3):
-        gap += normals[0, c] * (place[c] - points[0, c])
-    return gap
+    return dot(vector(triangles.normals[face], 0), minus(place, vector(triangles.points[face], 0)))
 
 
 @inlined
 def _square(one, other):
     """Return the squared distance of two places (3,) [m2]."""
-    return (one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2
+    way = minus(one, other)
+    return dot(way, way)
 
 
 @inlined
 def _passed(triangles, face, start, place, when, near, ahead):
     """Return whether a way that leads behind a face at its border remains ``ahead`` [m] of the other face of a convex
     edge there."""
-    points, normals, boxes = triangles.points, triangles.normals, triangles.boxes
-    both = triangles.limits[0, 0] > 0.0
-    n, leaves = len(points), len(boxes) >> 1
-    x = start[0] + when * (place[0] - start[0])
-    y = start[1] + when * (place[1] - start[1])
-    z = start[2] + when * (place[2] - start[2])
-    k = 1
-    while True:
-        if _away(boxes[k], x, y, z) <= near * near:
-            if k < leaves:
-                k *= 2
+    points, normals, both = triangles.points, triangles.normals, triangles.limits[0, 0] > 0.0
+    at = along(start, when, minus(place, start))
+    leaf = _next_leaf(triangles, 0, at, at, near * near)
+    while leaf > 0:
+        for j in _of_leaf(triangles, leaf):
+            side = -1.0 if both and _gap(triangles, j, start) < 0.0 else 1.0
+            if j == face or side * _gap(triangles, j, place) < ahead:
                 continue
-            for j in range(n * (k - leaves) // leaves, n * (k - leaves + 1) // leaves):
-                side = -1.0 if both and _gap(triangles, j, start) < 0.0 else 1.0
-                if j == face or side * _gap(triangles, j, place) < ahead:
-                    continue
-                ax, ay, az, _ = _arm(points[j], normals[j], x, y, z)
-                side = -1.0 if both and _gap(triangles, face, start) < 0.0 else 1.0
-                bend = _gap(triangles, face, points[j, 0]) + _gap(triangles, face, points[j, 1])
-                bend = side * (bend + _gap(triangles, face, points[j, 2]))
-                if ax * ax + ay * ay + az * az <= near * near and bend < -triangles.limits[0, 2]:
-                    return True
-        k = _after(k)
-        if k == 1:
-            return False
+            arm, _ = _arm(points[j], normals[j], at)
+            side = -1.0 if both and _gap(triangles, face, start) < 0.0 else 1.0
+            bend = _gap(triangles, face, points[j, 0]) + _gap(triangles, face, points[j, 1])
+            bend = side * (bend + _gap(triangles, face, points[j, 2]))
+            if dot(arm, arm) <= near * near and bend < -triangles.limits[0, 2]:
+                return True
+        leaf = _next_leaf(triangles, leaf, at, at, near * near)
+    return False
 
 
 @inlined
@@ -273,47 +255,33 @@ def _crossed(triangles, start, place, tolerance, least):
 
     A ``start`` that is behind a face by no more than the tolerance is in front of it.
     """
-    points, normals, boxes = triangles.points, triangles.normals, triangles.boxes
     both, rounding = triangles.limits[0, 0] > 0.0, triangles.limits[0, 2]
-    n, leaves = len(points), len(boxes) >> 1
     found, soonest, highest = -1, math.inf, -math.inf
-    slack = max(tolerance, rounding)
-    way = math.sqrt(_square(start, place))
+    slack, way = max(tolerance, rounding), math.sqrt(_square(start, place))
     # a node that falls on an edge along one of its faces is stopped, one that has been stopped moves along them
     ahead = -least if least > 0.0 else rounding
-    k = 1
-    while True:
-        box = boxes[k]
-        meets = True
-        for c in range(3):
-            low, high = min(start[c], place[c]), max(start[c], place[c])
-            meets = meets and low <= box[c + 3] + slack and high >= box[c] - slack
-        if meets:
-            if k < leaves:
-                k *= 2
+    low = min(start[0], place[0]), min(start[1], place[1]), min(start[2], place[2])
+    high = max(start[0], place[0]), max(start[1], place[1]), max(start[2], place[2])
+    leaf = _next_leaf(triangles, 0, low, high, 3.0 * slack * slack)
+    while leaf > 0:
+        for j in _of_leaf(triangles, leaf):
+            before, after = _gap(triangles, j, start), _gap(triangles, j, place)
+            if both and before < 0.0:
+                before, after = -before, -after
+            if before < -slack or after >= -least or after >= before:
                 continue
-            for j in range(n * (k - leaves) // leaves, n * (k - leaves + 1) // leaves):
-                before, after = _gap(triangles, j, start), _gap(triangles, j, place)
-                if both and before < 0.0:
-                    before, after = -before, -after
-                if before < -slack or after >= -least or after >= before:
-                    continue
-                when = max(before, 0.0) / (max(before, 0.0) - after)
-                if when > soonest or (when == soonest and after <= highest):
-                    continue
-                x = start[0] + when * (place[0] - start[0])
-                y = start[1] + when * (place[1] - start[1])
-                z = start[2] + when * (place[2] - start[2])
-                x, y, z, part = _arm(points[j], normals[j], x, y, z)
-                # where a way that is almost parallel to the face crosses it is known but roughly
-                near = rounding * (1.0 + way / (before - after))
-                if x * x + y * y + z * z - min(before, 0.0) ** 2 <= near * near and not _passed(
-                    triangles, j, start, place, when, max(near, slack), ahead
-                ):
-                    found, soonest, highest = j, when, after
-        k = _after(k)
-        if k == 1:
-            return found
+            when = max(before, 0.0) / (max(before, 0.0) - after)
+            if when > soonest or (when == soonest and after <= highest):
+                continue
+            arm, _ = _arm(triangles.points[j], triangles.normals[j], along(start, when, minus(place, start)))
+            # where a way that is almost parallel to the face crosses it is known but roughly
+            near = rounding * (1.0 + way / (before - after))
+            if dot(arm, arm) - min(before, 0.0) ** 2 <= near * near and not _passed(
+                triangles, j, start, place, when, max(near, slack), ahead
+            ):
+                found, soonest, highest = j, when, after
+        leaf = _next_leaf(triangles, leaf, low, high, 3.0 * slack * slack)
+    return found
 
 
 @inlined
@@ -357,8 +325,7 @@ def faces_at(triangles, start, free, fixed, tolerance, normals, offsets):
     count = 0
     for sweeps in range(2):
         count = 0
-        for c in range(3):
-            place[0, c], held[0, c], levels[0, c], moves[0, c] = free[c], fixed[c], -math.inf, 0.0
+        place[0, :], held[0, :], levels[0, :], moves[0, :] = free, fixed, -math.inf, 0.0
         for _ in range(_ROUNDS):
             least = rounding if count else 0.0
             behind = _behind(triangles, start, place[0], tolerance, least)
@@ -375,28 +342,20 @@ def faces_at(triangles, start, free, fixed, tolerance, normals, offsets):
             # what has not passed through a sheet is on its own side, even if the face of the start has another one
             gap = _gap(triangles, face, start) if face == crossed else _gap(triangles, face, place[0])
             side = -1.0 if both and gap < 0.0 else 1.0
-            level = clearance
-            for c in range(3):
-                planes[0, slot, c] = side * triangles.normals[face, 0, c]
-                level += planes[0, slot, c] * triangles.points[face, 0, c]
-            levels[0, slot], count = level, max(count, slot + 1)
-            for c in range(3):
-                place[0, c] = free[c]
+            normal = times(side, vector(triangles.normals[face], 0))
+            put(planes[0], slot, normal)
+            levels[0, slot] = clearance + dot(normal, vector(triangles.points[face], 0))
+            count, place[0, :] = max(count, slot + 1), free
             if project(place, held, planes, levels, rounding, moves) >= 0:
                 face = -1  # the caller finds the same
                 break
         if face < 0:
             break
     if face >= 0:  # more than three planes: the node stays where it is
-        way = math.sqrt(_square(start, free))
-        levels[0, 0], levels[0, 1], levels[0, 2], count = 0.0, -math.inf, -math.inf, 1
-        for c in range(3):
-            planes[0, 0, c] = (start[c] - free[c]) / way
-            levels[0, 0] += planes[0, 0, c] * start[c]
-    for k in range(3):
-        offsets[k] = levels[0, k]
-        for c in range(3):
-            normals[k, c] = planes[0, k, c]
+        normal = times(1.0 / math.sqrt(_square(start, free)), minus(start, free))
+        put(planes[0], 0, normal)
+        levels[0, 0], levels[0, 1], levels[0, 2], count = dot(normal, start), -math.inf, -math.inf, 1
+    offsets[:], normals[:, :] = levels[0], planes[0]
     return count
 
 

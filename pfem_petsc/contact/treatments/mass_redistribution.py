@@ -75,19 +75,18 @@ def redistribute(model: Model) -> Redistribution:
                 f"{key}: wall {contact.names[k]!r} must be a plane, not curved nor a rectangle, must not turn, "
                 "and name a node_set: its nodes lose mass; use another contact.treatment"
             )
-    if inertia.damped:
-        raise InputError(f"{key}: a node without mass cannot be damped; use a material without damping, no [[dashpot]]")
-    if model.bars.springs is not None:
-        raise InputError(f"{key}: a node without mass cannot have a [[spring]]; use another contact.treatment")
-    if model.supports.inclined is not None:
-        raise InputError(
-            f"{key}: normal and frame of a [[support]] must be along axes; or use another contact.treatment"
-        )
-    if model.external.state_forces:
-        raise InputError(
-            f"{key}: a node without mass cannot follow [wind], whose force depends on its velocity; use another "
-            "contact.treatment"
-        )
+    other = "use another contact.treatment"
+    for applies, text in (
+        (inertia.damped, "a node without mass cannot be damped; use a material without damping, no [[dashpot]]"),
+        (model.bars.springs is not None, f"a node without mass cannot have a [[spring]]; {other}"),
+        (model.supports.inclined is not None, f"normal and frame of a [[support]] must be along axes; or {other}"),
+        (
+            model.external.state_forces,
+            f"a node without mass cannot follow [wind], whose force depends on its velocity; {other}",
+        ),
+    ):
+        if applies:
+            raise InputError(f"{key}: {text}")
     owned = mesh.n_owned
     members = contact.members
     with agreed(mesh.comm):

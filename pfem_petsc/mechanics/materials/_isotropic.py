@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numpy as np
-
 from ...case.base import NonNegativeFloat, PositiveFloat
-from ..compiled import inlined, kernel
-from .base import Law, MaterialKeys, Softening, mean_rate, yield_texts
+from ..compiled import inlined
+from .base import Law, MaterialKeys, Softening, mean_of_work, yield_texts
 
 NOISE = 4.0 * 2.0**-52
 """Residual relative to its terms below which it is rounding."""
@@ -58,8 +56,6 @@ def make_solver(residual: Callable) -> Callable:
 VARIABLES = (("plastic_strain", ""), ("accumulated_plastic_strain", ""))
 ENERGIES = ("elastic_energy", "plastic_heat", "hardening_energy")
 
-_ROUNDING = 1e-8  # E (e1 - e0)/s1, below which the derivative of the mean stress would be rounding
-
 
 class PlasticKeys(MaterialKeys):
     """Keys of materials with an initial yield stress and hardening."""
@@ -74,14 +70,13 @@ class PlasticKeys(MaterialKeys):
         return yield_texts(key, hint, "yield_stress", self.yield_stress, self.young_modulus)
 
 
-def isotropic_law(curve: Callable, mean: Callable, scale: Callable, find: Callable | None = None) -> Law:
+def isotropic_law(curve: Callable, scale: Callable, find: Callable | None = None) -> Law:
     """Make a rate-independent law.
 
     Parameters
     ----------
     curve : compiled function of (a, p) that returns R [Pa], dR/da [Pa], and the densities of heat and of energy stored
         by isotropic hardening [J/m3], whose sum is the integral of R from 0 to a. p[0] = E, p[1] = H [Pa]
-    mean : compiled function of (a, x, p): mean of R between a and a + x [Pa]
     scale : compiled function of (p, factor of modulus, factor of yield stress) that returns p at a temperature
     find : compiled function of (|s_trial - H e_p|, excess over R(a), E + H, a, p) that returns the plastic strain x of
         a step; None: by Newton's method, with a curve whose slope does not increase
@@ -127,46 +122,6 @@ def isotropic_law(curve: Callable, mean: Callable, scale: Callable, find: Callab
         return stress, tangent, (plastic, accumulated), (elastic, heat, stored + 0.5 * kinematic * plastic * plastic)
 
     @inlined
-    def beyond(stress0, stress, change, before, after, p):
-        """Return S - s1 of a step that yields; ``change`` of strain, internal variables ``before`` and ``after``."""
-        young, kinematic = p[0], p[1]
-        flow = after[0] - before[0]
-        sign = 1.0 if flow > 0.0 else -1.0
-        strength, _, _, _ = curve(before[1], p)
-        yielding = kinematic * before[0] + sign * strength
-        plastic = sign * mean(before[1], after[1] - before[1], p) + 0.5 * kinematic * (before[0] + after[0])
-        found = (yielding - stress0) * (0.5 * (stress0 + yielding) - stress)
-        found += 0.5 * (stress - yielding) * (yielding - stress)
-        return (found / young + flow * (plastic - stress)) / change
-
-    @inlined
-    def mean_stress(stress0, strain0, strain, step, temperature, p, q):
-        """Return the mean stress of the step and its derivative; see the module."""
-        stress, modulus, new, _ = response(strain, mean_rate(strain0, strain, step), step, temperature, p, q)
-        change = strain - strain0
-        if new[1] == q[1] or abs(change) * p[0] <= _ROUNDING * abs(stress):
-            return 0.5 * (stress0 + stress), 0.5 * modulus
-        part = beyond(stress0, stress, change, q, new, p)
-        return stress + part, -part / change
-
-    @kernel
-    def correct(p, change, before, after, out):
-        for k in range(len(change)):
-            old, new = (before[0, k], before[1, k]), (after[0, k], after[1, k])
-            if new[1] != old[1]:
-                strength, _, _, _ = curve(new[1], p)
-                stress = p[1] * new[0] + (strength if new[0] > old[0] else -strength)
-                strain = change[k] / p[0] + new[0] - old[0]
-                if abs(strain) * p[0] > _ROUNDING * abs(stress):
-                    out[k] = beyond(stress - change[k], stress, strain, old, new, p) + 0.5 * change[k]
-
-    def mean_correction(p: tuple, stress: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Return S - (s0 + s1)/2 [Pa] of each bar; see :class:`~pfem_petsc.mechanics.materials.base.Law`."""
-        out = np.zeros(len(stress))
-        correct(p, stress, np.ascontiguousarray(before), np.ascontiguousarray(after), out)
-        return out
-
-    @inlined
     def dissipated(p, q):
         """Return the densities of heat and hardening energy [J/m3]."""
         _, _, heat, stored = curve(q[1], p)
@@ -176,7 +131,7 @@ def isotropic_law(curve: Callable, mean: Callable, scale: Callable, find: Callab
         response,
         internal=VARIABLES,
         energies=ENERGIES,
-        mean_stress=mean_stress,
-        mean_correction=mean_correction,
+        mean_stress=mean_of_work(response),
+        mean_of_work=True,
         softening=Softening(scale, dissipated),
     )

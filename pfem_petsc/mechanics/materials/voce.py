@@ -12,7 +12,7 @@ from ...case.base import NonNegativeFloat
 from ..compiled import inlined
 from ._isotropic import PlasticKeys, isotropic_law
 
-__all__ = ["LAW", "Parameters", "curve", "mean", "scale"]
+__all__ = ["LAW", "Parameters", "curve", "scale"]
 
 
 class Parameters(PlasticKeys):
@@ -45,18 +45,9 @@ def curve(accumulated, p):
 
 
 @inlined
-def mean(accumulated, flow, p):
-    """Return the mean of R between a and a + x [Pa]."""
-    x = p[5] * flow
-    share = -math.expm1(-x) / x if x > 0.0 else 1.0
-    risen = 1.0 - math.exp(-p[5] * accumulated) * share
-    return p[2] + p[3] * (accumulated + 0.5 * flow) + p[4] * risen
-
-
-@inlined
 def scale(p, modulus, strength):
     """Return the parameters at a temperature."""
     return modulus * p[0], strength * p[1], strength * p[2], strength * p[3], strength * p[4], p[5]
 
 
-LAW = isotropic_law(curve, mean, scale)
+LAW = isotropic_law(curve, scale)

@@ -46,18 +46,12 @@ def measured(measure: int, stretch: float) -> tuple[float, float, float]:
 
 
 @register_jitable
-def _engineering_ratio(s0: float, s1: float) -> tuple[float, float]:
-    total = s0 + s1
-    return 2.0 / total, -2.0 / (total * total)
-
-
-@register_jitable
-def _green_ratio(s0: float, s1: float) -> tuple[float, float]:
-    return 1.0, 0.0
-
-
-@register_jitable
-def _logarithmic_ratio(s0: float, s1: float) -> tuple[float, float]:
+def mean_ratio(measure: int, s0: float, s1: float) -> tuple[float, float]:
+    """Return L^2 R and L^2 dR/ds1 of a measure for the stretches s0 = l0/L, s1 = l1/L."""
+    if measure == ENGINEERING:
+        return 2.0 / (s0 + s1), -2.0 / ((s0 + s1) * (s0 + s1))
+    if measure == GREEN:
+        return 1.0, 0.0
     q = s1 / s0 - 1.0
     if abs(q) < 1e-4:
         # ln(1+q)/(q (1 + q/2)) = 1 - q + 5/6 q^2 - 2/3 q^3 + ...
@@ -68,14 +62,6 @@ def _logarithmic_ratio(s0: float, s1: float) -> tuple[float, float]:
         value = math.log1p(q) / bottom
         slope = (1.0 / (1.0 + q) - value * (1.0 + q)) / bottom
     return value / (s0 * s0), slope / (s0 * s0 * s0)
-
-
-@register_jitable
-def mean_ratio(measure: int, s0: float, s1: float) -> tuple[float, float]:
-    """Return L^2 R and L^2 dR/ds1 of a measure for the stretches s0 = l0/L, s1 = l1/L."""
-    if measure == ENGINEERING:
-        return _engineering_ratio(s0, s1)
-    return _green_ratio(s0, s1) if measure == GREEN else _logarithmic_ratio(s0, s1)
 
 
 class ForceElements(Protocol):
@@ -116,22 +102,23 @@ def virgin(law: Law) -> tuple[float, ...]:
 
 class MatrixRows(NamedTuple):
     """Where bars add blocks to a matrix in compressed rows, see :class:`~.block_pattern.BlockPattern`:
-    ``ptr`` (owned + 1,), ``slots`` (b, 4), ``values``."""
+    ``ptr`` (owned + 1,), ``slots`` (b, 4), ``values``; ``ends`` (b, 2) of the bars."""
 
     ptr: np.ndarray
     slots: np.ndarray
     values: np.ndarray
+    ends: np.ndarray
 
 
 @inlined
-def _add_blocks(rows, ends, k, c, d, n, g, mass):
+def _add_blocks(rows, k, c, d, n, g, mass):
     """Add the stiffness c d n^T + g I of a bar, and its inertia, to the rows of its owned ends."""
     values = rows.values
     for side in range(4):
         slot = rows.slots[k, side]
         if slot < 0:
             continue
-        row = ends[k, 0] if side < 2 else ends[k, 1]
+        row = rows.ends[k, side // 2]
         sign = 1.0 if side % 2 == 0 else -1.0
         at = 6 * rows.ptr[row] + 3 * slot
         wide = 3 * (rows.ptr[row + 1] - rows.ptr[row])
@@ -152,23 +139,31 @@ def end_difference(x, ends, k):
 
 
 @kernel
-def add_tangents(x, ends, stored, inertia, rows):
+def add_tangents(x, stored, inertia, rows):
     """Add the stiffness ``stored`` (2, b) of bars, see ``Bars.stiffnesses``, and ``inertia`` (b,) [kg/s2], which is
     added twice on the diagonal and once off it, to the rows of a matrix."""
-    for k in range(len(ends)):
-        d = end_difference(x, ends, k)
-        _add_blocks(rows, ends, k, stored[0, k], d, d, stored[1, k], inertia[k])
+    for k in range(len(rows.ends)):
+        d = end_difference(x, rows.ends, k)
+        _add_blocks(rows, k, stored[0, k], d, d, stored[1, k], inertia[k])
 
 
 @kernel
-def add_step_tangents(x0, x, ends, coefficients, weight, inertia, rows):
+def add_bars(stored, rows):
+    """Add the stiffness ``stored`` (5, b) of bars, see ``Bars.linearise``, to the rows of a matrix."""
+    for k in range(len(rows.ends)):
+        n = stored[0, k], stored[1, k], stored[2, k]
+        _add_blocks(rows, k, stored[3, k], n, n, stored[4, k], 0.0)
+
+
+@kernel
+def add_step_tangents(x0, x, coefficients, weight, inertia, rows):
     """Add ``weight`` times the derivative of the forces of steps, not symmetric; ``coefficients``: of
     :func:`~.internal_forces.step_coefficients`."""
-    for k in range(len(ends)):
-        d0, d = end_difference(x0, ends, k), end_difference(x, ends, k)
+    for k in range(len(rows.ends)):
+        d0, d = end_difference(x0, rows.ends, k), end_difference(x, rows.ends, k)
         middle = (0.5 * (d0[0] + d[0]), 0.5 * (d0[1] + d[1]), 0.5 * (d0[2] + d[2]))
         c, dc = coefficients[0, k], coefficients[1, k]
-        _add_blocks(rows, ends, k, weight * dc, middle, d, weight * 0.5 * c, inertia[k])
+        _add_blocks(rows, k, weight * dc, middle, d, weight * 0.5 * c, inertia[k])
 
 
 @kernel
@@ -200,11 +195,7 @@ def write_directions(x, bars, stored):
 def bar_lengths(points, bars, lengths):
     """Write the lengths (b,) of bars (b, 2) between points (n, 3)."""
     for k in range(len(bars)):
-        a = bars[k, 0]
-        b = bars[k, 1]
-        dx = points[b, 0] - points[a, 0]
-        dy = points[b, 1] - points[a, 1]
-        dz = points[b, 2] - points[a, 2]
+        dx, dy, dz = end_difference(points, bars, k)
         lengths[k] = (dx * dx + dy * dy + dz * dz) ** 0.5
 
 
@@ -212,15 +203,9 @@ def bar_lengths(points, bars, lengths):
 def first_inverted(x, before, bars, rest):
     """Return the first shortened bar whose direction has reversed, or -1; those with zero ``rest`` are not checked."""
     for k in range(len(bars)):
-        a = bars[k, 0]
-        b = bars[k, 1]
-        dx = x[b, 0] - x[a, 0]
-        dy = x[b, 1] - x[a, 1]
-        dz = x[b, 2] - x[a, 2]
+        dx, dy, dz = end_difference(x, bars, k)
         if dx * dx + dy * dy + dz * dz < 0.8 * rest[k] * rest[k]:
-            back = dx * (before[b, 0] - before[a, 0])
-            back += dy * (before[b, 1] - before[a, 1])
-            back += dz * (before[b, 2] - before[a, 2])
-            if back < 0.0:
+            ax, ay, az = end_difference(before, bars, k)
+            if dx * ax + dy * ay + dz * az < 0.0:
                 return k
     return -1

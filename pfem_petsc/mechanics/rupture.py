@@ -205,4 +205,3 @@ def _mean_stress(law: Callable[..., Any], count: int) -> Callable[..., Any]:
 
 def _modulus(law: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
     return lambda p, temperatures: law(p[_OF_LAW:], temperatures)
-

@@ -12,6 +12,7 @@ from petsc4py import PETSc
 
 from ..mechanics.block_pattern import BlockPattern
 from ..mechanics.compiled import kernel
+from ..mechanics.elements import MatrixRows, add_bars
 
 if TYPE_CHECKING:
     from ..contact.transform import Transform
@@ -74,23 +75,6 @@ def _add_lumped(ptr, diagonal, inertia, values):
         at = 6 * ptr[row] + 3 * diagonal[row]
         for i in range(3):
             values[at + i * (width + 1)] += inertia[row]
-
-
-@kernel
-def _add_bars(bars, stored, ptr, slots, values):
-    for k in range(len(bars)):
-        for s in range(4):
-            slot = slots[k, s]
-            if slot < 0:
-                continue
-            row = bars[k, s // 2]
-            sign = 1.0 if s % 2 == 0 else -1.0
-            width = 3 * (ptr[row + 1] - ptr[row])
-            at = 6 * ptr[row] + 3 * slot
-            for i in range(3):
-                for j in range(3):
-                    values[at + i * width + j] += sign * stored[3, k] * stored[i, k] * stored[j, k]
-                values[at + i * (width + 1)] += sign * stored[4, k]
 
 
 @kernel
@@ -335,7 +319,7 @@ class HessianMatrix:
 
     def add_bars(self, stored: np.ndarray, values: np.ndarray) -> None:
         """Add the bars' stiffness from the data of :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`, (5, b)."""
-        _add_bars(self.mesh.bars, stored, self.pattern.ptr, self.pattern.slots, values)
+        add_bars(stored, MatrixRows(self.pattern.ptr, self.pattern.slots, values, self.mesh.bars))
 
     def constrain(self, scale: float, values: np.ndarray) -> None:
         """Replace rows and columns of prescribed components by ``scale`` on the diagonal."""

@@ -42,7 +42,6 @@ FOLLOWED = {"node_set": "apex", "direction": [0.0, 0.0, -1.0]}
         ({"method": "arc_length", "step": 0.1, "max_step": 0.01}, "max_step = 0.01 is smaller"),
         ({"method": "arc_length", "branch_at": [0]}, "from 1"),
         ({"method": "arc_length", "branch_at": [1], "critical_points": False}, "critical_points"),
-        ({"method": "displacement", **FOLLOWED, "constraint": "spherical"}, "constraint"),
     ],
 )
 def test_keys_that_are_refused(static, words):

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from ..case.tables import Section
     from ..mesh.distribution import DistributedMesh
     from ..mesh.slab import MeshSlab
-    from .block_pattern import BlockPattern
+    from .elements import BlockPattern
 
 
 def bar_shapes(section: Section, length: np.ndarray, area: np.ndarray) -> BarShapes:

@@ -10,9 +10,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..mechanics.block_pattern import BlockPattern
 from ..mechanics.compiled import kernel
-from ..mechanics.elements import MatrixRows, add_bars
+from ..mechanics.elements import BlockPattern, MatrixRows, add_bars
 
 if TYPE_CHECKING:
     from ..contact.transform import Transform
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 def turn_blocks(ptr, local_columns, place, left, right, values):
     """Multiply the rows of nodes by matrices ``left`` (m, 3, 3), and their columns by ``right``, from the right.
 
-    ``ptr``, ``local_columns``, ``values``: of a :class:`~pfem_petsc.mechanics.block_pattern.BlockPattern`; ``place``
+    ``ptr``, ``local_columns``, ``values``: of a :class:`~pfem_petsc.mechanics.elements.BlockPattern`; ``place``
     (local,): of a node among the m, -1 for others.
     """
     block = np.zeros((3, 3))

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from ...case.base import PositiveFloat
 from ..compiled import inlined
-from ._isotropic import PlasticKeys, isotropic_law
+from ._plastic import PlasticKeys, isotropic_law
 
 __all__ = ["LAW", "Parameters", "curve", "scale"]
 

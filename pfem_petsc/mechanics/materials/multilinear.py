@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from ...case.base import Finite, listed
 from ..compiled import inlined
-from ._isotropic import isotropic_law
+from ._plastic import isotropic_law
 from .base import MaterialKeys, yield_texts
 
 __all__ = ["LAW", "Parameters", "curve", "find", "scale"]

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from ...case.base import PositiveFloat
 from ..compiled import inlined
-from ._isotropic import isotropic_law
+from ._plastic import isotropic_law
 from .base import MaterialKeys, yield_texts
 
 __all__ = ["LAW", "Parameters", "curve", "scale"]

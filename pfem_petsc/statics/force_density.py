@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..integrators.base import Balance
     from ..solvers.linear import LinearChoice
     from ..stepping.model import Model
-    from .methods.force_density import Parameters
+    from .keys import ForceDensityKeys
 
 _DIRECT_UP_TO = 200_000
 """Nodes up to which a factorisation is used; beyond, conjugate gradients with multigrid, if no density is negative."""
@@ -89,7 +89,7 @@ class ForceDensityStepper(StaticStepper):
     kept_numbers = (*StaticStepper.kept_numbers, "solves")
     finds_jumps = False
 
-    def __init__(self, model: Model, choice: LinearChoice, parameters: Parameters) -> None:
+    def __init__(self, model: Model, choice: LinearChoice, parameters: ForceDensityKeys) -> None:
         _check(model)
         super().__init__(model, choice, parameters)
         with agreed(model.comm):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..integrators.base import State
     from ..solvers.linear import LinearChoice
     from ..stepping.model import Model
-    from .methods.relaxation import Parameters
+    from .keys import RelaxationKeys
 
 
 RESIDUAL, KINETIC, SUPPORTS, WALLS, BARS, FAILED, WIDTH = range(7)
@@ -339,7 +339,7 @@ class RelaxationStepper(StaticStepper):
     columns = (*StaticStepper.columns, "pseudo_steps", "residual")
     finds_jumps = False
 
-    def __init__(self, model: Model, choice: LinearChoice, parameters: Parameters) -> None:
+    def __init__(self, model: Model, choice: LinearChoice, parameters: RelaxationKeys) -> None:
         _check(model)
         super().__init__(model, choice, parameters)
         self.parameters = parameters

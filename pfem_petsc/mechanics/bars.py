@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from ..case.tables import Section
     from ..mesh.distribution import DistributedMesh
     from ..mesh.slab import MeshSlab
-    from .block_pattern import BlockPattern
+    from .elements import BlockPattern
 
 
 def bar_shapes(section: Section, length: np.ndarray, area: np.ndarray) -> BarShapes:
@@ -642,7 +642,7 @@ class Bars:
     ) -> None:
         """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to the values of a matrix; with
         positions ``start``, the derivative of :meth:`step_forces` from there in the place of K_t."""
-        rows = MatrixRows(pattern.ptr, pattern.slots, values)
+        rows = MatrixRows(pattern.ptr, pattern.slots, values, self.ends)
         mass = np.zeros(len(self.ends))
         for block, m in zip(self.blocks, inertia, strict=True):
             mass[block.start : block.stop] = m * self.mass_lengths[block.start : block.stop]
@@ -650,10 +650,10 @@ class Bars:
         if start is None:
             if weight:
                 self.stiffnesses(x, weight, stored)
-            add_tangents(x, self.ends, stored, mass, rows)
+            add_tangents(x, stored, mass, rows)
         else:
             self._step_coefficients(start, x, stored)
-            add_step_tangents(start, x, self.ends, stored, weight, mass, rows)
+            add_step_tangents(start, x, stored, weight, mass, rows)
         for family in self.families:  # in a step, their force is that at its middle
             family.add_tangents(weight if start is None else 0.5 * weight, pattern, values)
 

@@ -172,8 +172,10 @@ def _copy(n, values, at, out, to):
 
 
 @inlined
-def _read_bars(g, measure, nodes, bars, far, x, rest, heat, work):
-    """Read the bars of a group into the workspace; return how many are short."""
+def _read_bars(g, measure, runs, x, rest, heat, work):
+    """Read the bars of a group into the workspace; return how many are short. ``runs``: nodes, bars and far ends of the
+    layout."""
+    nodes, bars, far = runs
     if g.star:
         short = _differences_of_stars(g, nodes, bars, far, x, rest, work)
     else:
@@ -332,7 +334,7 @@ def internal_forces(x, f, bars, laws, step, commit, energies):
         law, p, area, gone = laws[s], bars.parameters[s], bars.area[s], bars.gone[s]
         for group in range(layout.sections[s], layout.sections[s + 1]):
             g = group_of(layout, s, group, bars.places[s])
-            short = _read_bars(g, bars.measures[s], nodes, ends, far, x, rest, bars.heat, work)
+            short = _read_bars(g, bars.measures[s], (nodes, ends, far), x, rest, bars.heat, work)
             _read_history(g, bars.rows[s], history, work)
             law(p, step, work, g.n)
             _pull(g.n, area, areas, g.first, work)
@@ -404,7 +406,7 @@ def stiffnesses(x, bars, laws, step, weight, stored):
         law, p, area, gone = laws[s], bars.parameters[s], bars.area[s], bars.gone[s]
         for group in range(layout.sections[s], layout.sections[s + 1]):
             g = group_of(layout, s, group, bars.places[s])
-            _read_bars(g, bars.measures[s], nodes, ends, far, x, rest, bars.heat, work)
+            _read_bars(g, bars.measures[s], (nodes, ends, far), x, rest, bars.heat, work)
             _read_history(g, bars.rows[s], history, work)
             law(p, step, work, g.n)
             _stiffness_of_group(g.n, bars.measures[s], area, areas, g.first, rest, work)
@@ -427,7 +429,7 @@ def states(x, bars, laws, out, densities):
         row = HISTORY + bars.rows[s]
         for group in range(layout.sections[s], layout.sections[s + 1]):
             g = group_of(layout, s, group, bars.places[s])
-            _read_bars(g, measure, layout.nodes, layout.bars, layout.far, x, bars.rest, bars.heat, work)
+            _read_bars(g, measure, (layout.nodes, layout.bars, layout.far), x, bars.rest, bars.heat, work)
             _read_history(g, bars.rows[s], history, work)
             law(p, 0.0, work, g.n)
             for run in range(g.run, g.end):

@@ -81,57 +81,10 @@ def join_components(components, out):
         nodes[3 * i + 2] = zs[i]
 
 
-class Sweep(NamedTuple):
-    """Runs and chunks of the bars [start, stop) of a block. See :class:`BarLayout`.
-
-    Attributes
-    ----------
-    heads : (runs,) uint32, lower end of the first bar of each run
-    fars : (runs,) uint32, its upper end
-    starts : (runs + 1,) uint32, first bar of each run, and the end
-    chunks : (chunks + 1,) uint32, first run of each chunk, and the end
-    diagonal : (chunks,) bool, whether the runs of a chunk are diagonal, else stars
-    counted : number of leading chunks whose bars are counted on this rank
-    """
-
-    heads: np.ndarray
-    fars: np.ndarray
-    starts: np.ndarray
-    chunks: np.ndarray
-    diagonal: np.ndarray
-    counted: int
-
-
-def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int = CHUNK) -> Sweep:
-    """Make the sweep over ``bars`` (b, 2) [start, stop), of which [start, counted) are counted.
-
-    Chunks end after ``chunk`` bars, at ``counted``, and where the lower end passes to another block of nodes.
-    """
-    low, high = np.sort(bars[start:stop], axis=1).T
-    begins = np.ones(stop - start, dtype=np.bool_)
-    begins[1:] = np.diff(low // NODE_BLOCK) != 0
-    begins[counted - start :][:1] = True
-    at = np.flatnonzero(begins)
-    since = np.arange(stop - start) - np.repeat(at, np.diff(at, append=stop - start))
-    at = np.flatnonzero(since % chunk == 0)
-    follows, alike = np.zeros((2, stop - start), dtype=np.bool_)
-    follows[1:] = (np.diff(low) == 1) & (np.diff(high) == 1)  # both ends are the nodes after those of the bar before
-    alike[1:] = np.diff(low) == 0
-    follows[at] = alike[at] = False
-    sizes = np.diff(at, append=stop - start)
-    diagonal = sizes >= LEAST_RUN * np.add.reduceat(~follows, at, dtype=np.int64) if len(at) else sizes > 0
-    runs = np.flatnonzero(~np.where(np.repeat(diagonal, sizes), follows, alike))
-    chunks = np.searchsorted(runs, np.append(at, stop - start))
-    return Sweep(
-        *(values.astype(np.uint32) for values in (low[runs], high[runs], np.append(runs + start, stop), chunks)),
-        diagonal,
-        int(np.searchsorted(at, counted - start)),
-    )
-
-
 NO_BAR = -1.0
 """Rest length of a column without a bar [m]."""
 
+_NONE = np.empty(0, dtype=np.int64)
 _MOST = 1.25  # columns for each bar; beyond, they cost more than the begin and end of each run
 
 
@@ -176,70 +129,69 @@ class BarLayout(NamedTuple):
 def make_layout(bars: np.ndarray, blocks: Sequence[tuple[int, int, int]]) -> BarLayout:
     """Make the layout of ``bars`` (b, 2) of sections [start, stop) that follow each other, of which [start, counted)
     are counted; ``blocks``: (start, counted, stop) of each section."""
-    sections, counted, parts, groups, columns = [0], [], [], 0, 0
-    for block in blocks:
-        sweep = make_sweep(bars, *block)
-        part = _make_groups(sweep)
-        first_run = np.searchsorted(part.runs, sweep.chunks[sweep.counted])
-        counted.append(groups + int(first_run))
-        parts.append((sweep, part._replace(starts=part.starts + columns, runs=part.runs)))
-        groups, columns = groups + len(part.heads), int(parts[-1][1].starts[-1])
-        sections.append(groups)
-    n_runs = np.cumsum([0, *(len(sweep.heads) for sweep, _ in parts)])
+    found = [_make_groups(bars, *block) for block in blocks]
+    counts = np.array([[len(part.runs) - 1, part.starts[-1], len(part.nodes)] for part in found]).reshape(-1, 3)
+    sections, columns, runs = np.pad(np.cumsum(counts, axis=0), ((1, 0), (0, 0))).T
 
-    def joined(arrays: list[np.ndarray], kind: type, end: int | None = None) -> np.ndarray:
-        return np.concatenate([*arrays, [] if end is None else [end]]).astype(kind)
+    def joined(arrays: list[np.ndarray], kind: type, *end: int) -> np.ndarray:
+        return np.concatenate([*arrays, end]).astype(kind)
 
-    stars = joined([part.stars for _, part in parts], np.bool_)
+    stars = joined([part.stars for part in found], np.bool_)
     far = np.empty(len(bars) if stars.any() else 0, dtype=np.uint32)
     np.maximum(bars[: len(far), 0], bars[: len(far), 1], out=far, casting="unsafe")
     return BarLayout(
-        np.array(sections, dtype=np.int64),
-        np.array(counted, dtype=np.int64),
+        sections.astype(np.int64),
+        np.array([part.counted + first for part, first in zip(found, sections, strict=False)], dtype=np.int64),
         stars,
-        joined([part.heads for _, part in parts], np.int64),
-        joined([part.fars for _, part in parts], np.int64),
-        joined([part.starts[:-1] for _, part in parts], np.int64, columns),
-        joined([part.runs[:-1] + first for (_, part), first in zip(parts, n_runs, strict=False)], np.int64, n_runs[-1]),
-        joined([sweep.heads for sweep, _ in parts], np.uint32),
-        joined([sweep.starts[:-1] for sweep, _ in parts], np.uint32, blocks[-1][2] if len(blocks) else 0),
+        joined([part.heads for part in found], np.int64),
+        joined([part.fars for part in found], np.int64),
+        joined([part.starts[:-1] + at for part, at in zip(found, columns, strict=False)], np.int64, columns[-1]),
+        joined([part.runs[:-1] + at for part, at in zip(found, runs, strict=False)], np.int64, runs[-1]),
+        joined([part.nodes for part in found], np.uint32),
+        joined([part.bars for part in found], np.uint32, blocks[-1][2] if len(blocks) else 0),
         far,
     )
 
 
-class _Groups(NamedTuple):
-    """The groups of a sweep, see :class:`BarLayout`."""
+def _make_groups(bars: np.ndarray, start: int, counted: int, stop: int) -> BarLayout:
+    """Return the layout of one section, without ``sections`` and ``far``, and with the first of ``bars`` of each run.
 
-    stars: np.ndarray
-    heads: np.ndarray
-    fars: np.ndarray
-    starts: np.ndarray
-    runs: np.ndarray
-
-
-def _make_groups(sweep: Sweep) -> _Groups:
-    """Make the groups of the runs of a sweep: of one chunk of stars each, or of diagonal runs of one offset, of one
-    block of nodes."""
-    n = len(sweep.heads)
-    firsts = sweep.chunks[:-1].astype(np.int64)
-    star = np.repeat(~sweep.diagonal, np.diff(sweep.chunks.astype(np.int64)))
-    block = sweep.heads[firsts] // NODE_BLOCK
-    begins = np.ones(len(firsts), dtype=np.bool_)  # chunks that begin a group in any case
-    begins[1:] = ~sweep.diagonal[1:] | ~sweep.diagonal[:-1] | (block[1:] != block[:-1])
-    begins[sweep.counted :][:1] = True
-    fresh = np.zeros(n + 1, dtype=np.bool_)
-    fresh[firsts[begins]] = True
-    group_of = np.empty(n, dtype=np.int64)
-    count = _group_runs(sweep.heads, sweep.fars, sweep.starts, fresh, star, group_of)
-    runs = np.searchsorted(group_of, np.arange(count + 1))
-    stars = star[runs[:-1]]
-    first, last = runs[:-1], runs[1:] - 1
-    run_heads, run_starts = sweep.heads.astype(np.int64), sweep.starts.astype(np.int64)
-    lead = run_heads[first] % LANES
-    wide = run_heads[last] + run_starts[last + 1] - run_starts[last] - (run_heads[first] - lead)
-    counts = np.where(stars, run_starts[last + 1] - run_starts[first], -(-wide // LANES) * LANES)
-    heads, fars = (np.where(stars, 0, ends[first] - lead) for ends in (run_heads, sweep.fars.astype(np.int64)))
-    return _Groups(stars, heads, fars, np.append(0, np.cumsum(counts)), runs)
+    Its bars are divided where CHUNK are reached, where the lower end passes to another block of nodes, and at
+    ``counted``, into chunks of diagonal runs, whose ends are the nodes after those of the bar before, or of stars. A
+    group is a chunk of stars, or consists of diagonal runs of one offset and one block of nodes.
+    """
+    low, high = np.sort(bars[start:stop], axis=1).T.astype(np.int64)
+    begins = np.ones(stop - start, dtype=np.bool_)
+    begins[1:] = np.diff(low // NODE_BLOCK) != 0
+    begins[counted - start :][:1] = True
+    at = np.flatnonzero(begins)
+    since = np.arange(stop - start) - np.repeat(at, np.diff(at, append=stop - start))
+    at = np.flatnonzero(since % CHUNK == 0)
+    follows, alike = np.zeros((2, stop - start), dtype=np.bool_)
+    follows[1:] = (np.diff(low) == 1) & (np.diff(high) == 1)
+    alike[1:] = np.diff(low) == 0
+    follows[at] = alike[at] = False
+    sizes = np.diff(at, append=stop - start)
+    diagonal = sizes >= LEAST_RUN * np.add.reduceat(~follows, at, dtype=np.int64) if len(at) else sizes > 0
+    every = np.repeat(diagonal, sizes)
+    first_bars = np.flatnonzero(~np.where(every, follows, alike))
+    nodes, ends, star = low[first_bars], high[first_bars], ~every[first_bars]
+    begins = np.ones(len(at), dtype=np.bool_)  # chunks that begin a group in any case
+    begins[1:] = ~diagonal[1:] | ~diagonal[:-1] | (np.diff(low[at] // NODE_BLOCK) != 0)
+    begins |= at == counted - start
+    fresh = np.isin(first_bars, at[begins])
+    limits = np.append(first_bars, stop - start)
+    group_of_run = np.empty(len(nodes), dtype=np.int64)
+    count = _group_runs(nodes, ends, limits, fresh, star, group_of_run)
+    runs = np.searchsorted(group_of_run, np.arange(count + 1))
+    stars, first, last = star[runs[:-1]], runs[:-1], runs[1:] - 1
+    lead = nodes[first] % LANES
+    wide = nodes[last] + limits[last + 1] - limits[last] - (nodes[first] - lead)
+    sizes = np.where(stars, limits[last + 1] - limits[first], -(-wide // LANES) * LANES)
+    heads, fars = (np.where(stars, 0, each[first] - lead) for each in (nodes, ends))
+    before = np.searchsorted(runs, np.searchsorted(first_bars, counted - start))
+    columns = np.append(0, np.cumsum(sizes))
+    return BarLayout(_NONE, before, stars, heads, fars, columns, runs, nodes, first_bars + start, _NONE)
 
 
 @kernel
@@ -249,12 +201,11 @@ def _group_runs(heads, fars, starts, fresh, star, group_of):
     first = 0  # run that begins the group
     bars = 0
     for run in range(len(heads)):
-        count = np.int64(starts[run + 1]) - np.int64(starts[run])
-        head, before = np.int64(heads[run]), np.int64(heads[run - 1]) if run else np.int64(-1)
+        count, head = starts[run + 1] - starts[run], heads[run]
         alike = run > 0 and not fresh[run]
         if alike and not star[run]:
-            alike = np.int64(fars[run]) - head == np.int64(fars[run - 1]) - before and head > before
-            span = head + count - np.int64(heads[first]) // LANES * LANES
+            alike = fars[run] - head == fars[run - 1] - heads[run - 1] and head > heads[run - 1]
+            span = head + count - heads[first] // LANES * LANES
             alike = alike and span <= CHUNK and span <= _MOST * (bars + count) + LANES
         if not alike:
             groups += 1

@@ -87,14 +87,11 @@ def motion_of(entry: Support | WallKeys) -> Motion | None:
         return _accelerated(np.array(entry.acceleration, dtype=np.float64))
     if entry.motion is not None:
         rows = np.array(entry.motion, dtype=np.float64)
-        smooth = getattr(entry, "interpolation", "smooth") == "smooth"
-        return Motion(rows[:, 0], pieces(rows[:, 0], rows[:, 1:], smooth), jumps=not smooth)
+        return _through(rows[:, 0], rows[:, 1:], getattr(entry, "interpolation", "smooth"))
     if entry.velocity is not None and has_rows(entry.velocity):
         return _moving(np.array(entry.velocity, dtype=np.float64))
     if entry.velocity is not None and any(entry.velocity):
-        coefficients = np.zeros((1, 4, 3))
-        coefficients[0, 1] = entry.velocity
-        return Motion(np.zeros(1), coefficients)
+        return _uniform(entry.velocity)
     return None
 
 
@@ -103,13 +100,21 @@ def rotation_of(wall: WallKeys) -> Motion | None:
     if wall.rotation is None:
         return None
     if wall.rotation.angles is None:
-        coefficients = np.zeros((1, 4, 3))
-        coefficients[0, 1, 0] = wall.rotation.angular_velocity
-        return Motion(np.zeros(1), coefficients)
+        return _uniform((wall.rotation.angular_velocity, 0.0, 0.0))
     rows = np.array(wall.rotation.angles, dtype=np.float64)
     values = np.column_stack([rows[:, 1], np.zeros((len(rows), 2))])
-    smooth = wall.rotation.interpolation == "smooth"
-    return Motion(rows[:, 0], pieces(rows[:, 0], values, smooth), jumps=not smooth)
+    return _through(rows[:, 0], values, wall.rotation.interpolation)
+
+
+def _uniform(velocity: Sequence[float]) -> Motion:
+    coefficients = np.zeros((1, 4, 3))
+    coefficients[0, 1] = velocity
+    return Motion(np.zeros(1), coefficients)
+
+
+def _through(times: np.ndarray, values: np.ndarray, interpolation: str) -> Motion:
+    smooth = interpolation == "smooth"
+    return Motion(times, pieces(times, values, smooth), jumps=not smooth)
 
 
 def pieces(times: np.ndarray, values: np.ndarray, smooth: bool) -> np.ndarray:
@@ -131,6 +136,8 @@ def pieces(times: np.ndarray, values: np.ndarray, smooth: bool) -> np.ndarray:
 
 def spline_slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the slopes (n,) of the cubic spline through values (n,), zero at both ends and at intervals of rest."""
+    from scipy.linalg import solve_banded  # takes longer than most cases need
+
     width = np.diff(times)
     rate = np.diff(values) / width
     still = np.zeros(len(times), dtype=bool)
@@ -140,18 +147,12 @@ def spline_slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
     still[1:] |= rests
     # continuity of the second derivative at row i:
     # m[i-1]/w[i-1] + 2 m[i] (1/w[i-1] + 1/w[i]) + m[i+1]/w[i] = 3 (rate[i-1]/w[i-1] + rate[i]/w[i])
-    inverse = (1.0 / width).tolist()
-    right = (3.0 * rate / width).tolist()
-    fixed = still.tolist()
-    slopes, factors = [0.0] * len(times), [0.0] * len(times)
-    for i in range(1, len(times) - 1):
-        if not fixed[i]:
-            pivot = 2.0 * (inverse[i - 1] + inverse[i]) - inverse[i - 1] * factors[i - 1]
-            factors[i] = inverse[i] / pivot
-            slopes[i] = (right[i - 1] + right[i] - inverse[i - 1] * slopes[i - 1]) / pivot
-    for i in range(len(times) - 2, 0, -1):
-        slopes[i] -= factors[i] * slopes[i + 1]
-    return np.array(slopes)
+    inverse, right = np.pad(1.0 / width, 1), np.pad(3.0 * rate / width, 1)
+    bands = np.zeros((3, len(times)))
+    bands[0, 1:] = np.where(still[:-1], 0.0, inverse[1:-1])
+    bands[1] = 2.0 * (inverse[:-1] + inverse[1:])
+    bands[2, :-1] = np.where(still[1:], 0.0, inverse[1:-1])
+    return solve_banded((1, 1), bands, np.where(still, 0.0, right[:-1] + right[1:]))
 
 
 def _rests(width: np.ndarray, rate: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from ..mesh.ordering import NODE_BLOCK
 from .chunk_laws import ROW
 from .compiled import inlined, kernel
-from .layout import DIFFERENCES, FORCES, BarLayout, aligned, new_components, split_components, spread_values
+from .layout import DIFFERENCES, FORCES, BarLayout, Group, aligned, new_components, split_components, spread_values
 
 if TYPE_CHECKING:
     from .bars import Bars
@@ -118,15 +118,15 @@ def _end(first, end, nodal, u, sums, out):
 
 
 @inlined
-def _add_products_of_runs(n, head, far, first, origin, x, u, stored, sums, work):
-    """Add the products of n columns to the upper ends, and subtract them from the lower ones in a workspace for the
-    nodes of a block, which begins at ``origin``."""
-    for k in range(n):
-        a, b, i, at = np.uint64(head + k), np.uint64(far + k), np.uint64(first + k), np.uint64(head - origin + k)
+def _add_products_of_runs(g, x, u, stored, sums, work):
+    """Add the products of a group of runs to the upper ends, and subtract them from the lower ones in a workspace for
+    the nodes of a block, at the place of the group in it."""
+    for k in range(g.n):
+        a, b, i, at = np.uint64(g.head + k), np.uint64(g.far + k), np.uint64(g.first + k), np.uint64(g.at + k)
         dx, dy, dz = x[0, b] - x[0, a], x[1, b] - x[1, a], x[2, b] - x[2, a]
         ux, uy, uz = u[0, b] - u[0, a], u[1, b] - u[1, a], u[2, b] - u[2, a]
-        c, g = stored[0, i] * (dx * ux + dy * uy + dz * uz), stored[1, i]
-        px, py, pz = c * dx + g * ux, c * dy + g * uy, c * dz + g * uz
+        c, across = stored[0, i] * (dx * ux + dy * uy + dz * uz), stored[1, i]
+        px, py, pz = c * dx + across * ux, c * dy + across * uy, c * dz + across * uz
         work[_X + at] -= px
         work[_Y + at] -= py
         work[_Z + at] -= pz
@@ -149,10 +149,11 @@ def _flush(origin, count, sums, work):
 
 
 @inlined
-def _add_products_of_stars(first_run, end, first, nodes, bars, far, x, u, stored, sums):
-    """Add the products of a group of stars, whose first column is ``first``."""
-    ahead = first - np.int64(bars[first_run])
-    for run in range(first_run, end):
+def _add_products_of_stars(g, runs, x, u, stored, sums):
+    """Add the products of a group of stars; ``runs``: nodes, bars and far ends of the layout."""
+    nodes, bars, far = runs
+    ahead = g.first - np.int64(bars[g.run])
+    for run in range(g.run, g.end):
         a = np.uint64(nodes[run])
         ax, ay, az = x[0, a], x[1, a], x[2, a]
         px, py, pz = u[0, a], u[1, a], u[2, a]
@@ -161,9 +162,8 @@ def _add_products_of_stars(first_run, end, first, nodes, bars, far, x, u, stored
             b, i = np.uint64(far[k]), np.uint64(ahead + k)
             dx, dy, dz = x[0, b] - ax, x[1, b] - ay, x[2, b] - az
             ux, uy, uz = u[0, b] - px, u[1, b] - py, u[2, b] - pz
-            c = stored[0, i] * (dx * ux + dy * uy + dz * uz)
-            g = stored[1, i]
-            fx, fy, fz = c * dx + g * ux, c * dy + g * uy, c * dz + g * uz
+            c, across = stored[0, i] * (dx * ux + dy * uy + dz * uz), stored[1, i]
+            fx, fy, fz = c * dx + across * ux, c * dy + across * uy, c * dz + across * uz
             sx += fx
             sy += fy
             sz += fz
@@ -182,11 +182,13 @@ def multiply(layout, x, vectors, stored, sums, work, task):
 
     Vectors are split shortly before they are needed, and products written as soon as they are complete.
     """
-    nodal, u, out = task.nodal, task.u, task.out
+    nodal, u, out, runs = task.nodal, task.u, task.out, (layout.nodes, layout.bars, layout.far)
     begun, ended, origin, wide = np.int64(0), np.int64(0), np.int64(-1), np.int64(0)
     for group in range(len(layout.heads)):
         first, head, star = layout.starts[group], layout.heads[group], layout.stars[group]
+        n = layout.starts[group + 1] - first
         block = np.int64(-1) if star else head // NODE_BLOCK * NODE_BLOCK
+        g = Group(first, n, head, layout.fars[group], layout.runs[group], layout.runs[group + 1], star, head - block, n)
         if block != origin and origin >= 0:
             _flush(origin, wide, sums, work)
             wide = np.int64(0)
@@ -198,14 +200,10 @@ def multiply(layout, x, vectors, stored, sums, work, task):
             _begin(begun, task.needed[group], u, vectors, sums)
             begun = task.needed[group]
         if star:
-            runs = layout.runs[group], layout.runs[group + 1]
-            _add_products_of_stars(
-                runs[0], runs[1], first, layout.nodes, layout.bars, layout.far, x, vectors, stored, sums
-            )
+            _add_products_of_stars(g, runs, x, vectors, stored, sums)
         else:
-            n = layout.starts[group + 1] - first
-            wide = max(wide, head - origin + n)
-            _add_products_of_runs(n, head, layout.fars[group], first, origin, x, vectors, stored, sums, work)
+            wide = max(wide, g.at + n)
+            _add_products_of_runs(g, x, vectors, stored, sums, work)
     if origin >= 0:
         _flush(origin, wide, sums, work)
     nodes = len(u) // 3

@@ -86,7 +86,6 @@ def breakable(law: Law) -> Law:
         energies=(*law.energies, "rupture_dissipation"),
         smooth=False,
         mean_stress=None if law.mean_stress is None else _mean_stress(law.mean_stress, count),
-        mean_correction=None if law.mean_correction is None else _correction(law.mean_correction, count),
         modulus=None if law.modulus is None else _modulus(law.modulus),
         rupture=count,
         whole=law,
@@ -206,13 +205,3 @@ def _mean_stress(law: Callable[..., Any], count: int) -> Callable[..., Any]:
 
 def _modulus(law: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
     return lambda p, temperatures: law(p[_OF_LAW:], temperatures)
-
-
-def _correction(law: Callable[..., np.ndarray], count: int) -> Callable[..., np.ndarray]:
-    def mean_correction(p: Any, stress: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        left = 1.0 - np.abs(before[count])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            change = np.where(left > 0.0, stress / left, 0.0)
-        return left * law(p[_OF_LAW:], change, before[:count], after[:count])
-
-    return mean_correction

@@ -15,7 +15,7 @@ from .supports import axes_of
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from .block_pattern import BlockPattern
+    from .elements import BlockPattern
 
 
 class Springs:

@@ -10,8 +10,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..mechanics.block_pattern import BlockPattern
 from ..mechanics.compiled import kernel
+from ..mechanics.elements import BlockPattern, MatrixRows, add_bars
 
 if TYPE_CHECKING:
     from ..contact.transform import RowCoordinates, Transform
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def turn_blocks(ptr, local_columns, place, left, right, values):
     """Multiply the rows of nodes by matrices ``left`` (m, 3, 3), and their columns by ``right``, from the right.
 
-    ``ptr``, ``local_columns``, ``values``: of a :class:`~pfem_petsc.mechanics.block_pattern.BlockPattern`; ``place``
+    ``ptr``, ``local_columns``, ``values``: of a :class:`~pfem_petsc.mechanics.elements.BlockPattern`; ``place``
     (local,): of a node among the m, -1 for others.
     """
     block = np.zeros((3, 3))
@@ -63,23 +63,6 @@ def _add_lumped(ptr, diagonal, inertia, values):
         at = 6 * ptr[row] + 3 * diagonal[row]
         for i in range(3):
             values[at + i * (width + 1)] += inertia[row]
-
-
-@kernel
-def _add_bars(bars, stored, ptr, slots, values):
-    for k in range(len(bars)):
-        for s in range(4):
-            slot = slots[k, s]
-            if slot < 0:
-                continue
-            row = bars[k, s // 2]
-            sign = 1.0 if s % 2 == 0 else -1.0
-            width = 3 * (ptr[row + 1] - ptr[row])
-            at = 6 * ptr[row] + 3 * slot
-            for i in range(3):
-                for j in range(3):
-                    values[at + i * width + j] += sign * stored[3, k] * stored[i, k] * stored[j, k]
-                values[at + i * (width + 1)] += sign * stored[4, k]
 
 
 @kernel
@@ -320,7 +303,7 @@ class HessianMatrix:
 
     def add_bars(self, stored: np.ndarray, values: np.ndarray) -> None:
         """Add the bars' stiffness from the data of :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`, (5, b)."""
-        _add_bars(self.mesh.bars, stored, self.pattern.ptr, self.pattern.slots, values)
+        add_bars(stored, MatrixRows(self.pattern.ptr, self.pattern.slots, values, self.mesh.bars))
 
     def constrain(self, scale: float, values: np.ndarray) -> None:
         """Replace rows and columns of prescribed components by ``scale`` on the diagonal."""

@@ -15,6 +15,7 @@ from petsc4py import PETSc
 
 from ..mechanics.chunk_laws import CHUNK
 from ..mechanics.compiled import inlined, kernel
+from ..mechanics.elements import end_difference
 from ..mechanics.mass import consistent_product
 from ..mechanics.products import BarProducts
 
@@ -165,13 +166,10 @@ class Extension:
 def add_blocks(bars, x, stored, blocks):
     """Add the diagonal blocks (local nodes, 6): xx, xy, xz, yy, yz, zz."""
     for k in range(len(bars)):
-        a, b = bars[k, 0], bars[k, 1]
-        dx = x[b, 0] - x[a, 0]
-        dy = x[b, 1] - x[a, 1]
-        dz = x[b, 2] - x[a, 2]
-        c = stored[0, k]
-        g = stored[1, k]
-        for i in (a, b):
+        dx, dy, dz = end_difference(x, bars, k)
+        c, g = stored[0, k], stored[1, k]
+        for end in range(2):
+            i = bars[k, end]
             blocks[i, 0] += c * dx * dx + g
             blocks[i, 1] += c * dx * dy
             blocks[i, 2] += c * dx * dz
@@ -184,12 +182,11 @@ def add_blocks(bars, x, stored, blocks):
 def drop_negative(bars, x, stored):
     """Replace negative eigenvalues of the bars' stiffness, g and c d.d + g, by zero."""
     for k in range(len(bars)):
-        c = stored[0, k]
-        g = stored[1, k]
+        c, g = stored[0, k], stored[1, k]
         if c >= 0.0 and g >= 0.0:
             continue
-        a, b = bars[k, 0], bars[k, 1]
-        square = (x[b, 0] - x[a, 0]) ** 2 + (x[b, 1] - x[a, 1]) ** 2 + (x[b, 2] - x[a, 2]) ** 2
+        dx, dy, dz = end_difference(x, bars, k)
+        square = dx * dx + dy * dy + dz * dz
         left = max(g, 0.0)
         stored[0, k] = (max(c * square + g, 0.0) - left) / square if square > 0.0 else 0.0
         stored[1, k] = left

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
-from ..mechanics.block_pattern import expand_columns
 from ..mechanics.compiled import kernel
+from ..mechanics.elements import expand_columns
 from ..mesh.exchange import Router
 from .background_grid import BackgroundGrid, Summands, arrange, assemble, interpolate, neighbours, restrict, stabilise
 from .linear import reproducible_products

@@ -146,6 +146,8 @@ class CriticalPoints:
         At a bifurcation the equations are singular, and Newton's method needs too many iterations; beside it the value
         is accurate.
         """
+        from scipy.interpolate import barycentric_interpolate
+
         before = [trial for trial in tried if trial[1] > 0.0]
         beyond = [trial for trial in tried if trial[1] <= 0.0]
         low = max(before)[0] if before else first.size
@@ -158,11 +160,8 @@ class CriticalPoints:
             size = guess + side * _BESIDE * self.size
             if size not in [trial[0] for trial in tried]:
                 tried.append((size, value(self._at(size))))
-        near = np.array(sorted(tried, key=lambda trial: abs(trial[0] - guess))[:4])
-        sizes, values = near.T
-        others = [np.delete(values, k) for k in range(len(values))]
-        weights = [np.prod(other / (other - f)) for f, other in zip(values, others, strict=True)]
-        return float(np.dot(weights, sizes))
+        sizes, values = np.array(sorted(tried, key=lambda trial: abs(trial[0] - guess))[:4]).T
+        return float(barycentric_interpolate(values, sizes, 0.0))
 
     def _crossing(self, size: float, beyond: Point) -> Point:
         """Return the point at a bifurcation, interpolated between points on both sides of it.
@@ -173,7 +172,7 @@ class CriticalPoints:
         before = self._at(low) if low > _BESIDE * self.size else self.first
         low = max(low, 0.0) if before is not self.first else 0.0
         u, load_factor, tangent, slope = self._cubic(before, low, beyond, self.control.measure(beyond), size)
-        length = self.points.metric.length(tangent, slope)
+        length = self.points.metric.length(tangent)
         return replace(beyond, u=u, load_factor=load_factor, tangent=tangent / length, slope=slope / length)
 
     def _end(self, point: Point) -> _End:
@@ -191,22 +190,17 @@ class CriticalPoints:
         self, first: Point, low: float, second: Point, high: float, size: float
     ) -> tuple[np.ndarray, float, np.ndarray, float]:
         """Return displacement, load factor and their derivatives at a length, by cubic interpolation of two points."""
-        h = high - low
-        t = (size - low) / h
-        values = (
-            (1.0 + 2.0 * t) * (1.0 - t) ** 2,
-            t * t * (3.0 - 2.0 * t),
-            t * (1.0 - t) ** 2 * h,
-            t * t * (t - 1.0) * h,
-        )
-        rates = 6.0 * t * (t - 1.0) / h, 6.0 * t * (1.0 - t) / h, (1.0 - t) * (1.0 - 3.0 * t), t * (3.0 * t - 2.0)
+        from scipy.interpolate import CubicHermiteSpline  # takes longer than most paths need
+
         # lengths are not measured along the path: that of an arc is a chord
-        speeds = [self.control.rate(point) for point in (first, second)]
-        u = np.stack([first.u, second.u, first.tangent / speeds[0], second.tangent / speeds[1]])
-        slopes = [first.slope / speeds[0], second.slope / speeds[1]]
-        loads = np.array([first.load_factor, second.load_factor, *slopes])
-        at, along = np.tensordot(values, u, 1), np.tensordot(rates, u, 1)
-        return at, float(np.dot(values, loads)), along, float(np.dot(rates, loads))
+        points = [
+            (np.append(point.u, point.load_factor), np.append(point.tangent, point.slope)) for point in (first, second)
+        ]
+        rates = [rate / self.control.rate(point) for (_, rate), point in zip(points, (first, second), strict=True)]
+        curve = CubicHermiteSpline([low, high], [value for value, _ in points], rates)
+        at, along = curve(size), curve(size, 1)
+        shape = first.u.shape
+        return at[:-1].reshape(shape), float(at[-1]), along[:-1].reshape(shape), float(along[-1])
 
     def _locate(
         self,

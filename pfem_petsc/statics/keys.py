@@ -70,11 +70,6 @@ class PathKeys(Increments):
     branch_mode: PositiveInt = 1
     """which of the critical modes, where a bifurcation has several: 1, 2, ..., n, then sums and differences of pairs"""
 
-    @property
-    def spherical(self) -> bool:
-        """Whether the load factor counts in lengths."""
-        return False
-
     @model_validator(mode="after")
     def _consistent(self) -> PathKeys:
         if (self.node_set is None) != (self.direction is None):

@@ -202,42 +202,36 @@ class BorderedSystem:
 
 @dataclass
 class Metric:
-    """Length of (u, change): cylindrical, sqrt(w u.u), or spherical, sqrt((w u.u + change^2)/2).
+    """Length sqrt(w u.u) of displacements u, in units of the load factor.
 
     Attributes
     ----------
     comm : MPI.Comm
-    spherical : whether the load factor counts
     weight : w, one over the square of the first response [1/m2]
     """
 
     comm: MPI.Comm
-    spherical: bool
     weight: float = 1.0
 
-    def product(self, u: np.ndarray, change: float, other: np.ndarray, other_change: float) -> float:
-        """Return the inner product of two displacements (owned, 3) with changes of the load factor. Collective."""
-        by_u = self.weight * dot(self.comm, u, other)
-        return 0.5 * (by_u + change * other_change) if self.spherical else by_u
+    def product(self, u: np.ndarray, other: np.ndarray) -> float:
+        """Return the inner product of two displacements (owned, 3). Collective."""
+        return self.weight * dot(self.comm, u, other)
 
-    def length(self, u: np.ndarray, change: float) -> float:
-        """Return the length of a displacement with a change of the load factor. Collective."""
-        return float(np.sqrt(self.product(u, change, u, change)))
+    def length(self, u: np.ndarray) -> float:
+        """Return the length of a displacement (owned, 3). Collective."""
+        return float(np.sqrt(self.product(u, u)))
 
 
 class Arc:
-    """The point of a path at a distance, by the constraint (|(u, change)|^2 - s^2)/(2 s) = 0, where ``change`` is that
-    of the load factor."""
+    """The point of a path at a distance, by the constraint (|u|^2 - s^2)/(2 s) = 0."""
 
     def __init__(self, metric: Metric, size: float) -> None:
         self.metric, self.size = metric, size
 
     def terms(self, u: np.ndarray, change: float) -> tuple[float, np.ndarray, float]:
         """Return the value, and its derivatives by u (owned, 3) and by the load factor. Collective."""
-        metric, s = self.metric, self.size
-        value = (metric.product(u, change, u, change) - s * s) / (2.0 * s)
-        share = 0.5 if metric.spherical else 1.0
-        return value, (share * metric.weight / s) * u, share * change / s if metric.spherical else 0.0
+        s = self.size
+        return (self.metric.product(u, u) - s * s) / (2.0 * s), (self.metric.weight / s) * u, 0.0
 
 
 class Direction:
@@ -313,7 +307,7 @@ class Point:
     Attributes
     ----------
     u : (owned, 3) displacement from the last point [m]
-    load_factor : at the point; ``start`` at the last one
+    load_factor : at the point
     tangent, slope : unit tangent of the path: displacement part (owned, 3) [m] and change of the load factor
     negatives : number of negative eigenvalues of the stiffness, -1 if not computed
     nearest : magnitude of the eigenvalue nearest to zero [N/m]
@@ -322,17 +316,11 @@ class Point:
 
     u: np.ndarray
     load_factor: float
-    start: float
     tangent: np.ndarray
     slope: float
     negatives: int
     nearest: float
     newton: int
-
-    @property
-    def change(self) -> float:
-        """Change of the load factor from the last point."""
-        return self.load_factor - self.start
 
 
 _LEAST = 1e-9  # displacement along the direction per length of the path, below which it decreases
@@ -355,12 +343,12 @@ class ArcControl:
 
     def measure(self, point: Point) -> float:
         """Return the measure of a point. Collective."""
-        return self.metric.length(point.u, point.change)
+        return self.metric.length(point.u)
 
     def rate(self, point: Point) -> float:
         """Return the derivative of the measure along the tangent at a point. Collective."""
-        length = self.metric.length(point.u, point.change)
-        return self.metric.product(point.u, point.change, point.tangent, point.slope) / length if length else 1.0
+        length = self.metric.length(point.u)
+        return self.metric.product(point.u, point.tangent) / length if length else 1.0
 
     def length(self, size: float, tangent: np.ndarray) -> float:
         """Return the length along the tangent at the state that reaches a measure. Collective."""
@@ -453,7 +441,7 @@ class PointSolver:
         NotConverged
             On all ranks.
         """
-        start, guess = self.state.time, (u, load_factor)
+        guess = u, load_factor
         try:
             u, load_factor, newton = self.newton(constraint, u.copy(), load_factor)
         except NotConverged:
@@ -464,10 +452,9 @@ class PointSolver:
                 constraint = self._work(guess[0])
             u, load_factor, newton = self.newton(constraint, *self._unloading(constraint, *guess), careful=True)
         tangent, slope = self.tangent(u, load_factor)
-        if self.metric.product(u, load_factor - start, tangent, slope) < 0.0:
+        if self.metric.product(u, tangent) < 0.0:
             tangent, slope = -tangent, -slope
-        negatives, nearest = self.spectrum(u)
-        return Point(u, load_factor, start, tangent, slope, negatives, nearest, newton)
+        return Point(u, load_factor, tangent, slope, *self.spectrum(u), newton)
 
     def newton(
         self, constraint: Arc | Linear, u: np.ndarray, load_factor: float, careful: bool = False
@@ -582,7 +569,7 @@ class PointSolver:
         """Return the unit tangent at an equilibrium along which the load factor increases."""
         self.system.linearise(u)
         v = self.system.response(u, load_factor)
-        length = self.metric.length(v, 1.0)
+        length = self.metric.length(v)
         return v / length, 1.0 / length
 
     def spectrum(self, u: np.ndarray) -> tuple[int, float]:
@@ -601,12 +588,10 @@ class PointSolver:
         self.stability.matrix.update(self.system.problem, point.u)
         found = []
         for mode in self.stability.modes(count):
-            along = self.metric.product(mode, 0.0, point.tangent, 0.0)
-            mode = (
-                mode - along / max(self.metric.product(point.tangent, 0.0, point.tangent, 0.0), 1e-300) * point.tangent
-            )
-            found.append(mode / self.metric.length(mode, 0.0))
+            along = self.metric.product(mode, point.tangent) / max(self.metric.length(point.tangent) ** 2, 1e-300)
+            mode = mode - along * point.tangent
+            found.append(mode / self.metric.length(mode))
         pairs = [
             (found[i] + sign * found[j]) for i in range(count) for j in range(i + 1, count) for sign in (1.0, -1.0)
         ]
-        return found + [pair / self.metric.length(pair, 0.0) for pair in pairs]
+        return found + [pair / self.metric.length(pair) for pair in pairs]

@@ -85,7 +85,7 @@ class PathStepper(StaticStepper):
         self.keys = keys
         self.scheme = PathEquilibrium()
         self.end = float(keys.max_points)  # of the clock
-        self.metric = Metric(model.comm, keys.spherical)
+        self.metric = Metric(model.comm)
         self.direction = None
         if keys.node_set is not None:
             self.direction = Direction(model, keys.node_set, keys.direction)
@@ -311,9 +311,9 @@ class PathStepper(StaticStepper):
             )
         self.weight = self.metric.weight = 1.0 / size**2
         sign = self.control.orient(response, size)
-        length = self.metric.length(response, 1.0)
+        length = self.metric.length(response)
         tangent, slope = sign * response / length, sign / length
-        return Point(u, state.time, state.time, tangent, slope, *points.spectrum(u), newton), moved
+        return Point(u, state.time, tangent, slope, *points.spectrum(u), newton), moved
 
     def _next_point(self, size: float) -> tuple[Point, list[Event], str]:
         """Return the point at a length or at a limit before it, the critical points on the way, and the limit reached.
@@ -372,7 +372,7 @@ class PathStepper(StaticStepper):
         cornered = bool(self.scale and self.model.bars.kept_names)
         if cornered and self.direction.of(point.tangent) < 0.0:  # where bars yield the path may turn by any angle
             point = replace(point, tangent=-point.tangent, slope=-point.slope)
-        cosine = self.metric.product(point.tangent, point.slope, self.state.memory["tangent"], self.slope)
+        cosine = self.metric.product(point.tangent, self.state.memory["tangent"])
         if cosine < _TURN and 0.5 * size >= self.keys.smallest:
             raise NotConverged(
                 f"{self.points.place}: the path turns by {np.degrees(np.arccos(max(cosine, -1.0))):.3g} degrees"
@@ -500,7 +500,7 @@ class PathStepper(StaticStepper):
         if not abs(along) > 1e-12 * size:
             u, load_factor, newton = points.newton(self._load_factor(-state.time, self.arc), zero, state.time)
             tangent, slope = state.memory["tangent"], self.slope
-            return Point(u, load_factor, state.time, tangent, slope, *points.spectrum(u), newton), PARTED
+            return Point(u, load_factor, tangent, slope, *points.spectrum(u), newton), PARTED
         point = points.find(Linear(comm, gradient, 0.0, self.arc), zero, state.time)
         sign = np.sign(dot(comm, gradient, point.tangent))
         return replace(point, tangent=sign * point.tangent, slope=float(sign * point.slope)), ""

@@ -571,7 +571,7 @@ class StaticStepper(ImplicitStepper):
         square = dot(self.model.comm, response, response)
         if not square:  # nothing changes with the load factor
             return ""
-        metric = Metric(self.model.comm, False, 1.0 / square)
+        metric = Metric(self.model.comm, 1.0 / square)
         points, softest = PointSolver(state, system, metric, False), 1.0
         for length in size * _LENGTHS:
             try:
@@ -580,7 +580,7 @@ class StaticStepper(ImplicitStepper):
                 continue
             if point.slope < 0.0:
                 return "it is a limit point: beyond it the load falls, as bars yield or unload"
-            if point.change > size:
+            if point.load_factor - state.time > size:
                 return ""
             softest = min(softest, point.slope)
         if not softest < _SOFT:

@@ -23,8 +23,7 @@ from ..solvers.linear import LinearChoice, MassSolver, unsymmetric
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
 from ..solvers.newton import Forcing, NewtonSolver, Tolerance, zero_tolerance
-from ..solvers.node_loops import extend, extrapolate, motion_energy, net_force, squares, translate
-from ..solvers.problem import StepProblem
+from ..solvers.problem import StepProblem, extend, extrapolate, motion_energy, net_force, squares, translate
 from ..tolerances import ON_BOUND
 from .guard import StepGuard
 from .stepper import AttributeOf, Solution, Stepper

@@ -144,14 +144,10 @@ class BarChanges:
 
     def _mean_stress(self, before: dict, k: int, block: BarBlock) -> np.ndarray:
         """Return the mean stress of the counted bars of a block in the step [Pa]."""
-        counted = slice(block.counted - block.start)
         first, last, viscous = self._ends(before, k, block)
         mean = 0.5 * (first + last) + viscous
         if block.law.mean_of_work:
             return self._mean_of_work(before, block, mean)
-        if block.law.mean_correction is not None:
-            variables = before["_variables"][k][:, counted], self._variables[k][:, counted]
-            mean += block.law.mean_correction(block.parameters, last - first, *variables)
         return mean
 
     def _mean_of_work(self, before: dict, block: BarBlock, mean: np.ndarray) -> np.ndarray:

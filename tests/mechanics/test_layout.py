@@ -1,4 +1,4 @@
-"""Runs and chunks of bars, and the order that makes runs of them."""
+"""Runs and groups of bars, and the order that makes runs of them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pfem_petsc.mechanics.layout import (
     gather_values,
     group_of,
     make_layout,
-    make_sweep,
     run_column,
     spread_values,
 )
@@ -20,31 +19,13 @@ from pfem_petsc.mesh.ordering import LEAST_RUN, NODE_BLOCK, bar_order
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=60), st.booleans(), st.data())
-def test_every_bar_is_in_one_run_of_one_chunk(ends, drawn_in_order, data):
+def test_every_bar_is_in_one_run_of_one_group(ends, drawn_in_order, data):
     bars = np.array(ends, dtype=np.int32).reshape(-1, 2)
     if drawn_in_order:
         bars = bars[bar_order(bars, None, 7)]
     start = data.draw(st.integers(0, len(bars)))
     stop = data.draw(st.integers(start, len(bars)))
     counted = data.draw(st.integers(start, stop))
-    chunk = data.draw(st.integers(1, 9))
-    sweep = make_sweep(bars, start, counted, stop, chunk)
-    starts, chunks = sweep.starts, sweep.chunks
-    low, high = bars.min(axis=1), bars.max(axis=1)
-    assert len(starts) == len(sweep.heads) + 1 and starts[-1] == stop
-    assert chunks[0] == 0 and chunks[-1] == len(sweep.heads)
-    assert len(sweep.heads) == 0 or starts[0] == start
-    for number in range(len(chunks) - 1):
-        first, last = int(starts[chunks[number]]), int(starts[chunks[number + 1]])
-        assert 0 < last - first <= chunk
-        assert last <= counted if number < sweep.counted else first >= counted
-        for run in range(chunks[number], chunks[number + 1]):
-            bar = np.arange(starts[run], starts[run + 1])
-            assert len(bar)
-            step = bar - bar[0] if sweep.diagonal[number] else 0
-            np.testing.assert_array_equal(low[bar], sweep.heads[run] + step)
-            if sweep.diagonal[number]:
-                np.testing.assert_array_equal(high[bar], sweep.fars[run] + step)
     check_layout(bars, (start, counted, stop))
 
 
@@ -100,17 +81,17 @@ def test_a_lattice_goes_by_diagonals_and_chance_by_stars():
     nodes = int(bars.max()) + 1
     mixed = bars[random.permutation(len(bars))]
     mixed = mixed[bar_order(mixed, None, nodes)]
-    sweep = make_sweep(mixed, 0, len(mixed), len(mixed))
-    assert sweep.diagonal.all()
-    assert len(mixed) > 8 * len(sweep.heads)
+    layout = make_layout(mixed, [(0, len(mixed), len(mixed))])
+    assert not layout.stars.any()
+    assert len(mixed) > 8 * len(layout.nodes)
     numbers = random.permutation(nodes).astype(np.int32)
     scattered = numbers[bars]
     scattered = scattered[bar_order(scattered, None, nodes)]
-    sweep = make_sweep(scattered, 0, len(scattered), len(scattered))
-    assert not sweep.diagonal.any()
+    layout = make_layout(scattered, [(0, len(scattered), len(scattered))])
+    assert layout.stars.all()
     low = scattered.min(axis=1)
     assert (np.diff(low) >= 0).all()
-    assert len(sweep.heads) <= len(np.unique(low)) + len(sweep.diagonal)
+    assert len(layout.nodes) <= len(np.unique(low)) + len(layout.heads)
 
 
 def test_groups_are_of_blocks_of_nodes():

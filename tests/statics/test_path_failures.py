@@ -42,7 +42,6 @@ FOLLOWED = {"node_set": "apex", "direction": [0.0, 0.0, -1.0]}
         ({"method": "arc_length", "step": 0.1, "max_step": 0.01}, "max_step = 0.01 is smaller"),
         ({"method": "arc_length", "branch_at": [0]}, "from 1"),
         ({"method": "arc_length", "branch_at": [1], "critical_points": False}, "critical_points"),
-        ({"method": "displacement", **FOLLOWED, "constraint": "spherical"}, "constraint"),
     ],
 )
 def test_keys_that_are_refused(static, words):
@@ -81,7 +80,6 @@ def test_path_that_cannot_go_on_keeps_its_points(tmp_path):
 def test_displacement_that_turns_back(tmp_path):
     """The dome of 16 bars goes up again after the third limit point: displacement control says so and stops."""
     data = Case.load("dome_16").to_dict()
-    del data["static"]["constraint"]
     data["static"]["method"] = "displacement"
     text = failure(Case.from_dict(data), tmp_path / "a")
     assert "arc_length" in text

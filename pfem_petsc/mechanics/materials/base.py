@@ -92,7 +92,6 @@ def softened(law: Law) -> Law:
         internal=law.internal if dissipated is None else (*law.internal, *DENSITIES),
         smooth=False,
         mean_stress=mean_at_temperature if elastic else None,
-        mean_correction=None,
         mean_of_work=False,  # a change of the modulus changes energies too
         no_mean_stress="" if elastic else _REASON,
         modulus=modulus,
@@ -151,7 +150,6 @@ def damped(law: Law) -> Law:
         energies=(*law.energies, "viscous_dissipation"),
         rate=True,
         mean_stress=None if mean_stress is None else mean_with_damping,
-        mean_correction=_of_own(law.mean_correction),
         # energies are functions of strain and internal variables, unless the law itself depends on the rate
         mean_of_work=law.mean_of_work or (not law.rate and law.modulus is None),
         modulus=_of_own(law.modulus),
@@ -309,9 +307,6 @@ class Law:
         [Pa] over the step from stress0 and strain0 to strain, whose work is the change of energies, and its derivative
         with respect to strain; the rate over the step is :func:`mean_rate`. The energy-momentum scheme requires it;
         None: the scheme rejects the law
-    mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p without data of bars, the
-        change of stress and the internal variables before and after, (variables, bars), for the work of changing
-        temperatures; None for zero
     mean_of_work : whether ``mean_stress`` is the change of all energies over that of the strain, as by the function
         :func:`mean_of_work`; it then holds for the work of changing temperatures too
     static_limit : for a law with ``rate``: whether it has a limit at the rate zero, which static analyses use; the
@@ -334,7 +329,6 @@ class Law:
     rate: bool = False
     smooth: bool = False
     mean_stress: Callable[..., Any] | None = None
-    mean_correction: Callable[[tuple[float, ...], np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
     mean_of_work: bool = False
     static_limit: bool = False
     softening: Softening | None = None

@@ -13,8 +13,7 @@ from pydantic import Field
 
 from ...case.base import PositiveFloat
 from ..compiled import inlined
-from ._viscous import HardeningKeys, scale, stored, viscous_law
-from .voce import curve
+from ._plastic import HardeningKeys, curve, scale, stored, viscous_law
 
 __all__ = ["LAW", "Parameters", "flow_stress"]
 
@@ -34,7 +33,7 @@ class Parameters(HardeningKeys):
 
 @inlined
 def flow_stress(accumulated, rate, temperature, p):
-    """See :func:`~pfem_petsc.mechanics.materials._viscous.viscous_law`."""
+    """See :func:`~pfem_petsc.mechanics.materials._plastic.viscous_law`."""
     strength, slope, _, _ = curve(accumulated, p)
     factor = (rate * p[6]) ** p[7] if rate > 0.0 else 0.0
     return strength * (1.0 + factor), slope * (1.0 + factor), strength * factor * p[7], 0.0

@@ -5,26 +5,21 @@ linear law has a closed form: da = f_trial / (E + H + K). On the yield surface s
 plastic work is the function of state s_Y a + K a^2/2 + H e_p^2/2; its first term is heat, the rest is stored by
 hardening.
 
-In a step that yields during the last fraction q of the strain increment, the stress follows the line of modulus E up to
-the yield stress and the line of modulus Et from there. With the plastic strain de_p of the step its mean is
-
-    S = (s0 + s1)/2 + E de_p (1 - q)/2,   q = E de_p/((E - Et)(e1 - e0)),   dS/de1 = (Et + (E - Et)(1 - q)^2)/2.
-
-The energies are functions of state on that path, so the work S (e1 - e0) is the change of elastic energy plus the
-plastic dissipation, which is nonnegative. The work of (s0 + s1)/2 would be less than the dissipation.
+The mean stress of a step is the change of the energies over that of the strain, as they are functions of state on the
+path of a step: its work is the change of elastic energy plus the plastic dissipation, which is nonnegative. The work of
+(s0 + s1)/2 would be less than the dissipation.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba.extending import register_jitable
 
 from ...case.base import NonNegativeFloat, PositiveFloat
-from .base import Law, MaterialKeys, Softening, yield_texts
+from .base import Law, MaterialKeys, Softening, mean_of_work, yield_texts
 
-__all__ = ["LAW", "Parameters", "mean_correction", "response"]
+__all__ = ["LAW", "Parameters", "response"]
 
 
 class Parameters(MaterialKeys):
@@ -77,34 +72,6 @@ def response(strain, rate, step, temperature, p, q):
 
 
 @register_jitable
-def mean_stress(stress0, strain0, strain, step, temperature, p, q):
-    """Return the mean stress of the step and its derivative; see the module."""
-    stress, modulus, (flowed, _), _ = response(strain, 0.0, step, temperature, p, q)
-    mean = 0.5 * (stress0 + stress)
-    if flowed != q[0]:
-        young, change = p[0], strain - strain0
-        lost = young - modulus
-        part = young * (flowed - q[0]) / (lost * change) if change != 0.0 else 1.0
-        part = min(max(part, 0.0), 1.0)  # clips rounding only: the start is not outside the yield surface
-        mean += 0.5 * young * (flowed - q[0]) * (1.0 - part)
-        modulus += lost * (1.0 - part) * (1.0 - part)
-    return mean, 0.5 * modulus
-
-
-def mean_correction(p: tuple[float, ...], stress: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the contribution of yielding to the mean stress of a step beyond (s0 + s1)/2: E de_p (1 - q)/2 [Pa].
-
-    ``stress`` s1 - s0 [Pa], internal variables (2, bars) ``before`` and ``after`` the step.
-    """
-    young, *_, inverse = p
-    flow = after[0] - before[0]
-    change = stress / young + flow
-    with np.errstate(divide="ignore", invalid="ignore"):
-        q = np.where(flow != 0.0, flow / (young * inverse * change), 1.0)
-    return 0.5 * young * flow * (1.0 - np.clip(np.nan_to_num(q, nan=1.0, posinf=1.0, neginf=1.0), 0.0, 1.0))
-
-
-@register_jitable
 def scale(p, modulus, strength):
     """Return the parameters at a temperature."""
     young, isotropic, kinematic = modulus * p[0], strength * p[2], strength * p[3]
@@ -121,7 +88,7 @@ LAW = Law(
     response,
     internal=(("plastic_strain", ""), ("accumulated_plastic_strain", "")),
     energies=("elastic_energy", "plastic_heat", "hardening_energy"),
-    mean_stress=mean_stress,
-    mean_correction=mean_correction,
+    mean_stress=mean_of_work(response),
+    mean_of_work=True,
     softening=Softening(scale, dissipated),
 )

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from ...case.base import NonNegativeFloat, PositiveFloat
 from ..compiled import inlined
-from ._viscous import viscous_law
+from ._plastic import viscous_law
 from .base import MaterialKeys, yield_texts
 
 __all__ = ["LAW", "Parameters", "flow_stress", "heating", "stored"]
@@ -65,7 +65,7 @@ class Parameters(MaterialKeys):
 
 @inlined
 def flow_stress(accumulated, rate, temperature, p):
-    """See :func:`~pfem_petsc.mechanics.materials._viscous.viscous_law`."""
+    """See :func:`~pfem_petsc.mechanics.materials._plastic.viscous_law`."""
     coefficient, exponent, by_log, reference = p[3], p[4], p[5], p[6]
     risen = coefficient * accumulated**exponent if accumulated > 0.0 else 0.0
     slope = 0.0

@@ -13,9 +13,9 @@ from pydantic import Field
 
 from ...case.base import PositiveFloat
 from ..compiled import inlined
-from ._isotropic import PlasticKeys, isotropic_law
+from ._plastic import PlasticKeys, isotropic_law
 
-__all__ = ["LAW", "Parameters", "curve", "mean", "power_mean", "scale"]
+__all__ = ["LAW", "Parameters", "curve", "scale"]
 
 
 class Parameters(PlasticKeys):
@@ -42,29 +42,9 @@ def curve(accumulated, p):
 
 
 @inlined
-def power_mean(accumulated, flow, exponent):
-    """Return the mean of a^n between a and a + x."""
-    above = exponent + 1.0
-    if not (flow > 0.0):
-        return accumulated**exponent
-    if accumulated <= 0.0:
-        return flow**exponent / above
-    ratio = flow / accumulated
-    if ratio > 0.5:
-        return ((accumulated + flow) ** above - accumulated**above) / (above * flow)
-    return accumulated**exponent * math.expm1(above * math.log1p(ratio)) / (above * ratio)
-
-
-@inlined
-def mean(accumulated, flow, p):
-    """Return the mean of R between a and a + x [Pa]."""
-    return p[2] + p[3] * power_mean(accumulated, flow, p[4])
-
-
-@inlined
 def scale(p, modulus, strength):
     """Return the parameters at a temperature."""
     return modulus * p[0], strength * p[1], strength * p[2], strength * p[3], p[4]
 
 
-LAW = isotropic_law(curve, mean, scale)
+LAW = isotropic_law(curve, scale)

@@ -14,10 +14,10 @@ from pydantic import Field, model_validator
 
 from ...case.base import Finite, listed
 from ..compiled import inlined
-from ._isotropic import isotropic_law
+from ._plastic import isotropic_law
 from .base import MaterialKeys, yield_texts
 
-__all__ = ["LAW", "Parameters", "curve", "find", "mean", "scale"]
+__all__ = ["LAW", "Parameters", "curve", "find", "scale"]
 
 _ELASTIC = 1e-3  # relative tolerance of the first row's strain, whose plastic part is then taken as zero
 
@@ -97,25 +97,6 @@ def curve(accumulated, p):
 
 
 @inlined
-def mean(accumulated, flow, p):
-    """Return the mean of R between a and a + x [Pa]: the sum over the pieces between."""
-    rows = p[3]
-    end = accumulated + flow
-    k = piece(accumulated, rows)
-    at = accumulated
-    total = 0.0
-    while True:
-        last = k == len(rows) - 1 or end <= rows[k + 1, 0]
-        to = end if last else rows[k + 1, 0]
-        total += (to - at) * (rows[k, 1] + rows[k, 2] * (0.5 * (at + to) - rows[k, 0]))
-        if last:
-            break
-        at = to
-        k += 1
-    return p[2] * total / (end - accumulated)
-
-
-@inlined
 def find(size, excess, stiffness, accumulated, p):
     """Return the plastic strain x of a step: |s_trial| - E x = R(a + x), piece by piece."""
     rows, factor = p[3], p[2]
@@ -136,4 +117,4 @@ def scale(p, modulus, strength):
     return modulus * p[0], p[1], strength * p[2], p[3]
 
 
-LAW = isotropic_law(curve, mean, scale, find)
+LAW = isotropic_law(curve, scale, find)

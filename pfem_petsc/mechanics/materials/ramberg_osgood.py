@@ -15,11 +15,10 @@ from pydantic import Field
 
 from ...case.base import PositiveFloat
 from ..compiled import inlined
-from ._isotropic import isotropic_law
+from ._plastic import isotropic_law
 from .base import MaterialKeys, yield_texts
-from .ludwik import power_mean
 
-__all__ = ["LAW", "Parameters", "curve", "mean", "scale"]
+__all__ = ["LAW", "Parameters", "curve", "scale"]
 
 
 class Parameters(MaterialKeys):
@@ -51,15 +50,9 @@ def curve(accumulated, p):
 
 
 @inlined
-def mean(accumulated, flow, p):
-    """Return the mean of R between a and a + x [Pa]."""
-    return p[2] * power_mean(accumulated / p[3], flow / p[3], p[4])
-
-
-@inlined
 def scale(p, modulus, strength):
     """Return the parameters at a temperature."""
     return modulus * p[0], p[1], strength * p[2], p[3], p[4]
 
 
-LAW = isotropic_law(curve, mean, scale)
+LAW = isotropic_law(curve, scale)

@@ -6,13 +6,11 @@ With Q = 0 it is the elastoplastic law.
 
 from __future__ import annotations
 
-import math
-
 from ...case.base import NonNegativeFloat
 from ..compiled import inlined
-from ._isotropic import PlasticKeys, isotropic_law
+from ._plastic import PlasticKeys, curve, isotropic_law
 
-__all__ = ["LAW", "Parameters", "curve", "mean", "scale"]
+__all__ = ["LAW", "Parameters", "curve", "scale"]
 
 
 class Parameters(PlasticKeys):
@@ -32,31 +30,9 @@ class Parameters(PlasticKeys):
 
 
 @inlined
-def curve(accumulated, p):
-    """Return R, dR/da, and the densities s_Y a and int(R - s_Y); p = (E, H, s_Y, K, Q, b, ...)."""
-    strength, linear, saturation, rate = p[2], p[3], p[4], p[5]
-    x = rate * accumulated
-    risen = -math.expm1(-x)
-    # int(1 - exp(-b a)) = a - (1 - exp(-b a))/b, by its series where the two terms cancel
-    part = accumulated * x * (0.5 - x * (1.0 / 6.0 - x / 24.0)) if x < 1e-4 else accumulated - risen / rate
-    stored = 0.5 * linear * accumulated * accumulated + saturation * part
-    slope = linear + saturation * rate * (1.0 - risen)
-    return strength + linear * accumulated + saturation * risen, slope, strength * accumulated, stored
-
-
-@inlined
-def mean(accumulated, flow, p):
-    """Return the mean of R between a and a + x [Pa]."""
-    x = p[5] * flow
-    share = -math.expm1(-x) / x if x > 0.0 else 1.0
-    risen = 1.0 - math.exp(-p[5] * accumulated) * share
-    return p[2] + p[3] * (accumulated + 0.5 * flow) + p[4] * risen
-
-
-@inlined
 def scale(p, modulus, strength):
     """Return the parameters at a temperature."""
     return modulus * p[0], strength * p[1], strength * p[2], strength * p[3], strength * p[4], p[5]
 
 
-LAW = isotropic_law(curve, mean, scale)
+LAW = isotropic_law(curve, scale)

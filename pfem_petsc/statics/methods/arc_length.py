@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from ..keys import PathKeys
 
@@ -14,19 +14,10 @@ if TYPE_CHECKING:
 __all__ = ["Parameters", "make_stepper"]
 
 
-class Parameters(PathKeys):
-    """Keys of the path, and of its measure."""
-
-    constraint: Literal["cylindrical", "spherical"] = "cylindrical"
-    """whether lengths are of displacements alone, or of displacements and load factor"""
-
-    @property
-    def spherical(self) -> bool:
-        """Whether the load factor counts in lengths."""
-        return self.constraint == "spherical"
+Parameters = PathKeys
 
 
-def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> PathStepper:
+def make_stepper(model: Model, parameters: PathKeys, choice: LinearChoice) -> PathStepper:
     """The stepper of a case. Collective."""
     from ..path_stepper import PathStepper
 

@@ -817,9 +817,12 @@ class ExplicitContact(NodeWalls):
         ways = self.ways(start, before, poses)
         self.find_faces(nodes, free, poses, 0.0)
         of_nodes = stiffness, self.fixed[nodes], applies, self.log.touching[nodes]
+        acting = None
         for _ in range(_CURVED_ROUNDS):
             if others:
-                planes = self.planes(applies, at, poses, self.acting(nodes, free, poses, self._part), nodes)
+                if acting is None or self.surfaces_of_triangles:
+                    acting = self.acting(nodes, free, poses, self._part)
+                planes = self.planes(applies, at, poses, acting, nodes)
             memory = [array[nodes] for array in self._memory] if bounces else [none, none]
             sums = WallSums(*(getattr(self.nothing, name).copy() for name in WallForces.sums))
             given = Arrivals(free, start, ways, drift, *of_nodes, *memory, *planes)

@@ -263,7 +263,10 @@ class Impacts:
         """Return the loss of nodes (m,) that begin or cease to touch walls, see :meth:`step`. Collective with walls
         with mass."""
         contact, log = self.model.contact, self.model.contact.log
-        free = contact.motion.bodies
+        free, last = contact.motion.bodies, self._free_rates
+        self._free_rates = free.state.v
+        if len(nodes) == 0 and (not free.any or self.model.comm.size == 1):
+            return 0.0
         if contact.plain and not free.any:
             normals, gaps = wall_gaps(nodes, x, contact.surfaces.at(poses.shifts[contact.wall_of]))
         else:
@@ -275,10 +278,9 @@ class Impacts:
         if free.any:
             pulls[free.at] = np.where(free.hinged[:, None], 0.0, free.weight / free.mass[:, None])
             linear, angular = np.zeros((2, len(contact.names), 3))
-            linear[free.at], angular[free.at] = free.changes(None if load is None else self._free_rates)
+            linear[free.at], angular[free.at] = free.changes(None if load is None else last)
             unpushed = linear + np.cross(angular, contact.motion.arms(x[nodes], time))
             rates = rates + unpushed[:, contact.wall_of]
-            self._free_rates = free.state.v
         approach = Approach(normals, gaps, free_v, free_a, np.ascontiguousarray(rates), pulls[contact.wall_of])
         touched = Touched(log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.slack)
         loss, _ = stop_nodes(nodes, approach, touched, self.model.inertia.mass, self.counted, speeds)

@@ -267,6 +267,7 @@ class Impacts:
         self._free_rates = free.state.v
         if len(nodes) == 0 and (not free.any or self.model.comm.size == 1):
             return 0.0
+        nodes = np.sort(nodes)  # sums do not depend on when nodes met walls, which a restart does not know
         if contact.plain and not free.any:
             normals, gaps = wall_gaps(nodes, x, contact.surfaces.at(poses.shifts[contact.wall_of]))
         else:

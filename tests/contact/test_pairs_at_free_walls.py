@@ -73,11 +73,11 @@ def test_masses_in_a_row_stop_together(comm, shared_tmp_path):
 @pytest.mark.parallel
 @pytest.mark.parametrize(("kind", "friction"), [("planes", 0.3), ("rough", 0.0), ("elastic", 0.0)])
 def test_restart_and_ranks(kind, friction, comm, shared_tmp_path):
-    """A stop and a restart leave no trace, nor does the number of ranks."""
+    """A stop and a restart leave no trace, nor does the number of ranks, but for the order of sums over ranks."""
     case = two_lattices(shared_tmp_path / "m.vtu", "central_differences", velocity=(2.0, -0.3, -2.0), end=0.012)
     case["wall"], case["contact_pair"][0]["friction"] = walls_of(kind), friction
     case = Case.from_dict(case)
-    history = assert_restart_is_bitwise(case, comm, shared_tmp_path, 25, 45)
+    history = assert_restart_is_bitwise(case, comm, shared_tmp_path, 25, 45, allowed=1e-9 if comm.size > 1 else 0.0)
     wall = "ball" if kind != "planes" else "wall1"
     assert np.abs(history[f"wall/{wall}/force"]).max() > 0.0
     names = "kinetic_energy", f"wall/{wall}/impulse", f"wall/{wall}/position", "pair/faces/impulse"

@@ -9,7 +9,6 @@ from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
 from ..integrators.base import Balance, State
-from ..mechanics.records import by_reference
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of, slab_range
 from ..parallel.agreement import agreed, agreed_call
@@ -22,7 +21,6 @@ from .fixed_rows import FixedRows, TwoNodeRows
 from .friction import FAST, planes_at_rest, sliding
 from .projection import Planes
 from .rows import FreeNodes, RowSet, WallsOfNodes, free_positions, last_forces, push_nodes
-from .surfaces import OTHER
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -132,12 +130,11 @@ class _WallsAtRows:
         """
         contact, at, poses = self._contact, self.nodes, self._contact.motion.poses(balance.time)
         free, (start, drift), none = x[at], starts, np.empty((0, len(contact.wall_of)))
-        walls = contact.walls_at(poses, balance.acting, 0.0)
-        reference, before = by_reference(walls), free if start is None else start[at]
+        walls, before = contact.walls_at(poses, balance.acting), free if start is None else start[at]
         ways = np.zeros((len(at), len(contact.wall_of), 3))
         if start is not None:
             ways = contact.ways(before, contact.motion.poses(contact.state.time), poses)
-        others = (walls.surfaces.radii == OTHER).any()
+        others = not contact.known.all()
         acting = contact.acting_from(before, free, poses, balance.acting) if others and balance.acting < 1.0 else None
         of_nodes = np.empty(0), none[:, :0] > 0.0, applies[at], none > 0.0
         given = Arrivals(free, before, ways, drift[at], *of_nodes, *memory[:, at], none[:, :, None], none)
@@ -147,7 +144,7 @@ class _WallsAtRows:
             if others:
                 normals, offsets = contact.planes(applies[at], place[at], poses, acting)
                 there = given._replace(normals=normals, offsets=offsets)
-            return planes_of(place[at], pushed[at], there, reference)[0]
+            return planes_of(place[at], pushed[at], there, walls)[0]
 
         return WallsOfNodes(self._places, planes, (memory[0] > 0.0).any(axis=1) | self.curved)
 
@@ -285,15 +282,13 @@ class ConstraintSet:
         self.jacobian = np.where(self.rows.fixed[:, None, None], self.rows.fixed_jacobian, jacobian)
         self.two.record.closed[:] = closed[self.two.at] > 0
 
-    def explicit(
-        self, balance: Balance, state: State, u: np.ndarray, stiffness: np.ndarray, tolerance: float
-    ) -> np.ndarray | None:
+    def explicit(self, balance: Balance, state: State, u: np.ndarray, stiffness: np.ndarray) -> np.ndarray | None:
         """Return the forces (n, 3) [N] on the nodes of rows in a step in which each node is solved on its own, with
         increments ``u`` (owned, 3) without rows, for :meth:`push`; None if no row acts on a node of this rank.
         Collective.
 
-        ``stiffness`` (owned,) is the force for a displacement of a node [N/m]. ``tolerance`` [m] is the depth up to
-        which one of several rows that share nodes counts as satisfied.
+        ``stiffness`` (owned,) is the force for a displacement of a node [N/m]. Rows that come and go are those that
+        :meth:`find` has found.
 
         Raises
         ------
@@ -302,8 +297,6 @@ class ConstraintSet:
         """
         if not self:
             return None
-        if self.dynamic:
-            self.find(balance.predictor + u, np.zeros(len(u)), balance.time)
         rows, x, walls = self.rows, self._x, self._walls
         flags, far = slice(4, 4 + walls.flags), np.empty((0, 4 + walls.flags))
         if not rows.partners.alone:
@@ -328,7 +321,7 @@ class ConstraintSet:
         moved = rows.along(rows.fixed_jacobian, x - start) if self.rebounds else np.empty(0)
         pull = rows.along(rows.fixed_jacobian, drift) - moved if self.rebounds else moved
         lift, before = self._lift(pull), self.force > 0.0
-        pushes, self.jacobian, system = rows.project(nodes, tolerance, stopping, lift)
+        pushes, self.jacobian, system = rows.project(nodes, self.contact.tolerance, stopping, lift)
         self.force, self.drag, self.friction = pushes.force, pushes.drag, 0.0
         if self.rebounds:
             fresh, arrived = (self.force > 0.0) & ~before & (rows.restitution > 0.0), rows.values(start)
@@ -462,8 +455,7 @@ class ConstraintSet:
         special, kind = walls.restitution > 0.0, "without restitution"
         if explicit:
             open_ones = [k for k in walls.surfaces_of_triangles if not walls.walls[k].closed]
-            special = np.isin(walls.wall_of, [*walls.motion.bodies.at, *open_ones])
-            kind = "without mass, and a surface of triangles must be closed"
+            special, kind = np.isin(walls.wall_of, open_ones), "closed"
         else:
             self._check_relative()
         special = special & self._walls.meets

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from ..errors import InputError, SimulationFailure
 from ..integrators.base import Balance, State
 from ..parallel.agreement import agreed
-from ..tolerances import BEYOND, ON_BOUND, PROJECTED
+from ..tolerances import BEYOND, ON_BOUND
 from .explicit import ExplicitContact
 from .frames import MIN_VOLUME, NodalFrames, Planes, RowPlanes, build_frames
 from .node_walls import WallForces
@@ -40,11 +40,11 @@ class Contact(ExplicitContact):
 
     @property
     def steady(self) -> bool:
-        """Whether compiled steps serve the walls: infinite flat ones, spheres, cylinders and surfaces of triangles, at
-        rest or with prescribed motion, but not tied."""
+        """Whether compiled steps serve the walls: infinite flat ones, spheres, cylinders and surfaces of triangles,
+        not tied."""
         triangles = np.isin(np.arange(len(self.walls)), self.surfaces_of_triangles)
         known = bool(((self.at_rest.radii != OTHER) | triangles).all()) and not self.partial
-        return not self.any or (known and not self.ties.any and not self.motion.bodies.any)
+        return not self.any or (known and not self.ties.any)
 
     def record(self, walls: WallForces, time: float, h: float) -> FreshTies:
         """Record a step of ``h`` [s] whose positions at ``time`` have these forces; return the nodes that were tied.
@@ -236,7 +236,7 @@ def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh
     moved = np.empty(0, dtype=np.int64)
     with agreed(mesh.comm):
         try:
-            moved, *_ = contact.explicit(points, way, np.ones(owned), 0.0, PROJECTED * contact.size)
+            moved, *_ = contact.explicit(points, way, np.ones(owned), 0.0)
         except SimulationFailure as failure:
             raise InputError(f"{case.source}: wall.adjust: {failure}") from failure
     points += way

@@ -5,14 +5,14 @@ restitution.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..errors import SimulationFailure
 from ..mechanics.compiled import NEEDED, inlined, kernel
-from ..mechanics.records import by_reference, record
+from ..mechanics.records import References, record
 from ..mesh.ordering import NODE_BLOCK
 from ..tolerances import FIXED_POINT, PROJECTED, RANK
 from .friction import jam
@@ -34,6 +34,7 @@ ADRIFT = 3
 """Why the place of a node is not found, beside the reasons of a problem at planes: those of round walls do not
 settle."""
 
+_LEAST_WAY = 1e-3  # that walls with mass are assumed to move in a step by contact, relative to L; or to turn [rad]
 _CURVED_ROUNDS = 100  # projections of a step until tangent planes and positions agree
 _LEAST_PART, _LARGEST_PART = 0.02, 8.0  # of the way to the next position whose planes are tried
 _ROOT = 1e-14  # relative error of squares, more than those of sums of three and of a root
@@ -344,11 +345,11 @@ def planes_of(at, pushed, given, walls):
     return planes, pulls
 
 
-def kind_of(walls: PressedWalls) -> tuple[Any, Any, Any]:
+def kind_of(radii: np.ndarray, friction: np.ndarray) -> tuple[Any, Any, Any]:
     """Return whether any walls are curved, whether any are rough, and whether these or several are: ``NEEDED`` or
-    None."""
-    curved, rough = is_round(walls.surfaces.radii).any(), walls.friction.any()
-    return tuple(NEEDED if kind else None for kind in (curved, rough, rough or walls.friction.shape[1] > 1))
+    None; ``radii`` (w,) of Surfaces, ``friction`` (2, w) of PressedWalls."""
+    curved, rough = is_round(radii).any(), friction.any()
+    return tuple(NEEDED if kind else None for kind in (curved, rough, rough or len(radii) > 1))
 
 
 @kernel
@@ -400,6 +401,106 @@ def press_nodes(given, walls, sums, curved, rough, several):
     return failed, why, found, total, touching, dissipated
 
 
+class Levers(NamedTuple):
+    """Walls with mass (f,): that of each slot, ``body`` (w,), -1 for none; and their ``pivots`` (2, f, 3), where the
+    forces of the balance act and at the end of the step [m]."""
+
+    body: np.ndarray
+    pivots: np.ndarray
+
+
+class Held(NamedTuple):
+    """Nodes (m,) that walls (w,) stop or that are tied to them: ``stiffness`` (m,) [N/m], components ``fixed`` by
+    supports (m, 3) and walls that they are ``touching`` (m, w) bool, positions ``acts`` (m, 3) where the forces of the
+    balance act, and ``places`` at the end of the step (m, 3) [m]."""
+
+    stiffness: np.ndarray
+    fixed: np.ndarray
+    touching: np.ndarray
+    acts: np.ndarray
+    places: np.ndarray
+
+
+@inlined
+def _slope_of_plane(j, k, weight, normal, given, held, walls):
+    """Return the derivative (3, 3) of the force of wall k on the j-th node by the wall's position [N/m].
+
+    The normal force of a node that slips drags it by mu times itself against the slip, which turns with the wall; one
+    that sticks follows the wall in all directions. Exact for nodes at one wall.
+    """
+    slope = weight * np.outer(normal, normal)
+    rough, static = walls.friction[0, k], walls.friction[1, k]
+    if static > 0.0:
+        slip = held.places[j] - given.start[j] - given.ways[j, k]
+        slip -= (slip @ normal) * normal
+        size = math.sqrt(slip @ slip)
+        turning, drag = 1.0, rough * max(normal @ (held.places[j] - given.free[j]), 0.0)  # over k
+        if size > walls.tolerance:
+            slip /= size
+            turning = drag / (size + drag)
+        else:
+            slip[:] = 0.0
+        slope -= rough * weight * np.outer(slip, normal)
+        across_slip = np.eye(3) - np.outer(normal, normal) - np.outer(slip, slip)
+        for c in range(3):
+            slope[c] += (0.0 if held.fixed[j, c] else held.stiffness[j] * turning) * across_slip[c]
+    return slope
+
+
+@kernel
+def slopes_of_walls(given, held, walls, levers):
+    """Return the derivatives (f, 6, 6) of forces of walls with mass on nodes, and of the moments of these about the
+    pivots, by displacements and small rotations of the walls.
+
+    ``given`` are those of the first of the :class:`Held` nodes; the others are tied.
+    """
+    normals = planes_of(held.places[: len(given.free)], given.free, given, walls)[0].normals
+    total, w = np.zeros((levers.pivots.shape[1], 6, 6)), held.touching.shape[1]
+    rows, weights, whole = np.zeros((w, 3)), np.empty(w), np.empty((3, 6))
+    for j in range(len(held.places)):
+        count, stiffness, tied = 0, held.stiffness[j], j >= len(normals)
+        for k in range(w):
+            if held.touching[j, k]:
+                for c in range(3):
+                    rows[count, c] = 0.0 if held.fixed[j, c] or tied else normals[j, k, c]
+                count += 1
+        inverse = np.linalg.pinv(rows[: max(count, 1)].copy(), RANK)
+        for k in range(count):  # the diagonal of k (N N^T)^-1
+            weights[k] = stiffness * (inverse[0, k] ** 2 + inverse[1, k] ** 2 + inverse[2, k] ** 2)
+        count = 0
+        for k in range(w):
+            if not held.touching[j, k]:
+                continue
+            count, i = count + 1, levers.body[k]
+            if i < 0:
+                continue
+            if tied:
+                slope = np.diag(np.where(held.fixed[j], 0.0, stiffness))
+            else:
+                slope = _slope_of_plane(j, k, weights[count - 1], normals[j, k].copy(), given, held, walls)
+            arms = np.stack((held.acts[j] - levers.pivots[0, i], held.places[j] - levers.pivots[1, i]))
+            lever = across(arms)
+            whole[:, :3], whole[:, 3:] = slope, -(slope @ lever[1])
+            total[i, :3] += whole
+            total[i, 3:] += lever[0] @ whole
+    return total
+
+
+class OutOfReachError(Exception):
+    """Walls with mass move farther in a step than was assumed when nodes near them were sought; on all ranks."""
+
+
+class Stopped(NamedTuple):
+    """Nodes (m,) that walls stop: positions and forces (m, 3) [m], [N], WallForces, and the Arrivals of those that are
+    not tied; None for none."""
+
+    nodes: np.ndarray
+    places: np.ndarray
+    force: np.ndarray
+    walls: WallForces
+    given: Arrivals | None
+
+
 class ExplicitContact(NodeWalls):
     """Walls that project free positions onto the region that they allow.
 
@@ -408,7 +509,11 @@ class ExplicitContact(NodeWalls):
     ties : Ties
     plain : infinite flat walls, spheres and cylinders without ties: compiled passes handle them alone
     room : (owned,) int64, where compiled passes list the nodes beyond the former; (0,) without walls
-    called : (walls,) bool, other walls and those that turn; at_rest : Surfaces of all walls (walls,) if none turned
+    known : (slots,) bool, planes, spheres and cylinders that do not turn, which compiled passes know
+    called : (walls,) bool, other walls and those with mass
+    limits : (2,) how far walls with mass are assumed to move [m] and to turn [rad] in a step by contact
+    tolerance : depth beyond a wall that counts as none [m]
+    at_rest : Surfaces of all walls (walls,) if none turned
     """
 
     def __init__(
@@ -424,7 +529,14 @@ class ExplicitContact(NodeWalls):
         self._unmoved = np.zeros((len(self.wall_of), 3))
         self.pushes = np.zeros((2, len(self.walls), 3))  # known forces of walls on bars, and their moments
         self.plain = bool((self.surfaces.radii != OTHER).all()) and not (self.partial or self.ties.any)
-        self.called = self.surfaces.radii[self.first] == OTHER
+        massive = [wall.mass is not None for wall in (case.wall if parameters is None else parameters)]
+        self.called = (self.surfaces.radii[self.first] == OTHER) | np.array(massive, dtype=bool)
+        self.tolerance, self.known = PROJECTED * self.size, self.surfaces.radii != OTHER
+        self._coefficients = np.array([self.friction, self.static_friction])
+        self._forgotten = np.empty(0), *np.empty((2, 0, len(self.wall_of)))
+        self._placed, self._references = self.surfaces.copy(), References()
+        self._kind = kind_of(self.surfaces.radii, self._coefficients)
+        self.limits = np.array([_LEAST_WAY * self.size, _LEAST_WAY])
         self.at_rest = Surfaces.of(self.walls, np.zeros(len(self.walls), dtype=bool))
         self._part = 1.0  # see :meth:`acting`
         self.room = np.empty(len(self.members) if self.any else 0, dtype=np.int64)
@@ -435,8 +547,8 @@ class ExplicitContact(NodeWalls):
         u: np.ndarray,
         stiffness: np.ndarray,
         time: float,
-        tolerance: float,
         part: float = 1.0,
+        pushing: Balance | None = None,
     ) -> tuple[np.ndarray, np.ndarray, WallForces]:
         """Correct increments ``u`` (owned, 3), in place, so that the positions predictor + u satisfy the walls.
 
@@ -444,22 +556,24 @@ class ExplicitContact(NodeWalls):
         ----------
         predictor, u : (owned, 3); their sum is the position at ``time`` without walls [m]
         stiffness : (owned,) alpha m + eta c: force for a displacement of the node [N/m]
-        tolerance : [m]
         part : see :meth:`acting`; other parts than 1 need the state
+        pushing : the balance of a step in which nodes push walls with mass, for :meth:`push_walls`
 
         Returns
         -------
         (nodes (m,), force (m, 3) [N] by the walls, WallForces)
         """
         self._part, x = part, predictor + u
-        if self.motion.bodies.any:
-            self.push_walls(x, stiffness, time, tolerance)
         try:
-            nodes, correction, force, walls = self.project(x, stiffness, time, tolerance)
+            if pushing is None:
+                found = self.project(x, stiffness, time)
+            else:
+                found = self.push_walls(lambda: x, stiffness, pushing)
+            nodes, places, force, walls, _ = self.book(found, time)
         except SimulationFailure:  # until other ranks know of it, the other nodes stay at walls
             u[:] = x - predictor
             raise
-        u[nodes] += correction
+        u[nodes] += places - x[nodes]
         return nodes, force, walls
 
     def placeless(self, node: int, why: int, x: np.ndarray, time: float) -> str:
@@ -484,47 +598,117 @@ class ExplicitContact(NodeWalls):
             f"the friction of node {self.mesh.node_ids[node]} on its walls did not converge; reduce time.step"
         )
 
-    def walls_at(self, poses: Poses, part: float, tolerance: float) -> PressedWalls:
-        """Return the walls at the end of a step that is not compiled."""
-        return self.pressed_walls(self.surfaces.at(poses.shifts[self.wall_of]), part, tolerance, self._unmoved)
+    def walls_at(self, poses: Poses, part: float) -> Any:
+        """Return the walls at the end of a step that is not compiled, by reference, until they are placed anew."""
+        placed, displacements = self._placed, poses.shifts[self.wall_of]
+        placed.offsets[:] = self.surfaces.offsets + np.einsum("ij,ij->i", placed.normals, displacements)
+        placed.centres[:] = self.surfaces.centres + displacements
+        return self._references.of(self.pressed_walls(placed, part, self._unmoved))
 
-    def pressed_walls(self, surfaces: Surfaces, part: float, tolerance: float, way: np.ndarray) -> PressedWalls:
+    @property
+    def _memory(self) -> list[np.ndarray]:
+        """The memory (owned, slots) of nodes that have hit walls with restitution, see :class:`Arrivals`."""
+        return [self.state.memory.setdefault(name, np.zeros(self.members.shape)) for name in ("rebound", "arrival")]
+
+    def pressed_walls(self, surfaces: Surfaces, part: float, way: np.ndarray) -> PressedWalls:
         """Return walls for compiled passes, see :class:`PressedWalls`."""
-        members = self.members
-        friction = np.array([self.friction, self.static_friction])
-        memory = 2 * [np.empty((0, len(self.wall_of)))]
-        if self.rebounds:
-            memory = [self.state.memory.setdefault(name, np.zeros(members.shape)) for name in ("rebound", "arrival")]
-        restitution, pushed = self.restitution if self.rebounds else np.empty(0), self._unmoved
+        (restitution, *memory), pushed = self._forgotten, self._unmoved
         bodies = self.motion.bodies
-        if bodies.any:
+        if self.rebounds:
+            restitution, memory = self.restitution, self._memory
+        if self.rebounds and bodies.any:
             pushes = np.zeros((len(self.walls), 3))
             pushes[bodies.at] = bodies.displacements(np.inf) - bodies.unpushed()[0]
             pushed = pushes[self.wall_of]
-        sets, moved = (self.all_nodes, members), (self.wall_of, way, pushed)
-        return PressedWalls(surfaces, part, *sets, tolerance, self.room, *moved, friction, restitution, *memory)
+        sets, moved = (self.all_nodes, self.members), (self.wall_of, way, pushed)
+        return PressedWalls(
+            surfaces, part, *sets, self.tolerance, self.room, *moved, self._coefficients, restitution, *memory
+        )
 
-    def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
-        """Find the final positions of walls with mass in an explicit step. Collective."""
-        free = self.motion.bodies
+    def push_walls(
+        self,
+        place: Callable[[], np.ndarray],
+        stiffness: np.ndarray,
+        balance: Balance,
+        coupled: bool = False,
+        some: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> Stopped:
+        """Find the final positions of walls with mass in an explicit step; return the nodes that walls stop then, which
+        :meth:`book` is to be told. Collective.
+
+        Parameters
+        ----------
+        place : returns positions (owned, 3) of nodes without walls [m]
+        stiffness : see :meth:`explicit`; balance : of the step
+        coupled : whether these positions depend on where the walls are
+        some : nodes among which those near the walls are, see :meth:`press_some`; None for all
+
+        Raises
+        ------
+        OutOfReachError
+            If ``some`` may not be all nodes that the walls meet.
+        """
+        bodies, time, self._part = self.motion.bodies, balance.time, balance.acting
         failure: SimulationFailure | None = None
+        chosen, sought, first, found = some, None, True, None
 
-        def forces() -> tuple[np.ndarray, np.ndarray]:
-            nonlocal failure
+        def forces() -> tuple[np.ndarray, Callable[[], np.ndarray] | None]:
+            nonlocal failure, chosen, sought, first, found
+            fresh, first = first, False
             try:
-                nodes, correction, _, walls = self.project(x, stiffness, time, tolerance, booked=False)
+                x = place()
+                if sought is None or bodies.strays(sought, self.limits):
+                    if sought is not None:
+                        self.limits *= 2.0
+                    if some is not None and sought is not None:
+                        raise OutOfReachError
+                    sought = bodies.way
+                    # coupled nodes may be anywhere in the next trial
+                    chosen = self._near_bodies(x, time) if some is None and not coupled else some
+                found = self.project(x, stiffness, time, chosen)
             except SimulationFailure as met:  # raised once all ranks have left the iteration
                 failure = failure or met
-                return np.zeros((2, len(free.at), 3)), np.zeros((len(free.at), 6, 6))
-            slopes = self._slope(nodes, x[nodes], correction, stiffness[nodes], walls, time)
-            pushes = np.stack([walls.force, walls.moment])
-            return (pushes + self.pushes)[:, free.at], self._by_twists(slopes, nodes, walls.places)
+                return np.zeros((2, len(bodies.at), 3)), lambda: np.zeros((len(bodies.at), 6, 6))
+            pushes = np.stack([found.walls.force, found.walls.moment]) + self.pushes
+            slopes = None if coupled and not fresh else lambda: self._slopes(found, stiffness, time)
+            return pushes[:, bodies.at], slopes
 
-        found = free.solve(forces, FIXED_POINT * self.size)
+        settled = bodies.solve(forces, FIXED_POINT * self.size)
         if failure is not None:
             raise failure
-        if not found:
+        if not settled:
             raise SimulationFailure(self.unsettled_message())
+        return found
+
+    def _near_bodies(self, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nodes that rebound, and those that walls may meet at a time [s] which move as far as is assumed,
+        of nodes at (owned, 3)."""
+        arms = np.zeros(len(x))
+        for pivot in self.motion.bodies.pivots(1.0):
+            np.maximum(arms, ((x - pivot) ** 2).sum(axis=1), out=arms)
+        reach = self.limits[0] + self.limits[1] * np.sqrt(arms)
+        near = np.flatnonzero(self.near(x, self.motion.poses(time), reach))
+        return np.flatnonzero((self._memory[0] > 0.0).any(axis=1)) if self.rebounds else near[:0], near
+
+    def _slopes(self, found: Stopped, stiffness: np.ndarray, time: float) -> np.ndarray:
+        """Return this rank's share of the derivatives of :func:`slopes_of_walls`."""
+        bodies, nodes, places, given = self.motion.bodies, found.nodes, found.places, found.given
+        if not len(nodes):
+            return np.zeros((len(bodies.at), 6, 6))
+        body = np.full(len(self.walls), -1)
+        body[bodies.at] = np.arange(len(bodies.at))
+        levers = Levers(body[self.wall_of], np.stack([bodies.pivots(part) for part in (self._part, 1.0)]))
+        start = places if self.state is None else self.state.position[nodes]
+        acts = start + self._part * (places - start)
+        held = Held(stiffness[nodes], self.fixed[nodes], found.walls.touching, acts, places)
+        walls, w = self.walls_at(self.motion.poses(time), self._part), len(self.wall_of)
+        if given is None:  # all are tied
+            some, vectors, planes = np.empty((0, w)), np.empty((0, 3)), np.empty((0, w, 3))
+            flags = vectors > 0.0, some > 0.0, some > 0.0
+            given = Arrivals(
+                vectors, vectors, planes, vectors, some[:, 0], *flags, some[:, :0], some[:, :0], planes, some
+            )
+        return slopes_of_walls(given, held, walls, levers)
 
     def _set_rebounds(self, given: Arrivals, normals: np.ndarray, unpushed: np.ndarray) -> None:
         """Set the memory of nodes that hit walls with inertia, at planes with normals (m, slots, 3); ``unpushed``
@@ -544,111 +728,55 @@ class ExplicitContact(NodeWalls):
             "'node_set'"
         )
 
-    def _slope(
-        self,
-        nodes: np.ndarray,
-        free: np.ndarray,
-        correction: np.ndarray,
-        stiffness: np.ndarray,
-        walls: WallForces,
-        time: float,
-    ) -> np.ndarray:
-        """Return the derivatives (m, slots, 3, 3) [N/m] of the walls' forces on nodes by the walls' positions.
-
-        Nodes (m,) at ``free`` (m, 3) without walls are moved by ``correction`` (m, 3) [m]. The normal force of a node
-        that slips drags it by mu times itself against the slip, which turns with the wall; one that sticks follows the
-        wall in all directions. Exact for nodes at one wall.
-        """
-        touching, tied = walls.touching, np.zeros(len(nodes), dtype=bool)
-        poses = self.motion.poses(time)
-        acting = self.acting(nodes, free, poses, self._part)
-        normals, _ = self.planes(touching, walls.places, poses, acting, nodes)
-        if self.ties.any:
-            tied = self.ties.held[nodes]
-            touching = touching & ~tied[:, None]
-        held = touching[:, :, None] & ~self.fixed[nodes][:, None, :]
-        active = np.where(held, normals, 0.0)
-        inverse = np.linalg.pinv(active, rcond=RANK) if len(nodes) else np.zeros((0, 3, len(self.wall_of)))
-        weight = stiffness[:, None] * (inverse * inverse).sum(axis=1)  # the diagonal of k (N N^T)^-1
-        weight = np.where(touching, weight, 0.0)
-        slope = np.einsum("mw,mwi,mwj->mwij", weight, normals, normals)
-        gives = stiffness[:, None, None] * (walls.touching & tied[:, None])[:, :, None] * ~self.fixed[nodes][:, None, :]
-        slope += gives[:, :, :, None] * np.eye(3)
-        if not self.has_friction:
-            return slope
-        start = self.state.position[nodes]
-        slip = (walls.places - start)[:, None, :] - self.ways(start, self._poses_before(), poses)
-        slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
-        size = np.linalg.norm(slip, axis=2)
-        slips = size > PROJECTED * self.size
-        slip /= np.where(slips, size, np.inf)[:, :, None]
-        rough = np.where(touching, self.friction, 0.0)
-        slope -= np.einsum("mw,mwi,mwj->mwij", rough * weight, slip, normals)
-        drag = rough * np.maximum(np.einsum("mwi,mi->mw", normals, correction), 0.0)  # over k
-        turning = np.where(slips, drag / np.where(slips, size + drag, 1.0), self.static_friction > 0.0)
-        sideways = (
-            np.eye(3) - normals[:, :, :, None] * normals[:, :, None, :] - slip[:, :, :, None] * slip[:, :, None, :]
-        )
-        return slope + np.einsum("mw,mwi,mwij->mwij", stiffness[:, None] * turning, held.astype(float), sideways)
-
-    def _by_twists(self, slopes: np.ndarray, nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Return the derivatives (f, 6, 6) of forces of walls with mass, and their moments about the centres, by
-        displacements and small rotations of these from the ``slopes`` of :meth:`_slope` of nodes (m,) at ``places``."""
-        bodies, start = self.motion.bodies, places if self.state is None else self.state.position[nodes]
-        acts, result = start + self._part * (places - start), np.zeros((len(self.motion.bodies.at), 6, 6))
-        for i, k in enumerate(bodies.at):
-            each = slopes[:, self.wall_of == k].sum(axis=1)
-            lever, turned = (across(at - bodies.pivots(part)[i]) for at, part in ((acts, self._part), (places, 1.0)))
-            whole = np.concatenate([each, -each @ turned], axis=2)
-            result[i] = np.concatenate([whole, lever @ whole], axis=1).sum(axis=0)
-        return result
-
     def project(
-        self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool = True
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, WallForces]:
+        self,
+        x: np.ndarray,
+        stiffness: np.ndarray,
+        time: float,
+        some: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> Stopped:
         """Project free positions (owned, 3) onto the region that the walls allow; a failure leaves those found there.
 
-        ``booked`` : whether the step is final and not a trial. Returns the nodes (m,), their corrections (m, 3) [m],
-        the forces on them (m, 3) [N], and the sums per wall.
+        ``some`` : see :meth:`press_some`, None for all nodes; :meth:`book` is to be told of the final positions.
         """
-        nodes, moved, force, sums = self._press(x, stiffness, time, tolerance, booked)
-        if self.ties.any:
-            tied, walls, places, pull = self.ties.hold(x, stiffness, time)
-            every = np.zeros((len(tied), len(self.wall_of), 3))
-            every[np.arange(len(tied)), self.first[walls]] = pull
-            own = np.zeros(every.shape[:2], dtype=bool)
-            own[np.arange(len(tied)), self.first[walls]] = True
-            nodes, moved, force = np.append(nodes, tied), np.vstack([moved, places]), np.vstack([force, pull])
-            touching = np.vstack([sums.touching, own])
-            start = places if self.state is None else self.state.position[tied]
-            held = self.sums(tied, every, (places, start + self._part * (places - start)), own)
-            sums = WallForces(
-                *(getattr(sums, name) + getattr(held, name) for name in WallForces.sums),
-                nodes,
-                touching,
-                moved,
-                sums.friction,
-            )
-        return nodes, moved - x[nodes], force, sums
-
-    def _press(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool) -> tuple:
-        """Return nodes (m,) near walls that are not tied to them, positions (m, 3), forces (m, 3), and the sums per
-        wall."""
         poses = self.motion.poses(time)
-        walls = self.walls_at(poses, self._part, tolerance)
+        walls = self.walls_at(poses, self._part)
         self.forget_faces()
-        marked = np.full(len(x) // NODE_BLOCK + 1, len(walls.restitution) > 0)
-        nodes = walls.room[: find_penetrating(np.ascontiguousarray(x.T), by_reference(walls), marked)].copy()
-        if (walls.surfaces.radii == OTHER).any():
-            nodes = np.union1d(nodes, np.flatnonzero(self.near(x, poses)))
+        if some is not None:
+            nodes = np.union1d(some[0], some[1][self.near(x[some[1]], poses, nodes=some[1])])
+        else:
+            marked = np.full(len(x) // NODE_BLOCK + 1, self.rebounds)
+            nodes = self.room[: find_penetrating(np.ascontiguousarray(x.T), walls, marked)].copy()
+            if not self.known.all():
+                nodes = np.union1d(nodes, np.flatnonzero(self.near(x, poses)))
         if self.ties.any:
             nodes = nodes[~self.ties.held[nodes]]
         free = x[nodes]
         try:
-            return self._press_some(nodes, free, stiffness[nodes], poses, walls, booked)
+            found = self._press_some(nodes, free, stiffness[nodes], poses, walls)
         except SimulationFailure:
             x[nodes] = free
             raise
+        return self._with_tied(found, x, stiffness, time) if self.ties.any else found
+
+    def _with_tied(self, found: Stopped, x: np.ndarray, stiffness: np.ndarray, time: float) -> Stopped:
+        """Add the nodes that are tied to walls."""
+        tied, walls, places, pull = self.ties.hold(x, stiffness, time)
+        every, sums = np.zeros((len(tied), len(self.wall_of), 3)), found.walls
+        every[np.arange(len(tied)), self.first[walls]] = pull
+        own = np.zeros(every.shape[:2], dtype=bool)
+        own[np.arange(len(tied)), self.first[walls]] = True
+        start = places if self.state is None else self.state.position[tied]
+        held = self.sums(tied, every, (places, start + self._part * (places - start)), own)
+        nodes, moved = np.append(found.nodes, tied), np.vstack([found.places, places])
+        sums = WallForces(
+            *(getattr(sums, name) + getattr(held, name) for name in WallForces.sums),
+            nodes,
+            np.vstack([sums.touching, own]),
+            moved,
+            sums.friction,
+        )
+        return Stopped(nodes, moved, np.vstack([found.force, pull]), sums, found.given)
 
     def press_some(
         self,
@@ -656,23 +784,16 @@ class ExplicitContact(NodeWalls):
         x: np.ndarray,
         stiffness: np.ndarray,
         balance: Balance,
-        tolerance: float,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, WallForces]:
+    ) -> Stopped:
         """Press ``some`` nodes, those (f,) that compiled loops have found beyond walls, and those (s,) of others that
         are beyond walls that these do not know, where :meth:`explicit` looks at all nodes.
 
         ``x`` (owned, 3), ``stiffness`` (owned,) : of these nodes, see :meth:`explicit`; ``balance`` : of the step
-
-        Returns
-        -------
-        (nodes (m,), positions (m, 3) [m], forces (m, 3) [N], WallForces)
         """
-        found, suspects = some
-        self._part, poses = balance.acting, self.motion.poses(balance.time)
-        walls = self.walls_at(poses, self._part, tolerance)
-        self.forget_faces()
-        nodes = np.union1d(found, suspects[self.near(x[suspects], poses, nodes=suspects)])
-        return self._press_some(nodes, x[nodes], stiffness[nodes], poses, walls)
+        self._part = balance.acting
+        if self.motion.bodies.any:
+            return self.book(self.push_walls(lambda: x, stiffness, balance, some=some), balance.time)
+        return self.book(self.project(x, stiffness, balance.time, some), balance.time)
 
     def _press_some(
         self,
@@ -680,35 +801,35 @@ class ExplicitContact(NodeWalls):
         free: np.ndarray,
         stiffness: np.ndarray,
         poses: Poses,
-        walls: PressedWalls,
-        booked: bool = True,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, WallForces]:
-        """As :meth:`_press` of nodes (m,) that are ``free`` to move to (m, 3), where a failure leaves what is found."""
-        w, state, reference, tolerance = len(self.wall_of), self.state, by_reference(walls), walls.tolerance
+        walls: Any,
+    ) -> Stopped:
+        """Press nodes (m,) that are ``free`` to move to (m, 3), where a failure leaves what is found."""
+        w, state = len(self.wall_of), self.state
         if len(nodes) == 0:
-            return nodes, np.empty((0, 3)), np.empty((0, 3)), self.nothing
+            return Stopped(nodes, np.empty((0, 3)), np.empty((0, 3)), self.nothing, None)
         before = poses if state is None else self._poses_before()
-        bounces, others, at = len(walls.restitution) > 0, (walls.surfaces.radii == OTHER).any(), free
+        bounces, others, at = self.rebounds, not self.known.all(), free
         start, drift = free if state is None else state.position[nodes], np.zeros_like(free)
         if bounces:
             drift = (poses.time - state.time) * state.memory["half_velocity"][nodes]
         applies = self.applicable(nodes, free, poses)
-        planes = np.empty((0, w, 3)), np.empty((0, w))
+        planes, none = (np.empty((0, w, 3)), np.empty((0, w))), np.empty((len(nodes), 0))
         ways = self.ways(start, before, poses)
         self.find_faces(nodes, free, poses, 0.0)
         of_nodes = stiffness, self.fixed[nodes], applies, self.log.touching[nodes]
+        acting = None
         for _ in range(_CURVED_ROUNDS):
             if others:
-                planes = self.planes(applies, at, poses, self.acting(nodes, free, poses, self._part), nodes)
-            memory = [
-                array[nodes] if bounces else np.empty((len(nodes), 0)) for array in (walls.rebound, walls.arrival)
-            ]
+                if acting is None or self.surfaces_of_triangles:
+                    acting = self.acting(nodes, free, poses, self._part)
+                planes = self.planes(applies, at, poses, acting, nodes)
+            memory = [array[nodes] for array in self._memory] if bounces else [none, none]
             sums = WallSums(*(getattr(self.nothing, name).copy() for name in WallForces.sums))
             given = Arrivals(free, start, ways, drift, *of_nodes, *memory, *planes)
-            pressed = press_nodes(given, reference, sums, *kind_of(walls))
+            pressed = press_nodes(given, walls, sums, *self._kind)
             failed, why, (places, *_), force, touching, friction = pressed
-            settled = failed >= 0 or not others or np.abs(places - at).max() <= tolerance
-            if settled and not self.find_faces(nodes, places, poses, tolerance):
+            settled = failed >= 0 or not others or np.abs(places - at).max() <= self.tolerance
+            if settled and not self.find_faces(nodes, places, poses, self.tolerance):
                 break
             at = places
         else:
@@ -716,9 +837,19 @@ class ExplicitContact(NodeWalls):
         if failed >= 0:
             free[:] = places
             raise SimulationFailure(self.placeless(nodes[failed], why, places[failed], poses.time))
-        if bounces and booked:
-            if len(self.motion.bodies.turners):
-                unpushed = self.ways(start, before, self.motion.poses_without_contact(poses.time))
-                self._set_rebounds(given, planes_of(places, free, given, reference)[0].normals, unpushed)
-            walls.rebound[nodes], walls.arrival[nodes] = memory
-        return nodes, places, force, WallForces(*sums, nodes, touching, places, friction)
+        return Stopped(nodes, places, force, WallForces(*sums, nodes, touching, places, friction), given)
+
+    def book(self, found: Stopped, time: float) -> Stopped:
+        """Keep the memory of the nodes that walls stop at the end of a step, at a time [s]; return them."""
+        given = found.given
+        if not self.rebounds or given is None:
+            return found
+        nodes = found.nodes[: len(given.free)]
+        if len(self.motion.bodies.turners):
+            poses, places = self.motion.poses(time), found.places[: len(nodes)]
+            unpushed = self.ways(given.start, self._poses_before(), self.motion.poses_without_contact(time))
+            planes, _ = planes_of(places, given.free, given, self.walls_at(poses, self._part))
+            self._set_rebounds(given, planes.normals, unpushed)
+        for array, values in zip(self._memory, (given.rebound, given.arrival), strict=True):
+            array[nodes] = values
+        return found

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..tolerances import TIME
-from .rotations import changes_of_turns, steps_of_bodies, turns_by, vectors_of
+from .rotations import turn_bodies, turns_by, vectors_of
 
 if TYPE_CHECKING:
     from .walls.base import WallKeys
@@ -22,7 +22,7 @@ _ITERATIONS = 200
 _ROUNDED = 100.0  # moves of up to so many tolerances that do not get smaller are those of rounding
 _FULL_MOVES = 20  # Newton's method converges after a few active sets, or else alternates between some of them
 
-Answer = tuple[np.ndarray, np.ndarray | None]
+Answer = tuple[np.ndarray, Callable[[], np.ndarray] | None]
 
 
 class BodyMotion(NamedTuple):
@@ -105,7 +105,7 @@ class FreeWalls:
         self._times, self._ends = (0.0, 0.0), (self.state.x, self.state.x)  # of the step
         self._start, self._vectors = self.turns, np.zeros((len(self.turners), 3))  # turns at its start, and in it
         self._slopes = np.zeros_like(self.turns)  # of small rotations at its end by the unknowns
-        self.moves = int(self.any)
+        self.moves = self._state_moves = int(self.any)
 
     def follow(self, earlier: Self) -> None:
         """Go on from the motion of the same walls in an earlier stage."""
@@ -113,7 +113,7 @@ class FreeWalls:
             setattr(self.state, name, getattr(earlier.state, name).copy())
         self._ends = self.state.x, self.state.x
         self.turns = self._start = earlier.turns.copy()
-        self.moves += 1
+        self._place()
 
     def start(self, h: float) -> None:
         """Initialise the acceleration and the scheme's memory."""
@@ -134,6 +134,7 @@ class FreeWalls:
         state.time = time
         self._balance, self._start = self.scheme.balance(state, h), self.turns
         self._times, self._ends = (time, self._balance.time), (state.x.copy(), state.x)
+        self._place()
         self._move(self._u)
 
     def finish(self, h: float, end: float) -> None:
@@ -148,13 +149,32 @@ class FreeWalls:
             self.turns = turns_by(vectors) @ self._start
             if self.scheme.solves_end:  # else contact holds at the end of the balance
                 self._times, self._ends, self._vectors = (self._times[0], end), (before, state.x.copy()), vectors
+            self._place()
+
+    def _place(self) -> None:
+        """Take account of another state."""
         self.moves += 1
+        self._state_moves = self.moves
+
+    def version(self, time: float) -> int:
+        """Return a number that changes when the walls are elsewhere at a time [s]: they move as they are solved for."""
+        return self._state_moves if time == self.state.time else self.moves
 
     def _move(self, u: np.ndarray) -> None:
         """Move the walls to the increments (f + t, 3) of the step being solved [m]."""
         self._u, self.moves = u, self.moves + 1
         self._ends = self._ends[0], self._balance.predictor + u
         self._vectors, self._slopes = self._turn(self._ends[1] - self._ends[0])
+
+    @property
+    def way(self) -> tuple[np.ndarray, np.ndarray]:
+        """Displacements (f, 3) [m] at the end of the step being solved, and rotation vectors (t, 3) [rad] in it."""
+        return self._ends[1][: len(self.at)], self._vectors
+
+    def strays(self, way: tuple[np.ndarray, np.ndarray], limits: np.ndarray) -> bool:
+        """Return whether any wall has moved farther from where it was by a ``way`` than limits (2,) [m], [rad]."""
+        changes = (np.sqrt(((one - other) ** 2).sum(axis=1)) for one, other in zip(self.way, way, strict=True))
+        return any(change.max(initial=0.0) > limit for change, limit in zip(changes, limits, strict=True))
 
     def _turn(self, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the rotation vectors (t, 3) [rad] by which walls turn from the present state while the particles go
@@ -167,16 +187,13 @@ class FreeWalls:
         """
         if not len(self.turners):
             return self._vectors, self._slopes
-        turns, own = self.turns, self._scale * ways[len(self.at) :]
-        found = steps_of_bodies(np.einsum("tji,tj->ti", turns, own), self.inertia)
-        if found is None:
+        vectors, slopes = turn_bodies(self.turns, self._scale, self.inertia, ways[len(self.at) :])
+        if not np.isfinite(vectors).all():
             raise SimulationFailure(
                 "a wall with inertia turns by more than about a radian in a step, which does not determine its motion; "
                 "reduce time.step"
             )
-        vectors, slopes = found
-        turned = turns @ changes_of_turns(vectors) @ slopes @ turns.swapaxes(1, 2)
-        return np.einsum("tij,tj->ti", turns, vectors), turned * self._scale[:, :, None]
+        return vectors, slopes
 
     def _part(self, time: float) -> float:
         """Return the part of the step that has gone by at a time [s]."""
@@ -297,8 +314,9 @@ class FreeWalls:
         Parameters
         ----------
         forces : returns, where the walls are at the end of the step, this rank's sums of their forces on the truss [N]
-            and of the moments of these about the origin [N m] (2, f, 3), and of the derivatives (f, 6, 6) of force and
-            moment about the centre by displacement and small rotation of the wall, or None where these are not known
+            and of the moments of these about the origin [N m] (2, f, 3), and what returns that of the derivatives
+            (f, 6, 6) of force and moment about the centre by displacement and small rotation of the wall, or None where
+            these are not known
         tolerance : of the walls' positions [m]
         """
         if not self.any:
@@ -310,7 +328,7 @@ class FreeWalls:
         u = ((self._load(0.0) - inertial) / (balance.alpha * masses)).ravel()
         matrix, earlier, last = np.diag(weight), None, np.inf
 
-        def evaluate(u: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+        def evaluate(u: np.ndarray) -> tuple[np.ndarray, Callable | None, np.ndarray]:
             self._move(u.reshape(-1, 3))
             pushes, slope = forces()
             pushes = pushes.copy()
@@ -321,10 +339,12 @@ class FreeWalls:
 
         force, slope, residual = evaluate(u)
         for iteration in range(_ITERATIONS):
+            if np.abs(np.linalg.solve(matrix, residual)).max() <= tolerance:
+                break
             if slope is not None:
-                slope = slope.copy()
-                self.comm.Allreduce(MPI.IN_PLACE, slope)
-                matrix = self._matrix(weight, slope)
+                derivatives = slope()
+                self.comm.Allreduce(MPI.IN_PLACE, derivatives)
+                matrix = self._matrix(weight, derivatives)
             elif earlier is not None:
                 # Broyden: the matrix nearest to the previous one that is consistent with the last move
                 du, dr = u - earlier[0], residual - earlier[1]
@@ -402,4 +422,4 @@ class FreeWalls:
             state.memory[name] = np.array(array, dtype=float).reshape(shape)
         for name in self._KEPT:
             setattr(self, name, np.array(kept["step"][name], dtype=float).reshape(np.shape(getattr(self, name))))
-        self.moves += 1
+        self._place()

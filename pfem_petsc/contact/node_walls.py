@@ -477,14 +477,16 @@ class NodeWalls:
                 along = np.einsum("mwi,mi->mw", normals[:, s:last], x)
                 offsets[:, s:last] = np.where(np.isfinite(distances), along - distances, -np.inf)
                 continue
-            own, offsets[:, s] = wall.planes(poses.rest(k, x))
+            rest = poses.rest(k, x)
+            own, offsets[:, s] = wall.planes(rest)
             normals[:, s] = poses.turned(k, own)
-            offsets[:, s] += normals[:, s] @ poses.shifts[k]
-            if not self.flat[s]:
-                if acting is not None:
-                    other = acting[:, s].any(axis=1)
-                    normals[other, s] = acting[other, s]
-                offsets[:, s] = np.einsum("mi,mi->m", normals[:, s], x) - self.gap(k, x, poses)
+            if self.flat[s]:
+                offsets[:, s] += normals[:, s] @ poses.shifts[k]
+                continue
+            if acting is not None:
+                other = acting[:, s].any(axis=1)
+                normals[other, s] = acting[other, s]
+            offsets[:, s] = np.einsum("mi,mi->m", normals[:, s], x) - wall.gaps(rest)
         offsets[~applicable] = -np.inf
         return normals, offsets
 

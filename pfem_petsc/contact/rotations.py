@@ -7,27 +7,51 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..mechanics.compiled import inlined, kernel
+
 _ROUNDS = 50  # of Newton's method, which needs five
 _NEAR = 1e-9  # last move [rad], the square of which is below rounding
 _SMALL = 1e-2  # angle [rad] below which differences of nearly equal numbers are a series
 
 
-def across(vectors: np.ndarray) -> np.ndarray:
+@kernel
+def across(vectors):
     """Return the matrices (w, 3, 3) of products of vectors (w, 3) from the left, v x ..."""
-    return np.cross(np.eye(3), vectors[:, None, :])
+    products = np.zeros((len(vectors), 3, 3))
+    for w in range(len(vectors)):
+        for c in range(3):
+            one, other = (c + 1) % 3, (c + 2) % 3
+            products[w, other, one], products[w, one, other] = vectors[w, c], -vectors[w, c]
+    return products
 
 
-def turns_about(axes: np.ndarray, angles: np.ndarray) -> np.ndarray:
+@inlined
+def _series(vectors, first, second):
+    """Return I + a V + b V V (w, 3, 3) with numbers (w,) and the products V = v x ... of vectors (w, 3)."""
+    found = across(vectors)
+    for w in range(len(vectors)):
+        product = found[w].copy()
+        found[w] = np.eye(3) + first[w] * product + second[w] * (product @ product)
+    return found
+
+
+@kernel
+def turns_about(axes, angles):
     """Return matrices (w, 3, 3) of rotations by angles (w,) [rad] about unit axes (w, 3), by Rodrigues' formula."""
-    product = across(axes)
-    sine, versed = np.sin(angles), 2.0 * np.sin(0.5 * angles) ** 2
-    return np.eye(3) + sine[:, None, None] * product + versed[:, None, None] * (product @ product)
+    return _series(axes, np.sin(angles), 2.0 * np.sin(0.5 * angles) ** 2)
 
 
-def turns_by(vectors: np.ndarray) -> np.ndarray:
+@inlined
+def _angles(vectors):
+    """Return the lengths (w,) of vectors (w, 3)."""
+    return np.sqrt(vectors[:, 0] ** 2 + vectors[:, 1] ** 2 + vectors[:, 2] ** 2)
+
+
+@kernel
+def turns_by(vectors):
     """Return the matrices (w, 3, 3) of rotation vectors (w, 3) [rad]."""
-    angles = np.linalg.norm(vectors, axis=1)
-    return turns_about(vectors / np.where(angles > 0.0, angles, 1.0)[:, None], angles)
+    angles = _angles(vectors)
+    return turns_about(vectors / np.where(angles > 0.0, angles, 1.0).reshape(-1, 1), angles)
 
 
 def vectors_of(turns: np.ndarray) -> np.ndarray:
@@ -51,19 +75,21 @@ def vectors_of(turns: np.ndarray) -> np.ndarray:
     return quaternion[:, 1:] * (angles / np.where(sines > 0.0, sines, 1.0))[:, None]
 
 
-def changes_of_turns(vectors: np.ndarray) -> np.ndarray:
+@kernel
+def changes_of_turns(vectors):
     """Return the matrices (w, 3, 3) from a change of rotation vectors (w, 3) to the small rotation, in space, that the
     rotations change by."""
-    angles, product = np.linalg.norm(vectors, axis=1), across(vectors)
+    angles = _angles(vectors)
     whole = np.maximum(angles, _SMALL)
     rest = np.where(angles < _SMALL, 1.0 / 6.0 - angles**2 / 120.0, (whole - np.sin(whole)) / whole**3)
-    versed = 0.5 * np.sinc(angles / (2.0 * np.pi)) ** 2
-    return np.eye(3) + versed[:, None, None] * product + rest[:, None, None] * (product @ product)
+    half = 0.5 * np.maximum(angles, 1e-9)
+    return _series(vectors, 0.5 * (np.sin(half) / half) ** 2, rest)
 
 
-def steps_of_bodies(ways: np.ndarray, inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+@kernel
+def steps_of_bodies(ways, inertia):
     """Return the rotation vectors (t, 3) [rad] by which rigid bodies turn in a step, and their derivatives (t, 3, 3) by
-    the ways; None if the step is too large for one of them.
+    the ways; the former are infinite if the step is too large for one of them.
 
     ``ways`` (t, 3) are the integrals of the angular momentum about the centre over the step [kg m2], fixed in space,
     and ``inertia`` (t, 3, 3) [kg m2], all in the axes of the body at the start of the step. The angular velocity is
@@ -71,16 +97,37 @@ def steps_of_bodies(ways: np.ndarray, inertia: np.ndarray) -> tuple[np.ndarray, 
     reversible, so that the energy of a free body oscillates about a constant (Hairer, Lubich and Wanner, Geometric
     Numerical Integration, VII.5 and XI).
     """
-    vectors = np.linalg.solve(inertia, ways[:, :, None])[:, :, 0]
-    for _ in range(_ROUNDS):
-        halfway = turns_by(-0.5 * vectors)
-        there = np.einsum("tij,tj->ti", halfway, ways)
-        slope = inertia - 0.5 * across(there) @ changes_of_turns(-0.5 * vectors)
-        lack = there - np.einsum("tij,tj->ti", inertia, vectors)
-        move = np.linalg.solve(slope, lack[:, :, None])[:, :, 0]
-        vectors = vectors + move
-        if not np.abs(vectors).max(initial=0.0) < np.pi:
-            return None
-        if np.abs(move).max(initial=0.0) <= _NEAR:
-            return vectors, np.linalg.solve(slope, halfway)
-    return None
+    vectors, slopes, there = np.zeros_like(ways), np.zeros_like(inertia), np.zeros_like(ways)
+    for t in range(len(ways)):
+        part, move = slice(t, t + 1), np.full(3, np.inf)
+        vectors[t] = np.linalg.solve(inertia[t], ways[t])
+        for _ in range(_ROUNDS):
+            if not np.abs(move).max() > _NEAR:
+                break
+            halfway = turns_by(-0.5 * vectors[part])[0]
+            there[t] = halfway @ ways[t]
+            slope = inertia[t] - 0.5 * across(there[part])[0] @ changes_of_turns(-0.5 * vectors[part])[0]
+            move = np.linalg.solve(slope, there[t] - inertia[t] @ vectors[t])
+            vectors[t] += move
+            if not np.abs(vectors[t]).max() < np.pi:
+                break
+            slopes[t] = np.linalg.solve(slope, halfway)
+        if not (np.abs(move).max() <= _NEAR and np.abs(vectors[t]).max() < np.pi):
+            vectors[t] = np.inf
+    return vectors, slopes
+
+
+@kernel
+def turn_bodies(turns, scale, inertia, ways):
+    """Return the rotation vectors (t, 3) [rad], in space, of :func:`steps_of_bodies` of bodies at ``turns`` (t, 3, 3)
+    from rest, and the derivatives (t, 3, 3) of small rotations at the end by the ways (t, 3), which ``scale`` (t, 1)
+    makes those of angular momenta."""
+    own = np.empty_like(ways)
+    for t in range(len(turns)):
+        own[t] = turns[t].T @ (scale[t, 0] * ways[t])
+    vectors, slopes = steps_of_bodies(own, inertia)
+    changes = changes_of_turns(vectors)
+    for t in range(len(turns)):
+        slopes[t] = scale[t, 0] * (turns[t] @ changes[t] @ slopes[t] @ turns[t].T)
+        vectors[t] = turns[t] @ vectors[t]
+    return vectors, slopes

@@ -68,7 +68,7 @@ class WallMotion:
     """
 
     def __init__(self, walls: Sequence[WallKeys], centres: np.ndarray, holds: bool = False) -> None:
-        self._motions = [None if holds else motion_of(wall) for wall in walls]
+        self._motions = [None if holds or wall.mass is not None else motion_of(wall) for wall in walls]
         self._rotations = [None if holds else rotation_of(wall) for wall in walls]
         n = len(walls)
         rotates = np.array([wall.rotation is not None for wall in walls], dtype=bool)
@@ -103,7 +103,7 @@ class WallMotion:
         """Return where walls are at a time [s], read-only."""
         if self._last[0] is not self.held or len(self._last[1]) > _LATEST:
             self._last = self.held, {}
-        known, key = self._last[1], (time, self.bodies.moves)  # they move as they are solved for
+        known, key = self._last[1], (time, self.bodies.version(time))
         if key not in known:
             known[key] = self._poses(time)
         return known[key]
@@ -122,7 +122,8 @@ class WallMotion:
         turned = turns_about(self._axes, self._prescribed(self._rotations, 0, time)[:, 0])
         turns = turned @ turns
         turns[bodies.at[bodies.turners]] = bodies.turned(time) if turned_by is None else turned_by
-        about = np.where(np.isin(np.arange(len(turns)), bodies.at)[:, None, None], turns, turned)
+        about = turned.copy()
+        about[bodies.at] = turns[bodies.at]
         return Poses(shifts + self._centres - np.einsum("wij,wj->wi", about, self._centres), turns, time)
 
     def schedule(self, times: np.ndarray) -> np.ndarray:

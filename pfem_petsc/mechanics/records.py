@@ -55,6 +55,10 @@ def _maker(cls: type) -> Any:
     return make
 
 
+def _is_same(one: Any, other: Any) -> bool:
+    return one is other or (isinstance(one, float) and one == other)
+
+
 class References:
     """Records of named tuples, one of each class, which are kept as long as their fields are the same objects."""
 
@@ -68,7 +72,7 @@ class References:
         if not COMPILED or not hasattr(sys.modules[cls.__module__], f"{cls.__name__}Reference"):
             return values
         before, reference = self._kept.get(cls, (None, None))
-        if before is None or any(one is not other for one, other in zip(before, values, strict=True)):
+        if before is None or not all(map(_is_same, before, values)):
             reference = _maker(cls)(*(self.of(value) if isinstance(value, tuple) else value for value in values))
             self._kept[cls] = values, reference
         return reference

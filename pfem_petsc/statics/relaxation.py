@@ -17,7 +17,7 @@ from ..mechanics.compiled import kernel
 from ..parallel.agreement import agreed
 from ..solvers.newton import Tolerance, largest_at_node
 from ..stepping.stepper import Solution
-from ..tolerances import PROJECTED, TIME
+from ..tolerances import TIME
 from .stability import LARGEST, Stability
 from .stepper import StaticStepper
 
@@ -157,7 +157,6 @@ class PseudoMotion:
         reach = np.full(local, np.inf)
         np.minimum.at(reach, mesh.bars.ravel(), np.repeat(_REACH * model.bars.rest, 2))
         self._reach = reach[:owned].copy()
-        self._tolerance = PROJECTED * model.size
         self._failure: SimulationFailure | None = None
         self._external_norm = 0.0
 
@@ -246,7 +245,7 @@ class PseudoMotion:
         """Project increments (owned, 3) from ``x`` onto the walls, and store the forces."""
         owned, contact = self.model.mesh.n_owned, self.model.contact
         try:
-            self.held, force, self.walls = contact.explicit(self.x[:owned], u, self.mass, self.time, self._tolerance)
+            self.held, force, self.walls = contact.explicit(self.x[:owned], u, self.mass, self.time)
         except SimulationFailure as failure:
             self._failure = self._failure or failure
             return

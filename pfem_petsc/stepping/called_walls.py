@@ -1,7 +1,9 @@
-"""Surfaces of triangles and walls that turn in compiled steps: loops find the nodes near them, which Python presses."""
+"""Surfaces of triangles, walls that turn, and those with mass in compiled steps: loops find the nodes near them, which
+Python presses."""
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -10,15 +12,19 @@ from ..contact.surfaces import OTHER, Surfaces, tangent
 from ..mechanics.compiled import addressed, inlined
 from ..mechanics.records import record
 from ..tolerances import BEYOND
-from .contact_phase import PUSHED, find_beyond, note_contacts, stop_on_walls
+from .contact_phase import PUSHED, find_beyond, note_contacts
 from .impact import join_nodes
-from .phases import LOST, displace
+from .phases import LOST, displace, put_rates, rates_of
 
 if TYPE_CHECKING:
     from ..contact.contact import Contact
 
-PRESSED, STOPPED = range(2)
-"""What a call of Python does: press nodes, or find where they stop."""
+MOVED, PRESSED, STOPPED = range(3)
+"""What a call of Python does: begin the step of walls with mass, press nodes, or find the energy that they lose and end
+the step of walls with mass."""
+
+AGAIN = 1
+"""What a call returns if walls with mass may meet more nodes than those found."""
 
 FOUND, SUSPECTS = range(2)  # places of numbers of nodes
 
@@ -33,13 +39,15 @@ class CalledWalls(NamedTuple):
     boxes : (w, 6) lower and upper corners of surfaces of triangles at rest [m]
     first : (w,) the first slot of each
     slack : distance from a wall below which it may stop a node [m]
+    massive : whether walls have mass, on all ranks; reach : (w, 2) how far these may move [m] and turn [rad] by contact
+        in a step, zero for others; pivots : (w, 3) their centres without contact at its end [m]
     poses, angles : (t, w, 12) and (t, w) [rad], see :meth:`~pfem_petsc.contact.wall_motion.WallMotion.turns`, at the
         start of the first step, the end of each, and of one more
     axes, centres : (w, 3) about which walls turn; torques : (w,) at the start of a step [N m]
     counts : (2,) numbers of nodes that are known to be beyond walls, and of others in ``nodes`` (n,)
     free : (n, 3) positions to which nodes move [m]
-    force : (n, 3) on pressed nodes [N]; friction : (1,) energy that it dissipates [J]
-    normals, rates : (n, s, 3), gaps : (n, s), of ``nodes`` that begin or cease to touch walls
+    force : (n, 3) on pressed nodes [N]
+    losses : (2,) energy that friction of these dissipates, and that closing contacts lose [J]
     """
 
     called: np.ndarray
@@ -47,6 +55,9 @@ class CalledWalls(NamedTuple):
     boxes: np.ndarray
     first: np.ndarray
     slack: float
+    massive: bool
+    reach: np.ndarray
+    pivots: np.ndarray
     poses: np.ndarray
     angles: np.ndarray
     axes: np.ndarray
@@ -56,27 +67,24 @@ class CalledWalls(NamedTuple):
     nodes: np.ndarray
     free: np.ndarray
     force: np.ndarray
-    friction: np.ndarray
-    normals: np.ndarray
-    rates: np.ndarray
-    gaps: np.ndarray
+    losses: np.ndarray
 
 
 def new_called_walls(contact: Contact) -> CalledWalls:
     """Return the walls of a rank."""
-    w, slots, called = len(contact.walls), len(contact.wall_of), contact.called
+    w, called = len(contact.walls), contact.called
     n = len(contact.members) if called.any() else 0
     boxes = np.zeros((w, 6))
     for k in contact.surfaces_of_triangles:
         triangles = contact.walls[k].triangles
         boxes[k] = triangles.boxes[1] + np.repeat([-1.0, 1.0], 3) * triangles.limits[0, 1]
-    rooms = np.empty((n, 3)), np.empty((n, 3)), np.zeros(1), np.empty((n, slots, 3)), np.empty((n, slots, 3))
+    masses = contact.motion.bodies.any, np.zeros((w, 2)), np.zeros((w, 3))
     times = np.zeros((0, w, 12)), np.zeros((0, w))
     sets = np.zeros(2, dtype=np.int64), np.empty(n, dtype=np.int64)
     slack = 4.0 * BEYOND * contact.size
     turns = *contact.motion.pivots, np.zeros(w)
     shapes = called, contact.at_rest, boxes, contact.first
-    return CalledWalls(*shapes, slack, *times, *turns, *sets, *rooms, np.empty((n, slots)))
+    return CalledWalls(*shapes, slack, *masses, *times, *turns, *sets, *np.empty((2, n, 3)), np.zeros(2))
 
 
 @inlined
@@ -93,12 +101,16 @@ def _at_rest(pose, x, y, z):
 @inlined
 def _may_stop(k, called, starts, ends, i, step):
     """Return whether wall k may stop node i on its way from ``starts`` to ``ends`` (3, n)."""
-    end = _at_rest(called.poses[step + 2, k], ends[0, i], ends[1, i], ends[2, i])
+    end, slack, square = _at_rest(called.poses[step + 2, k], ends[0, i], ends[1, i], ends[2, i]), called.slack, 0.0
+    if called.reach[k, 0] > 0.0:
+        for c in range(3):
+            square += (ends[c, i] - called.pivots[k, c]) ** 2
+        slack += called.reach[k, 0] + called.reach[k, 1] * math.sqrt(square)
     if called.at_rest.radii[k] != OTHER:
         _, _, _, gap = tangent(k, called.at_rest, end[0], end[1], end[2])
-        return gap < called.slack
+        return gap < slack
     start = _at_rest(called.poses[step + 1, k], starts[0, i], starts[1, i], starts[2, i])
-    box, slack, meets = called.boxes[k], called.slack, True
+    box, meets = called.boxes[k], True
     for c in range(3):
         meets = meets and min(start[c], end[c]) <= box[3 + c] + slack and max(start[c], end[c]) >= box[c] - slack
     return meets
@@ -134,21 +146,26 @@ def press_called(s, step):
     nodes, motion, walls, out, contacts, called = s.nodes, s.motion, s.walls, s.pressed, s.contacts, s.called_walls
     counts = called.counts
     counts[FOUND] = find_beyond(motion, walls, out, contacts)
-    counts[SUSPECTS] = _suspect(s, step)
-    m = 0
-    if counts[FOUND] > 0 or counts[SUSPECTS] > 0:
-        for i in walls.pressed.room[: counts[FOUND]]:
-            _show(i, s)
-        for i in called.nodes[: counts[SUSPECTS]]:
-            _show(i, s)
-        s.course.unsolved = s.calls.walls(step, PRESSED)
-        m = counts[FOUND] if s.course.unsolved == 0 else 0
-        for j in range(m):
-            i = out.nodes[j]
-            for c in range(3):
-                displace(c, i, out.places[j, c] - walls.free[c, i], nodes, motion, s.sums)
-                motion.contact[i, c] += called.force[j, c]
-        contacts.friction = called.friction[0]
+    if called.massive and s.calls.walls(step, MOVED) != 0:
+        s.course.unsolved = LOST
+        return
+    found, answer, m = counts[FOUND], AGAIN, 0
+    while answer == AGAIN:
+        counts[SUSPECTS], answer = _suspect(s, step), 0
+        if found > 0 or counts[SUSPECTS] > 0 or called.massive:
+            for i in walls.pressed.room[:found]:
+                _show(i, s)
+            for i in called.nodes[: counts[SUSPECTS]]:
+                _show(i, s)
+            answer = s.calls.walls(step, PRESSED)
+            s.course.unsolved = answer
+            m = counts[FOUND] if answer == 0 else 0
+            contacts.friction = called.losses[0]
+    for j in range(m):
+        i = out.nodes[j]
+        for c in range(3):
+            displace(c, i, out.places[j, c] - walls.free[c, i], nodes, motion, s.sums)
+            motion.contact[i, c] += called.force[j, c]
     note_contacts(m, walls, out, contacts)
 
 
@@ -156,33 +173,32 @@ def press_called(s, step):
 def close_on_called(s, step):
     """Find the energy that nodes lose which close on walls, and which nodes are on walls, as
     :func:`~pfem_petsc.stepping.contact_phase.close_on_walls` does."""
-    contacts, touched, called = s.contacts, s.walls.touched, s.called_walls
-    if len(contacts.met) == 0 and len(contacts.touched) == 0:
+    contacts, touched, called, state = s.contacts, s.walls.touched, s.called_walls, s.state
+    if len(contacts.met) == 0 and len(contacts.touched) == 0 and not called.massive:
         return
-    around = join_nodes(contacts.met, contacts.touched, s.walls.present)
-    slots, m = touched.closed.shape[1], 0
-    which = np.empty(len(around), dtype=np.int64)
-    for j in range(len(around)):
-        i, changes = around[j], False
-        for k in range(slots):
+    around, m, count = join_nodes(contacts.met, contacts.touched, s.walls.present), 0, 0
+    for i in around:
+        changes = False
+        for k in range(touched.closed.shape[1]):
             changes = changes or touched.touching[i, k] != touched.closed[i, k]
         if changes:
-            called.nodes[m], which[m] = i, j
+            called.nodes[m] = i
             m += 1
+            rates_of(i, s.motion, state.v, state.a)
             for c in range(3):
-                s.state.x[i, c] = s.motion.x[c, i]
-    normals, rates, gaps = (
-        np.zeros((len(around), slots, 3)),
-        np.zeros((len(around), slots, 3)),
-        np.zeros((len(around), slots)),
-    )
+                state.x[i, c] = s.motion.x[c, i]
     called.counts[SUSPECTS] = m
-    if m > 0 and s.calls.walls(step, STOPPED) != 0:
-        s.course.unsolved = LOST
-        return
-    for q in range(m):
-        normals[which[q]], rates[which[q]], gaps[which[q]] = called.normals[q], called.rates[q], called.gaps[q]
-    stop_on_walls(s, step, around, normals, gaps, rates)
+    if m > 0 or called.massive:
+        put_rates(s.moving, step, s.held, state.v, state.a)
+        if s.calls.walls(step, STOPPED) != 0:
+            s.course.unsolved = LOST
+            return
+        contacts.impact += called.losses[1]
+    for i in around:
+        if touched.closed[i].any():
+            around[count] = i
+            count += 1
+    contacts.met = around[:count].copy()
 
 
 @addressed

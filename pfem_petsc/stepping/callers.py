@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import types
 
+from ..contact.explicit import OutOfReachError
 from ..errors import SimulationFailure
 from ..mesh.exchange import CFunction
 from ..parallel.ending import is_alone
-from ..tolerances import PROJECTED
-from .called_walls import FOUND, PRESSED, SUSPECTS, CalledWalls, new_called_walls
+from .called_walls import AGAIN, FOUND, MOVED, PRESSED, SUSPECTS, CalledWalls, new_called_walls
 from .compiled_loop import SOLVE, CalledRows
 from .phases import FAILED, LOST
 
@@ -54,17 +54,16 @@ class Caller:
 
     def _call(self, step: int, what: int) -> int:
         try:
-            self._make(self._begin + step + 1, what)
+            return self._make(self._begin + step + 1, what) or 0
         except BaseException as error:  # noqa: BLE001  # an exception cannot pass the compiled loop: end raises it
             if isinstance(error, SimulationFailure) and self._goes_on(what):
                 self.failure = error
                 return FAILED
             self._error = error
             return LOST
-        return 0
 
-    def _make(self, step: int, what: int) -> None:
-        """Do something at the end of a step of a number."""
+    def _make(self, step: int, what: int) -> int | None:
+        """Do something at the end of a step of a number; return what the loop is to know, None for nothing."""
         raise NotImplementedError
 
     def _goes_on(self, what: int) -> bool:
@@ -88,7 +87,6 @@ class RowCaller(Caller):
         super().__init__(stepper)
         self.links = stepper.model.links
         self._stiffness, self._u, self._contact = stiffness, u, contact
-        self._tolerance = PROJECTED * stepper.model.size
         self._totals = np.empty((0, 3))
         n = 0 if self.links.separate else len(u)
         nodes, counts, loss = np.empty((2, n), dtype=np.int64), np.zeros(2, dtype=np.int64), np.zeros(2)
@@ -128,7 +126,8 @@ class RowCaller(Caller):
         stepper = self.stepper
         stepper.state.time = step * stepper.h
         stepper.balance = replace(stepper.balance, predictor=record.predictor, time=(step + 1) * stepper.h)
-        load = links.explicit(stepper.balance, stepper.state, self._u, self._stiffness, self._tolerance)
+        links.find(stepper.balance.predictor + self._u, np.zeros(len(self._u)), stepper.balance.time)
+        load = links.explicit(stepper.balance, stepper.state, self._u, self._stiffness)
         if load is not None:
             links.push(load, self._stiffness, self._u, self._contact)
         self._totals[:], record.loss[1] = links.totals(), links.friction
@@ -168,7 +167,7 @@ class TouchCaller(Caller):
 
 
 class WallCaller(Caller):
-    """Presses nodes onto surfaces of triangles and walls that turn.
+    """Presses nodes onto surfaces of triangles and walls that turn, and moves walls with mass.
 
     Parameters
     ----------
@@ -181,7 +180,8 @@ class WallCaller(Caller):
         self._walls, self._stiffness = stepper.model.contact, nodes.stiffness
         self._pressed, self._contact = pressed, contact
         self._record, self._found_at = new_called_walls(self._walls), -1
-        self._balance = stepper.scheme.balance(stepper.state, stepper.h)
+        if self._walls.called.any():
+            stepper.balance = stepper.scheme.balance(stepper.state, stepper.h)
 
     def schedule(self, times: np.ndarray) -> CalledWalls:
         """Return the walls in steps between times (t,) [s], and one more."""
@@ -191,31 +191,49 @@ class WallCaller(Caller):
         angles, poses = walls.motion.turns(times)
         sums = self.stepper.solution.walls
         record.torques[:] = walls.motion.torques(sums.force, sums.moment, state.time)
+        self._poses, self._force = poses, sums.force
         return record._replace(angles=angles, poses=poses)
 
-    def _make(self, step: int, what: int) -> None:
+    def _make(self, step: int, what: int) -> int | None:
         stepper, record, walls, out = self.stepper, self._record, self._walls, self._pressed
-        state, some = stepper.state, record.nodes[: record.counts[SUSPECTS]]
-        state.time = step * stepper.h
-        if what == PRESSED:
-            state.contact = self._contact
+        state, some, bodies = stepper.state, record.nodes[: record.counts[SUSPECTS]], walls.motion.bodies
+        state.time, state.contact, h = step * stepper.h, self._contact, stepper.h
+        if what == MOVED:
+            self._move(step)
+        elif what == PRESSED:
             found, self._found_at = walls.room[: record.counts[FOUND]].copy(), step
-            tolerance = PROJECTED * stepper.model.size
-            balance = replace(self._balance, time=(step + 1) * stepper.h)
-            nodes, places, force, sums = walls.press_some(
-                (found, some), record.free, self._stiffness, balance, tolerance
-            )
-            m = len(nodes)
-            record.counts[FOUND], record.friction[0] = m, sums.friction
-            out.nodes[:m], out.places[:m], out.touching[:m], record.force[:m] = nodes, places, sums.touching, force
+            balance = replace(stepper.balance, time=(step + 1) * h)
+            try:
+                stopped = walls.press_some((found, some), record.free, self._stiffness, balance)
+            except OutOfReachError:
+                record.reach[bodies.at] = walls.limits
+                return AGAIN
+            m, sums = len(stopped.nodes), stopped.walls
+            record.counts[FOUND], record.losses[0] = m, sums.friction
+            out.nodes[:m], out.places[:m], out.touching[:m] = stopped.nodes, stopped.places, sums.touching
+            record.force[:m] = stopped.force
             out.force[:], out.contacts[:], out.moment[:] = sums.force, sums.contacts, sums.moment
-            return
-        if self._found_at != step:
-            walls.forget_faces()
-        x, m = state.position[some], len(some)
-        every = np.ones((m, len(walls.wall_of)), dtype=bool)
-        record.normals[:m], record.gaps[:m] = walls.distances(every, x, walls.motion.poses(state.time), some)
-        record.rates[:m] = walls.rates(x, state.time, ahead=True)
+        else:
+            if self._found_at != step:
+                walls.forget_faces()
+            bodies.finish(h, state.time)
+            motion, poses = (state.v, state.a), walls.motion.poses(state.time)
+            record.losses[1] = stepper.ledger.impacts.on_walls(some, state.position, motion, None, state.time, poses)
+            if bodies.any:
+                push, self._force = 0.5 * (self._force + out.force), out.force.copy()
+                stepper.ledger.follow_bodies(push)
+        return None
+
+    def _move(self, step: int) -> None:
+        """Begin the step of walls with mass; show where they are, and would be at its end without contact."""
+        record, motion, h, k = self._record, self._walls.motion, self.stepper.h, step - self._begin
+        bodies = motion.bodies
+        bodies.begin(step * h, h)
+        for at, poses in ((k, motion.poses(step * h)), (k + 1, motion.poses_without_contact((step + 1) * h))):
+            turns = poses.turns[bodies.at] if len(poses.turns) else np.tile(np.eye(3), (len(bodies.at), 1, 1))
+            self._poses[at, bodies.at] = np.hstack([turns.reshape(-1, 9), poses.shifts[bodies.at]])
+        record.reach[bodies.at] = self._walls.limits
+        record.pivots[bodies.at] = bodies.centres + bodies.unpushed()[0]
 
     def _goes_on(self, what: int) -> bool:
         return what == PRESSED

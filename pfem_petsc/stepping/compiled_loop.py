@@ -471,7 +471,12 @@ def run_compiled(s, phases, starts, due, flags):
     others wait for their messages. It returns the first four of Contacts, and writes the outcome.
     """
     contacts, course, motion, sums, pressed = s.contacts, s.course, s.motion, s.sums, s.pressed
-    count, several, linked, calling = len(due), s.messages.several, len(s.rows.force) > 0, s.called.any
+    count, several, linked, calling = (
+        len(due),
+        s.messages.several,
+        len(s.rows.force) > 0,
+        s.called.any or s.called_walls.massive,
+    )
     agrees = several and (s.bars.can_break or calling)  # ranks that make the same steps
     keeps = flags.shape[1] > 0 or linked or calling or len(s.nodes.damping) > 0 or s.nodes.external.shape[1] > 0
     pressed.failure[0] = -1

@@ -15,6 +15,7 @@ from ..columns import BAR_ENERGIES, HEAD, Share, at_state, fill_at_state
 from ..contact.explicit import kind_of
 from ..contact.fixed_rows import FixedRows, pressed_nodes
 from ..contact.node_walls import NOTED, WallForces
+from ..contact.surfaces import OTHER
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.chunk_laws import first_class
@@ -149,6 +150,7 @@ class CompiledSteps:
         at = self._width - share.probes.size
         self._bar_probes = slice(at - bars, at)
         self._ends_at_rows = bars > 0 or not all(column.looped for column in self._at_state)
+        self._ends_at_rows |= model.contact.motion.bodies.any  # rows have where they are
         return_freed_memory()
 
     def _make_nodes(self) -> Nodes:
@@ -169,11 +171,12 @@ class CompiledSteps:
         touched = Touched(
             log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.ledger.impacts.slack
         )
-        surfaces = contact.surfaces
+        called = contact.called[contact.wall_of]
+        surfaces = contact.surfaces._replace(radii=np.where(called, OTHER, contact.surfaces.radii))
         at_end, level = surfaces.copy(), surfaces.copy()
         acting = self.stepper.scheme.balance(self.stepper.state, self.stepper.h).acting
         way = np.zeros(level.centres.shape)
-        walls = contact.pressed_walls(at_end, acting, PROJECTED * self.model.size, way)
+        walls = contact.pressed_walls(at_end, acting, way)
         room = np.empty((3, n if len(contact.walls) else 0)), np.zeros(n // NODE_BLOCK + 1, dtype=bool)
         motions = self._wall_motions(0, 0)
         return WallArrays(walls, surfaces, level, motions, touched, log.present, log.releases, *room)
@@ -212,7 +215,8 @@ class CompiledSteps:
         called, walls = self._called.record.any, len(model.contact.walls) > 0
         several, springs, moves = model.comm.size > 1, len(self._springs.nodes) > 0, model.supports.moves
         touch, walls_move = walls or linked or called, model.contact.moving.any()
-        press, close = press_walls(*kind_of(self._walls.pressed)) if walls else None, close_on_walls
+        pressed, close = self._walls.pressed, close_on_walls
+        press = press_walls(*kind_of(pressed.surfaces.radii, pressed.friction)) if walls else None
         if model.contact.called.any():
             press, close = press_called, close_on_called
         chosen = {
@@ -246,7 +250,7 @@ class CompiledSteps:
                 (push_particles, True),
                 (work_of_walls, walls_move),
             ),
-            AGREE: ((agree, several and (model.bars.can_break or called)),),
+            AGREE: ((agree, several and (model.bars.can_break or called or model.contact.motion.bodies.any)),),
             END: ((put_state, True),),
             RECORD: (
                 (sum_ends, True),

@@ -270,14 +270,8 @@ def close_on_walls(s, step):
         for k in range(rates.shape[1]):
             for c in range(3):
                 rates[j, k, c] = walls.motions[step + 1, 1, k, c]
-    stop_on_walls(s, step, around, normals, gaps, rates)
-
-
-@inlined
-def stop_on_walls(s, step, around, normals, gaps, rates):
-    """Find the energy that nodes (m,) lose which close on walls with normals, distances and velocities of these."""
-    contacts, nodes, walls = s.contacts, s.nodes, s.walls
     v, a = state = s.state.v, s.state.a
+    nodes = s.nodes
     free_v, free_a = _free_rates(around, nodes, s.motion, (s.moving, step, s.held), state)
     for j in range(len(around)):
         i = around[j]

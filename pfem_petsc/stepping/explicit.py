@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
 from ..parallel.ending import is_alone
-from ..tolerances import BEYOND, PROJECTED
+from ..tolerances import BEYOND
 from .compiled_steps import CompiledSteps
 from .stepper import Solution, Stepper
 
@@ -85,16 +86,22 @@ class ExplicitStepper(Stepper):
             u += state.contact / stiffness[:, None]
         if supports.any:
             supports.put(u, supports.lacking(balance.predictor, balance.time))
-        walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.size
+        walls, held, bodies = model.contact.nothing, self._nobody, model.contact.motion.bodies
         with self._faults(balance):
-            pushes = model.links.explicit(balance, state, u, stiffness, tolerance)
+            model.links.find(balance.predictor + u, np.zeros(len(u)), balance.time)
+            if bodies.any and model.links.walled:
+                place = partial(self._place_coupled, balance, u, stiffness)
+                model.contact.push_walls(place, stiffness, balance, coupled=True)
+        with self._faults(balance):
+            pushes = model.links.explicit(balance, state, u, stiffness)
             if pushes is not None:
                 state.contact = state.contact.copy()
                 model.links.push(pushes, stiffness, u, state.contact)
         if model.contact.any:
-            # also after a failure of links: with walls with mass this call is collective
+            # also after a failure of links: with walls with mass this is collective
             with self._faults(balance):
-                arguments = balance.predictor, u, stiffness, balance.time, tolerance, balance.acting
+                pushing = balance if bodies.any and not model.links.walled else None
+                arguments = balance.predictor, u, stiffness, balance.time, balance.acting, pushing
                 held, force, walls = model.contact.explicit(*arguments)
                 if len(held):
                     if state.contact is self.zero:
@@ -106,6 +113,19 @@ class ExplicitStepper(Stepper):
         if supports.any:
             state.support = supports.part(stiffness[:, None] * u - load - state.contact)
         return Solution(u, state.f, walls, contacts=model.links.count_held(held))
+
+    def _place_coupled(self, balance: Balance, u: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+        """Return the positions (owned, 3) that rows leave nodes with increments (owned, 3) at, with walls where they
+        are. Collective."""
+        links, moved = self.model.links, u.copy()
+        before = links.state
+        try:
+            pushes = links.explicit(balance, self.state, u, stiffness)
+        finally:
+            links.state = before
+        if pushes is not None:
+            links.push(pushes, stiffness, moved, np.zeros_like(u))
+        return balance.predictor + moved
 
 
 class RedistributedStepper(Stepper):

@@ -215,7 +215,12 @@ class Impacts:
         """
         if not self.active:
             return 0.0
-        loss = self._on_walls(x, motion, load, time, poses) if self.model.contact.any else 0.0
+        loss, contact, log = 0.0, self.model.contact, self.model.contact.log
+        if contact.any and (len(self.met) or len(log.last) or contact.motion.bodies.any):
+            around, closed = join_nodes(self.met, log.last, log.present), self.stepper.closed
+            changing = around[(log.touching[around] != closed[around]).any(axis=1)]
+            loss = self.on_walls(changing, x, motion, load, time, poses)
+            self.met = around[closed[around].any(axis=1)]
         if len(self.model.links.two.at):
             loss += self.of_rows(x, motion, load)
         return 0.0 if self.elastic else loss
@@ -246,19 +251,23 @@ class Impacts:
             return v, a
         return np.where(fixed, motion[0][nodes], v), np.where(fixed, motion[1][nodes], a)
 
-    def _on_walls(
+    def on_walls(
         self,
+        nodes: np.ndarray,
         x: np.ndarray,
         motion: tuple[np.ndarray, np.ndarray],
         load: np.ndarray | None,
         time: float,
         poses: Poses,
     ) -> float:
+        """Return the loss of nodes (m,) that begin or cease to touch walls, see :meth:`step`. Collective with walls
+        with mass."""
         contact, log = self.model.contact, self.model.contact.log
-        free = contact.motion.bodies
-        if len(self.met) == 0 and len(log.last) == 0 and not free.any:
+        free, last = contact.motion.bodies, self._free_rates
+        self._free_rates = free.state.v
+        if len(nodes) == 0 and (not free.any or self.model.comm.size == 1):
             return 0.0
-        nodes = join_nodes(self.met, log.last, log.present)
+        nodes = np.sort(nodes)  # sums do not depend on when nodes met walls, which a restart does not know
         if contact.plain and not free.any:
             normals, gaps = wall_gaps(nodes, x, contact.surfaces.at(poses.shifts[contact.wall_of]))
         else:
@@ -270,13 +279,12 @@ class Impacts:
         if free.any:
             pulls[free.at] = np.where(free.hinged[:, None], 0.0, free.weight / free.mass[:, None])
             linear, angular = np.zeros((2, len(contact.names), 3))
-            linear[free.at], angular[free.at] = free.changes(None if load is None else self._free_rates)
+            linear[free.at], angular[free.at] = free.changes(None if load is None else last)
             unpushed = linear + np.cross(angular, contact.motion.arms(x[nodes], time))
             rates = rates + unpushed[:, contact.wall_of]
-            self._free_rates = free.state.v
         approach = Approach(normals, gaps, free_v, free_a, np.ascontiguousarray(rates), pulls[contact.wall_of])
         touched = Touched(log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.slack)
-        loss, self.met = stop_nodes(nodes, approach, touched, self.model.inertia.mass, self.counted, speeds)
+        loss, _ = stop_nodes(nodes, approach, touched, self.model.inertia.mass, self.counted, speeds)
         if contact.ties.any:
             loss += self._tied(nodes, normals, speeds, free_v, rates)
         if free.any:

@@ -16,6 +16,7 @@ from .impulses import Impulses, NoImpulses
 from .phases import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS, numerical_dissipation, power, sum_momenta
 
 if TYPE_CHECKING:
+    from ..contact.free_walls import BodyMotion
     from ..mechanics.bars import BarBlock
     from .stepper import Stepper
 
@@ -443,9 +444,7 @@ class Ledger:
         if not contact.moving.any():
             return
         self._angles = contact.motion.angles(time)
-        bodies = contact.motion.bodies
-        self._bodies = bodies.motion
-        self.sums[_AT["wall_kinetic_energy"]] = bodies.kinetic if self.model.comm.rank == 0 else 0.0
+        self._keep_bodies()
 
     def _work_of_walls(self) -> tuple[float, float, float, float]:
         """Return this rank's share of the work on the truss by walls with prescribed motion and by walls with mass, the
@@ -457,23 +456,44 @@ class Ledger:
         weight, times the mean of its velocities before and after; of its rotation, see
         :meth:`~pfem_petsc.contact.free_walls.FreeWalls.works`.
         """
-        stepper, contact = self.stepper, self.model.contact
+        contact = self.model.contact
         if not contact.moving.any():
             return 0.0, 0.0, 0.0, 0.0
-        bodies, displacements, before = contact.motion.bodies, self._displacements, self._bodies
-        angles = self._angles
+        before, angles, bodies = self._displacements, self._angles, contact.motion.bodies
+        (push, torques), earlier = self.impulses.mean_pushes(), self._bodies
         self._walls_before()
-        (push, torques), way = self.impulses.mean_pushes(), self._displacements - displacements
-        way[bodies.at] = stepper.part * 0.5 * (before.velocity + self._bodies.velocity)
-        works = (push * way).sum(axis=1)
-        given = float(works[bodies.at].sum())
-        work = float(works.sum()) - given
+        works = (push * (self._displacements - before)).sum(axis=1)
+        works[bodies.at] = 0.0
+        work = float(works.sum())
         if len(torques):
             work += float((torques * (self._angles - angles)).sum())
+        return work, *self._work_of_bodies(push, earlier)
+
+    def _work_of_bodies(self, push: np.ndarray, before: BodyMotion) -> tuple[float, float, float]:
+        """Return this rank's share of the work of walls with mass on the truss by mean forces (walls, 3) [N] since a
+        motion, the work of their weight, and their numerical dissipation [J]."""
+        bodies, part = self.model.contact.motion.bodies, self.stepper.part
+        ways = part * 0.5 * (before.velocity + self._bodies.velocity)
+        given = float((push[bodies.at] * ways).sum())
         if self.model.comm.rank:
-            return work, given, 0.0, 0.0
-        turning, weight, lost = bodies.works(before, self._bodies, stepper.part)
-        return work, given + turning, weight, lost
+            return given, 0.0, 0.0
+        turning, weight, lost = bodies.works(before, self._bodies, part)
+        return given + turning, weight, lost
+
+    def follow_bodies(self, push: np.ndarray) -> None:
+        """Add the works of walls with mass in a compiled step with mean forces (walls, 3) [N]."""
+        before = self._bodies
+        self._keep_bodies()
+        given, weight, lost = self._work_of_bodies(push, before)
+        self.powers[CONTACT] -= given
+        self.powers[EXTERNAL] += weight
+        self.powers[INERTIAL] += lost
+
+    def _keep_bodies(self) -> None:
+        """Store the motion of walls with mass."""
+        bodies = self.model.contact.motion.bodies
+        self._bodies = bodies.motion
+        self.sums[_AT["wall_kinetic_energy"]] = bodies.kinetic if self.model.comm.rank == 0 else 0.0
 
     def _before_jump(self, after: Moment) -> tuple[Moment, float]:
         """Return the end of the step before velocity jumps, and the energy of the jumps [J], a work of contact."""

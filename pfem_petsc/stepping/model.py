@@ -231,9 +231,9 @@ class Model:
     @property
     def steady(self) -> bool:
         """Whether steps can be compiled ones: supports are along axes, bars and damping constant in time, loads
-        depend on time alone, and walls are infinite, spheres, cylinders or surfaces of triangles, without mass and
-        not tied, which bars do not touch between their nodes; beside pairs and constraints they are not triangles and
-        do not turn."""
+        depend on time alone, and walls are infinite, spheres, cylinders or surfaces of triangles, not tied, which
+        bars do not touch between their nodes; beside pairs and constraints they are not triangles, do not turn, and
+        have no mass."""
         others = any(family is not self.bars.springs for family in self.bars.families)
         between = self.self_contact is not None and self.self_contact.at_walls is not None
         changing = self.supports.inclined is not None or self.bars_vary or others or self.inertia.varies or between

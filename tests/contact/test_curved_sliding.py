@@ -171,7 +171,8 @@ def test_friction_on_a_sphere_in_large_steps(side, friction):
         *(np.empty((m, 0)), np.empty((m, 0)), np.empty((0, 1, 3)), np.empty((0, 1))),
     )
     sums = WallSums(np.zeros((1, 3)), np.zeros(1, dtype=np.int64), np.zeros((1, 3)))
-    failed, _, (x, *_), force, _, dissipated = press_nodes(given, walls, sums, *kind_of(walls))
+    kind = kind_of(walls.surfaces.radii, walls.friction)
+    failed, _, (x, *_), force, _, dissipated = press_nodes(given, walls, sums, *kind)
     assert m > 60 and turned.sum() > 20 and failed < 0
     np.testing.assert_allclose(np.linalg.norm(x, axis=1), 1.0, atol=1e-12)
     np.testing.assert_allclose(force, stiffness * (x - free), atol=1e-12)

@@ -34,15 +34,25 @@ def increasing(rows: tuple | None) -> tuple | None:
     return rows
 
 
-class Rotation(StrictModel):
+class Hinge(StrictModel):
+    """An axis fixed in space about which a wall with inertia turns freely."""
+
+    centre: Vector3
+    """a point of the axis at rest [m]; that of a rotation moves with the wall"""
+    axis: Vector3
+    """direction of the axis, of any nonzero length"""
+
+    @field_validator("axis")
+    @classmethod
+    def _has_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        return direction(value, f"the direction of the axis of the {cls.__name__.lower()}")
+
+
+class Rotation(Hinge):
     """Rotation of a wall about an axis."""
 
     exactly_one = (("angular_velocity", "angles"),)
 
-    centre: Vector3
-    """a point of the axis at rest [m]; it moves with the wall"""
-    axis: Vector3
-    """direction of the axis, of any nonzero length"""
     angular_velocity: Finite | None = None
     """constant angular velocity [rad/s], by the right-hand rule"""
     angles: Annotated[tuple[Row2, ...], listed] | None = None
@@ -50,29 +60,10 @@ class Rotation(StrictModel):
     interpolation: Literal["smooth", "linear"] = "smooth"
     """interpolation of ``angles`` between its rows: a cubic spline, or straight lines with velocity jumps at rows"""
 
-    @field_validator("axis")
-    @classmethod
-    def _has_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        return direction(value, "the direction of the axis of rotation")
-
     @field_validator("angles")
     @classmethod
     def _times_increase(cls, rows: tuple | None) -> tuple | None:
         return increasing(rows)
-
-
-class Hinge(StrictModel):
-    """An axis fixed in space about which a wall with inertia turns freely."""
-
-    centre: Vector3
-    """a point of the axis [m]"""
-    axis: Vector3
-    """direction of the axis, of any nonzero length"""
-
-    @field_validator("axis")
-    @classmethod
-    def _has_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        return direction(value, "the direction of the axis of the hinge")
 
 
 class WallKeys(SurfaceKeys, WallParameters):

@@ -17,13 +17,11 @@ import numpy as np
 
 from ..errors import InputError, written
 from ..parallel.agreement import agreed
-from .camera import at_one_scale, cameras
 from .chart import opened
-from .colours import MARKS, ColourField, ColourScale, limits_of
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_rows, even_times
 from .options import Options
-from .page import Heading, Page, grid, inset_room
-from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Segments, Style, few_threads
+from .page import MARKS, ColourField, ColourScale, Heading, Page, grid, inset_room, limits_of
+from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Segments, Style, at_one_scale, cameras, few_threads
 
 if TYPE_CHECKING:
     from mpi4py import MPI

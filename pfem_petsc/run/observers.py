@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from ..columns import Row
+from ..columns import Fields, Row, Snapshot
 from ..contact.monitoring import Piercing, check_positions
 from ..errors import SimulationFailure
-from ..fields import Fields, Snapshot
 from ..output.checkpoint import write_checkpoint
 from ..output.lock import FolderLock
 from ..output.units import duration

@@ -11,9 +11,8 @@ import numpy as np
 from mpi4py import MPI
 
 from ..case.schema import Case
-from ..columns import Row, declared
+from ..columns import Fields, Row, declared
 from ..errors import EarlyStop, SimulationFailure, printable
-from ..fields import Fields
 from ..mechanics.compiled import Compilation
 from ..mechanics.springs import with_connectors
 from ..mesh.whole import without_slashes

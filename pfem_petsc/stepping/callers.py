@@ -11,7 +11,7 @@ from numba import types
 
 from ..errors import SimulationFailure
 from ..mesh.exchange import CFunction
-from ..parallel.ending import is_alone
+from ..parallel.agreement import is_alone
 from ..tolerances import PROJECTED
 from .called_walls import FOUND, PRESSED, SUSPECTS, CalledWalls, new_called_walls
 from .compiled_loop import SOLVE, CalledRows

@@ -305,10 +305,6 @@ STATUS = ("intact", "broken", "slack")
 """Meaning of the numbers 0, 1, 2 of the field ``status``."""
 
 
-def _always(model: Any) -> bool:
-    return True
-
-
 class Field(NamedTuple):
     """One field.
 
@@ -325,7 +321,7 @@ class Field(NamedTuple):
     place: str
     unit: str
     value: Callable[[Any], np.ndarray]
-    default: Callable[[Any], bool] = _always
+    default: Callable[[Any], bool] = lambda model: True
 
 
 # to add a field, add one entry here

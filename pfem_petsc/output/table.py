@@ -98,23 +98,6 @@ class Table(Mapping[str, np.ndarray]):
             writer.writerows(zip(*lists, strict=True))
         return path
 
-    def to_parquet(self, path: Path | str) -> Path:
-        """Write the table as a Parquet file.
-
-        Raises
-        ------
-        InputError
-            If pyarrow is not installed, or the file cannot be written.
-        """
-        try:
-            from pyarrow import parquet, table
-        except ImportError as error:
-            raise InputError(f"to_parquet needs pyarrow: pip install pyarrow ({error}); to_csv does not") from error
-        path = Path(path)
-        with written(path, "the table"):
-            parquet.write_table(table(dict(self)), path)
-        return path
-
     def to_markdown(self, path: Path | str | None = None) -> str:
         """Return the table as text of Markdown, and write it to a file if one is given; an earlier file is replaced.
 
@@ -414,7 +397,7 @@ class _Reader:
             signs = "expressions have + - * / and parentheses, and .norm of vectors"
             return self.error(f"'{function[0]}(...)': there are no functions; {signs}")
         whole = re.sub(r"(\[\d+\])?(\.(x|y|z|norm|min|max))?([-*/]\d[\d.e-]*)*$", "", found[0])
-        hint = nearest(whole, [name for name in self._names if not _is_change(name, self._names[name])])
+        hint = nearest(whole, [name for name in self._names if name != self._names[name] + _MOVED])
         return InputError(f"the history has no column '{whole}'{hint}")
 
     def _added(self, one: Selected, other: Selected, operation: Callable) -> Selected:
@@ -447,10 +430,6 @@ def _common(one: str | None, other: str | None) -> str | None:
     if one is None or other is None:
         return None
     return one if dimensions(powers_of(one)) == dimensions(powers_of(other)) else None
-
-
-def _is_change(name: str, source: str) -> bool:
-    return name == source + _MOVED
 
 
 def _names(columns: Iterable[str]) -> Iterable[tuple[str, str]]:

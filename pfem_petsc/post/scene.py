@@ -569,7 +569,9 @@ class Scene:
         self._plotter.render_window.Render()  # which a screenshot does not
         made = np.asarray(self._plotter.screenshot(return_img=True, transparent_background=self._transparent))
         if self._transparent:  # colours over nothing are multiplied by their opacity
-            made = np.concatenate([_divided(made[..., :3], made[..., 3:]), made[..., 3:]], axis=2)
+            alpha = made[..., 3:]
+            colours = np.minimum(255 * made[..., :3].astype(np.uint16) // np.maximum(alpha, 1), 255)
+            made = np.concatenate([colours.astype(np.uint8), alpha], axis=2)
         return np.array(Image.fromarray(made).reduce(self._factor))
 
     def thickness(self, camera: Camera) -> float:
@@ -618,11 +620,6 @@ class Scene:
             if len(surface.edge):
                 actors.append(self._add(Layer(points, np.asarray(surface.edge), EDGE_COLOUR, 1.8), camera))
         return actors
-
-
-def _divided(colours: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Return colours (h, w, 3) that were multiplied by their opacity (h, w, 1) without it."""
-    return np.minimum(255 * colours.astype(np.uint16) // np.maximum(alpha, 1), 255).astype(np.uint8)
 
 
 def _width(count: int, lengths: np.ndarray, shortest: float, unit: float) -> float:

@@ -14,7 +14,7 @@ def run() -> int:
 
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for them in all installed packages
 
-    from .leaving import leave_at_exit
+    from .signals import leave_at_exit
 
     leaving = leave_at_exit()  # before the imports, so that what they do at exit is done before
 

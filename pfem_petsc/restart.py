@@ -459,15 +459,6 @@ def _continues(folder: Path, path: Path) -> bool:
     return (folder / RESULT).is_file() and path.resolve().parent == folder.resolve()
 
 
-def _refuse_other(restart: Restart) -> None:
-    """Refuse a checkpoint that another run has overwritten before this one got the lock."""
-    if check_seal(restart.path) != restart.file.digest:
-        raise InputError(
-            f"{restart.path}: another run has overwritten this checkpoint while this one was set up: nothing is "
-            "changed; start again with --restart"
-        )
-
-
 def _refuse_loss(path: Path, plan: Plan) -> None:
     """Refuse a restart that would truncate results beyond the end of the run."""
     with open_result(path) as result:
@@ -515,7 +506,11 @@ def prepare_folder(folder: Path, restart: Restart | None, plan: Plan) -> Path | 
     aside = None
     try:
         if restart is not None and restart.continues:
-            _refuse_other(restart)
+            if check_seal(restart.path) != restart.file.digest:  # before this one got the lock
+                raise InputError(
+                    f"{restart.path}: another run has overwritten this checkpoint while this one was set up: nothing "
+                    "is changed; start again with --restart"
+                )
             _refuse_gap(folder / RESULT, restart)
             _refuse_loss(folder / RESULT, plan)
             if restart.path.name == PREVIOUS and (folder / NAME).exists():

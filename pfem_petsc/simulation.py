@@ -18,8 +18,7 @@ from .errors import EarlyStop, InputError, PfemError, SimulationFailure
 from .integrators.base import State
 from .mechanics.loads import ForceState
 from .output.lock import FolderLock
-from .parallel.agreement import on_root, outcome
-from .parallel.ending import all_arrive, aside, passes_exception, watch
+from .parallel.agreement import all_arrive, aside, on_root, outcome, passes_exception, watch
 from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
 from .preflight.checks import forecast, inspect, later_gaps, summarise, warnings_before

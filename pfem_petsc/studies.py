@@ -32,8 +32,7 @@ from .case.toml import plain
 from .columns import LOST, STORED, SUPPLIED
 from .errors import InputError, PfemError
 from .output.result import Result, open_result, peak_force, touch_impulse
-from .output.selected import select
-from .output.table import SWEEP, Table, flat_columns
+from .output.table import SWEEP, Table, flat_columns, select
 from .registry import nearest
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "pfem_petsc"
 
 FLOORS = (
-    ("columns", "errors", "fields", "files", "leaving", "signals", "tolerances", "version"),
+    ("columns", "errors", "files", "signals", "tolerances", "version"),
     ("registry",),
     ("parallel",),
     ("cases",),

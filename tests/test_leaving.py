@@ -7,7 +7,7 @@ import sys
 import h5py
 import pytest
 
-from pfem_petsc import leaving
+from pfem_petsc import signals
 
 PLUGIN = """
 import atexit
@@ -37,7 +37,7 @@ def test_process_does_not_leave_early_after_a_failure_or_with_open_files(tmp_pat
     left = []
     monkeypatch.setattr(os, "_exit", left.append)
     monkeypatch.setattr(sys, "modules", {"h5py": h5py})
-    end = leaving.Leaving()
+    end = signals.Leaving()
     for end.status in (None, 2):
         end.leave()
     end.status = 0

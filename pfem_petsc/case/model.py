@@ -24,9 +24,9 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, core_schema
 
+from ..columns import cell_fields, point_fields
 from ..contact.walls.base import WALLS, WallKeys
 from ..errors import InputError
-from ..fields import cell_fields, point_fields
 from ..mechanics.materials.base import LAWS, MaterialKeys, internal_variables, law_name
 from ..registry import added_file, choices, lookup, modules, nearest
 from . import load_cases

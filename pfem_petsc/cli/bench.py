@@ -71,8 +71,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     """Measure and print. Collective."""
     start_petsc(arguments.petsc_options, comm.rank)
     from ..bench import report
-    from ..bench.compilation import compile_loops
-    from ..bench.measure import time_job
+    from ..bench.measure import compile_loops, time_job
     from ..parallel.agreement import on_root
 
     if not 0.0 < arguments.seconds < float("inf"):

@@ -241,7 +241,7 @@ def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
         status = function(comm)
         sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - whatever it is becomes a message and a status
-        from ..parallel.ending import all_arrive
+        from ..parallel.agreement import all_arrive
 
         if not all_arrive(failures):
             comm.Abort(_print(error, debug, f"rank {comm.rank}: "))

@@ -172,7 +172,6 @@ OF_MEMBERS = (
     argument("--each-case", action="store_true", help="rows for each of them, instead of for the one that governs"),
     argument("--limit", metavar="N", type=int, default=20, help="rows printed; default: %(default)s; 0: all"),
     argument("--csv", metavar="FILE", type=Path, help="write all rows as CSV"),
-    argument("--parquet", metavar="FILE", type=Path, help="write all rows as Parquet, which needs pyarrow"),
     argument("--markdown", metavar="FILE", type=Path, help="write all rows as a table of Markdown"),
     argument("--picture", metavar="FILE", type=Path, help="draw the truss in colours of utilisation, as PNG"),
 )
@@ -195,7 +194,7 @@ def print_members(arguments: argparse.Namespace) -> int:
         print(f"not computed to their ends, and left out: {', '.join(map(printable, left))}")
     if table.n_rows > limit:
         print(f"{table.n_rows - limit:,} more rows: --limit 0 prints all, --csv writes them")
-    for name in ("csv", "parquet", "markdown"):
+    for name in ("csv", "markdown"):
         file = getattr(arguments, name)
         if file is not None:
             getattr(table, f"to_{name}")(file)

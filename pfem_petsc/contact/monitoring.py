@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
+from ..columns import STATUS
 from ..errors import SimulationFailure
-from ..fields import STATUS
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..parallel.heap import returning_freed_memory

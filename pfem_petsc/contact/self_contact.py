@@ -37,8 +37,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
+from ..columns import STATUS
 from ..errors import InputError, SimulationFailure
-from ..fields import STATUS
 from ..mechanics.compiled import add_freely, inlined, kernel
 from ..mesh.distribution import bars_of_group
 from ..mesh.exchange import GhostExchange, Router

@@ -11,9 +11,8 @@ import numpy as np
 from mpi4py import MPI
 
 from ..case.tables import FIELD_KEYS, FieldValue
-from ..columns import BAR_ENERGIES, STORED
+from ..columns import BAR_ENERGIES, STATUS, STORED
 from ..errors import InputError
-from ..fields import STATUS
 from ..mesh import load_slab
 from ..mesh.distribution import group_hint
 from ..mesh.exchange import Router
@@ -543,7 +542,7 @@ class Bars:
         return found
 
     def status(self) -> np.ndarray:
-        """Return the status (b,) of each local bar, of :data:`~pfem_petsc.fields.STATUS`."""
+        """Return the status (b,) of each local bar, of :data:`~pfem_petsc.columns.STATUS`."""
         status = np.full(len(self.ends), float(STATUS.index("intact")))
         for block in self.blocks:
             if block.law.slack_row >= 0:

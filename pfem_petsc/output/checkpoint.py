@@ -173,11 +173,6 @@ def asked_checkpoint(folder: Path | str, asked: bool | Path | str) -> Path | Non
     return newest
 
 
-def _seal_size(n_arrays: int) -> int:
-    """Return the size of the user block for the seal of a file with ``n_arrays``: a power of two, as HDF5 requires."""
-    return 1 << (511 + 64 * n_arrays).bit_length()
-
-
 def _seal(path: Path) -> None:
     """Write the seal into the user block of a complete, closed file. Not collective."""
     with h5py.File(path, "r", locking=False) as file:
@@ -328,7 +323,8 @@ def write_checkpoint(
         {"scalars": dict(scalars), "attributes": dict(attributes)}, default=lambda value: value.tolist()
     )  # of NumPy
     try:
-        temporary = create_new(path, comm, _create, shapes, checks, state, userblock_size=_seal_size(len(shapes)))
+        size = 1 << (511 + 64 * len(shapes)).bit_length()  # of the seal: a power of two, as HDF5 requires
+        temporary = create_new(path, comm, _create, shapes, checks, state, userblock_size=size)
     except InputError as error:
         raise SimulationFailure(f"{path}: no checkpoint could be written: {error}") from error
 

@@ -18,8 +18,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
-from ..parallel.agreement import agreed, on_root, outcome
-from ..parallel.ending import aside
+from ..parallel.agreement import agreed, aside, on_root, outcome
 from ..parallel.heap import SharedArrays, share_memory
 
 CHUNK_BYTES = 1 << 20

@@ -30,8 +30,7 @@ from .layout import (
     mesh_sizes,
     read_attributes,
 )
-from .selected import select
-from .table import SWEEP, Table, flat_columns
+from .table import SWEEP, Table, flat_columns, select
 from .units import AXES, LOAD_FACTOR, TIME, Axis, engineering
 
 if TYPE_CHECKING:
@@ -402,7 +401,7 @@ class Result:
         Parameters
         ----------
         names : of columns, of groups of them as ``wall/floor``, or expressions as of
-            :func:`~pfem_petsc.output.selected.select`; default: all but those of events
+            :func:`~pfem_petsc.output.table.select`; default: all but those of events
 
         Raises
         ------

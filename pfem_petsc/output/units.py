@@ -8,9 +8,8 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import NamedTuple
 
-from ..columns import declared
+from ..columns import FIELDS, declared
 from ..errors import InputError
-from ..fields import FIELDS
 from ..mechanics.materials.base import LAWS
 from ..registry import modules
 

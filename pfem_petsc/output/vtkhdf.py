@@ -17,7 +17,7 @@ from ..errors import InputError, PfemError, SimulationFailure
 from ..parallel.agreement import on_root
 from ..parallel.heap import SharedArrays
 from .hdf5 import Growing, SharedFile, create_new, require_parallel_hdf5, require_room, write_rows, writing
-from .integrity import RowDigests, mark_digest, numbers_digest, seeded, snapshot_digests, summed, word_sum
+from .integrity import RowDigests, mark_digest, numbers_digest, reopen, seeded, snapshot_digests, summed, word_sum
 from .layout import (
     BARS,
     CHECKS,
@@ -36,7 +36,6 @@ from .layout import (
     field_datasets,
     row_type,
 )
-from .repair import reopen
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh

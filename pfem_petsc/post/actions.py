@@ -10,8 +10,7 @@ import numpy as np
 from ..errors import InputError
 from ..mechanics.supports import directions_of
 from ..output.units import engineering
-from .camera import Camera
-from .scene import NODE_COLOUR, Layer
+from .scene import NODE_COLOUR, Camera, Layer
 
 MOST = 40
 """Nodes with symbols; of more, some of them, at distances."""

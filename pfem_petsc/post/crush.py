@@ -24,8 +24,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..output.result import impulse_of
-from ..output.selected import select
-from ..output.table import Table
+from ..output.table import Table, select
 from ..registry import nearest
 from .options import WINDOW
 

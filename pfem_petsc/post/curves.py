@@ -15,8 +15,7 @@ import numpy as np
 from ..case.base import StrictModel
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.selected import Selected, select
-from ..output.table import varied
+from ..output.table import Selected, select, varied
 from ..output.units import TIME, prefix_for, unit_of
 from .chart import DASHES, REFERENCE, Chart, Curve, Panel, distinct, largest
 from .filters import AS_COMPUTED, Filter, amplitude_spectrum
@@ -232,7 +231,7 @@ def words(name: str) -> str:
 
 
 def column(history: History, name: str) -> dict[str, np.ndarray]:
-    """Return the curves (n,) of a name or an expression, which :func:`~pfem_petsc.output.selected.select` takes.
+    """Return the curves (n,) of a name or an expression, which :func:`~pfem_petsc.output.table.select` takes.
 
     Columns of nodes are the mean over the nodes, of reactions the sum. A vector without component gives those that are
     not zero up to rounding.

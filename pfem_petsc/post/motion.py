@@ -11,18 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from ..columns import STATUS
 from ..contact.rotations import turns_about, turns_by, vectors_of
 from ..contact.walls.base import WALLS, Surface, perpendicular, slab
 from ..errors import InputError
-from ..fields import STATUS
 from ..mechanics.bars import bar_shapes, mesh_of_cases, section_of_bars
 from ..mechanics.motion import rotation_of
 from ..output.units import MODE, POINT, Axis
 from ..registry import choices, lookup, nearest
 from .actions import Actions
-from .camera import Camera
-from .colours import GHOST, MARKS, TRAILS
-from .scene import Layer, Scene
+from .page import GHOST, MARKS, TRAILS
+from .scene import Camera, Layer, Scene
 
 MOST_FRAMES = 300
 """Snapshots that are drawn without an option: more make a film of over ten seconds."""

@@ -17,13 +17,11 @@ import numpy as np
 
 from ..errors import InputError, written
 from ..parallel.agreement import agreed
-from .camera import at_one_scale, cameras
 from .chart import opened
-from .colours import MARKS, ColourField, ColourScale, limits_of
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_rows, even_times
 from .options import Options
-from .page import Heading, Page, grid, inset_room
-from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Segments, Style, few_threads
+from .page import MARKS, ColourField, ColourScale, Heading, Page, grid, inset_room, limits_of
+from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Segments, Style, at_one_scale, cameras, few_threads
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -105,7 +103,9 @@ def render(
         film.tell_length(tell)
         with agreed(comm):
             if first:
-                _emptied(folder / "frames")
+                with written(folder / "frames/frame_0000.png", "the picture"):
+                    for old in (folder / "frames").glob("frame_*.png"):
+                        old.unlink()  # of an earlier film, which would end up in this one
         if comm.size == 1:
             helpers = _helpers(paths, folder, chosen, film.count)
             shares = [slice(k, None, len(helpers) + 1) for k in range(len(helpers) + 1)]
@@ -389,13 +389,6 @@ def _help() -> None:
         film = Film([stack.enter_context(opened(path)) for path in paths], options, _nothing)
         film.write(folder / "frames", share, _nothing)
         film.close()
-
-
-def _emptied(folder: Path) -> None:
-    """Create the folder of the frames and remove frames of an earlier film, which would end up in this one."""
-    with written(folder / "frame_0000.png", "the picture"):
-        for old in folder.glob("frame_*.png"):
-            old.unlink()
 
 
 def save(picture: np.ndarray, file: Path) -> Path:

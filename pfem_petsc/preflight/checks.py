@@ -26,7 +26,7 @@ from .geometry import Geometry
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..fields import Fields
+    from ..columns import Fields
     from ..mesh.distribution import DistributedMesh
     from ..stepping.model import Model
     from ..stepping.plan import Plan

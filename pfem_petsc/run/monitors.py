@@ -51,8 +51,7 @@ def _first_created(rows: list[list[float]], kept: list[float]) -> tuple[int, flo
     """Return the first of ``rows`` (m, k) of :data:`WATCHED` with which too many have more energy than was supplied,
     or m, and the energy created [J]; update the numbers ``kept`` between rows."""
     created = 0.0
-    for k in range(len(rows)):
-        row = rows[k]
+    for k, row in enumerate(rows):
         moving, lost = row[_KINETIC] + row[_WALLS], row[_LOST]
         if kept[_STARTED] == 0.0:
             kept[_STARTED], kept[_START_ELASTIC], kept[_START_SPRINGS] = 1.0, row[_ELASTIC], row[_SPRINGS]
@@ -61,11 +60,10 @@ def _first_created(rows: list[list[float]], kept: list[float]) -> tuple[int, flo
             kept[_MOST_LOST] = lost
         released = kept[_START_ELASTIC] - row[_ELASTIC] + kept[_START_SPRINGS] - row[_SPRINGS]
         kept[_MOST] = max(kept[_MOST], released)
-        for j in range(len(_SUPPLIED)):
+        for j, supplied in enumerate(_SUPPLIED, start=_LOWEST):
             # rises only: what a force has taken away, as drag does, it need not give back
-            work = row[_SUPPLIED[j]]
-            kept[_LOWEST + j] = min(kept[_LOWEST + j], work)
-            kept[_MOST] = max(kept[_MOST], work - kept[_LOWEST + j])
+            kept[j] = min(kept[j], row[supplied])
+            kept[_MOST] = max(kept[_MOST], row[supplied] - kept[j])
         kept[_MOST_LOST] = max(kept[_MOST_LOST], lost)
         created = min(kept[_MOST_LOST] - lost, moving - released)
         if row[_ACTIVE] > 0:
@@ -202,14 +200,6 @@ _CAUSES = [_AT[name] for name in CAUSES]
 _BEGUN, _START, _SCALE, _TOUCHED, _ROWS = range(5)
 
 
-def _sum(row: list[float], columns: list[int]) -> float:
-    """Return the sum of some columns, in their order."""
-    total = 0.0
-    for k in columns:
-        total += row[k]
-    return total
-
-
 def _first_gain(
     rows: list[list[float]], numbers: np.ndarray, limits: tuple[bool, float, float, float], kept: list[float]
 ) -> tuple[int, float]:
@@ -221,25 +211,19 @@ def _first_gain(
     """
     explicit, swing, rounding, last = limits
     gain = 0.0
-    for k in range(len(rows)):
-        row = rows[k]
-        net = _sum(row, _STORED) + _sum(row, _CAUSES) - _sum(row, _SUPPLIED)
+    for k, row in enumerate(rows):
+        stored, dissipated, supplied = ([row[j] for j in columns] for columns in (_STORED, _CAUSES, _SUPPLIED))
+        net = sum(stored) + sum(dissipated) - sum(supplied)
         if kept[_BEGUN] == 0.0:
             kept[_BEGUN], kept[_START] = 1.0, net
-        scale = max(kept[_SCALE], rounding, abs(kept[_START]))
-        for j in range(len(_SUPPLIED)):
-            scale = max(scale, abs(row[_SUPPLIED[j]]))
-        kept[_SCALE] = scale
+        kept[_SCALE] = scale = max(kept[_SCALE], rounding, abs(kept[_START]), *map(abs, supplied))
         if row[_ACTIVE] > 0:
             kept[_TOUCHED] = 1.0
         touched = kept[_TOUCHED] > 0.0
         gain = net - kept[_START]
         if explicit and not touched:
             # what its own energy may have gained for a while: all of it where nothing dissipates
-            dissipates = False
-            for j in range(len(_CAUSES)):
-                dissipates = dissipates or row[_CAUSES[j]] > 0.0
-            gain -= swing * (row[_ELASTIC] + row[_SPRINGS]) if dissipates else np.inf
+            gain -= swing * (row[_ELASTIC] + row[_SPRINGS]) if any(value > 0.0 for value in dissipated) else np.inf
         kept[_ROWS] = kept[_ROWS] + 1 if gain > _SHARE * scale + rounding else 0
         patience = 1 if touched else _AT_END if numbers[k] >= last else _GAIN_ROWS
         if kept[_ROWS] >= patience:

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from ..columns import Row
+from ..columns import Fields, Row, Snapshot
 from ..contact.monitoring import Piercing, check_positions
 from ..errors import SimulationFailure
-from ..fields import Fields, Snapshot
 from ..output.checkpoint import write_checkpoint
 from ..output.lock import FolderLock
 from ..output.units import duration
@@ -475,15 +474,13 @@ class Checkpointing(Observer):
             On all ranks; earlier checkpoints are kept.
         """
         if self._state.stepper.number != self.last_step:
-            self._write(self._path)
+            self.write_state(self._path)
             self.last_step = self._state.stepper.number
         self._synchroniser.checkpoint_written()
 
-    def write_origin(self, path: Path) -> None:
-        """Write the state that load cases start from, which a restart in one of them needs for those after it."""
-        self._write(path)
-
-    def _write(self, path: Path) -> None:
+    def write_state(self, path: Path) -> None:
+        """Write the state into a file: of load cases the one that they start from, which a restart in one needs for
+        those after it. Collective."""
         history, state, case = self._history, self._state, self._stages.case
         history.writer.flush_history()
         scalars = state.scalars(history.ledger.kept(), history.kept(), self._snapshots.kept())

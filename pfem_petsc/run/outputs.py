@@ -11,9 +11,8 @@ import numpy as np
 from mpi4py import MPI
 
 from ..case.schema import Case
-from ..columns import Row, declared
+from ..columns import Fields, Row, declared
 from ..errors import EarlyStop, SimulationFailure, printable
-from ..fields import Fields
 from ..mechanics.compiled import Compilation
 from ..mechanics.springs import with_connectors
 from ..mesh.whole import without_slashes
@@ -399,7 +398,7 @@ class Outputs:
         source, row = self._origin or (history, history.recorder.row())
         if self._origin is None and stages.next_starts_from is not None:
             self._origin = source, row
-            self.checkpointing.write_origin(self._folder / ORIGIN)
+            self.checkpointing.write_state(self._folder / ORIGIN)
         ended = f"step {self._stepper.number}, {self._stepper.axis.place(self._stepper.place)}"
         handed = stages.advance()
         stepper = stages.stepper

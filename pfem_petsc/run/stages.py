@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from ..columns import declared
+from ..columns import Fields, declared
 from ..contact.contact import check_start
 from ..errors import InputError, SimulationFailure
-from ..fields import Fields
 from ..preflight.checks import warnings_before
 from ..stepping.model import Model, StageStart
 from ..stepping.plan import Plan, make_plan

@@ -12,7 +12,7 @@ from numba import types
 from ..contact.explicit import OutOfReachError
 from ..errors import SimulationFailure
 from ..mesh.exchange import CFunction
-from ..parallel.ending import is_alone
+from ..parallel.agreement import is_alone
 from .called_walls import AGAIN, FOUND, MOVED, PRESSED, SUSPECTS, CalledWalls, new_called_walls
 from .compiled_loop import SOLVE, CalledRows
 from .phases import FAILED, LOST

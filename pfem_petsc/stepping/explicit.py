@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
-from ..parallel.ending import is_alone
+from ..parallel.agreement import is_alone
 from ..tolerances import BEYOND
 from .compiled_steps import CompiledSteps
 from .stepper import Solution, Stepper

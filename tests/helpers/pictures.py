@@ -8,10 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 from PIL import Image
 
-from pfem_petsc.post.camera import direction, fit
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.render import render
-from pfem_petsc.post.scene import Scene
+from pfem_petsc.post.scene import Scene, direction, fit
 
 
 def saturated(file) -> np.ndarray:

@@ -13,8 +13,7 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.cli.main import main
-from pfem_petsc.output.integrity import damages
-from pfem_petsc.output.repair import repair
+from pfem_petsc.output.integrity import damages, repair
 from pfem_petsc.output.table import Table
 
 POINTS = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1.0]]

@@ -14,8 +14,8 @@ from helpers.synthetic import Truss, assert_grid_is, assert_history_is, options,
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
+from pfem_petsc.output.integrity import repair
 from pfem_petsc.output.layout import Kept
-from pfem_petsc.output.repair import repair
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.vtkhdf import ResultWriter
 

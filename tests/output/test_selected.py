@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.output.selected import select
+from pfem_petsc.output.table import select
 from pfem_petsc.output.units import dimensions, powers_of, product, simplest, text_of
 
 TIME = np.linspace(0.0, 1.0, 5)

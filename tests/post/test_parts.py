@@ -9,9 +9,8 @@ import pytest
 from helpers.pictures import camera_of, corners
 from helpers.synthetic import SyntheticResult, ring
 
-from pfem_petsc.post.colours import ColourField
 from pfem_petsc.post.motion import chosen_frames, plane, wall_surfaces
-from pfem_petsc.post.page import grid
+from pfem_petsc.post.page import ColourField, grid
 from pfem_petsc.post.render import instants
 
 BOX = np.array([[0.0, 0.0, 0.0], [2.0, 1.0, 1.0]])

@@ -13,12 +13,11 @@ from mpi4py import MPI
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
-from pfem_petsc.output.selected import select
+from pfem_petsc.output.table import select
 from pfem_petsc.post.chart import STYLE
-from pfem_petsc.post.colours import ColourScale
 from pfem_petsc.post.curves import draw_curves, draw_spectra
 from pfem_petsc.post.filters import make_filter, window_mean
-from pfem_petsc.post.page import Heading, Page
+from pfem_petsc.post.page import ColourScale, Heading, Page
 from pfem_petsc.post.plot import plot
 
 

@@ -11,10 +11,10 @@ from PIL import Image
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.units import LOAD_FACTOR
-from pfem_petsc.post.camera import cameras
 from pfem_petsc.post.motion import Motion, Resampled
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.render import Options, render
+from pfem_petsc.post.scene import cameras
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from helpers.synthetic import SyntheticResult, lattice, ring
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.colours import GHOST, MARKS, TRAILS
 from pfem_petsc.post.motion import chosen_frames, drawn_radii, radii_of
 from pfem_petsc.post.options import frames_of
+from pfem_petsc.post.page import GHOST, MARKS, TRAILS
 from pfem_petsc.post.scene import Layer, Style
 
 

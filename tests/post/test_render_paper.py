@@ -15,13 +15,11 @@ from pfem_petsc.errors import InputError
 from pfem_petsc.output.table import Table
 from pfem_petsc.output.units import POINT
 from pfem_petsc.post.actions import Actions
-from pfem_petsc.post.camera import cameras
-from pfem_petsc.post.colours import ColourScale
 from pfem_petsc.post.members import draw_members
 from pfem_petsc.post.motion import Motion
-from pfem_petsc.post.page import Page, inset_room
+from pfem_petsc.post.page import ColourScale, Page, inset_room
 from pfem_petsc.post.render import Film, Options, instants
-from pfem_petsc.post.scene import Style
+from pfem_petsc.post.scene import Style, cameras
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import pytest
 from helpers.pages import EXAMPLES, PLUGINS, TEXT, run
 from helpers.stopped import assert_restart_is_bitwise
 
-from pfem_petsc import Case, Simulation, fields, open_result, registry
+from pfem_petsc import Case, Simulation, columns, open_result, registry
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.motion import wall_surfaces
@@ -85,14 +85,14 @@ def test_restart_to_the_last_bit(examples, comm, shared_tmp_path):
 @pytest.mark.parallel
 def test_field_is_one_entry(comm, shared_tmp_path):
     line = re.search(r"^```python\n(Field\(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1]
-    entry = eval(line, {"Field": fields.Field})  # noqa: S307 - the text of our own page
-    fields.FIELDS.append(entry)
+    entry = eval(line, {"Field": columns.Field})  # noqa: S307 - the text of our own page
+    columns.FIELDS.append(entry)
     try:
         keys = ["mesh.elements=4", "time.end=0.2", "output.fields=['stretch', 'strain']"]
         run(Case.load("rod_impact", keys), comm, shared_tmp_path / "rod")
         run(Case.load("rod_impact", ["time.end=0.02"]), comm, shared_tmp_path / "other")
     finally:
-        fields.FIELDS.remove(entry)
+        columns.FIELDS.remove(entry)
     result = open_result(shared_tmp_path / "rod")
     assert sorted(result.cell_fields) == ["strain", "stretch"] and not result.point_fields
     for k in range(len(result.times)):
@@ -105,7 +105,7 @@ def test_energy_term_is_one_line(tmp_path):
     """In a copy of the package: the columns of a row are laid out when it is imported. What such a column is in batches
     of steps, ``tests/stepping/test_batches.py`` tests."""
     line = re.search(r"^```python\n(energy\(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1]
-    package = Path(fields.__file__).parent
+    package = Path(columns.__file__).parent
     shutil.copytree(package, tmp_path / package.name)
     path = tmp_path / package.name / "columns.py"
     text = path.read_text()

@@ -32,7 +32,7 @@ def prose(page: Path) -> str:
 
 def program_lines(page: Path) -> list[list[str]]:
     """Words after ``python -m pfem_petsc`` of the lines that begin so in blocks of commands."""
-    lines = "".join(blocks(page, "", "sh", "bash")).splitlines()
+    lines = "".join(blocks(page, "", "sh", "bash")).replace("\\\n", " ").splitlines()
     words = [shlex.split(line, comments=True) for line in lines if line.startswith("python -m pfem_petsc ")]
     return [line[3:] for line in words]
 

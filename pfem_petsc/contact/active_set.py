@@ -98,15 +98,15 @@ def broken_walls(
     return beyond[met], broken[met]
 
 
-def is_misaligned(frames: NodalFrames, strengths: np.ndarray) -> bool:
-    """Return whether a wall presses through the row of an almost parallel wall, so that the force is off its normal."""
+def is_misaligned(frames: NodalFrames, fixed: np.ndarray, strengths: np.ndarray) -> bool:
+    """Return whether a wall presses through the row of an almost parallel wall, so that the force is off its normal on
+    components that are not ``fixed`` (m, 3)."""
     normal_forces = strengths > 0.0
     astray = normal_forces & frames.shared
     for node, wall in np.argwhere(astray):
         own = (frames.rows[node] == frames.rows[node, wall]) & ~frames.shared[node]
-        turn = np.abs(
-            frames.normals[node, wall] - frames.signs[node, wall] * frames.basis[node, frames.rows[node, wall]]
-        )
+        along = frames.ratios[node, wall] * frames.basis[node, frames.rows[node, wall]]
+        turn = np.abs(frames.normals[node, wall] - along)[~fixed[node]]
         if turn.max() > ON_BOUND and not (normal_forces[node] & own).any():
             return True
     return False
@@ -347,7 +347,7 @@ class ActiveSet:
             y = trial.transform.positions(x)[at]
             normal_forces = self.friction.check(frames, y, pull, normal_forces, noise, tolerance)
         left = np.union1d(joined, self.friction.unsettled)
-        unsettled = is_misaligned(frames, normal_forces)
+        unsettled = is_misaligned(frames, contact.fixed[at], normal_forces)
         by_walls, part = normal_forces[:, :walls], self.balance.acting
         unsettled = unsettled or is_off_surface(contact, self._poses, frames, by_walls, x, slack, part)
         if self.model.comm.allreduce(int(unsettled or len(left) > 0), op=MPI.MAX):

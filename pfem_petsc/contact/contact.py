@@ -101,13 +101,14 @@ class Contact(ExplicitContact):
         left = np.where(active != 0, residual, 0.0)
         for k in range(frames.rows.shape[1]):
             row = frames.rows[:, k]
-            sign = frames.signs[:, k]
+            ratio = frames.ratios[:, k]
+            sign = np.sign(ratio)
             safe = np.maximum(row, 0)
             touching = (row >= 0) & (active[every, safe] == -sign)
             # of almost parallel walls that share a row, take the nearest
             bound = np.where(sign > 0.0, frames.lower[every, safe], frames.upper[every, safe])
             touching &= sign * (bound - frames.bounds[:, k]) <= ON_BOUND * self.size
-            strengths[touching, k] = np.abs(left[every[touching], safe[touching]])
+            strengths[touching, k] = np.abs(left[every[touching], safe[touching]] / ratio[touching])
             left[every[touching], safe[touching]] = 0.0  # where walls share a bound, the first takes the force
         return strengths
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..mechanics.compiled import kernel
+from ..tolerances import FREE_PART
 
 _SINGULAR = 1e-6  # determinant of I - C below which a wedge is jammed
 
@@ -52,12 +53,12 @@ class Sliding:
 
     def __init__(self, frames: NodalFrames, at: np.ndarray, forces: SlipForces) -> None:
         self.nodes, self.at, self.inverse, self.forces = frames.nodes[at], at, frames.inverse[at], forces
-        self._walls = frames.rows[at], frames.signs[at], frames.normals[at]
+        self._walls = frames.rows[at], frames.ratios[at], frames.normals[at]
         self.maps, self.stiffness = np.tile(np.eye(3), (len(at), 1, 1)), np.zeros((len(at), 3, 3))
 
     def couple(self, x: np.ndarray, g: np.ndarray) -> np.ndarray:
         """Return the residual (m, 3) with friction from the one without, in frame coordinates, at positions (m, 3)."""
-        (rows, signs, normals), (known, friction, origins, start, weight) = self._walls, self.forces
+        (rows, ratios, normals), (known, friction, origins, start, weight) = self._walls, self.forces
         way = start + weight[:, None, None] * (x[:, None, :] - origins)
         way -= np.einsum("mwi,mwi->mw", way, normals)[:, :, None] * normals
         size = np.maximum(np.linalg.norm(way, axis=2), 1e-300)
@@ -66,7 +67,7 @@ class Sliding:
         coupling = np.zeros((len(self.nodes), 3, 3))
         turned = np.einsum("mji,mwj->mwi", self.inverse, directions)
         for k in range(rows.shape[1]):
-            factor = friction[:, k] * signs[:, k]
+            factor = friction[:, k] / ratios[:, k]
             coupling[every, :, np.maximum(rows[:, k], 0)] += factor[:, None] * turned[:, k]
         system = np.eye(3) - coupling
         jammed = np.abs(np.linalg.det(system)) < _SINGULAR
@@ -76,7 +77,7 @@ class Sliding:
         # the change of friction as the direction of slip turns
         self.stiffness[:] = 0.0
         for k in range(rows.shape[1]):
-            normal_forces = np.maximum(signs[:, k] * g[every, np.maximum(rows[:, k], 0)], 0.0)
+            normal_forces = np.maximum(g[every, np.maximum(rows[:, k], 0)] / ratios[:, k], 0.0)
             factor = friction[:, k] * normal_forces * weight / size[:, k]
             n, d = normals[:, k], directions[:, k]
             across = np.eye(3) - n[:, :, None] * n[:, None, :] - d[:, :, None] * d[:, None, :]
@@ -85,7 +86,7 @@ class Sliding:
 
 
 MIN_VOLUME = 0.04  # of the rows of B: cond(B) <= 2.6/0.04 = 65; two planes can share a node from 2.3 degrees
-_PARALLEL = 1e-14  # 1 - |cos| of normals that share a row; the bound is exact only at the given position
+_PARALLEL = 1e-14  # 1 - |cos| of free parts of normals that share a row; the bound is exact only at the given position
 _ALONG = 1e-15  # components of a unit normal off an axis that count as zero
 
 
@@ -99,8 +100,10 @@ class NodalFrames:
     basis, inverse : (m, 3, 3): y = B x
     lower, upper : (m, 3) bounds on y [m], infinite where there is no bound
     rows : (m, w) int8: the coordinate (0, 1, 2) that wall k bounds at the node, -1 for none
-    signs : (m, w) +1 for a lower bound, -1 for an upper one
-    shared : (m, w) bool: the coordinate belongs to an almost parallel wall, and the bound is exact at one position only
+    ratios : (m, w) r of n = r b on components that are not prescribed, b the row: positive for a lower bound,
+        negative for an upper one, 1 or -1 unless supports make different normals parallel
+    shared : (m, w) bool: the coordinate belongs to another wall, parallel to rounding on these components, and the
+        bound is exact at one position only
     bounds : (m, w) bounds of the walls on their coordinates [m]
     normals, offsets : (m, w, 3), (m, w) planes that have a row; offset -inf for the others
     oblique : whether any basis is not the identity
@@ -117,7 +120,7 @@ class NodalFrames:
         self.lower = np.full((m, 3), -np.inf)
         self.upper = np.full((m, 3), np.inf)
         self.rows = np.full((m, walls), -1, dtype=np.int8)
-        self.signs = np.ones((m, walls))
+        self.ratios = np.ones((m, walls))
         self.shared = np.zeros((m, walls), dtype=np.bool_)
         self.bounds = np.zeros((m, walls))
         self.normals = np.zeros((m, walls, 3))
@@ -185,7 +188,7 @@ class RowPlanes(NamedTuple):
         return *every, places
 
 
-_FILLED = "basis", "inverse", "lower", "upper", "rows", "signs", "shared", "bounds"
+_FILLED = "basis", "inverse", "lower", "upper", "rows", "ratios", "shared", "bounds"
 
 
 def build_frames(nodes: np.ndarray, planes: Planes, tolerance: float = 0.0, least: float = MIN_VOLUME) -> NodalFrames:
@@ -268,7 +271,7 @@ def _build(planes, tolerance, least, output):
     """Fill the arrays of :class:`NodalFrames` that ``_FILLED`` names; return whether any basis is not the identity, and
     a node with infeasible bounds, else -1."""
     fixed, normals, offsets, rank, places = planes
-    basis, inverse, lower, upper, rows, signs, shares, bounds = output
+    basis, inverse, lower, upper, rows, ratios, shares, bounds = output
     m, w = offsets.shape
     taken = np.zeros(3, dtype=np.bool_)
     spanned = np.zeros((3, 3))
@@ -297,17 +300,17 @@ def _build(planes, tolerance, least, output):
                 break
             done[wall] = True
             normal = normals[i, wall]
-            slot, sign, shared = -1, 1.0, False
+            slot, ratio, shared = -1, 1.0, False
             for row in range(3):
-                if taken[row]:
-                    cosine = basis[i, row, 0] * normal[0] + basis[i, row, 1] * normal[1] + basis[i, row, 2] * normal[2]
-                    if abs(cosine) > 1.0 - _PARALLEL:
-                        shared = True
-                        if not fixed[i, row]:
-                            slot = row
-                            sign = 1.0 if cosine > 0.0 else -1.0
-            if shared and slot < 0:
-                continue
+                if taken[row] and not fixed[i, row]:
+                    along, square, free = 0.0, 0.0, 0.0
+                    for c in range(3):
+                        if not fixed[i, c]:
+                            along += basis[i, row, c] * normal[c]
+                            square += basis[i, row, c] ** 2
+                            free += normal[c] ** 2
+                    if free > FREE_PART and abs(along) > (1.0 - _PARALLEL) * math.sqrt(square * free):
+                        slot, ratio, shared = row, along / square, True
             if not shared:
                 if n == 3:
                     continue
@@ -320,10 +323,10 @@ def _build(planes, tolerance, least, output):
                     if abs(normal[c]) > abs(normal[axis]):
                         axis = c
                 # the length along the axis is not enough: it is 1 to rounding for normals up to 1e-8 off the axis
-                along = max(abs(normal[(axis + 1) % 3]), abs(normal[(axis + 2) % 3])) <= _ALONG
-                if along and not taken[axis]:
+                only = max(abs(normal[(axis + 1) % 3]), abs(normal[(axis + 2) % 3])) <= _ALONG
+                if only and not taken[axis]:
                     slot = axis
-                    sign = 1.0 if normal[axis] > 0.0 else -1.0
+                    ratio = 1.0 if normal[axis] > 0.0 else -1.0
                     basis[i, slot, axis] = 1.0
                 else:
                     for c in range(3):
@@ -336,20 +339,19 @@ def _build(planes, tolerance, least, output):
                 n += 1
                 taken[slot] = True
             rows[i, wall] = slot
-            signs[i, wall] = sign
-            bound = sign * offsets[i, wall]
+            ratios[i, wall] = ratio
+            bound = offsets[i, wall] / ratio
             if shared:
-                here, gap, cosine, same = 0.0, -offsets[i, wall], 0.0, True
+                here, gap, same = 0.0, -offsets[i, wall], True
                 for c in range(3):
                     here += basis[i, slot, c] * places[i, c]
                     gap += normal[c] * places[i, c]
-                    cosine += normal[c] * basis[i, slot, c]
-                    same = same and normal[c] == sign * basis[i, slot, c]
+                    same = same and normal[c] == ratio * basis[i, slot, c]
                 if not same:
-                    bound = here - gap / cosine
+                    bound = here - gap / ratio
                     shares[i, wall] = True
             bounds[i, wall] = bound
-            if sign > 0.0:
+            if ratio > 0.0:
                 lower[i, slot] = max(lower[i, slot], bound)
             else:
                 upper[i, slot] = min(upper[i, slot], bound)

@@ -28,14 +28,16 @@ def test_bounds_are_the_planes(walls):
         np.testing.assert_allclose(basis @ inverse, np.eye(3), atol=1e-13 / MIN_VOLUME)
         assert np.linalg.cond(basis) < 2.6 / MIN_VOLUME
         x = rng.normal(size=3)
-        y = basis @ x
         for k in range(walls):
-            row, sign = frames.rows[0, k], frames.signs[0, k]
+            row, ratio = frames.rows[0, k], frames.ratios[0, k]
             if row >= 0:
-                assert sign * y[row] == pytest.approx(normals[k] @ x, abs=1e-13)
+                # the places are zero, where the prescribed components are as well
+                here, free = np.where(fixed, 0.0, x), basis @ np.where(fixed, 0.0, x)
+                gap = ratio * (free[row] - frames.bounds[0, k])
+                assert gap == pytest.approx(normals[k] @ here - offsets[k] + 10.0, abs=1e-12 / MIN_VOLUME)
         for c in np.flatnonzero(fixed):
             np.testing.assert_array_equal(basis[c], np.eye(3)[c])
-        given = (frames.rows[0] >= 0).sum()
+        given = len(set(frames.rows[0].tolist()) - {-1})
         assert given == min(walls, 3 - fixed.sum()) or walls > given
 
 

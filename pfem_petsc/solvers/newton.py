@@ -19,6 +19,7 @@ from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian, at_exit, outlive, pass_less_often
 
 if TYPE_CHECKING:
+    from ..mechanics.elements import BlockPattern
     from ..mesh.distribution import DistributedMesh
     from .problem import StepProblem
 
@@ -171,6 +172,7 @@ class NewtonSolver:
         self.mesh = mesh
         self.lagged = lagged
         self.hessian = hessian
+        self._pattern: BlockPattern | None = None  # that the linear solvers have seen, where bars touch
         self.choice, self.bounded = choice, bounded
         self.max_newton = max_newton
         self.length = length
@@ -380,6 +382,10 @@ class NewtonSolver:
                 return
         array = u.getArray(readonly=True).reshape(self.mesh.n_owned, 3)
         self.hessian.update(self.problem, array)
+        if self.limits and self.hessian.pattern is not self._pattern:
+            self._pattern = self.hessian.pattern
+            for solver in self._solvers.values():  # PETSc would go on with the factorisation of another pattern
+                solver.getKSP().reset()
 
     def _limit(self, u: PETSc.Vec, step: PETSc.Vec) -> bool:
         """Shorten a step in which bars would pass through each other; return whether it was."""

@@ -236,10 +236,8 @@ class ConstraintSet:
         vars(self).update(state)
 
     def find(self, x: np.ndarray, reach: np.ndarray, time: float) -> None:
-        """Find the rows of a step whose nodes end within ``reach`` (owned,) of positions (owned, 3) [m], if any come
+        """Find the rows of a step whose nodes end within ``reach`` (owned,) of positions (owned, 3) [m], as they come
         and go. Rows that stay keep their forces. What a search raises on one rank, all raise. Collective."""
-        if not self.dynamic:
-            return
         numbers = self.mesh.node_ids[: self.mesh.n_owned].astype(np.int64)
         nodes = ExpectedNodes(self.mesh.comm, numbers, x, reach, time)
         found = list(self._sources)
@@ -254,8 +252,15 @@ class ConstraintSet:
         self._take(counted, before)
         before.partners.close()
 
+    def find_explicit(self, balance: Balance, u: np.ndarray) -> None:
+        """Find the rows of an explicit step with increments ``u`` (owned, 3) without rows. Collective."""
+        if self.dynamic:
+            self.find(balance.predictor + u, np.zeros(len(u)), balance.time)
+
     def expect(self, state: State, balance: Balance) -> None:
         """Find the rows of an implicit step. Collective."""
+        if not self.dynamic:
+            return
         move = (balance.time - state.time) * state.v
         reach = 0.5 * np.linalg.norm(move, axis=1) + BEYOND * self.contact.size
         self.find(state.position + move, reach, balance.time)
@@ -288,7 +293,7 @@ class ConstraintSet:
         Collective.
 
         ``stiffness`` (owned,) is the force for a displacement of a node [N/m]. Rows that come and go are those that
-        :meth:`find` has found.
+        :meth:`find_explicit` has found.
 
         Raises
         ------

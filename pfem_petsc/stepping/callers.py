@@ -126,7 +126,7 @@ class RowCaller(Caller):
         stepper = self.stepper
         stepper.state.time = step * stepper.h
         stepper.balance = replace(stepper.balance, predictor=record.predictor, time=(step + 1) * stepper.h)
-        links.find(stepper.balance.predictor + self._u, np.zeros(len(self._u)), stepper.balance.time)
+        links.find_explicit(stepper.balance, self._u)
         load = links.explicit(stepper.balance, stepper.state, self._u, self._stiffness)
         if load is not None:
             links.push(load, self._stiffness, self._u, self._contact)

@@ -88,7 +88,7 @@ class ExplicitStepper(Stepper):
             supports.put(u, supports.lacking(balance.predictor, balance.time))
         walls, held, bodies = model.contact.nothing, self._nobody, model.contact.motion.bodies
         with self._faults(balance):
-            model.links.find(balance.predictor + u, np.zeros(len(u)), balance.time)
+            model.links.find_explicit(balance, u)
             if bodies.any and model.links.walled:
                 place = partial(self._place_coupled, balance, u, stiffness)
                 model.contact.push_walls(place, stiffness, balance, coupled=True)

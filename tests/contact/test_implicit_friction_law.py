@@ -41,7 +41,8 @@ def test_law_of_coulomb(name, integrator, parameters, comm, shared_tmp_path):
         if wall["type"] == "plane":
             n = np.tile(wall["normal"], (len(x), 1))
         else:
-            arm = x - np.array(wall["point"])
+            # the normal where the forces of the balance act: a conserving scheme takes them half way
+            arm = before + balance.acting * (x - before) - np.array(wall["point"])
             n = arm / np.linalg.norm(arm, axis=1)[:, None] * (-1.0 if wall.get("side") else 1.0)
         strength = np.einsum("mi,mi->m", r, n)
         drag = r - strength[:, None] * n

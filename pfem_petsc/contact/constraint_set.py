@@ -17,7 +17,7 @@ from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, ExpectedNodes, SetPart
 from .explicit import Arrivals, impact_square, planes_of, rebound_lift
-from .fixed_rows import FixedRows, TwoNodeRows
+from .fixed_rows import TwoNodeRows
 from .friction import FAST, planes_at_rest, sliding
 from .projection import Planes
 from .rows import FreeNodes, RowSet, WallsOfNodes, free_positions, last_forces, push_nodes
@@ -166,11 +166,9 @@ class ConstraintSet:
     two : TwoNodeRows
     alone : whether all rows of the model are over two nodes that no other row and no wall stops, with fixed directions
     separate : whether all are over two nodes with fixed directions, stay, are stopped by no walls, and are on one rank
-        each, so that compiled steps solve them, see :meth:`export_rows`
+        each, so that compiled loops see whether any is closed
     walled : whether walls can stop any node of the model's rows
     """
-
-    _KEPT = "force", "drag", "rebound", "arrival"
 
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], contact: Contact) -> None:
         self.source, self.contact, self.mesh = case.source, contact, contact.mesh
@@ -200,8 +198,6 @@ class ConstraintSet:
         own = rows.partners.alone and not self.dynamic and not self.walled and len(self.two.at) == len(rows.source)
         self.separate = self.mesh.comm.allreduce(own, op=MPI.LAND)
         self._x = np.empty((len(rows.numbers), 3))
-        self._exported: FixedRows | None = None  # for nodes of the stiffness
-        self._exported_for = np.empty(0)
         self.release()
 
     def __bool__(self) -> bool:
@@ -373,27 +369,6 @@ class ConstraintSet:
     def push(self, load: np.ndarray, stiffness: np.ndarray, u: np.ndarray, contact: np.ndarray) -> None:
         """Correct increments by the forces of :meth:`explicit`, and add these to ``contact``, (owned, 3) both."""
         push_nodes(self.rows.where, load, self.rows.free, stiffness, u, contact)
-
-    def export_rows(self, stiffness: np.ndarray, tolerance: float) -> FixedRows:
-        """Return :attr:`separate` rows with their present forces for compiled steps; none if they are not.
-
-        ``stiffness`` (owned,) is the force for a displacement of a node [N/m], the same array as long as its values
-        stay the same; ``tolerance`` : see :meth:`explicit`.
-        """
-        if self._exported is None or stiffness is not self._exported_for:
-            two = self.two if self.separate else TwoNodeRows(RowSet([], self.mesh, self.contact.fixed))
-            self._exported, self._exported_for = two.arrays(stiffness, tolerance, len(self.names)), stiffness
-        rows = self._exported
-        for name in self._KEPT if self.separate else ():
-            getattr(rows, name)[:] = getattr(self, name)
-        rows.closed[:] = self.two.record.closed[: len(rows.closed)]
-        return rows
-
-    def import_rows(self, rows: FixedRows) -> None:
-        """Take the forces after the last of the steps from rows that were exported."""
-        for name in self._KEPT if self.separate else ():
-            setattr(self, name, getattr(rows, name).copy())
-        self.two.record.closed[: len(rows.closed)] = rows.closed
 
     def pressed(self) -> np.ndarray:
         """Return the owned nodes (m,), ascending, on which rows press."""

@@ -6,61 +6,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import inlined, kernel
-from ..mechanics.records import record
-from .explicit import impact_square, rebound_lift
-from .projection import Groups, RowPushes, System, project_groups
-from .rows import FreeNodes, RowSet, find_broken, pair_values
-
-
-@record
-class FixedRows(NamedTuple):
-    """Rows over two nodes with fixed directions, n . (x_2 - x_1) >= least (p rows), in the order of the row set, and
-    their nodes (n,), which are all on this rank.
-
-    Attributes
-    ----------
-    nodes, order : (n,) local indices of the nodes, and these in ascending order
-    source, ends : (p,) table of each row; (2, p) its nodes
-    normals, least : (p, 3) unit directions; (p,) bounds [m]
-    along : (2, p) squared lengths of the free parts of the directions
-    force, drag : (p,) forces and (p, 3) friction forces on the second nodes [N]; overwritten, like all that follow
-    closed : (p,) bool, rows that have closed and not opened since
-    restitution : (p,) coefficients
-    rebound, arrival : (p,) memory of rows that have closed, see :class:`~pfem_petsc.contact.explicit.Arrivals`
-    totals : (tables, 3) forces on the second nodes of each table [N]
-    groups, system : see :mod:`~pfem_petsc.contact.projection`, the latter at ``x``
-    tolerance : a row among several that is violated by at most this counts as satisfied [m]
-    start, x, pushed : (n, 3) positions at the start of a step and without rows at its end, displacements by forces [m]
-    moves, load : (n, 3) displacements [m] and forces [N] by rows
-    """
-
-    nodes: np.ndarray
-    order: np.ndarray
-    source: np.ndarray
-    ends: np.ndarray
-    normals: np.ndarray
-    least: np.ndarray
-    along: np.ndarray
-    force: np.ndarray
-    drag: np.ndarray
-    closed: np.ndarray
-    restitution: np.ndarray
-    rebound: np.ndarray
-    arrival: np.ndarray
-    totals: np.ndarray
-    groups: Groups
-    system: System
-    tolerance: float
-    start: np.ndarray
-    x: np.ndarray
-    pushed: np.ndarray
-    moves: np.ndarray
-    load: np.ndarray
+from ..mechanics.compiled import kernel
+from .rows import RowSet
 
 
 class ClosingRows(NamedTuple):
-    """What :func:`close_rows` needs of rows; fields of :class:`FixedRows`."""
+    """Rows (p,) n . (x_2 - x_1) >= least that may close.
+
+    Attributes
+    ----------
+    normals, least : (p, 3) unit directions; (p,) bounds [m]
+    along : (2, p) squared lengths of the free parts of the directions
+    force : (p,) on the second nodes [N]; closed : (p,) bool, rows that have closed and not opened since
+    restitution : (p,) coefficients
+    """
 
     normals: np.ndarray
     least: np.ndarray
@@ -79,7 +38,7 @@ class TwoNodeRows:
     at : (p,) which rows of the set
     every : whether these are all rows of the set on this rank, no two of them with a common node
     ends, nodes : (2, p) nodes of the rows among those of the set, and their local indices, negative at other ranks
-    normals, least, along : see :class:`FixedRows`
+    normals, least, along : see :class:`ClosingRows`
     counted : (p,) bool, rows whose second node this rank owns
     record : ClosingRows, in the order of the set
     """
@@ -102,22 +61,6 @@ class TwoNodeRows:
         p = len(self.at)
         changing = np.zeros(p), np.zeros(p, dtype=bool)
         self.record = ClosingRows(self.normals, self.least, self.along, *changing, rows.restitution[self.at])
-
-    def arrays(self, stiffness: np.ndarray, tolerance: float, tables: int) -> FixedRows:
-        """Return the rows for compiled steps, without forces, which are all of the set.
-
-        ``stiffness`` (owned,) is the force for a displacement of a node [N/m]; all nodes must be on this rank.
-        ``tolerance`` : see :class:`FixedRows`; ``tables`` : number of tables of the case
-        """
-        rows, p, vectors = self.rows, len(self.at), np.zeros((6, len(self.rows.numbers), 3))
-        nodes = FreeNodes(vectors[0], stiffness[rows.where], vectors[0], at_start=False, free=rows.free)
-        system, (force, rebound, arrival) = rows.system(rows.fixed_jacobian, np.empty(p), nodes), np.zeros((3, p))
-        fixed = rows.source, self.ends, self.normals, self.least, self.along
-        forces = force, np.zeros((p, 3)), np.zeros(p, dtype=bool), self.record.restitution, rebound, arrival
-        totals = np.zeros((tables, 3))
-        return FixedRows(
-            rows.where, np.argsort(rows.where), *fixed, *forces, totals, rows.groups, system, tolerance, *vectors[1:]
-        )
 
     def gather(self, values: np.ndarray) -> np.ndarray:
         """Return values (2, p, ...) at the nodes of rows from those at owned nodes (owned, ...). Collective."""
@@ -153,68 +96,12 @@ class TwoNodeRows:
 
 
 @kernel
-def solve_fixed(rows, size):
-    """Find the forces of :class:`FixedRows` that would be at ``x``, the displacements of their nodes, and the memory of
-    those that close; ``size``: largest coordinate [m].
-
-    Returns the first group of rows without a solution, or -1, and why, see
-    :func:`~pfem_petsc.contact.projection.project_groups`; numbers of rows with a force, and of those whose force begins
-    or ends with respect to ``closed``; and the energy that friction dissipates [J].
-    """
-    system, force, drag, p = rows.system, rows.force, rows.drag, len(rows.force)
-    pulls, gaps, before = np.empty(p), np.empty(p), force > 0.0
-    pair_values(rows.ends, rows.normals, rows.least, rows.x, system.values)
-    force[:], drag[:], rows.moves[:], rows.load[:] = 0.0, 0.0, 0.0, 0.0
-    for r in range(p):
-        i, j, change, pulls[r] = rows.ends[0, r], rows.ends[1, r], 0.0, 0.0
-        for c in range(3):
-            system.slips[r, c] = rows.x[j, c] - rows.start[j, c] - (rows.x[i, c] - rows.start[i, c])
-            change += rows.normals[r, c] * system.slips[r, c]
-            pulls[r] -= rows.normals[r, c] * (rows.pushed[j, c] - rows.pushed[i, c])
-        gaps[r] = system.values[r] - change
-        system.values[r] -= rebound_lift(rows.restitution[r], rows.rebound[r], rows.arrival[r], pulls[r])
-    tolerances, failed, why = np.full(len(rows.groups.starts) - 1, rows.tolerance), -1, 0
-    if find_broken(rows.groups, system, rows.x, tolerances) > 0:
-        which, pushes = np.flatnonzero(tolerances >= 0.0), RowPushes(force, drag, rows.moves)
-        failed, why = project_groups(which, rows.groups, system, tolerances, size, pushes)
-    count, altered, work = 0, 0, 0.0
-    for r in range(p):
-        i, j, change, presses = rows.ends[0, r], rows.ends[1, r], 0.0, force[r] > 0.0
-        count, altered = count + presses, altered + (presses != rows.closed[r])
-        for c in range(3 if presses else 0):
-            change += rows.normals[r, c] * system.slips[r, c]
-            part = force[r] * rows.normals[r, c] + drag[r, c]
-            rows.load[i, c] -= part
-            rows.load[j, c] += part
-            work -= drag[r, c] * (system.slips[r, c] + rows.moves[j, c] - rows.moves[i, c])
-        fresh = presses and not before[r] and rows.restitution[r] > 0.0
-        rows.rebound[r] = impact_square(-change, gaps[r], pulls[r]) if fresh else 0.0
-        rows.arrival[r] = gaps[r] if fresh else 0.0
-    return failed, why, count, altered, work
-
-
-@inlined
-def pressed_nodes(rows, pressing):
-    """Return the nodes (m,), ascending, of ``pressing`` rows, which are all that have a force."""
-    nodes, count = np.empty(min(2 * pressing, len(rows.nodes)), dtype=np.int64), 0
-    pushed = np.zeros(len(rows.nodes) if pressing > 0 else 0, dtype=np.bool_)
-    for r in range(len(rows.force) if pressing > 0 else 0):
-        for k in range(2):
-            pushed[rows.ends[k, r]] |= rows.force[r] > 0.0
-    for k in rows.order[: len(pushed)]:
-        if pushed[k]:
-            nodes[count] = rows.nodes[k]
-            count += 1
-    return nodes[:count].copy()
-
-
-@kernel
 def close_rows(rows, at, ends, counted, slack):
     """Return the energy [J] that closing rows lose, see :mod:`~pfem_petsc.stepping.impact`; update ``rows.closed``.
 
     Parameters
     ----------
-    rows : ClosingRows or FixedRows
+    rows : ClosingRows
     at : (m,) rows whose force begins or ends
     ends : (2, m, 10) position, velocity and acceleration without contact, and mass of their nodes
     counted : (p,) bool, rows whose energy this rank counts

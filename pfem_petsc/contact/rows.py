@@ -420,6 +420,11 @@ class RowSet:
         return NaturalOrder(comm, router.reply(sum(counts[: comm.rank]) + place), sum(counts))
 
     @cached_property
+    def moving(self) -> np.ndarray:
+        """Owned nodes (m,), ascending, of the rows of any rank."""
+        return np.union1d(self.here, self.partners.rows)
+
+    @cached_property
     def alike(self) -> list[Alike]:
         """Return all groups, collected by shape."""
         starts, members, node_starts, nodes = self.groups

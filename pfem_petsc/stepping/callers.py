@@ -14,7 +14,7 @@ from ..errors import SimulationFailure
 from ..mesh.exchange import CFunction
 from ..parallel.agreement import is_alone
 from .called_walls import AGAIN, FOUND, MOVED, PRESSED, SUSPECTS, CalledWalls, new_called_walls
-from .compiled_loop import SOLVE, CalledRows
+from .compiled_loop import CHANGING, CLOSED, HELD, SOLVE, CalledRows
 from .phases import FAILED, LOST
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from .stepper import Stepper
 
 _CALL = types.int64(types.int64, types.int64)
-_HELD, _CHANGING = range(2)  # nodes of CalledRows, and the places of their numbers
 
 
 class Caller:
@@ -72,11 +71,10 @@ class Caller:
 
 
 class RowCaller(Caller):
-    """Solves the rows that compiled loops cannot solve, when one asks for it: rows that turn, come and go, share nodes,
-    are on several ranks, or whose nodes walls stop too.
+    """Solves rows when a compiled loop asks for it.
 
-    The loop calls once in each step, when the nodes have moved without rows, and again if rows have closed or opened,
-    when the velocities at their nodes are known.
+    The loop calls when the nodes have moved without rows, in each step unless it can see that none of them is closed,
+    and again if rows have closed or opened, when the velocities at their nodes are known.
 
     Attributes
     ----------
@@ -87,26 +85,33 @@ class RowCaller(Caller):
         super().__init__(stepper)
         self.links = stepper.model.links
         self._stiffness, self._u, self._contact = stiffness, u, contact
-        self._totals = np.empty((0, 3))
-        n = 0 if self.links.separate else len(u)
-        nodes, counts, loss = np.empty((2, n), dtype=np.int64), np.zeros(2, dtype=np.int64), np.zeros(2)
-        self.record = CalledRows(not self.links.separate, np.empty((n, 3)), u[:n], *nodes, counts, loss)
-        self._keep(_HELD, self.links.pressed())
-        if self.record.any:
+        links, any_rows = self.links, bool(self.links)
+        n = len(u) if any_rows else 0
+        nodes, counts, loss = np.empty((2, n), dtype=np.int64), np.zeros(3, dtype=np.int64), np.zeros(2)
+        two, watched = links.two, links.separate and any_rows
+        rows = two.nodes, two.normals, two.least
+        if not watched:
+            rows = np.empty((2, 0), dtype=np.int64), np.empty((0, 3)), np.empty(0)
+        moving, totals = np.arange(n) if links.dynamic else links.rows.moving, links.totals()
+        self.record = CalledRows(
+            any_rows, watched, moving, *rows, np.empty((n, 3)), u[:n], *nodes, counts, loss, totals
+        )
+        self._keep(HELD, links.pressed())
+        self._count_closed()
+        if any_rows:
             stepper.balance = stepper.scheme.balance(stepper.state, stepper.h)
 
     def _keep(self, which: int, nodes: np.ndarray) -> None:
-        if self.record.any:
-            room = self.record.held if which == _HELD else self.record.changing
-            self.record.counts[which] = len(nodes)
-            room[: len(nodes)] = nodes
+        room = self.record.held if which == HELD else self.record.changing
+        self.record.counts[which] = len(nodes)
+        room[: len(nodes)] = nodes
 
-    def begin_rows(self, step: int, totals: np.ndarray) -> CalledRows:
-        """Prepare calls in steps from one of a number on; forces on the last nodes of rows are written to ``totals``
-        (tables, 3) [N]."""
-        self.begin(step)
-        self._totals = totals
-        return self.record
+    def _count_closed(self) -> None:
+        """Count the rows without which the loop cannot go on alone: with forces, closed, or about to rebound."""
+        links = self.links
+        closed = (links.force > 0.0) | (links.rebound > 0.0)
+        closed[links.two.at] |= links.two.record.closed
+        self.record.counts[CLOSED] = np.count_nonzero(closed)
 
     def _make(self, step: int, what: int) -> None:
         if what == SOLVE:
@@ -120,9 +125,9 @@ class RowCaller(Caller):
     def _solve(self, step: int) -> None:
         """Solve the rows of the balance at the end of a step of a number; if that fails, they have no forces."""
         links, record = self.links, self.record
-        self._keep(_HELD, np.empty(0, dtype=np.int64))
-        self._keep(_CHANGING, np.empty(0, dtype=np.int64))
-        self._totals[:] = record.loss[:] = 0.0
+        record.counts[:] = 0
+        record.totals[:] = 0.0
+        record.loss[:] = 0.0
         stepper = self.stepper
         stepper.state.time = step * stepper.h
         stepper.balance = replace(stepper.balance, predictor=record.predictor, time=(step + 1) * stepper.h)
@@ -130,19 +135,21 @@ class RowCaller(Caller):
         load = links.explicit(stepper.balance, stepper.state, self._u, self._stiffness)
         if load is not None:
             links.push(load, self._stiffness, self._u, self._contact)
-        self._totals[:], record.loss[1] = links.totals(), links.friction
-        self._keep(_HELD, links.pressed())
+        record.totals[:], record.loss[1] = links.totals(), links.friction
+        self._keep(HELD, links.pressed())
+        self._count_closed()
         two = links.two
         changed = (links.force[two.at] > 0.0) != two.record.closed
         if changed.any():
             nodes = two.nodes[:, changed]
-            self._keep(_CHANGING, np.unique(nodes[nodes >= 0]))
+            self._keep(CHANGING, np.unique(nodes[nodes >= 0]))
 
     def _close(self) -> None:
         """Find the energy that rows lose, from velocities and accelerations of the state at their nodes."""
         state = self.stepper.state
         state.contact = self._contact
         self.record.loss[0] = self.stepper.ledger.impacts.of_rows(state.position, (state.v, state.a), None)
+        self._count_closed()
 
 
 class TouchCaller(Caller):

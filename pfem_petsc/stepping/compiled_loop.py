@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..columns import BAR_ENERGIES, HEAD, PROBED
-from ..contact.fixed_rows import FixedRows
 from ..mechanics.compiled import addressed, inlined, kernel
 from ..mechanics.elements import first_inverted
 from ..mechanics.internal_forces import BarArrays, internal_forces
@@ -50,6 +49,8 @@ from .phases import (
 SOLVE, CLOSE = range(2)
 """What a call of Python does: solve rows, or find the energy that they lose."""
 
+HELD, CHANGING, CLOSED = range(3)  # places of numbers in CalledRows
+
 record(Messages)  # which stands below the compiled loops
 
 
@@ -69,24 +70,34 @@ class StepBars(NamedTuple):
 
 @record
 class CalledRows(NamedTuple):
-    """Rows that Python solves (owned nodes n).
+    """Rows of pairs and constraints, which Python solves (owned nodes n).
 
     Attributes
     ----------
-    any : whether there are any
-    predictor, u : (n, 3) positions to which nodes move without forces, and increments; (0, 3) without calls
+    any : whether there are any; watched : whether steps without closed rows need no call
+    nodes : (m,) those whose motion Python needs
+    ends, normals, least : (2, p), (p, 3), (p,) of watched rows, n . (x_2 - x_1) >= least: nodes, unit directions and
+        bounds [m]; none otherwise
+    predictor, u : (n, 3) positions to which nodes move without forces, and increments; (0, 3) without rows
     held, changing : (n,) nodes on which rows press, ascending; nodes of rows whose force begins or ends
-    counts : (2,) their numbers
+    counts : (3,) their numbers, and of watched rows that are closed
     loss : (2,) energy that closing rows lose, and that friction of rows dissipates in the next step [J]
+    totals : (tables, 3) forces on the last nodes of the rows of each table [N]
     """
 
     any: bool
+    watched: bool
+    nodes: np.ndarray
+    ends: np.ndarray
+    normals: np.ndarray
+    least: np.ndarray
     predictor: np.ndarray
     u: np.ndarray
     held: np.ndarray
     changing: np.ndarray
     counts: np.ndarray
     loss: np.ndarray
+    totals: np.ndarray
 
 
 @record
@@ -136,7 +147,6 @@ class Contacts(NamedTuple):
     friction : energy that friction dissipates in the next step [J]
     near : nodes (m,) beyond walls, or that rebound
     others, pressing : nodes (m,) with contact forces of rows; these and ``near``
-    rows, altered : numbers of rows with a force, and of those whose force begins or ends
     impact : energy that contacts lose in the step [J]
     """
 
@@ -147,8 +157,6 @@ class Contacts(NamedTuple):
     near: np.ndarray
     others: np.ndarray
     pressing: np.ndarray
-    rows: int
-    altered: int
     impact: float
 
 
@@ -157,7 +165,7 @@ class Course(NamedTuple):
     """How a step goes on, which compiled steps assign: whether increments and energies are needed; what
     :func:`~pfem_petsc.mechanics.internal_forces.internal_forces` returns; the number of shares of rows that are
     written; whether a condition holds here, and after :func:`agree` on any rank; the error code of MPI; and what a call
-    of Python returned, or which group of rows has no solution, and why."""
+    of Python returned."""
 
     keeps: bool
     needs_energies: bool
@@ -195,7 +203,6 @@ class StepArrays(NamedTuple):
     loads: LoadSchedule
     walls: WallArrays
     called_walls: CalledWalls
-    rows: FixedRows
     called: CalledRows
     sums: StepSums
     pressed: ContactNodes
@@ -310,22 +317,36 @@ def touch_bars(s, step):
         s.course.unsolved = LOST
 
 
+@inlined
+def _any_broken(called, motion):
+    """Return whether nodes would end beyond a watched row."""
+    x, half, h = motion.x, motion.half, motion.h
+    for r in range(len(called.least)):
+        i, j, value = called.ends[0, r], called.ends[1, r], -called.least[r]
+        for c in range(3):
+            value += called.normals[r, c] * (x[c, j] - x[c, i] + h * (half[c, j] - half[c, i]))
+        if not value >= 0.0:
+            return True
+    return False
+
+
 @addressed
 def solve_called(s, step):
     """Have Python solve the rows of a step."""
-    called, motion, n = s.called, s.motion, len(s.called.u)
+    called, motion = s.called, s.motion
     h, x, half, u = motion.h, motion.x, motion.half, motion.u
-    join_components(x, s.state.x)
-    for i in range(n):
+    if called.watched and called.counts[CLOSED] == 0 and not _any_broken(called, motion):
+        return
+    for i in called.nodes:
         for c in range(3):
-            called.u[i, c] = u[c, i]
+            s.state.x[i, c], called.u[i, c] = x[c, i], u[c, i]
             called.predictor[i, c] = x[c, i] + (h * half[c, i] - u[c, i])
     s.course.unsolved = s.calls.python(step, SOLVE)
-    for i in range(n):
+    for i in called.nodes:
         for c in range(3):
             if called.u[i, c] != u[c, i]:
                 displace(c, i, called.u[i, c] - u[c, i], s.nodes, motion, s.sums)
-    s.contacts.others = called.held[: called.counts[0]]
+    s.contacts.others = called.held[: called.counts[HELD]]
 
 
 @addressed
@@ -341,13 +362,14 @@ def join_pressing(s, step):
 def close_called(s, step):
     """Have Python find the energy that rows lose."""
     called = s.called
-    if called.counts[1] > 0:
-        for i in called.changing[: called.counts[1]]:
+    if called.counts[CHANGING] > 0:
+        for i in called.changing[: called.counts[CHANGING]]:
             rates_of(i, s.motion, s.state.v, s.state.a)
         put_rates(s.moving, step, s.held, s.state.v, s.state.a)
         if s.calls.python(step, CLOSE) != 0:  # the rows have been solved, so this is an error
             s.course.unsolved = LOST
         s.contacts.impact += called.loss[0]
+        called.counts[CHANGING] = 0
 
 
 @addressed
@@ -360,7 +382,7 @@ def book_springs(s, step):
 @addressed
 def push_particles(s, step):
     """Advance the particles of the impulses by a step, with the forces of the balance, of walls and of rows."""
-    forces, walls, links, u, h = s.sums.forces, s.pressed.force, s.rows.totals, s.particles, s.motion.h
+    forces, walls, links, u, h = s.sums.forces, s.pressed.force, s.called.totals, s.particles, s.motion.h
     first, torques = WALLS + len(walls), s.called_walls.torques
     turns = first + len(walls) + 2 * len(links)
     for k in range(len(u)):
@@ -439,7 +461,7 @@ def record_row(s, step):
             row[_MOMENTA + 3 * k + c] = sums.momenta[k, c]
     row[_ACTIVE] = len(s.contacts.pressing)
     pressed = s.pressed
-    contact = ContactSums(pressed.force, pressed.moment, pressed.contacts, s.walls.releases, s.rows.totals)
+    contact = ContactSums(pressed.force, pressed.moment, pressed.contacts, s.walls.releases, s.called.totals)
     record_forces(s.impulses.v, contact, s.contacts.changes, row)
 
 
@@ -471,12 +493,8 @@ def run_compiled(s, phases, starts, due, flags):
     others wait for their messages. It returns the first four of Contacts, and writes the outcome.
     """
     contacts, course, motion, sums, pressed = s.contacts, s.course, s.motion, s.sums, s.pressed
-    count, several, linked, calling = (
-        len(due),
-        s.messages.several,
-        len(s.rows.force) > 0,
-        s.called.any or s.called_walls.massive,
-    )
+    count, several, linked = len(due), s.messages.several, s.called.any
+    calling = (linked and not s.called.watched) or s.called_walls.massive  # which ranks do together
     agrees = several and (s.bars.can_break or calling)  # ranks that make the same steps
     keeps = flags.shape[1] > 0 or linked or calling or len(s.nodes.damping) > 0 or s.nodes.external.shape[1] > 0
     pressed.failure[0] = -1

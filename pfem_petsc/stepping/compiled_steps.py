@@ -13,7 +13,6 @@ from numba import types
 
 from ..columns import BAR_ENERGIES, HEAD, Share, at_state, fill_at_state
 from ..contact.explicit import kind_of
-from ..contact.fixed_rows import FixedRows, pressed_nodes
 from ..contact.node_walls import NOTED, WallForces
 from ..contact.surfaces import OTHER
 from ..errors import SimulationFailure
@@ -24,7 +23,6 @@ from ..mechanics.records import References, by_reference
 from ..mesh.exchange import SIGNATURES, CFunction, mpi_functions
 from ..mesh.ordering import NODE_BLOCK
 from ..parallel.heap import return_freed_memory
-from ..tolerances import PROJECTED
 from .called_walls import close_on_called, press_called, work_of_turns
 from .callers import RowCaller, TouchCaller, WallCaller
 from .compiled_loop import (
@@ -36,6 +34,7 @@ from .compiled_loop import (
     DONE,
     END,
     FORCES,
+    HELD,
     IMPACTS,
     LOST_BY_MPI,
     NEAR,
@@ -48,7 +47,6 @@ from .compiled_loop import (
     TAKE,
     TURNED,
     UNSOLVED,
-    CalledRows,
     Calls,
     Contacts,
     ImpulseArrays,
@@ -74,15 +72,11 @@ from .compiled_loop import (
     touch_bars,
 )
 from .contact_phase import (
-    REASONS,
     WallArrays,
-    close_on_rows,
     close_on_walls,
     new_contact_nodes,
     place_walls,
     press_walls,
-    project_on_rows,
-    sum_rows,
     work_of_walls,
 )
 from .impact import Touched
@@ -134,8 +128,7 @@ class CompiledSteps:
         self._springs, self._sums, self._at_rest = self._make_springs(), new_sums(), self._moving_supports(0, 0)
         rooms = n, len(model.contact.walls), len(model.contact.wall_of)
         self._pressed, self._outcome = new_contact_nodes(*rooms), np.zeros(10, dtype=np.int64)
-        self._stiffness = self._nodes.stiffness if model.links else np.empty(0)
-        self._called = RowCaller(stepper, self._stiffness, self._u, self._contact)
+        self._called = RowCaller(stepper, self._nodes.stiffness, self._u, self._contact)
         self._toucher, self._wall_caller = (
             TouchCaller(stepper),
             WallCaller(stepper, self._nodes, self._pressed, self._contact),
@@ -201,20 +194,21 @@ class CompiledSteps:
         moved, probes = np.nonzero(self._held.nodes[at][:, None] == self.stepper.probed)
         return MovingSupports(at, columns[at], supports.origins[at], motions, np.column_stack([moved, probes]))
 
-    def _contacts(self, rows: FixedRows, called: CalledRows) -> Contacts:
+    def _contacts(self) -> Contacts:
         """Return the contacts before the first step."""
         log, met, friction = self.model.contact.log, self.ledger.impacts.met, float(self.ledger.friction_ahead)
-        others = np.concatenate([called.held[: called.counts[0]], pressed_nodes(rows, int((rows.force > 0.0).sum()))])
+        called = self._called.record
+        others = called.held[: called.counts[HELD]].copy()
         nodes = log.last, others, np.concatenate([log.last, others])
-        return Contacts(log.last, met, log.changes, friction, *nodes, 0, 0, 0.0)
+        return Contacts(log.last, met, log.changes, friction, *nodes, 0.0)
 
-    def _make_phases(self, signature: Any, linked: bool) -> tuple[Any, np.ndarray]:
+    def _make_phases(self, signature: Any) -> tuple[Any, np.ndarray]:
         """Return the phases of a step that this case needs, and where those of each time begin."""
         model = self.model
         damped, loaded, held = model.inertia.damped, model.external.active, len(self._held.nodes) > 0
         called, walls = self._called.record.any, len(model.contact.walls) > 0
         several, springs, moves = model.comm.size > 1, len(self._springs.nodes) > 0, model.supports.moves
-        touch, walls_move = walls or linked or called, model.contact.moving.any()
+        touch, walls_move = walls or called, model.contact.moving.any()
         pressed, close = self._walls.pressed, close_on_walls
         press = press_walls(*kind_of(pressed.surfaces.radii, pressed.friction)) if walls else None
         if model.contact.called.any():
@@ -235,17 +229,15 @@ class CompiledSteps:
                 (apply_supports, held),
             ),
             PRESS: (
-                (project_on_rows, linked),
                 (solve_called, called),
                 (press, walls),
                 (react, held),
                 (join_pressing, touch),
             ),
-            IMPACTS: ((close, walls), (close_on_rows, linked), (close_called, called)),
+            IMPACTS: ((close, walls), (close_called, called)),
             BOOK: (
                 (book_springs, springs),
                 (correct_moving, moves),
-                (sum_rows, linked),
                 (work_of_turns, model.contact.motion.turning.any()),
                 (push_particles, True),
                 (work_of_walls, walls_move),
@@ -295,8 +287,8 @@ class CompiledSteps:
         see :attr:`~pfem_petsc.stepping.stepper.Stepper.instants`, except for a step with a removal, which changes it.
 
         Fewer steps are made if a bar of any rank breaks, and if something fails; but several ranks whose bars cannot
-        break, and whose rows need no calls, make all steps, though the state remains that of the failure. The stepper
-        then has a fault.
+        break, and whose rows are on one rank each, make all steps, though the state remains that of the failure. The
+        stepper then has a fault.
         """
         stepper, ledger, state, model = self.stepper, self.ledger, self.stepper.state, self.model
         log, comm, due = model.contact.log, model.comm, self._due(min(most, left))
@@ -306,11 +298,10 @@ class CompiledSteps:
         shares = np.zeros((len(steps) + (0 if due[-1] else 1), self._width))
         begin, impulses = state.step, ledger.impulses.state
         flags = np.zeros((count, len(log.releases)), dtype=bool)
-        rows = model.links.export_rows(self._stiffness, PROJECTED * model.size)
-        called = self._called.begin_rows(begin, rows.totals)
+        self._called.begin(begin)
         self._toucher.begin(begin)
         self._wall_caller.begin(begin)
-        contacts = self._contacts(rows, called)
+        contacts = self._contacts()
         ledger.sums[_BROKEN] = stepper.ruptures.count
         half, walls = state.memory["half_velocity"], self._walls
         if model.contact.moving.any():
@@ -327,8 +318,7 @@ class CompiledSteps:
             model.external.schedule(range(begin + 1, begin + 1 + count), stepper.h),
             walls,
             self._wall_caller.schedule(self._times(begin, count)),
-            rows,
-            called,
+            self._called.record,
             self._sums,
             self._pressed,
             self._outcome,
@@ -347,7 +337,7 @@ class CompiledSteps:
         )
         reference = self._references.of(arrays)
         if self._phases is None:
-            self._phases = self._make_phases(types.void(numba.typeof(reference), types.int64), len(rows.force) > 0)
+            self._phases = self._make_phases(types.void(numba.typeof(reference), types.int64))
         contacts = Contacts(*run_compiled(reference, *self._phases, due, flags), *contacts[4:])
         self._toucher.end()
         self._wall_caller.end()
@@ -355,7 +345,6 @@ class CompiledSteps:
         made = self._outcome.tolist()
         if made[LOST_BY_MPI]:
             raise MPI.Exception(made[LOST_BY_MPI])
-        model.links.import_rows(rows)
         end, row = made[PASSED], shares[made[RECORDED] - 1]
         sound = self._take(made, contacts, row[_BARS])
         fill_at_state(self._at_state, stepper, row)
@@ -421,8 +410,6 @@ class CompiledSteps:
             node, place = pressed.nodes[infeasible], pressed.places[infeasible]
             time = stepper.scheme.balance(stepper.state, stepper.h).time
             return self._at_balance(self.model.contact.placeless(node, why, place, time))
-        if made[UNSOLVED] > 0:
-            return self._at_balance(self.model.links.rows.unsolved(*divmod(made[UNSOLVED], REASONS)))
         failure = self._called.failure or self._wall_caller.failure
         return self._at_balance(failure) if made[UNSOLVED] else None
 

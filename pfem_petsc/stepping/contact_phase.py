@@ -1,5 +1,5 @@
-"""The contact phase of a step in compiled loops: walls, and rows over two nodes of their own, move nodes to where they
-may be; contacts that close lose energy."""
+"""The contact phase of a step in compiled loops: walls move nodes to where they may be; contacts that close lose
+energy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from ..columns import HEAD
 from ..contact.explicit import Arrivals, PressedWalls, WallSums, find_penetrating, press_nodes
-from ..contact.fixed_rows import close_rows, pressed_nodes, solve_fixed
 from ..contact.node_walls import compare_contacts
 from ..contact.surfaces import Surfaces, wall_gaps
 from ..mechanics.compiled import addressed, inlined
@@ -20,9 +19,6 @@ from .impact import Approach, Touched, join_nodes, stop_nodes, unpressed
 from .phases import clear_rows, displace, put_rates, rates_of
 
 PUSHED = HEAD.first("contact_work")
-
-REASONS = 3
-"""A group of rows without a solution is told as its number times this, plus why."""
 
 
 @record
@@ -211,53 +207,6 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
 
 
 @addressed
-def project_on_rows(s, step):
-    """Move the nodes of :class:`~pfem_petsc.contact.fixed_rows.FixedRows` to where these may be."""
-    rows, nodes, motion, contacts = s.rows, s.nodes, s.motion, s.contacts
-    h, size = motion.h, 0.0
-    for k in range(len(rows.nodes)):
-        i = rows.nodes[k]
-        for c in range(3):
-            rows.start[k, c], rows.x[k, c] = motion.x[c, i], motion.x[c, i] + h * motion.half[c, i]
-            rows.pushed[k, c] = motion.u[c, i]
-            size = max(size, abs(rows.x[k, c]))
-    failed, why, contacts.rows, contacts.altered, s.called.loss[1] = solve_fixed(rows, size)
-    if failed >= 0 and s.course.unsolved == 0:
-        s.course.unsolved = REASONS * failed + why
-    contacts.others = pressed_nodes(rows, contacts.rows)
-    for k in range(len(rows.nodes) if contacts.rows > 0 else 0):
-        i = rows.nodes[k]
-        for c in range(3):
-            motion.contact[i, c] += rows.load[k, c]
-            if rows.moves[k, c] != 0.0:
-                displace(c, i, rows.moves[k, c], nodes, motion, s.sums)
-
-
-@addressed
-def sum_rows(s, step):
-    """Write the forces on the second nodes of each table to ``rows.totals``, as
-    :func:`~pfem_petsc.contact.rows.last_forces` does."""
-    rows = s.rows
-    clear_rows(rows.totals)
-    for p in range(len(rows.force) if s.contacts.rows > 0 else 0):
-        for c in range(3):
-            rows.totals[rows.source[p], c] += rows.force[p] * rows.normals[p, c] + rows.drag[p, c]
-
-
-@inlined
-def _free_rates(around, nodes, motion, moved, state):
-    """Return velocities and accelerations (m, 3) without contact of nodes (m,), and write those with it to ``state``,
-    (n, 3) both; ``moved``: MovingSupports, the step, and Prescribed."""
-    v, a = state
-    h = motion.h
-    for i in around:
-        rates_of(i, motion, v, a)
-    free_v, free_a = unpressed(around, v, a, motion.contact, nodes, 1.0 / (h * h), 0.5 / h)
-    put_rates(*moved, v, a)
-    return free_v, free_a
-
-
-@addressed
 def close_on_walls(s, step):
     """Find the energy that nodes lose which close on walls, and which nodes are on walls."""
     contacts, walls = s.contacts, s.walls
@@ -270,9 +219,11 @@ def close_on_walls(s, step):
         for k in range(rates.shape[1]):
             for c in range(3):
                 rates[j, k, c] = walls.motions[step + 1, 1, k, c]
-    v, a = state = s.state.v, s.state.a
-    nodes = s.nodes
-    free_v, free_a = _free_rates(around, nodes, s.motion, (s.moving, step, s.held), state)
+    v, a, nodes, motion = s.state.v, s.state.a, s.nodes, s.motion
+    for i in around:
+        rates_of(i, motion, v, a)
+    free_v, free_a = unpressed(around, v, a, motion.contact, nodes, 1.0 / (motion.h * motion.h), 0.5 / motion.h)
+    put_rates(s.moving, step, s.held, v, a)
     for j in range(len(around)):
         i = around[j]
         for c in range(3):
@@ -283,34 +234,3 @@ def close_on_walls(s, step):
     counted = np.ones(len(still), dtype=np.bool_)
     loss, contacts.met = stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))
     contacts.impact += loss
-
-
-@addressed
-def close_on_rows(s, step):
-    """Find the energy that rows lose which close."""
-    nodes, motion, rows, changed = s.nodes, s.motion, s.rows, s.contacts.altered
-    if changed == 0:
-        return
-    v, a = state = s.state.v, s.state.a
-    at, count = np.empty(changed, dtype=np.int64), 0
-    ends = np.empty((2, changed, 10))
-    for p in range(len(rows.force)):
-        if (rows.force[p] > 0.0) != rows.closed[p]:
-            at[count] = p
-            count += 1
-    for end in range(2):
-        around = np.empty(count, dtype=np.int64)
-        for m in range(count):
-            around[m] = rows.nodes[rows.ends[end, at[m]]]
-        free_v, free_a = _free_rates(around, nodes, motion, (s.moving, step, s.held), state)
-        for m in range(count):
-            i = around[m]
-            ends[end, m, 9] = nodes.mass[i]
-            for c in range(3):
-                # rows do not change prescribed components
-                fixed = rows.system.free[rows.ends[end, at[m]], c] == 0.0
-                ends[end, m, c] = motion.x[c, i]
-                ends[end, m, 3 + c] = v[i, c] if fixed else free_v[m, c]
-                ends[end, m, 6 + c] = a[i, c] if fixed else free_a[m, c]
-    counted = np.ones(len(rows.force), dtype=np.bool_)
-    s.contacts.impact += close_rows(rows, at, ends, counted, s.walls.touched.slack)

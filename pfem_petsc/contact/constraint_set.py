@@ -189,8 +189,6 @@ class ConstraintSet:
             source.name = name
         self.rows = rows = RowSet(self._sources, self.mesh, self.contact.fixed)
         self.two = TwoNodeRows(rows)
-        if len(self.two.at) == len(rows.source):
-            rows.pairs = self.two.ends, self.two.normals, self.two.least
         self._walls = _WallsAtRows(rows, self.contact)
         self._turning = self.mesh.comm.allreduce(not rows.fixed.all(), op=MPI.LOR)
         self.walled = self._walls.everywhere

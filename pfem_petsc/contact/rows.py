@@ -106,15 +106,6 @@ def gather_rows(at, array, vectors):
 
 
 @kernel
-def pair_values(ends, normals, least, x, values):
-    """Compute rows n . (x_2 - x_1) - least (r,) at positions (n, 3) of their nodes ``ends`` (2, r)."""
-    for r in range(len(values)):
-        i, j = ends[0, r], ends[1, r]
-        apart = normals[r, 0] * (x[j, 0] - x[i, 0]) + normals[r, 2] * (x[j, 2] - x[i, 2])
-        values[r] = apart + normals[r, 1] * (x[j, 1] - x[i, 1]) - least[r]
-
-
-@kernel
 def find_broken(groups, system, x, tolerances):
     """Find groups with a row below its bound or a node beyond a wall; return their number.
 
@@ -312,12 +303,9 @@ class RowSet:
     table : (r, 2 + k + m) int64: source, number, mesh numbers of the nodes, and the source's data as integers
     free : (n, 3) 1.0 where a component may move, 0.0 where a support prescribes it
     groups : Groups; group_of_row, group_of_node : (r,), (n,)
-    pairs : nodes (2, r), directions (r, 3) and bounds (r,) if these are all that the rows depend on, else None
     weights, friction, restitution : (r, k), (r, 2), (r,) see :class:`~pfem_petsc.contact.constraints.base.Constraint`
     rubs, rebounds : whether any table of rows of the model has friction, restitution
     """
-
-    pairs: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def __init__(self, sources: Sequence[Constraint], mesh: DistributedMesh, fixed: np.ndarray) -> None:
         self.mesh = mesh
@@ -496,11 +484,7 @@ class RowSet:
 
     def values(self, x: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Rows (r,) [m] at positions (n, 3); of some rows, ascending, if they are given, as below."""
-        if rows is not None or self.pairs is None:
-            return _joined(self._each(rows, "values", x))
-        values = np.empty(len(self.source))
-        pair_values(*self.pairs, x, values)
-        return values
+        return _joined(self._each(rows, "values", x)) if self.sources else np.empty(0)
 
     def gradients(self, x: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Gradients (r, k, 3) at positions (n, 3), zero behind the last node of a row."""

@@ -616,7 +616,7 @@ class ExplicitContact(NodeWalls):
         bodies = self.motion.bodies
         if self.rebounds:
             restitution, memory = self.restitution, self._memory
-        if self.rebounds and bodies.any:
+        if self.rebounds and bodies.begun:
             pushes = np.zeros((len(self.walls), 3))
             pushes[bodies.at] = bodies.displacements(np.inf) - bodies.unpushed()[0]
             pushed = pushes[self.wall_of]

@@ -122,6 +122,11 @@ class FreeWalls:
         self.state.a = self._load(0.0) / self._masses
         self.scheme.start(self.state, h)
 
+    @property
+    def begun(self) -> bool:
+        """Whether a step has begun since the start or a restart."""
+        return self._balance is not None
+
     def begin(self, time: float, h: float) -> None:
         """Set the balance of a step from ``time``; schemes that solve for the next position move the walls first."""
         if not self.any:

@@ -61,6 +61,10 @@ CASES = {
     # MUMPS, which small models take on several ranks, repeats to rounding only
     "pairs, implicit": ("rod_impact", (*SHORT, *TWO_RODS, "time.integrator=generalized_alpha", "solver.linear=cg")),
     "wall with mass": ("rod_impact", (*SHORT, "wall.0.mass=0.5", "wall.0.velocity=[-0.1,0,0]")),
+    "wall with mass that rebounds": (
+        "rod_impact",
+        (*SHORT, "wall.0.mass=0.5", "wall.0.velocity=[-0.1,0,0]", "wall.0.restitution=0.5"),
+    ),
     # it ends where nodes were in the mesh
     "heavy wall": ("rod_impact", (*SHORT, "wall.0.mass=5", "wall.0.velocity=[-0.2,0,0]")),
     "wall with mass, implicit": (

@@ -133,7 +133,7 @@ def read_triangles(path: Path, key: str) -> tuple[np.ndarray, np.ndarray]:
     import numpy as np
 
     from ..errors import InputError
-    from ._numbers import whole_numbers
+    from ._common import whole_numbers
 
     try:
         points, corners, offsets = _reader_of(path, "", "read_faces").read_faces(path)

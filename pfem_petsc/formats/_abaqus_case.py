@@ -11,8 +11,7 @@ import numpy as np
 from ..mesh.whole import PLANE, WholeMesh
 from ._abaqus_keywords import Block
 from ._abaqus_model import AtNodes, Deck, listed
-from ._numbers import number_of
-from ._tables import alike, free_name, name_of
+from ._common import alike, free_name, name_of, number_of
 
 MADE = "_section_"
 """Beginning of the names of element sets that the writer makes for areas."""

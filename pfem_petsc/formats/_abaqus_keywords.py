@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import readable_whole
-from ._numbers import number_of, numbers_of, shown
+from ._common import number_of, numbers_of, shown
 
 KNOWN: dict[str, tuple[str, ...]] = {
     "AMPLITUDE": ("NAME", "DEFINITION", "TIME", "VALUE"),

@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
 from ._abaqus_keywords import KNOWN, Block
-from ._numbers import number_of, places_of, whole_numbers
+from ._common import number_of, places_of, whole_numbers
 
 _ONE_BY_ONE = "write the nodes and elements one by one (Abaqus/CAE and most preprocessors do)"
 _REFUSED = dict.fromkeys(

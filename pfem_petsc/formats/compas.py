@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
-from ._polygons import edges
+from ._common import edges
 
 SUFFIXES = (".json",)
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
-from ._numbers import numbers_of, places_of, shown, whole_numbers
+from ._common import numbers_of, places_of, shown, whole_numbers
 
 SUFFIXES = (".msh",)
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
-from ._tables import alike, free_name
+from ._common import alike, free_name
 
 SUFFIXES = (".bdf", ".nas", ".dat")
 

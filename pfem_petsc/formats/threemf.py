@@ -22,8 +22,7 @@ import numpy as np
 from ..errors import InputError
 from ..mesh.slab import check_memory
 from ..mesh.whole import WholeMesh
-from ._numbers import whole_numbers
-from ._polygons import drop_bare_nodes
+from ._common import drop_bare_nodes, whole_numbers
 
 SUFFIXES = (".3mf",)
 

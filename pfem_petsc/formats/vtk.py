@@ -7,8 +7,8 @@ array of strings named ``group_names`` or ``section_names`` replaces these names
 same names define node groups (a negative value: no group). An array named ``group:NAME`` is the group NAME of those
 with a value other than 0; these may overlap. Other arrays with one component are fields of bars and nodes.
 
-VTK reads, STL files too (:mod:`~pfem_petsc.formats.stl`), in a process of its own, because it aborts the process on
-some damaged files. That process runs this module as a program, which therefore imports no MPI.
+VTK reads in a process of its own, because it aborts the process on some damaged files. That process runs this module as
+a program, which therefore imports no MPI.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from ..errors import InputError
-from ._polygons import drop_bare_nodes, edges
+from ._common import drop_bare_nodes, edges
 
 if TYPE_CHECKING:
     import pyvista
@@ -103,8 +103,6 @@ def _extract(path: str) -> int:
             from vtkmodules.vtkIOXML import vtkXMLPolyDataReader as Reader
         case ".vtk":
             from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader as Reader
-        case ".stl":
-            from vtkmodules.vtkIOGeometry import vtkSTLReader as Reader
         case _:
             from vtkmodules.vtkIOHDF import vtkHDFReader as Reader
 

@@ -143,7 +143,7 @@ def read_triangles(path: Path, key: str) -> tuple[np.ndarray, np.ndarray]:
         if sizes.min() < 3:
             raise InputError(f"{path}: face {sizes.argmin()} (from 0) has {sizes.min()} corners: expected 3 or more")
         n = len(points)
-        corners = whole_numbers(corners, 0, n, f"{path}: there is no point {{}}: the file has {n}, from 0".format)
+        corners = whole_numbers(corners, 0, n, f"{path}: there is no point ", f": the file has {n}, from 0")
     except InputError as error:
         raise InputError(f"{key}{error}") from None
     face = np.repeat(np.arange(len(sizes)), sizes - 2)

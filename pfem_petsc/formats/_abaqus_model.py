@@ -202,8 +202,9 @@ def _ends(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _labels(values: np.ndarray, block: Block, what: str) -> np.ndarray:
-    refused = "{}: {} is not the label of a {}: a whole number from 1 on"
-    return whole_numbers(values, 1, 2**53, lambda found: refused.format(block.where, found, what))
+    return whole_numbers(
+        values, 1, 2**53, f"{block.where}: ", f" is not the label of a {what}: a whole number from 1 on"
+    )
 
 
 def _union(parts: list[np.ndarray]) -> np.ndarray:

@@ -47,11 +47,12 @@ def number_of(text: str) -> float:
         return float("nan")
 
 
-def whole_numbers(values: np.ndarray, first: int, end: int, refused: Callable[[str], str]) -> np.ndarray:
-    """Return numbers as int64, from ``first`` to ``end`` - 1; ``refused`` makes a message about another one."""
+def whole_numbers(values: np.ndarray, first: int, end: int, before: str, after: str) -> np.ndarray:
+    """Return numbers as int64, from ``first`` to ``end`` - 1; a message about another has it between two texts."""
     wrong = values[~((values >= first) & (values < end) & (values == np.rint(values)))]
     if wrong.size:
-        raise InputError(refused("nothing" if np.isnan(wrong.flat[0]) else f"{wrong.flat[0]:.15g}"))
+        found = "nothing" if np.isnan(wrong.flat[0]) else f"{wrong.flat[0]:.15g}"
+        raise InputError(before + found + after)
     return values.astype(np.int64)
 
 

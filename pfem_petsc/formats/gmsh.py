@@ -210,8 +210,7 @@ class _Numbers:
     def _whole(self, values: np.ndarray) -> np.ndarray:
         if values.dtype.kind != "f":
             return values.astype(np.int64)
-        refused = f"{self.where}: {{}} is not a count or a tag: a whole number"
-        return whole_numbers(values, 1 - 2**53, 2**53, refused.format)
+        return whole_numbers(values, 1 - 2**53, 2**53, f"{self.where}: ", " is not a count or a tag: a whole number")
 
 
 def _physical_names(path: Path, payload: bytes) -> list[dict[int, str]]:

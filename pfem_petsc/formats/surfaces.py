@@ -81,8 +81,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         (ends, owner), groups = content.faces.sides(closed=True), content.face_groups
     if len(ends) == 0:
         raise InputError(f"{path}: has neither lines nor faces, whose edges would be bars")
-    refused = f"{path}: there is no point {{}}: the file has {n}, numbered from {first}"
-    bars = whole_numbers(ends + first, first, first + n, refused.format) - first
+    refused = f"{path}: there is no point ", f": the file has {n}, numbered from {first}"
+    bars = whole_numbers(ends + first, first, first + n, *refused) - first
     bars, number = edges(bars) if of_faces else (bars, np.arange(len(bars)))
     members = {name: np.unique(number[np.isin(owner, own)]) for name, own in groups.items()}
     mesh = WholeMesh(content.points, bars, bar_groups={name: own for name, own in members.items() if len(own)})

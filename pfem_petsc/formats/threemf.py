@@ -11,7 +11,6 @@ import zipfile
 import zlib
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
-from itertools import chain, islice
 from pathlib import Path
 from typing import IO, Any
 from xml.etree import ElementTree
@@ -128,6 +127,7 @@ class _Model:
         self.items: list[Placed] = []
         self.not_read: list[str] = []
         self.node_groups: dict[str, np.ndarray] = {}
+        self._sizes: dict[str, np.ndarray] = {}
         texts, namespaces = defaultdict(list), {}
         for event, element in ElementTree.iterparse(stream, ("start-ns", "end")):
             if event == "start-ns":
@@ -175,8 +175,8 @@ class _Model:
         numbers = element.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
         return number, _numbers([tuple(numbers)], f"{self.where}: transform of object {number}", 12).reshape(4, 3)
 
-    def placed(self, number: str, place: np.ndarray, depth: int = 0) -> Iterator[tuple[_Object, np.ndarray]]:
-        """Yield content and transform (4, 3) of an object and its components.
+    def sizes(self, number: str, depth: int = 0) -> np.ndarray:
+        """Return how many objects and components an object consists of, and the number of vertices of those with beams.
 
         Raises
         ------
@@ -187,11 +187,19 @@ class _Model:
             raise InputError(f"{self.where}: there is no object {number}, which the build or a component names")
         if depth > _DEEPEST:
             raise InputError(f"{self.where}: object {number} is a component of itself")
-        yield self.objects[number], place
-        for other, inner in self.objects[number].components:
-            yield from self.placed(
-                other, np.vstack([inner[:3] @ place[:3], inner[3] @ place[:3] + place[3]]), depth + 1
-            )
+        if number not in self._sizes:
+            found = self.objects[number]
+            own = np.array([1, len(found.points) * bool(len(found.ends))], object)
+            self._sizes[number] = own + sum(self.sizes(other, depth + 1) for other, _ in found.components)
+        return self._sizes[number]
+
+    def placed(self, number: str, place: np.ndarray) -> Iterator[tuple[_Object, np.ndarray]]:
+        """Yield content and transform (4, 3) of an object and its components, those that have beams."""
+        found = self.objects[number]
+        if len(found.ends):
+            yield found, place
+        for other, inner in found.components:
+            yield from self.placed(other, np.vstack([inner[:3] @ place[:3], inner[3] @ place[:3] + place[3]]))
 
 
 def _numbers(rows: Sequence[str | tuple[str | None, ...] | None], what: str, width: int = 1) -> np.ndarray:
@@ -211,14 +219,14 @@ def _whole(values: np.ndarray, n: int, what: str) -> np.ndarray:
 
 def _assembled(path: Path, model: _Model) -> WholeMesh:
     """Return the lattices of all items of the build as one mesh."""
-    placed = list(islice(chain.from_iterable(model.placed(*item) for item in model.items), _INSTANCES + 1))
-    if len(placed) > _INSTANCES:
+    instances, nodes = sum((model.sizes(number) for number, _ in model.items), np.array([0, 0], object))
+    if instances > _INSTANCES:
         raise InputError(
-            f"{model.where}: the build places more than {_INSTANCES:,} objects and components: write the lattice as "
-            "fewer, larger objects"
+            f"{model.where}: the build places {instances:,} objects and components, and at most {_INSTANCES:,} are "
+            "read: write the lattice as fewer, larger objects"
         )
-    placed = [(found, place) for found, place in placed if len(found.ends)]
-    check_memory(sum(len(found.points) for found, _ in placed), str(path))
+    check_memory(nodes, str(path))
+    placed = [each for item in model.items for each in model.placed(*item)]
     if not placed:
         raise InputError(f"{path}: has no beam lattice; a surface of triangles is read from STL")
     points, bars, radii = [], [], []

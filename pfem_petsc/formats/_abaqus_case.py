@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..mesh.whole import PLANE, WholeMesh
-from ._abaqus_keywords import Block
-from ._abaqus_model import AtNodes, Deck, listed
+from ._abaqus_model import AtNodes, Block, Deck, listed
 from ._common import alike, free_name, name_of, number_of
 
 MADE = "_section_"

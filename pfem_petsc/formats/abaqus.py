@@ -21,8 +21,7 @@ import numpy as np
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
 from ._abaqus_case import MADE, Conditions, add_initial_stress, add_materials, add_sections, short, value_of
-from ._abaqus_keywords import Block, blocks
-from ._abaqus_model import Deck
+from ._abaqus_model import Block, Deck, blocks
 
 SUFFIXES = (".inp",)
 

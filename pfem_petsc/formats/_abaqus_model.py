@@ -306,16 +306,13 @@ _NOTHING = np.empty(0, np.int64)
 
 
 class _Elements(NamedTuple):
-    """Elements of a block that are bars: labels (n,), and those of their nodes (n, 2 or 3)."""
+    """Elements of a block that are bars: labels (n,), those of their nodes (n, 2 or 3), and whether they have no third
+    direction."""
 
     block: Block
     labels: np.ndarray
     nodes: np.ndarray
-
-    @property
-    def plane(self) -> bool:
-        """Whether they have no third direction."""
-        return _PLANE.fullmatch(self.block.get("TYPE").upper()) is not None
+    plane: bool
 
 
 class AtNodes(NamedTuple):
@@ -346,11 +343,10 @@ class _Scope:
     def instance(self, name: str, place: np.ndarray) -> _Scope:
         """Return an instance of a part, to which content of its own can be added."""
         sets = {
-            kind: {upper: replace(one, entries=list(one.entries)) for upper, one in found.items()}
+            kind: {upper: replace(one, entries=[*one.entries]) for upper, one in found.items()}
             for kind, found in self.sets.items()
         }
-        own = (list(self.nodes), list(self.elements), list(self.at_nodes))
-        return _Scope(name, *own, sets, list(self.sections), place)
+        return _Scope(name, [*self.nodes], [*self.elements], [*self.at_nodes], sets, [*self.sections], place)
 
     def add(self, kind: str, name: str, block: Block, entries: Iterable[_Labels]) -> None:
         """Add members to a set."""
@@ -366,31 +362,24 @@ class _Scope:
         points = np.concatenate([np.empty((0, 3)), *(own for _, own in self.nodes)])
         known, first, at = np.unique(labels, return_index=True, return_inverse=True)
         if len(known) < len(labels):
-            moved = np.flatnonzero((points != points[first[at.ravel()]]).any(axis=1))
+            moved = labels[(points != points[first[at.ravel()]]).any(axis=1)]
             if len(moved):
-                raise InputError(
-                    f"{path}: *NODE: node {labels[moved[0]]} is listed more than once, at different positions"
-                )
+                raise InputError(f"{path}: *NODE: node {moved[0]} is listed more than once, at different positions")
             keep = np.sort(first)
             labels, points = labels[keep], points[keep]
         order = np.argsort(labels, kind="stable")
-        ends = [np.empty((0, 2), np.int64)]
-        plane = [np.empty(0, bool)]
+        ends, plane = [np.empty((0, 2), np.int64)], [np.empty(0, bool)]
         for elements in self.elements:
-            block, own, wanted = elements
-            found, there = places_of(known, wanted)
-            if not there.all():
-                element, side = np.argwhere(~there)[0]
-                raise InputError(
-                    f"{block.where}: node {wanted[element, side]} of element {own[element]} is not defined"
-                )
+            found, there = places_of(known, elements.nodes)
+            for element, side in np.argwhere(~there)[:1]:
+                what = f"node {elements.nodes[element, side]} of element {elements.labels[element]}"
+                raise InputError(f"{elements.block.where}: {what} is not defined")
             ends.append(_ends(order[found], points))
-            plane.append(np.full(len(own), elements.plane))
-        bars = np.concatenate([_NOTHING, *(own for _, own, _ in self.elements)])
+            plane.append(np.full(len(found), elements.plane))
+        bars = np.concatenate([_NOTHING, *(elements.labels for elements in self.elements)])
         sequence = np.argsort(bars, kind="stable")
-        twice = np.flatnonzero(np.diff(bars[sequence]) == 0)
-        if len(twice):
-            raise InputError(f"{path}: *ELEMENT: element {bars[sequence[twice[0]]]} is listed more than once")
+        for label in bars[sequence[1:]][np.diff(bars[sequence]) == 0][:1]:
+            raise InputError(f"{path}: *ELEMENT: element {label} is listed more than once")
         self.at = {"NSET": (known, order + n_nodes), "ELSET": (bars[sequence], sequence + n_bars)}
         if not np.array_equal(self.place, np.eye(4, 3)):
             points = points @ self.place[:3] + self.place[3]
@@ -464,15 +453,12 @@ class Deck:
         self.procedure: Block | None = None
         self.calculix = False
         """Whether the file is one of CalculiX, where sections differ."""
-        self._files = False
         self._scope = self._outer = self.scopes[""]
         self._ended = False
         self._beyond: Block | None = None
         self._open: dict[str, None] = {}
-        self._notes: dict[str, int] = {}
-        self._other_types: set[str] = set()
-        self._constraints: dict[str, None] = {}
-        self._unread: dict[str, None] = {}
+        self._left: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        """How often there is what is left out or read as something else: ``types`` of elements, ``constraints``, ..."""
         self._unknown: dict[tuple[str, str], str] = {}
         self._material: list[Block] = []
         self._told: list[str] = []
@@ -503,7 +489,7 @@ class Deck:
                 self.procedure = block
                 self.calculix |= "SOLVER" in block.parameters
             else:
-                self._leave_out(keyword)
+                self._left["keywords"][keyword] += 1
         else:
             self._add_to_model(block)
         return self._beyond is None
@@ -511,12 +497,8 @@ class Deck:
     @property
     def ambiguous(self) -> bool:
         """Whether the file may be one of CalculiX: both programs have its output."""
-        return self._files and not self.calculix
-
-    def _leave_out(self, keyword: str) -> None:
-        self._files |= keyword.replace(" ", "") in ("NODEFILE", "ELFILE")
-        if keyword not in _PASSED_OVER and not any(word in keyword for word in ("OUTPUT", "PRINT", "FILE")):
-            self._unread[f"*{keyword}"] = None
+        files = {keyword.replace(" ", "") for keyword in self._left["keywords"]}
+        return not self.calculix and not files.isdisjoint(("NODEFILE", "ELFILE"))
 
     def _add_to_model(self, block: Block) -> None:
         match block.keyword:
@@ -538,11 +520,11 @@ class Deck:
             case "INITIAL CONDITIONS":
                 self.initial.append(block)
             case keyword if keyword in _CONSTRAINTS:
-                self._constraints[f"*{keyword}"] = None
+                self._left["constraints"][f"*{keyword}"] += 1
             case keyword if keyword in _REFUSED:
                 raise InputError(f"{block.where} is not read: {_REFUSED[keyword]}")
             case keyword:
-                self._leave_out(keyword)
+                self._left["keywords"][keyword] += 1
 
     def _open_scope(self, block: Block) -> None:
         """Make what follows the content of a part, an instance or the assembly, or of what is around it."""
@@ -585,16 +567,16 @@ class Deck:
             rows = block.rows(count + more + 1 + bool(more), count + 1)[:, : count + 1]
             labels = _labels(rows[:, 0], block, "element")
             nodes = _labels(rows[:, 1:].ravel(), block, "node").reshape(len(rows), count)
-            self._scope.elements.append(_Elements(block, labels, nodes))
+            self._scope.elements.append(_Elements(block, labels, nodes, _PLANE.fullmatch(kind) is not None))
             self.calculix |= _CALCULIX.fullmatch(kind) is not None
             if note:
-                self._notes[f"{kind}: {note}"] = self._notes.get(f"{kind}: {note}", 0) + len(rows)
+                self._left["notes"][f"{kind}: {note}"] += len(rows)
         elif kind in _AT_NODES:
             labels = np.array([self._at_nodes(kind, block, *line) for line in block.lines()], np.int64)
         else:
-            self._other_types.add(kind)
+            self._left["types"][kind] += 1
         if block.get("ELSET"):
-            self._scope.add("ELSET", block.get("ELSET"), block, [_Labels(labels)] if len(labels) else [])
+            self._scope.add("ELSET", block.get("ELSET"), block, [_Labels(labels)] * bool(len(labels)))
 
     def _at_nodes(self, kind: str, block: Block, where: str, words: list[str]) -> int:
         """Add an element that belongs to nodes, and return its label."""
@@ -649,52 +631,47 @@ class Deck:
 
     def mesh(self) -> WholeMesh:
         """Return nodes and bars of all instances in their order, without nodes where no bar ends, and their groups."""
-        told = [f"{self.path}: {n} elements {note}" for note, n in self._notes.items()]
-        if self._other_types:
-            told.append(f"{self.path}: left out elements of the types {', '.join(sorted(self._other_types))}")
-        told += [f"{where}: {name} is left out: it is not read" for (_, name), where in self._unknown.items()]
-        told += [*self._told, *self._cut_off()]
+        told = [f"{n} elements {note}" for note, n in self._left["notes"].items()]
+        types = sorted(self._left["types"])
+        told += [f"left out elements of the types {', '.join(types)}"] * bool(types)
+        mesh_told = [f"{self.path}: {text}" for text in told]
+        mesh_told += [f"{where}: {name} is left out: it is not read" for (_, name), where in self._unknown.items()]
+        mesh_told += [*self._told, *self._cut_off()]
         self.scopes[_ASSEMBLY] = self.assembly
-        labels, points, bars = [_NOTHING], [np.empty((0, 3))], [np.empty((0, 2), np.int64)]
-        plane = [np.empty(0, bool)]
+        parts, n_nodes, n_bars = [], 0, 0
         for scope in self.scopes.values():
-            parts = scope.placed(self.path, sum(map(len, points)), sum(map(len, bars)))
-            for whole, part in zip((labels, points, bars, plane), parts):
-                whole.append(part)
-        self.plane = np.concatenate(plane)
-        all_points, all_bars = np.concatenate(points), np.concatenate(bars)
-        used = np.zeros(len(all_points), bool)
-        used[all_bars] = True
-        self.labels_left_out = np.concatenate(labels)[~used].tolist()
+            parts.append(scope.placed(self.path, n_nodes, n_bars))
+            n_nodes, n_bars = n_nodes + len(parts[-1][0]), n_bars + len(parts[-1][2])
+        labels, points, bars, self.plane = map(np.concatenate, zip(*parts))
+        used = np.zeros(len(points), bool)
+        used[bars] = True
+        self.labels_left_out = labels[~used].tolist()
         number = np.where(used, np.cumsum(used) - 1, -1)
         for scope in self.scopes.values():
             known, at = scope.at["NSET"]
             scope.at["NSET"] = known, number[at]
-        self.groups = {}
+        self.groups, every = {}, self.scopes.values()
+        of_nodes = {s.upper() for scope in every for block, s in scope.sections if block.keyword in OF_NODES}
+        others = types or any(scope.at_nodes for scope in every)
+        told = []
         for kind, what in _WHAT.items():
             self._lost: dict[int, int] = {}  # a set that another one names counts once
-            self.groups[kind] = self._groups(kind)
+            groups = self._groups(kind)
             lost = sum(self._lost.values())
-            others = self._other_types or any(scope.at_nodes for scope in self.scopes.values())
             if lost and (kind == "NSET" or not others):
-                told.append(f"{self.path}: {lost} members of {what} sets are not there, and are left out")
-            sets = [one for scope in self.scopes.values() for one in scope.sets[kind].values()]
+                told.append(f"{lost} members of {what} sets are not there, and are left out")
+            sets = [one for scope in every for one in scope.sets[kind].values()]
             bare = {one.name for one in sets if one.entries and not any(len(entry.labels) for entry in one.entries)}
-            empty = [name for name, members in self.groups[kind].items() if not len(members) and name not in bare]
-            for name in empty:
-                del self.groups[kind][name]
-            given = {s.upper() for scope in self.scopes.values() for b, s in scope.sections if b.keyword in OF_NODES}
-            empty = [name for name in empty if kind == "NSET" or name.upper().rpartition(".")[2] not in given]
-            if empty:
-                why = "no bar ends at their nodes" if kind == "NSET" else "none of their elements is a bar"
-                told.append(f"{self.path}: left out the {what} sets {listed(empty)}: {why}")
-        mesh = WholeMesh(all_points[used], number[all_bars], self.groups["NSET"], dict(self.groups["ELSET"]))
-        mesh.warnings = told
-        if self._constraints:
-            mesh.warnings.append(
-                f"{self.path}: left out {', '.join(self._constraints)}; nodes that they connect are joined by `mesh "
-                "clean` if they are at the same place"
-            )
+            self.groups[kind] = {name: own for name, own in groups.items() if len(own) or name in bare}
+            empty = [name for name in groups if name not in self.groups[kind]]
+            empty = [name for name in empty if kind == "NSET" or name.upper().rpartition(".")[2] not in of_nodes]
+            why = "no bar ends at their nodes" if kind == "NSET" else "none of their elements is a bar"
+            told += [f"left out the {what} sets {listed(empty)}: {why}"] * bool(empty)
+        constraints = ", ".join(self._left["constraints"])
+        way_out = "nodes that they connect are joined by `mesh clean` if they are at the same place"
+        told += [f"left out {constraints}; {way_out}"] * bool(constraints)
+        mesh = WholeMesh(points[used], number[bars], self.groups["NSET"], dict(self.groups["ELSET"]))
+        mesh.warnings = mesh_told + [f"{self.path}: {text}" for text in told]
         return mesh
 
     def _groups(self, kind: str) -> dict[str, np.ndarray]:
@@ -747,24 +724,21 @@ class Deck:
     def of_nodes(self) -> Iterator[tuple[Block, list[tuple[AtNodes, list[int]]]]]:
         """Yield what masses, springs and dashpots have, with each element and the numbers of its nodes in the mesh, -1
         for a node where no bar ends."""
-        for key, scope in self.scopes.items():
-            for block, name in scope.sections:
-                if block.keyword not in OF_NODES:
-                    continue
-                found: list[tuple[AtNodes, list[int]]] = []
-                for entry in self._set(block, scope, name).entries:
-                    own = entry.instance or key
-                    elements = self.scopes[own].at_nodes
-                    for i in np.flatnonzero(entry.within(np.array([element.label for element in elements], np.int64))):
-                        if elements[i].kind.startswith(block.keyword):
-                            numbers = [self._number(instance or own, label) for instance, label in elements[i].nodes]
-                            found.append((elements[i], numbers))
+        sections = [(key, scope, *section) for key, scope in self.scopes.items() for section in scope.sections]
+        for key, scope, block, name in sections:
+            found: list[tuple[AtNodes, list[int]]] = []
+            for entry in self._set(block, scope, name).entries if block.keyword in OF_NODES else ():
+                own = entry.instance or key
+                elements = self.scopes[own].at_nodes
+                for i in np.flatnonzero(entry.within(np.array([element.label for element in elements], np.int64))):
+                    if elements[i].kind.startswith(block.keyword):
+                        nodes = [
+                            (instance or own, [_Labels(np.array([label]))]) for instance, label in elements[i].nodes
+                        ]
+                        members = [self._members("NSET", *node).tolist() for node in nodes]
+                        found.append((elements[i], [next(iter(each), -1) for each in members]))
+            if block.keyword in OF_NODES:
                 yield block, found
-
-    def _number(self, key: str, label: int) -> int:
-        known, at = self.scopes[key].at["NSET"]
-        place, there = places_of(known, np.array([label]))
-        return int(at[place[0]]) if there[0] else -1
 
     def _set(self, block: Block, scope: _Scope, name: str) -> _Set:
         if name.upper() not in scope.sets["ELSET"]:
@@ -795,7 +769,11 @@ class Deck:
 
     def left_out(self) -> Iterator[str]:
         """Yield what the step has that is not read."""
-        if self._unread:
-            yield f"{self.path}: left out {', '.join(self._unread)}: keywords that are not read"
+        silent = ("OUTPUT", "PRINT", "FILE")
+        unread = [
+            name for name in self._left["keywords"] if name not in _PASSED_OVER and not any(map(name.count, silent))
+        ]
+        if unread:
+            yield f"{self.path}: left out {', '.join(f'*{name}' for name in unread)}: keywords that are not read"
         if self._beyond is not None:
             yield f"{self._beyond.where}: left out with all that follows: only the first step is read"

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator
 from itertools import count
 from pathlib import Path
@@ -80,11 +80,11 @@ _PROPERTIES = {"ELASTIC": ("young_modulus", 2), "DENSITY": ("density", 1), "EXPA
 
 def _add_materials(mesh: WholeMesh, deck: Deck) -> None:
     """Add the table of materials to a mesh."""
-    for name, blocks in deck.materials.values():
+    for name, own in deck.materials.values():
         values: dict[str, Any] = {}
-        told = [(block, _material_value(block, values)) for block in blocks]
+        told = [(block, _material_value(block, values)) for block in own]
         if values.get("cable") and len(values.get("plastic", ((), (0.0,)))[1]) > 1:
-            told.append((blocks[-1], "*PLASTIC with hardening is left out: bars without compression have none"))
+            told.append((own[-1], "*PLASTIC with hardening is left out: bars without compression have none"))
             del values["plastic"]
         mesh.warnings += [f"{block.where}: {text}" for block, text in told if text]
         mesh.tables.setdefault("material", {})[name] = _material_keys(values)
@@ -92,18 +92,19 @@ def _add_materials(mesh: WholeMesh, deck: Deck) -> None:
 
 def _material_value(block: Block, material: dict[str, Any]) -> str:
     """Read what belongs to a material; return what is to be said about it."""
-    if block.keyword == "DAMPING":
-        for name, key in (("ALPHA", "alpha"), ("BETA", "stiffness_damping")):
-            material[key] = number_of(block.get(name)) if name in block.parameters else material.get(key, 0.0)
-            if np.isnan(material[key]):
-                material[key] = 0.0
-                return f"{block.get(name)!r} is not a number: left out"
-        return ""
-    if block.keyword == "NO TENSION":
-        return "left out: there is no law of bars that carry compression alone"
-    if block.keyword == "NO COMPRESSION":
-        material["cable"] = True
-        return ""
+    match block.keyword:
+        case "DAMPING":
+            for name, key in (("ALPHA", "alpha"), ("BETA", "stiffness_damping")):
+                value = number_of(block.get(name)) if name in block.parameters else material.get(key, 0.0)
+                material[key] = 0.0 if np.isnan(value) else value
+                if np.isnan(value):
+                    return f"{block.get(name)!r} is not a number: left out"
+            return ""
+        case "NO TENSION":
+            return "left out: there is no law of bars that carry compression alone"
+        case "NO COMPRESSION":
+            material["cable"] = True
+            return ""
     if block.get("TYPE", "ISOTROPIC").upper() not in ("ISOTROPIC", "ISO"):
         return f"TYPE={block.get('TYPE')}: left out"
     key, column = _PROPERTIES.get(block.keyword, ("plastic", 2))
@@ -120,9 +121,10 @@ def _material_value(block: Block, material: dict[str, Any]) -> str:
         return told
     hardening = block.get("HARDENING", "ISOTROPIC").upper()
     stress, strain = np.nan_to_num(rows[cold, :2]).T
-    known = hardening == "ISOTROPIC" or (hardening == "KINEMATIC" and len(stress) <= 2)
-    if not known or "RATE" in block.parameters:
-        return f"HARDENING={hardening}: left out" if not known else "RATE: left out"
+    if hardening != "ISOTROPIC" and not (hardening == "KINEMATIC" and len(stress) <= 2):
+        return f"HARDENING={hardening}: left out"
+    if "RATE" in block.parameters:
+        return "RATE: left out"
     if strain[0] != 0.0 or stress[0] <= 0.0 or (np.diff(strain) <= 0.0).any() or (np.diff(stress) < 0.0).any():
         return "a curve that does not start at plastic strain 0, or that falls: left out"
     material["plastic"] = hardening, stress, strain
@@ -132,21 +134,16 @@ def _material_value(block: Block, material: dict[str, Any]) -> str:
 def _material_keys(values: dict[str, Any]) -> dict[str, Any]:
     """A material's keys; rows of stress over plastic strain are a curve over strain, constant after the last row."""
     keys = {key: values[key] for key in ("young_modulus", "density", "thermal_expansion") if key in values}
-    if values.get("alpha") and "density" in values:
-        keys["damping"] = values["alpha"] * values["density"]
-    if values.get("stiffness_damping"):
-        keys["stiffness_damping"] = values["stiffness_damping"]
-    if values.get("cable"):
-        keys["law"] = "cable"
-    if "plastic" not in values:
-        return keys
-    hardening, stress, strain = values["plastic"]
-    if len(stress) == 1:
+    keys["damping"] = values.get("alpha", 0.0) * values.get("density", 0.0)
+    keys["stiffness_damping"] = values.get("stiffness_damping", 0.0)
+    keys = {key: value for key, value in keys.items() if value or "damping" not in key}
+    keys |= {"law": "cable"} if values.get("cable") else {}
+    hardening, stress, strain = values.get("plastic", ("", [], []))
+    if len(stress) == 1 or hardening == "KINEMATIC":
         keys["yield_stress"] = float(stress[0])
-    elif hardening == "KINEMATIC":
-        slope = (stress[1] - stress[0]) / strain[1]
-        keys |= {"yield_stress": float(stress[0]), "kinematic_hardening": float(slope)}
-    elif "young_modulus" in keys:
+    if len(stress) > 1 and hardening == "KINEMATIC":
+        keys["kinematic_hardening"] = float((stress[1] - stress[0]) / strain[1])
+    elif len(stress) > 1 and "young_modulus" in keys:
         curve = np.stack([stress / keys["young_modulus"] + strain, stress], axis=1)
         keys |= {"law": "multilinear", "curve": curve.tolist()}
     return keys
@@ -200,16 +197,14 @@ def _without_made(mesh: WholeMesh, deck: Deck, sections: dict[str, dict[str, Any
     """Return one section with the areas of the field in the place of those whose sets the writer has made for
     areas, which are no groups then."""
     own = deck.scopes[""].sets["ELSET"]
-    made = [
-        name for name in sections if name.startswith(_MADE) and (name.upper() not in own or own[name.upper()].internal)
-    ]
+    internal = {name for name in sections if name.upper() not in own or own[name.upper()].internal}
+    made = [name for name in sections if name.startswith(_MADE) and name in internal]
     materials = {sections[name].get("material") for name in made}
     if len(materials) != 1:
         return sections
-    for name in made:
-        mesh.bar_groups.pop(name, None)
-    material = materials.pop()
+    mesh.bar_groups = {name: members for name, members in mesh.bar_groups.items() if name not in made}
     others = {name: keys for name, keys in sections.items() if name not in made}
+    material = materials.pop()
     return others | {"bars": {"area_field": "area", **({"material": material} if material else {})}}
 
 
@@ -275,25 +270,21 @@ def _own_material(mesh: WholeMesh, block: Block, rows: np.ndarray, group: str) -
 def _add_initial_stress(mesh: WholeMesh, deck: Deck) -> list[str]:
     """Give sections the initial stresses of their bars, as parts of their own where these differ; return what is to be
     said."""
-    told, stress, count = [], np.zeros(len(mesh.bars)), np.zeros(len(mesh.bars))
+    told, stress, points = [], np.zeros(len(mesh.bars)), np.zeros(len(mesh.bars))
     across = mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]]
-    for where, words, block in _initial_lines(deck, "STRESS"):
-        values = [_value(words, at) for at in range(1, max(len(words), 2))]
-        members = deck.members_of("ELSET", block, words[0])
-        if not np.isfinite(values).all():
-            told.append(f"{where}: {', '.join(words)[:60]!r} is left out: expected elements and their stress")
-        elif len(values) == 7:  # of CalculiX: an integration point, and components along the axes of the model
+    for members, values in _initial_values(deck, "STRESS", told, "expected elements and their stress"):
+        if len(values) == 7:  # of CalculiX: an integration point, and components along the axes of the model
             _, xx, yy, zz, xy, xz, yz = values
             tensor, along = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), across[members]
             with np.errstate(invalid="ignore"):  # of bars without length, which a case refuses
                 share = np.einsum("ij,jk,ik->i", along, tensor, along) / (along**2).sum(axis=1)
             stress[members] += np.nan_to_num(share)
-            count[members] += 1.0
+            points[members] += 1.0
         else:
-            stress[members], count[members] = values[0], 1.0
+            stress[members], points[members] = values[0], 1.0
     if not stress.any():
         return told
-    stress = np.array([_short(value) for value in stress / np.maximum(count, 1.0)])
+    stress = np.array([_short(value) for value in stress / np.maximum(points, 1.0)])
     sections = mesh.tables.setdefault("section", {})
     rest = np.ones(len(mesh.bars), bool)
     for keys in sections.values():
@@ -302,21 +293,34 @@ def _add_initial_stress(mesh: WholeMesh, deck: Deck) -> list[str]:
         sections["others"] = {}
     for name, keys in list(sections.items()):
         members = mesh.bar_groups.get(keys["bars"], np.empty(0, int)) if "bars" in keys else np.flatnonzero(rest)
-        values = np.unique(stress[members])
+        values = np.unique(stress[members]).tolist()
         if len(values) == 1 and values[0] != 0.0:
-            keys["prestress"] = float(values[0])
-        for k, value in enumerate(values.tolist() if len(values) > 1 else [], 1):
+            keys["prestress"] = values[0]
+        for k, value in enumerate(values if len(values) > 1 else [], 1):
             group = name_of(mesh.bar_groups, members[stress[members] == value], f"{name}_{k}")
             sections.pop(name, None)
             sections[group] = {**keys, "bars": group, **({"prestress": value} if value else {})}
     return told
 
 
-def _initial_lines(deck: Deck, kind: str) -> Iterator[tuple[str, list[str], Block]]:
-    """Yield the lines of the initial conditions of a type."""
+_AXES = (1.0, 2.0, 3.0)
+
+
+def _initial_values(
+    deck: Deck, kind: str, told: list[str], expected: str, axes: tuple[float, ...] | None = None
+) -> Iterator[tuple[np.ndarray, list[float]]]:
+    """Yield the members and the values of each line of the initial conditions of a type; others are told.
+
+    ``axes`` are those that the first value may be, where it is one.
+    """
     for block in deck.initial:
-        if block.get("TYPE").upper() == kind:
-            yield from ((where, words, block) for where, words in block.lines())
+        for where, words in block.lines() if block.get("TYPE").upper() == kind else ():
+            count_of = {"STRESS": max(len(words) - 1, 1), "TEMPERATURE": 1, "VELOCITY": 2}
+            values = [_value(words, at) for at in range(1, 1 + count_of[kind])]
+            if np.isfinite(values).all() and (axes is None or values[0] in axes):
+                yield deck.members_of("ELSET" if kind == "STRESS" else "NSET", block, words[0]), values
+            else:
+                told.append(f"{where}: {', '.join(words)[:60]!r} is left out: {expected}")
 
 
 # ---- supports, loads, temperatures, and what belongs to nodes
@@ -324,6 +328,10 @@ def _initial_lines(deck: Deck, kind: str) -> Iterator[tuple[str, list[str], Bloc
 _FIXED = {"PINNED": "xyz", "ENCASTRE": "xyz", "XSYMM": "x", "YSYMM": "y", "ZSYMM": "z"}
 _FIXED |= {"XASYMM": "yz", "YASYMM": "xz", "ZASYMM": "xy"}
 _AT_REST: tuple[str, _Rows] = ("", ())
+
+
+_TABULAR = {"DEFINITION": "TABULAR", "VALUE": "RELATIVE"}
+_INITIAL = ("STRESS", "TEMPERATURE", "VELOCITY")
 
 
 class _Conditions:
@@ -356,19 +364,18 @@ class _Conditions:
     def add(self) -> list[str]:
         """Add the tables to the mesh, and return what is to be said."""
         kinds = {"DLOAD": self._weigh, "CLOAD": self._push, "BOUNDARY": self._hold, "TEMPERATURE": self._heat}
-        replaced = False
+        new = [each for each, step in self._deck.conditions if each.keyword == "BOUNDARY" and step]
+        new = [each for each in new if each.get("OP").upper() == "NEW"]
         for block, in_step in self._deck.conditions:
-            if block.keyword == "BOUNDARY" and in_step and block.get("OP").upper() == "NEW" and not replaced:
-                replaced = True
+            if block in new[:1]:
                 self._supports.clear()
                 self._held[:] = 0
             self._in_step, self._over = in_step, self._rows(block)
-            told: dict[str, list[str]] = {}
+            told: defaultdict[str, list[str]] = defaultdict(list)
             for where, words in block.lines():
                 self._line = f"{where}: {', '.join(words)[:60]!r}"
-                reason = kinds[block.keyword](block, words)
-                if reason:
-                    told.setdefault(reason, []).append(self._line)
+                told[kinds[block.keyword](block, words)].append(self._line)
+            told.pop("", None)
             for reason, lines in told.items():
                 more = f" (and {len(lines) - 1} more lines)" if len(lines) > 1 else ""
                 self._told.append(f"{lines[0]}{more} is {reason}")
@@ -381,20 +388,17 @@ class _Conditions:
             **self._tables_of_nodes(),
         }
         self._mesh.tables |= {name: table for name, table in tables.items() if table}
-        for block in self._deck.initial:
-            if block.get("TYPE").upper() not in ("STRESS", "TEMPERATURE", "VELOCITY"):
-                self._told.append(f"{block.where}, TYPE={block.get('TYPE')} is left out: it is not read")
-        return self._told
+        others = [each for each in self._deck.initial if each.get("TYPE").upper() not in _INITIAL]
+        return self._told + [f"{each.where}, TYPE={each.get('TYPE')} is left out: it is not read" for each in others]
 
     # ---- over time
 
     def _rows(self, block: Block) -> _Rows:
         """Return factors over the time of a dynamic step, or over the load factor; none: as without a table."""
-        usual = "RAMP" if self._static else "STEP"
         if block.get("AMPLITUDE"):
             return self._amplitude(block)
-        kind = self._deck.step.get("AMPLITUDE", usual).upper() if self._deck.step else usual
-        if kind == usual:
+        usual, step = "RAMP" if self._static else "STEP", self._deck.step
+        if step is None or step.get("AMPLITUDE", usual).upper() == usual:
             return ()
         return ((0.0, 1.0), (1.0, 1.0)) if self._static else ((0.0, 0.0), (self._period, 1.0))
 
@@ -404,10 +408,7 @@ class _Conditions:
         pairs = found.numbers() if found is not None else None
         if found is None:
             told = "there is none of this name"
-        elif (
-            found.get("DEFINITION", "TABULAR").upper() != "TABULAR"
-            or found.get("VALUE", "RELATIVE").upper() != "RELATIVE"
-        ):
+        elif any(found.get(key, usual).upper() != usual for key, usual in _TABULAR.items()):
             told = "only tables of factors are read"
         elif pairs is None or len(pairs) % 2 or not np.isfinite(pairs).all() or not (np.diff(pairs[::2]) > 0.0).all():
             told = "expected pairs of times, which increase, and factors"
@@ -505,13 +506,10 @@ class _Conditions:
             return "", members
         wanted = target.replace('"', "").replace("/", "_")
         last = wanted.rpartition(".")[2]
-        for upper in (wanted.upper(), last.upper()):
-            name = self._names.get(upper, "")
-            if name and np.array_equal(groups[name], members):
-                return name, members
-        name = f"node_{wanted}" if last.isdecimal() else wanted
-        if name in groups and not np.array_equal(groups[name], members):
-            name = free_name(groups, name)
+        new = f"node_{wanted}" if last.isdecimal() else wanted
+        known = [*(self._names.get(upper) for upper in (wanted.upper(), last.upper())), new]
+        name = next((each for each in known if each in groups and np.array_equal(groups[each], members)), None)
+        name = name or free_name(groups, new)
         groups[name] = members
         return name, members
 
@@ -530,10 +528,8 @@ class _Conditions:
             keys: dict[str, Any] = {"node_set": name, "fix": "".join("xyz"[axis] for axis in sorted(axes))}
             columns = [axes.get(axis, [0.0] * len(times)) for axis in range(3)]
             rows = [list(row) for row in zip(times, *columns)]
-            if kind:
-                keys[kind] = rows[0][1:] if kind == "velocity" else rows
-            if kind == "motion":
-                keys["interpolation"] = "linear"
+            keys |= {kind: rows[0][1:] if kind == "velocity" else rows} if kind else {}
+            keys |= {"interpolation": "linear"} if kind == "motion" else {}
             tables[free_name(tables, name)] = keys
         return tables
 
@@ -559,9 +555,9 @@ class _Conditions:
 
     def _gravity_tables(self) -> dict[str, dict[str, Any]]:
         every: list[tuple[np.ndarray, _Rows]] = []
-        for (vector, rows), (line, count) in self._gravity.items():
-            every.append((count.min() * np.array(vector), rows))
-            if count.max() > count.min():
+        for (vector, rows), (line, times) in self._gravity.items():
+            every.append((times.min() * np.array(vector), rows))
+            if times.max() > times.min():
                 self._told.append(f"{line} is left out: the gravity of a case acts on all bars")
         total = sum((vector for vector, _ in every), np.zeros(3))
         if not any(rows for _, rows in every):
@@ -574,12 +570,9 @@ class _Conditions:
         """Return the temperatures of bars, the means of those of their nodes, above the initial ones."""
         mesh = self._mesh
         initial = np.zeros(len(mesh.points))
-        for where, words, block in _initial_lines(self._deck, "TEMPERATURE"):
-            value = _value(words, 1)
-            if np.isfinite(value):
-                initial[self._deck.members_of("NSET", block, words[0])] = value
-            else:
-                self._told.append(f"{where}: {', '.join(words)[:60]!r} is left out: expected nodes and a temperature")
+        expected = "expected nodes and a temperature"
+        for members, (value,) in _initial_values(self._deck, "TEMPERATURE", self._told, expected):
+            initial[members] = value
         times = self._times([rows for _, _, rows in self._temperatures])
         above = np.zeros((len(initial), len(times)))
         for members, value, rows in self._temperatures:
@@ -596,15 +589,11 @@ class _Conditions:
 
     def _velocity_tables(self) -> dict[str, dict[str, Any]]:
         velocity = np.zeros((len(self._mesh.points), 3))
-        for where, words, block in _initial_lines(self._deck, "VELOCITY"):
-            axis, value = _value(words, 1), _value(words, 2)
-            if not self._dynamic or axis not in (1.0, 2.0, 3.0) or not np.isfinite(value):
-                told = (
-                    "expected nodes, 1, 2 or 3, and a number" if self._dynamic else "it has no effect without *DYNAMIC"
-                )
-                self._told.append(f"{where}: {', '.join(words)[:60]!r} is left out: {told}")
-            else:
-                velocity[self._deck.members_of("NSET", block, words[0]), int(axis) - 1] = value
+        axes, expected = _AXES, "expected nodes, 1, 2 or 3, and a number"
+        if not self._dynamic:
+            axes, expected = (), "it has no effect without *DYNAMIC"
+        for members, (axis, value) in _initial_values(self._deck, "VELOCITY", self._told, expected, axes):
+            velocity[members, int(axis) - 1] = value
         groups = self._mesh.node_groups
         return {name: {"node_set": name, "velocity": row} for row, name in alike(groups, velocity, "velocity")}
 
@@ -614,36 +603,28 @@ class _Conditions:
         groups, n = self._mesh.node_groups, len(self._mesh.points)
         values = {"MASS": np.zeros((n, 1)), "SPRING": np.zeros((n, 3)), "DASHPOT": np.zeros((n, 3))}
         tables: dict[str, dict[str, dict[str, Any]]] = {"mass": {}, "spring": {}, "dashpot": {}}
-        known: list[AtNodes] = []
+        known: set[int] = set()
         for block, elements in self._deck.of_nodes():
-            told: dict[str, int] = {}
-            for element, nodes in elements:
-                known.append(element)
-                reason = self._add_of_nodes(block, element, nodes, values, tables)
-                if reason:
-                    told[reason] = told.get(reason, 0) + 1
-            self._told += [f"{block.where}: left out {count} elements: {reason}" for reason, count in told.items()]
-        every = [element for scope in self._deck.scopes.values() for element in scope.at_nodes]
-        bare = len({id(element) for element in every} - {id(element) for element in known})
-        if bare:
-            self._told.append(
-                f"{self._deck.path}: left out {bare} masses, springs or dashpots without *MASS, *SPRING or *DASHPOT"
-            )
-        for (value,), name in alike(groups, values["MASS"], "mass"):
-            tables["mass"][name] = {"node_set": name, "value": value}
-        for row, name in alike(groups, values["SPRING"], "spring"):
-            tables["spring"][free_name(tables["spring"], name)] = {"node_set": name, "stiffness": row}
+            known |= {id(element) for element, _ in elements}
+            told = Counter(self._add_of_nodes(block, *element, values, tables) for element in elements)
+            told.pop("", None)
+            self._told += [f"{block.where}: left out {number} elements: {why}" for why, number in told.items()]
+        every = {id(element) for scope in self._deck.scopes.values() for element in scope.at_nodes}
+        told = []
+        if every - known:
+            told.append(f"{len(every - known)} masses, springs or dashpots without *MASS, *SPRING or *DASHPOT")
         # a dashpot of a case acts in all directions: those in which a node is held do not matter
         damped = values["DASHPOT"]
         most = damped.max(axis=1, keepdims=True)
         uneven = ((damped != most) & (self._held == 0)).any(axis=1)
         if uneven.any():
-            self._told.append(
-                f"{self._deck.path}: left out the dashpots of {int(uneven.sum())} nodes: those of a case act equally "
-                "in all directions"
-            )
-        for (value,), name in alike(groups, np.where(uneven[:, None], 0.0, most), "dashpot"):
-            tables["dashpot"][free_name(tables["dashpot"], name)] = {"node_set": name, "coefficient": value}
+            nodes = f"the dashpots of {int(uneven.sum())} nodes"
+            told.append(f"{nodes}: those of a case act equally in all directions")
+        self._told += [f"{self._deck.path}: left out {text}" for text in told]
+        values["DASHPOT"] = np.where(uneven[:, None], 0.0, most)
+        for (kind, own), key in zip(tables.items(), ("value", "stiffness", "coefficient")):
+            for row, name in alike(groups, values[kind.upper()], kind):
+                own[free_name(own, name)] = {"node_set": name, key: row if kind == "spring" else row[0]}
         return tables
 
     def _add_of_nodes(
@@ -656,21 +637,21 @@ class _Conditions:
     ) -> str:
         """Add an element that belongs to nodes to the values of nodes or to the tables; return why not."""
         odd = [name for name in ("NONLINEAR", "ORIENTATION") if name in block.parameters]
+        odd += [f"TYPE={kind}" for kind in [block.get("TYPE", "ISO")] if kind.upper() not in ("ISOTROPIC", "ISO")]
         lines = [words for _, words in block.lines()]
-        at_ground = element.kind.endswith("1")
-        directed = at_ground or element.kind.endswith("2")
+        directed = element.kind[-1] in "12"
         axes = [_value(lines[0], at) for at in range(len(nodes))] if directed and lines else []
-        if not directed and len(lines) > 1 and lines[0][0] in ("1", "2", "3", "0"):
-            lines = lines[1:]  # degrees of freedom, which do not matter along a line
-        data = lines[1 if directed else 0 :]
+        # degrees of freedom do not matter along a line
+        free = not directed and len(lines) > 1 and lines[0][0] in ("1", "2", "3", "0")
+        data = lines[int(directed or free) :]
         value = _value(data[0], 0) if data else np.nan
-        if odd or block.get("TYPE", "ISOTROPIC").upper() not in ("ISOTROPIC", "ISO"):
-            return f"{odd[0] if odd else 'TYPE=' + block.get('TYPE')} is not read"
+        if odd:
+            return f"{odd[0]} is not read"
         if not 0.0 < value < np.inf:
             return "expected a positive number"
         if min(nodes) < 0:
             return "no bar ends at their nodes"
-        if any(axis not in (1.0, 2.0, 3.0) for axis in axes):
+        if any(axis not in _AXES for axis in axes):
             return "bars have the degrees of freedom 1, 2 and 3 alone"
         if len(nodes) == 1:
             values[block.keyword][nodes[0], int(axes[0]) - 1 if axes else 0] += value
@@ -678,14 +659,10 @@ class _Conditions:
         line = self._mesh.points[nodes[1]] - self._mesh.points[nodes[0]]
         if axes and not (axes[0] == axes[1] and np.count_nonzero(line) == 1 and line[int(axes[0]) - 1]):
             return "those of a case act along the line between their nodes"
-        names = [
-            name_of(
-                self._mesh.node_groups, np.array([node]), "node_" + (f"{instance}.{label}" if instance else f"{label}")
-            )
-            for node, (instance, label) in zip(nodes, element.nodes)
-        ]
+        labels = [f"node_{instance}.{label}" if instance else f"node_{label}" for instance, label in element.nodes]
+        groups, own = self._mesh.node_groups, tables[block.keyword.lower()]
+        names = [name_of(groups, np.array([node]), label) for node, label in zip(nodes, labels)]
         key = {"SPRING": "stiffness", "DASHPOT": "coefficient"}[block.keyword]
-        own = tables[block.keyword.lower()]
         own[free_name(own, " to ".join(names))] = {"between": names, key: value}
         return ""
 
@@ -702,14 +679,12 @@ def _add_analysis(mesh: WholeMesh, deck: Deck) -> None:
     if deck.procedure is None:
         return
     tables, told = _analysis(deck.procedure)
-    if tables:
-        mesh.tables["analysis"] = tables
-    if told:
-        mesh.warnings.append(f"{deck.procedure.where}: {told}")
-    step, explicit = deck.step, "EXPLICIT" in deck.procedure.parameters
-    small = step is not None and step.get("NLGEOM", "NO").upper() == "NO" and not explicit
-    if small and {"static", "time"} & tables.keys() and "modes" not in tables:
-        mesh.warnings.append(f"{step.where} has no NLGEOM: the case has large displacements, as all cases do")
+    mesh.tables |= {"analysis": tables} if tables else {}
+    mesh.warnings += [f"{deck.procedure.where}: {told}"] * bool(told)
+    small = deck.step is not None and deck.step.get("NLGEOM", "NO").upper() == "NO"
+    large = "EXPLICIT" in deck.procedure.parameters or "modes" in tables
+    if small and not large and tables.keys() & {"static", "time"}:
+        mesh.warnings.append(f"{deck.step.where} has no NLGEOM: the case has large displacements, as all cases do")
 
 
 def _analysis(block: Block) -> tuple[dict[str, dict[str, Any]], str]:
@@ -789,19 +764,16 @@ def _set_lines(head: str, members: np.ndarray) -> Iterator[str]:
 def _section_lines(mesh: WholeMesh, names: dict[str, str]) -> Iterator[str]:
     """Return a section for all bars of the same area and material."""
     n = len(mesh.bars)
-    areas = mesh.bar_fields.get("area", np.full(n, np.nan)).copy()
-    material = np.full(n, -1)
-    materials: list[str] = []
-    tables = mesh.tables.get("section", {})
+    areas, material = mesh.bar_fields.get("area", np.full(n, np.nan)).copy(), np.full(n, -1)
     # those without a group are for all bars that no other one names
-    for keys in sorted(tables.values(), key=lambda keys: "bars" in keys):
+    tables = sorted(mesh.tables.get("section", {}).values(), key=lambda keys: "bars" in keys)
+    materials = list(dict.fromkeys(keys["material"] for keys in tables if keys.get("material")))
+    for keys in tables:
         members = mesh.bar_groups.get(keys["bars"], np.empty(0, np.int64)) if "bars" in keys else np.arange(n)
         if "area" in keys and "area" not in mesh.bar_fields:
             areas[members] = keys["area"]
-        name = keys.get("material")
-        if name:
-            materials += [] if name in materials else [name]
-            material[members] = materials.index(name)
+        if keys.get("material"):
+            material[members] = materials.index(keys["material"])
     pairs, which = np.unique(np.column_stack([np.nan_to_num(areas, nan=-1.0), material]), axis=0, return_inverse=True)
     which = which.ravel()
     order = np.argsort(which, kind="stable")
@@ -824,12 +796,13 @@ def _section_lines(mesh: WholeMesh, names: dict[str, str]) -> Iterator[str]:
 def _material_lines(name: str, keys: dict[str, Any]) -> Iterator[str]:
     yield f"*MATERIAL, NAME={_quoted(name)}"
     density, young = keys.get("density"), keys.get("young_modulus")
-    if density is not None:
-        yield from ("*DENSITY", f"{density!r},")
-    if young is not None:
-        yield from ("*ELASTIC", f"{young!r}, 0.0")
-    if keys.get("thermal_expansion"):
-        yield from ("*EXPANSION", f"{keys['thermal_expansion']!r},")
+    for keyword, value, more in (
+        ("DENSITY", density, ","),
+        ("ELASTIC", young, ", 0.0"),
+        ("EXPANSION", keys.get("thermal_expansion") or None, ","),
+    ):
+        if value is not None:
+            yield from (f"*{keyword}", f"{value!r}{more}")
     damping = f", ALPHA={keys['damping'] / density!r}" if density and keys.get("damping") else ""
     damping += f", BETA={keys['stiffness_damping']!r}" if keys.get("stiffness_damping") else ""
     if damping:
@@ -848,15 +821,13 @@ def _material_lines(name: str, keys: dict[str, Any]) -> Iterator[str]:
 
 def _unique_names(groups: dict[str, np.ndarray]) -> dict[str, str]:
     """Return names that differ in capitals too, quoted where need be."""
-    found: dict[str, str] = {}
-    taken: set[str] = set()
+    found: dict[str, str] = {}  # by names in capitals
     for name in groups:
         own = name
-        while own.upper() in taken:
+        while own.upper() in found:
             own += "_"
-        taken.add(own.upper())
-        found[name] = _quoted(own)
-    return found
+        found[own.upper()] = _quoted(own)
+    return dict(zip(groups, found.values()))
 
 
 def _quoted(name: str) -> str:

@@ -115,16 +115,11 @@ def _pair(path: Path) -> tuple[Path, Path, list[str]]:
     raise InputError(f"{path}: a mesh in tables is a pair of files, {pair[0]} and {pair[1]}: {missing}")
 
 
-def _words_in(stem: str) -> Iterator[tuple[int, int, int]]:
-    """Yield the words for a kind of table in a name, the last first: kind, and where it begins and ends."""
-    found = [
-        (match.end(), match.end() - match.start(), kind)
-        for kind, words in enumerate(_FILE_WORDS)
-        for word in words
-        for match in re.finditer(word, stem.lower())
-    ]
-    for stop, length, kind in sorted(found, reverse=True):
-        yield kind, stop - length, stop
+def _words_in(stem: str) -> list[tuple[int, int, int]]:
+    """Return the words for a kind of table in a name, the last first: kind, and where it begins and ends."""
+    words = [(kind, word) for kind, words in enumerate(_FILE_WORDS) for word in words]
+    found = [(kind, *match.span()) for kind, word in words for match in re.finditer(word, stem.lower())]
+    return sorted(found, key=lambda each: (each[2], each[2] - each[1], each[0]), reverse=True)
 
 
 def _kind(path: Path) -> int | None:
@@ -133,9 +128,8 @@ def _kind(path: Path) -> int | None:
         table = _Table(path, head_only=True)
     except InputError:
         return None
-    if table.place(_AXES[0]) is not None and table.place(_AXES[1]) is not None:
-        return 0
-    return 1 if table.pairs_of_ends() else None
+    of_nodes = None not in (table.place(_AXES[0]), table.place(_AXES[1]))
+    return 0 if of_nodes else 1 if table.pairs_of_ends() else None
 
 
 def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
@@ -237,28 +231,19 @@ class _Table:
         self._lines = np.array(kept[1:], np.int64) + 1
         self.n = len(self._lines)
         texts = (lines[i] for i in (kept[:1] if head_only else kept))
-        rows = csv.reader(texts, delimiter=separator, skipinitialspace=True, strict=True)
         try:
-            self._given = next(rows)
-            self.headings = [_without_unit(name) for name in self._given]
-            self.columns: list[list[str]] = [[] for _ in self.headings]
-            count = self._fill(rows)
+            self._given, *rows = csv.reader(texts, delimiter=separator, skipinitialspace=True, strict=True)
         except csv.Error as error:
             raise InputError(f"{path}: {error}") from None
-        if count != self.n and not head_only:
-            raise InputError(f"{path}: a text in quotes goes over several lines")
-        self._keys = [re.sub(r"[\W_]+", "", name.lower()) for name in self.headings]
-
-    def _fill(self, rows: Iterator[list[str]]) -> int:
-        """Put the entries into columns, row by row, which needs less memory and time; return the number of rows."""
-        width, count = len(self.headings), 0
-        for count, row in enumerate(rows, 1):
+        width = len(self._given)
+        for k, row in enumerate(rows):
             if len(row) != width and (len(row) < width or any(word.strip() for word in row[width:])):
-                where = self.where(count - 1)
-                raise InputError(f"{where}: {len(row)} entries; expected {width}, as the first line has")
-            for column, word in zip(self.columns, row):
-                column.append(word)
-        return count
+                raise InputError(f"{self.where(k)}: {len(row)} entries; expected {width}, as the first line has")
+        if len(rows) != self.n and not head_only:
+            raise InputError(f"{path}: a text in quotes goes over several lines")
+        self.headings = [_without_unit(name) for name in self._given]
+        self.columns = [list(column) for column in zip(*rows)] or [[] for _ in self._given]
+        self._keys = [re.sub(r"[\W_]+", "", name.lower()) for name in self.headings]
 
     def where(self, row: int) -> str:
         """Return file and line of a row."""
@@ -384,7 +369,7 @@ def _label(word: str) -> str:
 
 def write(path: Path, mesh: WholeMesh) -> None:
     """Write both tables, to the last digit; groups without members are not in them."""
-    kind, start, stop = next(_words_in(path.stem), (0, 0, 0))
+    kind, start, stop = next(iter(_words_in(path.stem)), (0, 0, 0))
     if not stop:
         pair = f"{path.stem}_nodes.csv and {path.stem}_bars.csv"
         raise InputError(f"{path}: a mesh in tables is a pair of files, {pair}: name one of them")

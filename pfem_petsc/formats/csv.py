@@ -88,22 +88,19 @@ def _pair(path: Path) -> tuple[Path, Path, list[str]]:
     others = sorted(p for p in path.parent.iterdir() if p.suffix.lower() in SUFFIXES and p.name != path.name)
     named = {other.name.lower(): other for other in others}
     kind: int | None = None
-    found: list[tuple[int, Path]] = []
+    found: dict[tuple[int, Path], str] = {}
     for kind_of_word, start, stop in _words_in(path.stem):
         kind = kind_of_word
-        for word in _FILE_WORDS[1 - kind]:
-            other = named.get(f"{path.stem[:start]}{word}{path.stem[stop:]}{path.suffix}".lower())
-            if other is not None and (kind, other) not in found:
-                found.append((kind, other))
-    warnings = []
+        names = [f"{path.stem[:start]}{word}{path.stem[stop:]}{path.suffix}" for word in _FILE_WORDS[1 - kind]]
+        found |= {(kind, named[name.lower()]): "" for name in names if name.lower() in named}
     if not found:
         own = _kind(path)
         kind = kind if own is None else own
         fitting = [other for other in others if kind is not None and _kind(other) == 1 - kind]
-        found = [(kind, other) for other in fitting if kind is not None]
-        warnings = [f"{path}: goes with {other.name}, by the columns of both" for other in fitting]
+        found = {(kind, other): f"{path}: goes with {other.name}, by the columns of both" for other in fitting}
     if len(found) == 1:
-        ((kind, other),) = found
+        (((kind, other), told),) = found.items()
+        warnings = [told] * bool(told)
         return (path, other, warnings) if kind == 0 else (other, path, warnings)
     if found:
         names = ", ".join(other.name for _, other in found)
@@ -146,19 +143,20 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     axes = [nodes.numbers(axis, names) for axis, names in zip("xyz", _AXES)]
     ids, number = _numbers_of_ids(nodes, bars, pair)
     ends = np.empty((bars.n, 2), np.int64)
+    named = (
+        f"whose ids are in column {nodes.shown(ids)}, like {', '.join(islice(number, 3))}" if ids is not None else ""
+    )
     for side, place in enumerate(pair):
         ends[:, side] = np.fromiter((number.get(label, -1) for label in bars.labels(place)), np.int64, bars.n)
-        if (ends[:, side] < 0).any():
-            row = int((ends[:, side] < 0).argmax())
+        for row in np.flatnonzero(ends[:, side] < 0)[:1].tolist():
             label = next(islice(bars.labels(place), row, None))
-            told = "where nodes are numbered from 0, because it has no column of ids" if ids is None else ""
-            told = told or f"whose ids are in column {nodes.shown(ids)}, like {', '.join(islice(number, 3))}"
+            told = named or "where nodes are numbered from 0, because it has no column of ids"
             raise InputError(f"{bars.where(row)}: there is no node {label!r} in {of_nodes.name}, {told}")
     mesh = WholeMesh(np.stack(axes, axis=1), ends, nodes.groups(), bars.groups())
     coordinates = [place for place in map(nodes.place, _AXES) if place is not None]
     mesh.warnings = warnings + nodes.units(coordinates, "converts by --scale (0.001 for millimetres)")
-    fields = [place for _, place in bars.others([])]
-    mesh.warnings += bars.units(fields, "converts the column area alone, by --scale squared, with the coordinates")
+    remedy = "converts the column area alone, by --scale squared, with the coordinates"
+    mesh.warnings += bars.units([place for _, place in bars.others([])], remedy)
     used = [nodes.place(names) for names in (*_AXES, _GROUPS)]
     mesh.node_fields, texts = nodes.fields([*used, ids, *nodes.places(chain(*_NODE_IDS))])
     if texts or (used[2] is None and mesh.node_fields):
@@ -321,8 +319,7 @@ class _Table:
             raise InputError(f"{self.path}: line 1: there is no column {axis!r}; it has {self._all()}; {known}")
         words = self.columns[place]
         values = self.converted(words)
-        if values is None:
-            row = next(row for row, word in enumerate(words) if self.converted([word]) is None)
+        for row in [k for k, word in enumerate(words) if self.converted([word]) is None][:1] if values is None else ():
             raise InputError(f"{self.where(row)}: column {self.shown(place)}: {words[row][:40]!r} is not a number")
         return values
 

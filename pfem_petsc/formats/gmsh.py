@@ -417,10 +417,12 @@ def _lines(mesh: WholeMesh) -> Iterator[str]:
         yield from (f'{dimension} {tag} "{_quoted(name)}"' for tag, name in enumerate(groups, 1))
     yield from ("$EndPhysicalNames", "$Entities", f"{len(grouped)} {len(curves)} 0 0")
     for node in grouped.tolist():
-        yield f"{node + 1} {_numbers(mesh.points[node])} {_tags(points[point_of[node]])}"
+        tags = points[point_of[node]]
+        yield _row(node + 1, *mesh.points[node].tolist(), len(tags), *tags)
     for number, groups in enumerate(curves):
         ends = mesh.points[np.unique(mesh.bars[curve_of == number])]
-        yield f"{number + 1} {_numbers(ends.min(axis=0))} {_numbers(ends.max(axis=0))} {_tags(groups)} 0"
+        box = (*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist())
+        yield _row(number + 1, *box, len(groups), *groups, 0)
     n, m = len(mesh.points), len(mesh.bars)
     yield from ("$EndEntities", "$Nodes", f"1 {n} 1 {n}", f"1 1 0 {n}")
     yield from map(str, range(1, n + 1))
@@ -458,12 +460,8 @@ def _combinations(groups: dict[str, np.ndarray], n: int) -> tuple[list[list[int]
     return [found[i] for i in present.tolist()], number.ravel()
 
 
-def _numbers(values: np.ndarray) -> str:
-    return " ".join(repr(value) for value in values.tolist())
-
-
-def _tags(tags: list[int]) -> str:
-    return " ".join(map(str, [len(tags), *tags]))
+def _row(*numbers: float) -> str:
+    return " ".join(map(repr, numbers))
 
 
 def _quoted(name: str) -> str:

@@ -62,8 +62,8 @@ def suffixes(*what: str) -> dict[str, ModuleType]:
     """Return the module of each suffix; ``what`` are functions of which it must have one, as ``write``."""
     from ..registry import modules
 
-    found = modules(__name__).values()
-    return {suffix: m for m in found if any(hasattr(m, name) for name in what) for suffix in m.SUFFIXES}
+    found = [each for each in modules(__name__).values() if any(hasattr(each, name) for name in what)]
+    return {suffix: each for each in found for suffix in each.SUFFIXES}
 
 
 def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
@@ -81,15 +81,12 @@ def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = Non
 
     # files that rank 0 sends on need not be there on other machines
     reader = importlib.import_module(on_root(comm, lambda: _reader_of(path, "mesh.file: ").__name__))
-    wanted = fields or {}
     if hasattr(reader, "read_on"):
-        slab = reader.read_on(path, comm, wanted)
+        slab = reader.read_on(path, comm, fields or {})
         check_size(slab.n_nodes, str(path))
         return slab
-    whole = None
     with agreed(comm):
-        if comm.rank == 0:
-            whole = _read(reader, path, wanted)
+        whole = _read(reader, path, fields or {}) if comm.rank == 0 else None
     return scattered(whole, str(path), comm)
 
 
@@ -168,9 +165,9 @@ def _read(reader: Any, path: Path, fields: Mapping[str, str] | None) -> WholeMes
     except MemoryError:
         raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
     check_fields(path, fields, {*whole.bar_fields, *whole.node_fields})
-    if fields is not None:
-        whole.bar_fields = {name: whole.bar_fields[name] for name in fields if name in whole.bar_fields}
-        whole.node_fields = {name: whole.node_fields[name] for name in fields if name in whole.node_fields}
+    for kind in ("bar_fields", "node_fields") if fields is not None else ():
+        own = getattr(whole, kind)
+        setattr(whole, kind, {name: own[name] for name in fields if name in own})
     return whole
 
 

@@ -51,14 +51,11 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     except (TypeError, AttributeError) as error:
         raise InputError(f"{path}: its {kind} or edges are not what COMPAS writes: {error}") from None
     mesh = WholeMesh(points.reshape(-1, 3), np.array(ends, np.int64).reshape(-1, 2))
-    left = [
-        *_attributes(nodes, mesh.node_fields, mesh.node_groups),
-        *_attributes(bars, mesh.bar_fields, mesh.bar_groups),
-    ]
+    left = [*_attributes(nodes, mesh.node_fields, mesh.node_groups)]
+    left += _attributes(bars, mesh.bar_fields, mesh.bar_groups)
     for name, values in (mesh.node_fields | mesh.bar_fields).items():
-        if not np.isfinite(values).all():
-            n = int((~np.isfinite(values)).sum())
-            mesh.warnings.append(f"{path}: the attribute {name} is not a finite number {n} times")
+        n = int((~np.isfinite(values)).sum())
+        mesh.warnings += [f"{path}: the attribute {name} is not a finite number {n} times"] * bool(n)
     if left:
         mesh.warnings.append(f"{path}: left out the attributes {', '.join(left)}: not one number for each node or edge")
     if len(found) > 1:

@@ -72,8 +72,9 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
         raise InputError(f"{path}: cannot be read with VTK ({last[0]}); is VTK 9.2 or newer installed?")
     arrays = pickle.loads(done.stdout)
-    left_out, snapshots, faces = (arrays.pop(name) for name in ("left_out", "snapshots", "faces"))
-    mesh = WholeMesh(points=arrays.pop("points"), bars=arrays.pop("bars"))
+    names = ("left_out", "snapshots", "faces", "points", "bars")
+    left_out, snapshots, faces, points, bars = (arrays.pop(name) for name in names)
+    mesh = WholeMesh(points, bars)
     for key, values in arrays.items():
         kind, _, name = key.partition("/")
         getattr(mesh, kind)[name] = values

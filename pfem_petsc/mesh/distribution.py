@@ -156,40 +156,13 @@ def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, keep: bo
     mesh = DistributedMesh()
     mesh.comm = comm
     mesh.n_nodes, mesh.n_bars, mesh.volume, mesh.filled = slab.n_nodes, slab.n_bars, slab.volume, slab.filled
-    bar_section = np.asarray(bar_section, dtype=np.int32)
-    if comm.size == 1:
-        mesh.partitioner = "none (one rank)"
-        _alone(mesh, slab, bar_section, keep)
-    else:
-        owners, mesh.partitioner = partition(slab, comm)
-        _among_ranks(mesh, slab, bar_section, owners, keep)
+    owners, mesh.partitioner = partition(slab, comm)
+    _send_to_owners(mesh, slab, np.asarray(bar_section, dtype=np.int32), owners, keep)
     return mesh
 
 
-def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, keep: bool) -> None:
-    """Reorder nodes and bars on one rank, with few temporary arrays of the size of the mesh."""
-    order = np.argsort(sweep_keys(slab.points if slab.undisturbed is None else slab.undisturbed), kind="stable")
-    place = np.empty(len(order), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    mesh.n_owned = mesh.n_local = slab.n_nodes
-    mesh.first_node = 0
-    mesh.node_ids = order.astype(np.int64, copy=False)
-    mesh.ghost_numbers = np.empty(0, np.int64)
-    mesh.points = slab.points[order]
-    if not keep:
-        slab.points, slab.undisturbed = slab.points[:0].copy(), None
-    mesh._exchange = GhostExchange(mesh.comm, np.array([0, slab.n_nodes]), mesh.ghost_numbers)
-    mesh.node_groups = {name: np.sort(place[members]) for name, members in slab.node_groups.items()}
-    groups = {name: _membership(members, len(slab.bars)) for name, members in slab.bar_groups.items()}
-    ends = place[slab.bars]
-    if not keep:
-        slab.bars = slab.bars[:0].copy()
-    del place
-    _arrange_bars(mesh, ends, None, section, groups, slab.bar_fields)
-
-
-def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray, keep: bool) -> None:
-    """Distribute over several ranks: number nodes on their owners, then send bars to the owners of their ends."""
+def _send_to_owners(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray, keep: bool) -> None:
+    """Number nodes on their owners, then send bars to the owners of their ends."""
     comm = mesh.comm
     to_owner = Router(comm, owners)
     ids = to_owner.send(np.arange(slab.first_node, slab.first_node + len(owners)))
@@ -201,30 +174,28 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
     del places
     n_owned = len(ids)
     starts = np.concatenate([[0], np.cumsum(comm.allgather(n_owned))]).astype(np.int64)
+    first, last = starts[comm.rank], starts[comm.rank + 1]
     numbers = np.empty(n_owned, np.int64)
-    numbers[order] = np.arange(starts[comm.rank], starts[comm.rank + 1])
+    numbers[order] = np.arange(first, last)
     # The directory has the PETSc numbers (and with `starts` the owners) of the slab's nodes on the rank of the slab.
     directory = to_owner.reply(numbers)
     del to_owner, numbers
 
     bars, bar_ids, section, groups, fields = _fetch_bars(slab, section, directory, starts, comm, keep)
 
-    first, last = starts[comm.rank], starts[comm.rank + 1]
-    elsewhere = bars[(bars < first) | (bars >= last)]
-    ghosts = np.unique(elsewhere)
+    outside = (bars < first) | (bars >= last)
+    ghosts = np.unique(bars[outside])
     ends = (bars - first).astype(np.int32)
-    ends[(bars < first) | (bars >= last)] = n_owned + np.searchsorted(ghosts, elsewhere)
-    del bars, elsewhere
+    ends[outside] = n_owned + np.searchsorted(ghosts, bars[outside])
+    del bars, outside
 
     mesh.n_owned, mesh.n_local, mesh.first_node = n_owned, n_owned + len(ghosts), int(first)
     mesh.ghost_numbers = ghosts.astype(np.int64)
     mesh._exchange = GhostExchange(comm, starts, mesh.ghost_numbers)
-    mesh.points = np.empty((mesh.n_local, 3))
-    mesh.points[:n_owned] = points[order]
-    mesh.update_ghosts(mesh.points)
     # Mesh numbers are far below 2^53, so they are exact as floating-point numbers.
-    travelling = np.empty((mesh.n_local, 1))
-    travelling[:n_owned, 0] = ids[order]
+    mesh.points, travelling = np.empty((mesh.n_local, 3)), np.empty((mesh.n_local, 1))
+    mesh.points[:n_owned], travelling[:n_owned, 0] = points[order], ids[order]
+    mesh.update_ghosts(mesh.points)
     mesh.update_ghosts(travelling)
     mesh.node_ids = travelling[:, 0].astype(np.int64)
 
@@ -271,12 +242,12 @@ def _fetch_bars(
 def _arrange_bars(
     mesh: DistributedMesh,
     ends: np.ndarray,
-    bar_ids: np.ndarray | None,
+    bar_ids: np.ndarray,
     section: np.ndarray,
     groups: dict[str, np.ndarray],
     fields: dict[str, np.ndarray],
 ) -> None:
-    """Sort the local bars by section, counted bars first, then for locality; ``bar_ids`` None: 0, 1, ..."""
+    """Sort the local bars by section, counted bars first, then for locality."""
     borrowed = ends[:, 0] >= mesh.n_owned
     kind = None
     if borrowed.any() or (len(section) and section.min() != section.max()) or section[:1].any():
@@ -285,7 +256,7 @@ def _arrange_bars(
     del borrowed
     order = bar_order(ends, kind, mesh.n_local)
     mesh.bars = ends[order]
-    mesh.bar_ids = (order if bar_ids is None else bar_ids[order]).astype(index_type(mesh.n_bars), copy=False)
+    mesh.bar_ids = bar_ids[order].astype(index_type(mesh.n_bars), copy=False)
     mesh.bar_groups = {name: np.flatnonzero(mask[order]).astype(np.int32) for name, mask in groups.items()}
     mesh.bar_fields = {name: values[order] for name, values in fields.items()}
     counts = np.bincount(kind) if kind is not None else np.array([len(ends)])

@@ -265,7 +265,7 @@ _BARS_SENT = 1 << 18  # number of bars whose ends are sent at a time, to keep te
 
 
 def partition(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, str]:
-    """Compute the owner, among several ranks, of every node of this rank's slab. Collective.
+    """Compute the owner of every node of this rank's slab. Collective.
 
     PT-Scotch cuts few bars, for equal numbers of nodes. A space-filling curve through the nodes divided into parts of
     equal work, independent of the slabs, serves structured meshes, a PETSc without PT-Scotch, and meshes of which a
@@ -277,8 +277,10 @@ def partition(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, str]:
     -------
     owners : (nodes of the slab,) int32
     used : str
-        ``"ptscotch"`` or ``"coordinates"``, for the log.
+        ``"ptscotch"``, ``"coordinates"`` or ``"none (one rank)"``, for the log.
     """
+    if comm.size == 1:
+        return np.zeros(len(slab.points), np.int32), "none (one rank)"
     owners = None if slab.structured else _by_graph(slab, comm)
     if owners is not None and _is_even(owners, slab, comm):
         return owners, "ptscotch"

@@ -248,11 +248,9 @@ def _arrange_bars(
     fields: dict[str, np.ndarray],
 ) -> None:
     """Sort the local bars by section, counted bars first, then for locality."""
-    borrowed = ends[:, 0] >= mesh.n_owned
-    kind = None
+    borrowed, kind = ends[:, 0] >= mesh.n_owned, None
     if borrowed.any() or (len(section) and section.min() != section.max()) or section[:1].any():
-        kind = 2 * section
-        kind += borrowed
+        kind = 2 * section + borrowed
     del borrowed
     order = bar_order(ends, kind, mesh.n_local)
     mesh.bars = ends[order]
@@ -261,12 +259,11 @@ def _arrange_bars(
     mesh.bar_fields = {name: values[order] for name, values in fields.items()}
     counts = np.bincount(kind) if kind is not None else np.array([len(ends)])
     counts = np.append(counts, np.zeros(len(counts) % 2, counts.dtype)).reshape(-1, 2)
-    mesh.blocks = []
-    start = 0
+    mesh.blocks, start = [], 0
     for number, (counted, others) in enumerate(counts.tolist()):
         if counted + others:
             mesh.blocks.append(Block(number, start, start + counted, start + counted + others))
-            start += counted + others
+        start += counted + others
 
 
 def _membership(members: np.ndarray, n: int) -> np.ndarray:
@@ -322,38 +319,30 @@ def bars_of_group(case: Case, mesh: DistributedMesh, key: str, name: str) -> np.
 
 
 def _members_of(case: Case, where: str, node_set: NodeSet, mesh: DistributedMesh) -> np.ndarray:
-    points = mesh.points[: mesh.n_owned]
-    ids = mesh.node_ids[: mesh.n_owned]
+    points, ids = mesh.points[: mesh.n_owned], mesh.node_ids[: mesh.n_owned]
     if node_set.nearest is not None:
         distance = np.linalg.norm(points - np.array(node_set.nearest), axis=1)
-        best = (np.inf, -1)
-        if len(distance):
-            shortest = distance.min()
-            best = (float(shortest), int(ids[distance == shortest].min()))
-        winner = min(entry for entry in mesh.comm.allgather(best) if entry[1] >= 0)
-        return np.flatnonzero(ids == winner[1])
+        shortest = float(distance.min(initial=np.inf))
+        best = shortest, int(ids[distance == shortest].min(initial=mesh.n_nodes))
+        _, winner = min(mesh.comm.allgather(best))
+        return np.flatnonzero(ids == winner)
     if node_set.box is not None:
-        low, high = np.array(node_set.box[0]), np.array(node_set.box[1])
+        low, high = map(np.array, node_set.box)
         return np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     if node_set.group is not None:
-        groups = sorted(mesh.node_groups)
         if node_set.group in mesh.node_groups:
             return np.sort(mesh.node_groups[node_set.group])
-        bars = mesh.bar_groups.get(node_set.group)
-        if bars is not None:
-            ends = np.unique(mesh.bars[bars])
+        if node_set.group in mesh.bar_groups:
+            ends = np.unique(mesh.bars[mesh.bar_groups[node_set.group]])
             return ends[ends < mesh.n_owned]
-        known = groups + sorted(mesh.bar_groups)
-        hint = group_hint(case, node_set.group, known)
+        hint = group_hint(case, node_set.group, [*sorted(mesh.node_groups), *sorted(mesh.bar_groups)])
         raise InputError(f"{where}.group = {node_set.group!r}: no such group in the mesh{hint}")
     if node_set.selection is not None:
         return np.sort(mesh.node_groups[str(node_set.selection)])
     if node_set.indices is not None:
         wanted = np.array(node_set.indices, dtype=np.int64)
         outside = wanted[(wanted < 0) | (wanted >= mesh.n_nodes)]
-        if len(outside):
-            raise InputError(
-                f"{where}.indices: node {outside[0]} does not exist; the mesh has nodes 0 to {mesh.n_nodes - 1}"
-            )
+        for node in outside[:1]:
+            raise InputError(f"{where}.indices: node {node} does not exist; the mesh has nodes 0 to {mesh.n_nodes - 1}")
         return np.flatnonzero(np.isin(ids, wanted))
     return np.arange(mesh.n_owned)

@@ -194,18 +194,27 @@ class Parameters(StrictModel):
             if not can_be_variable(name):
                 raise ValueError(f"fields.{name}: expected a name of letters, digits and underscores")
         self.expressions()
-        if self.map is not None and self.curved is not None:
-            raise ValueError("map and the table [mesh.curved] exclude each other: give one of them")
-        if self.cells is None and (self.surface is None or self.curved is not None or self.map is not None):
-            raise ValueError("the key cells is missing: number of cells along x, y and z")
-        if (self.kind == "cell") != (self.cell is not None):
-            raise ValueError('kind = "cell" and the table [mesh.cell] with points and struts need each other')
-        if self.angle is not None and self.kind != "auxetic":
-            raise ValueError(f'angle belongs to kind = "auxetic" (default {ANGLE:g}), not to {self.kind!r}')
-        if self.seed is not None and not (self.perturbation or self.missing):
-            raise ValueError("seed needs perturbation or missing")
-        if self.curved is not None and self.curved.closed and self.cells is not None and self.cells[0] < 3:
-            raise ValueError("curved.closed = true needs 3 cells or more along x")
+        curved, shell = self.curved is not None, self.curved is not None and self.curved.closed
+        needs_cells = self.surface is None or curved or self.map is not None
+        for wrong, text in (
+            (curved and self.map is not None, "map and the table [mesh.curved] exclude each other: give one of them"),
+            (needs_cells and self.cells is None, "the key cells is missing: number of cells along x, y and z"),
+            (
+                (self.kind == "cell") != (self.cell is not None),
+                'kind = "cell" and the table [mesh.cell] with points and struts need each other',
+            ),
+            (
+                self.angle is not None and self.kind != "auxetic",
+                f'angle belongs to kind = "auxetic" (default {ANGLE:g}), not to {self.kind!r}',
+            ),
+            (self.seed is not None and not (self.perturbation or self.missing), "seed needs perturbation or missing"),
+            (
+                shell and self.cells is not None and self.cells[0] < 3,
+                "curved.closed = true needs 3 cells or more along x",
+            ),
+        ):
+            if wrong:
+                raise ValueError(text)
         return self
 
     def expressions(self) -> Fields:
@@ -289,13 +298,6 @@ class ItemByItem(Numbering):
         item = np.searchsorted(self._starts, numbers, side="right") - 1
         row, k = np.divmod(numbers - self._starts[item], self.shapes[item, 2])
         return Places(item, *np.divmod(row, self.shapes[item, 1]), k)
-
-    def pieces(self, first: int, last: int) -> Iterator[tuple[np.ndarray, Places]]:
-        """Divide the range [first, last) into numbers and what they are, one item at a time, which is faster."""
-        for item, (base, end) in enumerate(zip(self._starts[:-1].tolist(), self._starts[1:].tolist())):
-            for start in range(max(first, base), min(last, end), PIECE):
-                numbers = np.arange(start, min(start + PIECE, last, end))
-                yield numbers, Places(item, *np.unravel_index(numbers - base, tuple(self.shapes[item])))
 
 
 class CellByCell(Numbering):

@@ -281,10 +281,14 @@ def partition(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, str]:
     """
     if comm.size == 1:
         return np.zeros(len(slab.points), np.int32), "none (one rank)"
+    works = _works(slab, comm)
     owners = None if slab.structured else _by_graph(slab, comm)
-    if owners is not None and _is_even(owners, slab, comm):
-        return owners, "ptscotch"
-    return _by_coordinates(slab, _works(slab, comm), comm), "coordinates"
+    if owners is not None:
+        shares = np.bincount(owners, weights=works, minlength=comm.size)
+        comm.Allreduce(MPI.IN_PLACE, shares)
+        if shares.max() <= UNEVEN * shares.mean():
+            return owners, "ptscotch"
+    return _by_coordinates(slab, works, comm), "coordinates"
 
 
 def bounding_box(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
@@ -303,13 +307,6 @@ def _works(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
         ends = Router(comm, slab_of(ends, slab.n_nodes, comm.size)).send(ends)
         works += np.bincount(ends - slab.first_node, minlength=len(slab.points))
     return works
-
-
-def _is_even(owners: np.ndarray, slab: MeshSlab, comm: MPI.Comm) -> bool:
-    """Return whether the ranks have about the same work. Collective."""
-    shares = np.bincount(owners, weights=_works(slab, comm), minlength=comm.size)
-    comm.Allreduce(MPI.IN_PLACE, shares)
-    return bool(shares.max() <= UNEVEN * shares.mean())
 
 
 def _by_coordinates(slab: MeshSlab, works: np.ndarray, comm: MPI.Comm) -> np.ndarray:

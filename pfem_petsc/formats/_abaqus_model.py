@@ -226,9 +226,9 @@ def _included(block: Block, path: Path, above: tuple[Path, ...]) -> Path:
 
 # ---- the model
 
-_ONE_BY_ONE = "write the nodes and elements one by one (Abaqus/CAE and most preprocessors do)"
 _REFUSED = dict.fromkeys(
-    ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SUBSTRUCTURE GENERATE"), _ONE_BY_ONE
+    ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SUBSTRUCTURE GENERATE"),
+    "write the nodes and elements one by one (Abaqus/CAE and most preprocessors do)",
 ) | {
     "SYSTEM": "write the nodes in global coordinates",
     "PARAMETER": "write the values in the place of the names, as 1e7 for <E>",
@@ -631,12 +631,10 @@ class Deck:
 
     def mesh(self) -> WholeMesh:
         """Return nodes and bars of all instances in their order, without nodes where no bar ends, and their groups."""
-        told = [f"{n} elements {note}" for note, n in self._left["notes"].items()]
+        told = [f"{self.path}: {n} elements {note}" for note, n in self._left["notes"].items()]
         types = sorted(self._left["types"])
-        told += [f"left out elements of the types {', '.join(types)}"] * bool(types)
-        mesh_told = [f"{self.path}: {text}" for text in told]
-        mesh_told += [f"{where}: {name} is left out: it is not read" for (_, name), where in self._unknown.items()]
-        mesh_told += [*self._told, *self._cut_off()]
+        told += [f"{self.path}: left out elements of the types {', '.join(types)}"] * bool(types)
+        told += [f"{where}: {name} is left out: it is not read" for (_, name), where in self._unknown.items()]
         self.scopes[_ASSEMBLY] = self.assembly
         parts, n_nodes, n_bars = [], 0, 0
         for scope in self.scopes.values():
@@ -653,25 +651,24 @@ class Deck:
         self.groups, every = {}, self.scopes.values()
         of_nodes = {s.upper() for scope in every for block, s in scope.sections if block.keyword in OF_NODES}
         others = types or any(scope.at_nodes for scope in every)
-        told = []
+        mesh = WholeMesh(points[used], number[bars], warnings=[*told, *self._told, *self._cut_off()])
         for kind, what in _WHAT.items():
             self._lost: dict[int, int] = {}  # a set that another one names counts once
             groups = self._groups(kind)
             lost = sum(self._lost.values())
-            if lost and (kind == "NSET" or not others):
-                told.append(f"{lost} members of {what} sets are not there, and are left out")
+            here = kind == "NSET" or not others
+            mesh.tell(lost and here, f"{self.path}: {lost} members of {what} sets are not there, and are left out")
             sets = [one for scope in every for one in scope.sets[kind].values()]
             bare = {one.name for one in sets if one.entries and not any(len(entry.labels) for entry in one.entries)}
             self.groups[kind] = {name: own for name, own in groups.items() if len(own) or name in bare}
             empty = [name for name in groups if name not in self.groups[kind]]
             empty = [name for name in empty if kind == "NSET" or name.upper().rpartition(".")[2] not in of_nodes]
             why = "no bar ends at their nodes" if kind == "NSET" else "none of their elements is a bar"
-            told += [f"left out the {what} sets {listed(empty)}: {why}"] * bool(empty)
+            mesh.tell(empty, f"{self.path}: left out the {what} sets {listed(empty)}: {why}")
         constraints = ", ".join(self._left["constraints"])
         way_out = "nodes that they connect are joined by `mesh clean` if they are at the same place"
-        told += [f"left out {constraints}; {way_out}"] * bool(constraints)
-        mesh = WholeMesh(points[used], number[bars], self.groups["NSET"], dict(self.groups["ELSET"]))
-        mesh.warnings = mesh_told + [f"{self.path}: {text}" for text in told]
+        mesh.tell(constraints, f"{self.path}: left out {constraints}; {way_out}")
+        mesh.node_groups, mesh.bar_groups = self.groups["NSET"], dict(self.groups["ELSET"])
         return mesh
 
     def _groups(self, kind: str) -> dict[str, np.ndarray]:

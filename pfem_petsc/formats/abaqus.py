@@ -51,14 +51,17 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         raise InputError(f"{path}: has no trusses or beams, which would be bars")
     _add_materials(mesh, deck)
     _add_sections(mesh, deck)
-    told = _add_initial_stress(mesh, deck) + _Conditions(mesh, deck).add()
-    if fields is None:  # of no interest to a run, which takes mesh and groups alone
-        mesh.warnings += [*told, *deck.left_out()]
+    told = [*mesh.warnings]
+    _add_initial_stress(mesh, deck)
+    _Conditions(mesh, deck).add()
+    if fields is None:
+        mesh.warnings += deck.left_out()
         _add_analysis(mesh, deck)
+    else:  # a run takes mesh and groups alone
+        mesh.warnings = told
     lost = deck.labels_left_out
-    if lost:
-        text = ", ".join(map(str, lost[:5])) + (", ..." if len(lost) > 5 else "")
-        mesh.warnings.append(f"{path}: left out {len(lost)} nodes where no bar ends (labels {text})")
+    labels = ", ".join(map(str, lost[:5])) + (", ..." if len(lost) > 5 else "")
+    mesh.tell(lost, f"{path}: left out {len(lost)} nodes where no bar ends (labels {labels})")
     return mesh
 
 
@@ -165,32 +168,27 @@ def _add_sections(mesh: WholeMesh, deck: Deck) -> None:
         found = _section_keys(block, rows, deck.calculix)
         if not found.get("area", 0.0) > 0.0:
             what = f"SECTION={block.get('SECTION')}" if block.get("SECTION") else "the data line"
-            mesh.warnings.append(f"{block.where}: no area is known from {what}")
+            mesh.tell(True, f"{block.where}: no area is known from {what}")
             found.pop("area", None)
-        elif deck.ambiguous and found.get("shape") == "round":
-            mesh.warnings.append(
-                f"{block.where}: CIRC is read with a radius, as in Abaqus: in a file of CalculiX it is a diameter"
-            )
+        either = deck.ambiguous and found.get("shape") == "round"
+        read_as = "CIRC is read with a radius, as in Abaqus: in a file of CalculiX it is a diameter"
+        mesh.tell(either, f"{block.where}: {read_as}")
         areas[members] = found.get("area", np.nan)
         material = block.get("MATERIAL")
         if material:
             found["material"] = deck.materials.get(material.upper(), (material, []))[0]
-            if "DENSITY" in block.parameters:
-                mesh.warnings.append(f"{block.where}: DENSITY is left out: that of the material is taken")
+            told = f"{block.where}: DENSITY is left out: that of the material is taken"
+            mesh.tell("DENSITY" in block.parameters, told)
         elif block.keyword in ("BEAM GENERAL SECTION", "FRAME SECTION"):
             found |= _own_material(mesh, block, rows, group)
         sections[group] = {"bars": group, **found}
-    if without:
-        mesh.warnings.append(
-            f"{deck.path}: left out the sections of {listed(without)}: none of their elements is a bar"
-        )
-    whole = bool(len(areas)) and bool((areas > 0.0).all())
+    mesh.tell(without, f"{deck.path}: left out the sections of {listed(without)}: none of their elements is a bar")
+    unknown = int(np.isnan(areas).sum())
+    whole = len(areas) > 0 and (areas > 0.0).all()
     if sections:
         mesh.tables["section"] = _without_made(mesh, deck, sections) if whole else sections
-    if whole:
-        mesh.bar_fields["area"] = areas
-    elif sections and np.isnan(areas).any():
-        mesh.warnings.append(f"{deck.path}: {int(np.isnan(areas).sum())} bars have no area: there is no field area")
+        mesh.tell(unknown, f"{deck.path}: {unknown} bars have no area: there is no field area")
+    mesh.bar_fields |= {"area": areas} if whole else {}
 
 
 def _without_made(mesh: WholeMesh, deck: Deck, sections: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -257,8 +255,7 @@ def _own_material(mesh: WholeMesh, block: Block, rows: np.ndarray, group: str) -
         "thermal_expansion": float(rows[0, 2]) if len(rows) else np.nan,
     }
     keys = {key: value for key, value in values.items() if 0.0 < value < np.inf}
-    if len(rows) > 1:
-        mesh.warnings.append(f"{block.where}: values at the first temperature are taken for all temperatures")
+    mesh.tell(len(rows) > 1, f"{block.where}: values at the first temperature are taken for all temperatures")
     if not keys:
         return {}
     materials = mesh.tables.setdefault("material", {})
@@ -267,12 +264,11 @@ def _own_material(mesh: WholeMesh, block: Block, rows: np.ndarray, group: str) -
     return {"material": name}
 
 
-def _add_initial_stress(mesh: WholeMesh, deck: Deck) -> list[str]:
-    """Give sections the initial stresses of their bars, as parts of their own where these differ; return what is to be
-    said."""
-    told, stress, points = [], np.zeros(len(mesh.bars)), np.zeros(len(mesh.bars))
+def _add_initial_stress(mesh: WholeMesh, deck: Deck) -> None:
+    """Give sections the initial stresses of their bars, as parts of their own where these differ."""
+    stress, points = np.zeros((2, len(mesh.bars)))
     across = mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]]
-    for members, values in _initial_values(deck, "STRESS", told, "expected elements and their stress"):
+    for members, values in _initial_values(mesh, deck, "STRESS", "expected elements and their stress"):
         if len(values) == 7:  # of CalculiX: an integration point, and components along the axes of the model
             _, xx, yy, zz, xy, xz, yz = values
             tensor, along = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), across[members]
@@ -283,7 +279,7 @@ def _add_initial_stress(mesh: WholeMesh, deck: Deck) -> list[str]:
         else:
             stress[members], points[members] = values[0], 1.0
     if not stress.any():
-        return told
+        return
     stress = np.array([_short(value) for value in stress / np.maximum(points, 1.0)])
     sections = mesh.tables.setdefault("section", {})
     rest = np.ones(len(mesh.bars), bool)
@@ -300,14 +296,13 @@ def _add_initial_stress(mesh: WholeMesh, deck: Deck) -> list[str]:
             group = name_of(mesh.bar_groups, members[stress[members] == value], f"{name}_{k}")
             sections.pop(name, None)
             sections[group] = {**keys, "bars": group, **({"prestress": value} if value else {})}
-    return told
 
 
 _AXES = (1.0, 2.0, 3.0)
 
 
 def _initial_values(
-    deck: Deck, kind: str, told: list[str], expected: str, axes: tuple[float, ...] | None = None
+    mesh: WholeMesh, deck: Deck, kind: str, expected: str, axes: tuple[float, ...] | None = None
 ) -> Iterator[tuple[np.ndarray, list[float]]]:
     """Yield the members and the values of each line of the initial conditions of a type; others are told.
 
@@ -320,7 +315,7 @@ def _initial_values(
             if np.isfinite(values).all() and (axes is None or values[0] in axes):
                 yield deck.members_of("ELSET" if kind == "STRESS" else "NSET", block, words[0]), values
             else:
-                told.append(f"{where}: {', '.join(words)[:60]!r} is left out: {expected}")
+                mesh.tell(True, f"{where}: {', '.join(words)[:60]!r} is left out: {expected}")
 
 
 # ---- supports, loads, temperatures, and what belongs to nodes
@@ -331,7 +326,6 @@ _AT_REST: tuple[str, _Rows] = ("", ())
 
 
 _TABULAR = {"DEFINITION": "TABULAR", "VALUE": "RELATIVE"}
-_INITIAL = ("STRESS", "TEMPERATURE", "VELOCITY")
 
 
 class _Conditions:
@@ -343,7 +337,6 @@ class _Conditions:
 
     def __init__(self, mesh: WholeMesh, deck: Deck) -> None:
         self._mesh, self._deck = mesh, deck
-        self._told: list[str] = []
         self._in_step, self._over = False, ()
         self._names = {name.upper(): name for name in mesh.node_groups}
         step = deck.procedure
@@ -361,8 +354,8 @@ class _Conditions:
         """By vectors and their factors: the first line, and how often each bar has it."""
         self._temperatures: list[tuple[np.ndarray, float, _Rows]] = []
 
-    def add(self) -> list[str]:
-        """Add the tables to the mesh, and return what is to be said."""
+    def add(self) -> None:
+        """Add the tables to the mesh, and warnings."""
         kinds = {"DLOAD": self._weigh, "CLOAD": self._push, "BOUNDARY": self._hold, "TEMPERATURE": self._heat}
         new = [each for each, step in self._deck.conditions if each.keyword == "BOUNDARY" and step]
         new = [each for each in new if each.get("OP").upper() == "NEW"]
@@ -378,7 +371,7 @@ class _Conditions:
             told.pop("", None)
             for reason, lines in told.items():
                 more = f" (and {len(lines) - 1} more lines)" if len(lines) > 1 else ""
-                self._told.append(f"{lines[0]}{more} is {reason}")
+                self._mesh.tell(True, f"{lines[0]}{more} is {reason}")
         tables = {
             "support": self._support_tables() | self._plane_tables(),
             "load": self._load_tables(),
@@ -388,8 +381,9 @@ class _Conditions:
             **self._tables_of_nodes(),
         }
         self._mesh.tables |= {name: table for name, table in tables.items() if table}
-        others = [each for each in self._deck.initial if each.get("TYPE").upper() not in _INITIAL]
-        return self._told + [f"{each.where}, TYPE={each.get('TYPE')} is left out: it is not read" for each in others]
+        for each in self._deck.initial:
+            other = each.get("TYPE").upper() not in ("STRESS", "TEMPERATURE", "VELOCITY")
+            self._mesh.tell(other, f"{each.where}, TYPE={each.get('TYPE')} is left out: it is not read")
 
     # ---- over time
 
@@ -417,7 +411,7 @@ class _Conditions:
             rows = [(_short(time / scale), factor) for time, factor in pairs.reshape(-1, 2).tolist()]
             return tuple(rows if len(rows) != 1 else [rows[0], (rows[0][0] + 1.0, rows[0][1])])
         text = f"{block.where}: AMPLITUDE={name} is left out: {told}"
-        self._told += [text] if text not in self._told else []
+        self._mesh.tell(text not in self._mesh.warnings, text)
         return ()
 
     def _factors(self, rows: _Rows, times: np.ndarray) -> np.ndarray:
@@ -543,7 +537,7 @@ class _Conditions:
         if len(free) == 0:
             return {}
         bent = ", which is not the same for all" if np.ptp(self._mesh.points[members, 2]) else ""
-        self._told.append(f"{self._deck.path}: the case holds {len(free)} nodes of plane elements along z{bent}")
+        self._mesh.tell(True, f"{self._deck.path}: the case holds {len(free)} nodes of plane elements along z{bent}")
         return {PLANE: {"node_set": name_of(self._mesh.node_groups, free, "plane"), "fix": "z"}}
 
     def _load_tables(self) -> dict[str, dict[str, Any]]:
@@ -557,8 +551,8 @@ class _Conditions:
         every: list[tuple[np.ndarray, _Rows]] = []
         for (vector, rows), (line, times) in self._gravity.items():
             every.append((times.min() * np.array(vector), rows))
-            if times.max() > times.min():
-                self._told.append(f"{line} is left out: the gravity of a case acts on all bars")
+            uneven = times.max() > times.min()
+            self._mesh.tell(uneven, f"{line} is left out: the gravity of a case acts on all bars")
         total = sum((vector for vector, _ in every), np.zeros(3))
         if not any(rows for _, rows in every):
             return {"gravity": {"acceleration": total.tolist()}} if total.any() else {}
@@ -571,7 +565,7 @@ class _Conditions:
         mesh = self._mesh
         initial = np.zeros(len(mesh.points))
         expected = "expected nodes and a temperature"
-        for members, (value,) in _initial_values(self._deck, "TEMPERATURE", self._told, expected):
+        for members, (value,) in _initial_values(mesh, self._deck, "TEMPERATURE", expected):
             initial[members] = value
         times = self._times([rows for _, _, rows in self._temperatures])
         above = np.zeros((len(initial), len(times)))
@@ -592,7 +586,7 @@ class _Conditions:
         axes, expected = _AXES, "expected nodes, 1, 2 or 3, and a number"
         if not self._dynamic:
             axes, expected = (), "it has no effect without *DYNAMIC"
-        for members, (axis, value) in _initial_values(self._deck, "VELOCITY", self._told, expected, axes):
+        for members, (axis, value) in _initial_values(self._mesh, self._deck, "VELOCITY", expected, axes):
             velocity[members, int(axis) - 1] = value
         groups = self._mesh.node_groups
         return {name: {"node_set": name, "velocity": row} for row, name in alike(groups, velocity, "velocity")}
@@ -607,20 +601,18 @@ class _Conditions:
         for block, elements in self._deck.of_nodes():
             known |= {id(element) for element, _ in elements}
             told = Counter(self._add_of_nodes(block, *element, values, tables) for element in elements)
-            told.pop("", None)
-            self._told += [f"{block.where}: left out {number} elements: {why}" for why, number in told.items()]
+            for why, number in told.items():
+                self._mesh.tell(why, f"{block.where}: left out {number} elements: {why}")
         every = {id(element) for scope in self._deck.scopes.values() for element in scope.at_nodes}
-        told = []
-        if every - known:
-            told.append(f"{len(every - known)} masses, springs or dashpots without *MASS, *SPRING or *DASHPOT")
+        bare, path = len(every - known), self._deck.path
+        what = "masses, springs or dashpots without *MASS, *SPRING or *DASHPOT"
+        self._mesh.tell(bare, f"{path}: left out {bare} {what}")
         # a dashpot of a case acts in all directions: those in which a node is held do not matter
         damped = values["DASHPOT"]
         most = damped.max(axis=1, keepdims=True)
         uneven = ((damped != most) & (self._held == 0)).any(axis=1)
-        if uneven.any():
-            nodes = f"the dashpots of {int(uneven.sum())} nodes"
-            told.append(f"{nodes}: those of a case act equally in all directions")
-        self._told += [f"{self._deck.path}: left out {text}" for text in told]
+        nodes = f"the dashpots of {int(uneven.sum())} nodes: those of a case act equally in all directions"
+        self._mesh.tell(uneven.any(), f"{path}: left out {nodes}")
         values["DASHPOT"] = np.where(uneven[:, None], 0.0, most)
         for (kind, own), key in zip(tables.items(), ("value", "stiffness", "coefficient")):
             for row, name in alike(groups, values[kind.upper()], kind):
@@ -680,11 +672,11 @@ def _add_analysis(mesh: WholeMesh, deck: Deck) -> None:
         return
     tables, told = _analysis(deck.procedure)
     mesh.tables |= {"analysis": tables} if tables else {}
-    mesh.warnings += [f"{deck.procedure.where}: {told}"] * bool(told)
+    mesh.tell(told, f"{deck.procedure.where}: {told}")
     small = deck.step is not None and deck.step.get("NLGEOM", "NO").upper() == "NO"
     large = "EXPLICIT" in deck.procedure.parameters or "modes" in tables
     if small and not large and tables.keys() & {"static", "time"}:
-        mesh.warnings.append(f"{deck.step.where} has no NLGEOM: the case has large displacements, as all cases do")
+        mesh.tell(True, f"{deck.step.where} has no NLGEOM: the case has large displacements, as all cases do")
 
 
 def _analysis(block: Block) -> tuple[dict[str, dict[str, Any]], str]:

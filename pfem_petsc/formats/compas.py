@@ -55,11 +55,9 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     left += _attributes(bars, mesh.bar_fields, mesh.bar_groups)
     for name, values in (mesh.node_fields | mesh.bar_fields).items():
         n = int((~np.isfinite(values)).sum())
-        mesh.warnings += [f"{path}: the attribute {name} is not a finite number {n} times"] * bool(n)
-    if left:
-        mesh.warnings.append(f"{path}: left out the attributes {', '.join(left)}: not one number for each node or edge")
-    if len(found) > 1:
-        mesh.warnings.append(f"{path}: has {len(found)} networks, graphs and meshes: the first one is read")
+        mesh.tell(n, f"{path}: the attribute {name} is not a finite number {n} times")
+    mesh.tell(left, f"{path}: left out the attributes {', '.join(left)}: not one number for each node or edge")
+    mesh.tell(len(found) > 1, f"{path}: has {len(found)} networks, graphs and meshes: the first one is read")
     return mesh
 
 

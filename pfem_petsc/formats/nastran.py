@@ -66,7 +66,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     mesh = WholeMesh(points, np.searchsorted(labels, ends))
 
     def told(condition: object, text: str) -> None:
-        mesh.warnings += [f"{path}: {text}"] if condition else []
+        mesh.tell(condition, f"{path}: {text}")
 
     left, cards = len(deck.nodes) - len(labels), _cards(deck, "left out cards that are not read: ")
     told(left, f"left out {left} GRID where no bar ends")

@@ -87,12 +87,9 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     members = {name: np.unique(number[np.isin(owner, own)]) for name, own in groups.items()}
     mesh = WholeMesh(content.points, bars, bar_groups={name: own for name, own in members.items() if len(own)})
     mesh.node_fields, mesh.bar_fields = content.node_fields, content.bar_fields
-    if of_faces:
-        mesh.warnings.append(f"{path}: has no lines: the {len(bars)} edges of its {faces} faces are bars")
-    elif faces:
-        mesh.warnings.append(f"{path}: the lines are bars: left out {faces} faces")
-    if content.left:
-        mesh.warnings.append(f"{path}: left out {', '.join(content.left)}: not read")
+    mesh.tell(of_faces, f"{path}: has no lines: the {len(bars)} edges of its {faces} faces are bars")
+    mesh.tell(faces and not of_faces, f"{path}: the lines are bars: left out {faces} faces")
+    mesh.tell(content.left, f"{path}: left out {', '.join(content.left)}: not read")
     drop_bare_nodes(path, mesh)
     return mesh
 

@@ -253,10 +253,9 @@ def _assembled(path: Path, model: _Model) -> WholeMesh:
     if (area > 0.0).all():
         mesh.bar_fields["area"] = area
     cones = int((one != two).sum())
-    told = [f"requires the extension {uri}, which is not read" for uri in model.not_read]
-    told += [f"{cones} beams whose radii differ have a constant area, with the same volume"] * bool(cones)
-    told += [f"left out {model.triangles} triangles"] * bool(model.triangles)
-    mesh.warnings = [f"{path}: {text}" for text in told]
+    mesh.warnings = [f"{path}: requires the extension {uri}, which is not read" for uri in model.not_read]
+    mesh.tell(cones, f"{path}: {cones} beams whose radii differ have a constant area, with the same volume")
+    mesh.tell(model.triangles, f"{path}: left out {model.triangles} triangles")
     drop_bare_nodes(path, mesh)
     return mesh
 

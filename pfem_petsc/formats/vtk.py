@@ -78,14 +78,12 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     for key, values in arrays.items():
         kind, _, name = key.partition("/")
         getattr(mesh, kind)[name] = values
-    if faces:
-        mesh.warnings.append(f"{path}: has no lines: the {len(mesh.bars)} edges of its {faces} faces are bars")
-    if left_out:
-        mesh.warnings.append(f"{path}: left out {left_out} cells that are not {'faces' if faces else 'lines'}")
+    mesh.tell(faces, f"{path}: has no lines: the {len(mesh.bars)} edges of its {faces} faces are bars")
+    mesh.tell(left_out, f"{path}: left out {left_out} cells that are not {'faces' if faces else 'lines'}")
     if left_out or faces:
         drop_bare_nodes(path, mesh)
-    if snapshots > 1:
-        mesh.warnings.append(f"{path}: has {snapshots} snapshots: the mesh and its fields are those of the last one")
+    several = snapshots > 1
+    mesh.tell(several, f"{path}: has {snapshots} snapshots: the mesh and its fields are those of the last one")
     return mesh
 
 

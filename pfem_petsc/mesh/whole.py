@@ -44,6 +44,10 @@ class WholeMesh:
     source: str = "mesh"
     """The file, for messages."""
 
+    def tell(self, condition: object, text: str) -> None:
+        """Add a warning if a condition holds."""
+        self.warnings += [text] if condition else []
+
     def slab(self, source: str) -> MeshSlab:
         """Return the mesh as the slab of one rank."""
         groups = [

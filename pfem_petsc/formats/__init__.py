@@ -35,21 +35,21 @@ if TYPE_CHECKING:
 
 __all__ = ["read_slab", "read_triangles", "read_whole", "suffixes", "write_whole", "writer_of"]
 
-_GEOMETRY = (
-    "; this is a geometry: mesh its curves by `gmsh -1 -clmin 1e22 {name} -o {stem}.msh`, one bar each, or with the "
-    "length of bars after -clmin (pip install gmsh)"
-)
-_GMSH = "; convert it by `gmsh {name} -save -o {stem}.msh` (pip install gmsh)"
-_MESHIO = "; convert it by `meshio convert {name} {stem}.vtk` (pip install meshio)"
-_DRAWING = (
-    "; export its lines as Wavefront OBJ from the program that made it, or convert it by the script for drawings in "
-    "docs/meshes.md"
-)
 _CONVERT = {
-    **dict.fromkeys((".geo", ".geo_unrolled", ".step", ".stp", ".iges", ".igs", ".brep"), _GEOMETRY),
-    **dict.fromkeys((".unv", ".med"), _GMSH),
-    **dict.fromkeys((".xdmf", ".mesh", ".mdpa", ".avs"), _MESHIO),
-    **dict.fromkeys((".dxf", ".3dm"), _DRAWING),
+    **dict.fromkeys(
+        (".geo", ".geo_unrolled", ".step", ".stp", ".iges", ".igs", ".brep"),
+        "; this is a geometry: mesh its curves by `gmsh -1 -clmin 1e22 {name} -o {stem}.msh`, one bar each, or with "
+        "the length of bars after -clmin (pip install gmsh)",
+    ),
+    **dict.fromkeys((".unv", ".med"), "; convert it by `gmsh {name} -save -o {stem}.msh` (pip install gmsh)"),
+    **dict.fromkeys(
+        (".xdmf", ".mesh", ".mdpa", ".avs"), "; convert it by `meshio convert {name} {stem}.vtk` (pip install meshio)"
+    ),
+    **dict.fromkeys(
+        (".dxf", ".3dm"),
+        "; export its lines as Wavefront OBJ from the program that made it, or convert it by the script for drawings "
+        "in docs/meshes.md",
+    ),
     **dict.fromkeys((".dwg", ".skp", ".blend", ".3ds", ".fbx"), "; export its lines as Wavefront OBJ or DXF"),
     ".ifc": "; export the axes of the members as lines (Wavefront OBJ or DXF) from the program that made it",
     ".fem": "; this is bulk data: `(echo SOL 101; echo CEND; cat {name}) > {stem}.bdf`",

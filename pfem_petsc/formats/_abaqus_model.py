@@ -51,8 +51,9 @@ KNOWN: dict[str, tuple[str, ...]] = {
     "TEMPERATURE": ("OP", "AMPLITUDE"),
 }
 """Parameters of keywords that are read, or that change nothing for bars; others are told."""
-_ENDS = ("END STEP", "END PART", "END INSTANCE", "END ASSEMBLY")
-_SPACED = {name.replace(" ", ""): name for name in (*KNOWN, *_ENDS)}
+_OPEN = ("PART", "INSTANCE", "ASSEMBLY", "STEP")
+"""Keywords that another one, with END, closes."""
+_SPACED = {name.replace(" ", ""): name for name in (*KNOWN, *(f"END {name}" for name in _OPEN))}
 """Keywords by their letters: CalculiX ignores the blanks in them."""
 
 _DEEPEST = 20
@@ -260,17 +261,11 @@ _BARS = (
 )
 """Types of elements that are bars, their numbers of nodes and of those that only tell an orientation, and what is to be
 said about them."""
-_PLANE = re.compile(r"[A-Z]+2.*")
-"""Those of bars in the plane of x and y."""
-_CALCULIX = re.compile(r"B3[12]R")
-"""Beams that CalculiX alone has."""
 _AT_NODES = {"MASS": 1, "SPRINGA": 2, "SPRING1": 1, "SPRING2": 2, "DASHPOTA": 2, "DASHPOT1": 1, "DASHPOT2": 2}
 """Types of elements that belong to nodes, and the numbers of these."""
 SECTIONS = ("SOLID SECTION", "BEAM SECTION", "BEAM GENERAL SECTION", "FRAME SECTION")
 OF_NODES = ("MASS", "SPRING", "DASHPOT")
 """Keywords of what elements have: bars, and those that belong to nodes."""
-_OPEN = ("PART", "INSTANCE", "ASSEMBLY", "STEP")
-"""Keywords that another one, with END, closes."""
 _ASSEMBLY = "*ASSEMBLY"
 """Key of the assembly among instances."""
 _WHAT = {"NSET": "node", "ELSET": "element"}
@@ -567,8 +562,9 @@ class Deck:
             rows = block.rows(count + more + 1 + bool(more), count + 1)[:, : count + 1]
             labels = _labels(rows[:, 0], block, "element")
             nodes = _labels(rows[:, 1:].ravel(), block, "node").reshape(len(rows), count)
-            self._scope.elements.append(_Elements(block, labels, nodes, _PLANE.fullmatch(kind) is not None))
-            self.calculix |= _CALCULIX.fullmatch(kind) is not None
+            plane = re.fullmatch("[A-Z]+2.*", kind) is not None  # of x and y
+            self._scope.elements.append(_Elements(block, labels, nodes, plane))
+            self.calculix |= kind in ("B31R", "B32R")  # beams that CalculiX alone has
             if note:
                 self._left["notes"][f"{kind}: {note}"] += len(rows)
         elif kind in _AT_NODES:
@@ -750,19 +746,16 @@ class Deck:
         groups = self.groups["ELSET"]
         names = {name.upper(): name for name in groups}
         found: dict[int, tuple[Block, str, list[tuple[str, np.ndarray]]]] = {}
-        for key, scope in self.scopes.items():
-            for block, name in scope.sections:
-                if block.keyword in OF_NODES:
-                    continue
-                full = f"{scope.name}.{name}".upper().replace("/", "_")
-                members = self._members("ELSET", key, self._set(block, scope, name).entries)
-                found.setdefault(id(block), (block, name, []))[2].append((full, members))
+        every = [(key, scope, *section) for key, scope in self.scopes.items() for section in scope.sections]
+        for key, scope, block, name in [each for each in every if each[2].keyword not in OF_NODES]:
+            full = f"{scope.name}.{name}".upper().replace("/", "_")
+            members = self._members("ELSET", key, self._set(block, scope, name).entries)
+            found.setdefault(id(block), (block, name, []))[2].append((full, members))
         for block, name, parts in found.values():
             short = names.get(name.upper().replace("/", "_"))
             if short is not None and np.array_equal(groups[short], _union([members for _, members in parts])):
-                yield block, short, groups[short]
-            else:
-                yield from ((block, names.get(full, short or name), members) for full, members in parts)
+                parts, name = [(short.upper(), groups[short])], short
+            yield from ((block, names.get(full, short or name), members) for full, members in parts)
 
     def left_out(self) -> Iterator[str]:
         """Yield what the step has that is not read."""

@@ -637,14 +637,14 @@ class _Conditions:
         free = not directed and len(lines) > 1 and lines[0][0] in ("1", "2", "3", "0")
         data = lines[int(directed or free) :]
         value = _value(data[0], 0) if data else np.nan
-        if odd:
-            return f"{odd[0]} is not read"
-        if not 0.0 < value < np.inf:
-            return "expected a positive number"
-        if min(nodes) < 0:
-            return "no bar ends at their nodes"
-        if any(axis not in _AXES for axis in axes):
-            return "bars have the degrees of freedom 1, 2 and 3 alone"
+        for wrong, text in (
+            (odd, f"{', '.join(odd[:1])} is not read"),
+            (not 0.0 < value < np.inf, "expected a positive number"),
+            (min(nodes) < 0, "no bar ends at their nodes"),
+            (any(axis not in _AXES for axis in axes), "bars have the degrees of freedom 1, 2 and 3 alone"),
+        ):
+            if wrong:
+                return text
         if len(nodes) == 1:
             values[block.keyword][nodes[0], int(axes[0]) - 1 if axes else 0] += value
             return ""
@@ -797,18 +797,15 @@ def _material_lines(name: str, keys: dict[str, Any]) -> Iterator[str]:
             yield from (f"*{keyword}", f"{value!r}{more}")
     damping = f", ALPHA={keys['damping'] / density!r}" if density and keys.get("damping") else ""
     damping += f", BETA={keys['stiffness_damping']!r}" if keys.get("stiffness_damping") else ""
-    if damping:
-        yield f"*DAMPING{damping}"
+    yield from [f"*DAMPING{damping}"] * bool(damping)
     first = keys.get("yield_stress")
     isotropic, kinematic = keys.get("isotropic_hardening") or 0.0, keys.get("kinematic_hardening") or 0.0
     if "curve" in keys and young:
         yield "*PLASTIC"
         yield from (f"{stress!r}, {max(strain - stress / young, 0.0)!r}" for strain, stress in keys["curve"])
     elif first is not None and keys.get("law", "elastoplastic") == "elastoplastic" and not (isotropic and kinematic):
-        yield "*PLASTIC, HARDENING=KINEMATIC" if kinematic else "*PLASTIC"
-        yield f"{first!r}, 0.0"
-        if isotropic or kinematic:
-            yield f"{first + isotropic + kinematic!r}, 1.0"
+        yield from ("*PLASTIC, HARDENING=KINEMATIC" if kinematic else "*PLASTIC", f"{first!r}, 0.0")
+        yield from [f"{first + isotropic + kinematic!r}, 1.0"] * bool(isotropic or kinematic)
 
 
 def _unique_names(groups: dict[str, np.ndarray]) -> dict[str, str]:

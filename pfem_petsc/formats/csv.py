@@ -206,6 +206,9 @@ def _numbers_of_ids(nodes: _Table, bars: _Table, pair: tuple[int, int]) -> tuple
     return candidates[0], number
 
 
+_UNIT = r"[\[(]\s*((?:mm|cm|dm|km|in|inch|ft|yd)[²2]?)\s*[\])]\s*$"
+
+
 class _Table:
     """A table with names of columns; ``headings`` are these without units, ``columns`` the entries."""
 
@@ -221,7 +224,8 @@ class _Table:
         separator = max(";\t,", key=lines[kept[0]].count)
         above = kept[0] - 1
         # programs that write arrays put a # before the names of the columns
-        numbers = any(map(_is_number, lines[kept[0]].split(separator)))
+        words = lines[kept[0]].split(separator)
+        numbers = any(re.fullmatch(r"\s*[-+]?\d*[.,]?\d+(e[-+]?\d+)?\s*", word, re.I) for word in words)
         if numbers and above >= 0 and lines[above].count(separator) == lines[kept[0]].count(separator) > 0:
             lines[above] = lines[above].lstrip("# ")
             kept.insert(0, above)
@@ -297,13 +301,10 @@ class _Table:
 
     def units(self, places: Iterable[int], remedy: str) -> list[str]:
         """Return a warning about columns in other units of length or area than metres; ``remedy``: of the verb mesh."""
-        found = []
-        for place in places:
-            unit = re.search(r"[\[(]\s*((?:mm|cm|dm|km|in|inch|ft|yd)[²2]?)\s*[\])]\s*$", self._given[place])
-            if unit:
-                found.append(f"{self.shown(place)} in {unit[1]}")
+        given = [(place, re.search(_UNIT, self._given[place])) for place in places]
+        found = ", ".join(f"{self.shown(place)} in {unit[1]}" for place, unit in given if unit)
         told = "whose numbers are taken as they are; write them in metres and square metres; the verb mesh"
-        return [f"{self.path}: has {', '.join(found)}, {told} {remedy}"] if found else []
+        return [f"{self.path}: has {found}, {told} {remedy}"] * bool(found)
 
     def labels(self, place: int) -> Iterator[str]:
         """Yield the entries of a column; whole numbers written as 3.0 or +3 are 3."""
@@ -347,10 +348,6 @@ def _without_unit(name: str) -> str:
     """Return the name of a column without a unit in brackets; ``area`` is written in small letters."""
     name = re.sub(r"\s*[\[(].*?[\])]\s*$", "", name.strip()).strip()
     return "area" if name.lower() == "area" else name
-
-
-def _is_number(word: str) -> bool:
-    return re.fullmatch(r"\s*[-+]?\d*[.,]?\d+(e[-+]?\d+)?\s*", word, re.I) is not None
 
 
 def _label(word: str) -> str:

@@ -160,14 +160,6 @@ _TYPES |= {"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-class _Element(NamedTuple):
-    """Vertices, faces or edges: their number, and names and types of their properties; of lists, two types."""
-
-    name: str
-    count: int
-    properties: list[tuple[str, list[str]]]
-
-
 def _ply(path: Path) -> _Content:
     content = path.read_bytes()
     head = re.match(rb"(?:\xef\xbb\xbf)?ply\s*\n(.*?)end_header[ \t]*\r?\n", content, re.DOTALL)
@@ -176,7 +168,7 @@ def _ply(path: Path) -> _Content:
     order, elements = _header(path, head[1].decode("ascii", "replace"))
     try:
         body = _Body(order, content[head.end() :])
-        tables = {element.name: body.table(element) for element in elements}
+        tables = {name: body.table(n, properties) for name, (n, properties) in elements.items()}
         points = np.stack([tables["vertex"].pop(axis) for axis in "xyz"], axis=1)
         ends, faces = tables.get("edge", {}), tables.get("face", {})
         lines = np.stack([ends.pop(key) for key in ("vertex1", "vertex2")], axis=1) if ends else np.empty((0, 2))
@@ -184,7 +176,7 @@ def _ply(path: Path) -> _Content:
     except (ValueError, KeyError) as error:
         what = f"the header has no {error}" if isinstance(error, KeyError) else error
         raise InputError(f"{path}: {what}: expected vertices with x, y and z, and edges or faces of them") from None
-    left = [f"{each.count} {each.name}" for each in elements if each.name not in ("vertex", "edge", "face")]
+    left = [f"{n} {name}" for name, (n, _) in elements.items() if name not in ("vertex", "edge", "face")]
     left += [f"{body.left} {'bytes' if order else 'numbers'} after the last element"] if body.left else []
     polygons = _Polygons(np.array(corners), np.array(offsets)), _Polygons(lines.ravel(), 2 * np.arange(len(lines) + 1))
     fields = [{k: values for k, values in own.items() if isinstance(values, np.ndarray)}
@@ -192,16 +184,21 @@ def _ply(path: Path) -> _Content:
     return _Content(points, *polygons, node_fields=fields[0], bar_fields=fields[1], left=left)
 
 
-def _header(path: Path, text: str) -> tuple[str, list[_Element]]:
-    order, elements = None, []
+Properties = list[tuple[str, list[str]]]
+"""Names and types of the properties of an element; of lists, two types."""
+
+
+def _header(path: Path, text: str) -> tuple[str, dict[str, tuple[int, Properties]]]:
+    """Return the byte order, empty for a text, and by name the number of vertices, faces or edges with properties."""
+    order, elements, properties = None, {}, []
     for line in text.splitlines():
         match line.split():
             case ["format", name, _] if name in _ORDERS:
                 order = _ORDERS[name]
             case ["element", name, count] if count.isdigit():
-                elements.append(_Element(name, int(count), []))
+                elements[name] = int(count), (properties := [])
             case ["property", *types, name] if elements and all(t in _TYPES for t in types if t != "list"):
-                elements[-1].properties.append((name, [_TYPES[t] for t in types if t != "list"]))
+                properties.append((name, [_TYPES[t] for t in types if t != "list"]))
             case ["comment" | "obj_info", *_] | []:
                 pass
             case _:
@@ -232,9 +229,8 @@ class _Body:
             raise ValueError("it ends early")
         return np.ndarray((n,), row, self._all, start)
 
-    def table(self, element: _Element) -> dict[str, np.ndarray | tuple[np.ndarray, np.ndarray]]:
+    def table(self, n: int, properties: Properties) -> dict[str, np.ndarray | tuple[np.ndarray, np.ndarray]]:
         """Return the properties by name: numbers (n,), of lists all members and where the list of each begins."""
-        n, properties = element.count, element.properties
         if all(len(types) == 1 for _, types in properties):
             rows = self._take(n, *(types[0] for _, types in properties))
             return {name: rows[f"{k}"].astype(np.float64) for k, (name, _) in enumerate(properties)}

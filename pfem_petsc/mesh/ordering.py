@@ -370,13 +370,8 @@ def _adjacency(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
         ends = np.concatenate([bars, bars[:, ::-1]]).astype(np.int64)
         ends = Router(comm, slab_of(ends[:, 0], slab.n_nodes, comm.size)).send(ends)
         parts.append((ends[:, 0] - slab.first_node) * slab.n_nodes + ends[:, 1])
-    pairs = np.concatenate([np.empty(0, np.int64), *parts])
+    node, neighbour = np.divmod(np.unique(np.concatenate([np.empty(0, np.int64), *parts])), slab.n_nodes)
     del parts
-    pairs.sort()
-    if len(pairs):
-        pairs = pairs[np.append(True, pairs[1:] != pairs[:-1])]
-    node, neighbour = np.divmod(pairs, slab.n_nodes)
-    del pairs
     rows = np.zeros(len(slab.points) + 1, PETSc.IntType)
     rows[1:] = np.cumsum(np.bincount(node, minlength=len(slab.points)))
     return rows, neighbour.astype(PETSc.IntType)

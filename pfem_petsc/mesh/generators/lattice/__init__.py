@@ -292,10 +292,12 @@ class _Left:
             masks["surface"] = self._counts(self.lost)[used] > 0
         new = new_before + np.arange(len(self.points))
         first_node, moved = _moved(comm, np.concatenate([number[used], total + new]), total + n_new)
-        points = moved(np.concatenate([block.positions(old, places), self.points]))
-        undisturbed = None
-        if block.disturbed:
-            undisturbed = moved(np.concatenate([block.positions(old, places, disturbed=False), self.points]))
+        points, undisturbed = (
+            moved(np.concatenate([block.positions(old, places, disturbed), self.points]))
+            if disturbed or block.disturbed
+            else None
+            for disturbed in (True, False)
+        )
         groups = {
             name: first_node + np.flatnonzero(moved(np.concatenate([mask, np.full(len(new), name == "surface")])))
             for name, mask in masks.items()

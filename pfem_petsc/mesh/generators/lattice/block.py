@@ -453,7 +453,9 @@ class Block(Joints):
         for axis, factor in enumerate(keys.grading or (1.0, 1.0, 1.0)):
             edge, count = keys.pitch * cell.aspect[axis], -(-int(cells[axis]) // cell.layers[axis])
             if isinstance(factor, str):
-                self._levels.append(graded_levels(count, edge, factor, axis))
+                levels = [*islice(_borders(edge, factor, axis), count + 1)]
+                # no expression has to hold beyond the last cell: what lies there only completes the arithmetic
+                self._levels.append(np.array([*levels, 2.0 * levels[-1] - levels[-2]]))
             else:
                 check_length(edge * factor, f"mesh.pitch times mesh.grading[{axis}]")
                 self._levels.append(edge * factor * np.arange(count + 2))
@@ -466,7 +468,8 @@ class Block(Joints):
                 f"mesh.perturbation = {keys.perturbation!r}: ends of a strut of {shortest:.4g} m could meet; choose "
                 f"less than {shortest / (2.0 * math.sqrt(3.0) * keys.pitch):.4g}"
             )
-        self._extents = self._box()
+        sizes = zip(self.cells / np.array(cell.layers), self._levels)
+        self._extents = np.array([np.interp(size, np.arange(len(level)), level) for size, level in sizes])
         farthest = float(np.abs(keys.origin or 0.0).max()) + float(self._extents.max())
         check_length(farthest, "mesh.origin and the extent of the block")
         self.volume = self._shell() if keys.curved is not None else float(np.prod(self._extents))
@@ -475,11 +478,6 @@ class Block(Joints):
         """Return the volumes (n,) [m3] of the cells at places of bars, before they are curved or mapped."""
         edges = [level[index + 1] - level[index] for level, index in zip(self._levels, places[1:])]
         return np.prod(edges, axis=0)
-
-    def _box(self) -> np.ndarray:
-        """Return the edges (3,) [m] of the block before it is moved."""
-        sizes = self.cells / np.array(self.cell.layers)
-        return np.array([np.interp(size, np.arange(len(level)), level) for size, level in zip(sizes, self._levels)])
 
     def _shell(self) -> float:
         """Return the volume of the shell [m3] to which the block is mapped."""
@@ -512,10 +510,7 @@ class Block(Joints):
                 held = [self.on_face(places, name) for name in self.faces if FACES[name][0] == axis]
                 drawn = random_numbers(keys.seed or 0, axis, numbers)
                 points[:, axis] += ~np.any(held, axis=0) * (self._amplitude * (2.0 * drawn - 1.0))
-        if keys.curved is not None:
-            points = self._curved(points)
-        if keys.origin is not None:
-            points = points + np.array(keys.origin)
+        points = (points if keys.curved is None else self._curved(points)) + np.array(keys.origin or 0.0)
         if keys.map is not None:
             points = np.stack([self.expressions.at(points, f"map[{axis}]") for axis in range(3)], axis=1)
         return points
@@ -559,21 +554,6 @@ def _mixed(z: np.ndarray) -> np.ndarray:
     return z ^ (z >> np.uint64(31))
 
 
-def graded_levels(cells: int, edge: float, factor: str, axis: int) -> np.ndarray:
-    """Return the coordinates (cells + 2,) [m] of the borders of cells along an axis, and of one more.
-
-    Cell numbers s are mapped to coordinates x by dx/ds = edge factor(x), x(0) = 0 (Runge-Kutta of order 4).
-
-    Raises
-    ------
-    InputError
-        If the factor is not positive somewhere.
-    """
-    levels = list(islice(_borders(edge, factor, axis), cells + 1))
-    # no expression has to hold beyond the last cell: what lies there only completes the arithmetic
-    return np.array([*levels, 2.0 * levels[-1] - levels[-2]])
-
-
 def graded_count(length: float, edge: float, factor: str, axis: int, most: int = 20_000) -> int:
     """Return the least number of graded cells that cover a length [m] from x = 0 on.
 
@@ -593,7 +573,15 @@ def graded_count(length: float, edge: float, factor: str, axis: int, most: int =
 
 
 def _borders(edge: float, factor: str, axis: int) -> Iterator[float]:
-    """Yield the coordinates [m] of the borders of graded cells, from 0 on."""
+    """Yield the coordinates [m] of the borders of graded cells, from 0 on.
+
+    Cell numbers s are mapped to coordinates x by dx/ds = edge factor(x), x(0) = 0 (Runge-Kutta of order 4).
+
+    Raises
+    ------
+    InputError
+        If the factor is not positive somewhere.
+    """
     name = COORDINATES[axis]
     expression = Expression(factor, (name,))
 

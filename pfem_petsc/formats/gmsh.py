@@ -424,16 +424,14 @@ def _lines(mesh: WholeMesh) -> Iterator[str]:
         box = (*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist())
         yield _row(number + 1, *box, len(groups), *groups, 0)
     n, m = len(mesh.points), len(mesh.bars)
-    yield from ("$EndEntities", "$Nodes", f"1 {n} 1 {n}", f"1 1 0 {n}")
-    yield from map(str, range(1, n + 1))
+    yield from ("$EndEntities", "$Nodes", f"1 {n} 1 {n}", f"1 1 0 {n}", *map(str, range(1, n + 1)))
     yield from (f"{x!r} {y!r} {z!r}" for x, y, z in mesh.points.tolist())
     total = m + len(grouped)
     yield from ("$EndNodes", "$Elements", f"{len(curves) + len(grouped)} {total} 1 {total}")
     for number in range(len(curves)):
         members = np.flatnonzero(curve_of == number)
-        yield f"1 {number + 1} 1 {len(members)}"
-        rows = np.column_stack([members, mesh.bars[members]]) + 1
-        yield from (f"{tag} {a} {b}" for tag, a, b in rows.tolist())
+        rows = (np.column_stack([members, mesh.bars[members]]) + 1).tolist()
+        yield from (f"1 {number + 1} 1 {len(rows)}", *(f"{tag} {a} {b}" for tag, a, b in rows))
     for tag, node in enumerate(grouped.tolist(), m + 1):
         yield from (f"0 {node + 1} 15 1", f"{tag} {node + 1}")
     yield "$EndElements"

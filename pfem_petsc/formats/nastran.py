@@ -59,9 +59,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         raise InputError(f"{path}: GRID {largest}, at which a bar ends: a GRID has at most 8 digits in Nastran")
     ends = np.array(pairs, np.int64)
     labels = np.unique(ends)
-    missing = [label for label in labels.tolist() if label not in deck.nodes]
-    if missing:
-        raise InputError(f"{path}: there is no GRID {missing[0]}, at which a bar ends")
+    for label in [label for label in labels.tolist() if label not in deck.nodes][:1]:
+        raise InputError(f"{path}: there is no GRID {label}, at which a bar ends")
     points = np.array([deck.nodes[label].get_position() for label in labels.tolist()])
     mesh = WholeMesh(points, np.searchsorted(labels, ends))
 

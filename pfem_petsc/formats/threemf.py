@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
+from itertools import repeat
 from pathlib import Path
 from typing import IO, Any
 from xml.etree import ElementTree
@@ -260,7 +261,6 @@ def _assembled(path: Path, model: _Model) -> WholeMesh:
     return mesh
 
 
-_OWN = "urn:pfem_petsc"
 _TYPES = (
     '<?xml version="1.0" encoding="UTF-8"?>\n'
     '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">'
@@ -300,8 +300,8 @@ def write(path: Path, mesh: WholeMesh) -> None:
 
 
 def _model_text(mesh: WholeMesh, radius: np.ndarray) -> Iterator[str]:
-    yield '<?xml version="1.0" encoding="UTF-8"?>\n<model unit="meter" xml:lang="en-US"'
-    yield f' xmlns="{_CORE}" xmlns:b="{_LATTICES}2017/02" xmlns:own="{_OWN}" requiredextensions="b">\n'
+    names = f'xmlns="{_CORE}" xmlns:b="{_LATTICES}2017/02" xmlns:own="urn:pfem_petsc" requiredextensions="b"'
+    yield f'<?xml version="1.0" encoding="UTF-8"?>\n<model unit="meter" xml:lang="en-US" {names}>\n'
     for number, (name, members) in enumerate(mesh.node_groups.items()):
         numbers = " ".join(map(str, members.tolist()))
         yield f'<metadata name="own:{_GROUP}{number}" type="xs:string">{escape(name)}\n{numbers}</metadata>\n'
@@ -311,12 +311,9 @@ def _model_text(mesh: WholeMesh, radius: np.ndarray) -> Iterator[str]:
     shortest = _SHORT * float(length.min(initial=1.0))
     yield f'</vertices>\n<triangles/>\n<b:beamlattice radius="{float(radius[0])!r}" minlength="{shortest!r}"'
     yield ' cap="sphere">\n<b:beams>\n'
-    if (radius == radius[0]).all():
-        yield "".join(f'<b:beam v1="{a}" v2="{b}"/>\n' for a, b in mesh.bars.tolist())
-    else:
-        rows = zip(mesh.bars.tolist(), radius.tolist(), strict=True)
-        yield "".join(f'<b:beam v1="{a}" v2="{b}" r1="{r!r}" r2="{r!r}"/>\n' for (a, b), r in rows)
-    yield "</b:beams>\n"
+    same = (radius == radius[0]).all()
+    radii = repeat("") if same else (f' r1="{r!r}" r2="{r!r}"' for r in radius.tolist())
+    yield "".join(f'<b:beam v1="{a}" v2="{b}"{r}/>\n' for (a, b), r in zip(mesh.bars.tolist(), radii)) + "</b:beams>\n"
     if mesh.bar_groups:
         yield "<b:beamsets>\n"
         for number, (name, members) in enumerate(mesh.bar_groups.items()):

@@ -169,10 +169,9 @@ def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
     if n_nodes == 0 or n_cells == 0:
         raise ValueError(f"{n_nodes} points and {n_cells} cells: not a mesh of bars, or a damaged file")
     kinds = vtk_to_numpy(grid.GetCellTypesArray())
-    cells = np.flatnonzero((kinds == _LINE) | (kinds == _POLY_LINE))
-    of_faces = len(cells) == 0
-    if of_faces:
-        cells = np.flatnonzero(np.isin(kinds, _FACES))
+    lines = np.isin(kinds, (_LINE, _POLY_LINE))
+    of_faces = not lines.any()
+    cells = np.flatnonzero(np.isin(kinds, _FACES) if of_faces else lines)
     if len(cells) == 0:
         raise ValueError(
             f"cells of types {np.unique(kinds).tolist()}; bars are lines (type 3) or edges of faces (types 5, 7, 9), "
@@ -196,8 +195,7 @@ def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
     bars = ends[np.stack([start + one, start + (one + 1) % np.repeat(size, count)], axis=1)].astype(np.int64)
     yield "points", vtk_to_numpy(grid.GetPoints().GetData()).astype(np.float64)
     yield "bars", edges(bars)[0] if of_faces else bars
-    yield "faces", len(cells) if of_faces else 0
-    yield "left_out", n_cells - len(cells)
+    yield from (("faces", len(cells) if of_faces else 0), ("left_out", n_cells - len(cells)))
     of_nodes, of_bars = ("node", grid.GetPointData(), slice(None)), ("bar", grid.GetCellData(), lines)
     for kind, data, kept in (of_nodes,) if of_faces else (of_nodes, of_bars):
         for name, members in _groups_of(data, texts, kept).items():
@@ -224,18 +222,14 @@ def _groups_of(data: Any, fields: Any, kept: slice | np.ndarray) -> dict[str, np
         for name, values in arrays.items()
         if name.startswith(_MASK) and len(name) > len(_MASK)
     }
-    for array in _NAMED:
-        if data.GetArray(array) is None:
-            continue
+    for array in [name for name in _NAMED if data.GetArray(name) is not None]:
         values = arrays.get(array)
         if values is None or not np.array_equal(values, np.rint(values)):
             raise ValueError(f"array {array!r} must hold one whole number for each")
-        values = values[kept]
-        names = fields.GetAbstractArray(f"{array}_names")
+        values, names = values[kept].astype(np.int64), fields.GetAbstractArray(f"{array}_names")
         n_names = names.GetNumberOfValues() if names is not None and names.IsA("vtkStringArray") else 0
-        for value in np.unique(values[values >= 0]):
-            i = int(value)
-            groups[names.GetValue(i) if i < n_names else f"{array}_{i}"] = np.flatnonzero(values == value)
+        for i in np.unique(values[values >= 0]).tolist():
+            groups[names.GetValue(i) if i < n_names else f"{array}_{i}"] = np.flatnonzero(values == i)
     return groups
 
 
@@ -311,13 +305,17 @@ def _write_vtkhdf(path: Path, mesh: WholeMesh) -> None:
         root = file.create_group("VTKHDF", track_order=True)
         root.attrs["Version"] = np.array([1, 0], np.int64)
         root.attrs.create("Type", b"UnstructuredGrid", dtype=h5py.string_dtype("ascii", 16))
-        sizes = {"NumberOfPoints": len(mesh.points), "NumberOfCells": n, "NumberOfConnectivityIds": 2 * n}
-        for name, size in sizes.items():
-            root[name] = np.array([size], np.int64)
-        root["Points"] = np.asarray(mesh.points, np.float64)
-        root["Connectivity"] = np.asarray(mesh.bars, np.int64).ravel()
-        root["Offsets"] = np.arange(0, 2 * n + 1, 2, dtype=np.int64)
-        root["Types"] = np.full(n, _LINE, np.uint8)
+        datasets = {
+            "NumberOfPoints": np.array([len(mesh.points)], np.int64),
+            "NumberOfCells": np.array([n], np.int64),
+            "NumberOfConnectivityIds": np.array([2 * n], np.int64),
+            "Points": np.asarray(mesh.points, np.float64),
+            "Connectivity": np.asarray(mesh.bars, np.int64).ravel(),
+            "Offsets": np.arange(0, 2 * n + 1, 2, dtype=np.int64),
+            "Types": np.full(n, _LINE, np.uint8),
+        }
+        for name, values in datasets.items():
+            root[name] = values
         for kind, arrays in _data(mesh).items():
             # in the order in which they are given
             group = root.create_group({"cell_data": "CellData", "point_data": "PointData"}[kind], track_order=True)

@@ -35,21 +35,21 @@ if TYPE_CHECKING:
 
 __all__ = ["read_slab", "read_triangles", "read_whole", "suffixes", "write_whole", "writer_of"]
 
-_GEOMETRY = (
-    "; this is a geometry: mesh its curves by `gmsh -1 -clmin 1e22 {name} -o {stem}.msh`, one bar each, or with the "
-    "length of bars after -clmin (pip install gmsh)"
-)
-_GMSH = "; convert it by `gmsh {name} -save -o {stem}.msh` (pip install gmsh)"
-_MESHIO = "; convert it by `meshio convert {name} {stem}.vtk` (pip install meshio)"
-_DRAWING = (
-    "; export its lines as Wavefront OBJ from the program that made it, or convert it by the script for drawings in "
-    "docs/meshes.md"
-)
 _CONVERT = {
-    **dict.fromkeys((".geo", ".geo_unrolled", ".step", ".stp", ".iges", ".igs", ".brep"), _GEOMETRY),
-    **dict.fromkeys((".unv", ".med"), _GMSH),
-    **dict.fromkeys((".xdmf", ".mesh", ".mdpa", ".avs"), _MESHIO),
-    **dict.fromkeys((".dxf", ".3dm"), _DRAWING),
+    **dict.fromkeys(
+        (".geo", ".geo_unrolled", ".step", ".stp", ".iges", ".igs", ".brep"),
+        "; this is a geometry: mesh its curves by `gmsh -1 -clmin 1e22 {name} -o {stem}.msh`, one bar each, or with "
+        "the length of bars after -clmin (pip install gmsh)",
+    ),
+    **dict.fromkeys((".unv", ".med"), "; convert it by `gmsh {name} -save -o {stem}.msh` (pip install gmsh)"),
+    **dict.fromkeys(
+        (".xdmf", ".mesh", ".mdpa", ".avs"), "; convert it by `meshio convert {name} {stem}.vtk` (pip install meshio)"
+    ),
+    **dict.fromkeys(
+        (".dxf", ".3dm"),
+        "; export its lines as Wavefront OBJ from the program that made it, or convert it by the script for drawings "
+        "in docs/meshes.md",
+    ),
     **dict.fromkeys((".dwg", ".skp", ".blend", ".3ds", ".fbx"), "; export its lines as Wavefront OBJ or DXF"),
     ".ifc": "; export the axes of the members as lines (Wavefront OBJ or DXF) from the program that made it",
     ".fem": "; this is bulk data: `(echo SOL 101; echo CEND; cat {name}) > {stem}.bdf`",
@@ -62,8 +62,8 @@ def suffixes(*what: str) -> dict[str, ModuleType]:
     """Return the module of each suffix; ``what`` are functions of which it must have one, as ``write``."""
     from ..registry import modules
 
-    found = modules(__name__).values()
-    return {suffix: m for m in found if any(hasattr(m, name) for name in what) for suffix in m.SUFFIXES}
+    found = [each for each in modules(__name__).values() if any(hasattr(each, name) for name in what)]
+    return {suffix: each for each in found for suffix in each.SUFFIXES}
 
 
 def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
@@ -81,15 +81,12 @@ def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = Non
 
     # files that rank 0 sends on need not be there on other machines
     reader = importlib.import_module(on_root(comm, lambda: _reader_of(path, "mesh.file: ").__name__))
-    wanted = fields or {}
     if hasattr(reader, "read_on"):
-        slab = reader.read_on(path, comm, wanted)
+        slab = reader.read_on(path, comm, fields or {})
         check_size(slab.n_nodes, str(path))
         return slab
-    whole = None
     with agreed(comm):
-        if comm.rank == 0:
-            whole = _read(reader, path, wanted)
+        whole = _read(reader, path, fields or {}) if comm.rank == 0 else None
     return scattered(whole, str(path), comm)
 
 
@@ -133,7 +130,7 @@ def read_triangles(path: Path, key: str) -> tuple[np.ndarray, np.ndarray]:
     import numpy as np
 
     from ..errors import InputError
-    from ._numbers import whole_numbers
+    from ._common import whole_numbers
 
     try:
         points, corners, offsets = _reader_of(path, "", "read_faces").read_faces(path)
@@ -143,7 +140,7 @@ def read_triangles(path: Path, key: str) -> tuple[np.ndarray, np.ndarray]:
         if sizes.min() < 3:
             raise InputError(f"{path}: face {sizes.argmin()} (from 0) has {sizes.min()} corners: expected 3 or more")
         n = len(points)
-        corners = whole_numbers(corners, 0, n, f"{path}: there is no point {{}}: the file has {n}, from 0".format)
+        corners = whole_numbers(corners, 0, n, f"{path}: there is no point ", f": the file has {n}, from 0")
     except InputError as error:
         raise InputError(f"{key}{error}") from None
     face = np.repeat(np.arange(len(sizes)), sizes - 2)
@@ -168,9 +165,9 @@ def _read(reader: Any, path: Path, fields: Mapping[str, str] | None) -> WholeMes
     except MemoryError:
         raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
     check_fields(path, fields, {*whole.bar_fields, *whole.node_fields})
-    if fields is not None:
-        whole.bar_fields = {name: whole.bar_fields[name] for name in fields if name in whole.bar_fields}
-        whole.node_fields = {name: whole.node_fields[name] for name in fields if name in whole.node_fields}
+    for kind in ("bar_fields", "node_fields") if fields is not None else ():
+        own = getattr(whole, kind)
+        setattr(whole, kind, {name: own[name] for name in fields if name in own})
     return whole
 
 

@@ -1,23 +1,235 @@
-"""The model in an Abaqus input file: parts, instances and sets, as one mesh with groups."""
+"""Abaqus and CalculiX input files: keywords, with the files that they include, and the model that they describe: parts,
+instances and sets as one mesh with groups."""
 
 from __future__ import annotations
 
+import codecs
 import re
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import InputError
+from ..files import readable_whole
 from ..mesh.whole import WholeMesh
-from ._abaqus_keywords import KNOWN, Block
-from ._numbers import number_of, places_of, whole_numbers
+from ._common import number_of, numbers_of, places_of, shown, whole_numbers
 
-_ONE_BY_ONE = "write the nodes and elements one by one (Abaqus/CAE and most preprocessors do)"
+KNOWN: dict[str, tuple[str, ...]] = {
+    "AMPLITUDE": ("NAME", "DEFINITION", "TIME", "VALUE"),
+    "ASSEMBLY": ("NAME",),
+    "BEAM GENERAL SECTION": (*("ELSET", "SECTION", "MATERIAL", "DENSITY", "POISSON", "ZERO"), "LUMPED"),
+    "BEAM SECTION": (*("ELSET", "SECTION", "MATERIAL", "POISSON", "TEMPERATURE"), "LUMPED"),
+    "BOUNDARY": ("OP", "TYPE", "AMPLITUDE", "FIXED"),
+    "CLOAD": ("OP", "AMPLITUDE"),
+    "DAMPING": ("ALPHA", "BETA"),
+    "DASHPOT": ("ELSET", "NONLINEAR", "ORIENTATION"),
+    "DENSITY": (),
+    "DLOAD": ("OP", "AMPLITUDE"),
+    "ELASTIC": ("TYPE",),
+    "ELEMENT": ("TYPE", "ELSET", "INPUT"),
+    "ELSET": ("ELSET", "GENERATE", "INSTANCE", "INTERNAL", "UNSORTED"),
+    "EXPANSION": ("TYPE", "ZERO"),
+    "FRAME SECTION": ("ELSET", "SECTION", "DENSITY", "ZERO"),
+    "INITIAL CONDITIONS": ("TYPE", "INPUT"),
+    "INSTANCE": ("NAME", "PART"),
+    "MASS": ("ELSET", "TYPE"),
+    "MATERIAL": ("NAME",),
+    "NO COMPRESSION": (),
+    "NO TENSION": (),
+    "NODE": ("NSET", "SYSTEM", "INPUT"),
+    "NSET": ("NSET", "ELSET", "GENERATE", "INSTANCE", "INTERNAL", "UNSORTED"),
+    "PART": ("NAME",),
+    "PLASTIC": ("HARDENING", "RATE"),
+    "SOLID SECTION": ("ELSET", "MATERIAL", "CONTROLS"),
+    "SPRING": ("ELSET", "NONLINEAR", "ORIENTATION"),
+    "STEP": (*("NAME", "NLGEOM", "INC", "INCF", "AMPLITUDE", "PERTURBATION", "UNSYMM", "CONVERT SDI"), "EXTRAPOLATION"),
+    "TEMPERATURE": ("OP", "AMPLITUDE"),
+}
+"""Parameters of keywords that are read, or that change nothing for bars; others are told."""
+_OPEN = ("PART", "INSTANCE", "ASSEMBLY", "STEP")
+"""Keywords that another one, with END, closes."""
+_SPACED = {name.replace(" ", ""): name for name in (*KNOWN, *(f"END {name}" for name in _OPEN))}
+"""Keywords by their letters: CalculiX ignores the blanks in them."""
+
+_DEEPEST = 20
+"""Number of files that include one another."""
+
+_SHORT = 200
+"""Number of letters up to which lines are read one by one, which is faster then."""
+
+_COMMENT = re.compile(rb"^[ \t]*\*\*[^\n]*", re.MULTILINE)
+_KEYWORD = re.compile(rb"(^[ \t]*\*(?:[^\n]*,[ \t]*\n(?![ \t]*\*))*[^\n]*\n?)", re.MULTILINE)
+"""A line that begins with an asterisk, with those that continue it after a comma."""
+_COMMA = re.compile(r',(?=(?:[^"]*"[^"]*")*[^"]*$)')
+"""A comma outside of quotes."""
+_TAIL = re.compile(rb",[ \t]*\n")
+_EXPONENTS = bytes.maketrans(b"Dd", b"ee")
+"""Those of Fortran: 1.D+3."""
+
+
+class Piece(NamedTuple):
+    """Data lines of a file, from the line of a number on."""
+
+    path: Path
+    line: int
+    text: bytes
+
+
+@dataclass
+class Block:
+    """A keyword, in capitals without the asterisk, with its parameters and data lines."""
+
+    path: Path
+    line: int
+    keyword: str
+    parameters: dict[str, str]
+    """Names in capitals."""
+    pieces: list[Piece] = field(default_factory=list)
+
+    @property
+    def where(self) -> str:
+        """File and line, for messages."""
+        return f"{self.path}: line {self.line}: *{self.keyword}"
+
+    def get(self, name: str, default: str = "") -> str:
+        """Return the value of a parameter."""
+        return self.parameters.get(name, default)
+
+    def required(self, name: str) -> str:
+        """Return the value of a parameter that must be there."""
+        value = self.parameters.get(name)
+        if not value:
+            raise InputError(f"{self.where}: the parameter {name}= is missing")
+        return value
+
+    def lines(self, *pieces: Piece) -> Iterator[tuple[str, list[str]]]:
+        """Return where it is, and the words between commas, of each data line; a last empty one is left out."""
+        for path, first, text in pieces or self.pieces:
+            for number, line in enumerate(text.split(b"\n"), first):
+                if line.strip():
+                    words = words_of(line.decode("utf-8", "replace"))
+                    some = words[:-1] if len(words) > 1 and not words[-1] else words
+                    yield f"{path}: line {number}: *{self.keyword}", some
+
+    def rows(self, width: int, least: int = 1) -> np.ndarray:
+        """Return the numbers of all data lines, (lines, width): NaN where a line has fewer, and at least ``least``.
+
+        Raises
+        ------
+        InputError
+            Naming file and line, for anything else.
+        """
+        found = [np.empty((0, width))]
+        for piece in self.pieces:
+            alike = _alike(piece.text) if len(piece.text) > _SHORT else None
+            if alike is not None and least <= alike.shape[1] <= width:
+                found.append(np.pad(alike, ((0, 0), (0, width - alike.shape[1])), constant_values=np.nan))
+            else:
+                found += [_row(where, words, width, least) for where, words in self.lines(piece)]
+        return np.concatenate(found)
+
+    def numbers(self) -> np.ndarray | None:
+        """Return all numbers of the data lines one after the other; None if there is anything else."""
+        try:
+            return numbers_of(b"\n".join(piece.text for piece in self.pieces).replace(b",", b" ").translate(_EXPONENTS))
+        except ValueError:
+            return None
+
+
+def words_of(line: str) -> list[str]:
+    """Return the words between the commas of a line."""
+    return [word.strip() for word in (_COMMA.split(line) if '"' in line else line.split(","))]
+
+
+def _row(where: str, words: list[str], width: int, least: int) -> np.ndarray:
+    if not least <= len(words) <= width:
+        raise InputError(
+            f"{where}: {', '.join(words)[:60]!r} has {len(words)} values; expected "
+            f"{least}{'' if least == width else f' to {width}'} with commas"
+        )
+    row = np.full((1, width), np.nan)
+    for k, word in enumerate(words):
+        row[0, k] = number_of(word)
+        if word and np.isnan(row[0, k]):
+            raise InputError(f"{where}: {word[:40]!r} is not a number")
+    return row
+
+
+def _alike(text: bytes) -> np.ndarray | None:
+    """Return the numbers of lines that have as many each, in a row each; None if they are not so simple."""
+    try:
+        return np.loadtxt(
+            StringIO(_TAIL.sub(b"\n", text).translate(_EXPONENTS).decode("latin1")), delimiter=",", ndmin=2
+        )
+    except ValueError:
+        return None
+
+
+def blocks(path: Path, above: tuple[Path, ...] = (), before: Block | None = None) -> Iterator[Block]:
+    """Yield the blocks of a file, and of those that it includes; a block is complete when the next one comes.
+
+    ``above`` are the files that include this one, and ``before`` is the block at that place, whose data may go on here.
+
+    Raises
+    ------
+    InputError
+        For data before the first keyword, and files that cannot be included.
+    """
+    try:
+        content = readable_whole(path).read_bytes().removeprefix(codecs.BOM_UTF8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot open: {error.strerror}") from None
+    if b"\0" in content:
+        raise InputError(f"{path}: is not text: save it as an Abaqus input file in UTF-8 or ASCII")
+    content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    line, block = 1, before
+    for k, text in enumerate(_KEYWORD.split(_COMMENT.sub(b"", content))):
+        if k % 2:
+            found = _keyword(path, line, text.decode("utf-8", "replace"))
+            if found.keyword != "INCLUDE":
+                block = found
+                yield block
+            if found.keyword == "INCLUDE" or "INPUT" in found.parameters:
+                for inner in blocks(_included(found, path, above), (*above, path), block):
+                    block = inner
+                    yield inner
+        elif text.strip():
+            if block is None:
+                first = shown(text.strip().split(b"\n")[0])
+                raise InputError(f"{path}: line {line}: {first!r} precedes the first *KEYWORD")
+            block.pieces.append(Piece(path, line, text))
+        line += text.count(b"\n")
+
+
+def _keyword(path: Path, line: int, text: str) -> Block:
+    words = words_of(text.lstrip("* \t"))
+    if not words[0]:
+        raise InputError(f"{path}: line {line}: {text.strip()[:60]!r} is no keyword")
+    keyword, *pairs = [(" ".join(name.upper().split()), value) for name, _, value in (w.partition("=") for w in words)]
+    name = _SPACED.get(keyword[0].replace(" ", ""), keyword[0])
+    return Block(path, line, name, {name: value.strip().strip('"') for name, value in pairs if name})
+
+
+def _included(block: Block, path: Path, above: tuple[Path, ...]) -> Path:
+    name = block.required("INPUT")
+    file = (above[0] if above else path).parent / name
+    if len(above) >= _DEEPEST or file.resolve() in {other.resolve() for other in (*above, path)}:
+        raise InputError(f"{block.where}: {name} includes itself")
+    if not file.is_file():
+        raise InputError(f"{block.where}: there is no file {file}")
+    return file
+
+
+# ---- the model
+
 _REFUSED = dict.fromkeys(
-    ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SUBSTRUCTURE GENERATE"), _ONE_BY_ONE
+    ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SUBSTRUCTURE GENERATE"),
+    "write the nodes and elements one by one (Abaqus/CAE and most preprocessors do)",
 ) | {
     "SYSTEM": "write the nodes in global coordinates",
     "PARAMETER": "write the values in the place of the names, as 1e7 for <E>",
@@ -49,17 +261,11 @@ _BARS = (
 )
 """Types of elements that are bars, their numbers of nodes and of those that only tell an orientation, and what is to be
 said about them."""
-_PLANE = re.compile(r"[A-Z]+2.*")
-"""Those of bars in the plane of x and y."""
-_CALCULIX = re.compile(r"B3[12]R")
-"""Beams that CalculiX alone has."""
 _AT_NODES = {"MASS": 1, "SPRINGA": 2, "SPRING1": 1, "SPRING2": 2, "DASHPOTA": 2, "DASHPOT1": 1, "DASHPOT2": 2}
 """Types of elements that belong to nodes, and the numbers of these."""
 SECTIONS = ("SOLID SECTION", "BEAM SECTION", "BEAM GENERAL SECTION", "FRAME SECTION")
 OF_NODES = ("MASS", "SPRING", "DASHPOT")
 """Keywords of what elements have: bars, and those that belong to nodes."""
-_OPEN = ("PART", "INSTANCE", "ASSEMBLY", "STEP")
-"""Keywords that another one, with END, closes."""
 _ASSEMBLY = "*ASSEMBLY"
 """Key of the assembly among instances."""
 _WHAT = {"NSET": "node", "ELSET": "element"}
@@ -95,16 +301,13 @@ _NOTHING = np.empty(0, np.int64)
 
 
 class _Elements(NamedTuple):
-    """Elements of a block that are bars: labels (n,), and those of their nodes (n, 2 or 3)."""
+    """Elements of a block that are bars: labels (n,), those of their nodes (n, 2 or 3), and whether they have no third
+    direction."""
 
     block: Block
     labels: np.ndarray
     nodes: np.ndarray
-
-    @property
-    def plane(self) -> bool:
-        """Whether they have no third direction."""
-        return _PLANE.fullmatch(self.block.get("TYPE").upper()) is not None
+    plane: bool
 
 
 class AtNodes(NamedTuple):
@@ -135,11 +338,10 @@ class _Scope:
     def instance(self, name: str, place: np.ndarray) -> _Scope:
         """Return an instance of a part, to which content of its own can be added."""
         sets = {
-            kind: {upper: replace(one, entries=list(one.entries)) for upper, one in found.items()}
+            kind: {upper: replace(one, entries=[*one.entries]) for upper, one in found.items()}
             for kind, found in self.sets.items()
         }
-        own = (list(self.nodes), list(self.elements), list(self.at_nodes))
-        return _Scope(name, *own, sets, list(self.sections), place)
+        return _Scope(name, [*self.nodes], [*self.elements], [*self.at_nodes], sets, [*self.sections], place)
 
     def add(self, kind: str, name: str, block: Block, entries: Iterable[_Labels]) -> None:
         """Add members to a set."""
@@ -155,31 +357,24 @@ class _Scope:
         points = np.concatenate([np.empty((0, 3)), *(own for _, own in self.nodes)])
         known, first, at = np.unique(labels, return_index=True, return_inverse=True)
         if len(known) < len(labels):
-            moved = np.flatnonzero((points != points[first[at.ravel()]]).any(axis=1))
+            moved = labels[(points != points[first[at.ravel()]]).any(axis=1)]
             if len(moved):
-                raise InputError(
-                    f"{path}: *NODE: node {labels[moved[0]]} is listed more than once, at different positions"
-                )
+                raise InputError(f"{path}: *NODE: node {moved[0]} is listed more than once, at different positions")
             keep = np.sort(first)
             labels, points = labels[keep], points[keep]
         order = np.argsort(labels, kind="stable")
-        ends = [np.empty((0, 2), np.int64)]
-        plane = [np.empty(0, bool)]
+        ends, plane = [np.empty((0, 2), np.int64)], [np.empty(0, bool)]
         for elements in self.elements:
-            block, own, wanted = elements
-            found, there = places_of(known, wanted)
-            if not there.all():
-                element, side = np.argwhere(~there)[0]
-                raise InputError(
-                    f"{block.where}: node {wanted[element, side]} of element {own[element]} is not defined"
-                )
+            found, there = places_of(known, elements.nodes)
+            for element, side in np.argwhere(~there)[:1]:
+                what = f"node {elements.nodes[element, side]} of element {elements.labels[element]}"
+                raise InputError(f"{elements.block.where}: {what} is not defined")
             ends.append(_ends(order[found], points))
-            plane.append(np.full(len(own), elements.plane))
-        bars = np.concatenate([_NOTHING, *(own for _, own, _ in self.elements)])
+            plane.append(np.full(len(found), elements.plane))
+        bars = np.concatenate([_NOTHING, *(elements.labels for elements in self.elements)])
         sequence = np.argsort(bars, kind="stable")
-        twice = np.flatnonzero(np.diff(bars[sequence]) == 0)
-        if len(twice):
-            raise InputError(f"{path}: *ELEMENT: element {bars[sequence[twice[0]]]} is listed more than once")
+        for label in bars[sequence[1:]][np.diff(bars[sequence]) == 0][:1]:
+            raise InputError(f"{path}: *ELEMENT: element {label} is listed more than once")
         self.at = {"NSET": (known, order + n_nodes), "ELSET": (bars[sequence], sequence + n_bars)}
         if not np.array_equal(self.place, np.eye(4, 3)):
             points = points @ self.place[:3] + self.place[3]
@@ -202,8 +397,9 @@ def _ends(nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _labels(values: np.ndarray, block: Block, what: str) -> np.ndarray:
-    refused = "{}: {} is not the label of a {}: a whole number from 1 on"
-    return whole_numbers(values, 1, 2**53, lambda found: refused.format(block.where, found, what))
+    return whole_numbers(
+        values, 1, 2**53, f"{block.where}: ", f" is not the label of a {what}: a whole number from 1 on"
+    )
 
 
 def _union(parts: list[np.ndarray]) -> np.ndarray:
@@ -252,15 +448,12 @@ class Deck:
         self.procedure: Block | None = None
         self.calculix = False
         """Whether the file is one of CalculiX, where sections differ."""
-        self._files = False
         self._scope = self._outer = self.scopes[""]
         self._ended = False
         self._beyond: Block | None = None
         self._open: dict[str, None] = {}
-        self._notes: dict[str, int] = {}
-        self._other_types: set[str] = set()
-        self._constraints: dict[str, None] = {}
-        self._unread: dict[str, None] = {}
+        self._left: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        """How often there is what is left out or read as something else: ``types`` of elements, ``constraints``, ..."""
         self._unknown: dict[tuple[str, str], str] = {}
         self._material: list[Block] = []
         self._told: list[str] = []
@@ -291,7 +484,7 @@ class Deck:
                 self.procedure = block
                 self.calculix |= "SOLVER" in block.parameters
             else:
-                self._leave_out(keyword)
+                self._left["keywords"][keyword] += 1
         else:
             self._add_to_model(block)
         return self._beyond is None
@@ -299,12 +492,8 @@ class Deck:
     @property
     def ambiguous(self) -> bool:
         """Whether the file may be one of CalculiX: both programs have its output."""
-        return self._files and not self.calculix
-
-    def _leave_out(self, keyword: str) -> None:
-        self._files |= keyword.replace(" ", "") in ("NODEFILE", "ELFILE")
-        if keyword not in _PASSED_OVER and not any(word in keyword for word in ("OUTPUT", "PRINT", "FILE")):
-            self._unread[f"*{keyword}"] = None
+        files = {keyword.replace(" ", "") for keyword in self._left["keywords"]}
+        return not self.calculix and not files.isdisjoint(("NODEFILE", "ELFILE"))
 
     def _add_to_model(self, block: Block) -> None:
         match block.keyword:
@@ -326,11 +515,11 @@ class Deck:
             case "INITIAL CONDITIONS":
                 self.initial.append(block)
             case keyword if keyword in _CONSTRAINTS:
-                self._constraints[f"*{keyword}"] = None
+                self._left["constraints"][f"*{keyword}"] += 1
             case keyword if keyword in _REFUSED:
                 raise InputError(f"{block.where} is not read: {_REFUSED[keyword]}")
             case keyword:
-                self._leave_out(keyword)
+                self._left["keywords"][keyword] += 1
 
     def _open_scope(self, block: Block) -> None:
         """Make what follows the content of a part, an instance or the assembly, or of what is around it."""
@@ -373,16 +562,17 @@ class Deck:
             rows = block.rows(count + more + 1 + bool(more), count + 1)[:, : count + 1]
             labels = _labels(rows[:, 0], block, "element")
             nodes = _labels(rows[:, 1:].ravel(), block, "node").reshape(len(rows), count)
-            self._scope.elements.append(_Elements(block, labels, nodes))
-            self.calculix |= _CALCULIX.fullmatch(kind) is not None
+            plane = re.fullmatch("[A-Z]+2.*", kind) is not None  # of x and y
+            self._scope.elements.append(_Elements(block, labels, nodes, plane))
+            self.calculix |= kind in ("B31R", "B32R")  # beams that CalculiX alone has
             if note:
-                self._notes[f"{kind}: {note}"] = self._notes.get(f"{kind}: {note}", 0) + len(rows)
+                self._left["notes"][f"{kind}: {note}"] += len(rows)
         elif kind in _AT_NODES:
             labels = np.array([self._at_nodes(kind, block, *line) for line in block.lines()], np.int64)
         else:
-            self._other_types.add(kind)
+            self._left["types"][kind] += 1
         if block.get("ELSET"):
-            self._scope.add("ELSET", block.get("ELSET"), block, [_Labels(labels)] if len(labels) else [])
+            self._scope.add("ELSET", block.get("ELSET"), block, [_Labels(labels)] * bool(len(labels)))
 
     def _at_nodes(self, kind: str, block: Block, where: str, words: list[str]) -> int:
         """Add an element that belongs to nodes, and return its label."""
@@ -437,52 +627,44 @@ class Deck:
 
     def mesh(self) -> WholeMesh:
         """Return nodes and bars of all instances in their order, without nodes where no bar ends, and their groups."""
-        told = [f"{self.path}: {n} elements {note}" for note, n in self._notes.items()]
-        if self._other_types:
-            told.append(f"{self.path}: left out elements of the types {', '.join(sorted(self._other_types))}")
+        told = [f"{self.path}: {n} elements {note}" for note, n in self._left["notes"].items()]
+        types = sorted(self._left["types"])
+        told += [f"{self.path}: left out elements of the types {', '.join(types)}"] * bool(types)
         told += [f"{where}: {name} is left out: it is not read" for (_, name), where in self._unknown.items()]
-        told += [*self._told, *self._cut_off()]
         self.scopes[_ASSEMBLY] = self.assembly
-        labels, points, bars = [_NOTHING], [np.empty((0, 3))], [np.empty((0, 2), np.int64)]
-        plane = [np.empty(0, bool)]
+        parts, n_nodes, n_bars = [], 0, 0
         for scope in self.scopes.values():
-            parts = scope.placed(self.path, sum(map(len, points)), sum(map(len, bars)))
-            for whole, part in zip((labels, points, bars, plane), parts):
-                whole.append(part)
-        self.plane = np.concatenate(plane)
-        all_points, all_bars = np.concatenate(points), np.concatenate(bars)
-        used = np.zeros(len(all_points), bool)
-        used[all_bars] = True
-        self.labels_left_out = np.concatenate(labels)[~used].tolist()
+            parts.append(scope.placed(self.path, n_nodes, n_bars))
+            n_nodes, n_bars = n_nodes + len(parts[-1][0]), n_bars + len(parts[-1][2])
+        labels, points, bars, self.plane = map(np.concatenate, zip(*parts))
+        used = np.zeros(len(points), bool)
+        used[bars] = True
+        self.labels_left_out = labels[~used].tolist()
         number = np.where(used, np.cumsum(used) - 1, -1)
         for scope in self.scopes.values():
             known, at = scope.at["NSET"]
             scope.at["NSET"] = known, number[at]
-        self.groups = {}
+        self.groups, every = {}, self.scopes.values()
+        of_nodes = {s.upper() for scope in every for block, s in scope.sections if block.keyword in OF_NODES}
+        others = types or any(scope.at_nodes for scope in every)
+        mesh = WholeMesh(points[used], number[bars], warnings=[*told, *self._told, *self._cut_off()])
         for kind, what in _WHAT.items():
             self._lost: dict[int, int] = {}  # a set that another one names counts once
-            self.groups[kind] = self._groups(kind)
+            groups = self._groups(kind)
             lost = sum(self._lost.values())
-            others = self._other_types or any(scope.at_nodes for scope in self.scopes.values())
-            if lost and (kind == "NSET" or not others):
-                told.append(f"{self.path}: {lost} members of {what} sets are not there, and are left out")
-            sets = [one for scope in self.scopes.values() for one in scope.sets[kind].values()]
+            here = kind == "NSET" or not others
+            mesh.tell(lost and here, f"{self.path}: {lost} members of {what} sets are not there, and are left out")
+            sets = [one for scope in every for one in scope.sets[kind].values()]
             bare = {one.name for one in sets if one.entries and not any(len(entry.labels) for entry in one.entries)}
-            empty = [name for name, members in self.groups[kind].items() if not len(members) and name not in bare]
-            for name in empty:
-                del self.groups[kind][name]
-            given = {s.upper() for scope in self.scopes.values() for b, s in scope.sections if b.keyword in OF_NODES}
-            empty = [name for name in empty if kind == "NSET" or name.upper().rpartition(".")[2] not in given]
-            if empty:
-                why = "no bar ends at their nodes" if kind == "NSET" else "none of their elements is a bar"
-                told.append(f"{self.path}: left out the {what} sets {listed(empty)}: {why}")
-        mesh = WholeMesh(all_points[used], number[all_bars], self.groups["NSET"], dict(self.groups["ELSET"]))
-        mesh.warnings = told
-        if self._constraints:
-            mesh.warnings.append(
-                f"{self.path}: left out {', '.join(self._constraints)}; nodes that they connect are joined by `mesh "
-                "clean` if they are at the same place"
-            )
+            self.groups[kind] = {name: own for name, own in groups.items() if len(own) or name in bare}
+            empty = [name for name in groups if name not in self.groups[kind]]
+            empty = [name for name in empty if kind == "NSET" or name.upper().rpartition(".")[2] not in of_nodes]
+            why = "no bar ends at their nodes" if kind == "NSET" else "none of their elements is a bar"
+            mesh.tell(empty, f"{self.path}: left out the {what} sets {listed(empty)}: {why}")
+        constraints = ", ".join(self._left["constraints"])
+        way_out = "nodes that they connect are joined by `mesh clean` if they are at the same place"
+        mesh.tell(constraints, f"{self.path}: left out {constraints}; {way_out}")
+        mesh.node_groups, mesh.bar_groups = self.groups["NSET"], dict(self.groups["ELSET"])
         return mesh
 
     def _groups(self, kind: str) -> dict[str, np.ndarray]:
@@ -535,24 +717,21 @@ class Deck:
     def of_nodes(self) -> Iterator[tuple[Block, list[tuple[AtNodes, list[int]]]]]:
         """Yield what masses, springs and dashpots have, with each element and the numbers of its nodes in the mesh, -1
         for a node where no bar ends."""
-        for key, scope in self.scopes.items():
-            for block, name in scope.sections:
-                if block.keyword not in OF_NODES:
-                    continue
-                found: list[tuple[AtNodes, list[int]]] = []
-                for entry in self._set(block, scope, name).entries:
-                    own = entry.instance or key
-                    elements = self.scopes[own].at_nodes
-                    for i in np.flatnonzero(entry.within(np.array([element.label for element in elements], np.int64))):
-                        if elements[i].kind.startswith(block.keyword):
-                            numbers = [self._number(instance or own, label) for instance, label in elements[i].nodes]
-                            found.append((elements[i], numbers))
+        sections = [(key, scope, *section) for key, scope in self.scopes.items() for section in scope.sections]
+        for key, scope, block, name in sections:
+            found: list[tuple[AtNodes, list[int]]] = []
+            for entry in self._set(block, scope, name).entries if block.keyword in OF_NODES else ():
+                own = entry.instance or key
+                elements = self.scopes[own].at_nodes
+                for i in np.flatnonzero(entry.within(np.array([element.label for element in elements], np.int64))):
+                    if elements[i].kind.startswith(block.keyword):
+                        nodes = [
+                            (instance or own, [_Labels(np.array([label]))]) for instance, label in elements[i].nodes
+                        ]
+                        members = [self._members("NSET", *node).tolist() for node in nodes]
+                        found.append((elements[i], [next(iter(each), -1) for each in members]))
+            if block.keyword in OF_NODES:
                 yield block, found
-
-    def _number(self, key: str, label: int) -> int:
-        known, at = self.scopes[key].at["NSET"]
-        place, there = places_of(known, np.array([label]))
-        return int(at[place[0]]) if there[0] else -1
 
     def _set(self, block: Block, scope: _Scope, name: str) -> _Set:
         if name.upper() not in scope.sets["ELSET"]:
@@ -567,23 +746,24 @@ class Deck:
         groups = self.groups["ELSET"]
         names = {name.upper(): name for name in groups}
         found: dict[int, tuple[Block, str, list[tuple[str, np.ndarray]]]] = {}
-        for key, scope in self.scopes.items():
-            for block, name in scope.sections:
-                if block.keyword in OF_NODES:
-                    continue
-                full = f"{scope.name}.{name}".upper().replace("/", "_")
-                members = self._members("ELSET", key, self._set(block, scope, name).entries)
-                found.setdefault(id(block), (block, name, []))[2].append((full, members))
+        every = [(key, scope, *section) for key, scope in self.scopes.items() for section in scope.sections]
+        for key, scope, block, name in [each for each in every if each[2].keyword not in OF_NODES]:
+            full = f"{scope.name}.{name}".upper().replace("/", "_")
+            members = self._members("ELSET", key, self._set(block, scope, name).entries)
+            found.setdefault(id(block), (block, name, []))[2].append((full, members))
         for block, name, parts in found.values():
             short = names.get(name.upper().replace("/", "_"))
             if short is not None and np.array_equal(groups[short], _union([members for _, members in parts])):
-                yield block, short, groups[short]
-            else:
-                yield from ((block, names.get(full, short or name), members) for full, members in parts)
+                parts, name = [(short.upper(), groups[short])], short
+            yield from ((block, names.get(full, short or name), members) for full, members in parts)
 
     def left_out(self) -> Iterator[str]:
         """Yield what the step has that is not read."""
-        if self._unread:
-            yield f"{self.path}: left out {', '.join(self._unread)}: keywords that are not read"
+        silent = ("OUTPUT", "PRINT", "FILE")
+        unread = [
+            name for name in self._left["keywords"] if name not in _PASSED_OVER and not any(map(name.count, silent))
+        ]
+        if unread:
+            yield f"{self.path}: left out {', '.join(f'*{name}' for name in unread)}: keywords that are not read"
         if self._beyond is not None:
             yield f"{self._beyond.where}: left out with all that follows: only the first step is read"

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
-from ._polygons import edges
+from ._common import edges
 
 SUFFIXES = (".json",)
 
@@ -51,18 +51,13 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     except (TypeError, AttributeError) as error:
         raise InputError(f"{path}: its {kind} or edges are not what COMPAS writes: {error}") from None
     mesh = WholeMesh(points.reshape(-1, 3), np.array(ends, np.int64).reshape(-1, 2))
-    left = [
-        *_attributes(nodes, mesh.node_fields, mesh.node_groups),
-        *_attributes(bars, mesh.bar_fields, mesh.bar_groups),
-    ]
+    left = [*_attributes(nodes, mesh.node_fields, mesh.node_groups)]
+    left += _attributes(bars, mesh.bar_fields, mesh.bar_groups)
     for name, values in (mesh.node_fields | mesh.bar_fields).items():
-        if not np.isfinite(values).all():
-            n = int((~np.isfinite(values)).sum())
-            mesh.warnings.append(f"{path}: the attribute {name} is not a finite number {n} times")
-    if left:
-        mesh.warnings.append(f"{path}: left out the attributes {', '.join(left)}: not one number for each node or edge")
-    if len(found) > 1:
-        mesh.warnings.append(f"{path}: has {len(found)} networks, graphs and meshes: the first one is read")
+        n = int((~np.isfinite(values)).sum())
+        mesh.tell(n, f"{path}: the attribute {name} is not a finite number {n} times")
+    mesh.tell(left, f"{path}: left out the attributes {', '.join(left)}: not one number for each node or edge")
+    mesh.tell(len(found) > 1, f"{path}: has {len(found)} networks, graphs and meshes: the first one is read")
     return mesh
 
 

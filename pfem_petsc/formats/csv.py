@@ -88,22 +88,19 @@ def _pair(path: Path) -> tuple[Path, Path, list[str]]:
     others = sorted(p for p in path.parent.iterdir() if p.suffix.lower() in SUFFIXES and p.name != path.name)
     named = {other.name.lower(): other for other in others}
     kind: int | None = None
-    found: list[tuple[int, Path]] = []
+    found: dict[tuple[int, Path], str] = {}
     for kind_of_word, start, stop in _words_in(path.stem):
         kind = kind_of_word
-        for word in _FILE_WORDS[1 - kind]:
-            other = named.get(f"{path.stem[:start]}{word}{path.stem[stop:]}{path.suffix}".lower())
-            if other is not None and (kind, other) not in found:
-                found.append((kind, other))
-    warnings = []
+        names = [f"{path.stem[:start]}{word}{path.stem[stop:]}{path.suffix}" for word in _FILE_WORDS[1 - kind]]
+        found |= {(kind, named[name.lower()]): "" for name in names if name.lower() in named}
     if not found:
         own = _kind(path)
         kind = kind if own is None else own
         fitting = [other for other in others if kind is not None and _kind(other) == 1 - kind]
-        found = [(kind, other) for other in fitting if kind is not None]
-        warnings = [f"{path}: goes with {other.name}, by the columns of both" for other in fitting]
+        found = {(kind, other): f"{path}: goes with {other.name}, by the columns of both" for other in fitting}
     if len(found) == 1:
-        ((kind, other),) = found
+        (((kind, other), told),) = found.items()
+        warnings = [told] * bool(told)
         return (path, other, warnings) if kind == 0 else (other, path, warnings)
     if found:
         names = ", ".join(other.name for _, other in found)
@@ -115,16 +112,11 @@ def _pair(path: Path) -> tuple[Path, Path, list[str]]:
     raise InputError(f"{path}: a mesh in tables is a pair of files, {pair[0]} and {pair[1]}: {missing}")
 
 
-def _words_in(stem: str) -> Iterator[tuple[int, int, int]]:
-    """Yield the words for a kind of table in a name, the last first: kind, and where it begins and ends."""
-    found = [
-        (match.end(), match.end() - match.start(), kind)
-        for kind, words in enumerate(_FILE_WORDS)
-        for word in words
-        for match in re.finditer(word, stem.lower())
-    ]
-    for stop, length, kind in sorted(found, reverse=True):
-        yield kind, stop - length, stop
+def _words_in(stem: str) -> list[tuple[int, int, int]]:
+    """Return the words for a kind of table in a name, the last first: kind, and where it begins and ends."""
+    words = [(kind, word) for kind, words in enumerate(_FILE_WORDS) for word in words]
+    found = [(kind, *match.span()) for kind, word in words for match in re.finditer(word, stem.lower())]
+    return sorted(found, key=lambda each: (each[2], each[2] - each[1], each[0]), reverse=True)
 
 
 def _kind(path: Path) -> int | None:
@@ -133,9 +125,8 @@ def _kind(path: Path) -> int | None:
         table = _Table(path, head_only=True)
     except InputError:
         return None
-    if table.place(_AXES[0]) is not None and table.place(_AXES[1]) is not None:
-        return 0
-    return 1 if table.pairs_of_ends() else None
+    of_nodes = None not in (table.place(_AXES[0]), table.place(_AXES[1]))
+    return 0 if of_nodes else 1 if table.pairs_of_ends() else None
 
 
 def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
@@ -152,19 +143,20 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     axes = [nodes.numbers(axis, names) for axis, names in zip("xyz", _AXES)]
     ids, number = _numbers_of_ids(nodes, bars, pair)
     ends = np.empty((bars.n, 2), np.int64)
+    named = (
+        f"whose ids are in column {nodes.shown(ids)}, like {', '.join(islice(number, 3))}" if ids is not None else ""
+    )
     for side, place in enumerate(pair):
         ends[:, side] = np.fromiter((number.get(label, -1) for label in bars.labels(place)), np.int64, bars.n)
-        if (ends[:, side] < 0).any():
-            row = int((ends[:, side] < 0).argmax())
+        for row in np.flatnonzero(ends[:, side] < 0)[:1].tolist():
             label = next(islice(bars.labels(place), row, None))
-            told = "where nodes are numbered from 0, because it has no column of ids" if ids is None else ""
-            told = told or f"whose ids are in column {nodes.shown(ids)}, like {', '.join(islice(number, 3))}"
+            told = named or "where nodes are numbered from 0, because it has no column of ids"
             raise InputError(f"{bars.where(row)}: there is no node {label!r} in {of_nodes.name}, {told}")
     mesh = WholeMesh(np.stack(axes, axis=1), ends, nodes.groups(), bars.groups())
     coordinates = [place for place in map(nodes.place, _AXES) if place is not None]
     mesh.warnings = warnings + nodes.units(coordinates, "converts by --scale (0.001 for millimetres)")
-    fields = [place for _, place in bars.others([])]
-    mesh.warnings += bars.units(fields, "converts the column area alone, by --scale squared, with the coordinates")
+    remedy = "converts the column area alone, by --scale squared, with the coordinates"
+    mesh.warnings += bars.units([place for _, place in bars.others([])], remedy)
     used = [nodes.place(names) for names in (*_AXES, _GROUPS)]
     mesh.node_fields, texts = nodes.fields([*used, ids, *nodes.places(chain(*_NODE_IDS))])
     if texts or (used[2] is None and mesh.node_fields):
@@ -214,6 +206,9 @@ def _numbers_of_ids(nodes: _Table, bars: _Table, pair: tuple[int, int]) -> tuple
     return candidates[0], number
 
 
+_UNIT = r"[\[(]\s*((?:mm|cm|dm|km|in|inch|ft|yd)[²2]?)\s*[\])]\s*$"
+
+
 class _Table:
     """A table with names of columns; ``headings`` are these without units, ``columns`` the entries."""
 
@@ -229,7 +224,8 @@ class _Table:
         separator = max(";\t,", key=lines[kept[0]].count)
         above = kept[0] - 1
         # programs that write arrays put a # before the names of the columns
-        numbers = any(map(_is_number, lines[kept[0]].split(separator)))
+        words = lines[kept[0]].split(separator)
+        numbers = any(re.fullmatch(r"\s*[-+]?\d*[.,]?\d+(e[-+]?\d+)?\s*", word, re.I) for word in words)
         if numbers and above >= 0 and lines[above].count(separator) == lines[kept[0]].count(separator) > 0:
             lines[above] = lines[above].lstrip("# ")
             kept.insert(0, above)
@@ -237,28 +233,19 @@ class _Table:
         self._lines = np.array(kept[1:], np.int64) + 1
         self.n = len(self._lines)
         texts = (lines[i] for i in (kept[:1] if head_only else kept))
-        rows = csv.reader(texts, delimiter=separator, skipinitialspace=True, strict=True)
         try:
-            self._given = next(rows)
-            self.headings = [_without_unit(name) for name in self._given]
-            self.columns: list[list[str]] = [[] for _ in self.headings]
-            count = self._fill(rows)
+            self._given, *rows = csv.reader(texts, delimiter=separator, skipinitialspace=True, strict=True)
         except csv.Error as error:
             raise InputError(f"{path}: {error}") from None
-        if count != self.n and not head_only:
-            raise InputError(f"{path}: a text in quotes goes over several lines")
-        self._keys = [re.sub(r"[\W_]+", "", name.lower()) for name in self.headings]
-
-    def _fill(self, rows: Iterator[list[str]]) -> int:
-        """Put the entries into columns, row by row, which needs less memory and time; return the number of rows."""
-        width, count = len(self.headings), 0
-        for count, row in enumerate(rows, 1):
+        width = len(self._given)
+        for k, row in enumerate(rows):
             if len(row) != width and (len(row) < width or any(word.strip() for word in row[width:])):
-                where = self.where(count - 1)
-                raise InputError(f"{where}: {len(row)} entries; expected {width}, as the first line has")
-            for column, word in zip(self.columns, row):
-                column.append(word)
-        return count
+                raise InputError(f"{self.where(k)}: {len(row)} entries; expected {width}, as the first line has")
+        if len(rows) != self.n and not head_only:
+            raise InputError(f"{path}: a text in quotes goes over several lines")
+        self.headings = [_without_unit(name) for name in self._given]
+        self.columns = [list(column) for column in zip(*rows)] or [[] for _ in self._given]
+        self._keys = [re.sub(r"[\W_]+", "", name.lower()) for name in self.headings]
 
     def where(self, row: int) -> str:
         """Return file and line of a row."""
@@ -314,13 +301,10 @@ class _Table:
 
     def units(self, places: Iterable[int], remedy: str) -> list[str]:
         """Return a warning about columns in other units of length or area than metres; ``remedy``: of the verb mesh."""
-        found = []
-        for place in places:
-            unit = re.search(r"[\[(]\s*((?:mm|cm|dm|km|in|inch|ft|yd)[²2]?)\s*[\])]\s*$", self._given[place])
-            if unit:
-                found.append(f"{self.shown(place)} in {unit[1]}")
+        given = [(place, re.search(_UNIT, self._given[place])) for place in places]
+        found = ", ".join(f"{self.shown(place)} in {unit[1]}" for place, unit in given if unit)
         told = "whose numbers are taken as they are; write them in metres and square metres; the verb mesh"
-        return [f"{self.path}: has {', '.join(found)}, {told} {remedy}"] if found else []
+        return [f"{self.path}: has {found}, {told} {remedy}"] * bool(found)
 
     def labels(self, place: int) -> Iterator[str]:
         """Yield the entries of a column; whole numbers written as 3.0 or +3 are 3."""
@@ -336,8 +320,7 @@ class _Table:
             raise InputError(f"{self.path}: line 1: there is no column {axis!r}; it has {self._all()}; {known}")
         words = self.columns[place]
         values = self.converted(words)
-        if values is None:
-            row = next(row for row, word in enumerate(words) if self.converted([word]) is None)
+        for row in [k for k, word in enumerate(words) if self.converted([word]) is None][:1] if values is None else ():
             raise InputError(f"{self.where(row)}: column {self.shown(place)}: {words[row][:40]!r} is not a number")
         return values
 
@@ -367,10 +350,6 @@ def _without_unit(name: str) -> str:
     return "area" if name.lower() == "area" else name
 
 
-def _is_number(word: str) -> bool:
-    return re.fullmatch(r"\s*[-+]?\d*[.,]?\d+(e[-+]?\d+)?\s*", word, re.I) is not None
-
-
 def _label(word: str) -> str:
     word = word.strip()
     if word.isdigit() and (word[0] != "0" or word == "0"):
@@ -384,7 +363,7 @@ def _label(word: str) -> str:
 
 def write(path: Path, mesh: WholeMesh) -> None:
     """Write both tables, to the last digit; groups without members are not in them."""
-    kind, start, stop = next(_words_in(path.stem), (0, 0, 0))
+    kind, start, stop = next(iter(_words_in(path.stem)), (0, 0, 0))
     if not stop:
         pair = f"{path.stem}_nodes.csv and {path.stem}_bars.csv"
         raise InputError(f"{path}: a mesh in tables is a pair of files, {pair}: name one of them")

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
-from ._numbers import numbers_of, places_of, shown, whole_numbers
+from ._common import numbers_of, places_of, shown, whole_numbers
 
 SUFFIXES = (".msh",)
 
@@ -48,9 +48,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     layout = _layout(path, b"".join(sections.get("MeshFormat", [])))
     if "PartitionedEntities" in sections:
         raise InputError(f"{path}: section $PartitionedEntities: save the mesh without partitions")
-    for name in ("Nodes", "Elements"):
-        if name not in sections:
-            raise InputError(f"{path}: has no section ${name}")
+    for name in [name for name in ("Nodes", "Elements") if name not in sections]:
+        raise InputError(f"{path}: has no section ${name}")
 
     def numbers(name: str) -> _Numbers:
         return _Numbers(f"{path}: section ${name}", sections[name][0], layout)
@@ -61,8 +60,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     elements = _Elements(numbers("Elements"), entities)
     order = np.argsort(node_tags, kind="stable")
     known = node_tags[order]
-    if (known[1:] == known[:-1]).any():
-        twice = known[1:][known[1:] == known[:-1]][0]
+    for twice in known[1:][known[1:] == known[:-1]][:1]:
         raise InputError(f"{path}: section $Nodes: node {twice} is listed more than once")
     lines, marked = elements.joined_lines() if layout.old else elements.lines, elements.marked
     if any(_ORDERED in comments for comments in sections.get("Comments", [])):
@@ -80,14 +78,23 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     mesh = WholeMesh(points, ends.reshape(-1, 2))
     mesh.node_groups = elements.groups(names[0], len(points), of_points, marked[:, 1])
     mesh.bar_groups = elements.groups(names[1], len(lines), np.arange(len(lines)), lines[:, 3])
-    if elements.others:
-        mesh.warnings.append(f"{path}: left out {elements.others} elements that are neither lines nor points")
+    told = f"{path}: left out {elements.others} elements that are neither lines nor points"
+    mesh.tell(elements.others, told)
     for kind, what, tags, found in (
         ("ElementData", "line", lines[:, 0], mesh.bar_fields),
         ("NodeData", "node", node_tags, mesh.node_fields),
     ):
         for payload in sections.get(kind, []):
-            _add_data(f"{path}: section ${kind}", payload, layout, what, tags, found, mesh.warnings)
+            name, own, values = _data(f"{path}: section ${kind}", payload, layout)
+            order = np.argsort(own, kind="stable")
+            place, there = places_of(own[order], tags)
+            where = f"{path}: section ${kind} {name!r} is left out"
+            if values is None:
+                mesh.warnings.append(f"{where}: a field has a name without slash and one component")
+            elif there.all() and not np.isnan(values).any():
+                found[name] = values[order[place], 0]
+            else:
+                mesh.warnings.append(f"{where}: it does not have a value for each {what}")
     return mesh
 
 
@@ -152,13 +159,12 @@ class _Numbers:
         try:
             return numbers_of(text)
         except ValueError:
-            for number, words in enumerate(text.split(b"\n"), 1):
-                for word in words.split():
-                    try:
-                        float(word)
-                    except ValueError:
-                        raise InputError(f"{self.where}, line {number}: {shown(word)!r} is not a number") from None
-            raise InputError(f"{self.where}: contains text other than numbers") from None
+            for number, line in enumerate(text.split(b"\n"), 1):
+                try:
+                    numbers_of(line)
+                except ValueError as error:
+                    raise InputError(f"{self.where}, line {number}: {error}") from None
+            raise
 
     def count(self) -> int:
         """Return the count at the start of a section of version 2.2, which is text in a binary file too."""
@@ -201,6 +207,19 @@ class _Numbers:
         """Return at most the next ``n`` numbers of a text without taking them."""
         return self._all[self._at : self._at + n]
 
+    def blocks(self, what: str) -> Iterator[list[int]]:
+        """Yield three integers and the number of ``what`` at the head of each block of version 4."""
+        n_blocks, declared = self.sizes(4)[:2].tolist()
+        done = 0
+        for _ in range(n_blocks):
+            head = [*self.ints(3).tolist(), int(self.sizes(1)[0])]
+            done += head[-1]
+            if done > declared:
+                break
+            yield head
+        if done != declared:
+            raise InputError(f"{self.where} declares {declared} {what}, its blocks hold {done}")
+
     def end(self) -> None:
         """Refuse surplus numbers."""
         left = self._all[self._at :]
@@ -210,8 +229,7 @@ class _Numbers:
     def _whole(self, values: np.ndarray) -> np.ndarray:
         if values.dtype.kind != "f":
             return values.astype(np.int64)
-        refused = f"{self.where}: {{}} is not a count or a tag: a whole number"
-        return whole_numbers(values, 1 - 2**53, 2**53, refused.format)
+        return whole_numbers(values, 1 - 2**53, 2**53, f"{self.where}: ", " is not a count or a tag: a whole number")
 
 
 def _physical_names(path: Path, payload: bytes) -> list[dict[int, str]]:
@@ -247,21 +265,13 @@ def _nodes(numbers: _Numbers) -> tuple[np.ndarray, np.ndarray]:
         tags, points = numbers.rows(numbers.count(), 3)
         numbers.end()
         return tags, points
-    n_blocks, declared = numbers.sizes(4)[:2].tolist()
-    tags, points, done = [np.empty(0, np.int64)], [np.empty((0, 3))], 0
-    for _ in range(n_blocks):
-        dimension, _, parametric = numbers.ints(3).tolist()
+    tags, points = [np.empty(0, np.int64)], [np.empty((0, 3))]
+    for dimension, _, parametric, n in numbers.blocks("nodes"):
         if dimension not in (0, 1, 2, 3):
             raise InputError(f"{numbers.where}: a block of entities of dimension {dimension}")
-        n = int(numbers.sizes(1)[0])
-        done += n
-        if done > declared:
-            break
         tags.append(numbers.sizes(n))
         width = 3 + (dimension if parametric else 0)
         points.append(numbers.reals(n * width).reshape(n, width)[:, :3].astype(np.float64))
-    if done != declared:
-        raise InputError(f"{numbers.where} declares {declared} nodes, its blocks hold {done}")
     numbers.end()
     return np.concatenate(tags), np.concatenate(points)
 
@@ -279,17 +289,14 @@ class _Elements:
     def __init__(self, numbers: _Numbers, groups: dict[tuple[int, int], list[int]]) -> None:
         self._numbers, self._groups = numbers, groups
         self._combinations: dict[tuple[int, ...], int] = {}
-        self.others = 0
-        lines, marked = [np.empty((0, 4), np.int64)], [np.empty((0, 2), np.int64)]
+        self.others, found = 0, {_LINE: [np.empty((0, 4), np.int64)], _POINT: [np.empty((0, 3), np.int64)]}
         for kind, rows, which in self._blocks_2() if numbers.layout.old else self._blocks_4():
-            if kind == _LINE:
-                lines.append(np.column_stack([rows, np.broadcast_to(which, len(rows))]))
-            elif kind == _POINT:
-                marked.append(np.column_stack([rows[:, 1], np.broadcast_to(which, len(rows))]))
+            if kind in found:
+                found[kind].append(np.column_stack([rows, np.broadcast_to(which, len(rows))]))
             else:
                 self.others += len(rows)
         numbers.end()
-        self.lines, self.marked = np.concatenate(lines), np.concatenate(marked)
+        self.lines, self.marked = np.concatenate(found[_LINE]), np.concatenate(found[_POINT])[:, 1:]
 
     def _number(self, tags: Iterable[int]) -> int:
         """Return the number of a combination; a negative tag is the same group with reversed orientation, 0 is none."""
@@ -305,16 +312,10 @@ class _Elements:
 
     def _blocks_4(self) -> Iterator[tuple[int, np.ndarray, int]]:
         """Yield the type, rows of tag and nodes, and combination of groups of elements."""
-        numbers, done = self._numbers, 0
-        n_blocks, declared = numbers.sizes(4)[:2].tolist()
-        for _ in range(n_blocks):
-            dimension, entity, kind = numbers.ints(3).tolist()
-            n, width = int(numbers.sizes(1)[0]), 1 + self._nodes_of(kind)
-            done += n
-            rows = numbers.sizes(n * width).reshape(n, width)
+        for dimension, entity, kind, n in self._numbers.blocks("elements"):
+            width = 1 + self._nodes_of(kind)
+            rows = self._numbers.sizes(n * width).reshape(n, width)
             yield kind, rows, self._number(self._groups.get((dimension, entity), ()))
-        if done != declared:
-            raise InputError(f"{numbers.where} declares {declared} elements, its blocks hold {done}")
 
     def _blocks_2(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Elements follow one another in runs of the same type and number of tags: in text, these are searched for."""
@@ -347,8 +348,7 @@ class _Elements:
 
     def joined_lines(self) -> np.ndarray:
         """Return the lines without copies: version 2 lists a line once for each of its groups."""
-        lines = self.lines
-        combinations = list(self._combinations)
+        lines, combinations = self.lines, list(self._combinations)
         grouped = np.array([bool(tags) for tags in combinations] or [False])[lines[:, 3]]
         if not grouped.any():
             return lines
@@ -374,16 +374,9 @@ class _Elements:
         return {name: np.flatnonzero(mask) for name, mask in masks.items()}
 
 
-def _add_data(
-    where: str,
-    payload: bytes,
-    layout: _Layout,
-    what: str,
-    tags: np.ndarray,
-    fields: dict[str, np.ndarray],
-    warnings: list[str],
-) -> None:
-    """Add the field of a section of data, whose head is always text; ``tags`` (n,) of lines or nodes."""
+def _data(where: str, payload: bytes, layout: _Layout) -> tuple[str, np.ndarray, np.ndarray | None]:
+    """Return the name of a section of data, whose head is always text, with its tags (n,) and values (n, 1); without
+    values if they cannot be a field."""
     text = BytesIO(payload)
     words: list[list[bytes]] = []
     for _ in range(3):  # texts, real numbers, whole numbers
@@ -392,21 +385,14 @@ def _add_data(
             raise InputError(f"{where}: {shown(count)!r} is not the number of its tags")
         words.append([text.readline().strip() for _ in range(int(count))])
     name = words[0][0].decode("utf-8", "replace").strip('"') if words[0] else ""
-    where = f"{where} {name!r}"
     if len(words[2]) < 3 or not all(re.fullmatch(rb"\d{1,18}", word) for word in words[2][:3]):
-        raise InputError(f"{where}: expected three whole numbers: time step, components, number of elements")
+        raise InputError(f"{where} {name!r}: expected three whole numbers: time step, components, number of elements")
     if int(words[2][1]) != 1 or not name or "/" in name:
-        warnings.append(f"{where} is left out: a field has a name without slash and one component")
-        return
-    numbers = _Numbers(where, text.read(), layout)
-    own, values = numbers.rows(int(words[2][2]), 1)
+        return name, np.empty(0, np.int64), None
+    numbers = _Numbers(f"{where} {name!r}", text.read(), layout)
+    tags, values = numbers.rows(int(words[2][2]), 1)
     numbers.end()
-    order = np.argsort(own, kind="stable")
-    place, there = places_of(own[order], tags)
-    if there.all() and not np.isnan(values).any():
-        fields[name] = values[order[place], 0]
-    else:
-        warnings.append(f"{where} is left out: it does not have a value for each {what}")
+    return name, tags, values
 
 
 # ---- writing
@@ -431,21 +417,21 @@ def _lines(mesh: WholeMesh) -> Iterator[str]:
         yield from (f'{dimension} {tag} "{_quoted(name)}"' for tag, name in enumerate(groups, 1))
     yield from ("$EndPhysicalNames", "$Entities", f"{len(grouped)} {len(curves)} 0 0")
     for node in grouped.tolist():
-        yield f"{node + 1} {_numbers(mesh.points[node])} {_tags(points[point_of[node]])}"
+        tags = points[point_of[node]]
+        yield _row(node + 1, *mesh.points[node].tolist(), len(tags), *tags)
     for number, groups in enumerate(curves):
         ends = mesh.points[np.unique(mesh.bars[curve_of == number])]
-        yield f"{number + 1} {_numbers(ends.min(axis=0))} {_numbers(ends.max(axis=0))} {_tags(groups)} 0"
+        box = (*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist())
+        yield _row(number + 1, *box, len(groups), *groups, 0)
     n, m = len(mesh.points), len(mesh.bars)
-    yield from ("$EndEntities", "$Nodes", f"1 {n} 1 {n}", f"1 1 0 {n}")
-    yield from map(str, range(1, n + 1))
+    yield from ("$EndEntities", "$Nodes", f"1 {n} 1 {n}", f"1 1 0 {n}", *map(str, range(1, n + 1)))
     yield from (f"{x!r} {y!r} {z!r}" for x, y, z in mesh.points.tolist())
     total = m + len(grouped)
     yield from ("$EndNodes", "$Elements", f"{len(curves) + len(grouped)} {total} 1 {total}")
     for number in range(len(curves)):
         members = np.flatnonzero(curve_of == number)
-        yield f"1 {number + 1} 1 {len(members)}"
-        rows = np.column_stack([members, mesh.bars[members]]) + 1
-        yield from (f"{tag} {a} {b}" for tag, a, b in rows.tolist())
+        rows = (np.column_stack([members, mesh.bars[members]]) + 1).tolist()
+        yield from (f"1 {number + 1} 1 {len(rows)}", *(f"{tag} {a} {b}" for tag, a, b in rows))
     for tag, node in enumerate(grouped.tolist(), m + 1):
         yield from (f"0 {node + 1} 15 1", f"{tag} {node + 1}")
     yield "$EndElements"
@@ -472,12 +458,8 @@ def _combinations(groups: dict[str, np.ndarray], n: int) -> tuple[list[list[int]
     return [found[i] for i in present.tolist()], number.ravel()
 
 
-def _numbers(values: np.ndarray) -> str:
-    return " ".join(repr(value) for value in values.tolist())
-
-
-def _tags(tags: list[int]) -> str:
-    return " ".join(map(str, [len(tags), *tags]))
+def _row(*numbers: float) -> str:
+    return " ".join(map(repr, numbers))
 
 
 def _quoted(name: str) -> str:

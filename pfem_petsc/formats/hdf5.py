@@ -130,8 +130,8 @@ def _content(path: Path, fields: Mapping[str, str] | None) -> _Content:
         for kind, n in (("node_fields", counts[0]), ("bar_fields", counts[1])):
             group = file.get(kind)
             sets = {name: group.get(name) for name in group} if isinstance(group, h5py.Group) else {}
-            sets = {name: data for name, data in sets.items() if isinstance(data, h5py.Dataset) and data.shape == (n,)}
-            known[kind] = [name for name, data in sets.items() if data.dtype.kind in "fiu"]
+            fits = [name for name, data in sets.items() if isinstance(data, h5py.Dataset) and data.shape == (n,)]
+            known[kind] = [name for name in fits if sets[name].dtype.kind in "fiu"]
     check_fields(path, fields, {*known["bar_fields"], *known["node_fields"]})
     return _Content(counts[0], counts[1], groups, known)
 

@@ -15,6 +15,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
-from ._tables import alike, free_name
+from ._common import alike, free_name
 
 SUFFIXES = (".bdf", ".nas", ".dat")
 
@@ -58,14 +59,13 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         raise InputError(f"{path}: GRID {largest}, at which a bar ends: a GRID has at most 8 digits in Nastran")
     ends = np.array(pairs, np.int64)
     labels = np.unique(ends)
-    missing = [label for label in labels.tolist() if label not in deck.nodes]
-    if missing:
-        raise InputError(f"{path}: there is no GRID {missing[0]}, at which a bar ends")
+    for label in [label for label in labels.tolist() if label not in deck.nodes][:1]:
+        raise InputError(f"{path}: there is no GRID {label}, at which a bar ends")
     points = np.array([deck.nodes[label].get_position() for label in labels.tolist()])
     mesh = WholeMesh(points, np.searchsorted(labels, ends))
 
     def told(condition: object, text: str) -> None:
-        mesh.warnings += [f"{path}: {text}"] if condition else []
+        mesh.tell(condition, f"{path}: {text}")
 
     left, cards = len(deck.nodes) - len(labels), _cards(deck, "left out cards that are not read: ")
     told(left, f"left out {left} GRID where no bar ends")
@@ -85,12 +85,12 @@ def _deck(path: Path) -> Any:
         raise InputError(
             f"{path}: Nastran bulk data is read by pyNastran, which is not installed: pip install pyNastran ({error})"
         ) from None
-    lines: list[str] = []
-    deck = BDF(log=SimpleLogger("error", log_func=lambda _, text: lines.append(text)))
+    deck = BDF(log=SimpleLogger("error", log_func=lambda *_: None))
     deck.enable_cards(_READ)
     content = path.read_bytes()
     bulk_only = not re.search(rb"^\s*(CEND|BEGIN\s+BULK)", content, re.MULTILINE | re.IGNORECASE)
     source = _source(path, content)
+    apart = ("elements", "properties", "masses", "materials", "loads", "constraints", "aero", "sets", "optimization")
     try:
         # it prints, and writes a file into the current folder, when an included file is missing
         with (
@@ -99,10 +99,7 @@ def _deck(path: Path) -> Any:
             contextlib.redirect_stdout(io.StringIO()),
         ):
             deck.read_bdf(**source, xref=False, punch=bulk_only)
-            deck.cross_reference(
-                **{f"xref_{what}": False for what in ("elements", "properties", "masses", "materials", "loads")},
-                **{f"xref_{what}": False for what in ("constraints", "aero", "sets", "optimization")},
-            )
+            deck.cross_reference(**{f"xref_{what}": False for what in apart})
     except RecursionError:
         raise InputError(
             f"{path}: coordinate systems ({', '.join(_COORDINATES)}) define each other in a circle"
@@ -160,19 +157,19 @@ def _add_sections(path: Path, mesh: WholeMesh, deck: Any, bars: list[Any], told:
             continue
         group = free_name(sections, "conrod" if of_rod else f"{source.type.lower()}_{source.pid}")
         mesh.bar_groups[group] = np.array(numbers)
-        sections[group] = {"bars": group}
         if not (size := float(source.Area())) >= 0.0:
             card = f"CONROD {bar.eid}" if of_rod else f"{source.type} {source.pid}"
             raise InputError(f"{path}: {card} has the area {size:g}: expected a positive one")
         bare |= set() if size else {group}
-        if size:
-            sections[group]["area"] = area[numbers] = size
-        if source.type == "PTUBE":
-            told(source.OD2 not in (None, source.OD1), f"PTUBE {source.pid} has two diameters: its area is their mean")
-            sections[group] |= {"shape": "tube", "thickness": source.t} if 0.0 < source.t < 0.5 * source.OD1 else {}
+        area[numbers] = size or np.nan
+        tube = source.type == "PTUBE"
+        two = tube and source.OD2 not in (None, source.OD1)
+        told(two, f"PTUBE {source.pid} has two diameters: its area is their mean")
+        shape = {"shape": "tube", "thickness": source.t} if tube and 0.0 < source.t < 0.5 * source.OD1 else {}
+        own = {"area": size} if size else {}
+        sections[group] = {"bars": group, **own, **shape, "material": f"mat1_{source.mid}"}
         mass += len(numbers) * bool(np.any(source.nsm))
         material = deck.materials.get(source.mid)
-        sections[group]["material"] = f"mat1_{source.mid}"
         values = {"young_modulus": "e", "density": "rho", "thermal_expansion": "a"}
         found = {key: float(getattr(material, name, None) or 0.0) for key, name in values.items()}
         found["density"] *= weight
@@ -255,20 +252,18 @@ class _Conditions:
         self._told(unused, f"left out the SPC sets {unused}: the case has {', '.join(map(str, sets)) or 'none'}")
         lines = [(label, str(node.ps or ""), 0.0) for label, node in deck.nodes.items() if label in self._at]
         for card in (card for number in sets for card in deck.spcs.get(number, [])):
-            if card.type == "SPC1":
-                lines += [(label, card.components, 0.0) for label in card.node_ids]
-            else:
-                lines += list(zip(card.node_ids, card.components, card.enforced))
+            one = card.type == "SPC1"
+            lines += zip(
+                card.node_ids, *((repeat(card.components), repeat(0.0)) if one else (card.components, card.enforced))
+            )
         absent = sorted({label for label, *_ in lines} - self._deck.nodes.keys())
         some = ", ".join(map(str, absent[:5])) + (", ..." if len(absent) > 5 else "")
         self._told(absent, f"left out the supports of {len(absent)} GRID that do not exist: {some}")
         for label, components, value in lines:
             i, axes = self._at.get(label, -1), ["123".index(c) for c in str(components) if c in "123"]
-            if i < 0 or not axes:  # of other nodes, and rotations, which bars do not have
-                continue
-            system, every = int(deck.nodes[label].cd), len(axes) == 3
-            for axis in axes:
-                across = np.eye(3)[axis]
+            every = len(axes) == 3
+            for axis in axes if i >= 0 else ():  # of other nodes, and rotations, which bars do not have
+                system, across = int(deck.nodes[label].cd), np.eye(3)[axis]
                 if system and (value or not every):
                     across = self._vector(system, across, f"the support of GRID {label}")
                 own = axis if every else int(abs(across).argmax())
@@ -283,19 +278,18 @@ class _Conditions:
             free = int((~held[:, axis]).sum())
             self._told(free, f"the case holds {free} nodes of a flat truss along {'xyz'[axis]}, as AUTOSPC does")
             held[:, axis] = True
-        tables: dict[str, dict[str, Any]] = {}
-        for row, name in self._tables(np.hstack([held, moved]), lambda row: f"fixed_{_axes(row)}"):
-            motion = {"motion": [[0.0] * 4, [1.0, *row[3:]]], "interpolation": "linear"} if any(row[3:]) else {}
-            tables[name] = {"node_set": name, "fix": _axes(row), **motion}
-        return tables
+        moving = {"interpolation": "linear"}
+        return {
+            name: {"node_set": name, "fix": _axes(row)}
+            | ({"motion": [[0.0] * 4, [1.0, *row[3:]]], **moving} if any(row[3:]) else {})
+            for row, name in self._tables(np.hstack([held, moved]), lambda row: f"fixed_{_axes(row)}")
+        }
 
     def _masses(self) -> dict[str, dict[str, Any]]:
-        values, others = np.zeros((len(self._labels), 1)), 0
-        for card in self._deck.masses.values():
-            i = self._at.get(card.nid, -1)
-            others += i < 0
-            if i >= 0:
-                values[i] += card.mass * _mass_scale(self._deck)
+        values, cards = np.zeros((len(self._labels), 1)), self._deck.masses.values()
+        for card in [card for card in cards if card.nid in self._at]:
+            values[self._at[card.nid]] += card.mass * _mass_scale(self._deck)
+        others = sum(card.nid not in self._at for card in cards)
         self._told(others, f"left out {others} CONM2 where no bar ends")
         found = self._tables(values, lambda _: "mass")
         return {name: {"node_set": name, "value": value} for (value,), name in found}
@@ -313,16 +307,12 @@ class _Conditions:
             ] or [(number, 1.0)]
             used |= {one for one, _ in parts}
             found[name] = self._load_tables(parts)
-        unused = sorted(set(deck.loads) - used)
-        self._told(
-            unused, f"left out the load sets {unused}: the case has {', '.join(map(str, sorted(used))) or 'none'}"
-        )
+        unused, taken = sorted(set(deck.loads) - used), ", ".join(map(str, sorted(used))) or "none"
+        self._told(unused, f"left out the load sets {unused}: the case has {taken}")
         if len(found) == 1:
             return next(iter(found.values()))
-        cases = {}
-        for name, tables in found.items():
-            rows = {"load": list(tables["load"].values()), **tables["gravity"]}
-            cases[name] = {key: value for key, value in rows.items() if value}
+        cases = {name: {"load": list(own["load"].values()), **own["gravity"]} for name, own in found.items()}
+        cases = {name: {key: value for key, value in keys.items() if value} for name, keys in cases.items()}
         return {"load_case": {name: keys for name, keys in cases.items() if keys}}
 
     def _load_tables(self, parts: list[tuple[int, float]]) -> dict[str, dict[str, Any]]:
@@ -349,8 +339,7 @@ class _Conditions:
         return {"load": loads, "gravity": {"gravity": {"acceleration": gravity.tolist()}} if gravity.any() else {}}
 
     def _analysis(self) -> dict[str, dict[str, Any]]:
-        deck = self._deck
-        small = "is linear: the case has large displacements, as all cases do"
+        deck, small = self._deck, "is linear: the case has large displacements, as all cases do"
         match deck.sol:
             case None:
                 return {}

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from itertools import repeat
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 from xml.etree import ElementTree
-from xml.parsers import expat
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -22,8 +22,7 @@ import numpy as np
 from ..errors import InputError
 from ..mesh.slab import check_memory
 from ..mesh.whole import WholeMesh
-from ._numbers import whole_numbers
-from ._polygons import drop_bare_nodes
+from ._common import drop_bare_nodes, whole_numbers
 
 SUFFIXES = (".3mf",)
 
@@ -55,25 +54,18 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
                 model = _Model(f"{path}: {name}", stream)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
         raise InputError(f"{path}: is not 3MF, or damaged ({error}): write it again") from None
-    except (
-        ElementTree.ParseError,
-        expat.ExpatError,
-        LookupError,
-        ValueError,
-    ) as error:  # the last two for unknown encodings
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the last two for unknown encodings
         raise InputError(f"{path}: {error}: the file is damaged: write it again") from None
     return _assembled(path, model)
 
 
 def _model_name(path: Path, archive: zipfile.ZipFile) -> str:
     """Return the name of the model from the relationships of the package."""
-    names = archive.namelist()
-    found = []
+    names, found = archive.namelist(), []
     if "_rels/.rels" in names:
         with _part(path, archive, "_rels/.rels") as stream:
-            found = [
-                e.get("Target", "").lstrip("/") for e in ElementTree.parse(stream).iter() if e.get("Type") == _MODEL
-            ]
+            parts = ElementTree.parse(stream).iter()
+            found = [part.get("Target", "").lstrip("/") for part in parts if part.get("Type") == _MODEL]
     for name in (*found, "3D/3dmodel.model"):
         if name in names:
             return name
@@ -94,41 +86,32 @@ def _part(path: Path, archive: zipfile.ZipFile, name: str) -> IO[bytes]:
 Placed = tuple[str, np.ndarray]
 """An object of a component or item, and its transform (4, 3), applied to rows [x, y, z, 1] from the right."""
 
-
-@dataclass
-class _Texts:
-    """Attributes of the elements of an object, as they are in the file; None for those that are missing."""
-
-    name: str = ""
-    vertices: list[tuple[str | None, ...]] = field(default_factory=list)
-    beams: list[tuple[str | None, ...]] = field(default_factory=list)
-    radius: str | None = None
-    sets: list[tuple[str, list[str | None]]] = field(default_factory=list)
-    components: list[Placed] = field(default_factory=list)
+_ATTRIBUTES = {"vertex": ("x", "y", "z"), "beam": ("v1", "v2", "r1", "r2"), "ref": ("index",)}
 
 
 class _Object:
     """An object: ``points`` (n, 3), ``ends`` (m, 2) and ``radii`` (m, 2) of beams, ``sets`` of beams by name,
-    and ``components``."""
+    and ``components``.
 
-    def __init__(self, where: str, texts: _Texts) -> None:
-        self.name, self.components = texts.name, texts.components
-        self.points = _numbers(texts.vertices, f"{where}: a vertex", 3)
-        table = _numbers(texts.beams, f"{where}: a beam", 4)
+    Parameters
+    ----------
+    texts : by tags, the attributes of the elements in it
+    """
+
+    def __init__(self, where: str, name: str, texts: dict[str, list[Any]]) -> None:
+        self.name, self.components = name, texts["component"]
+        self.points = _numbers(texts["vertex"], f"{where}: a vertex", 3)
+        table = _numbers(texts["beam"], f"{where}: a beam", 4)
         for k in np.flatnonzero(np.isnan(table[:, :2]).any(axis=1))[:1].tolist():
             raise InputError(f"{where}: beam {k} lacks the vertex at one of its ends (v1, v2)")
         self.ends, self.radii = _whole(table[:, :2], len(self.points), f"{where}: beams: vertex"), table[:, 2:]
-        default = _numbers([texts.radius], f"{where}: radius").ravel()
+        default = _numbers(texts["beamlattice"] or [None], f"{where}: radius").ravel()
         for radius in self.radii.T:  # the second radius of a beam is the first one where it is not given
-            radius[:] = np.where(np.isnan(radius), default, radius)
-            default = radius
-        bad = np.flatnonzero(~(self.radii >= 0.0).all(axis=1))
-        if len(bad):
-            raise InputError(
-                f"{where}: beam {bad[0]} has no radius (r1, or radius of the beamlattice) that is positive"
-            )
+            radius[:] = default = np.where(np.isnan(radius), default, radius)
+        for k in np.flatnonzero(~(self.radii >= 0.0).all(axis=1))[:1].tolist():
+            raise InputError(f"{where}: beam {k} has no radius (r1, or radius of the beamlattice) that is positive")
         self.sets = {}
-        for group, numbers in texts.sets:
+        for group, numbers in texts["beamset"]:
             members = _numbers(numbers, f"{where}: beamset {group}").ravel()
             self.sets[group.replace("/", "_")] = _whole(members, len(self.ends), f"{where}: beamset {group}: beam")
 
@@ -140,74 +123,60 @@ class _Model:
     """
 
     def __init__(self, where: str, stream: IO[bytes]) -> None:
-        self.where = where
+        self.where, self.scale, self.triangles = where, 1e-3, 0
+        self.objects: dict[str, _Object] = {}
         self.items: list[Placed] = []
-        self.scale, self.triangles = 1e-3, 0
         self.not_read: list[str] = []
         self.node_groups: dict[str, np.ndarray] = {}
-        self._counts: dict[str, tuple[int, int]] = {}
-        self._texts: dict[str, _Texts] = {}
-        self._current = _Texts()
-        self._metadata: list[list[str]] = []
-        self._namespaces: dict[str, str] = {}
-        self._parser = expat.ParserCreate(namespace_separator=" ")
-        self._parser.buffer_text = True
-        self._parser.StartElementHandler = self._start
-        self._parser.StartNamespaceDeclHandler = lambda prefix, uri: self._namespaces.update({prefix or "": uri})
-        self._parser.ParseFile(stream)
-        self.objects = {number: _Object(f"{where}: object {number}", texts) for number, texts in self._texts.items()}
-        for parts in self._metadata:
-            name, _, numbers = "".join(parts).partition("\n")
-            found = _numbers(numbers.split(), f"{where}: node group {name}").ravel()
-            self.node_groups[name] = _whole(found, 2**53, f"{where}: node group {name}: node")
+        self._sizes: dict[str, np.ndarray] = {}
+        texts, namespaces = defaultdict(list), {}
+        for event, element in ElementTree.iterparse(stream, ("start-ns", "end")):
+            if event == "start-ns":
+                namespaces[element[0]] = element[1]
+                continue
+            get, tag = element.get, element.tag.rpartition("}")[2]
+            match tag:
+                case "vertex" | "beam" | "ref":
+                    texts[tag].append(tuple(map(get, _ATTRIBUTES[tag])))
+                case "triangle":
+                    self.triangles += 1
+                case "beamset":
+                    name = get("name") or get("identifier") or f"beamset_{len(texts[tag])}"
+                    texts[tag].append((name, texts.pop("ref", [])))
+                case "beamlattice":
+                    texts[tag] = [get("radius")]
+                case "component":
+                    texts[tag].append(self._placed(element))
+                case "object":
+                    number = get("id", "")
+                    self.objects[number] = _Object(f"{where}: object {number}", get("name", ""), texts)
+                    texts = defaultdict(list)
+                case "item":
+                    self.items.append(self._placed(element))
+                case "metadata" if get("name", "").partition(":")[2].startswith(_GROUP):
+                    name, _, numbers = (element.text or "").partition("\n")
+                    found = _numbers(numbers.split(), f"{where}: node group {name}").ravel()
+                    self.node_groups[name] = _whole(found, 2**53, f"{where}: node group {name}: node")
+                case "model":
+                    unit = get("unit", "millimeter")
+                    if unit not in _UNITS:
+                        raise InputError(f"{where}: unit {unit!r}; known: {', '.join(_UNITS)}")
+                    self.scale = _UNITS[unit]
+                    required = [namespaces.get(prefix, prefix) for prefix in get("requiredextensions", "").split()]
+                    self.not_read = [uri for uri in required if not uri.startswith(_LATTICES)]
+            element.clear()  # large lattices take memory enough as numbers
 
-    def _start(self, tag: str, attributes: dict[str, str]) -> None:
-        get, current = attributes.get, self._current
-        match tag.rpartition(" ")[2]:
-            case "vertex":
-                current.vertices.append((get("x"), get("y"), get("z")))
-            case "beam":
-                current.beams.append((get("v1"), get("v2"), get("r1"), get("r2")))
-            case "triangle":
-                self.triangles += 1
-            case "ref" if current.sets:
-                current.sets[-1][1].append(get("index"))
-            case "beamset":
-                current.sets.append((get("name") or get("identifier") or f"beamset_{len(current.sets)}", []))
-            case "beamlattice":
-                current.radius = get("radius")
-            case "component":
-                current.components.append(self._placed(attributes))
-            case "object":
-                self._current = self._texts[get("id", "")] = _Texts(get("name", ""))
-            case "item":
-                self.items.append(self._placed(attributes))
-            case "metadata":  # whose text goes on up to the next one, or to the resources
-                parts: list[str] = []
-                self._parser.CharacterDataHandler = parts.append
-                if get("name", "").partition(":")[2].startswith(_GROUP):
-                    self._metadata.append(parts)
-            case "resources":
-                self._parser.CharacterDataHandler = None
-            case "model":
-                unit = get("unit", "millimeter")
-                if unit not in _UNITS:
-                    raise InputError(f"{self.where}: unit {unit!r}; known: {', '.join(_UNITS)}")
-                self.scale = _UNITS[unit]
-                required = [self._namespaces.get(prefix, prefix) for prefix in get("requiredextensions", "").split()]
-                self.not_read = [uri for uri in required if not uri.startswith(_LATTICES)]
-
-    def _placed(self, attributes: dict[str, str]) -> Placed:
-        number = attributes.get("objectid", "")
-        if any(key.rpartition(" ")[2] == "path" for key in attributes):
+    def _placed(self, element: ElementTree.Element) -> Placed:
+        number = element.get("objectid", "")
+        if any(key.rpartition("}")[2] == "path" for key in element.attrib):
             raise InputError(
                 f"{self.where}: object {number} is in another part of the file (production extension), which is not "
                 "read: export without it"
             )
-        numbers = attributes.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
+        numbers = element.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
         return number, _numbers([tuple(numbers)], f"{self.where}: transform of object {number}", 12).reshape(4, 3)
 
-    def count(self, number: str, depth: int = 0) -> tuple[int, int]:
+    def sizes(self, number: str, depth: int = 0) -> np.ndarray:
         """Return how many objects and components an object consists of, and the number of vertices of those with beams.
 
         Raises
@@ -219,15 +188,14 @@ class _Model:
             raise InputError(f"{self.where}: there is no object {number}, which the build or a component names")
         if depth > _DEEPEST:
             raise InputError(f"{self.where}: object {number} is a component of itself")
-        if number not in self._counts:
+        if number not in self._sizes:
             found = self.objects[number]
-            parts = [self.count(other, depth + 1) for other, _ in found.components]
-            nodes = len(found.points) * bool(len(found.ends)) + sum(part[1] for part in parts)
-            self._counts[number] = 1 + sum(part[0] for part in parts), nodes
-        return self._counts[number]
+            own = np.array([1, len(found.points) * bool(len(found.ends))], object)
+            self._sizes[number] = own + sum(self.sizes(other, depth + 1) for other, _ in found.components)
+        return self._sizes[number]
 
     def placed(self, number: str, place: np.ndarray) -> Iterator[tuple[_Object, np.ndarray]]:
-        """Return content and transform (4, 3) of an object and its components, those that have beams."""
+        """Yield content and transform (4, 3) of an object and its components, those that have beams."""
         found = self.objects[number]
         if len(found.ends):
             yield found, place
@@ -247,26 +215,23 @@ def _numbers(rows: Sequence[str | tuple[str | None, ...] | None], what: str, wid
 
 
 def _whole(values: np.ndarray, n: int, what: str) -> np.ndarray:
-    return whole_numbers(
-        values, 0, n, lambda found: f"{what} {found} is not there; they are numbered from 0 to {n - 1}"
-    )
+    return whole_numbers(values, 0, n, f"{what} ", f" is not there; they are numbered from 0 to {n - 1}")
 
 
 def _assembled(path: Path, model: _Model) -> WholeMesh:
     """Return the lattices of all items of the build as one mesh."""
-    counts = [model.count(number) for number, _ in model.items]
-    instances = sum(count for count, _ in counts)
+    instances, nodes = sum((model.sizes(number) for number, _ in model.items), np.array([0, 0], object))
     if instances > _INSTANCES:
         raise InputError(
             f"{model.where}: the build places {instances:,} objects and components, and at most {_INSTANCES:,} are "
             "read: write the lattice as fewer, larger objects"
         )
-    check_memory(sum(nodes for _, nodes in counts), str(path))
+    check_memory(nodes, str(path))
     placed = [each for item in model.items for each in model.placed(*item)]
     if not placed:
         raise InputError(f"{path}: has no beam lattice; a surface of triangles is read from STL")
     points, bars, radii = [], [], []
-    groups: dict[str, dict[str, list[np.ndarray]]] = {"node_groups": {}, "bar_groups": {}}
+    node_groups, bar_groups = defaultdict(list), defaultdict(list)
     n_nodes = n_bars = 0
     for k, (found, place) in enumerate(placed):
         own = found.points * model.scale
@@ -275,34 +240,27 @@ def _assembled(path: Path, model: _Model) -> WholeMesh:
         points.append(own)
         bars.append(found.ends + n_nodes)
         radii.append(found.radii * (abs(np.linalg.det(place[:3])) ** (1.0 / 3.0) * model.scale))
-        sets = dict(found.sets)
-        if len(placed) > 1:
-            name = found.name or f"object_{k}"
-            sets[name] = np.concatenate([sets.get(name, np.empty(0, np.int64)), np.arange(len(found.ends))])
-        for group, members in sets.items():
-            groups["bar_groups"].setdefault(group, []).append(members + n_bars)
+        whole = [(found.name or f"object_{k}", np.arange(len(found.ends)))] if len(placed) > 1 else []
+        for group, members in (*found.sets.items(), *whole):
+            bar_groups[group].append(members + n_bars)
         for group, members in model.node_groups.items():
-            groups["node_groups"].setdefault(group, []).append(members[members < len(own)] + n_nodes)
+            node_groups[group].append(members[members < len(own)] + n_nodes)
         n_nodes, n_bars = n_nodes + len(own), n_bars + len(found.ends)
-    mesh = WholeMesh(np.concatenate(points), np.concatenate(bars))
-    for kind, named in groups.items():
-        setattr(mesh, kind, {name: np.unique(np.concatenate(parts)) for name, parts in named.items()})
+    groups = [{name: np.unique(np.concatenate(parts)) for name, parts in every.items()}
+              for every in (node_groups, bar_groups)]  # fmt: skip
+    mesh = WholeMesh(np.concatenate(points), np.concatenate(bars), *groups)
     one, two = np.concatenate(radii).T
     area = np.where(one == two, np.pi * one * one, np.pi / 3.0 * (one * one + one * two + two * two))
     if (area > 0.0).all():
         mesh.bar_fields["area"] = area
-    mesh.warnings += [f"{path}: requires the extension {uri}, which is not read" for uri in model.not_read]
-    if (one != two).any():
-        mesh.warnings.append(
-            f"{path}: {int((one != two).sum())} beams whose radii differ have a constant area, with the same volume"
-        )
-    if model.triangles:
-        mesh.warnings.append(f"{path}: left out {model.triangles} triangles")
+    cones = int((one != two).sum())
+    mesh.warnings = [f"{path}: requires the extension {uri}, which is not read" for uri in model.not_read]
+    mesh.tell(cones, f"{path}: {cones} beams whose radii differ have a constant area, with the same volume")
+    mesh.tell(model.triangles, f"{path}: left out {model.triangles} triangles")
     drop_bare_nodes(path, mesh)
     return mesh
 
 
-_OWN = "urn:pfem_petsc"
 _TYPES = (
     '<?xml version="1.0" encoding="UTF-8"?>\n'
     '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">'
@@ -342,8 +300,8 @@ def write(path: Path, mesh: WholeMesh) -> None:
 
 
 def _model_text(mesh: WholeMesh, radius: np.ndarray) -> Iterator[str]:
-    yield '<?xml version="1.0" encoding="UTF-8"?>\n<model unit="meter" xml:lang="en-US"'
-    yield f' xmlns="{_CORE}" xmlns:b="{_LATTICES}2017/02" xmlns:own="{_OWN}" requiredextensions="b">\n'
+    names = f'xmlns="{_CORE}" xmlns:b="{_LATTICES}2017/02" xmlns:own="urn:pfem_petsc" requiredextensions="b"'
+    yield f'<?xml version="1.0" encoding="UTF-8"?>\n<model unit="meter" xml:lang="en-US" {names}>\n'
     for number, (name, members) in enumerate(mesh.node_groups.items()):
         numbers = " ".join(map(str, members.tolist()))
         yield f'<metadata name="own:{_GROUP}{number}" type="xs:string">{escape(name)}\n{numbers}</metadata>\n'
@@ -353,12 +311,9 @@ def _model_text(mesh: WholeMesh, radius: np.ndarray) -> Iterator[str]:
     shortest = _SHORT * float(length.min(initial=1.0))
     yield f'</vertices>\n<triangles/>\n<b:beamlattice radius="{float(radius[0])!r}" minlength="{shortest!r}"'
     yield ' cap="sphere">\n<b:beams>\n'
-    if (radius == radius[0]).all():
-        yield "".join(f'<b:beam v1="{a}" v2="{b}"/>\n' for a, b in mesh.bars.tolist())
-    else:
-        rows = zip(mesh.bars.tolist(), radius.tolist(), strict=True)
-        yield "".join(f'<b:beam v1="{a}" v2="{b}" r1="{r!r}" r2="{r!r}"/>\n' for (a, b), r in rows)
-    yield "</b:beams>\n"
+    same = (radius == radius[0]).all()
+    radii = repeat("") if same else (f' r1="{r!r}" r2="{r!r}"' for r in radius.tolist())
+    yield "".join(f'<b:beam v1="{a}" v2="{b}"{r}/>\n' for (a, b), r in zip(mesh.bars.tolist(), radii)) + "</b:beams>\n"
     if mesh.bar_groups:
         yield "<b:beamsets>\n"
         for number, (name, members) in enumerate(mesh.bar_groups.items()):

@@ -7,8 +7,8 @@ array of strings named ``group_names`` or ``section_names`` replaces these names
 same names define node groups (a negative value: no group). An array named ``group:NAME`` is the group NAME of those
 with a value other than 0; these may overlap. Other arrays with one component are fields of bars and nodes.
 
-VTK reads, STL files too (:mod:`~pfem_petsc.formats.stl`), in a process of its own, because it aborts the process on
-some damaged files. That process runs this module as a program, which therefore imports no MPI.
+VTK reads in a process of its own, because it aborts the process on some damaged files. That process runs this module as
+a program, which therefore imports no MPI.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from ..errors import InputError
-from ._polygons import drop_bare_nodes, edges
+from ._common import drop_bare_nodes, edges
 
 if TYPE_CHECKING:
     import pyvista
@@ -72,19 +72,18 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
         raise InputError(f"{path}: cannot be read with VTK ({last[0]}); is VTK 9.2 or newer installed?")
     arrays = pickle.loads(done.stdout)
-    left_out, snapshots, faces = (arrays.pop(name) for name in ("left_out", "snapshots", "faces"))
-    mesh = WholeMesh(points=arrays.pop("points"), bars=arrays.pop("bars"))
+    names = ("left_out", "snapshots", "faces", "points", "bars")
+    left_out, snapshots, faces, points, bars = (arrays.pop(name) for name in names)
+    mesh = WholeMesh(points, bars)
     for key, values in arrays.items():
         kind, _, name = key.partition("/")
         getattr(mesh, kind)[name] = values
-    if faces:
-        mesh.warnings.append(f"{path}: has no lines: the {len(mesh.bars)} edges of its {faces} faces are bars")
-    if left_out:
-        mesh.warnings.append(f"{path}: left out {left_out} cells that are not {'faces' if faces else 'lines'}")
+    mesh.tell(faces, f"{path}: has no lines: the {len(mesh.bars)} edges of its {faces} faces are bars")
+    mesh.tell(left_out, f"{path}: left out {left_out} cells that are not {'faces' if faces else 'lines'}")
     if left_out or faces:
         drop_bare_nodes(path, mesh)
-    if snapshots > 1:
-        mesh.warnings.append(f"{path}: has {snapshots} snapshots: the mesh and its fields are those of the last one")
+    several = snapshots > 1
+    mesh.tell(several, f"{path}: has {snapshots} snapshots: the mesh and its fields are those of the last one")
     return mesh
 
 
@@ -103,8 +102,6 @@ def _extract(path: str) -> int:
             from vtkmodules.vtkIOXML import vtkXMLPolyDataReader as Reader
         case ".vtk":
             from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader as Reader
-        case ".stl":
-            from vtkmodules.vtkIOGeometry import vtkSTLReader as Reader
         case _:
             from vtkmodules.vtkIOHDF import vtkHDFReader as Reader
 
@@ -172,10 +169,9 @@ def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
     if n_nodes == 0 or n_cells == 0:
         raise ValueError(f"{n_nodes} points and {n_cells} cells: not a mesh of bars, or a damaged file")
     kinds = vtk_to_numpy(grid.GetCellTypesArray())
-    cells = np.flatnonzero((kinds == _LINE) | (kinds == _POLY_LINE))
-    of_faces = len(cells) == 0
-    if of_faces:
-        cells = np.flatnonzero(np.isin(kinds, _FACES))
+    lines = np.isin(kinds, (_LINE, _POLY_LINE))
+    of_faces = not lines.any()
+    cells = np.flatnonzero(np.isin(kinds, _FACES) if of_faces else lines)
     if len(cells) == 0:
         raise ValueError(
             f"cells of types {np.unique(kinds).tolist()}; bars are lines (type 3) or edges of faces (types 5, 7, 9), "
@@ -199,8 +195,7 @@ def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
     bars = ends[np.stack([start + one, start + (one + 1) % np.repeat(size, count)], axis=1)].astype(np.int64)
     yield "points", vtk_to_numpy(grid.GetPoints().GetData()).astype(np.float64)
     yield "bars", edges(bars)[0] if of_faces else bars
-    yield "faces", len(cells) if of_faces else 0
-    yield "left_out", n_cells - len(cells)
+    yield from (("faces", len(cells) if of_faces else 0), ("left_out", n_cells - len(cells)))
     of_nodes, of_bars = ("node", grid.GetPointData(), slice(None)), ("bar", grid.GetCellData(), lines)
     for kind, data, kept in (of_nodes,) if of_faces else (of_nodes, of_bars):
         for name, members in _groups_of(data, texts, kept).items():
@@ -227,18 +222,14 @@ def _groups_of(data: Any, fields: Any, kept: slice | np.ndarray) -> dict[str, np
         for name, values in arrays.items()
         if name.startswith(_MASK) and len(name) > len(_MASK)
     }
-    for array in _NAMED:
-        if data.GetArray(array) is None:
-            continue
+    for array in [name for name in _NAMED if data.GetArray(name) is not None]:
         values = arrays.get(array)
         if values is None or not np.array_equal(values, np.rint(values)):
             raise ValueError(f"array {array!r} must hold one whole number for each")
-        values = values[kept]
-        names = fields.GetAbstractArray(f"{array}_names")
+        values, names = values[kept].astype(np.int64), fields.GetAbstractArray(f"{array}_names")
         n_names = names.GetNumberOfValues() if names is not None and names.IsA("vtkStringArray") else 0
-        for value in np.unique(values[values >= 0]):
-            i = int(value)
-            groups[names.GetValue(i) if i < n_names else f"{array}_{i}"] = np.flatnonzero(values == value)
+        for i in np.unique(values[values >= 0]).tolist():
+            groups[names.GetValue(i) if i < n_names else f"{array}_{i}"] = np.flatnonzero(values == i)
     return groups
 
 
@@ -314,13 +305,17 @@ def _write_vtkhdf(path: Path, mesh: WholeMesh) -> None:
         root = file.create_group("VTKHDF", track_order=True)
         root.attrs["Version"] = np.array([1, 0], np.int64)
         root.attrs.create("Type", b"UnstructuredGrid", dtype=h5py.string_dtype("ascii", 16))
-        sizes = {"NumberOfPoints": len(mesh.points), "NumberOfCells": n, "NumberOfConnectivityIds": 2 * n}
-        for name, size in sizes.items():
-            root[name] = np.array([size], np.int64)
-        root["Points"] = np.asarray(mesh.points, np.float64)
-        root["Connectivity"] = np.asarray(mesh.bars, np.int64).ravel()
-        root["Offsets"] = np.arange(0, 2 * n + 1, 2, dtype=np.int64)
-        root["Types"] = np.full(n, _LINE, np.uint8)
+        datasets = {
+            "NumberOfPoints": np.array([len(mesh.points)], np.int64),
+            "NumberOfCells": np.array([n], np.int64),
+            "NumberOfConnectivityIds": np.array([2 * n], np.int64),
+            "Points": np.asarray(mesh.points, np.float64),
+            "Connectivity": np.asarray(mesh.bars, np.int64).ravel(),
+            "Offsets": np.arange(0, 2 * n + 1, 2, dtype=np.int64),
+            "Types": np.full(n, _LINE, np.uint8),
+        }
+        for name, values in datasets.items():
+            root[name] = values
         for kind, arrays in _data(mesh).items():
             # in the order in which they are given
             group = root.create_group({"cell_data": "CellData", "point_data": "PointData"}[kind], track_order=True)

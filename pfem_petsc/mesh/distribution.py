@@ -38,6 +38,7 @@ class Block:
     stop: int
 
 
+@dataclass(eq=False)
 class DistributedMesh:
     """One rank's part of a distributed mesh; created by :func:`distribute`.
 
@@ -50,8 +51,8 @@ class DistributedMesh:
     """Nodes of the whole mesh."""
     n_bars: int
     """Bars of the whole mesh."""
-    n_connectors: int = 0
-    """Of these the last ones are springs and dashpots."""
+    partitioner: str
+    """The partitioner, for the log."""
     n_owned: int
     n_local: int
     first_node: int
@@ -62,26 +63,25 @@ class DistributedMesh:
     """(n_ghost,) int64: PETSc numbers of the ghosts."""
     points: np.ndarray
     """(n_local, 3) float64 [m]: reference positions."""
+    node_groups: dict[str, np.ndarray]
+    """int32 local indices of owned members, ascending."""
     bars: np.ndarray
     """(b, 2) int32: local ends, in the order of the mesh."""
     bar_ids: np.ndarray
     """(b,) mesh numbers: int64, or the smallest sufficient integer type."""
     blocks: list[Block]
     """By section, ascending; only sections with local bars."""
-    node_groups: dict[str, np.ndarray]
-    """int32 local indices of owned members, ascending."""
     bar_groups: dict[str, np.ndarray]
     """int32 local bar indices, ascending."""
     bar_fields: dict[str, np.ndarray]
     """(b,) float64: values of local bars."""
-    partitioner: str
-    """The partitioner, for the log."""
+    _exchange: GhostExchange
+    n_connectors: int = 0
+    """Of the bars the last ones are springs and dashpots."""
     volume: float | None = None
     """What a lattice fills [m3]; None for other meshes."""
     filled: float | None = None
     """Volume of the cells whose struts are left in a surface [m3]."""
-
-    _exchange: GhostExchange
 
     @cached_property
     def counted(self) -> slice | np.ndarray:
@@ -153,87 +153,66 @@ def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, keep: bo
     DistributedMesh
         Reproducible for the same mesh and number of ranks.
     """
-    mesh = DistributedMesh()
-    mesh.comm = comm
-    mesh.n_nodes, mesh.n_bars, mesh.volume, mesh.filled = slab.n_nodes, slab.n_bars, slab.volume, slab.filled
-    bar_section = np.asarray(bar_section, dtype=np.int32)
-    if comm.size == 1:
-        mesh.partitioner = "none (one rank)"
-        _alone(mesh, slab, bar_section, keep)
-    else:
-        owners, mesh.partitioner = partition(slab, comm)
-        _among_ranks(mesh, slab, bar_section, owners, keep)
-    return mesh
-
-
-def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, keep: bool) -> None:
-    """Reorder nodes and bars on one rank, with few temporary arrays of the size of the mesh."""
-    order = np.argsort(sweep_keys(slab.points if slab.undisturbed is None else slab.undisturbed), kind="stable")
-    place = np.empty(len(order), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    mesh.n_owned = mesh.n_local = slab.n_nodes
-    mesh.first_node = 0
-    mesh.node_ids = order.astype(np.int64, copy=False)
-    mesh.ghost_numbers = np.empty(0, np.int64)
-    mesh.points = slab.points[order]
-    if not keep:
-        slab.points, slab.undisturbed = slab.points[:0].copy(), None
-    mesh._exchange = GhostExchange(mesh.comm, np.array([0, slab.n_nodes]), mesh.ghost_numbers)
-    mesh.node_groups = {name: np.sort(place[members]) for name, members in slab.node_groups.items()}
-    groups = {name: _membership(members, len(slab.bars)) for name, members in slab.bar_groups.items()}
-    ends = place[slab.bars]
-    if not keep:
-        slab.bars = slab.bars[:0].copy()
-    del place
-    _arrange_bars(mesh, ends, None, section, groups, slab.bar_fields)
-
-
-def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray, keep: bool) -> None:
-    """Distribute over several ranks: number nodes on their owners, then send bars to the owners of their ends."""
-    comm = mesh.comm
+    owners, partitioner = partition(slab, comm)
+    # nodes are numbered on their owners
     to_owner = Router(comm, owners)
     ids = to_owner.send(np.arange(slab.first_node, slab.first_node + len(owners)))
-    points = to_owner.send(slab.points)
-    places = points if slab.undisturbed is None else to_owner.send(slab.undisturbed)
+    own_points = to_owner.send(slab.points)
+    places = own_points if slab.undisturbed is None else to_owner.send(slab.undisturbed)
     if not keep:
         slab.points, slab.undisturbed = slab.points[:0].copy(), None
     order = np.lexsort((ids, sweep_keys(places, sweep_axes(*bounding_box(places, comm)))))
     del places
     n_owned = len(ids)
     starts = np.concatenate([[0], np.cumsum(comm.allgather(n_owned))]).astype(np.int64)
+    first, last = starts[comm.rank], starts[comm.rank + 1]
     numbers = np.empty(n_owned, np.int64)
-    numbers[order] = np.arange(starts[comm.rank], starts[comm.rank + 1])
+    numbers[order] = np.arange(first, last)
     # The directory has the PETSc numbers (and with `starts` the owners) of the slab's nodes on the rank of the slab.
     directory = to_owner.reply(numbers)
     del to_owner, numbers
 
-    bars, bar_ids, section, groups, fields = _fetch_bars(slab, section, directory, starts, comm, keep)
-
-    first, last = starts[comm.rank], starts[comm.rank + 1]
-    elsewhere = bars[(bars < first) | (bars >= last)]
-    ghosts = np.unique(elsewhere)
+    # bars go to the owners of their ends
+    bars, *of_bars = _fetch_bars(slab, np.asarray(bar_section, dtype=np.int32), directory, starts, comm, keep)
+    outside = (bars < first) | (bars >= last)
+    ghosts = np.unique(bars[outside]).astype(np.int64)
     ends = (bars - first).astype(np.int32)
-    ends[(bars < first) | (bars >= last)] = n_owned + np.searchsorted(ghosts, elsewhere)
-    del bars, elsewhere
+    ends[outside] = n_owned + np.searchsorted(ghosts, bars[outside])
+    del bars, outside
 
-    mesh.n_owned, mesh.n_local, mesh.first_node = n_owned, n_owned + len(ghosts), int(first)
-    mesh.ghost_numbers = ghosts.astype(np.int64)
-    mesh._exchange = GhostExchange(comm, starts, mesh.ghost_numbers)
-    mesh.points = np.empty((mesh.n_local, 3))
-    mesh.points[:n_owned] = points[order]
-    mesh.update_ghosts(mesh.points)
+    n_local, exchange = n_owned + len(ghosts), GhostExchange(comm, starts, ghosts)
     # Mesh numbers are far below 2^53, so they are exact as floating-point numbers.
-    travelling = np.empty((mesh.n_local, 1))
-    travelling[:n_owned, 0] = ids[order]
-    mesh.update_ghosts(travelling)
-    mesh.node_ids = travelling[:, 0].astype(np.int64)
-
-    _arrange_bars(mesh, ends, bar_ids, section, groups, fields)
-    mesh.node_groups = {}
+    points, travelling = np.empty((n_local, 3)), np.empty((n_local, 1))
+    points[:n_owned], travelling[:n_owned, 0] = own_points[order], ids[order]
+    exchange.update(points)
+    exchange.update(travelling)
+    node_groups = {}
     for name, members in slab.node_groups.items():
         member_numbers = directory[members - slab.first_node]
         arrived = Router(comm, _owner(member_numbers, starts)).send(member_numbers)
-        mesh.node_groups[name] = np.sort(arrived - first).astype(np.int32)
+        node_groups[name] = np.sort(arrived - first).astype(np.int32)
+    bars, bar_ids, blocks, bar_groups, bar_fields = _arranged(ends, *of_bars, n_owned, n_local)
+    return DistributedMesh(
+        comm=comm,
+        n_nodes=slab.n_nodes,
+        n_bars=slab.n_bars,
+        partitioner=partitioner,
+        n_owned=n_owned,
+        n_local=n_local,
+        first_node=int(first),
+        node_ids=travelling[:, 0].astype(np.int64),
+        ghost_numbers=ghosts,
+        points=points,
+        node_groups=node_groups,
+        bars=bars,
+        bar_ids=bar_ids,
+        blocks=blocks,
+        bar_groups=bar_groups,
+        bar_fields=bar_fields,
+        _exchange=exchange,
+        volume=slab.volume,
+        filled=slab.filled,
+    )
 
 
 def _fetch_bars(
@@ -268,34 +247,30 @@ def _fetch_bars(
     return to_owners.send(numbers), ids, to_owners.send(section), groups, fields
 
 
-def _arrange_bars(
-    mesh: DistributedMesh,
+def _arranged(
     ends: np.ndarray,
-    bar_ids: np.ndarray | None,
+    bar_ids: np.ndarray,
     section: np.ndarray,
     groups: dict[str, np.ndarray],
     fields: dict[str, np.ndarray],
-) -> None:
-    """Sort the local bars by section, counted bars first, then for locality; ``bar_ids`` None: 0, 1, ..."""
-    borrowed = ends[:, 0] >= mesh.n_owned
-    kind = None
+    n_owned: int,
+    n_local: int,
+) -> tuple[np.ndarray, np.ndarray, list[Block], dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return bars, mesh numbers, blocks, groups and fields sorted by section, counted bars first, then for locality."""
+    borrowed, kind = ends[:, 0] >= n_owned, None
     if borrowed.any() or (len(section) and section.min() != section.max()) or section[:1].any():
-        kind = 2 * section
-        kind += borrowed
+        kind = 2 * section + borrowed
     del borrowed
-    order = bar_order(ends, kind, mesh.n_local)
-    mesh.bars = ends[order]
-    mesh.bar_ids = (order if bar_ids is None else bar_ids[order]).astype(index_type(mesh.n_bars), copy=False)
-    mesh.bar_groups = {name: np.flatnonzero(mask[order]).astype(np.int32) for name, mask in groups.items()}
-    mesh.bar_fields = {name: values[order] for name, values in fields.items()}
+    order = bar_order(ends, kind, n_local)
     counts = np.bincount(kind) if kind is not None else np.array([len(ends)])
     counts = np.append(counts, np.zeros(len(counts) % 2, counts.dtype)).reshape(-1, 2)
-    mesh.blocks = []
-    start = 0
+    blocks, start = [], 0
     for number, (counted, others) in enumerate(counts.tolist()):
         if counted + others:
-            mesh.blocks.append(Block(number, start, start + counted, start + counted + others))
-            start += counted + others
+            blocks.append(Block(number, start, start + counted, start + counted + others))
+        start += counted + others
+    members = {name: np.flatnonzero(mask[order]).astype(np.int32) for name, mask in groups.items()}
+    return ends[order], bar_ids[order], blocks, members, {name: values[order] for name, values in fields.items()}
 
 
 def _membership(members: np.ndarray, n: int) -> np.ndarray:
@@ -351,38 +326,30 @@ def bars_of_group(case: Case, mesh: DistributedMesh, key: str, name: str) -> np.
 
 
 def _members_of(case: Case, where: str, node_set: NodeSet, mesh: DistributedMesh) -> np.ndarray:
-    points = mesh.points[: mesh.n_owned]
-    ids = mesh.node_ids[: mesh.n_owned]
+    points, ids = mesh.points[: mesh.n_owned], mesh.node_ids[: mesh.n_owned]
     if node_set.nearest is not None:
         distance = np.linalg.norm(points - np.array(node_set.nearest), axis=1)
-        best = (np.inf, -1)
-        if len(distance):
-            shortest = distance.min()
-            best = (float(shortest), int(ids[distance == shortest].min()))
-        winner = min(entry for entry in mesh.comm.allgather(best) if entry[1] >= 0)
-        return np.flatnonzero(ids == winner[1])
+        shortest = float(distance.min(initial=np.inf))
+        best = shortest, int(ids[distance == shortest].min(initial=mesh.n_nodes))
+        _, winner = min(mesh.comm.allgather(best))
+        return np.flatnonzero(ids == winner)
     if node_set.box is not None:
-        low, high = np.array(node_set.box[0]), np.array(node_set.box[1])
+        low, high = map(np.array, node_set.box)
         return np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     if node_set.group is not None:
-        groups = sorted(mesh.node_groups)
         if node_set.group in mesh.node_groups:
             return np.sort(mesh.node_groups[node_set.group])
-        bars = mesh.bar_groups.get(node_set.group)
-        if bars is not None:
-            ends = np.unique(mesh.bars[bars])
+        if node_set.group in mesh.bar_groups:
+            ends = np.unique(mesh.bars[mesh.bar_groups[node_set.group]])
             return ends[ends < mesh.n_owned]
-        known = groups + sorted(mesh.bar_groups)
-        hint = group_hint(case, node_set.group, known)
+        hint = group_hint(case, node_set.group, [*sorted(mesh.node_groups), *sorted(mesh.bar_groups)])
         raise InputError(f"{where}.group = {node_set.group!r}: no such group in the mesh{hint}")
     if node_set.selection is not None:
         return np.sort(mesh.node_groups[str(node_set.selection)])
     if node_set.indices is not None:
         wanted = np.array(node_set.indices, dtype=np.int64)
         outside = wanted[(wanted < 0) | (wanted >= mesh.n_nodes)]
-        if len(outside):
-            raise InputError(
-                f"{where}.indices: node {outside[0]} does not exist; the mesh has nodes 0 to {mesh.n_nodes - 1}"
-            )
+        for node in outside[:1]:
+            raise InputError(f"{where}.indices: node {node} does not exist; the mesh has nodes 0 to {mesh.n_nodes - 1}")
         return np.flatnonzero(np.isin(ids, wanted))
     return np.arange(mesh.n_owned)

@@ -71,16 +71,10 @@ class Router:
         # One item is one row, so that the counts stay within the 32-bit integers of MPI.
         row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))).Commit()
         try:
-            self._comm.Alltoallv(
-                [rows, (leaving, _starts(leaving)), row], [received, (arriving, _starts(arriving)), row]
-            )
+            self._comm.Alltoallv([rows, leaving, row], [received, arriving, row])
         finally:
             row.Free()
         return received
-
-
-def _starts(counts: np.ndarray) -> np.ndarray:
-    return np.concatenate([[0], np.cumsum(counts)[:-1]])
 
 
 @dataclass
@@ -264,12 +258,10 @@ def swap(comm: MPI.Comm, ranks: np.ndarray, rows: np.ndarray) -> np.ndarray:
     Row i goes to rank ``ranks[i]``, which sends the same number of rows to this rank, in the same order.
     """
     order = np.argsort(ranks, kind="stable")
-    there, counts = np.unique(ranks, return_counts=True)
-    leaving, ends = np.ascontiguousarray(rows[order]), np.cumsum(counts)
+    leaving, parts = np.ascontiguousarray(rows[order]), _neighbours(np.bincount(ranks, minlength=comm.size))
     arriving = np.empty_like(leaving)
-    parts = [(int(rank), slice(end - count, end)) for rank, count, end in zip(there, counts, ends, strict=True)]
-    requests = [comm.Irecv(arriving[part], rank, _TAG - 1) for rank, part in parts]
-    requests += [comm.Isend(leaving[part], rank, _TAG - 1) for rank, part in parts]
+    requests = [comm.Irecv(arriving[a:b], rank, _TAG - 1) for rank, a, b in parts]
+    requests += [comm.Isend(leaving[a:b], rank, _TAG - 1) for rank, a, b in parts]
     MPI.Request.Waitall(requests)
     result = np.empty_like(arriving)
     result[order] = arriving

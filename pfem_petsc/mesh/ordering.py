@@ -265,7 +265,7 @@ _BARS_SENT = 1 << 18  # number of bars whose ends are sent at a time, to keep te
 
 
 def partition(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, str]:
-    """Compute the owner, among several ranks, of every node of this rank's slab. Collective.
+    """Compute the owner of every node of this rank's slab. Collective.
 
     PT-Scotch cuts few bars, for equal numbers of nodes. A space-filling curve through the nodes divided into parts of
     equal work, independent of the slabs, serves structured meshes, a PETSc without PT-Scotch, and meshes of which a
@@ -277,12 +277,18 @@ def partition(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, str]:
     -------
     owners : (nodes of the slab,) int32
     used : str
-        ``"ptscotch"`` or ``"coordinates"``, for the log.
+        ``"ptscotch"``, ``"coordinates"`` or ``"none (one rank)"``, for the log.
     """
+    if comm.size == 1:
+        return np.zeros(len(slab.points), np.int32), "none (one rank)"
+    works = _works(slab, comm)
     owners = None if slab.structured else _by_graph(slab, comm)
-    if owners is not None and _is_even(owners, slab, comm):
-        return owners, "ptscotch"
-    return _by_coordinates(slab, _works(slab, comm), comm), "coordinates"
+    if owners is not None:
+        shares = np.bincount(owners, weights=works, minlength=comm.size)
+        comm.Allreduce(MPI.IN_PLACE, shares)
+        if shares.max() <= UNEVEN * shares.mean():
+            return owners, "ptscotch"
+    return _by_coordinates(slab, works, comm), "coordinates"
 
 
 def bounding_box(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
@@ -301,13 +307,6 @@ def _works(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
         ends = Router(comm, slab_of(ends, slab.n_nodes, comm.size)).send(ends)
         works += np.bincount(ends - slab.first_node, minlength=len(slab.points))
     return works
-
-
-def _is_even(owners: np.ndarray, slab: MeshSlab, comm: MPI.Comm) -> bool:
-    """Return whether the ranks have about the same work. Collective."""
-    shares = np.bincount(owners, weights=_works(slab, comm), minlength=comm.size)
-    comm.Allreduce(MPI.IN_PLACE, shares)
-    return bool(shares.max() <= UNEVEN * shares.mean())
 
 
 def _by_coordinates(slab: MeshSlab, works: np.ndarray, comm: MPI.Comm) -> np.ndarray:
@@ -371,13 +370,8 @@ def _adjacency(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
         ends = np.concatenate([bars, bars[:, ::-1]]).astype(np.int64)
         ends = Router(comm, slab_of(ends[:, 0], slab.n_nodes, comm.size)).send(ends)
         parts.append((ends[:, 0] - slab.first_node) * slab.n_nodes + ends[:, 1])
-    pairs = np.concatenate([np.empty(0, np.int64), *parts])
+    node, neighbour = np.divmod(np.unique(np.concatenate([np.empty(0, np.int64), *parts])), slab.n_nodes)
     del parts
-    pairs.sort()
-    if len(pairs):
-        pairs = pairs[np.append(True, pairs[1:] != pairs[:-1])]
-    node, neighbour = np.divmod(pairs, slab.n_nodes)
-    del pairs
     rows = np.zeros(len(slab.points) + 1, PETSc.IntType)
     rows[1:] = np.cumsum(np.bincount(node, minlength=len(slab.points)))
     return rows, neighbour.astype(PETSc.IntType)

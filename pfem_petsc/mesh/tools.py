@@ -70,8 +70,7 @@ def coincident(points: np.ndarray, tolerance: float, source: str = "mesh") -> np
     tolerance : distance [m] up to which two nodes coincide, also through a third one; 0: equal coordinates
     source : of the nodes, for messages
     """
-    if not np.isfinite(points).all():
-        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+    for bad in np.flatnonzero(~np.isfinite(points).all(axis=1))[:1]:
         raise InputError(f"{source}: node {bad} has coordinates that are not finite: correct them first")
     if tolerance <= 0.0:
         _, first, place = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
@@ -97,31 +96,26 @@ def cleaned(mesh: WholeMesh, tolerance: float | None = None, sum_areas: bool = F
     -------
     The mesh, and what was done, as lines. Groups have the bars and nodes that stay for those that were removed.
     """
-    distance = tolerance_of(mesh) if tolerance is None else tolerance
-    done = []
+    distance, done = tolerance_of(mesh) if tolerance is None else tolerance, []
     node = coincident(mesh.points, distance, mesh.source)
     merged_away = int((node != np.arange(len(node))).sum())
-    if merged_away:
-        done.append(f"{merged_away} nodes merged with others within {distance:g} m")
+    done += [f"{merged_away} nodes merged with others within {distance:g} m"] * bool(merged_away)
     bars = node[mesh.bars]
     real = bars[:, 0] != bars[:, 1]
-    if not real.all():
-        done.append(f"{int((~real).sum())} bars without length removed")
+    done += [f"{int((~real).sum())} bars without length removed"] * (not real.all())
     first = np.full(len(bars), -1)
     first[real] = np.flatnonzero(real)[copies(bars[real])] if real.any() else -1
     kept = np.flatnonzero(first == np.arange(len(bars)))
-    double = int(real.sum()) - len(kept)
-    fields = {name: values[kept] for name, values in mesh.bar_fields.items()}
-    if double:
-        done.append(f"{double} bars between the same nodes as another one removed")
-        if sum_areas and "area" in fields:
-            fields["area"] = np.bincount(first[real], mesh.bar_fields["area"][real], len(bars))[kept]
-            done[-1] += ", their areas added to its area"
+    fields, double = {name: values[kept] for name, values in mesh.bar_fields.items()}, int(real.sum()) - len(kept)
+    added = ""
+    if double and sum_areas and "area" in fields:
+        fields["area"] = np.bincount(first[real], mesh.bar_fields["area"][real], len(bars))[kept]
+        added = ", their areas added to its area"
+    done += [f"{double} bars between the same nodes as another one removed{added}"] * bool(double)
     used = np.zeros(len(node), bool)
     used[bars[kept]] = True
     bare = len(node) - merged_away - int(used.sum())
-    if bare:
-        done.append(f"{bare} nodes without bars removed")
+    done += [f"{bare} nodes without bars removed"] * bool(bare)
     new_node = np.where(used, np.cumsum(used) - 1, -1)[node]
     new_bar = np.full(len(bars), -1)
     new_bar[kept] = np.arange(len(kept))
@@ -193,15 +187,14 @@ def refined(mesh: WholeMesh, n: int) -> WholeMesh:
     if n < 1:
         raise InputError(f"refine: {n} parts of a bar; expected a whole number from 1 on")
     old, count = len(mesh.points), len(mesh.bars)
-    start, end = mesh.points[mesh.bars[:, 0]], mesh.points[mesh.bars[:, 1]]
-    share = (np.arange(1, n) / n)[None, :, None]
-    inner = (start[:, None] * (1.0 - share) + end[:, None] * share).reshape(-1, 3)
+    (start, end), share = mesh.points[mesh.bars.T][..., None, :], (np.arange(1, n) / n)[:, None]
+    inner = (start * (1.0 - share) + end * share).reshape(-1, 3)
     between = old + np.arange(count * (n - 1)).reshape(count, n - 1)
     chain = np.concatenate([mesh.bars[:, :1], between, mesh.bars[:, 1:]], axis=1)
     bars = np.stack([chain[:, :-1], chain[:, 1:]], axis=2).reshape(-1, 2)
-    groups = {
-        name: (np.asarray(members)[:, None] * n + np.arange(n)).ravel() for name, members in mesh.bar_groups.items()
-    }
+    parts = np.arange(n)
+    groups = {name: (np.asarray(own)[:, None] * n + parts).ravel() for name, own in mesh.bar_groups.items()}
+    unknown = np.full(len(inner), np.nan)
     return replace(
         mesh,
         points=np.concatenate([mesh.points, inner]),
@@ -209,9 +202,7 @@ def refined(mesh: WholeMesh, n: int) -> WholeMesh:
         node_groups=dict(mesh.node_groups),
         bar_groups=groups,
         bar_fields={name: np.repeat(values, n) for name, values in mesh.bar_fields.items()},
-        node_fields={
-            name: np.concatenate([values, np.full(len(inner), np.nan)]) for name, values in mesh.node_fields.items()
-        },
+        node_fields={name: np.concatenate([values, unknown]) for name, values in mesh.node_fields.items()},
     )
 
 
@@ -286,9 +277,8 @@ def _sizes(mesh: WholeMesh) -> Iterator[tuple[str, str]]:
     yield "bars", f"{len(mesh.bars):,}"
     if len(mesh.points):
         low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-        yield "from", ", ".join(f"{x:.6g}" for x in low) + " m"
-        yield "to", ", ".join(f"{x:.6g}" for x in high) + " m"
-        yield "size", " x ".join(f"{x:.6g}" for x in high - low) + " m"
+        for label, corner, between in (("from", low, ", "), ("to", high, ", "), ("size", high - low, " x ")):
+            yield label, between.join(f"{x:.6g}" for x in corner) + " m"
     own = lengths(mesh)
     if len(own):
         yield "lengths", f"{own.min():.6g} to {own.max():.6g} m, mean {own.mean():.6g} m, total {own.sum():.6g} m"

@@ -44,6 +44,10 @@ class WholeMesh:
     source: str = "mesh"
     """The file, for messages."""
 
+    def tell(self, condition: object, text: str) -> None:
+        """Add a warning if a condition holds."""
+        self.warnings += [text] if condition else []
+
     def slab(self, source: str) -> MeshSlab:
         """Return the mesh as the slab of one rank."""
         groups = [
@@ -118,6 +122,7 @@ _STEEL = {"young_modulus": 210e9, "density": 7850.0}
 _AREA = 1e-4
 _AREAS = re.compile(r"(a|area|(cross[ _-]?section(al)?)[ _-]?(area)?)([ _-]?m\^?[2²])?", re.IGNORECASE)
 """Names of fields with areas [m2]."""
+_NODE_SET = "\n# [node_set.NAME]                 # or box, nearest, indices\n# all = true\n"
 _PROBED = 100
 """Number of nodes up to which a node set with a load has a probe."""
 
@@ -127,36 +132,31 @@ def tables_of(mesh: WholeMesh) -> tuple[dict[str, Any], list[str]]:
 
     Keys that it does not have get the values of steel and an area of 1 cm2.
     """
-    made: list[str] = []
     materials = {name: dict(keys) for name, keys in mesh.tables.get("material", {}).items()}
     sections = {name: dict(keys) for name, keys in mesh.tables.get("section", {}).items()}
     named = [keys["material"] for keys in sections.values() if keys.get("material")]
     for name in named or ([] if materials else ["steel"]):
         materials.setdefault(name, {})
     first = next(iter(materials))
-    for name, keys in materials.items():
-        for key, value in _STEEL.items():
-            if key not in keys:
-                keys[key] = value
-                made.append(f"material.{name}.{key}")
+    made = [f"material.{name}.{key}" for name, keys in materials.items() for key in _STEEL if key not in keys]
+    materials = {
+        name: keys | {key: _STEEL[key] for key in _STEEL if key not in keys} for name, keys in materials.items()
+    }
     covered = np.zeros(len(mesh.bars), bool)
     for keys in sections.values():
         covered[mesh.bar_groups.get(keys["bars"], []) if "bars" in keys else slice(None)] = True
     if not covered.all():
         sections["others" if sections else "bars"] = {}
+    field = next((name for name in sorted(mesh.bar_fields, key="area".__ne__) if _AREAS.fullmatch(name)), None)
+    area = {"area": _AREA} if field is None else {"area_field": field}
     for name, keys in sections.items():
-        if "area" not in keys and "area_field" not in keys:
-            field = next((name for name in sorted(mesh.bar_fields, key="area".__ne__) if _AREAS.fullmatch(name)), None)
-            if field is not None:
-                keys["area_field"] = field
-                made += [f"section.{name}.area_field, by the name of the field"] if field != "area" else []
-            else:
-                keys["area"] = _AREA
-                made.append(f"section.{name}.area")
+        if not keys.keys() & {"area", "area_field"}:
+            keys |= area
+            told = f"section.{name}.area" if field is None else f"section.{name}.area_field, by the name of the field"
+            made += [told] * (field != "area")
         if "material" not in keys:
             keys["material"] = first
-            if len(materials) > 1:
-                made.append(f"section.{name}.material")
+            made += [f"section.{name}.material"] * (len(materials) > 1)
     node_sets = {name: {"group": name} for name, members in mesh.node_groups.items() if len(members)}
     conditions = {name: table for name, table in case_tables(mesh.tables).items() if name in _CONDITIONS}
     return {"node_set": node_sets, "material": materials, "section": sections, **conditions}, made
@@ -175,10 +175,9 @@ def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
     relative = os.path.relpath(file.absolute(), case.absolute().parent)
     known = [name for name in _CONDITIONS if mesh.tables.get(name, {}).keys() - {PLANE}]
     analysis = mesh.tables.get("analysis", {})
-    if not known:
-        made.append("supports and loads" if analysis else "supports, loads, and the analysis")
-    elif not analysis:
-        made.append("the analysis, which is an explicit one of a millisecond")
+    missing = "supports and loads" if analysis else "supports, loads, and the analysis"
+    missing = missing if not known else "" if analysis else "the analysis, which is an explicit one of a millisecond"
+    made += [missing] * bool(missing)
     told = "Replace what is not known from it:" if made else "Supports, loads and the analysis are those of the file."
     lines = [f"# A case for {file.name}. {told}\n", *(f"#   {key}\n" for key in made), "\n"]
     data = {
@@ -188,18 +187,12 @@ def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
         **({} if known else {"gravity": {"acceleration": [0.0, 0.0, -9.81]}}),
         **(analysis or {"time": {"integrator": "central_differences", "step": "auto", "end": 1e-3}}),
     }
-    probes = _probes(mesh) if "static" in data or "time" in data else []
-    if probes:
-        data["output"] = {"probe": probes}
-    text = table_text(data)
-    if "support" in tables:
-        return "".join(lines) + text
-    groups = list(tables["node_set"])
-    held = groups[0] if groups else "NAME"
-    example = f'\n# [[support]]\n# node_set = "{held}"\n# fix = "xyz"\n'
-    if not groups:
-        example = "\n# [node_set.NAME]                 # or box, nearest, indices\n# all = true\n" + example
-    return "".join(lines) + text + example
+    probes = _probes(mesh) if data.keys() & {"static", "time"} else []
+    data |= {"output": {"probe": probes}} if probes else {}
+    held = next(iter(tables["node_set"]), "NAME")
+    example = "" if tables["node_set"] else _NODE_SET
+    example += f'\n# [[support]]\n# node_set = "{held}"\n# fix = "xyz"\n'
+    return "".join(lines) + table_text(data) + (example if "support" not in tables else "")
 
 
 SHORT = 1e-6
@@ -250,8 +243,7 @@ def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
     refuse(slab.bars[:, 0] == slab.bars[:, 1], bar, "bars start and end at the same node", "remove them")
     used, length = _lengths(slab, comm)
     remedy = "remove them: a node without bars has neither mass nor stiffness"
-    if slab.source.endswith(".msh"):
-        remedy += _BARE_NODES
+    remedy += _BARE_NODES if slab.source.endswith(".msh") else ""
     refuse(~used, lambda i: f"node {slab.first_node + i}", "nodes belong to no bar", remedy)
 
     def with_length(i: int) -> str:
@@ -265,10 +257,8 @@ def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
     )
     mean = comm.allreduce(float(length.sum())) / slab.n_bars
     text = _sentence(comm, length < SHORT * mean, with_length, f"bars are far shorter than the mean length {mean:g} m")
-    if text:
-        warnings = [*warnings, f"{slab.source}: {text}; the explicit time step decreases with the shortest bar"]
     _check_duplicates(slab, comm)
-    return warnings
+    return warnings + [f"{slab.source}: {text}; the explicit time step decreases with the shortest bar"] * bool(text)
 
 
 def check_numbers(slab: MeshSlab, comm: MPI.Comm) -> None:

@@ -45,12 +45,12 @@ def test_stl_edges(tmp_path):
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        (STL.replace("vertex 0 0 1", "vertex 0 0"), "cannot be read: STLReader error"),
-        (STL.replace("vertex 0 0 1", "vertex 0 0 one"), "cannot be read: STLReader error"),
-        (STL.replace("vertex 0 0 1\n", "\n"), "cannot be read: STLReader error"),
+        (STL.replace("vertex 0 0 1", "vertex 0 0"), "vertex: 'endloop' is not a number"),
+        (STL.replace("vertex 0 0 1", "vertex 0 0 one"), "vertex: 'one' is not a number"),
+        (STL.replace("vertex 0 0 1\n", "\n"), "has 5 vertices, 2 times endfacet and an endsolid; expected three"),
         ("x" * 83, "is not STL"),
         (b"x" * 80 + b"\2\0\0\0" + bytes(50), "the triangles that it declares take 184 bytes, and it has 134"),
-        (b"x" * 80 + bytes(4), "0 points and 0 cells"),
+        (b"x" * 80 + bytes(4), "has neither lines nor faces"),
     ],
 )
 def test_stl_with_one_thing_wrong(tmp_path, content, text):

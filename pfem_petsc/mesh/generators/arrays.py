@@ -26,6 +26,9 @@ INLINE = 10_000
 """Number of nodes and bars up to which the text of a case has the arrays; beyond, it has their digest."""
 
 
+_NAMED = ("node_groups", "bar_groups", "bar_fields")
+
+
 class Truss:
     """Nodes and bars as the mesh of a case: ``Case(mesh=truss, ...)``.
 
@@ -97,11 +100,9 @@ class Truss:
         slab = slab_from_arrays(source, points, bars, node_groups, bar_groups, bar_fields)
         self.warnings = check_mesh(slab, MPI.COMM_SELF)
         self.points, self.bars = _kept(slab.points), _kept(slab.bars)
-        self.node_groups = {name: _kept(members) for name, members in slab.node_groups.items()}
-        self.bar_groups = {name: _kept(members) for name, members in slab.bar_groups.items()}
-        self.bar_fields = {name: _kept(values) for name, values in slab.bar_fields.items()}
-        self.n_nodes, self.n_bars = slab.n_nodes, slab.n_bars
-        self.digest = _digest(slab)
+        for kind in _NAMED:
+            setattr(self, kind, {name: _kept(array) for name, array in getattr(slab, kind).items()})
+        self.n_nodes, self.n_bars, self.digest = slab.n_nodes, slab.n_bars, _digest(slab)
 
     @classmethod
     def read(cls, path: Path | str, bar_fields: Iterable[str] | None = None, *, clean: float | None = None) -> Truss:
@@ -131,9 +132,7 @@ class Truss:
     @classmethod
     def from_mesh(cls, mesh: WholeMesh) -> Truss:
         """Return the truss of a mesh returned by a reader, with its tables and warnings."""
-        named: dict[str, Any] = {
-            name: without_slashes(getattr(mesh, name)) for name in ("node_groups", "bar_groups", "bar_fields")
-        }
+        named: dict[str, Any] = {kind: without_slashes(getattr(mesh, kind)) for kind in _NAMED}
         truss = cls(mesh.points, mesh.bars, **named, source=mesh.source)
         truss.tables = case_tables(mesh.tables)
         truss.warnings = mesh.warnings + truss.warnings
@@ -145,10 +144,7 @@ class Truss:
     def to_mesh(self) -> WholeMesh:
         """Return the truss as a mesh for writers."""
         self._require("written")
-        groups = [
-            {name: rows.copy() for name, rows in table.items()}
-            for table in (self.node_groups, self.bar_groups, self.bar_fields)
-        ]
+        groups = [{name: rows.copy() for name, rows in getattr(self, kind).items()} for kind in _NAMED]
         tables = {name: dict(self.tables[name]) for name in ("material", "section") if name in self.tables}
         return WholeMesh(self.points.copy(), self.bars.copy(), *groups, tables=tables)
 
@@ -183,8 +179,8 @@ class Truss:
         """Return the truss as nested lists with the keys of ``[mesh]``; for a large truss, only its digest."""
         if self.points is None or self.n_nodes + self.n_bars > INLINE:
             return {"digest": self.digest}
-        tables = {"node_groups": self.node_groups, "bar_groups": self.bar_groups, "bar_fields": self.bar_fields}
-        lists = {key: {name: rows.tolist() for name, rows in table.items()} for key, table in tables.items() if table}
+        tables = {kind: getattr(self, kind) for kind in _NAMED}
+        lists = {kind: {name: rows.tolist() for name, rows in table.items()} for kind, table in tables.items() if table}
         return {"points": self.points.tolist(), "bars": self.bars.tolist(), **lists}
 
     def grid(self) -> pyvista.UnstructuredGrid:
@@ -292,17 +288,11 @@ class Parameters(StrictModel):
     @model_validator(mode="after")
     def _whole(self) -> Parameters:
         if self.truss is None and self.digest is None:
-            missing = [key for key in ("points", "bars") if getattr(self, key) is None]
-            if missing:
-                raise ValueError(f"expected the keys points and bars; {missing[0]} is missing")
+            for key in [key for key in ("points", "bars") if getattr(self, key) is None][:1]:
+                raise ValueError(f"expected the keys points and bars; {key} is missing")
             try:
-                self.__dict__["truss"] = Truss(
-                    self.points,
-                    self.bars,
-                    node_groups=self.node_groups,
-                    bar_groups=self.bar_groups,
-                    bar_fields=self.bar_fields,
-                )
+                named = {kind: getattr(self, kind) for kind in _NAMED}
+                self.__dict__["truss"] = Truss(self.points, self.bars, **named)
             except InputError as error:
                 raise InputError(str(error).removeprefix("Truss: ")) from error
         elif self.truss is not None and self.digest not in (None, self.truss.digest):

@@ -50,8 +50,12 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     after = (bay + 1) % n
     start = np.choose(family, [bay, n + bay, bay, bay, n + bay])
     end = np.choose(family, [after, n + after, n + bay, n + after, after])
+    # the outer nodes farthest towards +x and -x, from their numbers and not from coordinates
+    flat = parameters.orientation == "flat"
+    half = [n // 2] if (n % 2 == 1) == flat else [n // 2 - flat, n // 2 + (not flat)]
     node_groups = {"outer": part.nodes < n, "inner": part.nodes >= n}
-    node_groups |= {name: np.isin(part.nodes, members) for name, members in _extremes(parameters).items()}
+    node_groups["impact"] = np.isin(part.nodes, [0, n - 1] if flat else [0])
+    node_groups["opposite"] = np.isin(part.nodes, half)
     bar_groups = {"outer": family == 0, "inner": family == 1, "radial": family == 2, "diagonal": family >= 3}
     source = f"ring ({parameters.bracing}, {n} bays)"
     return part.slab(source, _points(parameters, part.nodes), (start, end), node_groups, bar_groups)
@@ -67,11 +71,3 @@ def _points(parameters: Parameters, node: np.ndarray) -> np.ndarray:
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(len(node))], axis=1)
     points[half_bays == n, 1] = 0.0
     return points
-
-
-def _extremes(parameters: Parameters) -> dict[str, list[int]]:
-    """Return the outer nodes farthest towards +x and -x, from their numbers and not from coordinates."""
-    n = parameters.bays
-    if parameters.orientation == "vertex":
-        return {"impact": [0], "opposite": [n // 2] if n % 2 == 0 else [n // 2, n // 2 + 1]}
-    return {"impact": [n - 1, 0], "opposite": [n // 2] if n % 2 else [n // 2 - 1, n // 2]}

@@ -32,12 +32,12 @@ class _Wanted(NamedTuple):
     fields: list[str]
     groups: list[str]
 
-
-def _wanted(block: Block, fields: Collection[str], groups: Collection[str] | None) -> _Wanted:
-    known = list(block.cell.groups) + ["skin"] * bool(block.cell.skin)
-    # a name that is not known may be misspelt: the message about it lists them all
-    wanted = groups is None or any(name not in ("surface", *FACES) for name in groups)
-    return _Wanted(list(fields), known if wanted else [])
+    @classmethod
+    def of(cls, block: Block, fields: Collection[str], groups: Collection[str] | None) -> _Wanted:
+        """Return these fields, and all bar groups unless none of ``groups`` can be one."""
+        # a name that is not known may be misspelt: the message about it lists them all
+        every = groups is None or any(name not in ("surface", *FACES) for name in groups)
+        return cls(list(fields), [*block.cell.groups, *["skin"] * bool(block.cell.skin)] if every else [])
 
 
 def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
@@ -49,7 +49,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     Bar groups: those of the unit cell.
     """
     block = Block(parameters, plain=True)
-    return _uncut(block, rank, size, _wanted(block, (), None))
+    return _uncut(block, rank, size, _Wanted.of(block, (), None))
 
 
 def generate_on(
@@ -78,7 +78,7 @@ def generate_on(
     partial = bool(keys.missing or surface or keys.keep is not None)
     with agreed(comm):
         block = Block(fitted(keys, surface) if surface is not None else keys, plain=not partial)
-        wanted, bare = _wanted(block, fields, groups), block.has_bare_nodes()
+        wanted, bare = _Wanted.of(block, fields, groups), block.has_bare_nodes()
         if keys.map is not None:  # what cannot be computed is found before anything is sent
             block.nodes.arrays(slab_range(block.nodes.total, comm.rank, comm.size), lambda *at: [block.positions(*at)])
     if not (partial or bare or keys.dangling == "remove"):
@@ -110,8 +110,8 @@ def _uncut(block: Block, rank: int, size: int, wanted: _Wanted) -> MeshSlab:
 
     points, *faces = block.nodes.arrays(nodes, of_nodes)
     ends, *marks = block.bars.arrays(bars, of_bars)
-    slab = MeshSlab(block.nodes.total, block.bars.total, nodes[0], points, bars[0], ends)
-    slab.node_groups = {name: nodes[0] + np.flatnonzero(mark) for name, mark in zip(block.faces, faces)}
+    groups = {name: nodes[0] + np.flatnonzero(mark) for name, mark in zip(block.faces, faces)}
+    slab = MeshSlab(block.nodes.total, block.bars.total, nodes[0], points, bars[0], ends, groups)
     slab.bar_groups = {name: bars[0] + np.flatnonzero(mark) for name, mark in zip(wanted.groups, marks)}
     slab.bar_fields = dict(zip(wanted.fields, marks[len(wanted.groups) :]))
     slab.volume = block.volume if block.keys.map is None else None
@@ -292,10 +292,12 @@ class _Left:
             masks["surface"] = self._counts(self.lost)[used] > 0
         new = new_before + np.arange(len(self.points))
         first_node, moved = _moved(comm, np.concatenate([number[used], total + new]), total + n_new)
-        points = moved(np.concatenate([block.positions(old, places), self.points]))
-        undisturbed = None
-        if block.disturbed:
-            undisturbed = moved(np.concatenate([block.positions(old, places, disturbed=False), self.points]))
+        points, undisturbed = (
+            moved(np.concatenate([block.positions(old, places, disturbed), self.points]))
+            if disturbed or block.disturbed
+            else None
+            for disturbed in (True, False)
+        )
         groups = {
             name: first_node + np.flatnonzero(moved(np.concatenate([mask, np.full(len(new), name == "surface")])))
             for name, mask in masks.items()

@@ -194,18 +194,27 @@ class Parameters(StrictModel):
             if not can_be_variable(name):
                 raise ValueError(f"fields.{name}: expected a name of letters, digits and underscores")
         self.expressions()
-        if self.map is not None and self.curved is not None:
-            raise ValueError("map and the table [mesh.curved] exclude each other: give one of them")
-        if self.cells is None and (self.surface is None or self.curved is not None or self.map is not None):
-            raise ValueError("the key cells is missing: number of cells along x, y and z")
-        if (self.kind == "cell") != (self.cell is not None):
-            raise ValueError('kind = "cell" and the table [mesh.cell] with points and struts need each other')
-        if self.angle is not None and self.kind != "auxetic":
-            raise ValueError(f'angle belongs to kind = "auxetic" (default {ANGLE:g}), not to {self.kind!r}')
-        if self.seed is not None and not (self.perturbation or self.missing):
-            raise ValueError("seed needs perturbation or missing")
-        if self.curved is not None and self.curved.closed and self.cells is not None and self.cells[0] < 3:
-            raise ValueError("curved.closed = true needs 3 cells or more along x")
+        curved, shell = self.curved is not None, self.curved is not None and self.curved.closed
+        needs_cells = self.surface is None or curved or self.map is not None
+        for wrong, text in (
+            (curved and self.map is not None, "map and the table [mesh.curved] exclude each other: give one of them"),
+            (needs_cells and self.cells is None, "the key cells is missing: number of cells along x, y and z"),
+            (
+                (self.kind == "cell") != (self.cell is not None),
+                'kind = "cell" and the table [mesh.cell] with points and struts need each other',
+            ),
+            (
+                self.angle is not None and self.kind != "auxetic",
+                f'angle belongs to kind = "auxetic" (default {ANGLE:g}), not to {self.kind!r}',
+            ),
+            (self.seed is not None and not (self.perturbation or self.missing), "seed needs perturbation or missing"),
+            (
+                shell and self.cells is not None and self.cells[0] < 3,
+                "curved.closed = true needs 3 cells or more along x",
+            ),
+        ):
+            if wrong:
+                raise ValueError(text)
         return self
 
     def expressions(self) -> Fields:
@@ -289,13 +298,6 @@ class ItemByItem(Numbering):
         item = np.searchsorted(self._starts, numbers, side="right") - 1
         row, k = np.divmod(numbers - self._starts[item], self.shapes[item, 2])
         return Places(item, *np.divmod(row, self.shapes[item, 1]), k)
-
-    def pieces(self, first: int, last: int) -> Iterator[tuple[np.ndarray, Places]]:
-        """Divide the range [first, last) into numbers and what they are, one item at a time, which is faster."""
-        for item, (base, end) in enumerate(zip(self._starts[:-1].tolist(), self._starts[1:].tolist())):
-            for start in range(max(first, base), min(last, end), PIECE):
-                numbers = np.arange(start, min(start + PIECE, last, end))
-                yield numbers, Places(item, *np.unravel_index(numbers - base, tuple(self.shapes[item])))
 
 
 class CellByCell(Numbering):
@@ -451,7 +453,9 @@ class Block(Joints):
         for axis, factor in enumerate(keys.grading or (1.0, 1.0, 1.0)):
             edge, count = keys.pitch * cell.aspect[axis], -(-int(cells[axis]) // cell.layers[axis])
             if isinstance(factor, str):
-                self._levels.append(graded_levels(count, edge, factor, axis))
+                levels = [*islice(_borders(edge, factor, axis), count + 1)]
+                # no expression has to hold beyond the last cell: what lies there only completes the arithmetic
+                self._levels.append(np.array([*levels, 2.0 * levels[-1] - levels[-2]]))
             else:
                 check_length(edge * factor, f"mesh.pitch times mesh.grading[{axis}]")
                 self._levels.append(edge * factor * np.arange(count + 2))
@@ -464,7 +468,8 @@ class Block(Joints):
                 f"mesh.perturbation = {keys.perturbation!r}: ends of a strut of {shortest:.4g} m could meet; choose "
                 f"less than {shortest / (2.0 * math.sqrt(3.0) * keys.pitch):.4g}"
             )
-        self._extents = self._box()
+        sizes = zip(self.cells / np.array(cell.layers), self._levels)
+        self._extents = np.array([np.interp(size, np.arange(len(level)), level) for size, level in sizes])
         farthest = float(np.abs(keys.origin or 0.0).max()) + float(self._extents.max())
         check_length(farthest, "mesh.origin and the extent of the block")
         self.volume = self._shell() if keys.curved is not None else float(np.prod(self._extents))
@@ -473,11 +478,6 @@ class Block(Joints):
         """Return the volumes (n,) [m3] of the cells at places of bars, before they are curved or mapped."""
         edges = [level[index + 1] - level[index] for level, index in zip(self._levels, places[1:])]
         return np.prod(edges, axis=0)
-
-    def _box(self) -> np.ndarray:
-        """Return the edges (3,) [m] of the block before it is moved."""
-        sizes = self.cells / np.array(self.cell.layers)
-        return np.array([np.interp(size, np.arange(len(level)), level) for size, level in zip(sizes, self._levels)])
 
     def _shell(self) -> float:
         """Return the volume of the shell [m3] to which the block is mapped."""
@@ -510,10 +510,7 @@ class Block(Joints):
                 held = [self.on_face(places, name) for name in self.faces if FACES[name][0] == axis]
                 drawn = random_numbers(keys.seed or 0, axis, numbers)
                 points[:, axis] += ~np.any(held, axis=0) * (self._amplitude * (2.0 * drawn - 1.0))
-        if keys.curved is not None:
-            points = self._curved(points)
-        if keys.origin is not None:
-            points = points + np.array(keys.origin)
+        points = (points if keys.curved is None else self._curved(points)) + np.array(keys.origin or 0.0)
         if keys.map is not None:
             points = np.stack([self.expressions.at(points, f"map[{axis}]") for axis in range(3)], axis=1)
         return points
@@ -557,21 +554,6 @@ def _mixed(z: np.ndarray) -> np.ndarray:
     return z ^ (z >> np.uint64(31))
 
 
-def graded_levels(cells: int, edge: float, factor: str, axis: int) -> np.ndarray:
-    """Return the coordinates (cells + 2,) [m] of the borders of cells along an axis, and of one more.
-
-    Cell numbers s are mapped to coordinates x by dx/ds = edge factor(x), x(0) = 0 (Runge-Kutta of order 4).
-
-    Raises
-    ------
-    InputError
-        If the factor is not positive somewhere.
-    """
-    levels = list(islice(_borders(edge, factor, axis), cells + 1))
-    # no expression has to hold beyond the last cell: what lies there only completes the arithmetic
-    return np.array([*levels, 2.0 * levels[-1] - levels[-2]])
-
-
 def graded_count(length: float, edge: float, factor: str, axis: int, most: int = 20_000) -> int:
     """Return the least number of graded cells that cover a length [m] from x = 0 on.
 
@@ -591,7 +573,15 @@ def graded_count(length: float, edge: float, factor: str, axis: int, most: int =
 
 
 def _borders(edge: float, factor: str, axis: int) -> Iterator[float]:
-    """Yield the coordinates [m] of the borders of graded cells, from 0 on."""
+    """Yield the coordinates [m] of the borders of graded cells, from 0 on.
+
+    Cell numbers s are mapped to coordinates x by dx/ds = edge factor(x), x(0) = 0 (Runge-Kutta of order 4).
+
+    Raises
+    ------
+    InputError
+        If the factor is not positive somewhere.
+    """
     name = COORDINATES[axis]
     expression = Expression(factor, (name,))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -45,13 +45,15 @@ class Surface:
 
     @property
     def volume(self) -> float:
-        """The volume [m3] inside."""
-        return volume_of(self.points, self.triangles)
+        """The volume [m3] inside, by the divergence theorem: positive with normals outwards."""
+        a, b, c = (self.points[self.triangles[:, k]] - self.points.mean(axis=0) for k in range(3))
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
     @property
     def area(self) -> float:
         """The area [m2] of the triangles."""
-        return area_of(self.points, self.triangles)
+        a, b, c = (self.points[self.triangles[:, k]] for k in range(3))
+        return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
     @cached_property
     def _data(self) -> list[pyvista.PolyData]:
@@ -170,20 +172,6 @@ class Surface:
         return line, np.clip(along, 0.0, 1.0)
 
 
-def area_of(points: np.ndarray, triangles: np.ndarray) -> float:
-    """Return the area of triangles."""
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
-
-def volume_of(points: np.ndarray, triangles: np.ndarray) -> float:
-    """Return the volume that closed triangles enclose, positive with normals outwards, by the divergence theorem."""
-    a, b, c = (points[triangles[:, k]] - points.mean(axis=0) for k in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
-
-
-_Triangles = tuple[np.ndarray, np.ndarray]
-
 _SUFFIXES = (".stl", ".obj", ".ply")
 
 _MERGED = 1e-7
@@ -196,23 +184,9 @@ _FLAT = 1e-9
 """Bodies with less volume than this fraction of their area times their size are left out."""
 
 
-class Bodies(NamedTuple):
-    """What a surface bounds by the even-odd rule: outer bodies, cavities in them, bodies in these, and so on.
-
-    Attributes
-    ----------
-    triangles : of all bodies, normals outwards from what is filled
-    layers : triangles of bodies that do not touch each other, with normals as if there were no others
-    warnings : list of str
-    """
-
-    triangles: np.ndarray
-    layers: list[np.ndarray]
-    warnings: list[str]
-
-
-def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Bodies:
-    """Return the bodies of a surface, every edge of which has an even number of triangles.
+def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Surface:
+    """Return the surface of the bodies of triangles, every edge of which has an even number of them: by the even-odd
+    rule outer bodies, cavities in them, bodies in these, and so on. Its layers have normals as if there were no others.
 
     Raises
     ------
@@ -228,15 +202,16 @@ def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Bodies:
     for members, turned in _connected(points, triangles, where) if len(triangles) else ():
         own = triangles[members]
         own[turned] = own[turned, ::-1]
-        volume = volume_of(points, own)
-        if abs(volume) <= _FLAT * area_of(points, own) * float(np.ptp(points[own.ravel()], axis=0).max()):
+        body = Surface(points, own)
+        volume = body.volume
+        if abs(volume) <= _FLAT * body.area * float(np.ptp(points[own.ravel()], axis=0).max()):
             x = ", ".join(f"{coordinate:.6g}" for coordinate in points[own[0, 0]])
             warnings.append(f"left out {len(own)} triangles that enclose no volume, at ({x}) in the file")
             continue
         parts.append(own if volume > 0.0 else own[:, ::-1].copy())
         given.append(0 if turned.any() else np.sign(volume))
     if not parts:
-        return Bodies(np.empty((0, 3), np.int64), [], warnings)
+        return Surface(points, np.empty((0, 3), np.int64))
     inside, touching = _nested(points, parts, where)
     for i in np.flatnonzero(inside.any(axis=1)):
         (around,) = [j for j in np.flatnonzero(inside[i]) if inside[j].sum() == inside[i].sum() - 1]
@@ -250,7 +225,8 @@ def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Bodies:
     for i in range(len(parts)):
         layer[i] = np.setdiff1d(np.arange(i + 1), layer[touching[i]])[0]
     layers = [_oriented(parts, inside, np.flatnonzero(layer == number)) for number in range(layer.max() + 1)]
-    return Bodies(_oriented(parts, inside, np.arange(len(parts))), layers, warnings)
+    told = [f"{where}: {text}" for text in warnings]
+    return Surface(points, _oriented(parts, inside, np.arange(len(parts))), layers, told)
 
 
 def _oriented(parts: list[np.ndarray], inside: np.ndarray, members: np.ndarray) -> np.ndarray:
@@ -365,21 +341,24 @@ def read_surface(path: Path, scale: float) -> Surface:
         raise InputError(f"{where}: no surface of triangles could be read from it")
     count, edge = _open_edges(triangles)
     if count:
-        points, triangles = _better((points, triangles), _triangles(data, _MERGED))
-        count, edge = _open_edges(triangles)
+        merged = _triangles(data, _MERGED)
+        fewer, other = _open_edges(merged[1])
+        if len(merged[1]) and fewer < count:  # a surface that has lost all triangles is no better
+            (points, triangles), count, edge = merged, fewer, other
     if count:
         a, b = (", ".join(f"{x:.6g}" for x in points[node]) for node in edge)
         raise InputError(
             f"{where}: the surface is not closed: {count} of its edges have a triangle on one side only, like that "
             f"from ({a}) to ({b}) in the file; close it in the program that made it (PyVista: mesh.fill_holes(size))"
         )
-    bodies = bodies_of(points, triangles, where)
-    if not bodies.layers:
+    surface = bodies_of(points, triangles, where)
+    if not surface.layers:
         raise InputError(f"{where}: the surface encloses no volume")
-    return Surface(scale * points, bodies.triangles, bodies.layers, [f"{where}: {text}" for text in bodies.warnings])
+    surface.points = scale * points
+    return surface
 
 
-def _triangles(data: pyvista.PolyData, tolerance: float = 0.0) -> _Triangles:
+def _triangles(data: pyvista.PolyData, tolerance: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Return points and triangles; points within the tolerance, in diagonals, are merged, flat triangles left out."""
     data = data.triangulate()
     if data.n_cells == 0:
@@ -395,8 +374,3 @@ def _open_edges(triangles: np.ndarray) -> tuple[int, np.ndarray]:
     pairs, count = np.unique(edges, axis=0, return_counts=True)
     wrong = pairs[count % 2 == 1]
     return len(wrong), wrong[0] if len(wrong) else np.empty(0, np.int64)
-
-
-def _better(one: _Triangles, two: _Triangles) -> _Triangles:
-    """Return the points and triangles with fewer open edges; a surface that has lost all triangles is no better."""
-    return two if len(two[1]) and _open_edges(two[1])[0] < _open_edges(one[1])[0] else one

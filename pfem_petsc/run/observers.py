@@ -241,9 +241,7 @@ class History(Observer):
         is the same unless a load case begins, with ``last``, the row of that end. Collective."""
         self.row, self.writer = last, earlier.writer
         first = self.recorder.begin_stage(source.recorder, last, handed)
-        self.blow_up.check(first, self._stepper.state)
-        if self._contact_watch is not None:
-            self._contact_watch.check(first)
+        self._check(first)
 
     def kept(self) -> dict[str, Any]:
         """Return what a restart goes on with, besides the ledger."""
@@ -252,7 +250,7 @@ class History(Observer):
             "iterations": list(self._stepper.iterations),
             "start_energy": recorder.start_energy,
             "energy_scale": recorder.energy_scale,
-            "blow_up": self.blow_up.kept(),
+            "blow_up": self.blow_up.kept,
             "row": {name: float(self.row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
         }
 
@@ -261,7 +259,7 @@ class History(Observer):
         recorder = self.recorder
         self._stepper.iterations = [int(n) for n in kept["iterations"]]
         recorder.start_energy, recorder.energy_scale = kept["start_energy"], kept["energy_scale"]
-        self.blow_up.load_state(kept["blow_up"])
+        self.blow_up.kept = kept["blow_up"]
         self.row = dict(kept["row"])
         start, stage = recorder.start_energy, kept.get("stage")
         if stage is not None:
@@ -306,18 +304,17 @@ class History(Observer):
 
     def _take(self, rows: np.ndarray) -> None:
         """Check rows (m, width), store the last one and add them to the history."""
-        layout = self.recorder.layout
-        values = rows[:, self._watched]
-        sound = self.blow_up.first_wrong(values)
+        for vector in rows:
+            row = Row(self.recorder.layout, vector)
+            self._check(row)
+            self.row = row
+            self.writer.append_history(row if self._model.comm.rank == 0 else None)
+
+    def _check(self, row: Row) -> None:
+        values = dict(zip(WATCHED, row.vector[self._watched].tolist(), strict=True))
+        self.blow_up.check(row, values, self._stepper.state)
         if self._contact_watch is not None:
-            gained = self._contact_watch.first_gain(values[:sound], rows[:sound, layout.first("step")])
-            if gained < sound:
-                self._contact_watch.tell_gain(Row(layout, rows[gained]))
-        for vector in rows[:sound]:
-            self.row = Row(layout, vector)
-            self.writer.append_history(self.row if self._model.comm.rank == 0 else None)
-        if sound < len(rows):
-            raise self.blow_up.failure(Row(layout, rows[sound]), self._stepper.state)
+            self._contact_watch.check(row, values)
 
     def complete(self) -> None:
         """Record the row of the last step."""

@@ -45,7 +45,7 @@ from .errors import InputError
 from .mechanics.bars import StrainEnergy
 from .mesh.exchange import Router
 from .mesh.slab import slab_of
-from .output.checkpoint import NAME, PREVIOUS, Checkpoint, asked_checkpoint, check_seal
+from .output.checkpoint import NAME, PREVIOUS, Checkpoint, asked_checkpoint
 from .output.integrity import checksum, examine
 from .output.result import RESULT_NAME as RESULT
 from .output.result import open_result
@@ -506,7 +506,9 @@ def prepare_folder(folder: Path, restart: Restart | None, plan: Plan) -> Path | 
     aside = None
     try:
         if restart is not None and restart.continues:
-            if check_seal(restart.path) != restart.file.digest:  # before this one got the lock
+            with Checkpoint(restart.path, MPI.COMM_SELF) as present:
+                replaced = present.digest != restart.file.digest
+            if replaced:  # before this one got the lock
                 raise InputError(
                     f"{restart.path}: another run has overwritten this checkpoint while this one was set up: nothing "
                     "is changed; start again with --restart"

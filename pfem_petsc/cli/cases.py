@@ -254,6 +254,7 @@ def check(arguments: argparse.Namespace, comm: MPI.Comm | None = None) -> int:
             f"the following arguments are required: CASE (give it before --set), or --env; see {PROGRAM} check --help"
         )
     case = load_case(arguments, comm)
+    from ..output.table import aligned
     from ..simulation import Simulation
 
     simulation = Simulation(case, comm, check_only=True)
@@ -262,8 +263,7 @@ def check(arguments: argparse.Namespace, comm: MPI.Comm | None = None) -> int:
     summary |= closer
     obstacle, notice = simulation.obstacle(), simulation.plan.scheme.notice
     if comm.rank == 0:
-        width = max(map(len, summary), default=0)
-        lines = [printable(case.title), *(f"  {label:{width}}  {text}" for label, text in summary.items())]
+        lines = [printable(case.title), *aligned(summary.items())]
         lines += [f"warning: {text}" for text in warnings]
         lines += [f"note: {notice}"] if notice else []
         print("\n".join(lines if obstacle else [*lines, "This case can run."]))
@@ -273,7 +273,7 @@ def check(arguments: argparse.Namespace, comm: MPI.Comm | None = None) -> int:
 
 
 def _check_machine() -> int:
-    from .environment import inspect_environment, report
+    from .machine import inspect_environment, report
 
     found = inspect_environment()
     print("\n".join(printable(line) for line in report(found)))

@@ -46,7 +46,7 @@ HOMES |= {
     "crush": "results",
     "info": "results",
     "sweep": "cases",
-    "bench": "bench",
+    "bench": "machine",
     "completion": "cases",
 }
 """Verbs, and the modules of this package whose ``VERBS`` have them."""

@@ -190,13 +190,13 @@ def _write(arguments: argparse.Namespace, mesh: WholeMesh, done: Sequence[str] =
 
 
 def _made(what: str, overrides: list[str]) -> WholeMesh:
+    import numpy as np
     from mpi4py import MPI
 
     from ..case.schema import Case
-    from ..mechanics.bars import select
+    from ..mechanics.bars import section_of_bars, select
     from ..mesh import load_slab
     from ..mesh.whole import WholeMesh
-    from ..post.motion import section_areas
     from ..registry import choices
 
     plain = what in choices("pfem_petsc.mesh.generators")
@@ -223,10 +223,13 @@ def _made(what: str, overrides: list[str]) -> WholeMesh:
     mesh = WholeMesh(slab.points, slab.bars.astype("int64"), slab.node_groups, slab.bar_groups, dict(slab.bar_fields))
     mesh.node_fields = slab.node_fields
     if not plain:
-        mesh.bar_fields["area"] = section_areas(case, slab)[1]
-        given = case.to_dict()
+        given, numbers = case.to_dict(), section_of_bars(case, slab)
         mesh.tables = {name: given[name] for name in ("material", "section") if name in given}
-        for name, section in case.section.items():  # groups that values of fields select are in the file
+        areas = mesh.bar_fields["area"] = np.ones(len(mesh.bars))
+        for number, (name, section) in enumerate(case.section.items()):
+            own, area = numbers == number, section.uniform_area
+            areas[own] = slab.bar_fields[section.area_field][own] if area is None else area
+            # groups that values of fields select are in the file
             if section.bars is not None:
                 mesh.tables["section"][name]["bars"] = str(section.bars)
     return mesh
@@ -239,12 +242,11 @@ def _tell(lines: Iterable[str]) -> None:
 
 def _info(arguments: argparse.Namespace) -> None:
     from ..mesh.tools import summary
+    from ..output.table import aligned
 
     for path in arguments.inputs:
         mesh = _read(path, arguments.scale)
-        lines = summary(mesh, arguments.tolerance)
-        width = max(len(label) for label, _ in lines)
-        _tell([str(path), *(f"  {label:{width}}  {text}" for label, text in lines)])
+        _tell([str(path), *aligned(summary(mesh, arguments.tolerance))])
 
 
 def _picture(arguments: argparse.Namespace) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 from ..errors import InputError
 from ..parallel.agreement import agreed
+from .table import aligned
 from .units import TIME, Axis, duration
 
 if TYPE_CHECKING:
@@ -146,8 +147,7 @@ class Progress:
 
     def summary(self, entries: dict[str, str]) -> None:
         """Print the start-up block: label and text of each entry, aligned."""
-        width = max((len(label) for label in entries), default=0)
-        self.message("\n".join([self._title, *(f"  {label:<{width}}  {text}" for label, text in entries.items())]))
+        self.message("\n".join([self._title, *aligned(entries.items())]))
 
     def update(
         self,

@@ -20,7 +20,7 @@ from .units import dimensions, powers_of, product, simplest
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["SWEEP", "Selected", "Table", "flat_columns", "select", "varied"]
+__all__ = ["SWEEP", "Selected", "Table", "aligned", "flat_columns", "html_table", "select", "varied"]
 
 
 _SHOWN = 10  # rows shown at the beginning and at the end of a long table
@@ -58,8 +58,8 @@ class Table(Mapping[str, np.ndarray]):
         """The rows as dictionaries."""
         return [{name: values[i] for name, values in self.items()} for i in range(self.n_rows)]
 
-    def where(self, rows: np.ndarray) -> Table:
-        """Return a table of some rows, given by numbers or as a boolean mask (rows,)."""
+    def where(self, rows: np.ndarray | slice) -> Table:
+        """Return a table of some rows, given by numbers, as a slice, or as a boolean mask (rows,)."""
         return Table({name: values[rows] for name, values in self.items()})
 
     def to_structured(self) -> np.ndarray:
@@ -114,6 +114,10 @@ class Table(Mapping[str, np.ndarray]):
                 Path(path).write_text(text, encoding="utf-8")
         return text
 
+    def to_html(self) -> str:
+        """Return all rows as a table of HTML."""
+        return html_table(([_text(value) for value in row] for row in zip(*self.values(), strict=True)), self)
+
     def _texts(self) -> tuple[list[list[str]], str]:
         """The heading and the shown rows as texts, and what is left out of a wide table: columns of zeros first."""
         shown, names = list(range(self.n_rows)), list(self)
@@ -145,10 +149,27 @@ class Table(Mapping[str, np.ndarray]):
 
     def _repr_html_(self) -> str:
         (head, *body), more = self._texts()
-        rows = "".join(f"<tr>{''.join(f'<td>{html.escape(text)}</td>' for text in line)}</tr>" for line in body)
-        heading = "".join(f"<th>{html.escape(text)}</th>" for text in head)
         below = f"{self.n_rows} rows. {more}".rstrip(" .")
-        return f"<table><thead><tr>{heading}</tr></thead><tbody>{rows}</tbody></table><p>{below}</p>"
+        return f"{html_table(body, head)}<p>{below}</p>"
+
+
+def aligned(entries: Iterable[tuple[str, str]]) -> list[str]:
+    """Return labels and their texts as lines, with the texts below each other."""
+    entries = list(entries)
+    width = max((len(label) for label, _ in entries), default=0)
+    return [f"  {label:{width}}  {text}" for label, text in entries]
+
+
+def html_table(lines: Iterable[Iterable[str]], head: Iterable[str] = ()) -> str:
+    """Return texts as a table of HTML; those that begin with a digit have the class ``number``."""
+    kinds = {True: ' class="number"', False: ""}
+    rows = (
+        "".join(f"<td{kinds[re.match('[-−]?[0-9]', text) is not None]}>{html.escape(text)}</td>" for text in line)
+        for line in lines
+    )
+    heading = "".join(f"<th>{html.escape(text)}</th>" for text in head)
+    body = "".join(f"<tr>{row}</tr>" for row in rows)
+    return f"<table><thead><tr>{heading}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def flat_columns(name: str, values: np.ndarray, vector: bool) -> dict[str, np.ndarray]:

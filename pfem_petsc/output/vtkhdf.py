@@ -16,7 +16,7 @@ from ..columns import Layout
 from ..errors import InputError, PfemError, SimulationFailure
 from ..parallel.agreement import on_root
 from ..parallel.heap import SharedArrays
-from .hdf5 import Growing, SharedFile, create_new, require_parallel_hdf5, require_room, write_rows, writing
+from .hdf5 import Growing, SharedFile, create_new, require_parallel_hdf5, require_room, writing
 from .integrity import RowDigests, mark_digest, numbers_digest, reopen, seeded, snapshot_digests, summed, word_sum
 from .layout import (
     BARS,
@@ -56,15 +56,7 @@ def _write_constants(shared: SharedFile, mesh: DistributedMesh, constants: Mappi
         slab = np.ascontiguousarray(order.to_slab(constant.values[mesh.counted]))
         total += seeded(name, word_sum(slab, order.first))
         shared.write(Growing(file[BARS][name]) if file else None, order.first, slab)
-    digest = summed(shared.comm, [total])
-
-    def finish() -> None:
-        with shared.writing():
-            if shared.comm.rank == 0:
-                write_rows(file[CHECKS][BARS], 0, digest)
-            file.flush()
-
-    shared.call(finish)
+    _write_digest(shared, BARS, total)
 
 
 def _write_connectivity(shared: SharedFile, mesh: DistributedMesh) -> None:
@@ -89,13 +81,18 @@ def _write_connectivity(shared: SharedFile, mesh: DistributedMesh) -> None:
         # there is one more offset than bars, which the last rank writes
         end = first + stop + (stop == count and comm.rank == comm.size - 1)
         shared.write(targets["Offsets"], first + start, 2 * np.arange(first + start, end))
-    digest = summed(comm, [total])
+    _write_digest(shared, "mesh", total)
+
+
+def _write_digest(shared: SharedFile, name: str, total: int) -> None:
+    """Write the checksum of what is written once, from the parts of the ranks. Collective."""
+    digest = summed(shared.comm, [total])
 
     def finish() -> None:
         with shared.writing():
-            if comm.rank == 0:
-                write_rows(file[CHECKS]["mesh"], 0, digest)
-            file.flush()
+            if shared.comm.rank == 0:
+                Growing(shared.file[CHECKS][name]).write(0, digest)
+            shared.file.flush()
 
     shared.call(finish)
 
@@ -359,7 +356,7 @@ class ResultWriter:
         contents = contents._replace(attributes=describe_run(comm, contents.attributes))
         compressed = contents.compressed
         if kept is None:
-            self._unpublished = create_new(self.path, comm, create_result, *sizes, contents, checked=True)
+            self._unpublished = create_new(self.path, comm, create_result, *sizes, contents)
         else:
             compressed = on_root(comm, reopen, self.path, sizes, contents, kept)
         self._shared = SharedFile(self._unpublished or self.path, comm, self.path, compressed)

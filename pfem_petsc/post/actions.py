@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mechanics.supports import directions_of
+from ..output.result import stage_at
 from ..output.units import engineering
 from .scene import NODE_COLOUR, Camera, Layer
 
@@ -64,7 +65,7 @@ class Actions:
             end = self._own(before, float(when[rows == before][-1]))
             held = external.loads_at(end), external.gravity_at(end), external.wind_at(end)
             self._models[number].external.hold(*held, True)
-        numbers = rows[np.minimum(np.searchsorted(when, times), len(when) - 1)].tolist()
+        numbers = stage_at(history, times).tolist()
         self._moments = [(k, self._own(k, float(time))) for k, time in zip(numbers, times, strict=True)]
         self._supports: list[list[tuple[np.ndarray, np.ndarray, float]]] = []  # nodes, directions, until when
         removed: list[dict[str | None, float]] = []

@@ -5,7 +5,7 @@ A wall module may define ``surface(parameters, bounds)``, which returns what is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,8 +15,9 @@ from ..columns import STATUS
 from ..contact.rotations import turns_about, turns_by, vectors_of
 from ..contact.walls.base import WALLS, Surface, perpendicular, slab
 from ..errors import InputError
-from ..mechanics.bars import bar_shapes, mesh_of_cases, section_of_bars
+from ..mechanics.bars import bar_shapes
 from ..mechanics.motion import rotation_of
+from ..output.result import stage_at
 from ..output.units import MODE, POINT, Axis
 from ..registry import choices, lookup, nearest
 from .actions import Actions
@@ -322,7 +323,22 @@ def _checked(span: Sequence[float], times: np.ndarray) -> tuple[float, float]:
     return max(first, float(times[0])), min(last, float(times[-1]))
 
 
-class Resampled:
+class Seen:
+    """A result, parts of which are other ones in pictures.
+
+    Parameters
+    ----------
+    result : an open result
+    """
+
+    def __init__(self, result: Any) -> None:
+        self._result = result
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._result, name)
+
+
+class Resampled(Seen):
     """A result at other times: positions and fields are linear between snapshots, and constant outside.
 
     Parameters
@@ -332,14 +348,12 @@ class Resampled:
     """
 
     def __init__(self, result: Any, times: np.ndarray) -> None:
-        self._result, self.times = result, np.asarray(times, dtype=float)
+        super().__init__(result)
+        self.times = np.asarray(times, dtype=float)
         own = np.asarray(result.times, dtype=float)
         place = np.interp(self.times, own, np.arange(len(own)))
         self._before = np.minimum(place.astype(int), len(own) - 1)
         self._part = place - self._before
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._result, name)
 
     def positions(self, i: int) -> np.ndarray:
         """Positions (nodes, 3) [m] at a time."""
@@ -376,31 +390,16 @@ def drawn_radii(result: Any, note: Callable[[str], None] | None = None) -> np.nd
 
 
 def radii_of(result: Any) -> np.ndarray | None:
-    """Return the outer radius of each bar (bars,) [m], None where it is not known.
+    """Return the outer radius of each bar (bars,) [m], None where the result does not have the areas of bars.
 
-    The mesh is made or read again, for the sections of bars and the fields of areas. Where it is not there any more,
-    all bars have the radius of the only section; with several sections, radii are not known. Springs and dashpots
-    between nodes have no section: they are as thin as the thinnest bar.
+    Springs and dashpots between nodes have no section: they are as thin as the thinnest bar.
     """
-    from mpi4py import MPI
-
-    case = result.case
-    sections = list(getattr(case, "section", {}).values())
-    if not sections:
+    if "area" not in getattr(result, "bar_data", ()):
         return None
-    length = _lengths(result)
-    try:
-        mesh = mesh_of_cases([case], MPI.COMM_SELF)
-        if mesh.n_bars > len(length):
-            raise InputError(f"the mesh of {case.source} has {mesh.n_bars} bars now, the result {len(length)}")
-        numbers, areas = section_areas(case, mesh)
-    except (InputError, OSError):
-        if len(sections) > 1 or sections[0].uniform_area is None:
-            return None
-        numbers, areas = np.zeros(len(length), dtype=int), np.full(len(length), sections[0].uniform_area)
+    names, areas, length = result.field("section", 0), result.field("area", 0), _lengths(result)
     radius = np.full(len(length), np.inf)
-    for number, section in enumerate(sections):
-        own = np.flatnonzero(numbers == number)
+    for name, section in result.case.section.items():
+        own = np.flatnonzero(names == name)
         radius[own] = bar_shapes(section, length[own], areas[own]).radius
     return np.where(np.isfinite(radius), radius, radius.min())
 
@@ -411,17 +410,7 @@ def _lengths(result: Any) -> np.ndarray:
     return np.linalg.norm(start[bars[:, 1]] - start[bars[:, 0]], axis=1)
 
 
-def section_areas(case: Any, mesh: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of the section of each bar of a whole mesh (bars,), and its area [m2]."""
-    numbers, areas = section_of_bars(case, mesh), np.ones(mesh.n_bars)
-    for number, section in enumerate(case.section.values()):
-        own = np.flatnonzero(numbers == number)
-        area = section.uniform_area
-        areas[own] = mesh.bar_fields[section.area_field][own] if area is None else area
-    return numbers, areas
-
-
-class ModeFrames:
+class ModeFrames(Seen):
     """Modes as the snapshots of a result that :func:`~pfem_petsc.post.render.render` draws, a period each.
 
     The field ``amplitude`` is the length of a node's displacement relative to the largest.
@@ -443,6 +432,7 @@ class ModeFrames:
     axis: Axis = MODE
 
     def __init__(self, result: Any, modes: Sequence[int] | None = None, period: int = PERIOD) -> None:
+        super().__init__(result)
         if period < 4:
             raise InputError(f"render: {period} frames a period are too few for modes; give 4 or more")
         found = result.modes
@@ -451,7 +441,6 @@ class ModeFrames:
             if not 1 <= number <= len(found):
                 raise InputError(f"render: mode {number} does not exist; the result holds modes 1 to {len(found)}")
         self._labels, self._period = [found.label(number - 1) for number in self._numbers], period
-        self.path, self.case, self.bars = result.path, result.case, result.bars
         self._place = result.positions(-1)
         shapes = found.shape[np.array(self._numbers, dtype=int) - 1]
         sizes = np.linalg.norm(shapes, axis=2)
@@ -461,7 +450,6 @@ class ModeFrames:
         self._shapes = shapes * (_LARGEST * extent / largest)[:, None, None]
         # walls are where they are at the end
         self.times = np.full(period * len(self._numbers), result.times[-1])
-        self.history: Mapping[str, np.ndarray] = result.history
 
     def positions(self, i: int) -> np.ndarray:
         """Positions (nodes, 3) [m] of frame i."""
@@ -469,8 +457,8 @@ class ModeFrames:
         return self._place + np.sin(2.0 * np.pi * phase / self._period) * self._shapes[mode]
 
     def field(self, name: str, i: int) -> np.ndarray:
-        """The amplitudes (nodes,) of frame i."""
-        return self._amplitudes[i // self._period]
+        """The amplitudes (nodes,) of frame i, and what bars have in all snapshots."""
+        return self._amplitudes[i // self._period] if name == "amplitude" else self._result.field(name, -1)
 
     def untrue(self, scale: float) -> str:
         """What displacements are, as they are no true ones."""
@@ -547,14 +535,11 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
     shifts, present = np.zeros((len(times), len(walls), 3)), np.zeros((len(times), len(walls)), dtype=bool)
     turns = np.tile(np.eye(3), (*present.shape, 1, 1))
     when = np.asarray(history["time"], dtype=float)
-    numbers = np.asarray(history["stage"]) if "stage" in history else np.zeros(len(when), dtype=int)
-    stages = result.case.stages
-    begins = [when[numbers < k].max(initial=0.0) if k in numbers else np.inf for k in range(1, len(stages))]
-    current = np.searchsorted(begins, times)
-    for number, stage in enumerate(stages):
+    current = stage_at(history, times)
+    for number, stage in enumerate(result.case.stages):
         reached = current >= number
         present[reached] = np.isin(names, [wall.name for wall in stage.wall])
-        since = np.asarray(times)[reached] - (begins[number - 1] if number else 0.0)
+        since = np.asarray(times)[reached] - (when[history["stage"] < number].max(initial=0.0) if number else 0.0)
         for wall in (wall for wall in stage.wall if getattr(wall, "rotation", None) is not None):
             axis = np.array(wall.rotation.axis) / np.linalg.norm(wall.rotation.axis)
             angles = rotation_of(wall).at(since)[:, 0, 0]

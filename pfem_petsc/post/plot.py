@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ..columns import LOST, STORED, SUPPLIED
+from ..columns import SUPPLIED
 from ..errors import InputError
+from ..output.result import balance_error
+from ..output.result import energies as energies_of
 from ..output.units import engineering, unit_of
 from .chart import COLOURS, REFERENCE, STYLE, Chart, Curve, Panel, area, distinct, largest, opened
 from .curves import (
@@ -140,16 +142,6 @@ def _free(file: Path, suffixes: Sequence[str]) -> Path:
     return next(free)
 
 
-def balance_error(history: History) -> np.ndarray | None:
-    """Return the imbalance of stored, lost and supplied energies since the first row, (n,) [J]; None without them."""
-    signs = {**dict.fromkeys((*STORED, *LOST), 1.0), **dict.fromkeys(SUPPLIED, -1.0)}
-    parts = [sign * read(history, name) for name, sign in signs.items() if name in history]
-    if not parts:
-        return None
-    total = np.sum(parts, axis=0)
-    return total - total[0]
-
-
 def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
     """Stacked stored and lost energies with what was supplied, the terms one by one, and the balance.
 
@@ -158,7 +150,7 @@ def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Pa
     error = balance_error(history)
     if error is None:
         return [], "", 1
-    held = {name: read(history, name) for name in (*STORED, *LOST, *SUPPLIED) if name in history}
+    held = energies_of(history)
     most = max(float(np.nanmax(np.abs(values))) for values in held.values())
     moving = {name: values for name, values in held.items() if np.abs(values).max() > 1e-12 * most}
     still = [words(name) for name in held if name not in moving]

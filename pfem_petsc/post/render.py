@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError, written
+from ..output.result import stage_at
 from ..parallel.agreement import agreed
 from .chart import opened
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_rows, even_times
@@ -354,8 +355,7 @@ def instants(result: Any, frames: Sequence[int], count: int) -> list[int]:
     frames = sorted(set(frames))
     cases = [number for number, stage in enumerate(result.case.stage) if stage.starts_from is not None]
     if cases:
-        when, given = result.history["time"], np.asarray(result.times)[frames]
-        number = np.asarray(result.history["stage"])[np.minimum(np.searchsorted(when, given), len(when) - 1)]
+        number = stage_at(result.history, np.asarray(result.times)[frames])
         frames = [frames[np.flatnonzero(number == k)[-1]] for k in cases if k in number] or frames
     return [frames[k] for k in even_rows(len(frames), count)]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Simulation
-from pfem_petsc.bench.measure import CROSSING, JOBS, KINDS, Job, PeakMemory, cells_for, make_case
+from pfem_petsc.bench import CROSSING, JOBS, KINDS, Job, PeakMemory, cells_for, make_case
 
 
 @pytest.mark.parametrize("kind", KINDS)

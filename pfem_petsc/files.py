@@ -1,14 +1,15 @@
-"""Sizes and kinds of files that are read whole, and the memory that bounds them."""
+"""Sizes and kinds of files that are read whole, and the memory that bounds them; folders that are moved aside."""
 
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import stat
 import zipfile
 from pathlib import Path
 
-__all__ = ["check_contents", "memory_of_machine", "readable_whole"]
+__all__ = ["check_contents", "memory_of_machine", "move_aside", "readable_whole"]
 
 
 def memory_of_machine() -> float:
@@ -59,3 +60,9 @@ def _check(size: int) -> None:
         raise OSError(
             errno.EFBIG, f"it has {size / 1e9:,.1f} GB of content, more than the memory of {memory / 1e9:,.1f} GB"
         )
+
+
+def move_aside(folder: Path) -> Path:
+    """Give a folder the next free numbered name, ``NAME.1``; return it."""
+    names = (folder.with_name(f"{folder.name}.{number}") for number in itertools.count(1))
+    return folder.rename(next(name for name in names if not name.exists()))

@@ -42,6 +42,7 @@ from mpi4py import MPI
 
 from .case.toml import short_text, split_key
 from .errors import InputError
+from .files import move_aside
 from .mechanics.bars import StrainEnergy
 from .mesh.exchange import Router
 from .mesh.slab import slab_of
@@ -524,11 +525,7 @@ def prepare_folder(folder: Path, restart: Restart | None, plan: Plan) -> Path | 
                     f"{folder}: holds results, which cannot be moved aside because the current folder is inside; "
                     "give another with -o, or continue them with --restart"
                 )
-            number = 1
-            while (free := folder.with_name(f"{folder.name}.{number}")).exists():
-                number += 1
-            folder.rename(free)
-            aside = free
+            aside = move_aside(folder)
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(

@@ -31,18 +31,14 @@ from .case.schema import Case
 from .case.toml import plain
 from .columns import LOST, STORED, SUPPLIED
 from .errors import InputError, PfemError
+from .files import move_aside
 from .output.result import Result, open_result, peak_force, touch_impulse
 from .output.table import SWEEP, Table, flat_columns, select
 from .registry import nearest
+from .signals import environment_alone
 
 if TYPE_CHECKING:
     from .case.schema import Case
-
-OF_A_LAUNCH = (
-    *("PMIX_", "PMI_", "OPAL_", "ORTE_", "PRTE_LAUNCHED", "OMPI_COMM_", "OMPI_APP_", "OMPI_UNIVERSE_", "OMPI_FILE_"),
-    *("OMPI_MCA_orte_", "OMPI_MCA_ess", "OMPI_MCA_pmix", "HYDRA_", "SLURM_PMI"),
-)
-"""Variables that a launcher of MPI sets, and that would make another process a rank of the same job."""
 
 _PATIENCE = 10.0  # seconds in which a process that is told to end must end
 _WATCH = 1.0  # seconds between two looks for the parent process
@@ -66,9 +62,8 @@ class Report(NamedTuple):
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of processes that MPI did not launch; one thread each, unless OMP_NUM_THREADS is set."""
-    own = {name: value for name, value in os.environ.items() if not name.startswith(OF_A_LAUNCH)}
-    return {"OMP_NUM_THREADS": "1", **own}
+    """Return the environment of a run's process: one thread, unless OMP_NUM_THREADS is set."""
+    return {"OMP_NUM_THREADS": "1", **environment_alone()}
 
 
 class _Process:
@@ -337,10 +332,7 @@ def _prepared(folder: Path) -> Path:
     """Create the output folder, after an existing one was moved aside to a numbered name."""
     try:
         if folder.exists() and any(folder.iterdir()):
-            free = next(
-                name for n in itertools.count(1) if not (name := folder.with_name(f"{folder.name}.{n}")).exists()
-            )
-            folder.rename(free)
+            move_aside(folder)
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot write the results of a sweep there: {error.strerror}") from error

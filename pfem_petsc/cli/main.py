@@ -33,7 +33,7 @@ from ..errors import (
     printable,
 )
 from ..registry import add_plugin, blame
-from ..signals import give_back_early
+from ..signals import give_back_early, launched_rank
 from .parser import PLUGINS, PROGRAM, Parser, Verb, fill
 
 if TYPE_CHECKING:
@@ -62,8 +62,6 @@ examples:
 
 CASE alone means run. Everything after -- goes to PETSc. VERB --help shows more."""
 
-
-RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "SLURM_PROCID")
 
 _PETSC_REFUSED = (62, 63, 83, 86)
 """Codes of PETSc errors: wrong or out of range argument, file cannot be opened, unknown type."""
@@ -170,15 +168,6 @@ def make_parser(only: str = "") -> tuple[Parser, dict[str, Verb]]:
             prog = f"{PROGRAM} {name} {action}"
             fill(actions.add_parser(action, help=text, description=text, prog=prog), (*arguments, PLUGINS))
     return parser, verbs
-
-
-def launched_rank() -> int | None:
-    """Return the rank of this process according to its launcher, None without a launcher."""
-    for variable in RANK_VARIABLES:
-        value = os.environ.get(variable, "")
-        if value.isdigit():
-            return int(value)
-    return None
 
 
 def refuse(error: PfemError, debug: bool) -> int:

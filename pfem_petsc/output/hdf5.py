@@ -54,9 +54,8 @@ class Growing:
         self._shape = (n_rows, *self._shape[1:])
         self._id.set_extent(self._shape)
 
-    def write(self, first: int | tuple[int, ...], rows: np.ndarray, collective: bool = False) -> None:
-        """Write rows (n, ...) starting at row ``first``, or an array at a place; no rows: join a collective transfer
-        without data."""
+    def write(self, first: int, rows: np.ndarray, collective: bool = False) -> None:
+        """Write rows (n, ...) starting at row ``first``; no rows: join a collective transfer without data."""
         if rows.size == 0:
             rows = np.empty((1,) * len(self._shape), dtype=self.dtype)
             source, target = h5py.h5s.create_simple(rows.shape), self._id.get_space()
@@ -64,8 +63,7 @@ class Growing:
             target.select_none()
         else:
             rows = np.ascontiguousarray(rows, dtype=self.dtype)
-            start = first if isinstance(first, tuple) else (first, *self._zeros)
-            source, target = _selection(self._shape, start, rows.shape)
+            source, target = _selection(self._shape, (first, *self._zeros), rows.shape)
         self._id.write(source, target, rows, self._type, _collective() if collective else None)
 
 
@@ -408,8 +406,8 @@ class SharedFile:
         with self.writing():
             return function()
 
-    def write(self, dataset: Growing | None, first: int, rows: np.ndarray, index: tuple[int, ...] = ()) -> None:
-        """Write each rank's rows (n, ...) from row ``first`` of a dataset, at an index of the dimensions before.
+    def write(self, dataset: Growing | None, first: int, rows: np.ndarray) -> None:
+        """Write each rank's rows (n, ...) from row ``first`` of a dataset.
 
         ``dataset`` is None on ranks that are no owners, whose rows go through memory that ranks share. Collective.
         """
@@ -422,9 +420,8 @@ class SharedFile:
             first, rows = 0, memory.arrays["rows"]
 
         def put() -> None:
-            start = (*index, first, *(0,) * (rows.ndim - 1))
             with self.writing():
-                dataset.write(start, rows.reshape((1,) * len(index) + rows.shape), collective=self.together)
+                dataset.write(first, rows, collective=self.together)
 
         self.call(put)
 

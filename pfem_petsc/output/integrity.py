@@ -24,6 +24,7 @@ from mpi4py import MPI
 from ..columns import Layout
 from ..errors import InputError
 from ..mechanics.compiled import kernel
+from ..signals import environment_alone
 from .hdf5 import dataset_names, fsync_all, is_compressed
 from .layout import (
     BARS,
@@ -184,7 +185,6 @@ _START = """import sys, mpi4py
 mpi4py.rc.initialize = False
 from pfem_petsc.output.integrity import main
 sys.exit(main())"""
-_LAUNCHERS = ("OMPI_", "PMIX_", "PMI_", "OPAL_", "ORTE_", "PRTE_", "MPI_LOCALRANKID", "SLURM_PROCID", "PALS_")
 
 
 def examine(path: Path, deep: bool | None = None) -> list[str]:
@@ -231,9 +231,8 @@ def _examined(path: Path, size: int, changed: int, deep: bool) -> tuple[tuple[st
 
 
 def _read_apart(path: Path, deep: bool) -> subprocess.CompletedProcess:
-    # Without the environment variables of the ranks, with which h5py would start MPI.
-    variables = {name: value for name, value in os.environ.items() if not name.startswith(_LAUNCHERS)}
-    root = str(Path(__file__).parents[2])
+    # without the variables of the ranks, with which h5py would start MPI
+    variables, root = environment_alone(), str(Path(__file__).parents[2])
     variables["PYTHONPATH"] = os.pathsep.join([root, *filter(None, [variables.get("PYTHONPATH")])])
     command = [sys.executable, "-c", _START, str(path), "deep" if deep else "quick"]
     return subprocess.run(

@@ -18,6 +18,7 @@ import numpy as np
 from ..errors import InputError, written
 from ..output.result import stage_at
 from ..parallel.agreement import agreed
+from ..signals import launched_rank
 from .chart import opened
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_rows, even_times
 from .options import Options
@@ -367,8 +368,7 @@ def _helpers(paths: Sequence[Any], folder: Path, options: Options, count: int) -
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     processes = min(cores, count // SHARE)
-    launched = any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMI_RANK"))
-    if processes < 2 or launched or not all(isinstance(path, (str, os.PathLike)) for path in paths):
+    if processes < 2 or launched_rank() is not None or not all(isinstance(path, (str, os.PathLike)) for path in paths):
         return []
     few_threads()
     code = "from pfem_petsc.post.render import _help; _help()"

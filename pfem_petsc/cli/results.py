@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, printable
-from ..post.options import PER, WINDOW, Options, PlotOptions
+from ..post.options import PER, WINDOW, Options, PlotOptions, reader
 from .parser import PROGRAM, Verb, argument, options_of, surviving
 
 if TYPE_CHECKING:
@@ -212,13 +212,6 @@ examples:
   mpirun -n 4 {PROGRAM} render results/lattice_drop --size 4k --orbit 90"""
 
 
-def _mode_numbers(text: str) -> list[int]:
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers of modes like 1,2,5") from None
-
-
 OF_RENDER = (
     argument("result", metavar="RESULT", nargs="+", help="result file, or its folder; several are drawn side by side"),
     argument("-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: that of the result"),
@@ -227,7 +220,9 @@ OF_RENDER = (
         metavar="N[,N...]",
         nargs="?",
         const=[],
-        type=_mode_numbers,
+        type=reader(
+            lambda text: [int(part) for part in text.split(",")], "is not a list of numbers of modes like 1,2,5"
+        ),
         help="draw the modes of a case with [modes], or those of these numbers, into DIR/modes; --frames is then the "
         "number of frames of a period",
     ),

@@ -255,6 +255,10 @@ class Doubts:
     ----------
     model : Model
     warn : receives a warning
+
+    Attributes
+    ----------
+    kept : counts so far, for a checkpoint or the next stage
     """
 
     def __init__(self, model: Model, warn: Callable[[str], None]) -> None:
@@ -272,15 +276,7 @@ class Doubts:
             kind: limit for kind, limit in self._limits.items() if model.comm.allreduce(bool(np.isfinite(limit).any()))
         }
         self._crossing = CrossingBars(model)
-        self._kept: dict[str, dict[str, Any]] = {}
-
-    def kept(self) -> dict[str, Any]:
-        """Return the counts so far, for a checkpoint or the next stage."""
-        return self._kept
-
-    def load_state(self, kept: dict[str, Any]) -> None:
-        """Go on with the counts of :meth:`kept`."""
-        self._kept = {kind: dict(counts) for kind, counts in kept.items()}
+        self.kept: dict[str, dict[str, Any]] = {}
 
     def look(self, x: np.ndarray, place: str, last: bool) -> None:
         """Examine the state at positions (local, 3) [m], ghosts included, at a place of the run. Collective.
@@ -301,7 +297,7 @@ class Doubts:
 
     def _counts(self, kind: str) -> dict[str, Any]:
         none = {"looks": 0, "seen": 0, "first": "", "most": 0, "worst": [0.0, -1, ""]}
-        return self._kept.setdefault(kind, none)
+        return self.kept.setdefault(kind, none)
 
     def _count(self, kind: str, number: int, worst: tuple[float, int], place: str, text: str) -> None:
         """Count a snapshot with a number of bars or pairs, and warn of the first one.
@@ -367,7 +363,7 @@ class Doubts:
     def summary(self) -> list[str]:
         """Return sentences for the end of the run, about what was seen again after its warning."""
         texts = []
-        for kind, counts in self._kept.items():
+        for kind, counts in self.kept.items():
             if counts["seen"] < 2:
                 continue
             often = f"in {counts['seen']:,} of {counts['looks']:,} snapshots, first at {counts['first']}"

@@ -398,12 +398,12 @@ class Snapshots(Observer):
 
     def kept(self) -> dict[str, Any]:
         """Return what a restart and the next stage go on with: the step of the last snapshot, and counts."""
-        return {"snapshot": self.last, "doubts": self._doubts.kept()}
+        return {"snapshot": self.last, "doubts": self._doubts.kept}
 
     def load_state(self, kept: Mapping[str, Any]) -> None:
         """Go on with what :meth:`kept` returned."""
         self.last = int(kept["snapshot"])
-        self._doubts.load_state(kept.get("doubts", {}))
+        self._doubts.kept = kept.get("doubts", {})
 
     def complete(self) -> None:
         """Write the snapshot of the last step."""

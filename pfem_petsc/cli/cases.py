@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ..case.toml import built_in_cases, built_in_path
 from ..errors import EarlyStop, InputError, SimulationFailure, printable
 from ..registry import choices, description
-from .parser import CASE, PLUGINS, PROGRAM, Verb, argument, fill, seconds, start_petsc
+from .main import CASE, PLUGINS, PROGRAM, Verb, argument, fill, make_parser, seconds, start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -308,8 +308,6 @@ OF_COMPLETION = (argument("shell", choices=("bash", "zsh"), help="the shell"),)
 def completion(arguments: argparse.Namespace) -> int:
     """Print the script."""
     import shtab
-
-    from .main import make_parser
 
     parser, _ = make_parser()
     words = " ".join(f"{key}=" for key in sorted(set(keys())))

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .. import bench
 from ..errors import InputError
-from .parser import PROGRAM, Verb, argument, start_petsc
+from .main import PROGRAM, Verb, argument, start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI

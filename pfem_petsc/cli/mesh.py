@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, printable, written
-from .parser import PROGRAM, Action, Verb, argument, setting
+from .main import PROGRAM, Action, Verb, argument, setting
 
 if TYPE_CHECKING:
     from ..mesh.whole import WholeMesh

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, printable
 from ..post.options import PER, WINDOW, Options, PlotOptions, reader
-from .parser import PROGRAM, Verb, argument, options_of, surviving
+from .main import PROGRAM, Verb, argument, options_of, surviving
 
 if TYPE_CHECKING:
     from mpi4py import MPI

@@ -489,6 +489,28 @@ def _analysis(stage: Any) -> str:
     return f"static, {stage.static.method}" if stage.static is not None else "modes of the initial state"
 
 
+def check_mesh(result: Any, mesh: Any) -> None:
+    """Refuse a mesh that is not the one of a result.
+
+    Raises
+    ------
+    InputError
+        If nodes or bars differ.
+    """
+    ends, numbers = np.asarray(result.bars), mesh.node_ids[mesh.bars]
+    counts = (result.n_nodes, len(ends)), (mesh.n_nodes, mesh.n_bars)
+    same = counts[0] == counts[1] and bool((ends[mesh.bar_ids] == numbers).all())
+    if same and "displacement" in result.point_fields:
+        points = np.asarray(result.positions(0), dtype=float) - np.asarray(result.field("displacement", 0), dtype=float)
+        size = float(np.ptp(mesh.points, axis=0).max())
+        same = bool(np.abs(points[mesh.node_ids] - mesh.points).max() <= 1e-5 * size)
+    if not same:
+        raise InputError(
+            f"{result.path}: the mesh of its case is another one now (it had {counts[0][0]:,} nodes and "
+            f"{counts[0][1]:,} bars): the table of members reads it again; put it back, or run the case again"
+        )
+
+
 def stage_at(history: Mapping[str, np.ndarray], times: Sequence[float]) -> np.ndarray:
     """Return the number of the stage (n,) of each of some times; the end of a stage belongs to it, not to the next."""
     if "stage" not in history:

@@ -19,10 +19,9 @@ from ..errors import InputError
 from ..mechanics.bars import bar_shapes
 from ..mechanics.motion import rotation_of
 from ..mechanics.supports import directions_of
-from ..output.result import stage_at
+from ..output.result import check_mesh, stage_at
 from ..output.units import MODE, POINT, Axis, engineering
 from ..registry import choices, lookup, nearest
-from .members import check_mesh
 from .page import GHOST, MARKS, TRAILS
 from .scene import NODE_COLOUR, Camera, Layer, Scene
 

@@ -17,8 +17,8 @@ from mpi4py import MPI
 from ..columns import Fields, Row, Snapshot
 from ..contact.monitoring import Piercing, check_positions
 from ..errors import SimulationFailure
+from ..files import FolderLock
 from ..output.checkpoint import write_checkpoint
-from ..output.lock import FolderLock
 from ..output.units import duration
 from ..output.vtkhdf import ResultWriter
 from ..restart import STATE_VERSION, RunState

@@ -10,7 +10,6 @@ import contextlib
 import itertools
 import os
 import pickle
-import queue
 import shutil
 import signal
 import subprocess
@@ -124,32 +123,27 @@ def performed(tasks: Sequence[Task], processes: int) -> Iterator[tuple[int, Repo
 
     If the iteration is left before its end, runs in progress are ended, and no others begin.
     """
-    workers = [_Process() for _ in range(max(min(processes, len(tasks)), 1))]
-    idle: queue.SimpleQueue[_Process] = queue.SimpleQueue()
-    stopped = threading.Event()
+    workers: list[_Process] = []
+    own = threading.local()
 
-    def with_next(task: Task) -> Report:
-        worker = idle.get()
-        try:
-            return worker.perform(task)
-        finally:
-            idle.put(worker)
-            if stopped.is_set():
-                worker.close()
+    def perform_apart(task: Task) -> Report:
+        if not hasattr(own, "worker"):
+            own.worker = _Process()
+            workers.append(own.worker)
+        return own.worker.perform(task)
 
-    with contextlib.ExitStack() as ending, ThreadPoolExecutor(len(workers)) as pool:
-        for worker in workers:
-            ending.callback(worker.close)
-            idle.put(worker)
-        runs = {pool.submit(with_next, task): number for number, task in enumerate(tasks)}
+    with ThreadPoolExecutor(max(min(processes, len(tasks)), 1)) as pool:
+        runs = {pool.submit(perform_apart, task): number for number, task in enumerate(tasks)}
         try:
             for run in as_completed(runs):
                 yield runs[run], run.result()
         finally:
-            stopped.set()
             pool.shutdown(wait=False, cancel_futures=True)
             for worker in workers if not all(run.done() for run in runs) else ():
                 worker.end()
+            pool.shutdown()
+            for worker in workers:
+                worker.close()
 
 
 def perform(task: Task) -> Report:

@@ -271,14 +271,9 @@ def write_checkpoint(
         if comm.rank == 0:
             temporary.unlink(missing_ok=True)
         raise
-    with writing(comm, temporary):
-        file.close()
-    with writing(comm, temporary):
-        if comm.rank == 0:
-            with open(temporary, "r+b") as raw:
-                raw.write(f"{_FORMAT} {_VERSION}\n".encode())
     first = first_of_machine(comm)
     with writing(comm, temporary):
+        file.close()
         if first:  # a machine has one cache of the file
             fsync_all(temporary)
     with writing(comm, path):
@@ -295,6 +290,9 @@ def _create(file: h5py.File, shapes: Mapping, state: str) -> None:
 
 
 def _put_in_place(temporary: Path, path: Path) -> None:
+    with open(temporary, "r+b") as raw:
+        raw.write(f"{_FORMAT} {_VERSION}\n".encode())
+    fsync_all(temporary)
     if path.exists():
         os.replace(path, path.with_name(f"{path.stem}-previous{path.suffix}"))
     os.replace(temporary, path)

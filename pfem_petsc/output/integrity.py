@@ -115,14 +115,6 @@ def seeded(name: str, total: int) -> int:
     return (total * (2 * zlib.crc32(name.encode()) + 1)) & _WORD
 
 
-def snapshot_digests(comm: MPI.Comm, sums: Mapping[str, int]) -> np.ndarray:
-    """Return checksums (fields,) uint64 of arrays distributed in slabs over the ranks, sorted by name. Collective.
-
-    ``sums``: name to :func:`word_sum` of this rank's rows, in the type in which they are stored.
-    """
-    return summed(comm, [seeded(name, part) for name, part in sorted(sums.items())])
-
-
 def mark_digest(n: int, step: int, time: float) -> int:
     """Return the checksum of the step and time [s] of snapshot n."""
     return zlib.crc32(np.array([n, step], dtype=np.int64).tobytes() + np.float64(time).tobytes())

@@ -18,7 +18,7 @@ from ..errors import InputError, PfemError, SimulationFailure
 from ..parallel.agreement import on_root
 from ..parallel.heap import SharedArrays
 from .hdf5 import Growing, SharedFile, create_new, require_parallel_hdf5, require_room, writing
-from .integrity import RowDigests, mark_digest, numbers_digest, reopen, seeded, snapshot_digests, summed, word_sum
+from .integrity import RowDigests, mark_digest, numbers_digest, reopen, seeded, summed, word_sum
 from .layout import (
     BARS,
     CHECKS,
@@ -257,7 +257,7 @@ class _Snapshots:
             sums[name] = word_sum(slab, order.first)
             with self._shared.writing():
                 self._data[name].write(n * order.n_global + order.first, slab, collective=self._shared.together)
-        return snapshot_digests(self._shared.owners, sums)
+        return summed(self._shared.owners, [seeded(name, part) for name, part in sorted(sums.items())])
 
     def mark(self, n: int, step: int, time: float, digests: np.ndarray) -> None:
         """Write the entries of snapshot n, except its time in ``/VTKHDF``, without counting it. For owners."""

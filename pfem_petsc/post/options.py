@@ -240,7 +240,7 @@ class PlotOptions:
 
     def __post_init__(self) -> None:
         from .chart import check_formats
-        from .filters import WINDOWS
+        from .curves import WINDOWS
 
         if self.spectrum is not None and (self.curves is not None or self.against is not None):
             raise InputError("plot: spectrum is a picture of its own: give it without curves and against")

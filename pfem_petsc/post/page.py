@@ -184,18 +184,6 @@ class ColourScale:
         ]
 
 
-def limits_of(
-    clim: tuple[float, float] | None, symmetric: bool, fields: Sequence[ColourField], frames: Sequence[int]
-) -> tuple[float, float]:
-    """Return the range of colours: the one given, or that of all fields, symmetric if asked for."""
-    found = [clim] if clim is not None else [field.limits(frames) for field in fields]
-    low, high = min(pair[0] for pair in found), max(pair[1] for pair in found)
-    if symmetric:
-        high = max(abs(low), abs(high))
-        low = -high
-    return low, high
-
-
 INK, PALE = "#1f242c", "#5b6472"
 _GROUPS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442")
 """Okabe and Ito: apart for all kinds of colour vision."""

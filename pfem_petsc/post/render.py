@@ -22,7 +22,7 @@ from ..signals import launched_rank
 from .chart import opened
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_rows, even_times
 from .options import Options
-from .page import MARKS, ColourField, ColourScale, Heading, Page, grid, inset_room, limits_of
+from .page import MARKS, ColourField, ColourScale, Heading, Page, grid, inset_room
 from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Segments, Style, at_one_scale, cameras, few_threads
 
 if TYPE_CHECKING:
@@ -187,7 +187,9 @@ class Film:
         shown, chosen = _timed(results, options, note)
         self.count = len(chosen)
         self.colours = [ColourField(result, options.field, options.component) for result in shown]
-        limits = limits_of(options.clim, options.symmetric, self.colours, chosen)
+        found = [options.clim] if options.clim is not None else [field.limits(chosen) for field in self.colours]
+        low, high = min(pair[0] for pair in found), max(pair[1] for pair in found)
+        limits = (-max(abs(low), abs(high)), max(abs(low), abs(high))) if options.symmetric else (low, high)
         if all(colour.rounded for colour in self.colours):
             note(f"{self.colours[0].title} is zero in all frames, to rounding")
         self.scale = ColourScale(limits, options.cmap, self.colours[0].unit)

@@ -60,7 +60,7 @@ def write_report(
     result_path : result file or its folder, or an open result
     output : the file; None: ``report.html`` beside the result
     pictures : whether to draw the truss; where that is not possible, the report says why
-    force_filter : of the forces: see :func:`~pfem_petsc.post.filters.make_filter`
+    force_filter : of the forces: see :func:`~pfem_petsc.post.curves.make_filter`
     field : that colours the bars
 
     Raises

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from statistics import median
 from time import perf_counter, process_time, sleep
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -359,26 +359,14 @@ BYTES_PER_ELEMENT = 24
 _ELEMENTS = 8_000_000  # 64 MB per array and process, larger than the share of a core in any current cache
 
 
-class Bandwidth(NamedTuple):
-    """STREAM triad [B/s], best of several: of one process alone, and of all ranks at once."""
-
-    alone: float
-    together: float
-    ranks: int
-
-    @property
-    def ratio(self) -> float:
-        """Bandwidth of all ranks relative to one: the maximum speed-up of memory-bound work."""
-        return self.together / self.alone
-
-
 def _triad(a, b, c, scalar):
     for i in range(len(a)):
         a[i] = b[i] + scalar * c[i]
 
 
-def measure_bandwidth(comm: MPI.Comm, repeats: int = 10) -> Bandwidth:
-    """Measure both. Collective; the other ranks sleep while one is measured."""
+def measure_bandwidth(comm: MPI.Comm, repeats: int = 10) -> dict[str, float]:
+    """Return the STREAM triad [B/s], best of several, of one process alone and of all ranks together, and their ratio,
+    the maximum speed-up of memory-bound work. Collective; the other ranks sleep while one is measured."""
     import numpy as np
 
     from .mechanics.compiled import kernel
@@ -399,8 +387,8 @@ def measure_bandwidth(comm: MPI.Comm, repeats: int = 10) -> Bandwidth:
     if comm.size > 1:
         # the slowest of a round, because all share the memory until it has finished
         slowest = np.max(comm.allgather(_seconds(triad, repeats, comm.Barrier)), axis=0)
-        together = comm.size * size / slowest.min()
-    return Bandwidth(float(alone), float(together), comm.size)
+        together = comm.size * size / float(slowest.min())
+    return {"alone": alone, "together": together, "ratio": together / alone, "bytes_per_element": BYTES_PER_ELEMENT}
 
 
 def processor() -> str:
@@ -445,11 +433,11 @@ def line(record: Record) -> str:
     )
 
 
-def machine_lines(bandwidth: Bandwidth) -> str:
+def machine_lines(bandwidth: dict[str, float], ranks: int) -> str:
     """Describe the bandwidth."""
-    text = f"STREAM triad ({BYTES_PER_ELEMENT} B an element): one process {bandwidth.alone / 1e9:.1f} GB/s"
-    if bandwidth.ranks > 1:
-        text += f", {bandwidth.ranks} at once {bandwidth.together / 1e9:.1f} GB/s ({bandwidth.ratio:.2f} x)"
+    text = f"STREAM triad ({BYTES_PER_ELEMENT} B an element): one process {bandwidth['alone'] / 1e9:.1f} GB/s"
+    if ranks > 1:
+        text += f", {ranks} at once {bandwidth['together'] / 1e9:.1f} GB/s ({bandwidth['ratio']:.2f} x)"
     return text + "\n"
 
 
@@ -463,20 +451,15 @@ def memory_slopes(records: list[Record]) -> dict[str, float]:
     return slopes
 
 
-def document(comm: MPI.Comm, bandwidth: Bandwidth, records: list[Record], tiny: list[Record]) -> str:
+def document(comm: MPI.Comm, bandwidth: dict[str, float], records: list[Record], tiny: list[Record]) -> str:
     """Return all measurements as JSON."""
     from .output.layout import describe_run
 
     content: dict[str, Any] = {
         "machine": {"processor": processor(), "cores": os.cpu_count(), "system": platform.platform()},
         "program": describe_run(comm, {}),
-        "ranks": bandwidth.ranks,
-        "bandwidth": {
-            "alone": bandwidth.alone,
-            "together": bandwidth.together,
-            "ratio": bandwidth.ratio,
-            "bytes_per_element": BYTES_PER_ELEMENT,
-        },
+        "ranks": comm.size,
+        "bandwidth": bandwidth,
         "runs": [asdict(record) | {"bars_per_second": record.rate} for record in records],
         "memory_slopes": memory_slopes(records),
         "overhead": [asdict(record) for record in tiny],

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .. import bench
-from ..errors import InputError
+from ..errors import InputError, written
 from .main import PROGRAM, Verb, argument, start_petsc
 
 if TYPE_CHECKING:
@@ -309,11 +309,13 @@ OF_BENCH = (
 def measure(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     """Measure and print. Collective."""
     start_petsc(arguments.petsc_options, comm.rank)
-    from ..parallel.agreement import on_root
+    from ..parallel.agreement import agreed
 
     if not 0.0 < arguments.seconds < float("inf"):
         raise InputError(f"--seconds {arguments.seconds}: give a positive time")
-    on_root(comm, _require_writable, arguments.output)
+    if arguments.output is not None:  # before the measurements, which take minutes
+        with agreed(comm), written(arguments.output, "the figures"):
+            arguments.output.open("a").close()
 
     def say(text: str) -> None:
         if comm.rank == 0:
@@ -333,7 +335,7 @@ def measure(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     title = f"{bench.processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {kind} lattices"
     say(title)
     bandwidth = bench.measure_bandwidth(comm)
-    say(bench.machine_lines(bandwidth))
+    say(bench.machine_lines(bandwidth, comm.size))
     say(bench.HEADER)
     records = []
     for size in sorted(arguments.sizes):
@@ -349,15 +351,6 @@ def measure(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     if arguments.output and comm.rank == 0:
         arguments.output.write_text(bench.document(comm, bandwidth, records, tiny), encoding="utf-8")
     return 0
-
-
-def _require_writable(path: Path | None) -> None:
-    """Open the output file before the measurements, which take minutes."""
-    try:
-        if path is not None:
-            path.open("a").close()
-    except OSError as error:
-        raise InputError(f"--output {path}: cannot be written: {error.strerror}") from error
 
 
 VERBS = (

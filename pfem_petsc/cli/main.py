@@ -245,7 +245,7 @@ def without_effect(options: Sequence[str]) -> list[str]:
     return lines
 
 
-HOMES = {"run": "cases", "list": "cases", "check": "cases", "mesh": "mesh", "render": "results", "plot": "results"}
+HOMES = {"run": "cases", "list": "cases", "check": "cases", "mesh": "cases", "render": "results", "plot": "results"}
 HOMES |= {
     "report": "results",
     "members": "results",

@@ -11,9 +11,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from ..columns import STATUS
-from ..contact.rotations import turns_about, turns_by, vectors_of
+from ..contact.rotations import turns_about
 from ..contact.walls.base import WALLS, Surface, perpendicular, slab
 from ..errors import InputError
 from ..mechanics.bars import bar_shapes
@@ -730,13 +731,10 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
             places = np.asarray(history[f"wall/{name}/position"], dtype=float)
             shifts[:, k] = np.stack([np.interp(times, when, column - column[0]) for column in places.T], axis=1)
         if f"wall/{name}/rotation" in history:
-            rows = turns_by(np.asarray(history[f"wall/{name}/rotation"], dtype=float))
-            last = np.clip(np.searchsorted(when, times, side="right") - 1, 0, max(len(when) - 2, 0))
-            after = np.minimum(last + 1, len(when) - 1)
-            span = when[after] - when[last]
-            part = np.clip((times - when[last]) / np.where(span > 0.0, span, 1.0), 0.0, 1.0)
-            way = vectors_of(rows[after] @ rows[last].swapaxes(1, 2))
-            turns[:, k] = turns_by(part[:, None] * way) @ rows[last]
+            kept = np.unique(when, return_index=True)[1]
+            rows = Rotation.from_rotvec(np.asarray(history[f"wall/{name}/rotation"], dtype=float)[kept])
+            between = Slerp(when[kept], rows) if len(kept) > 1 else lambda at, rows=rows: rows[np.zeros(len(at), int)]
+            turns[:, k] = between(np.clip(times, when[0], when[-1])).as_matrix()
     return shifts, turns, present
 
 

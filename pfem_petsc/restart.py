@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from .stepping.plan import Plan
     from .stepping.stepper import Stepper
 
-STATE_VERSION = 9
+STATE_VERSION = 10
 """Changed with the meaning of what is saved."""
 
 _MEMORY = "memory."

@@ -498,7 +498,16 @@ def check(arguments: argparse.Namespace, comm: MPI.Comm | None = None) -> int:
     if arguments.env:
         if arguments.case is not None or arguments.overrides:
             raise InputError("check --env checks the machine and takes no case: give one of the two")
-        return _check_machine()
+        from .machine import inspect_environment, report
+
+        found = inspect_environment()
+        print("\n".join(printable(line) for line in report(found)))
+        if missing := [each.name for each in found if each.state == "missing"]:
+            raise InputError(
+                f"check --env: missing: {', '.join(missing)}; the list above has the commands to install it"
+            )
+        print("This machine has everything that runs need.")
+        return 0
     if arguments.case is None:
         raise InputError(
             f"the following arguments are required: CASE (give it before --set), or --env; see {PROGRAM} check --help"
@@ -519,18 +528,6 @@ def check(arguments: argparse.Namespace, comm: MPI.Comm | None = None) -> int:
         print("\n".join(lines if obstacle else [*lines, "This case can run."]))
     if obstacle:
         raise InputError(obstacle)
-    return 0
-
-
-def _check_machine() -> int:
-    from .machine import inspect_environment, report
-
-    found = inspect_environment()
-    print("\n".join(printable(line) for line in report(found)))
-    missing = [each.name for each in found if each.state == "missing"]
-    if missing:
-        raise InputError(f"check --env: missing: {', '.join(missing)}; the list above has the commands to install it")
-    print("This machine has everything that runs need.")
     return 0
 
 

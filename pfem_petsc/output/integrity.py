@@ -394,7 +394,12 @@ def reopen(path: Path, sizes: tuple[int, int], contents: Contents, kept: Kept) -
     InputError
         If the file is missing or damaged, or has another mesh, other fields or other columns.
     """
-    _refuse_damaged(path)
+    if path.is_file() and (wrong := examine(path, deep=True)):
+        more = f", and {len(wrong) - 1} more like it" if len(wrong) > 1 else ""
+        raise InputError(
+            f"{path}: damaged: {wrong[0]}{more} (info --verify lists all): it is not continued; restore it from a "
+            "copy, or restart into another folder (-o), where new results begin at the checkpoint"
+        )
     with readable(path), h5py.File(path, "r", locking=False) as file:
         compressed = is_compressed(file["VTKHDF/Points"])
         _check_same(file, path, _counts(file, kept)[0], sizes, contents)
@@ -405,18 +410,6 @@ def reopen(path: Path, sizes: tuple[int, int], contents: Contents, kept: Kept) -
             write_case(file, contents.case_text, {**contents.attributes, "restarts_after_step": [*earlier, kept.step]})
             prepare_modes(file, contents.modes, sizes[0])
     return compressed
-
-
-def _refuse_damaged(path: Path) -> None:
-    if not path.is_file():
-        return
-    wrong = examine(path, deep=True)
-    if wrong:
-        more = f", and {len(wrong) - 1} more like it" if len(wrong) > 1 else ""
-        raise InputError(
-            f"{path}: damaged: {wrong[0]}{more} (info --verify lists all): it is not continued; restore it from a "
-            "copy, or restart into another folder (-o), where new results begin at the checkpoint"
-        )
 
 
 def _check_same(file: h5py.File, path: Path, n_snapshots: int, sizes: tuple[int, int], contents: Contents) -> None:

@@ -207,10 +207,9 @@ def _column(values: Sequence[Any] | np.ndarray) -> np.ndarray:
     if isinstance(values, np.ndarray) and values.ndim == 1:
         return values
     values = list(values)
-    logical = bool(values) and isinstance(values[0], bool | np.bool_)  # which are integers for Python
-    plain = [(int | np.integer, np.int64), (int | float | np.number, np.float64), (str, np.str_)]
-    for kind, dtype in [(bool | np.bool_, bool)] if logical else plain:
-        if all(isinstance(value, kind) and isinstance(value, bool | np.bool_) == logical for value in values):
+    kinds = {np.asarray(value).dtype.kind if np.isscalar(value) else "O" for value in values}
+    for known, dtype in (("iu", np.int64), ("iuf", np.float64), ("U", np.str_), ("b", bool)):
+        if kinds <= set(known):
             return np.array(values, dtype=dtype)
     made = np.empty(len(values), dtype=object)
     for i, value in enumerate(values):
@@ -425,9 +424,10 @@ class _Reader:
         one, other = one.reduced(), other.reduced()
         if one.vector != other.vector:
             raise self.error("one is a vector and the other is not; select a component, like .x")
-        unit = one.unit if other.plain else other.unit if one.plain else _common(one.unit, other.unit)
-        if unit is None and None not in (one.unit, other.unit):
+        units = [each.unit for each in (one, other) if not each.plain] or [None]
+        if None not in units and dimensions(powers_of(units[0])) != dimensions(powers_of(units[-1])):
             raise self.error(f"the units {one.unit or '1'} and {other.unit or '1'} differ")
+        unit = None if None in units else units[0]
         return Selected(operation(one.values, other.values), unit, one.vector, one.sources + other.sources)
 
     def _multiplied(self, one: Selected, other: Selected, power: int) -> Selected:
@@ -444,13 +444,6 @@ class _Reader:
         with np.errstate(divide="ignore", invalid="ignore"):
             values = a * b if power > 0 else np.where(b == 0.0, np.nan, a / b)
         return Selected(values, unit, one.vector or other.vector, one.sources + other.sources)
-
-
-def _common(one: str | None, other: str | None) -> str | None:
-    """Return the unit of both; None if one is not known, or their dimensions differ."""
-    if one is None or other is None:
-        return None
-    return one if dimensions(powers_of(one)) == dimensions(powers_of(other)) else None
 
 
 def _names(columns: Iterable[str]) -> Iterable[tuple[str, str]]:

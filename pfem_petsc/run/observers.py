@@ -245,38 +245,31 @@ class History(Observer):
 
     def kept(self) -> dict[str, Any]:
         """Return what a restart goes on with, besides the ledger."""
-        recorder = self.recorder
+        recorder, watch = self.recorder, self._contact_watch
         return {
             "iterations": list(self._stepper.iterations),
             "start_energy": recorder.start_energy,
             "energy_scale": recorder.energy_scale,
+            "carried": None if recorder.carried is None else recorder.carried.tolist(),
+            "rest": None if recorder.rest is None else recorder.rest.tolist(),
+            "watch": None if watch is None else watch.start,
             "blow_up": self.blow_up.kept,
             "row": {name: float(self.row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
         }
 
     def load_state(self, kept: Mapping[str, Any]) -> None:
-        """Take what :meth:`kept` gave; for a case with stages, under ``stage``, also what :meth:`stage` gave."""
+        """Take what :meth:`kept` gave."""
         recorder = self.recorder
         self._stepper.iterations = [int(n) for n in kept["iterations"]]
         recorder.start_energy, recorder.energy_scale = kept["start_energy"], kept["energy_scale"]
         self.blow_up.kept = kept["blow_up"]
         self.row = dict(kept["row"])
-        start, stage = recorder.start_energy, kept.get("stage")
-        if stage is not None:
-            before = stage["history"]
-            recorder.carried = None if before["carried"] is None else np.array(before["carried"])
-            recorder.rest[:], start = before["rest"], before["watch"]
+        if kept["carried"] is not None:
+            recorder.carried = np.array(kept["carried"])
+        if recorder.rest is not None:
+            recorder.rest[:] = kept["rest"]
         if self._contact_watch is not None:
-            self._contact_watch.start = start
-
-    def stage(self) -> dict[str, Any]:
-        """Return what a checkpoint must hold of the stages before."""
-        carried, watch = self.recorder.carried, self._contact_watch
-        return {
-            "carried": None if carried is None else carried.tolist(),
-            "rest": self.recorder.rest.tolist(),
-            "watch": None if watch is None else watch.start,
-        }
+            self._contact_watch.start = kept["watch"]
 
     def due(self, step: int) -> bool:
         """Return whether there is a row to record: of this step or, in a call, of one before."""
@@ -485,7 +478,7 @@ class Checkpointing(Observer):
             # the arrays of what the stage starts from are among those of nodes
             start = self._stages.model.start
             numbers = None if start is None else start.scalars()
-            scalars["stage"] = {"number": self._stages.number, "history": history.stage(), "start": numbers}
+            scalars["stage"] = {"number": self._stages.number, "start": numbers}
         attributes = {
             "state_version": STATE_VERSION,
             "pfem_petsc": __version__,

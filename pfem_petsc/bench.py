@@ -23,6 +23,7 @@ from time import perf_counter, process_time, sleep
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import numpy as np
     from mpi4py import MPI
 
     from .case.schema import Case
@@ -359,7 +360,7 @@ BYTES_PER_ELEMENT = 24
 _ELEMENTS = 8_000_000  # 64 MB per array and process, larger than the share of a core in any current cache
 
 
-def _triad(a, b, c, scalar):
+def _triad(a: np.ndarray, b: np.ndarray, c: np.ndarray, scalar: float) -> None:
     for i in range(len(a)):
         a[i] = b[i] + scalar * c[i]
 

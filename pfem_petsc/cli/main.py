@@ -245,15 +245,11 @@ def without_effect(options: Sequence[str]) -> list[str]:
     return lines
 
 
-HOMES = {"run": "cases", "list": "cases", "check": "cases", "mesh": "cases", "render": "results", "plot": "results"}
-HOMES |= {
-    "report": "results",
-    "members": "results",
-    "crush": "results",
-    "info": "results",
-    "sweep": "cases",
+HOMES = {
+    **dict.fromkeys(("run", "list", "check", "mesh"), "cases"),
+    **dict.fromkeys(("render", "plot", "report", "members", "crush", "info"), "results"),
+    **dict.fromkeys(("sweep", "completion"), "cases"),
     "bench": "machine",
-    "completion": "cases",
 }
 """Verbs, and the modules of this package whose ``VERBS`` have them."""
 

@@ -74,15 +74,20 @@ def write_report(
             raise InputError(f"{file}: is a folder; name a file for the report, {file / NAME}")
         with tempfile.TemporaryDirectory() as folder:
             curves = plot(result, folder, force_filter=force_filter)
-            drawn, reason = _draw(result, Path(folder) / "truss.png", field) if pictures else (None, "not asked for")
-            text = _document(result, curves, drawn, reason)
+            truss = (
+                _truss(result, Path(folder, "truss.png"), field) if pictures else _NO_PICTURES.format("not asked for")
+            )
+            text = _document(result, curves, truss)
     with written(file, "the report"):
         file.write_text(text, encoding="utf-8")
     return file
 
 
-def _draw(result: Any, file: Path, field: str) -> tuple[Path | None, str]:
-    """Draw six instants of the truss; return the picture, or why there is none."""
+_NO_PICTURES = "<p>No pictures of the truss: {}</p>"
+
+
+def _truss(result: Any, file: Path, field: str) -> str:
+    """Return six instants of the truss, drawn into a file, or why there are none."""
     from .options import Options
     from .render import Film, save
 
@@ -90,19 +95,14 @@ def _draw(result: Any, file: Path, field: str) -> tuple[Path | None, str]:
         film = Film([result], Options(field=field, size=SIZE), lambda text: None)
         picture = save(film.poster(), file)
     except InputError as error:
-        return None, str(error)
+        return _NO_PICTURES.format(html.escape(str(error)))
     film.close()
-    return picture, ""
+    return _figure(picture, "Instants, or ends of load cases, coloured by the field named beside the scale")
 
 
-def _document(result: Any, curves: Sequence[Path], drawn: Path | None, reason: str) -> str:
+def _document(result: Any, curves: Sequence[Path], truss: str) -> str:
     case, log = result.case, _log(result)
     title = case.title or case.name
-    truss = (
-        _figure(drawn, "Instants, or ends of load cases, coloured by the field named beside the scale") if drawn else ""
-    )
-    if not drawn:
-        truss = f"<p>No pictures of the truss: {html.escape(reason)}</p>"
     sections = {
         "Summary": html_table(result.summary().items()),
         "Warnings": "".join(f'<div class="warning">{html.escape(text)}</div>' for text in log["warnings"])

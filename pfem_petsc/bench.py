@@ -14,6 +14,7 @@ import platform
 import re
 import shutil
 import tempfile
+import timeit
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -376,18 +377,16 @@ def measure_bandwidth(comm: MPI.Comm, repeats: int = 10) -> dict[str, float]:
     a, b, c = np.zeros(_ELEMENTS), np.full(_ELEMENTS, 1.0), np.full(_ELEMENTS, 2.0)
     size = BYTES_PER_ELEMENT * _ELEMENTS
 
-    def triad() -> None:
-        loop(a, b, c, 3.0)
-
+    triad = partial(loop, a, b, c, 3.0)
     triad()  # compile, and touch every page
-    alone = size / min(_seconds(triad, repeats)) if comm.rank == 0 else 0.0
+    alone = size / min(timeit.repeat(triad, number=1, repeat=repeats)) if comm.rank == 0 else 0.0
     waiting = comm.Ibarrier()
     while not waiting.Test():
         sleep(0.01)
     alone = together = comm.bcast(alone)
     if comm.size > 1:
         # the slowest of a round, because all share the memory until it has finished
-        slowest = np.max(comm.allgather(_seconds(triad, repeats, comm.Barrier)), axis=0)
+        slowest = np.max(comm.allgather(timeit.repeat(triad, comm.Barrier, number=1, repeat=repeats)), axis=0)
         together = comm.size * size / float(slowest.min())
     return {"alone": alone, "together": together, "ratio": together / alone, "bytes_per_element": BYTES_PER_ELEMENT}
 
@@ -398,17 +397,6 @@ def processor() -> str:
         if found := re.search(r"^model name\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
             return found[1].strip()
     return platform.processor() or platform.machine()
-
-
-def _seconds(work: Callable[[], object], repeats: int, before: Callable[[], object] = lambda: None) -> list[float]:
-    """Return the time of each of some calls [s]; ``before`` is called before each and not timed."""
-    times = []
-    for _ in range(repeats):
-        before()
-        start = perf_counter()
-        work()
-        times.append(perf_counter() - start)
-    return times
 
 
 _FORMAT = "{:18} {:>11} {:>9} {:>9} {:>9} {:>8} {:>6} {:>7} {:>6} {:>6}"

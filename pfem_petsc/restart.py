@@ -460,12 +460,18 @@ def _continues(folder: Path, path: Path) -> bool:
     return (folder / RESULT).is_file() and path.resolve().parent == folder.resolve()
 
 
-def _refuse_loss(path: Path, plan: Plan) -> None:
-    """Refuse a restart that would truncate results beyond the end of the run."""
+def _refuse_loss(path: Path, restart: Restart, plan: Plan) -> None:
+    """Refuse a restart whose results end before the checkpoint, or would be truncated beyond the end of the run."""
+    examine(path, deep=False)
     with open_result(path) as result:
-        times = result.history["time"]
-        snapshots = int(plan.beyond(result.times).sum())
-    rows = int(plan.beyond(times).sum())
+        steps, times = result.history["step"], result.history["time"]
+    last = int(steps[-1]) if len(steps) else -1
+    if last < restart.last[1]:
+        raise InputError(
+            f"{path}: the history ends at step {last}, before {restart.path}, written after step {restart.step}: they "
+            "belong to different runs; restart into another folder (-o), where new results begin at the checkpoint"
+        )
+    rows, snapshots = (int(plan.beyond(numbers).sum()) for numbers in (times, result.times))
     if rows or snapshots:
         reached = max([*times[-1:], *result.times[-1:]])
         raise InputError(
@@ -473,19 +479,6 @@ def _refuse_loss(path: Path, plan: Plan) -> None:
             f"there would remove {rows} rows of the history and {snapshots} snapshots; set a later end (--set "
             f"{plan.axis.key}={reached - plan.axis.start:.6g} or more), choose another folder (-o), or start without "
             "--restart, which moves the results aside"
-        )
-
-
-def _refuse_gap(path: Path, restart: Restart) -> None:
-    """Refuse a restart whose results end before the checkpoint."""
-    examine(path, deep=False)
-    with open_result(path) as result:
-        steps = result.history["step"]
-        last = int(steps[-1]) if len(steps) else -1
-    if last < restart.last[1]:
-        raise InputError(
-            f"{path}: the history ends at step {last}, before {restart.path}, written after step {restart.step}: they "
-            "belong to different runs; restart into another folder (-o), where new results begin at the checkpoint"
         )
 
 
@@ -514,8 +507,7 @@ def prepare_folder(folder: Path, restart: Restart | None, plan: Plan) -> Path | 
                     f"{restart.path}: another run has overwritten this checkpoint while this one was set up: nothing "
                     "is changed; start again with --restart"
                 )
-            _refuse_gap(folder / RESULT, restart)
-            _refuse_loss(folder / RESULT, plan)
+            _refuse_loss(folder / RESULT, restart, plan)
             if restart.path.name == PREVIOUS and (folder / NAME).exists():
                 # A checkpoint later than the truncated results must not be used as the newest.
                 os.replace(folder / NAME, folder / ASIDE)

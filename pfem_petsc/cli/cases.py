@@ -319,7 +319,8 @@ OF_MESH = (
 def run_mesh(arguments: argparse.Namespace) -> int:
     """Do what the subcommand says, and return the exit status."""
     from ..formats import writer_of
-    from ..mesh.tools import cleaned, merged, refined
+    from ..mesh.tools import cleaned, merged, refined, summary
+    from ..output.table import aligned
 
     def inputs() -> list[WholeMesh]:
         paths = arguments.inputs if "inputs" in arguments else [arguments.input]
@@ -339,9 +340,19 @@ def run_mesh(arguments: argparse.Namespace) -> int:
             mesh, done = cleaned(*inputs(), arguments.tolerance, arguments.sum_areas)
             _write(arguments, mesh, done or ["nothing to clean"])
         case "info":
-            _info(arguments)
+            for path in arguments.inputs:
+                lines = summary(_read(path, arguments.scale), arguments.tolerance)
+                _tell([str(path), *aligned(lines)])
         case "picture":
-            _picture(arguments)
+            from ..post.page import mesh_page
+
+            (mesh,), output = inputs(), arguments.output or arguments.input.with_suffix(".png")
+            if output.suffix.lower() != ".png":
+                raise InputError(f"{output}: a picture is written as .png")
+            picture = mesh_page(mesh, arguments.size, arguments.view)
+            with written(output, "the picture"):
+                output.write_bytes(picture)
+            _tell([str(output)])
     return 0
 
 
@@ -428,28 +439,6 @@ def _made(what: str, overrides: list[str]) -> WholeMesh:
 def _tell(lines: Iterable[str]) -> None:
     for line in lines:
         print(printable(line))
-
-
-def _info(arguments: argparse.Namespace) -> None:
-    from ..mesh.tools import summary
-    from ..output.table import aligned
-
-    for path in arguments.inputs:
-        mesh = _read(path, arguments.scale)
-        _tell([str(path), *aligned(summary(mesh, arguments.tolerance))])
-
-
-def _picture(arguments: argparse.Namespace) -> None:
-    from ..post.page import mesh_page
-
-    output = arguments.output or arguments.input.with_suffix(".png")
-    mesh = _read(arguments.input, arguments.scale)
-    if output.suffix.lower() != ".png":
-        raise InputError(f"{output}: a picture is written as .png")
-    data = mesh_page(mesh, arguments.size, arguments.view)
-    with written(output, "the picture"):
-        output.write_bytes(data)
-    _tell([str(output)])
 
 
 CHECK = f"""\

@@ -22,7 +22,7 @@ from ..signals import launched_rank
 from .chart import opened
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_rows, even_times
 from .options import Options
-from .page import MARKS, ColourField, ColourScale, Heading, Page, grid, inset_room
+from .page import MARKS, ColourField, ColourScale, Heading, Page, grid
 from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Segments, Style, at_one_scale, cameras, few_threads
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ SHORT = 2.0  # seconds below which a film is too short to follow
 TELL = 5.0  # seconds between two progress messages
 SHARE = 12  # frames for which it is worth to start another process
 _TILES = 6
-_CURVE = 220  # pixels of a page of 1280 by 720: width of an inset
 
 # H.264 with 4:2:0 colours is supported everywhere, and requires even sizes
 _ENCODERS = {
@@ -230,13 +229,8 @@ class Film:
         several, columns = len(self.motions) > 1, 1
         if several:
             columns, _ = grid(len(self.motions), self._aspect(), Page.region_of(size)[2:])
-        room = (0, 0)
-        if self.options.inset is not None:
-            rows, (width, height) = -(-len(self.motions) // columns), Page.region_of(size)[2:]
-            unit = min(size[0] / 1280, size[1] / 720)
-            tile = width // columns, height // rows - (Page.strip_of(size) if several else 0)
-            room = inset_room(tile, self._aspect(), round(_CURVE * unit))
-        self._prepare(size, self._labels if several else [""], columns, room)
+        inset = self._aspect() if self.options.inset is not None else 0.0
+        self._prepare(size, self._labels if several else [""], columns, inset)
         if self.options.inset is not None:
             self._page.add_insets([motion.result for motion in self.motions], self.options.inset)
 
@@ -268,15 +262,13 @@ class Film:
             scene.close()
         self._scenes = []
 
-    def _prepare(
-        self, size: tuple[int, int], captions: Sequence[str], columns: int, room: tuple[int, int] = (0, 0)
-    ) -> None:
+    def _prepare(self, size: tuple[int, int], captions: Sequence[str], columns: int, inset: float = 0.0) -> None:
         """Make page, cameras and scenes for a size in pixels and drawings with captions in columns."""
         self.close()
         options = self.options
         marks = [MARKS[mark] for mark in options.marks]
         heading = Heading(self.title, self.colours[0].title, self.scale, marks, self.notes, options.transparent)
-        self._page = Page(size, heading, captions, columns, room)
+        self._page = Page(size, heading, captions, columns, inset)
         tile = self._page.tile
         self._cameras = [cameras(options, motion, tile[0] / tile[1]) for motion in self.motions]
         if len(self.motions) > 1:

@@ -393,8 +393,7 @@ def cfc(time: np.ndarray, values: np.ndarray, size: float, zero_before: bool = F
     InputError
         If the history is too coarse or too short for the class, or has less than three rows.
     """
-    passes = _Passes(f"CFC {size:g}", 2, _ROWS * size, lambda interval: CFC_CORNER * size)
-    return _filtered(passes, time, values, zero_before)
+    return _two_passes(time, values, zero_before, f"CFC {size:g}", 2, _ROWS * size, lambda interval: CFC_CORNER * size)
 
 
 def butterworth(
@@ -412,25 +411,26 @@ def butterworth(
         return math.atan(ratio * math.tan(math.pi * cutoff * interval)) / (math.pi * interval)
 
     # more than two rows per period: tan(pi f_d h) is infinite there
-    passes = _Passes(f"a cut-off of {engineering(cutoff, 'Hz', 3)}", order, 2.01 * cutoff, corner)
-    return _filtered(passes, time, values, zero_before)
+    what = f"a cut-off of {engineering(cutoff, 'Hz', 3)}"
+    return _two_passes(time, values, zero_before, what, order, 2.01 * cutoff, corner)
 
 
-class _Passes(NamedTuple):
-    """The name in messages, the order, the fewest rows per second, and the corner [Hz] at an interval [s]."""
+def _two_passes(
+    time: np.ndarray,
+    values: np.ndarray,
+    zero_before: bool,
+    what: str,
+    order: int,
+    rate: float,
+    corner: Callable[[float], float],
+) -> np.ndarray:
+    """Return the values (n,) at times (n,) [s] after a Butterworth filter forward and backward.
 
-    what: str
-    order: int
-    rate: float
-    corner: Callable[[float], float]
-
-
-def _filtered(passes: _Passes, time: np.ndarray, values: np.ndarray, zero_before: bool) -> np.ndarray:
-    """Return the values (n,) at times (n,) [s] after both passes."""
+    ``what``: the name in messages; ``rate``: the fewest rows per second; ``corner`` [Hz] at an interval [s]
+    """
     from scipy.signal import butter, sosfiltfilt
 
     time, values = np.asarray(time, dtype=float), np.asarray(values, dtype=float)
-    what, order, rate, corner = passes
     steps = np.diff(time)[np.diff(time) > 0.0]
     if len(steps) < 2:
         raise InputError(

@@ -77,7 +77,14 @@ class Motion:
         self.start = np.asarray(result.positions(0), dtype=float)
         self.times = np.asarray(result.times, dtype=float)[self.frames]
         self.n_bars = len(self.bars)
-        self._check_marks()
+        for mark in options.marks:
+            if mark not in MARKS:
+                raise InputError(f"render: mark = {mark!r} is not known; it is one of {', '.join(MARKS)}")
+            if MARKS[mark].field not in result.cell_fields:
+                raise InputError(
+                    f"render: mark = {mark!r}: the result holds no field '{MARKS[mark].field}'; "
+                    "name it in [output] fields and run again, or leave the mark out"
+                )
         self._trails = {name: self._trail(name) for name in options.trails}
         self.reach, self.hulls = 0.0, [_outermost(self._held(frame)) for frame in self.frames]
         self.boxes = np.array([[points.min(axis=0), points.max(axis=0)] for points in self.hulls])
@@ -100,16 +107,6 @@ class Motion:
         self.time_factor, self.time_unit = result.axis.scale(float(np.abs(every).max()))
         steps = np.diff(np.unique(self.time_factor * every))
         self._decimals = int(np.clip(np.ceil(0.3 - np.log10(np.median(steps))), 0, 6)) if len(steps) else 2
-
-    def _check_marks(self) -> None:
-        for mark in self._options.marks:
-            if mark not in MARKS:
-                raise InputError(f"render: mark = {mark!r} is not known; it is one of {', '.join(MARKS)}")
-            if MARKS[mark].field not in self.result.cell_fields:
-                raise InputError(
-                    f"render: mark = {mark!r}: the result holds no field '{MARKS[mark].field}'; "
-                    "name it in [output] fields and run again, or leave the mark out"
-                )
 
     def _moved(self, walls: Sequence[Any]) -> dict[int, list[Surface]]:
         """Return, by frame, the surfaces of the walls at that time; a wall at rest has the same one in all frames.
@@ -553,23 +550,8 @@ class Resampled(Seen):
 
 
 def drawn_radii(result: Any, note: Callable[[str], None] | None = None) -> np.ndarray | None:
-    """Return the radius of each bar (bars,) [m] as it is drawn, None where it is not known; ``note`` receives a remark
-    on bars that are drawn thinner than they are."""
-    radius = radii_of(result)
-    if radius is None:
-        return None
-    most = STOUT * _lengths(result)
-    stout = int(np.count_nonzero(radius > most))
-    if stout and note is not None:
-        note(
-            f"{stout} of {len(radius)} bars have a radius above {STOUT:g} of their length "
-            f"({radius.max():.3g} m at most), and are drawn with that; --radius-scale changes it"
-        )
-    return np.minimum(radius, most)
-
-
-def radii_of(result: Any) -> np.ndarray | None:
-    """Return the outer radius of each bar (bars,) [m], None where the result does not have the areas of bars.
+    """Return the outer radius of each bar (bars,) [m] as it is drawn, None where the result does not have the areas of
+    bars; ``note`` receives a remark on bars that are drawn thinner than they are.
 
     Springs and dashpots between nodes have no section: they are as thin as the thinnest bar.
     """
@@ -580,7 +562,14 @@ def radii_of(result: Any) -> np.ndarray | None:
     for name, section in result.case.section.items():
         own = np.flatnonzero(names == name)
         radius[own] = bar_shapes(section, length[own], areas[own]).radius
-    return np.where(np.isfinite(radius), radius, radius.min())
+    radius = np.where(np.isfinite(radius), radius, radius.min())
+    stout = int(np.count_nonzero(radius > STOUT * length))
+    if stout and note is not None:
+        note(
+            f"{stout} of {len(radius)} bars have a radius above {STOUT:g} of their length "
+            f"({radius.max():.3g} m at most), and are drawn with that; --radius-scale changes it"
+        )
+    return np.minimum(radius, STOUT * length)
 
 
 def _lengths(result: Any) -> np.ndarray:

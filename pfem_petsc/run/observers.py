@@ -25,7 +25,7 @@ from ..restart import STATE_VERSION, RunState
 from ..signals import SignalNotes, early
 from ..stepping.bar_events import MOST_TOLD
 from ..stepping.ledger import Ledger
-from ..stepping.stepper import Step, Stepper
+from ..stepping.stepper import Stepper
 from ..version import __version__
 from .monitors import WATCHED, BlowUp, ContactWatch, Doubts
 from .recorder import Handover, Recorder
@@ -184,8 +184,8 @@ class Observer(ABC):
         return self.every - step % self.every if self.every else NEVER
 
     @abstractmethod
-    def observe(self, made: Step) -> None:
-        """Act after a step."""
+    def observe(self) -> None:
+        """Act in the present state of the stepper, after a step."""
 
     def complete(self) -> None:
         """Act after the last step of the run, unless this has been done."""
@@ -226,7 +226,8 @@ class History(Observer):
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
         self.ledger = stepper.ledger = Ledger(stepper)
         self.recorder = Recorder(stepper, stages.columns)
-        self.recorder.put(stages.wall_positions)
+        for name, value in stages.wall_positions.items():  # which this stage may not have
+            self.recorder.rest[self.recorder.layout[name]] = value
         stepper.row_every, stepper.probed = self.every, self.recorder.probed
         inertial = stepper.scheme.inertial
         self.blow_up = BlowUp(model, inertial)
@@ -279,11 +280,11 @@ class History(Observer):
         """Never: compiled steps collect what rows need."""
         return NEVER
 
-    def observe(self, made: Step) -> None:
+    def observe(self) -> None:
         """Record rows: of compiled steps, and of the present state if it is due and not among them."""
         self.record()
-        if super().due(made.step) and self.row["step"] != made.step:
-            self.record()
+        if super().due(self._stepper.number):
+            self.complete()
 
     def record(self) -> None:
         """Record the rows of the last step or call, unless a rank has a fault, which is raised on all ranks."""
@@ -367,11 +368,7 @@ class Snapshots(Observer):
         self.last = -1
         self.writer: ResultWriter | None = None
 
-    def observe(self, made: Step) -> None:
-        """Write a snapshot."""
-        self.write()
-
-    def write(self) -> None:
+    def observe(self) -> None:
         """Check the nodes against the walls, then write a snapshot of the present state."""
         state, fields = self._stepper.state, self._fields
         if not self.every and 0 < state.step < self._stepper.last_step:
@@ -401,7 +398,7 @@ class Snapshots(Observer):
     def complete(self) -> None:
         """Write the snapshot of the last step."""
         if self.last != self._stepper.number:
-            self.write()
+            self.observe()
 
     def doubts(self) -> list[str]:
         """Return what the model could not represent, for the end of the run."""
@@ -451,11 +448,7 @@ class Checkpointing(Observer):
         """Return whether a checkpoint is due by the number of the step or by wall-clock time."""
         return super().due(step) or self._synchroniser.checkpoint_due
 
-    def observe(self, made: Step) -> None:
-        """Write a checkpoint."""
-        self.write()
-
-    def write(self) -> None:
+    def observe(self) -> None:
         """Flush the results, from which a restart continues, then write a checkpoint, unless the step has one.
 
         Raises
@@ -495,7 +488,7 @@ class Checkpointing(Observer):
     def complete(self) -> None:
         """Write the checkpoint of the last step, if the case requests checkpoints."""
         if self.at_end:
-            self.write()
+            self.observe()
 
 
 class Events(Observer):
@@ -520,7 +513,7 @@ class Events(Observer):
         """Return whether the step has events."""
         return bool(self._stepper.events)
 
-    def observe(self, made: Step) -> None:
+    def observe(self) -> None:
         """Record and report the events."""
         events, self._stepper.events = self._stepper.events, []
         for event in events:
@@ -557,14 +550,13 @@ class RuptureReport(Observer):
         """Return whether more bars are broken in the last row than have been reported; the same on all ranks."""
         return self._broken > self._told
 
-    def observe(self, made: Step) -> None:
-        """Report the bars that broke."""
-        self.complete()
-
     def complete(self) -> None:
         """Report the bars of the last row."""
-        if not self.due(0):
-            return
+        if self.due(0):
+            self.observe()
+
+    def observe(self) -> None:
+        """Report the bars that broke."""
         self._told = self._broken
         parts = self._comm.allgather(self._stepper.ruptures.take())
         breaks = sorted(part for share in parts for part in share)

@@ -12,7 +12,7 @@ from helpers.synthetic import SyntheticResult, lattice, ring
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.motion import chosen_frames, drawn_radii, radii_of
+from pfem_petsc.post.motion import chosen_frames, drawn_radii
 from pfem_petsc.post.options import frames_of
 from pfem_petsc.post.page import GHOST, MARKS, TRAILS
 from pfem_petsc.post.scene import Layer, Style
@@ -54,7 +54,7 @@ def bars_of_sections(tmp_path_factory):
 def test_radii_are_those_of_sections_and_fields(bars_of_sections):
     outer = 2e-4 / (2 * math.pi * 1e-3) + 0.5e-3
     expected = [math.sqrt(1e-4 / math.pi), outer, math.sqrt(4e-4 / math.pi)]
-    assert radii_of(open_result(bars_of_sections)) == pytest.approx(expected, rel=1e-12)
+    assert drawn_radii(open_result(bars_of_sections)) == pytest.approx(expected, rel=1e-12)
 
 
 def of_one_section(result, area):

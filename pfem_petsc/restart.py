@@ -42,10 +42,11 @@ from mpi4py import MPI
 
 from .case.toml import short_text, split_key
 from .errors import InputError
+from .files import move_aside
 from .mechanics.bars import StrainEnergy
 from .mesh.exchange import Router
 from .mesh.slab import slab_of
-from .output.checkpoint import NAME, PREVIOUS, Checkpoint, asked_checkpoint, check_seal
+from .output.checkpoint import NAME, PREVIOUS, Checkpoint, asked_checkpoint
 from .output.integrity import checksum, examine
 from .output.result import RESULT_NAME as RESULT
 from .output.result import open_result
@@ -60,7 +61,7 @@ if TYPE_CHECKING:
     from .stepping.plan import Plan
     from .stepping.stepper import Stepper
 
-STATE_VERSION = 9
+STATE_VERSION = 10
 """Changed with the meaning of what is saved."""
 
 _MEMORY = "memory."
@@ -459,12 +460,18 @@ def _continues(folder: Path, path: Path) -> bool:
     return (folder / RESULT).is_file() and path.resolve().parent == folder.resolve()
 
 
-def _refuse_loss(path: Path, plan: Plan) -> None:
-    """Refuse a restart that would truncate results beyond the end of the run."""
+def _refuse_loss(path: Path, restart: Restart, plan: Plan) -> None:
+    """Refuse a restart whose results end before the checkpoint, or would be truncated beyond the end of the run."""
+    examine(path, deep=False)
     with open_result(path) as result:
-        times = result.history["time"]
-        snapshots = int(plan.beyond(result.times).sum())
-    rows = int(plan.beyond(times).sum())
+        steps, times = result.history["step"], result.history["time"]
+    last = int(steps[-1]) if len(steps) else -1
+    if last < restart.last[1]:
+        raise InputError(
+            f"{path}: the history ends at step {last}, before {restart.path}, written after step {restart.step}: they "
+            "belong to different runs; restart into another folder (-o), where new results begin at the checkpoint"
+        )
+    rows, snapshots = (int(plan.beyond(numbers).sum()) for numbers in (times, result.times))
     if rows or snapshots:
         reached = max([*times[-1:], *result.times[-1:]])
         raise InputError(
@@ -472,19 +479,6 @@ def _refuse_loss(path: Path, plan: Plan) -> None:
             f"there would remove {rows} rows of the history and {snapshots} snapshots; set a later end (--set "
             f"{plan.axis.key}={reached - plan.axis.start:.6g} or more), choose another folder (-o), or start without "
             "--restart, which moves the results aside"
-        )
-
-
-def _refuse_gap(path: Path, restart: Restart) -> None:
-    """Refuse a restart whose results end before the checkpoint."""
-    examine(path, deep=False)
-    with open_result(path) as result:
-        steps = result.history["step"]
-        last = int(steps[-1]) if len(steps) else -1
-    if last < restart.last[1]:
-        raise InputError(
-            f"{path}: the history ends at step {last}, before {restart.path}, written after step {restart.step}: they "
-            "belong to different runs; restart into another folder (-o), where new results begin at the checkpoint"
         )
 
 
@@ -506,13 +500,14 @@ def prepare_folder(folder: Path, restart: Restart | None, plan: Plan) -> Path | 
     aside = None
     try:
         if restart is not None and restart.continues:
-            if check_seal(restart.path) != restart.file.digest:  # before this one got the lock
+            with Checkpoint(restart.path, MPI.COMM_SELF) as present:
+                replaced = present.digest != restart.file.digest
+            if replaced:  # before this one got the lock
                 raise InputError(
                     f"{restart.path}: another run has overwritten this checkpoint while this one was set up: nothing "
                     "is changed; start again with --restart"
                 )
-            _refuse_gap(folder / RESULT, restart)
-            _refuse_loss(folder / RESULT, plan)
+            _refuse_loss(folder / RESULT, restart, plan)
             if restart.path.name == PREVIOUS and (folder / NAME).exists():
                 # A checkpoint later than the truncated results must not be used as the newest.
                 os.replace(folder / NAME, folder / ASIDE)
@@ -522,11 +517,7 @@ def prepare_folder(folder: Path, restart: Restart | None, plan: Plan) -> Path | 
                     f"{folder}: holds results, which cannot be moved aside because the current folder is inside; "
                     "give another with -o, or continue them with --restart"
                 )
-            number = 1
-            while (free := folder.with_name(f"{folder.name}.{number}")).exists():
-                number += 1
-            folder.rename(free)
-            aside = free
+            aside = move_aside(folder)
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Signals that request a run to stop, recorded from the start of the program, and the end of the program.
+"""Signals that request a run to stop, recorded from the start of the program, its launcher, and the end of the program.
 
 Imports very little: ``python -m pfem_petsc`` installs the handlers before the other imports, which take a second.
 """
@@ -17,6 +17,25 @@ from types import FrameType
 from typing import TextIO
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGHUP)
+
+OF_A_LAUNCH = (
+    *("PMIX_", "PMI_", "OPAL_", "ORTE_", "PRTE_LAUNCHED", "OMPI_COMM_", "OMPI_APP_", "OMPI_UNIVERSE_", "OMPI_FILE_"),
+    *("OMPI_MCA_orte_", "OMPI_MCA_ess", "OMPI_MCA_pmix", "HYDRA_", "MPI_LOCALRANKID", "SLURM_PROCID", "SLURM_PMI"),
+    "PALS_",
+)
+"""Variables that a launcher of MPI sets, and that would make another process a rank of the same job."""
+
+
+def launched_rank() -> int | None:
+    """Return the rank of this process according to its launcher, None without a launcher."""
+    names = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "SLURM_PROCID")
+    return next((int(os.environ[name]) for name in names if os.environ.get(name, "").isdigit()), None)
+
+
+def environment_alone() -> dict[str, str]:
+    """Return the environment of processes that MPI does not launch."""
+    return {name: value for name, value in os.environ.items() if not name.startswith(OF_A_LAUNCH)}
+
 
 _PATIENCE = 10.0  # seconds after which a third signal of any kind ends the process; batch systems may send two at once
 

@@ -15,9 +15,9 @@ from mpi4py import MPI
 from .case.schema import Case
 from .contact.contact import check_start
 from .errors import EarlyStop, InputError, PfemError, SimulationFailure
+from .files import FolderLock
 from .integrators.base import State
 from .mechanics.loads import ForceState
-from .output.lock import FolderLock
 from .parallel.agreement import all_arrive, aside, on_root, outcome, passes_exception, watch
 from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged

@@ -10,7 +10,6 @@ import contextlib
 import itertools
 import os
 import pickle
-import queue
 import shutil
 import signal
 import subprocess
@@ -31,18 +30,14 @@ from .case.schema import Case
 from .case.toml import plain
 from .columns import LOST, STORED, SUPPLIED
 from .errors import InputError, PfemError
+from .files import move_aside
 from .output.result import Result, open_result, peak_force, touch_impulse
 from .output.table import SWEEP, Table, flat_columns, select
 from .registry import nearest
+from .signals import environment_alone
 
 if TYPE_CHECKING:
     from .case.schema import Case
-
-OF_A_LAUNCH = (
-    *("PMIX_", "PMI_", "OPAL_", "ORTE_", "PRTE_LAUNCHED", "OMPI_COMM_", "OMPI_APP_", "OMPI_UNIVERSE_", "OMPI_FILE_"),
-    *("OMPI_MCA_orte_", "OMPI_MCA_ess", "OMPI_MCA_pmix", "HYDRA_", "SLURM_PMI"),
-)
-"""Variables that a launcher of MPI sets, and that would make another process a rank of the same job."""
 
 _PATIENCE = 10.0  # seconds in which a process that is told to end must end
 _WATCH = 1.0  # seconds between two looks for the parent process
@@ -66,9 +61,8 @@ class Report(NamedTuple):
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of processes that MPI did not launch; one thread each, unless OMP_NUM_THREADS is set."""
-    own = {name: value for name, value in os.environ.items() if not name.startswith(OF_A_LAUNCH)}
-    return {"OMP_NUM_THREADS": "1", **own}
+    """Return the environment of a run's process: one thread, unless OMP_NUM_THREADS is set."""
+    return {"OMP_NUM_THREADS": "1", **environment_alone()}
 
 
 class _Process:
@@ -129,32 +123,27 @@ def performed(tasks: Sequence[Task], processes: int) -> Iterator[tuple[int, Repo
 
     If the iteration is left before its end, runs in progress are ended, and no others begin.
     """
-    workers = [_Process() for _ in range(max(min(processes, len(tasks)), 1))]
-    idle: queue.SimpleQueue[_Process] = queue.SimpleQueue()
-    stopped = threading.Event()
+    workers: list[_Process] = []
+    own = threading.local()
 
-    def with_next(task: Task) -> Report:
-        worker = idle.get()
-        try:
-            return worker.perform(task)
-        finally:
-            idle.put(worker)
-            if stopped.is_set():
-                worker.close()
+    def perform_apart(task: Task) -> Report:
+        if not hasattr(own, "worker"):
+            own.worker = _Process()
+            workers.append(own.worker)
+        return own.worker.perform(task)
 
-    with contextlib.ExitStack() as ending, ThreadPoolExecutor(len(workers)) as pool:
-        for worker in workers:
-            ending.callback(worker.close)
-            idle.put(worker)
-        runs = {pool.submit(with_next, task): number for number, task in enumerate(tasks)}
+    with ThreadPoolExecutor(max(min(processes, len(tasks)), 1)) as pool:
+        runs = {pool.submit(perform_apart, task): number for number, task in enumerate(tasks)}
         try:
             for run in as_completed(runs):
                 yield runs[run], run.result()
         finally:
-            stopped.set()
             pool.shutdown(wait=False, cancel_futures=True)
             for worker in workers if not all(run.done() for run in runs) else ():
                 worker.end()
+            pool.shutdown()
+            for worker in workers:
+                worker.close()
 
 
 def perform(task: Task) -> Report:
@@ -337,10 +326,7 @@ def _prepared(folder: Path) -> Path:
     """Create the output folder, after an existing one was moved aside to a numbered name."""
     try:
         if folder.exists() and any(folder.iterdir()):
-            free = next(
-                name for n in itertools.count(1) if not (name := folder.with_name(f"{folder.name}.{n}")).exists()
-            )
-            folder.rename(free)
+            move_aside(folder)
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot write the results of a sweep there: {error.strerror}") from error

@@ -25,7 +25,7 @@ from statistics import median
 
 import numpy as np
 
-from pfem_petsc.bench.measure import KINDS, cells_for
+from pfem_petsc.bench import KINDS, cells_for
 
 ROOT = Path(__file__).resolve().parent.parent
 DRIVERS = ROOT / "scripts" / "peers"

@@ -16,7 +16,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "pfem_petsc"
 
 FLOORS = (
-    ("columns", "errors", "files", "signals", "tolerances", "version"),
+    ("columns", "errors", "signals", "tolerances", "version"),
+    ("files",),
     ("registry",),
     ("parallel",),
     ("cases",),

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, printable
-from ..post.options import PER, WINDOW, Options, PlotOptions
-from .parser import PROGRAM, Verb, argument, options_of, surviving
+from ..post.options import PER, WINDOW, Options, PlotOptions, reader
+from .main import PROGRAM, Verb, argument, options_of, surviving
 
 if TYPE_CHECKING:
-    import numpy as np
     from mpi4py import MPI
 
-    from ..output.result import Modes, Result
+    from ..output.result import Result
 
 INFO = f"""\
 examples:
@@ -59,53 +56,13 @@ def info(arguments: argparse.Namespace) -> int:
 
 def describe(result: Result) -> list[str]:
     """Return a description of a result, as lines."""
-    rows = {"file": str(result.path), "mesh": f"{result.n_nodes:,} nodes, {result.n_bars:,} bars"}
-    rows |= {key: str(value) for key, value in result.attributes.items() if value not in ("", {}, [])}
-    times, axis, history = result.times, result.axis, result.history
-    names = list(history)
-    time = history["time"] if "time" in names else ()
-    rows["snapshots"] = f"{len(times)}: {axis.span(times[0], times[-1])}" if len(times) else "0"
-    rows["history"] = f"{len(time)} rows: {axis.span(time[0], time[-1])}" if len(time) else "0 rows"
-    width = max(map(len, rows))
-    lines = [result.case.title, *(f"  {label:{width}}  {text}" for label, text in rows.items())]
-    lines += _modes(result.modes) if result.n_modes else []
-    lines += ["history columns:", "  " + " ".join(names)]
-    if len(time):
-        lines += _energies(history)
-    broken = history["broken_bars"] if len(time) and "broken_bars" in names else [0]
-    if broken[-1]:
-        first = result.place(float(time[(broken > 0).argmax()]))
-        lines.append(f"{int(broken[-1]):,} of {result.n_bars:,} bars broke, the first at {first}")
-    return lines
+    from ..output.table import aligned
 
-
-def _modes(modes: Modes) -> list[str]:
-    """The frequencies or load factors, some in a line."""
-    from ..output.layout import MODE_VALUES
-
-    name, unit = MODE_VALUES[modes.kind]
-    values = [f"{value:.6g}" for value in modes.values]
-    heading = f"modes of {modes.kind}, {name.replace('_', ' ')}{f' [{unit}]' if unit else ''}:"
-    return [heading, *("  " + "  ".join(values[k : k + 8]) for k in range(0, len(values), 8))]
-
-
-def _energies(history: Mapping[str, np.ndarray]) -> list[str]:
-    """Return energies [J] at start and end and their imbalance, also relative to the largest energy in between."""
-    from ..columns import LOST, STORED, SUPPLIED
-    from ..output.units import engineering
-    from ..post.plot import balance_error
-
-    present = [name for name in (*STORED, *LOST, *SUPPLIED) if name in list(history)]
-    if not present:
-        return []
-    width = max(map(len, (*present, "balance error")))
-    lines, error = [f"{'energy':{width + 2}}  {'start':>12}  {'end':>12}"], float(balance_error(history)[-1])
-    for name in present:
-        start, end = float(history[name][0]), float(history[name][-1])
-        lines.append(f"  {name:{width}}  {engineering(start, 'J'):>12}  {engineering(end, 'J'):>12}")
-    scale = max(float(abs(history[name]).max()) for name in present)
-    relative = f" ({error / scale:.1e} of the largest)" if scale > 0.0 else ""
-    return [*lines, f"  {'balance error':{width}}  {engineering(error, 'J'):>26}{relative}"]
+    about = {key: str(value) for key, value in result.attributes.items() if value not in ("", {}, [])}
+    lines = [result.case.title, *aligned((result.summary() | about).items())]
+    if result.n_modes:
+        lines += [f"modes of {result.modes.kind}:", result.modes.table().text()]
+    return [*lines, "history columns:", "  " + " ".join(result.history)]
 
 
 OF_PLOT = (
@@ -228,15 +185,12 @@ OF_CRUSH = (
 
 def print_crush(arguments: argparse.Namespace) -> int:
     """Print the figures of a crush test, and the names of files that are written."""
-    from ..output.units import engineering
+    from ..output.table import aligned
     from ..post.crush import crush, draw_crush
 
     options = {name: getattr(arguments, name) for name in ("area", "height", "displacement", "window")}
     test = crush(surviving(arguments.result), arguments.wall, **options)
-    for row in test.figures().rows:
-        value, unit = row["value"], row["unit"]
-        text = engineering(value, unit) if unit in ("Pa", "J", "J/m³", "J/kg") else f"{value:.6g} {unit}".rstrip()
-        print(f"{row['figure']:34}  {text if math.isfinite(value) else 'none'}")
+    print("\n".join(aligned(test.texts().items())))
     for remark in test.remarks():
         print(remark)
     if arguments.csv is not None:
@@ -258,13 +212,6 @@ examples:
   mpirun -n 4 {PROGRAM} render results/lattice_drop --size 4k --orbit 90"""
 
 
-def _mode_numbers(text: str) -> list[int]:
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers of modes like 1,2,5") from None
-
-
 OF_RENDER = (
     argument("result", metavar="RESULT", nargs="+", help="result file, or its folder; several are drawn side by side"),
     argument("-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: that of the result"),
@@ -273,7 +220,9 @@ OF_RENDER = (
         metavar="N[,N...]",
         nargs="?",
         const=[],
-        type=_mode_numbers,
+        type=reader(
+            lambda text: [int(part) for part in text.split(",")], "is not a list of numbers of modes like 1,2,5"
+        ),
         help="draw the modes of a case with [modes], or those of these numbers, into DIR/modes; --frames is then the "
         "number of frames of a period",
     ),

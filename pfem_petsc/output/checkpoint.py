@@ -9,7 +9,7 @@ import os
 import time
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
@@ -18,10 +18,11 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
-from ..parallel.agreement import agreed, on_root
+from ..parallel.agreement import agreed
 from ..parallel.natural import NaturalOrder
 from .hdf5 import (
     HDF5_ERRORS,
+    Growing,
     create_new,
     first_line,
     first_of_machine,
@@ -31,7 +32,6 @@ from .hdf5 import (
     require_parallel_hdf5,
     require_room,
     set_text,
-    write_rows,
     writes_together,
     writing,
 )
@@ -41,9 +41,8 @@ NAME, PREVIOUS = "checkpoint.h5", "checkpoint-previous.h5"
 ORIGIN = "checkpoint-origin.h5"
 """The state that load cases start from."""
 
-_FORMAT, _VERSION = "pfem_petsc checkpoint", 1
-_LARGEST_SEAL = 1 << 20
-_BLOCK = 1 << 18  # number of bytes read at a time
+_FORMAT, _VERSION = "pfem_petsc checkpoint", 2
+_HEAD = 512  # bytes before those of HDF5: format and version, which a file gets when it is complete
 _ATTEMPTS = 20  # to open a file between two replacements
 
 
@@ -61,7 +60,7 @@ class Checkpoint:
     Attributes
     ----------
     scalars, attributes : dicts, as they were written; float64 exact to the last bit
-    digest : of everything except the values of the arrays, whose checksums are part of it
+    digest : of everything except the values of the arrays, whose checksums are part of it; HDF5 has those of the rest
 
     Raises
     ------
@@ -75,9 +74,9 @@ class Checkpoint:
         for attempt in range(_ATTEMPTS):
             with agreed(comm):
                 self._raw = _open(self.path)
-                mine = check_seal(self.path, self._raw)
-            digests = comm.allgather(mine)
-            if len(set(digests)) == 1:
+                state = self._state()
+            self.digest = hashlib.sha256(state).hexdigest()
+            if len(set(comm.allgather(self.digest))) == 1:
                 break
             # the file was replaced while the ranks opened it
             self.close()
@@ -87,8 +86,9 @@ class Checkpoint:
                 f"{self.path}: is replaced repeatedly, or not the same file on all machines: wait until the run that "
                 "writes it has ended"
             )
-        self.digest = digests[0]
-        self.scalars, self.attributes = on_root(comm, self._header)
+        content = json.loads(state)
+        self.scalars, self.attributes = content["scalars"], content["attributes"]
+        self._checksums: dict[str, int] = content["checksums"]
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
@@ -102,13 +102,23 @@ class Checkpoint:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _header(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        with _sound(self.path), h5py.File(self._raw, "r") as file:
-            state = file["state"][()]
-            if zlib.crc32(state) != file["state"].attrs["checksum"]:
-                raise InputError(f"{self.path}: damaged: its state does not match the checksum; {_remedy(self.path)}")
-        state = json.loads(state)
-        return state["scalars"], state["attributes"]
+    def _state(self) -> bytes:
+        """Return the text of all but the arrays, of a sound file. Not collective."""
+        path = self.path
+        with _sound(path):
+            name, _, version = self._raw.read(_HEAD).split(b"\n")[0].decode(errors="replace").rpartition(" ")
+        if name != _FORMAT:
+            raise InputError(f"{path}: not a checkpoint of pfem_petsc, or damaged at its beginning; {_remedy(path)}")
+        if version != str(_VERSION):
+            raise InputError(
+                f"{path}: has version {version} of the checkpoint format, this program reads {_VERSION}: restart with "
+                f"the version of pfem_petsc that wrote it, or {_remedy(path)}"
+            )
+        with _sound(path), h5py.File(self._raw, "r") as file:
+            state, expected = file["state"][()], file["state"].attrs["checksum"]
+        if zlib.crc32(state) != expected:
+            raise InputError(f"{path}: damaged: its state does not match the checksum; {_remedy(path)}")
+        return state
 
     def read(self, orders: Mapping[str, NaturalOrder]) -> dict[str, np.ndarray]:
         """Return this rank's owned rows (n_owned, ...) of arrays, in the types of the file, by name, on any number of
@@ -125,7 +135,7 @@ class Checkpoint:
             On all ranks, if the file is damaged, lacks one of the arrays, or has another number of rows.
         """
         path = self.path
-        slabs: dict[str, tuple[np.ndarray, int]] = {}
+        slabs = {}
         # Reading needs no collective transfers: every rank reads its slab independently.
         with agreed(self.comm), _sound(path), h5py.File(self._raw, "r") as file:
             for name, order in orders.items():
@@ -140,11 +150,11 @@ class Checkpoint:
                         f"{path}: {name} has {len(dataset)} rows, the case needs {order.n_global}: it belongs to "
                         "another mesh; restart the case it was written by"
                     )
-                slabs[name] = dataset[order.first : order.first + order.count], int(dataset.attrs["checksum"])
-        for name, (slab, expected) in slabs.items():
-            if checksum(self.comm, slab, orders[name].first) != expected:
+                slabs[name] = dataset[order.first : order.first + order.count]
+        for name, slab in slabs.items():
+            if checksum(self.comm, slab, orders[name].first) != self._checksums[name]:
                 raise InputError(f"{path}: damaged: the values of {name} do not match their checksum; {_remedy(path)}")
-        return {name: orders[name].from_slab(slab) for name, (slab, _) in slabs.items()}
+        return {name: orders[name].from_slab(slab) for name, slab in slabs.items()}
 
 
 def newest_checkpoint(folder: Path | str) -> Path | None:
@@ -173,91 +183,12 @@ def asked_checkpoint(folder: Path | str, asked: bool | Path | str) -> Path | Non
     return newest
 
 
-def _seal(path: Path) -> None:
-    """Write the seal into the user block of a complete, closed file. Not collective."""
-    with h5py.File(path, "r", locking=False) as file:
-        size = file.userblock_size
-        found = [(dataset.id.get_offset(), dataset.id.get_storage_size()) for dataset in file["arrays"].values()]
-    arrays = sorted([offset, length] for offset, length in found if length)
-    content = {"size": path.stat().st_size, "seal_size": size, "arrays": arrays}
-    with open(path, "rb") as raw:
-        text = json.dumps({**content, "digest": _digest(raw, content)})
-    line = f"{_FORMAT} {_VERSION}\n{text}\n".encode()
-    if len(line) > size:
-        raise ValueError(f"{path}: seal of {len(line)} bytes for {size}")
-    with open(path, "r+b") as raw:
-        raw.write(line.ljust(size))
-
-
-def check_seal(path: Path, raw: BinaryIO | None = None) -> str:
-    """Compare a file, except the values of its arrays, with its seal; return the digest. Not collective.
-
-    Parameters
-    ----------
-    path : Path
-    raw : the file opened for reading, in case ``path`` was replaced since; default: opened here
-
-    Raises
-    ------
-    InputError
-        If the file is not a checkpoint, of another version, truncated, or damaged.
-    """
-    try:
-        with nullcontext(raw) if raw is not None else open(path, "rb") as raw:
-            return _checked(path, raw)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}; {_remedy(path)}") from error
-
-
-def _checked(path: Path, raw: BinaryIO) -> str:
-    raw.seek(0)
-    head = raw.read(_LARGEST_SEAL).split(b"\n", 2)
-    first = head[0].decode(errors="replace")
-    name, _, version = first.rpartition(" ")
-    if name != _FORMAT:
-        raise InputError(f"{path}: not a checkpoint of pfem_petsc, or damaged at its beginning; {_remedy(path)}")
-    if version != str(_VERSION):
-        raise InputError(
-            f"{path}: has version {version} of the checkpoint format, this program reads {_VERSION}: restart with "
-            f"the version of pfem_petsc that wrote it, or {_remedy(path)}"
-        )
-    digest = None
-    try:
-        content: dict[str, Any] = json.loads(head[1])
-        size, digest = int(content["size"]), content.pop("digest")
-        actual = os.fstat(raw.fileno()).st_size
-        if actual != size:
-            raise InputError(f"{path}: damaged: has {actual} bytes of {size}; {_remedy(path)}")
-        sound = _digest(raw, content) == digest
-    except (ValueError, KeyError, TypeError, IndexError, OverflowError, AttributeError):
-        sound = False
-    if not sound:
-        raise InputError(f"{path}: damaged: the description of its content does not match the digest; {_remedy(path)}")
-    return str(digest)
-
-
 def _remedy(path: Path) -> str:
     """Return what a user can do without this checkpoint."""
     previous = path.with_name(f"{path.stem}-previous{path.suffix}")
     if previous.is_file():
         return f"restart from the one before: --restart {previous}"
     return "start without --restart"
-
-
-def _digest(raw: BinaryIO, content: dict[str, Any]) -> str:
-    """Return a digest of the seal's content and of all bytes after the user block except values of arrays."""
-    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
-    position = int(content["seal_size"])
-    for offset, length in [*content["arrays"], [int(content["size"]), 0]]:
-        raw.seek(position)
-        while position < offset:
-            block = raw.read(min(_BLOCK, offset - position))
-            if not block:
-                raise ValueError("the file ends early")
-            digest.update(block)
-            position += len(block)
-        position = offset + length
-    return digest.hexdigest()
 
 
 def _open(path: Path) -> BinaryIO:
@@ -319,12 +250,10 @@ def write_checkpoint(
     n_bytes = sum(dtype.itemsize * int(np.prod(shape, dtype=np.int64)) for shape, dtype in shapes.values())
     require_room(comm, path, n_bytes, target=path.parent)
     checks = {name: checksum(comm, slab, arrays[name][0].first) for name, slab in slabs.items()}
-    state = json.dumps(
-        {"scalars": dict(scalars), "attributes": dict(attributes)}, default=lambda value: value.tolist()
-    )  # of NumPy
+    content = {"scalars": dict(scalars), "attributes": dict(attributes), "checksums": checks}
+    state = json.dumps(content, default=lambda value: value.tolist())  # of NumPy
     try:
-        size = 1 << (511 + 64 * len(shapes)).bit_length()  # of the seal: a power of two, as HDF5 requires
-        temporary = create_new(path, comm, _create, shapes, checks, state, userblock_size=size)
+        temporary = create_new(path, comm, _create, shapes, state, userblock_size=_HEAD)
     except InputError as error:
         raise SimulationFailure(f"{path}: no checkpoint could be written: {error}") from error
 
@@ -334,7 +263,7 @@ def write_checkpoint(
     try:
         for name, slab in slabs.items():
             with writing(comm, temporary):
-                write_rows(file["arrays"][name], arrays[name][0].first, slab, collective=together)
+                Growing(file["arrays"][name]).write(arrays[name][0].first, slab, collective=together)
         with writing(comm, temporary):
             file.flush()
     except SimulationFailure:
@@ -342,13 +271,9 @@ def write_checkpoint(
         if comm.rank == 0:
             temporary.unlink(missing_ok=True)
         raise
-    with writing(comm, temporary):
-        file.close()
-    with writing(comm, temporary):
-        if comm.rank == 0:
-            _seal(temporary)
     first = first_of_machine(comm)
     with writing(comm, temporary):
+        file.close()
         if first:  # a machine has one cache of the file
             fsync_all(temporary)
     with writing(comm, path):
@@ -356,15 +281,18 @@ def write_checkpoint(
             _put_in_place(temporary, path)
 
 
-def _create(file: h5py.File, shapes: Mapping, checks: Mapping[str, int], state: str) -> None:
+def _create(file: h5py.File, shapes: Mapping, state: str) -> None:
     set_text(file, "state", state)
     file["state"].attrs["checksum"] = zlib.crc32(state.encode())
-    group = file.create_group("arrays")
     for name, (shape, dtype) in shapes.items():
-        group.create_dataset(name, shape=shape, dtype=dtype).attrs["checksum"] = np.uint64(checks[name])
+        file.create_dataset(f"arrays/{name}", shape=shape, dtype=dtype)
+    file.require_group("arrays")
 
 
 def _put_in_place(temporary: Path, path: Path) -> None:
+    with open(temporary, "r+b") as raw:
+        raw.write(f"{_FORMAT} {_VERSION}\n".encode())
+    fsync_all(temporary)
     if path.exists():
         os.replace(path, path.with_name(f"{path.stem}-previous{path.suffix}"))
     os.replace(temporary, path)

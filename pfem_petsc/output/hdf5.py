@@ -54,20 +54,16 @@ class Growing:
         self._shape = (n_rows, *self._shape[1:])
         self._id.set_extent(self._shape)
 
-    def write(self, first: int | tuple[int, ...], rows: np.ndarray | None = None, collective: bool = False) -> None:
-        """Write rows (n, ...) starting at row ``first``, or an array at a place; None or nothing: join a collective
-        transfer without data."""
-        if rows is None and not collective:
-            return
-        if rows is None or rows.size == 0:
+    def write(self, first: int, rows: np.ndarray, collective: bool = False) -> None:
+        """Write rows (n, ...) starting at row ``first``; no rows: join a collective transfer without data."""
+        if rows.size == 0:
             rows = np.empty((1,) * len(self._shape), dtype=self.dtype)
             source, target = h5py.h5s.create_simple(rows.shape), self._id.get_space()
             source.select_none()
             target.select_none()
         else:
             rows = np.ascontiguousarray(rows, dtype=self.dtype)
-            start = first if isinstance(first, tuple) else (first, *self._zeros)
-            source, target = _selection(self._shape, start, rows.shape)
+            source, target = _selection(self._shape, (first, *self._zeros), rows.shape)
         self._id.write(source, target, rows, self._type, _collective() if collective else None)
 
 
@@ -179,12 +175,11 @@ def create_new(
     build: Callable[..., None],
     *arguments: Any,
     userblock_size: int = 0,
-    checked: bool = False,
 ) -> Path:
     """Create an HDF5 file with its whole structure on rank 0 and return its temporary name.
 
-    ``build(file, *arguments)`` fills it; the first ``userblock_size`` bytes belong to the caller; a ``checked`` file
-    has the formats in which HDF5 stores checksums of everything except the values. With serial creation the structure
+    ``build(file, *arguments)`` fills it; the first ``userblock_size`` bytes belong to the caller. HDF5
+    stores checksums of everything except the values. With serial creation the structure
     is the same for any number of ranks, and an unwritable folder is the same error on all of them. Collective.
 
     Raises
@@ -198,11 +193,9 @@ def create_new(
     def create() -> None:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if checked:
-                create_checked(temporary, build, *arguments)
-            else:
-                with h5py.File(temporary, "w", locking=False, userblock_size=userblock_size) as file:
-                    build(file, *arguments)
+            h5py.File(temporary, "w", locking=False, libver=SUPERBLOCK, userblock_size=userblock_size).close()
+            with h5py.File(temporary, "r+", locking=False, libver=OBJECTS) as file:
+                build(file, *arguments)
         except (OSError, RuntimeError) as error:
             number = getattr(error, "errno", None)
             raise InputError(
@@ -223,13 +216,6 @@ def create_new(
                 )
             time.sleep(0.1)
     return temporary
-
-
-def create_checked(path: Path, build: Callable[..., None], *arguments: Any) -> None:
-    """Create a file with HDF5 checksums of everything except the values; ``build(file, *arguments)`` fills it."""
-    h5py.File(path, "w", locking=False, libver=SUPERBLOCK).close()
-    with h5py.File(path, "r+", locking=False, libver=OBJECTS) as file:
-        build(file, *arguments)
 
 
 def open_shared(path: Path, comm: MPI.Comm) -> h5py.File:
@@ -263,11 +249,6 @@ def writes_together(comm: MPI.Comm) -> bool:
     as each rank's writing of its own rows.
     """
     return comm.allreduce(int(first_of_machine(comm))) > 1
-
-
-def write_rows(dataset: h5py.Dataset, first: int, rows: np.ndarray | None, collective: bool = False) -> None:
-    """Write rows (n, ...) starting at row ``first``; None or no rows: join a collective transfer without data."""
-    Growing(dataset).write(first, rows, collective)
 
 
 def set_text(group: h5py.Group, name: str, text: str) -> None:
@@ -425,8 +406,8 @@ class SharedFile:
         with self.writing():
             return function()
 
-    def write(self, dataset: Growing | None, first: int, rows: np.ndarray, index: tuple[int, ...] = ()) -> None:
-        """Write each rank's rows (n, ...) from row ``first`` of a dataset, at an index of the dimensions before.
+    def write(self, dataset: Growing | None, first: int, rows: np.ndarray) -> None:
+        """Write each rank's rows (n, ...) from row ``first`` of a dataset.
 
         ``dataset`` is None on ranks that are no owners, whose rows go through memory that ranks share. Collective.
         """
@@ -439,9 +420,8 @@ class SharedFile:
             first, rows = 0, memory.arrays["rows"]
 
         def put() -> None:
-            start = (*index, first, *(0,) * (rows.ndim - 1))
             with self.writing():
-                dataset.write(start, rows.reshape((1,) * len(index) + rows.shape), collective=self.together)
+                dataset.write(first, rows, collective=self.together)
 
         self.call(put)
 

@@ -24,7 +24,8 @@ from mpi4py import MPI
 from ..columns import Layout
 from ..errors import InputError
 from ..mechanics.compiled import kernel
-from .hdf5 import create_checked, dataset_names, fsync_all, is_compressed, write_rows
+from ..signals import environment_alone
+from .hdf5 import dataset_names, fsync_all, is_compressed
 from .layout import (
     BARS,
     CHECKS,
@@ -32,7 +33,6 @@ from .layout import (
     MODE_VALUES,
     MODES,
     PER_STEP,
-    Constant,
     Contents,
     Kept,
     check_version,
@@ -40,9 +40,6 @@ from .layout import (
     complete_rows,
     complete_snapshots,
     constants,
-    create_field,
-    create_result,
-    create_snapshot_checks,
     field_datasets,
     field_names,
     mesh_sizes,
@@ -118,14 +115,6 @@ def seeded(name: str, total: int) -> int:
     return (total * (2 * zlib.crc32(name.encode()) + 1)) & _WORD
 
 
-def snapshot_digests(comm: MPI.Comm, sums: Mapping[str, int]) -> np.ndarray:
-    """Return checksums (fields,) uint64 of arrays distributed in slabs over the ranks, sorted by name. Collective.
-
-    ``sums``: name to :func:`word_sum` of this rank's rows, in the type in which they are stored.
-    """
-    return summed(comm, [seeded(name, part) for name, part in sorted(sums.items())])
-
-
 def mark_digest(n: int, step: int, time: float) -> int:
     """Return the checksum of the step and time [s] of snapshot n."""
     return zlib.crc32(np.array([n, step], dtype=np.int64).tobytes() + np.float64(time).tobytes())
@@ -188,7 +177,6 @@ _START = """import sys, mpi4py
 mpi4py.rc.initialize = False
 from pfem_petsc.output.integrity import main
 sys.exit(main())"""
-_LAUNCHERS = ("OMPI_", "PMIX_", "PMI_", "OPAL_", "ORTE_", "PRTE_", "MPI_LOCALRANKID", "SLURM_PROCID", "PALS_")
 
 
 def examine(path: Path, deep: bool | None = None) -> list[str]:
@@ -235,9 +223,8 @@ def _examined(path: Path, size: int, changed: int, deep: bool) -> tuple[tuple[st
 
 
 def _read_apart(path: Path, deep: bool) -> subprocess.CompletedProcess:
-    # Without the environment variables of the ranks, with which h5py would start MPI.
-    variables = {name: value for name, value in os.environ.items() if not name.startswith(_LAUNCHERS)}
-    root = str(Path(__file__).parents[2])
+    # without the variables of the ranks, with which h5py would start MPI
+    variables, root = environment_alone(), str(Path(__file__).parents[2])
     variables["PYTHONPATH"] = os.pathsep.join([root, *filter(None, [variables.get("PYTHONPATH")])])
     command = [sys.executable, "-c", _START, str(path), "deep" if deep else "quick"]
     return subprocess.run(
@@ -339,9 +326,7 @@ def main() -> int:
 
 
 COPIED = 1 << 28
-"""Files up to this size [B] are rewritten for a restart and then replaced."""
-PIECE = 1 << 24
-"""Number of bytes that are read and written at once."""
+"""Files up to this size [B] are copied for a restart and then replaced."""
 
 
 def repair(path: Path | str, kept: Kept | None = None) -> tuple[int, int]:
@@ -364,9 +349,12 @@ def repair(path: Path | str, kept: Kept | None = None) -> tuple[int, int]:
         # A kill in between must leave a file that VTK can read: VTK crashes on more times than steps, so the times are
         # removed first; it shows nothing for steps without data, so the data are removed last.
         steps["Values"].resize(n_snapshots, axis=0)
-        write_rows(steps["Values"], 0, file["snapshots/time"][:n_snapshots])
+        steps["Values"][:] = file["snapshots/time"][:n_snapshots]
         file.flush()
-        _count(file, counts)
+        steps.attrs.modify("NSteps", np.int64(n_snapshots))
+        tables = {name: n for name, n in zip(("history", EVENT), counts[1:], strict=True) if name in file}
+        for table, n in tables.items():
+            file[table].attrs.modify("rows", np.int64(n))
         file.flush()
         if n_snapshots == 0:
             # The first snapshot creates the fields, possibly not all of them.
@@ -374,33 +362,17 @@ def repair(path: Path | str, kept: Kept | None = None) -> tuple[int, int]:
             for kind in ("PointData", "CellData"):
                 for name in field_names(vtk, kind):
                     del vtk[kind][name], steps[f"{kind}Offsets"][name]
-        for name, n in _extents(file, counts).items():
+        n_nodes, n_bars = mesh_sizes(file)
+        grown = [steps[name] for name in PER_STEP] + [file["snapshots/step"], file["snapshots/time"]]
+        rows = {data.name: n_snapshots for data in grown + ([file[CHECKS]["snapshots"]] if n_snapshots else [])}
+        for name, data in field_datasets(vtk).items():
+            rows[data.name] = n_snapshots * (n_bars if name.startswith("CellData") else n_nodes)
+        for table, n in tables.items():
+            rows |= {f"{table}/{name}": n for name in dataset_names(file[table])} | {f"{CHECKS}/{table}": n}
+        for name, n in rows.items():
             file[name].resize(n, axis=0)
     fsync_all(path)
     return counts[:2]
-
-
-def _count(file: h5py.File, counts: tuple[int, int, int]) -> None:
-    """Set the numbers of snapshots, history rows and events that a file counts as complete."""
-    file["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(counts[0]))
-    for table, n in (("history", counts[1]), (EVENT, counts[2])):
-        if table in file:
-            file[table].attrs.modify("rows", np.int64(n))
-
-
-def _extents(file: h5py.File, counts: tuple[int, int, int]) -> dict[str, int]:
-    """Return the numbers of rows of all growing datasets, but those of modes, for these numbers of snapshots, history
-    rows and events."""
-    n_snapshots, vtk = counts[0], file["VTKHDF"]
-    n_nodes, n_bars = mesh_sizes(file)
-    rows = {f"VTKHDF/Steps/{name}": n_snapshots for name in (*PER_STEP, "Values")}
-    rows |= {f"snapshots/{name}": n_snapshots for name in ("step", "time")}
-    sizes = {name: n_bars if name.startswith("CellData") else n_nodes for name in field_datasets(vtk)}
-    rows |= {f"VTKHDF/{name}": n_snapshots * size for name, size in sizes.items()}
-    for table, n in (("history", counts[1]), (EVENT, counts[2])):
-        if table in file:
-            rows |= {f"{table}/{name}": n for name in dataset_names(file[table])} | {f"{CHECKS}/{table}": n}
-    return rows | ({f"{CHECKS}/snapshots": n_snapshots} if n_snapshots else {})
 
 
 def reopen(path: Path, sizes: tuple[int, int], contents: Contents, kept: Kept) -> bool:
@@ -422,34 +394,22 @@ def reopen(path: Path, sizes: tuple[int, int], contents: Contents, kept: Kept) -
     InputError
         If the file is missing or damaged, or has another mesh, other fields or other columns.
     """
-    _refuse_damaged(path)
-    with _replaced(path) as target:
-        with readable(path), h5py.File(path, "r", locking=False) as file:
-            counts, compressed = _counts(file, kept), is_compressed(file["VTKHDF/Points"])
-            _check_same(file, path, counts[0], sizes, contents)
-            earlier = list(read_attributes(file["case"]).get("restarts_after_step", []))
-            described = {**contents.attributes, "restarts_after_step": [*earlier, kept.step]}
-            contents = contents._replace(attributes=described)
-            if target != path:
-                create_checked(target, _rebuild, file, counts, contents)
-        if target == path:
-            repair(target, kept)
-            with h5py.File(target, "r+", locking=False) as file:
-                write_case(file, contents.case_text, described)
-                prepare_modes(file, contents.modes, sizes[0])
-    return compressed
-
-
-def _refuse_damaged(path: Path) -> None:
-    if not path.is_file():
-        return
-    wrong = examine(path, deep=True)
-    if wrong:
+    if path.is_file() and (wrong := examine(path, deep=True)):
         more = f", and {len(wrong) - 1} more like it" if len(wrong) > 1 else ""
         raise InputError(
             f"{path}: damaged: {wrong[0]}{more} (info --verify lists all): it is not continued; restore it from a "
             "copy, or restart into another folder (-o), where new results begin at the checkpoint"
         )
+    with readable(path), h5py.File(path, "r", locking=False) as file:
+        compressed = is_compressed(file["VTKHDF/Points"])
+        _check_same(file, path, _counts(file, kept)[0], sizes, contents)
+        earlier = list(read_attributes(file["case"]).get("restarts_after_step", []))
+    with _replaced(path) as target:
+        repair(target, kept)
+        with h5py.File(target, "r+", locking=False) as file:
+            write_case(file, contents.case_text, {**contents.attributes, "restarts_after_step": [*earlier, kept.step]})
+            prepare_modes(file, contents.modes, sizes[0])
+    return compressed
 
 
 def _check_same(file: h5py.File, path: Path, n_snapshots: int, sizes: tuple[int, int], contents: Contents) -> None:
@@ -488,43 +448,6 @@ def _check_same(file: h5py.File, path: Path, n_snapshots: int, sizes: tuple[int,
             )
 
 
-def _rebuild(target: h5py.File, source: h5py.File, counts: tuple[int, int, int], contents: Contents) -> None:
-    """Fill a new file with what is kept of another: nothing that a kill or damage has left in that one comes along.
-
-    ``counts``: snapshots, history rows and events
-    """
-    vtk, history = source["VTKHDF"], source["history"]
-    n_nodes, n_bars = mesh_sizes(source)
-    columns = {name: row_type(history[name]) for name in dataset_names(history)}
-    events = {name: dataset.dtype for name, dataset in source[EVENT].items()} if EVENT in source else {}
-    compressed = is_compressed(vtk["Points"])
-    kept = {name: source[BARS][name] for name in constants(source)}
-    has = {}
-    for name, data in kept.items():
-        has[name] = Constant(data[:0], data.attrs["unit"].decode(), list(data.attrs.get("names", ())))
-    of_file = {"columns": columns, "events": events, "compressed": compressed, "constants": has}
-    create_result(target, n_nodes, n_bars, contents._replace(**of_file))
-    if counts[0]:
-        for name, dataset in field_datasets(vtk).items():
-            kind, _, field = name.partition("/")
-            if field:
-                create_field(target["VTKHDF"], kind, field, dataset.shape[1:], dataset.dtype)
-        create_snapshot_checks(target)
-    rows = {"VTKHDF/Connectivity": 2 * n_bars, "VTKHDF/Offsets": n_bars + 1, f"{CHECKS}/mesh": 1}
-    rows |= {f"{BARS}/{name}": n_bars for name in kept} | ({f"{CHECKS}/{BARS}": 1} if kept else {})
-    rows |= _extents(target, counts)
-    for name, n in rows.items():
-        old, new = source[name], target[name]
-        if new.maxshape[0] is None:
-            new.resize(n, axis=0)
-        piece = max(1, PIECE // max(1, old.dtype.itemsize * int(np.prod(old.shape[1:], dtype=np.int64))))
-        if is_compressed(new):
-            piece = max(1, piece // new.chunks[0]) * new.chunks[0]
-        for first in range(0, n, piece):
-            write_rows(new, first, old[first : min(first + piece, n)])
-    _count(target, counts)
-
-
 def _counts(file: h5py.File, kept: Kept | None) -> tuple[int, int, int]:
     """Return the numbers of complete snapshots, history rows and events, up to the steps that are kept."""
     found = complete_snapshots(file), complete_rows(file), complete_rows(file, EVENT)
@@ -541,13 +464,15 @@ def _counts(file: h5py.File, kept: Kept | None) -> tuple[int, int, int]:
 def _replaced(path: Path) -> Iterator[Path]:
     """Context that yields the file to write for a restart, which replaces ``path`` at the end; messages name ``path``.
 
-    A kill between the few writes that replace the case would leave a file that HDF5 cannot open. A new file avoids this
-    and costs little unless it is large; large files are modified in place.
+    A kill between the few writes that replace the case would leave a file that HDF5 cannot open. A copy avoids this and
+    costs little unless it is large; large files are modified in place.
     """
     size = path.stat().st_size if path.is_file() else 0
     copied = 0 < size <= COPIED and shutil.disk_usage(path.parent).free > 2 * size
     target = path.with_name(path.name + ".new") if copied else path
     try:
+        if copied:
+            shutil.copyfile(path, target)
         yield target
         if copied:
             fsync_all(target)

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 from ..errors import InputError
 from ..parallel.agreement import agreed
+from ..signals import launched_rank
+from .table import aligned
 from .units import TIME, Axis, duration
 
 if TYPE_CHECKING:
@@ -24,9 +26,6 @@ FIRST_LINE = 2.0  # seconds until the first line, and between the first lines
 LAST_LINE = 10.0  # maximum number of seconds between lines
 SHORT = 240  # letters of a warning, if quiet
 BAR_REFRESH = 0.1  # seconds between two updates of the bar
-
-# Open MPI gives rank 0 a pseudo-terminal, so isatty() alone would draw a bar into the line-wise forwarding of mpirun.
-_LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID")
 
 
 class LogFile:
@@ -146,8 +145,7 @@ class Progress:
 
     def summary(self, entries: dict[str, str]) -> None:
         """Print the start-up block: label and text of each entry, aligned."""
-        width = max((len(label) for label in entries), default=0)
-        self.message("\n".join([self._title, *(f"  {label:<{width}}  {text}" for label, text in entries.items())]))
+        self.message("\n".join([self._title, *aligned(entries.items())]))
 
     def update(
         self,
@@ -343,8 +341,8 @@ def _speed(rate: float) -> str:
 
 def _is_terminal(stream: TextIO) -> bool:
     """Return whether a bar can be drawn into a stream: not into files, pipes, or the output of a launcher."""
-    launched = any(name in os.environ for name in _LAUNCHERS)
-    return stream.isatty() and not launched and os.environ.get("TERM", "dumb") != "dumb"
+    # Open MPI gives rank 0 a pseudo-terminal, whose lines mpirun forwards
+    return stream.isatty() and launched_rank() is None and os.environ.get("TERM", "dumb") != "dumb"
 
 
 def _bar(title: str, stream: TextIO) -> Any:

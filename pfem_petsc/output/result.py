@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import html
+import re
 import time
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import h5py
 import numpy as np
 
+from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..registry import nearest
 from .hdf5 import HDF5_ERRORS, dataset_names, first_line
@@ -30,7 +33,7 @@ from .layout import (
     mesh_sizes,
     read_attributes,
 )
-from .table import SWEEP, Table, flat_columns, select
+from .table import SWEEP, Table, aligned, flat_columns, html_table, select
 from .units import AXES, LOAD_FACTOR, TIME, Axis, engineering
 
 if TYPE_CHECKING:
@@ -118,6 +121,12 @@ class Modes:
         text = f"{self.values[k]:.6g} {unit}".rstrip()
         return f"mode {k + 1}: {text}" if unit else f"mode {k + 1}: {name.replace('_', ' ')} {text}"
 
+    def table(self) -> Table:
+        """Numbers of the modes from 1, and their frequencies or load factors."""
+        name, unit = MODE_VALUES[self.kind]
+        heading = name.replace("_", " ") + (f" [{unit}]" if unit else "")
+        return Table({"mode": np.arange(1, len(self) + 1), heading: self.values})
+
     def _read(self, name: str) -> np.ndarray:
         if name not in self._kept:
             raise InputError(f"{self._result.path}: modes of {self.kind} have no {name}{nearest(name, self._kept)}")
@@ -195,6 +204,7 @@ class Result:
 
     def reload(self) -> None:
         """List the data that the run has written since."""
+        self.__dict__.pop("case", None)
         self._patiently(self._look)
 
     def _look(self, file: h5py.File) -> None:
@@ -223,45 +233,53 @@ class Result:
         self._names = sorted(file[MODES]) if self.n_modes else []
 
     def summary(self) -> dict[str, str]:
-        """Return what matters of the run, as texts by name: file, mesh, end, snapshots, energies, largest forces."""
-        history, n = self.history, self._n_rows
+        """Return what matters of the run, as texts by name: file, mesh, analysis, end, energies, largest forces."""
+        history, case, n, times = self.history, self.case, self._n_rows, self.times
         rows = {"file": str(self.path), "mesh": f"{self.n_nodes:,} nodes, {self.n_bars:,} bars"}
-        if n:
-            last, steps = int(history["step"][-1]), self.attributes.get("steps")
-            rows["end"] = f"step {last:,}, {self.place(float(history['time'][-1]))}"
-            if self._static_stages:
-                rows["end"] += f", stage {int(history['stage'][-1]) + 1} of {len(self._static_stages)}"
-            elif steps is not None and self.axis is TIME:
-                rows["end"] += ", which is the end of the run" if last >= steps else f", of {int(steps):,} steps"
-            elif (end := self.case.end or 0.0) and self.axis is not TIME:  # a path has none
-                done = float(history["time"][-1]) >= end * (1.0 - 1e-9)
-                rows["end"] += ", which is the end of the run" if done else f", of {end:g}"
-        rows["snapshots"] = f"{len(self.times)}"
-        names = [name for name in ("kinetic_energy", "elastic_energy", "plastic_dissipation") if name in history]
-        for name in (*names, "external_work") if n else ():
-            values = history[name]
+        if len(times):
+            rows["extent"] = " × ".join(engineering(float(size), "m") for size in np.ptp(self.positions(0), axis=0))
+        rows["analysis"] = "; ".join((f"{one.name}: " if case.stage else "") + _analysis(one) for one in case.stages)
+        rows["snapshots"] = f"{len(times)}: {self.axis.span(times[0], times[-1])}" if len(times) else "0"
+        if not n:
+            return rows | {"history": "0 rows"}
+        time, last, steps = history["time"], int(history["step"][-1]), self.attributes.get("steps")
+        rows["history"] = f"{n} rows: {self.axis.span(float(time[0]), float(time[-1]))}"
+        rows["end"] = f"step {last:,}, {self.place(float(time[-1]))}"
+        if self._static_stages:
+            rows["end"] += f", stage {int(history['stage'][-1]) + 1} of {len(self._static_stages)}"
+        elif steps is not None and self.axis is TIME:
+            rows["end"] += ", which is the end of the run" if last >= steps else f", of {int(steps):,} steps"
+        elif (end := case.end or 0.0) and self.axis is not TIME:  # a path has none
+            done = float(time[-1]) >= end * (1.0 - 1e-9)
+            rows["end"] += ", which is the end of the run" if done else f", of {end:g}"
+        held = energies(history)
+        for name, values in held.items():
             if np.any(values):
-                most = engineering(float(values[np.argmax(np.abs(values))]), "J")
-                rows[name.replace("_", " ")] = f"{engineering(float(values[-1]), 'J')} at the end, largest {most}"
-        if n and "energy_imbalance" in history:
-            rows["energy imbalance"] = engineering(float(np.abs(history["energy_imbalance"]).max()), "J")
-        for name in (*(name for name in history if name.startswith("wall/")), "support_force") if n else ():
-            if name.endswith("force") and np.any(history[name]):
-                force, time, _ = peak_force(self, name)
-                rows[f"largest {name}"] = f"{engineering(force, 'N')} at {self.place(time)}"
-        if n and history["broken_bars"][-1]:
-            rows["broken bars"] = f"{int(history['broken_bars'][-1]):,} of {self.n_bars:,}"
+                three = (engineering(float(v), "J") for v in (values[0], values[np.abs(values).argmax()], values[-1]))
+                rows[name.replace("_", " ")] = "{} at the start, largest {}, {} at the end".format(*three)
+        if held:
+            worst, largest = (float(np.abs(v).max()) for v in (balance_error(history), np.array([*held.values()])))
+            rows["balance error"] = f"{engineering(worst, 'J')} ({worst / (largest or 1.0):.1e} of the largest energy)"
+        for name in (name for name in history if re.fullmatch("wall/.*/force|support_force", name)):
+            force, at, window = peak_force(self, name)
+            if name != "support_force" or force > 0.0:
+                over = f" (mean over {engineering(window, 's', 3)})" if window else ""
+                rows[f"largest {name}"] = f"{engineering(force, 'N')}{over} at {self.place(at)}" if force else "none"
+            wall = name.removeprefix("wall/").removesuffix("/force")
+            touching, impulse = touch_impulse(self, wall) if force and name.startswith("wall/") else (0.0, 0.0)
+            if impulse > 0.0:
+                share = f"{engineering(touching, 'N s', 3)} of {engineering(impulse, 'N s', 3)}"
+                rows[f"largest {name}"] += f"; impulse of first touches {share}"
+        if np.any(broken := history.get("broken_bars", 0)):
+            first = self.place(float(time[np.argmax(broken > 0)]))
+            rows["broken bars"] = f"{int(broken[-1]):,} of {self.n_bars:,}, the first at {first}"
         return rows
 
     def __str__(self) -> str:
-        rows = self.summary()
-        width = max(map(len, rows))
-        return "\n".join([self._title, *(f"  {name:{width}}  {text}" for name, text in rows.items())])
+        return "\n".join([self._title, *aligned(self.summary().items())])
 
     def _repr_html_(self) -> str:
-        texts = [[html.escape(text) for text in row] for row in self.summary().items()]
-        rows = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in texts)
-        return f"<table><caption>{html.escape(self._title)}</caption><tbody>{rows}</tbody></table>"
+        return f"<p>{html.escape(self._title)}</p>{html_table(self.summary().items())}"
 
     @property
     def _title(self) -> str:
@@ -304,12 +322,11 @@ class Result:
         """Text of one of its times: ``t = 1.000 s``, in static analyses and stages ``load factor 0.25``."""
         static, history = self._static_stages, self.history
         if any(static) and self._n_rows:
-            times, stages = history["time"], history["stage"]
-            stage = stages[min(int(np.searchsorted(times, time)), self._n_rows - 1)]
+            stage = int(stage_at(history, [time])[0])
             if static[stage]:
-                rows = stages == stage
-                text = LOAD_FACTOR.place(float(np.interp(time, times[rows], history["load_factor"][rows])))
-                return f"{self.case.stage[int(stage)].name}, {text}" if sum(static) > 1 else text
+                rows = history["stage"] == stage
+                text = LOAD_FACTOR.place(float(np.interp(time, history["time"][rows], history["load_factor"][rows])))
+                return f"{self.case.stage[stage].name}, {text}" if sum(static) > 1 else text
         return self.axis.place(time)
 
     @property
@@ -333,7 +350,7 @@ class Result:
             raise InputError(f"{self.path}: has no modes: give the case a table [modes], and let it run to its end")
         return Modes(self, self._names)
 
-    @property
+    @cached_property
     def case(self) -> Case:
         """The case, read from the text in the file; what plugins or packages that are not there had is a warning."""
         from ..case.schema import Case
@@ -464,6 +481,54 @@ class Result:
             f"<Result {self.path}: {len(self.times)} snapshots of {self.n_nodes} nodes and {self.n_bars} bars, "
             f"{self._n_rows} history rows>"
         )
+
+
+def _analysis(stage: Any) -> str:
+    if stage.time is not None:
+        return f"{stage.time.integrator}, {stage.time.mass} mass, to {engineering(stage.time.end, 's')}"
+    return f"static, {stage.static.method}" if stage.static is not None else "modes of the initial state"
+
+
+def check_mesh(result: Any, mesh: Any) -> None:
+    """Refuse a mesh that is not the one of a result.
+
+    Raises
+    ------
+    InputError
+        If nodes or bars differ.
+    """
+    ends, numbers = np.asarray(result.bars), mesh.node_ids[mesh.bars]
+    counts = (result.n_nodes, len(ends)), (mesh.n_nodes, mesh.n_bars)
+    same = counts[0] == counts[1] and bool((ends[mesh.bar_ids] == numbers).all())
+    if same and "displacement" in result.point_fields:
+        points = np.asarray(result.positions(0), dtype=float) - np.asarray(result.field("displacement", 0), dtype=float)
+        size = float(np.ptp(mesh.points, axis=0).max())
+        same = bool(np.abs(points[mesh.node_ids] - mesh.points).max() <= 1e-5 * size)
+    if not same:
+        raise InputError(
+            f"{result.path}: the mesh of its case is another one now (it had {counts[0][0]:,} nodes and "
+            f"{counts[0][1]:,} bars): the table of members reads it again; put it back, or run the case again"
+        )
+
+
+def stage_at(history: Mapping[str, np.ndarray], times: Sequence[float]) -> np.ndarray:
+    """Return the number of the stage (n,) of each of some times; the end of a stage belongs to it, not to the next."""
+    if "stage" not in history:
+        return np.zeros(len(times), dtype=int)
+    stages = np.asarray(history["stage"])
+    return stages[np.minimum(np.searchsorted(history["time"], times), len(stages) - 1)]
+
+
+def energies(history: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the stored, lost and supplied energies (rows,) [J] of a history by name."""
+    return {name: np.asarray(history[name], float) for name in (*STORED, *LOST, *SUPPLIED) if name in history}
+
+
+def balance_error(history: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Return the imbalance of stored, lost and supplied energies since the first row, (rows,) [J]; None without."""
+    held = energies(history)
+    total = sum(-values if name in SUPPLIED else values for name, values in held.items())
+    return total - total[0] if held else None
 
 
 def impulse_of(history: Any, column: str) -> np.ndarray | None:

@@ -20,7 +20,7 @@ from .units import dimensions, powers_of, product, simplest
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["SWEEP", "Selected", "Table", "flat_columns", "select", "varied"]
+__all__ = ["SWEEP", "Selected", "Table", "aligned", "flat_columns", "html_table", "select", "varied"]
 
 
 _SHOWN = 10  # rows shown at the beginning and at the end of a long table
@@ -58,8 +58,8 @@ class Table(Mapping[str, np.ndarray]):
         """The rows as dictionaries."""
         return [{name: values[i] for name, values in self.items()} for i in range(self.n_rows)]
 
-    def where(self, rows: np.ndarray) -> Table:
-        """Return a table of some rows, given by numbers or as a boolean mask (rows,)."""
+    def where(self, rows: np.ndarray | slice) -> Table:
+        """Return a table of some rows, given by numbers, as a slice, or as a boolean mask (rows,)."""
         return Table({name: values[rows] for name, values in self.items()})
 
     def to_structured(self) -> np.ndarray:
@@ -114,6 +114,10 @@ class Table(Mapping[str, np.ndarray]):
                 Path(path).write_text(text, encoding="utf-8")
         return text
 
+    def to_html(self) -> str:
+        """Return all rows as a table of HTML."""
+        return html_table(([_text(value) for value in row] for row in zip(*self.values(), strict=True)), self)
+
     def _texts(self) -> tuple[list[list[str]], str]:
         """The heading and the shown rows as texts, and what is left out of a wide table: columns of zeros first."""
         shown, names = list(range(self.n_rows)), list(self)
@@ -145,10 +149,27 @@ class Table(Mapping[str, np.ndarray]):
 
     def _repr_html_(self) -> str:
         (head, *body), more = self._texts()
-        rows = "".join(f"<tr>{''.join(f'<td>{html.escape(text)}</td>' for text in line)}</tr>" for line in body)
-        heading = "".join(f"<th>{html.escape(text)}</th>" for text in head)
         below = f"{self.n_rows} rows. {more}".rstrip(" .")
-        return f"<table><thead><tr>{heading}</tr></thead><tbody>{rows}</tbody></table><p>{below}</p>"
+        return f"{html_table(body, head)}<p>{below}</p>"
+
+
+def aligned(entries: Iterable[tuple[str, str]]) -> list[str]:
+    """Return labels and their texts as lines, with the texts below each other."""
+    entries = list(entries)
+    width = max((len(label) for label, _ in entries), default=0)
+    return [f"  {label:{width}}  {text}" for label, text in entries]
+
+
+def html_table(lines: Iterable[Iterable[str]], head: Iterable[str] = ()) -> str:
+    """Return texts as a table of HTML; those that begin with a digit have the class ``number``."""
+    kinds = {True: ' class="number"', False: ""}
+    rows = (
+        "".join(f"<td{kinds[re.match('[-−]?[0-9]', text) is not None]}>{html.escape(text)}</td>" for text in line)
+        for line in lines
+    )
+    heading = "".join(f"<th>{html.escape(text)}</th>" for text in head)
+    body = "".join(f"<tr>{row}</tr>" for row in rows)
+    return f"<table><thead><tr>{heading}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def flat_columns(name: str, values: np.ndarray, vector: bool) -> dict[str, np.ndarray]:
@@ -186,10 +207,9 @@ def _column(values: Sequence[Any] | np.ndarray) -> np.ndarray:
     if isinstance(values, np.ndarray) and values.ndim == 1:
         return values
     values = list(values)
-    logical = bool(values) and isinstance(values[0], bool | np.bool_)  # which are integers for Python
-    plain = [(int | np.integer, np.int64), (int | float | np.number, np.float64), (str, np.str_)]
-    for kind, dtype in [(bool | np.bool_, bool)] if logical else plain:
-        if all(isinstance(value, kind) and isinstance(value, bool | np.bool_) == logical for value in values):
+    kinds = {np.asarray(value).dtype.kind if np.isscalar(value) else "O" for value in values}
+    for known, dtype in (("iu", np.int64), ("iuf", np.float64), ("U", np.str_), ("b", bool)):
+        if kinds <= set(known):
             return np.array(values, dtype=dtype)
     made = np.empty(len(values), dtype=object)
     for i, value in enumerate(values):
@@ -404,9 +424,10 @@ class _Reader:
         one, other = one.reduced(), other.reduced()
         if one.vector != other.vector:
             raise self.error("one is a vector and the other is not; select a component, like .x")
-        unit = one.unit if other.plain else other.unit if one.plain else _common(one.unit, other.unit)
-        if unit is None and None not in (one.unit, other.unit):
+        units = [each.unit for each in (one, other) if not each.plain] or [None]
+        if None not in units and dimensions(powers_of(units[0])) != dimensions(powers_of(units[-1])):
             raise self.error(f"the units {one.unit or '1'} and {other.unit or '1'} differ")
+        unit = None if None in units else units[0]
         return Selected(operation(one.values, other.values), unit, one.vector, one.sources + other.sources)
 
     def _multiplied(self, one: Selected, other: Selected, power: int) -> Selected:
@@ -423,13 +444,6 @@ class _Reader:
         with np.errstate(divide="ignore", invalid="ignore"):
             values = a * b if power > 0 else np.where(b == 0.0, np.nan, a / b)
         return Selected(values, unit, one.vector or other.vector, one.sources + other.sources)
-
-
-def _common(one: str | None, other: str | None) -> str | None:
-    """Return the unit of both; None if one is not known, or their dimensions differ."""
-    if one is None or other is None:
-        return None
-    return one if dimensions(powers_of(one)) == dimensions(powers_of(other)) else None
 
 
 def _names(columns: Iterable[str]) -> Iterable[tuple[str, str]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +17,8 @@ from ..columns import Layout
 from ..errors import InputError, PfemError, SimulationFailure
 from ..parallel.agreement import on_root
 from ..parallel.heap import SharedArrays
-from .hdf5 import Growing, SharedFile, create_new, require_parallel_hdf5, require_room, write_rows, writing
-from .integrity import RowDigests, mark_digest, numbers_digest, reopen, seeded, snapshot_digests, summed, word_sum
+from .hdf5 import Growing, SharedFile, create_new, require_parallel_hdf5, require_room, writing
+from .integrity import RowDigests, mark_digest, numbers_digest, reopen, seeded, summed, word_sum
 from .layout import (
     BARS,
     CHECKS,
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     from ..parallel.natural import NaturalOrder
 
 
-_PIECE = 2**18  # number of bars whose connectivity is written at once on one rank
 # rows buffered in memory before they are written; fewer if rows are wide
 _BUFFER_ROWS, _BUFFER_BYTES = 1024, 1 << 24
 # bytes of a snapshot from which it is written beside the steps: less takes as long as handing it to a thread
@@ -56,15 +56,7 @@ def _write_constants(shared: SharedFile, mesh: DistributedMesh, constants: Mappi
         slab = np.ascontiguousarray(order.to_slab(constant.values[mesh.counted]))
         total += seeded(name, word_sum(slab, order.first))
         shared.write(Growing(file[BARS][name]) if file else None, order.first, slab)
-    digest = summed(shared.comm, [total])
-
-    def finish() -> None:
-        with shared.writing():
-            if shared.comm.rank == 0:
-                write_rows(file[CHECKS][BARS], 0, digest)
-            file.flush()
-
-    shared.call(finish)
+    _write_digest(shared, BARS, total)
 
 
 def _write_connectivity(shared: SharedFile, mesh: DistributedMesh) -> None:
@@ -73,29 +65,23 @@ def _write_connectivity(shared: SharedFile, mesh: DistributedMesh) -> None:
     Bars that are evaluated on two ranks are written by the rank that counts them.
     """
     comm, order = shared.comm, mesh.bar_order
-    first, count, file = order.first, order.count, shared.file
-    targets = {name: Growing(file["VTKHDF"][name]) if file else None for name in ("Connectivity", "Offsets")}
-    # one rank may have all bars: pieces keep the working arrays small
-    piece = count if comm.size > 1 else min(count, _PIECE)
-    total = 0
-    for start in range(0, max(count, 1), max(piece, 1)):
-        stop = min(start + piece, count)
-        if comm.size > 1:
-            ends = order.to_slab(mesh.node_ids[mesh.bars[mesh.counted]].astype(np.int64).reshape(-1, 2))
-        else:
-            ends = mesh.node_ids[mesh.bars[order.owned_rows(start, stop)]].astype(np.int64)
-        total += word_sum(ends.ravel(), 2 * (first + start))
-        shared.write(targets["Connectivity"], 2 * (first + start), ends.ravel())
-        # there is one more offset than bars, which the last rank writes
-        end = first + stop + (stop == count and comm.rank == comm.size - 1)
-        shared.write(targets["Offsets"], first + start, 2 * np.arange(first + start, end))
-    digest = summed(comm, [total])
+    ends = order.to_slab(mesh.node_ids[mesh.bars[mesh.counted]].astype(np.int64).reshape(-1, 2)).ravel()
+    # there is one more offset than bars, which the last rank writes
+    offsets = 2 * np.arange(order.first, order.first + order.count + (comm.rank == comm.size - 1))
+    for name, first, rows in (("Connectivity", 2 * order.first, ends), ("Offsets", order.first, offsets)):
+        shared.write(Growing(shared.file["VTKHDF"][name]) if shared.file else None, first, rows)
+    _write_digest(shared, "mesh", word_sum(ends, 2 * order.first))
+
+
+def _write_digest(shared: SharedFile, name: str, total: int) -> None:
+    """Write the checksum of what is written once, from the parts of the ranks. Collective."""
+    digest = summed(shared.comm, [total])
 
     def finish() -> None:
         with shared.writing():
-            if comm.rank == 0:
-                write_rows(file[CHECKS]["mesh"], 0, digest)
-            file.flush()
+            if shared.comm.rank == 0:
+                Growing(shared.file[CHECKS][name]).write(0, digest)
+            shared.file.flush()
 
     shared.call(finish)
 
@@ -271,7 +257,7 @@ class _Snapshots:
             sums[name] = word_sum(slab, order.first)
             with self._shared.writing():
                 self._data[name].write(n * order.n_global + order.first, slab, collective=self._shared.together)
-        return snapshot_digests(self._shared.owners, sums)
+        return summed(self._shared.owners, [seeded(name, part) for name, part in sorted(sums.items())])
 
     def mark(self, n: int, step: int, time: float, digests: np.ndarray) -> None:
         """Write the entries of snapshot n, except its time in ``/VTKHDF``, without counting it. For owners."""
@@ -349,7 +335,7 @@ class ResultWriter:
     ) -> None:
         require_parallel_hdf5(comm)
         self.path, self.comm = Path(path), comm
-        self._mesh = mesh
+        self._mesh, self._kind = mesh, contents.modes
         self._unpublished: Path | None = None  # temporary name until the file has complete data
         self._shared: SharedFile | None = None
         # The failure after which nothing can be written, and whether the open file can still be closed.
@@ -359,7 +345,7 @@ class ResultWriter:
         contents = contents._replace(attributes=describe_run(comm, contents.attributes))
         compressed = contents.compressed
         if kept is None:
-            self._unpublished = create_new(self.path, comm, create_result, *sizes, contents, checked=True)
+            self._unpublished = create_new(self.path, comm, create_result, *sizes, contents)
         else:
             compressed = on_root(comm, reopen, self.path, sizes, contents, kept)
         self._shared = SharedFile(self._unpublished or self.path, comm, self.path, compressed)
@@ -503,13 +489,9 @@ class ResultWriter:
         self.flush_history()
         self._ready()
         self._require_room(24 * self._mesh.n_nodes * len(values))
-        with self._whole_or_failed():
-            self._write_modes(eigenvalues, values, shapes)
-            self._shared.call(self._publish)
-
-    def _write_modes(self, eigenvalues: np.ndarray, values: np.ndarray, shapes: np.ndarray) -> None:
         shared, order, n = self._shared, self._mesh.node_order, len(eigenvalues)
         datasets: dict[str, Growing] = {}
+        name = MODE_VALUES[self._kind][0]
 
         def begin() -> None:
             datasets.update((name, Growing(dataset)) for name, dataset in shared.file[MODES].items())
@@ -517,28 +499,30 @@ class ResultWriter:
                 for dataset in datasets.values():
                     dataset.grow(n)
 
-        shared.call(begin)
-        digests = np.zeros(n, dtype=np.uint64)
-        for k in range(n):
-            slab = np.ascontiguousarray(order.to_slab(shapes[k]))
-            total = snapshot_digests(shared.comm, {"shape": word_sum(slab, order.first)})[0]
-            digests[k] = total ^ np.uint64(numbers_digest(k, eigenvalues[k], values[k]))
-            shared.write(datasets.get("shape"), order.first, slab, (k,))
+        def put(numbers: Mapping[str, np.ndarray], first: int) -> None:
+            with shared.writing():
+                for name, rows in numbers.items() if self.comm.rank == 0 else ():
+                    datasets[name].write(first, rows)
+                shared.file.flush()
 
         def finish() -> None:
-            checks = Growing(shared.file[CHECKS][MODES])
+            datasets[CHECKS] = Growing(shared.file[CHECKS][MODES])
             with shared.writing():
-                if shared.comm.rank == 0:
-                    datasets[next(name for name, _ in MODE_VALUES.values() if name in datasets)].write(0, values)
-                    datasets["eigenvalue"].write(0, eigenvalues)
-                shared.file.flush()
-            with shared.writing():
-                checks.grow(n)
-                if shared.comm.rank == 0:
-                    checks.write(0, digests)
-                shared.file.flush()
+                datasets[CHECKS].grow(n)
+            put({CHECKS: digests}, 0)
+            self._publish()
 
-        shared.call(finish)
+        with self._whole_or_failed():
+            shared.call(begin)
+            digests = np.zeros(n, dtype=np.uint64)
+            for k in range(n):
+                parts = self.comm.gather(order.to_slab(shapes[k]))
+                shape = np.concatenate(parts or [np.empty((0, 3))])
+                total = np.uint64(seeded("shape", word_sum(shape, 0)))
+                digests[k] = total ^ np.uint64(numbers_digest(k, eigenvalues[k], values[k]))
+                shared.call(partial(put, {"shape": shape[None]}, k))
+            shared.call(partial(put, {name: values, "eigenvalue": eigenvalues}, 0))
+            shared.call(finish)
 
     def close(self) -> None:
         """Write buffered rows and close the file; a second call does nothing. Collective."""

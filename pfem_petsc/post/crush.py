@@ -25,6 +25,7 @@ import numpy as np
 from ..errors import InputError
 from ..output.result import impulse_of
 from ..output.table import Table, select
+from ..output.units import engineering
 from ..registry import nearest
 from .options import WINDOW
 
@@ -103,6 +104,15 @@ class CrushTest(NamedTuple):
         ]
         names, values, units = zip(*rows, strict=True)
         return Table({"figure": list(names), "value": np.array(values), "unit": list(units)})
+
+    def texts(self) -> dict[str, str]:
+        """The figures as texts by name."""
+        found = {}
+        for row in self.figures().rows:
+            value, unit = row["value"], row["unit"]
+            text = engineering(value, unit) if unit in ("Pa", "J", "J/m³", "J/kg") else f"{value:.6g} {unit}".rstrip()
+            found[row["figure"]] = text if np.isfinite(value) else "none"
+        return found
 
     def _reaches(self, first: float, stress: float) -> float:
         """Return the strain beyond ``first`` at which the stress [Pa] is reached, NaN without."""

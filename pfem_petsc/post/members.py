@@ -21,9 +21,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import InputError
+from ..output.result import check_mesh, stage_at
 from ..output.table import Table
 from ..registry import nearest
-from .actions import check_mesh
 from .options import PER
 
 _COLLINEAR = 1e-4
@@ -224,11 +224,10 @@ def _stage_of(result: Any) -> tuple[np.ndarray, np.ndarray]:
     times, stages = np.asarray(result.times), result.case.stage
     if not stages:
         return np.zeros(len(times), dtype=int), np.ones(len(times), dtype=bool)
-    begins = np.asarray(result.stage_ends)
-    number = np.clip(np.searchsorted(begins[1:], times * (1.0 - _ROUNDING)), 0, len(stages) - 1)
+    number = stage_at(result.history, times * (1.0 - _ROUNDING))
     # a path ends where it ends; other analyses where the case says
     planned = np.array([np.nan if stage.end is None else stage.end for stage in stages])[number]
-    made = times - begins[np.minimum(number, len(begins) - 1)]
+    made = times - np.asarray(result.stage_ends)[number]
     return number, ~(made < planned * (1.0 - _ROUNDING)) & (made > 0.0)
 
 
@@ -412,13 +411,14 @@ def draw_members(
             path=result.path,
             case=result.case,
             bars=result.bars,
+            bar_data=result.bar_data,
             axis=result.axis,
             history=result.history,
             times=np.repeat(result.times[:1], len(cases)),
             positions=lambda snapshot: result.positions(0),
             point_fields=(),
             cell_fields=("utilisation",),
-            field=lambda name, snapshot: each[order[snapshot]],
+            field=lambda name, i: each[order[i]] if name == "utilisation" else result.field(name, 0),
             caption=lambda snapshot: str(cases[order[snapshot]]),
             instants=lambda count: list(range(len(cases))),
         )

@@ -1,27 +1,30 @@
-"""The motion of a result for pictures: its frames, where nodes, walls and probes are in each, and what is marked.
+"""The motion of a result for pictures: its frames, where nodes, walls and probes are in each, what is marked, and what
+acts, as the symbols of engineering drawings: triangles for supports, arrows for loads.
 
 A wall module may define ``surface(parameters, bounds)``, which returns what is drawn of a wall.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from ..columns import STATUS
-from ..contact.rotations import turns_about, turns_by, vectors_of
+from ..contact.rotations import turns_about
 from ..contact.walls.base import WALLS, Surface, perpendicular, slab
 from ..errors import InputError
-from ..mechanics.bars import bar_shapes, mesh_of_cases, section_of_bars
+from ..mechanics.bars import bar_shapes
 from ..mechanics.motion import rotation_of
-from ..output.units import MODE, POINT, Axis
+from ..mechanics.supports import directions_of
+from ..output.result import check_mesh, stage_at
+from ..output.units import MODE, POINT, Axis, engineering
 from ..registry import choices, lookup, nearest
-from .actions import Actions
 from .page import GHOST, MARKS, TRAILS
-from .scene import Camera, Layer, Scene
+from .scene import NODE_COLOUR, Camera, Layer, Scene
 
 MOST_FRAMES = 300
 """Snapshots that are drawn without an option: more make a film of over ten seconds."""
@@ -74,7 +77,14 @@ class Motion:
         self.start = np.asarray(result.positions(0), dtype=float)
         self.times = np.asarray(result.times, dtype=float)[self.frames]
         self.n_bars = len(self.bars)
-        self._check_marks()
+        for mark in options.marks:
+            if mark not in MARKS:
+                raise InputError(f"render: mark = {mark!r} is not known; it is one of {', '.join(MARKS)}")
+            if MARKS[mark].field not in result.cell_fields:
+                raise InputError(
+                    f"render: mark = {mark!r}: the result holds no field '{MARKS[mark].field}'; "
+                    "name it in [output] fields and run again, or leave the mark out"
+                )
         self._trails = {name: self._trail(name) for name in options.trails}
         self.reach, self.hulls = 0.0, [_outermost(self._held(frame)) for frame in self.frames]
         self.boxes = np.array([[points.min(axis=0), points.max(axis=0)] for points in self.hulls])
@@ -97,16 +107,6 @@ class Motion:
         self.time_factor, self.time_unit = result.axis.scale(float(np.abs(every).max()))
         steps = np.diff(np.unique(self.time_factor * every))
         self._decimals = int(np.clip(np.ceil(0.3 - np.log10(np.median(steps))), 0, 6)) if len(steps) else 2
-
-    def _check_marks(self) -> None:
-        for mark in self._options.marks:
-            if mark not in MARKS:
-                raise InputError(f"render: mark = {mark!r} is not known; it is one of {', '.join(MARKS)}")
-            if MARKS[mark].field not in self.result.cell_fields:
-                raise InputError(
-                    f"render: mark = {mark!r}: the result holds no field '{MARKS[mark].field}'; "
-                    "name it in [output] fields and run again, or leave the mark out"
-                )
 
     def _moved(self, walls: Sequence[Any]) -> dict[int, list[Surface]]:
         """Return, by frame, the surfaces of the walls at that time; a wall at rest has the same one in all frames.
@@ -241,6 +241,183 @@ class Motion:
         return Layer(np.concatenate([one, two, one + part, two - part]), lines, MARKS["broken"].colour, max(2.0, width))
 
 
+MOST_SYMBOLS = 40
+"""Nodes with symbols; of more, some of them, at distances."""
+_SYMBOL, _ARROW, _HEAD = 0.03, 0.14, 0.022  # of the diagonal of the truss: supports, the longest arrow, its head
+_APART = 0.05  # of the diagonal: the least distance of symbols, about, where there are many nodes
+_FRONT = 700.0  # pixels of a page of 1280 by 720: symbols are before the truss
+_SMALL = 0.02  # of the largest load of a stage: smaller ones have no arrow
+_ALONG = 0.999  # cosine from which a direction is that of the view
+
+
+class Actions:
+    """Supports and loads of a result, whose model is made again.
+
+    Parameters
+    ----------
+    result : an open result
+    kinds : ``supports``, ``loads``
+    times : of the frames, on the axis of the result
+    bounds : (2, 3) [m], corners of the truss, for the size of symbols
+
+    Attributes
+    ----------
+    notes : what is told of them below the picture
+    size : [m], how far symbols of supports extend
+
+    Raises
+    ------
+    InputError
+        If the mesh is not there any more, or has other bars.
+    """
+
+    def __init__(self, result: Any, kinds: Sequence[str], times: np.ndarray, bounds: np.ndarray) -> None:
+        from mpi4py import MPI
+
+        from ..stepping.model import Model
+
+        self._stages, self._start, history = result.case.stages, np.asarray(result.positions(0)), result.history
+        model = Model(self._stages[0], MPI.COMM_SELF, later=self._stages[1:])
+        check_mesh(result, model.mesh)
+        self._models = [model, *(Model(stage, MPI.COMM_SELF, model.mesh) for stage in self._stages[1:])]
+        self._ids, self._centre, self.notes = model.mesh.node_ids[: model.mesh.n_owned], bounds.mean(axis=0), []
+        self._diagonal, self._kinds = float(np.linalg.norm(bounds[1] - bounds[0])), kinds
+        self.size = 1.5 * _SYMBOL * self._diagonal if "supports" in kinds else 0.0
+        when = np.asarray(history["time"], dtype=float)
+        rows = np.asarray(history["stage"]) if "stage" in history else np.zeros(len(when), dtype=int)
+        self._history = when, rows, np.asarray(history.get("load_factor", when), dtype=float)
+        for number in np.unique(rows)[1:].tolist():  # each stage takes over what acts at the end of another one
+            first = self._stages[number].starts_from
+            before = number - 1 if first is None else first
+            external = self._models[before].external
+            end = self._own(before, float(when[rows == before][-1]))
+            held = external.loads_at(end), external.gravity_at(end), external.wind_at(end)
+            self._models[number].external.hold(*held, True)
+        numbers = stage_at(history, times).tolist()
+        self._moments = [(k, self._own(k, float(time))) for k, time in zip(numbers, times, strict=True)]
+        self._supports: list[list[tuple[np.ndarray, np.ndarray, float]]] = []  # nodes, directions, until when
+        removed: list[dict[str | None, float]] = []
+        for number, (stage, own) in enumerate(zip(self._stages, self._models, strict=True)):
+            before = removed[number - 1 if stage.starts_from is None else stage.starts_from] if number else {}
+            ends = dict.fromkeys(before, -np.inf) | {entry.supports: entry.time for entry in stage.remove}
+            removed.append(ends)
+            sets = [(self._ids[own.nodes[each.node_set]], each) for each in stage.support]
+            self._supports.append([(n, directions_of(each)[0], ends.get(each.name or "", np.inf)) for n, each in sets])
+        held_nodes = np.unique(
+            np.concatenate([self._ids[:0], *(nodes for each in self._supports for nodes, *_ in each)])
+        )
+        self._shown = self._thinned(held_nodes, "supported") if "supports" in kinds else self._ids[:0]
+        size = np.zeros((len(self._stages), len(self._ids)))
+        for number in range(len(times)) if "loads" in kinds else ():
+            own = size[self._moments[number][0]]
+            np.maximum(own, np.linalg.norm(self._loads(number), axis=1), out=own)
+        self._largest, self._loaded = size.max(axis=1, initial=0.0), self._ids[:0]
+        if self._largest.any():
+            large = size > _SMALL * self._largest[:, None]
+            self._loaded = self._thinned(np.flatnonzero(large.any(axis=0)), "loaded")
+
+    def _own(self, number: int, time: float) -> float:
+        """Return the load factor of a static stage, or the time since the start of another, at a time of the run."""
+        when, rows, factors = self._history
+        begin, own = float(when[rows < number].max(initial=0.0)), rows == number
+        if self._stages[number].static is None:
+            return time - begin
+        start = ([begin], [0.0]) if number else ([], [])  # of which the history has no row
+        return float(np.interp(time, [*start[0], *when[own]], [*start[1], *factors[own]]))
+
+    def _loads(self, number: int) -> np.ndarray:
+        """Return the loads (nodes, 3) [N] of a frame."""
+        (stage, own), loads = self._moments[number], np.zeros((len(self._ids), 3))
+        loads[self._ids] = self._models[stage].external.loads_at(own)
+        return loads
+
+    def _thinned(self, nodes: np.ndarray, what: str) -> np.ndarray:
+        """Return nodes for symbols, of many those nearest to the middles of the cells of a grid."""
+        some, apart = nodes, _APART * self._diagonal
+        while len(some) > MOST_SYMBOLS:
+            places = (self._start[nodes] - self._centre) / apart
+            order = np.argsort(np.linalg.norm(places - np.round(places), axis=1).round(6), kind="stable")
+            some = nodes[np.sort(order[np.unique(np.round(places[order]), axis=0, return_index=True)[1]])]
+            apart *= 1.1
+        if len(some) == len(nodes):
+            return nodes
+        self.notes.append(f"symbols at {len(some):,} of {len(nodes):,} {what} nodes")
+        return some
+
+    def longest(self, number: int) -> str:
+        """Say which load the longest arrow is, in all frames of the same stage or load case; nothing without loads."""
+        largest = float(self._largest[self._moments[number][0]])
+        return f"longest arrow {engineering(largest, 'N', 3)}" if largest else ""
+
+    def everywhere(self, number: int) -> dict[str, np.ndarray]:
+        """Gravity and wind (3,) of a frame, if there are any, by their names."""
+        if "loads" not in self._kinds:
+            return {}
+        stage, own = self._moments[number]
+        external = self._models[stage].external
+        ways = {"g": external.gravity_at(own), "wind": external.wind_at(own)}
+        return {name: way / np.linalg.norm(way) for name, way in ways.items() if way.any()}
+
+    def arrows(self, number: int, points: np.ndarray) -> np.ndarray:
+        """Return tails and tips (2, n, 3) [m] of the loads of a frame, whose tips are at points (nodes, 3) [m]."""
+        largest = self._largest[self._moments[number][0]]
+        if not largest:
+            return np.zeros((2, 0, 3))
+        force = self._loads(number)[self._loaded] / largest
+        kept = np.linalg.norm(force, axis=1) > _SMALL
+        force, at = force[kept], points[self._loaded[kept]]
+        return np.stack([at - _ARROW * self._diagonal * force, at])
+
+    def layers(self, number: int, points: np.ndarray, camera: Camera) -> list[Layer]:
+        """Return the symbols of a frame at points (nodes, 3) [m]."""
+        tails, tips = self.arrows(number, points)
+        way = tips - tails
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        way = way / np.maximum(length, 1e-300)
+        across = np.cross(way, camera.towards)
+        head = np.minimum(_HEAD * self._diagonal, 0.5 * length)
+        ends = [tips - head * way + side * 0.4 * head * across for side in (1.0, -1.0)]
+        pairs = [np.stack(pair, axis=1) for pair in [(tails, tips), *((tips, end) for end in ends)]]
+        return [_lines(pairs, 2.2), _lines(self._triangles(number, points, camera), 1.5)]
+
+    def _triangles(self, number: int, points: np.ndarray, camera: Camera) -> list[np.ndarray]:
+        """Return the lines (n, 2, 3) of supports: one triangle with strokes below where all seen directions are
+        held; else one for each direction, with a second line, along which the node may move."""
+        held: dict[int, list[np.ndarray]] = {}
+        stage, now = self._moments[number]
+        for nodes, directions, end in self._supports[stage]:
+            if now > end * (1.0 + 1e-9):
+                continue
+            seen = [d for d in directions if not (camera.parallel and abs(d @ camera.towards) > _ALONG)]
+            for node in np.intersect1d(nodes, self._shown).tolist():
+                held.setdefault(node, []).extend(seen)
+        lines: list[np.ndarray] = []
+        size, every = _SYMBOL * self._diagonal, 2 if camera.parallel else 3
+        upward = np.eye(3)[np.argmax(np.abs(camera.up))] * np.sign(camera.up[np.argmax(np.abs(camera.up))])
+        for node, ways in held.items():
+            at = points[node]
+            fixed = len(ways) >= every
+            for way in [upward] if fixed else ways:
+                side = way @ upward if abs(way @ upward) > 0.5 else (self._centre - at) @ way
+                away = -way if side >= 0.0 else way
+                across = np.cross(away, camera.towards)
+                across = 0.55 * across / max(float(np.linalg.norm(across)), 1e-300)
+                one, two = at + size * (away + across), at + size * (away - across)
+                lines += [np.array([[at, one], [one, two], [two, at]])]
+                if fixed:
+                    starts = np.linspace(one, two, 5)[:-1]
+                    lines += [np.stack([starts, starts + 0.3 * size * (away - across)], axis=1)]
+                else:
+                    lines += [np.array([[one, two]]) + 0.3 * size * away]
+        return lines
+
+
+def _lines(pairs: Sequence[np.ndarray], width: float) -> Layer:
+    """Return a layer of lines, as pairs of points (n, 2, 3) [m]."""
+    points = np.concatenate([np.zeros((0, 2, 3)), *pairs]).reshape(-1, 3)
+    return Layer(points, np.arange(len(points)).reshape(-1, 2), NODE_COLOUR, width, _FRONT)
+
+
 def _outermost(points: np.ndarray) -> np.ndarray:
     """Return the points of (n, 3) that are farthest in evenly spread directions, or the corners of the box of many."""
     if len(points) > _MOST_NODES:
@@ -322,7 +499,22 @@ def _checked(span: Sequence[float], times: np.ndarray) -> tuple[float, float]:
     return max(first, float(times[0])), min(last, float(times[-1]))
 
 
-class Resampled:
+class Seen:
+    """A result, parts of which are other ones in pictures.
+
+    Parameters
+    ----------
+    result : an open result
+    """
+
+    def __init__(self, result: Any) -> None:
+        self._result = result
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._result, name)
+
+
+class Resampled(Seen):
     """A result at other times: positions and fields are linear between snapshots, and constant outside.
 
     Parameters
@@ -332,14 +524,12 @@ class Resampled:
     """
 
     def __init__(self, result: Any, times: np.ndarray) -> None:
-        self._result, self.times = result, np.asarray(times, dtype=float)
+        super().__init__(result)
+        self.times = np.asarray(times, dtype=float)
         own = np.asarray(result.times, dtype=float)
         place = np.interp(self.times, own, np.arange(len(own)))
         self._before = np.minimum(place.astype(int), len(own) - 1)
         self._part = place - self._before
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._result, name)
 
     def positions(self, i: int) -> np.ndarray:
         """Positions (nodes, 3) [m] at a time."""
@@ -360,49 +550,26 @@ class Resampled:
 
 
 def drawn_radii(result: Any, note: Callable[[str], None] | None = None) -> np.ndarray | None:
-    """Return the radius of each bar (bars,) [m] as it is drawn, None where it is not known; ``note`` receives a remark
-    on bars that are drawn thinner than they are."""
-    radius = radii_of(result)
-    if radius is None:
+    """Return the outer radius of each bar (bars,) [m] as it is drawn, None where the result does not have the areas of
+    bars; ``note`` receives a remark on bars that are drawn thinner than they are.
+
+    Springs and dashpots between nodes have no section: they are as thin as the thinnest bar.
+    """
+    if "area" not in getattr(result, "bar_data", ()):
         return None
-    most = STOUT * _lengths(result)
-    stout = int(np.count_nonzero(radius > most))
+    names, areas, length = result.field("section", 0), result.field("area", 0), _lengths(result)
+    radius = np.full(len(length), np.inf)
+    for name, section in result.case.section.items():
+        own = np.flatnonzero(names == name)
+        radius[own] = bar_shapes(section, length[own], areas[own]).radius
+    radius = np.where(np.isfinite(radius), radius, radius.min())
+    stout = int(np.count_nonzero(radius > STOUT * length))
     if stout and note is not None:
         note(
             f"{stout} of {len(radius)} bars have a radius above {STOUT:g} of their length "
             f"({radius.max():.3g} m at most), and are drawn with that; --radius-scale changes it"
         )
-    return np.minimum(radius, most)
-
-
-def radii_of(result: Any) -> np.ndarray | None:
-    """Return the outer radius of each bar (bars,) [m], None where it is not known.
-
-    The mesh is made or read again, for the sections of bars and the fields of areas. Where it is not there any more,
-    all bars have the radius of the only section; with several sections, radii are not known. Springs and dashpots
-    between nodes have no section: they are as thin as the thinnest bar.
-    """
-    from mpi4py import MPI
-
-    case = result.case
-    sections = list(getattr(case, "section", {}).values())
-    if not sections:
-        return None
-    length = _lengths(result)
-    try:
-        mesh = mesh_of_cases([case], MPI.COMM_SELF)
-        if mesh.n_bars > len(length):
-            raise InputError(f"the mesh of {case.source} has {mesh.n_bars} bars now, the result {len(length)}")
-        numbers, areas = section_areas(case, mesh)
-    except (InputError, OSError):
-        if len(sections) > 1 or sections[0].uniform_area is None:
-            return None
-        numbers, areas = np.zeros(len(length), dtype=int), np.full(len(length), sections[0].uniform_area)
-    radius = np.full(len(length), np.inf)
-    for number, section in enumerate(sections):
-        own = np.flatnonzero(numbers == number)
-        radius[own] = bar_shapes(section, length[own], areas[own]).radius
-    return np.where(np.isfinite(radius), radius, radius.min())
+    return np.minimum(radius, STOUT * length)
 
 
 def _lengths(result: Any) -> np.ndarray:
@@ -411,17 +578,7 @@ def _lengths(result: Any) -> np.ndarray:
     return np.linalg.norm(start[bars[:, 1]] - start[bars[:, 0]], axis=1)
 
 
-def section_areas(case: Any, mesh: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of the section of each bar of a whole mesh (bars,), and its area [m2]."""
-    numbers, areas = section_of_bars(case, mesh), np.ones(mesh.n_bars)
-    for number, section in enumerate(case.section.values()):
-        own = np.flatnonzero(numbers == number)
-        area = section.uniform_area
-        areas[own] = mesh.bar_fields[section.area_field][own] if area is None else area
-    return numbers, areas
-
-
-class ModeFrames:
+class ModeFrames(Seen):
     """Modes as the snapshots of a result that :func:`~pfem_petsc.post.render.render` draws, a period each.
 
     The field ``amplitude`` is the length of a node's displacement relative to the largest.
@@ -443,6 +600,7 @@ class ModeFrames:
     axis: Axis = MODE
 
     def __init__(self, result: Any, modes: Sequence[int] | None = None, period: int = PERIOD) -> None:
+        super().__init__(result)
         if period < 4:
             raise InputError(f"render: {period} frames a period are too few for modes; give 4 or more")
         found = result.modes
@@ -451,7 +609,6 @@ class ModeFrames:
             if not 1 <= number <= len(found):
                 raise InputError(f"render: mode {number} does not exist; the result holds modes 1 to {len(found)}")
         self._labels, self._period = [found.label(number - 1) for number in self._numbers], period
-        self.path, self.case, self.bars = result.path, result.case, result.bars
         self._place = result.positions(-1)
         shapes = found.shape[np.array(self._numbers, dtype=int) - 1]
         sizes = np.linalg.norm(shapes, axis=2)
@@ -461,7 +618,6 @@ class ModeFrames:
         self._shapes = shapes * (_LARGEST * extent / largest)[:, None, None]
         # walls are where they are at the end
         self.times = np.full(period * len(self._numbers), result.times[-1])
-        self.history: Mapping[str, np.ndarray] = result.history
 
     def positions(self, i: int) -> np.ndarray:
         """Positions (nodes, 3) [m] of frame i."""
@@ -469,8 +625,8 @@ class ModeFrames:
         return self._place + np.sin(2.0 * np.pi * phase / self._period) * self._shapes[mode]
 
     def field(self, name: str, i: int) -> np.ndarray:
-        """The amplitudes (nodes,) of frame i."""
-        return self._amplitudes[i // self._period]
+        """The amplitudes (nodes,) of frame i, and what bars have in all snapshots."""
+        return self._amplitudes[i // self._period] if name == "amplitude" else self._result.field(name, -1)
 
     def untrue(self, scale: float) -> str:
         """What displacements are, as they are no true ones."""
@@ -547,14 +703,11 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
     shifts, present = np.zeros((len(times), len(walls), 3)), np.zeros((len(times), len(walls)), dtype=bool)
     turns = np.tile(np.eye(3), (*present.shape, 1, 1))
     when = np.asarray(history["time"], dtype=float)
-    numbers = np.asarray(history["stage"]) if "stage" in history else np.zeros(len(when), dtype=int)
-    stages = result.case.stages
-    begins = [when[numbers < k].max(initial=0.0) if k in numbers else np.inf for k in range(1, len(stages))]
-    current = np.searchsorted(begins, times)
-    for number, stage in enumerate(stages):
+    current = stage_at(history, times)
+    for number, stage in enumerate(result.case.stages):
         reached = current >= number
         present[reached] = np.isin(names, [wall.name for wall in stage.wall])
-        since = np.asarray(times)[reached] - (begins[number - 1] if number else 0.0)
+        since = np.asarray(times)[reached] - (when[history["stage"] < number].max(initial=0.0) if number else 0.0)
         for wall in (wall for wall in stage.wall if getattr(wall, "rotation", None) is not None):
             axis = np.array(wall.rotation.axis) / np.linalg.norm(wall.rotation.axis)
             angles = rotation_of(wall).at(since)[:, 0, 0]
@@ -567,13 +720,10 @@ def walls_at(result: Any, times: Sequence[float]) -> tuple[np.ndarray, np.ndarra
             places = np.asarray(history[f"wall/{name}/position"], dtype=float)
             shifts[:, k] = np.stack([np.interp(times, when, column - column[0]) for column in places.T], axis=1)
         if f"wall/{name}/rotation" in history:
-            rows = turns_by(np.asarray(history[f"wall/{name}/rotation"], dtype=float))
-            last = np.clip(np.searchsorted(when, times, side="right") - 1, 0, max(len(when) - 2, 0))
-            after = np.minimum(last + 1, len(when) - 1)
-            span = when[after] - when[last]
-            part = np.clip((times - when[last]) / np.where(span > 0.0, span, 1.0), 0.0, 1.0)
-            way = vectors_of(rows[after] @ rows[last].swapaxes(1, 2))
-            turns[:, k] = turns_by(part[:, None] * way) @ rows[last]
+            kept = np.unique(when, return_index=True)[1]
+            rows = Rotation.from_rotvec(np.asarray(history[f"wall/{name}/rotation"], dtype=float)[kept])
+            between = Slerp(when[kept], rows) if len(kept) > 1 else lambda at, rows=rows: rows[np.zeros(len(at), int)]
+            turns[:, k] = between(np.clip(times, when[0], when[-1])).as_matrix()
     return shifts, turns, present
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,36 +29,33 @@ _RANGES = {"fps": (1e-3, 1e3), "zoom": (1e-3, 1e3), "radius_scale": (1e-6, 1e6)}
 SIZES = {"720p": (1280, 720), "1080p": (1920, 1080), "4k": (3840, 2160)}
 
 
-def _view(text: str) -> str | list[float]:
-    if "," not in text:
-        return text
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a direction like 1,-1,0.5") from None
+def reader(convert: Callable[[str], Any], wrong: str) -> Callable[[str], Any]:
+    """Return what reads a word of the command line, and tells what is ``wrong`` where ``convert`` has a ValueError."""
+
+    def read(text: str) -> Any:
+        try:
+            return convert(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} {wrong}") from None
+
+    return read
 
 
-def frames_of(text: str) -> int | list[int]:
-    """Return a number of frames, or the numbers of frames with commas between or behind them."""
+def _frames(text: str) -> int | list[int]:
     parts = text.split(",")
     if len(parts) == 2 and not parts[1].strip():
         del parts[1]  # a list of one number: "12,"
-    try:
-        numbers = [int(part) for part in parts]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a number of frames nor a list like 0,10,20") from None
-    return numbers if "," in text else numbers[0]
+    return [int(part) for part in parts] if "," in text else int(text)
 
 
-def _size(text: str) -> tuple[int, int]:
-    if text.lower() in SIZES:
-        return SIZES[text.lower()]
+frames_of = reader(_frames, "is neither a number of frames nor a list like 0,10,20")
+"""Return a number of frames, or the numbers of frames with commas between or behind them."""
+
+
+def pixels(text: str) -> tuple[int, int]:
+    """Return width and height from ``1280x720``, or one of :data:`SIZES`; a ValueError if it is neither."""
     width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit()):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a size in pixels like 1280x720, or one of {', '.join(SIZES)}"
-        )
-    return int(width), int(height)
+    return SIZES[text.lower()] if text.lower() in SIZES else (int(width), int(height))
 
 
 def _option(default: Any, text: str, **settings: Any) -> Any:
@@ -86,13 +83,19 @@ class Options:
     )
     fps: float = _option(24.0, "frames per second of the film; default: 24", type=float)
     size: tuple[int, int] = _option(
-        (1280, 720), "pixels of a frame, or 720p, 1080p, 4k; default: 1280x720", metavar="WxH", type=_size
+        (1280, 720),
+        "pixels of a frame, or 720p, 1080p, 4k; default: 1280x720",
+        metavar="WxH",
+        type=reader(pixels, f"is not a size in pixels like 1280x720, or one of {', '.join(SIZES)}"),
     )
     view: str | Sequence[float] = _option(
         "auto",
         "xy, xz, yz, iso, front, back, left, right, top, bottom, a direction to the eye as x,y,z, or auto: along the "
         "flat direction of a flat structure, oblique otherwise; default: auto",
-        type=_view,
+        type=reader(
+            lambda text: [float(part) for part in text.split(",")] if "," in text else text,
+            "is not a direction like 1,-1,0.5",
+        ),
     )
     video: str | None = _option(None, "mp4, gif, both, webm, webp or none; default: mp4, webm with transparent")
     poster: bool = _option(True, "write no page of six instants", flag="--no-poster", action="store_false")
@@ -237,7 +240,7 @@ class PlotOptions:
 
     def __post_init__(self) -> None:
         from .chart import check_formats
-        from .filters import WINDOWS
+        from .curves import WINDOWS
 
         if self.spectrum is not None and (self.curves is not None or self.against is not None):
             raise InputError("plot: spectrum is a picture of its own: give it without curves and against")

@@ -184,24 +184,13 @@ class ColourScale:
         ]
 
 
-def limits_of(
-    clim: tuple[float, float] | None, symmetric: bool, fields: Sequence[ColourField], frames: Sequence[int]
-) -> tuple[float, float]:
-    """Return the range of colours: the one given, or that of all fields, symmetric if asked for."""
-    found = [clim] if clim is not None else [field.limits(frames) for field in fields]
-    low, high = min(pair[0] for pair in found), max(pair[1] for pair in found)
-    if symmetric:
-        high = max(abs(low), abs(high))
-        low = -high
-    return low, high
-
-
 INK, PALE = "#1f242c", "#5b6472"
 _GROUPS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442")
 """Okabe and Ito: apart for all kinds of colour vision."""
 _OTHERS = "#7a7a7a"
 _LETTERS = 16
 _CURVE, _MARKER = "#2563b0", "#d9482b"
+_CURVE_WIDTH = 220  # of an inset, in pixels of a page of 1280 by 720
 
 
 def _unit_of(size: tuple[int, int]) -> float:
@@ -249,7 +238,7 @@ class Page:
     heading : texts and colours
     captions : above the drawings, one for each; a single drawing has none
     columns : of the drawings
-    room : width and height in pixels of what is free on the right of and below each drawing, for a curve
+    inset : width over height of the truss where a curve is beside or below each drawing; 0: there is none
 
     Attributes
     ----------
@@ -263,7 +252,7 @@ class Page:
         heading: Heading,
         captions: Sequence[str] = ("",),
         columns: int = 1,
-        room: tuple[int, int] = (0, 0),
+        inset: float = 0.0,
     ) -> None:
         self._figure = figure = _figure(size, 0.0 if heading.transparent else 1.0)
         self._inches, self._channels = figure.dpi_scale_trans, 4 if heading.transparent else 3
@@ -271,9 +260,11 @@ class Page:
         self._insets: list[tuple[Line2D, np.ndarray, np.ndarray]] = []
         wide, high = figure.get_size_inches()
         left, top, width, height = self.region_of(size)
-        strip, rows = self.strip_of(size) if len(captions) > 1 else 0, -(-len(captions) // columns)
-        self._room, beside, below = room, *room
-        self.tile = width // columns - beside, height // rows - strip - below
+        rows, strip = -(-len(captions) // columns), round(34 * _unit_of(size)) if len(captions) > 1 else 0
+        tile = width // columns, height // rows - strip
+        self._room = inset_room(tile, inset, round(_CURVE_WIDTH * _unit_of(size))) if inset else (0, 0)
+        beside, below = self._room
+        self.tile = tile[0] - beside, tile[1] - below
         low, upper = 1.0 - (top + height - below) / size[1], 1.0 - (top + strip) / size[1]
         edges = {"left": left / size[0], "right": (left + width - beside) / size[0], "bottom": low, "top": upper}
         places = {**edges, "wspace": beside / self.tile[0], "hspace": (strip + below) / self.tile[1]}
@@ -313,11 +304,6 @@ class Page:
         """Return left, top, width and height of the part of a page with the drawings, in pixels."""
         left, top, right, bottom = (round(pixels * _unit_of(size)) for pixels in (20, 64, 150, 52))
         return left, top, size[0] - left - right, size[1] - top - bottom
-
-    @staticmethod
-    def strip_of(size: tuple[int, int]) -> int:
-        """Return the height of the strip above each of several drawings, in pixels."""
-        return round(34 * _unit_of(size))
 
     def draw(
         self,

@@ -3,32 +3,70 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import re
+import textwrap
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..columns import LOST, STORED, SUPPLIED
+from ..case.base import StrictModel
+from ..columns import SUPPLIED
 from ..errors import InputError
-from ..output.units import engineering, unit_of
-from .chart import COLOURS, REFERENCE, STYLE, Chart, Curve, Panel, area, distinct, largest, opened
+from ..output.result import balance_error
+from ..output.result import energies as energies_of
+from ..output.table import Selected, select, varied
+from ..output.units import engineering, prefix_for, unit_of
+from .chart import COLOURS, DASHES, REFERENCE, STYLE, Chart, Curve, Panel, area, distinct, largest, opened
 from .curves import (
+    AS_COMPUTED,
+    CLOSED_FORM,
     ClosedForm,
+    Filter,
     History,
+    amplitude_spectrum,
     closed_form,
     column,
-    draw_curves,
-    draw_spectra,
     exact_curves,
+    make_filter,
     read,
     smoothed,
     usual_curves,
+    window_mean,
     words,
 )
-from .filters import AS_COMPUTED, Filter, make_filter, window_mean
 from .options import PlotOptions
+
+_LONGEST = 50  # number of letters of a label that tells the values of a run
+
+_LINE = 40  # letters of a line of a legend
+
+_HEIGHT = 26  # letters of a line beside a panel
+
+_QUANTITY_OF = {
+    "": "ratio",
+    "N": "force",
+    "Pa": "stress",
+    "J": "energy",
+    "W": "power",
+    "m": "length",
+    "m²": "area",
+    "m³": "volume",
+    "m/s": "velocity",
+    "m/s²": "acceleration",
+    "s": "time",
+    "N s": "impulse",
+    "kg m/s": "momentum",
+    "N/m": "force by length",
+}
+"""What expressions are called on their axis, by their unit."""
+
+_UNIT = re.compile(r"\[((?:kg|Pa|Hz|rad|[msNJKW]|1/)(?:kg|Pa|Hz|rad|[msNJKW]|[²³ /()])*)\]")
+
+_PEAKS = 5  # of a spectrum, at most, that are told
+
 
 WINDOW = 0.02  # width of the moving average of forces, relative to the run
 
@@ -140,16 +178,6 @@ def _free(file: Path, suffixes: Sequence[str]) -> Path:
     return next(free)
 
 
-def balance_error(history: History) -> np.ndarray | None:
-    """Return the imbalance of stored, lost and supplied energies since the first row, (n,) [J]; None without them."""
-    signs = {**dict.fromkeys((*STORED, *LOST), 1.0), **dict.fromkeys(SUPPLIED, -1.0)}
-    parts = [sign * read(history, name) for name, sign in signs.items() if name in history]
-    if not parts:
-        return None
-    total = np.sum(parts, axis=0)
-    return total - total[0]
-
-
 def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
     """Stacked stored and lost energies with what was supplied, the terms one by one, and the balance.
 
@@ -158,7 +186,7 @@ def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Pa
     error = balance_error(history)
     if error is None:
         return [], "", 1
-    held = {name: read(history, name) for name in (*STORED, *LOST, *SUPPLIED) if name in history}
+    held = energies_of(history)
     most = max(float(np.nanmax(np.abs(values))) for values in held.values())
     moving = {name: values for name, values in held.items() if np.abs(values).max() > 1e-12 * most}
     still = [words(name) for name in held if name not in moving]
@@ -431,3 +459,266 @@ def _pressing(force: np.ndarray, normal: Sequence[float] | None) -> tuple[np.nda
     if normal is None:
         return np.linalg.norm(force, axis=1), "force"
     return force @ np.asarray(normal, dtype=float) / np.linalg.norm(normal), "normal force"
+
+
+def draw_curves(
+    results: Sequence[Any],
+    panels: Sequence[tuple[str, Filter | None]],
+    against: str | None = None,
+    chosen: Filter | None = None,
+    closed_forms: bool = True,
+    labels: Sequence[str] | None = None,
+) -> Chart:
+    """Draw panels of columns, with the curves of all results, over time or another column.
+
+    Parameters
+    ----------
+    results : open results
+    panels : columns, components of them or expressions, and the filter of each; energies are never filtered
+    against : a column of numbers, a component or an expression; None: time
+    chosen : filter of the column that they are drawn over
+    closed_forms : whether to draw the closed form of the first result
+    labels : names of the results in the legends, None: see :func:`labels_of`; of a single result, names of the curves
+    """
+    if not panels:
+        raise InputError("plot: no curves named; columns: " + ", ".join(results[0].history))
+    first = results[0]
+    labels, captions = _labels_and_captions(results, [name for name, _ in panels], labels)
+    if len({result.axis.symbol for result in results}) > 1 and against is None:
+        raise InputError("plot: the results are over different axes: " + ", ".join({r.axis.symbol for r in results}))
+    exact = closed_form(first) if closed_forms and against is None else None
+    times = [read(result.history, "time") for result in results]
+    places = times
+    if against is not None:
+        found = [column(result.history, against) for result in results]
+        if any(list(each) != [against] for each in found):
+            raise InputError(f"plot: against = {against!r} is a vector: name a component, {against}.x, .y, .z or .norm")
+        places = [_filtered(r, chosen, against, each[against]) for r, each in zip(results, found, strict=True)]
+    shared = all(np.array_equal(place, places[0]) for place in places)
+    over = None if against is None else (against, select(first.history, against).unit or "")
+    columns = {name: [column(result.history, name) for result in results] for name, _ in panels}
+    components = {name: _parts(found) for name, found in columns.items()}
+    split = any(len(parts) > 1 for parts in components.values())
+    drawn = []
+    for (name, smoothing), caption in zip(panels, captions, strict=True):
+        found, parts, whole = columns[name], components[name], select(first.history, name)
+        curves = []
+        for number, (each, label, result, place) in enumerate(zip(found, labels, results, places, strict=True)):
+            for k, part in enumerate(parts):
+                if part not in each:
+                    continue
+                shown = _filtered(result, smoothing, part, each[part])
+                style = _line(number, k, len(results), split)
+                component = part.rpartition(".")[2] if caption else part
+                words_of = (label if len(found) > 1 else "", component if len(parts) > 1 else "")
+                key = f"{part}: {label}" if len(found) > 1 else part
+                key += f", {smoothing.name}" if smoothing is not None and (name, None) in panels else ""
+                text = " ".join(word for word in words_of if word) or caption or "computed"
+                curves.append(Curve(text, shown, style, key, place, "" if shared else label))
+        for known in exact_curves(exact, [part for part in parts if part in found[0]], places[0]):
+            part = known.key.removesuffix(CLOSED_FORM)
+            curves.append(known._replace(values=_filtered(first, smoothing, part, known.values)))
+        title = parts[0] if len(parts) == 1 else name  # which component it is
+        label = caption or quantity_of(name, whole)
+        titles = [title] if not caption and words(title) != label else []
+        if smoothing is not None and smoothing.name != AS_COMPUTED:
+            titles.append(f"{AS_COMPUTED}, as all energies" if _is_energy(whole) else smoothing.name)
+        lines = sum(1 + curve.name.count("\n") for curve in curves)
+        height = max(0.9, 0.11 * lines)  # of the legend
+        drawn.append(Panel(label, whole.unit or "", curves, ": ".join(titles), height, over, None, len(curves) > 1))
+    axis = max((result.axis for result in results), key=lambda axis: axis.staged)
+    ends = first.stage_ends if len(results) == 1 and axis.staged else ()
+    return Chart(drawn, first.case.title or first.case.name, np.concatenate(times), axis, ends=ends)
+
+
+def _filtered(result: Any, chosen: Filter | None, name: str, values: np.ndarray) -> np.ndarray:
+    """Return the values (rows,) of a column or expression after a filter, those of energies as they are."""
+    history = result.history
+    if chosen is None or _is_energy(select(history, name)):
+        return values
+    sources = select(history, name).sources
+    # forces of contact are zero before the run, and so is what is computed from them, unless something is added
+    touch = all(one.startswith(("wall/", "pair/", "constraint/")) and one.endswith("/force") for one in sources)
+    before = {one: np.zeros_like(history[one][:1]) for one in sources if touch}
+    return smoothed(result, chosen, values, touch and not np.any(select(before, name).values))
+
+
+def _is_energy(found: Selected) -> bool:
+    return all(unit_of(source) == "J" for source in found.sources)
+
+
+def quantity_of(name: str, found: Selected) -> str:
+    """Return the label of the axis of a column, as words, or of an expression, by its unit."""
+    if found.single:
+        return words(name.rsplit("/", 1)[-1])
+    if found.unit is None:
+        return "value of unknown unit"
+    return "displacement" if found.unit == "m" and "displacement" in name else _QUANTITY_OF.get(found.unit, "value")
+
+
+def _parts(found: Sequence[Mapping[str, np.ndarray]]) -> list[str]:
+    """Return the names of the curves of :func:`column` of results: a vector that is zero in some has all components
+    there."""
+    parts = list(dict.fromkeys(part for curves in found for part in curves))
+    return [part for part in parts if any(np.any(curves.get(part, 0.0)) for curves in found)] or parts
+
+
+def _line(number: int, part: int, results: int, split: bool) -> dict[str, Any]:
+    """Return the style of a curve: a result has its colour in all panels.
+
+    Dashes are those of components, in charts ``split`` into them, else of a few results.
+    """
+    if results == 1:
+        return distinct(part, 0)
+    return distinct(number, part if split else number if results <= len(DASHES) else None)
+
+
+def _labels_and_captions(
+    results: Sequence[Any], names: Sequence[str], labels: Sequence[str] | None
+) -> tuple[list[str], list[str]]:
+    """Return the names of results, and those of the curves, which labels are for a single result, else empty."""
+    if len(results) > 1 or labels is None:
+        return labels_of(results, labels), [""] * len(names)
+    if len(labels) != len(names):
+        raise InputError(
+            f"plot: labels: one result needs a label for each curve ({len(names)} here), not {list(labels)}"
+        )
+    return labels_of(results), [textwrap.fill(label, _HEIGHT) for label in labels]
+
+
+def labels_of(results: Sequence[Any], given: Sequence[str] | None = None) -> list[str]:
+    """Return distinct names of results: those given, else what varies in runs of a sweep, else folders, or as much of
+    the paths as it takes.
+
+    Raises
+    ------
+    InputError
+        If names are given, but not one for each result.
+    """
+    if given is not None:
+        if len(given) != len(results) or len(set(given)) < len(given):
+            raise InputError(f"plot: labels: {len(results)} results need as many different labels, not {list(given)}")
+        return [textwrap.fill(label, _LINE) for label in given]
+    paths = [Path(result.path).absolute() for result in results]
+    labels = _values_of_runs(results[0].case, [varied(path.parent) for path in paths])
+    if len(set(labels)) == len(labels) and all(0 < len(label) <= _LONGEST for label in labels):
+        return labels
+    for count in range(1, max(len(path.parts) for path in paths)):
+        labels = ["/".join(path.parent.parts[-count:]) for path in paths]
+        if len(set(labels)) == len(labels):
+            return labels
+    return (
+        [str(path) for path in paths] if len(set(paths)) == len(paths) else [f"{k}: {p}" for k, p in enumerate(paths)]
+    )
+
+
+def _values_of_runs(case: Any, runs: Sequence[Mapping[str, str]]) -> list[str]:
+    """Return for each run of a sweep the values that differ between some of them, with as much of the keys as it takes;
+    empty texts for others."""
+    keys = [key for key in runs[0] if len({run.get(key) for run in runs}) > 1]
+    short = [key.rpartition(".")[2] for key in keys]
+    names = short if len(set(short)) == len(short) else keys
+    units = [_unit_of_key(case, key) for key in keys]
+    return [
+        ", ".join(f"{name} = {_text(run[key], unit)}" for name, key, unit in zip(names, keys, units) if key in run)
+        for run in runs
+    ]
+
+
+def _unit_of_key(case: Any, key: str) -> str:
+    """Return the unit that the text of a key of a case names, empty without: ``section.legs.thickness`` -> ``m``."""
+    *way, last = key.split(".")
+    table = case
+    for part in way:
+        table = table.get(part) if isinstance(table, Mapping) else getattr(table, part, None)
+    found = _UNIT.search(table.description(last)) if isinstance(table, StrictModel) else None
+    return found[1] if found else ""
+
+
+def _text(value: str, unit: str) -> str:
+    """Return a value with its unit and a prefix; a text that is no number as it is."""
+    if not unit or not re.fullmatch(r"-?\d+\.?\d*(e[-+]?\d+)?", value):
+        return value
+    factor, shown = prefix_for(float(value), unit)
+    return f"{float(value) * factor:.9g} {shown}"
+
+
+def draw_spectra(
+    results: Sequence[Any],
+    names: Sequence[str],
+    window: str = "hann",
+    highest: float | None = None,
+    labels: Sequence[str] | None = None,
+) -> Chart:
+    """Draw a panel with the amplitude spectrum of each named column; natural frequencies are dotted lines.
+
+    Parameters
+    ----------
+    results : open results of runs over time; with static stages, the longest part without them is taken
+    names : columns, components of them or expressions
+    window : see :func:`~pfem_petsc.post.curves.amplitude_spectrum`
+    highest : frequency at which the picture ends [Hz]; None: half the sampling rate
+    labels : names of the results, as of :func:`draw_curves`
+    """
+    first = results[0]
+    if not names:
+        raise InputError("plot: no columns named for spectra; columns: " + ", ".join(first.history))
+    if highest is not None and not highest > 0.0:
+        raise InputError(f"plot: highest frequency = {highest:g} Hz must be positive")
+    for result in results:
+        if not result.stretches:
+            raise InputError(f"{result.path}: spectra need a run over time, not a static analysis")
+    natural = first.modes.frequency if getattr(first, "n_modes", 0) and first.modes.kind == "vibration" else ()
+    labels, captions = _labels_and_captions(results, names, labels)
+    columns = [[column(result.history, name) for result in results] for name in names]
+    split = any(len(_parts(found)) > 1 for found in columns)
+    panels = []
+    for name, caption, found in zip(names, captions, columns, strict=True):
+        whole, parts = select(first.history, name), _parts(found)
+        unit = whole.unit or ""
+        curves = []
+        for number, (label, result) in enumerate(zip(labels, results, strict=True)):
+            time = read(result.history, "time")
+            rows = max(result.stretches, key=lambda rows, time=time: float(np.ptp(time[rows])))
+            for part in (part for part in parts if part in found[number]):
+                key = f"{part}: {label}" if len(results) > 1 else part
+                frequency, amplitude = amplitude_spectrum(time[rows], found[number][part][rows], window)
+                style = _line(number, parts.index(part), len(results), split)
+                curves.append(Curve(key, amplitude, style, place=frequency))
+        label = f"amplitude of\n{caption or quantity_of(name, whole)}"
+        legend, title = len(curves) > 1, f"window: {window}" if caption else f"{name}, window: {window}"
+        along = prefix_for(highest or max(curve.place[-1] for curve in curves), "Hz")
+        over, scale = ("frequency", "Hz"), (1.0, unit)
+        panels.append(Panel(label, unit, curves, title, 1.1, over, scale, legend, True, along))
+    title = first.case.title or first.case.name
+    chart = Chart(panels, title, np.zeros(1))
+    for axes, panel in zip(chart.axes, panels, strict=True):
+        factor, shown = panel.along
+        end = highest or max(curve.place[-1] for curve in panel.curves)
+        inside = [(curve.place > 0.0) & (curve.place <= end) for curve in panel.curves]
+        top = max(largest(curve.values[part]) for curve, part in zip(panel.curves, inside, strict=True))
+        if len(panel.curves) == 1:
+            _tell_peaks(axes, panel.curves[0].place[inside[0]], panel.curves[0].values[inside[0]], factor, shown)
+        if top > 0.0:
+            axes.set_ylim(1e-6 * top, 4.0 * top)
+        axes.set_xlim(0.0, end * factor)
+        for value in natural:
+            if 0.0 < value <= end:
+                axes.axvline(value * factor, color="#6b7280", linewidth=0.8, linestyle=":", zorder=0)
+    return chart
+
+
+def _tell_peaks(axes: Any, frequency: np.ndarray, amplitude: np.ndarray, factor: float, unit: str) -> None:
+    """Write the frequencies of the highest peaks beside them; each is higher than all within 6 % of the picture."""
+    from scipy.signal import find_peaks
+
+    if len(amplitude) < 3:
+        return
+    apart = max(1.0, 0.06 * (frequency[-1] - frequency[0]) / (frequency[1] - frequency[0]))
+    peaks, _ = find_peaks(amplitude, height=3e-3 * amplitude.max(), distance=apart)
+    for k in peaks[np.argsort(-amplitude[peaks])][:_PEAKS]:
+        left, middle, right = np.log(np.maximum(amplitude[k - 1 : k + 2], 1e-300))
+        bend = left - 2.0 * middle + right
+        place = frequency[k] + (0.5 * (left - right) / bend if bend < 0.0 else 0.0) * (frequency[1] - frequency[0])
+        text, at = f"{place * factor:.4g} {unit}", (frequency[k] * factor, amplitude[k])
+        axes.annotate(text, at, xytext=(3, 4), textcoords="offset points", fontsize=8)

@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError, written
+from ..output.result import stage_at
 from ..parallel.agreement import agreed
+from ..signals import launched_rank
 from .chart import opened
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_rows, even_times
 from .options import Options
-from .page import MARKS, ColourField, ColourScale, Heading, Page, grid, inset_room, limits_of
+from .page import MARKS, ColourField, ColourScale, Heading, Page, grid
 from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Segments, Style, at_one_scale, cameras, few_threads
 
 if TYPE_CHECKING:
@@ -30,7 +32,6 @@ SHORT = 2.0  # seconds below which a film is too short to follow
 TELL = 5.0  # seconds between two progress messages
 SHARE = 12  # frames for which it is worth to start another process
 _TILES = 6
-_CURVE = 220  # pixels of a page of 1280 by 720: width of an inset
 
 # H.264 with 4:2:0 colours is supported everywhere, and requires even sizes
 _ENCODERS = {
@@ -185,7 +186,9 @@ class Film:
         shown, chosen = _timed(results, options, note)
         self.count = len(chosen)
         self.colours = [ColourField(result, options.field, options.component) for result in shown]
-        limits = limits_of(options.clim, options.symmetric, self.colours, chosen)
+        found = [options.clim] if options.clim is not None else [field.limits(chosen) for field in self.colours]
+        low, high = min(pair[0] for pair in found), max(pair[1] for pair in found)
+        limits = (-max(abs(low), abs(high)), max(abs(low), abs(high))) if options.symmetric else (low, high)
         if all(colour.rounded for colour in self.colours):
             note(f"{self.colours[0].title} is zero in all frames, to rounding")
         self.scale = ColourScale(limits, options.cmap, self.colours[0].unit)
@@ -226,13 +229,8 @@ class Film:
         several, columns = len(self.motions) > 1, 1
         if several:
             columns, _ = grid(len(self.motions), self._aspect(), Page.region_of(size)[2:])
-        room = (0, 0)
-        if self.options.inset is not None:
-            rows, (width, height) = -(-len(self.motions) // columns), Page.region_of(size)[2:]
-            unit = min(size[0] / 1280, size[1] / 720)
-            tile = width // columns, height // rows - (Page.strip_of(size) if several else 0)
-            room = inset_room(tile, self._aspect(), round(_CURVE * unit))
-        self._prepare(size, self._labels if several else [""], columns, room)
+        inset = self._aspect() if self.options.inset is not None else 0.0
+        self._prepare(size, self._labels if several else [""], columns, inset)
         if self.options.inset is not None:
             self._page.add_insets([motion.result for motion in self.motions], self.options.inset)
 
@@ -264,15 +262,13 @@ class Film:
             scene.close()
         self._scenes = []
 
-    def _prepare(
-        self, size: tuple[int, int], captions: Sequence[str], columns: int, room: tuple[int, int] = (0, 0)
-    ) -> None:
+    def _prepare(self, size: tuple[int, int], captions: Sequence[str], columns: int, inset: float = 0.0) -> None:
         """Make page, cameras and scenes for a size in pixels and drawings with captions in columns."""
         self.close()
         options = self.options
         marks = [MARKS[mark] for mark in options.marks]
         heading = Heading(self.title, self.colours[0].title, self.scale, marks, self.notes, options.transparent)
-        self._page = Page(size, heading, captions, columns, room)
+        self._page = Page(size, heading, captions, columns, inset)
         tile = self._page.tile
         self._cameras = [cameras(options, motion, tile[0] / tile[1]) for motion in self.motions]
         if len(self.motions) > 1:
@@ -354,8 +350,7 @@ def instants(result: Any, frames: Sequence[int], count: int) -> list[int]:
     frames = sorted(set(frames))
     cases = [number for number, stage in enumerate(result.case.stage) if stage.starts_from is not None]
     if cases:
-        when, given = result.history["time"], np.asarray(result.times)[frames]
-        number = np.asarray(result.history["stage"])[np.minimum(np.searchsorted(when, given), len(when) - 1)]
+        number = stage_at(result.history, np.asarray(result.times)[frames])
         frames = [frames[np.flatnonzero(number == k)[-1]] for k in cases if k in number] or frames
     return [frames[k] for k in even_rows(len(frames), count)]
 
@@ -367,8 +362,7 @@ def _helpers(paths: Sequence[Any], folder: Path, options: Options, count: int) -
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     processes = min(cores, count // SHARE)
-    launched = any(name in os.environ for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMI_RANK"))
-    if processes < 2 or launched or not all(isinstance(path, (str, os.PathLike)) for path in paths):
+    if processes < 2 or launched_rank() is not None or not all(isinstance(path, (str, os.PathLike)) for path in paths):
         return []
     few_threads()
     code = "from pfem_petsc.post.render import _help; _help()"

@@ -6,19 +6,18 @@ import base64
 import html
 import re
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError, written
-from ..output.layout import EVENT, MODE_VALUES
-from ..output.result import peak_force, touch_impulse
+from ..output.layout import EVENT
+from ..output.table import Table, html_table
 from ..output.units import engineering
 from .chart import opened
-from .plot import balance_error, plot
+from .plot import plot
 
 NAME = "report.html"
 SIZE = (1600, 900)
@@ -61,7 +60,7 @@ def write_report(
     result_path : result file or its folder, or an open result
     output : the file; None: ``report.html`` beside the result
     pictures : whether to draw the truss; where that is not possible, the report says why
-    force_filter : of the forces: see :func:`~pfem_petsc.post.filters.make_filter`
+    force_filter : of the forces: see :func:`~pfem_petsc.post.curves.make_filter`
     field : that colours the bars
 
     Raises
@@ -75,15 +74,20 @@ def write_report(
             raise InputError(f"{file}: is a folder; name a file for the report, {file / NAME}")
         with tempfile.TemporaryDirectory() as folder:
             curves = plot(result, folder, force_filter=force_filter)
-            drawn, reason = _draw(result, Path(folder) / "truss.png", field) if pictures else (None, "not asked for")
-            text = _document(result, curves, drawn, reason)
+            truss = (
+                _truss(result, Path(folder, "truss.png"), field) if pictures else _NO_PICTURES.format("not asked for")
+            )
+            text = _document(result, curves, truss)
     with written(file, "the report"):
         file.write_text(text, encoding="utf-8")
     return file
 
 
-def _draw(result: Any, file: Path, field: str) -> tuple[Path | None, str]:
-    """Draw six instants of the truss; return the picture, or why there is none."""
+_NO_PICTURES = "<p>No pictures of the truss: {}</p>"
+
+
+def _truss(result: Any, file: Path, field: str) -> str:
+    """Return six instants of the truss, drawn into a file, or why there are none."""
     from .options import Options
     from .render import Film, save
 
@@ -91,111 +95,44 @@ def _draw(result: Any, file: Path, field: str) -> tuple[Path | None, str]:
         film = Film([result], Options(field=field, size=SIZE), lambda text: None)
         picture = save(film.poster(), file)
     except InputError as error:
-        return None, str(error)
+        return _NO_PICTURES.format(html.escape(str(error)))
     film.close()
-    return picture, ""
+    return _figure(picture, "Instants, or ends of load cases, coloured by the field named beside the scale")
 
 
-def _document(result: Any, curves: Sequence[Path], drawn: Path | None, reason: str) -> str:
+def _document(result: Any, curves: Sequence[Path], truss: str) -> str:
     case, log = result.case, _log(result)
     title = case.title or case.name
-    truss = (
-        _figure(drawn, "Instants, or ends of load cases, coloured by the field named beside the scale") if drawn else ""
-    )
-    if not drawn:
-        truss = f"<p>No pictures of the truss: {html.escape(reason)}</p>"
     sections = {
-        "Summary": _table(_summary(result)),
+        "Summary": html_table(result.summary().items()),
         "Warnings": "".join(f'<div class="warning">{html.escape(text)}</div>' for text in log["warnings"])
         or "<p>None.</p>",
         "Load cases": _load_cases(result),
         "Members": _members(result),
         "Truss": truss,
         "Curves": "".join(_figure(path, path.stem.replace("_", " ").capitalize()) for path in curves),
-        "Energies": _energies(result.history),
         "Crush tests": _crush(result),
         "Events": _events(result),
-        "Modes": _modes(result),
-        "Cost": _table(_cost(result, log)),
+        "Modes": result.modes.table().to_html() if result.n_modes else "",
+        "Cost": html_table(_cost(result, log).items()),
         "Case": f"<p>All keys, with defaults:</p><pre>{html.escape(result.case_text.strip())}</pre>",
-        "Versions": _table({key: str(value) for key, value in result.attributes.items() if value not in ("", {}, [])}),
+        "Versions": html_table(
+            (key, str(value)) for key, value in result.attributes.items() if value not in ("", {}, [])
+        ),
     }
     shown = {name: body for name, body in sections.items() if body}
     marks = {name: name.lower().replace(" ", "-") for name in shown}
     links = "".join(f'<a href="#{marks[name]}">{name}</a>' for name in shown)
     body = "".join(f'<h2 id="{marks[name]}">{name}</h2>{content}' for name, content in shown.items())
-    lead = f"{result.n_nodes:,} nodes, {result.n_bars:,} bars · {_span(result)}"
+    time = result.history["time"]
+    span = result.axis.span(float(time[0]), float(time[-1]))
+    lead = f"{result.n_nodes:,} nodes, {result.n_bars:,} bars · {span}"
     return (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>"
         f'<h1>{html.escape(title)}</h1><p class="lead">{html.escape(lead)}</p><nav>{links}</nav>{body}</body></html>\n'
     )
-
-
-def _span(result: Any) -> str:
-    time = np.asarray(result.history["time"], dtype=float)
-    return result.axis.span(float(time[0]), float(time[-1]))
-
-
-def _place(result: Any, time: float) -> str:
-    """Return a time in the unit of the end of the run, so that times of a report can be compared."""
-    if result.axis.staged:
-        return result.place(time)
-    factor, unit = result.axis.scale(float(result.history["time"][-1]))
-    return f"{result.axis.symbol} = {time * factor:.4g} {unit}" if unit else result.axis.place(time)
-
-
-def _summary(result: Any) -> dict[str, str]:
-    history, case = result.history, result.case
-    rows = {"result": str(result.path), "mesh": f"{result.n_nodes:,} nodes, {result.n_bars:,} bars"}
-    if len(result.times):
-        points = np.asarray(result.positions(0), dtype=float)
-        rows["extent"] = " × ".join(engineering(float(length), "m") for length in np.ptp(points, axis=0))
-    analysis = [f"{stage.name}: {_analysis(stage)}" if case.stage else _analysis(stage) for stage in case.stages]
-    rows["analysis"] = "; ".join(analysis)
-    rows["history"] = f"{len(history['time']):,} rows, {_span(result)}"
-    rows["snapshots"] = f"{len(result.times):,}"
-    for wall in case.every_wall:
-        force, time, window = peak_force(result, f"wall/{wall.name}/force")
-        over = f" (mean over {engineering(window, 's', 3)})" if window else ""
-        text = f"largest force {engineering(force, 'N')}{over} at {_place(result, time)}"
-        touching, impulse = touch_impulse(result, wall.name)
-        if impulse > 0.0:
-            share = f"{engineering(touching, 'N s', 3)} of {engineering(impulse, 'N s', 3)}"
-            text = f"{text}; impulse of first touches {share}"
-        rows[f"wall '{wall.name}'"] = text if force > 0.0 else "not touched"
-    if "broken_bars" in history and np.asarray(history["broken_bars"])[-1]:
-        rows["broken bars"] = f"{int(np.asarray(history['broken_bars'])[-1]):,} of {result.n_bars:,}"
-    return rows
-
-
-def _analysis(stage: Any) -> str:
-    if stage.time is not None:
-        return f"{stage.time.integrator}, {stage.time.mass} mass, to {engineering(stage.time.end, 's')}"
-    return f"static, {stage.static.method}" if stage.static is not None else "modes of the initial state"
-
-
-def _energies(history: Mapping[str, np.ndarray]) -> str:
-    held = {name: np.asarray(history[name], dtype=float) for name in (*STORED, *LOST, *SUPPLIED) if name in history}
-    error = balance_error(history)
-    if error is None:
-        return ""
-    side = {**dict.fromkeys(STORED, "stored"), **dict.fromkeys(LOST, "lost"), **dict.fromkeys(SUPPLIED, "supplied")}
-    lines = [
-        [
-            name.replace("_", " "),
-            side[name],
-            *(engineering(float(v), "J") for v in (values[0], values[np.abs(values).argmax()], values[-1])),
-        ]
-        for name, values in held.items()
-        if np.any(values)
-    ]
-    largest = max(float(np.abs(values).max()) for values in held.values())
-    worst = float(np.abs(error).max())
-    share = f" ({worst / largest:.1e} of the largest energy)" if largest > 0.0 else ""
-    text = f"<p>Largest imbalance of stored + lost − supplied: {engineering(worst, 'J')}{share}."
-    return f"{text} Terms that are zero are left out.</p>" + _grid(["energy", "", "start", "largest", "end"], lines)
 
 
 def _load_cases(result: Any) -> str:
@@ -217,7 +154,7 @@ def _load_cases(result: Any) -> str:
         reaction = ", ".join(engineering(float(value) if abs(value) > least else 0.0, "N") for value in force)
         lines.append([instant.case, engineering(float(moved.max()), "m"), f"node {moved.argmax()}", reaction])
     head = ["load case or combination", "largest displacement", "", "force of the supports (x, y, z)"]
-    return missing + (_grid(head, lines) if lines else "")
+    return missing + (html_table(lines, head) if lines else "")
 
 
 _MOST_MEMBERS = 20
@@ -244,13 +181,13 @@ def _members(result: Any) -> str:
             engineering(float(row["stress"]), "Pa"),
             *("" if np.isnan(row[name]) else f"{100.0 * row[name]:.1f} %" for name in table if "utilisation" in name),
             str(row["case"]),
-            _place(result, float(row["time"])),
+            result.place(float(row["time"])),
         ]
-        for row in table.where(np.arange(min(_MOST_MEMBERS, table.n_rows))).rows
+        for row in table.where(slice(_MOST_MEMBERS)).rows
     ]
     more = table.n_rows - len(lines)
     rest = f"<p>The command members lists the other {more:,}.</p>" if more else ""
-    return _grid(head, lines) + rest
+    return html_table(lines, head) + rest
 
 
 _CRUSHED = 0.05
@@ -271,14 +208,10 @@ def _crush(result: Any) -> str:
             continue  # it touches nothing, or the mesh is not there any more
         if test.strain[-1] < _CRUSHED:
             continue
-        rows = [
-            [row["figure"], f"{row['value']:.6g}" if np.isfinite(row["value"]) else "not reached", row["unit"]]
-            for row in test.figures().rows
-        ]
         with tempfile.TemporaryDirectory() as folder:
             picture = _figure(draw_crush(test, Path(folder) / "crush.png"), f"Wall {wall.name}: stress and strain")
         found += f"<p>Wall {html.escape(wall.name)}, area and height of the box around the mesh:</p>"
-        found += _grid(["", "", ""], rows) + picture
+        found += html_table(test.texts().items()) + picture
     return found
 
 
@@ -287,18 +220,9 @@ def _events(result: Any) -> str:
     names = [name for name in history if name.startswith(f"{EVENT}/")]
     if not names or not len(history[names[0]]):
         return ""
-    columns = [history[name] for name in names]
-    lines = [[f"{value:.6g}" if isinstance(value, float) else str(value) for value in row] for row in zip(*columns)]
-    more = f"<p>{len(lines) - 50:,} more are in the result.</p>" if len(lines) > 50 else ""
-    return _grid([name.removeprefix(f"{EVENT}/") for name in names], lines[:50]) + more
-
-
-def _modes(result: Any) -> str:
-    if not getattr(result, "n_modes", 0):
-        return ""
-    name, unit = MODE_VALUES[result.modes.kind]
-    lines = [[str(k + 1), f"{value:.6g}"] for k, value in enumerate(result.modes.values)]
-    return _grid(["mode", name.replace("_", " ") + (f" [{unit}]" if unit else "")], lines)
+    table = Table({name.removeprefix(f"{EVENT}/"): history[name] for name in names})
+    more = f"<p>{table.n_rows - 50:,} more are in the result.</p>" if table.n_rows > 50 else ""
+    return table.where(slice(50)).to_html() + more
 
 
 def _log(result: Any) -> dict[str, list[str]]:
@@ -330,22 +254,6 @@ def _cost(result: Any, log: Mapping[str, list[str]]) -> dict[str, str]:
     rows["result file"] = f"{Path(result.path).stat().st_size / 1e6:.3g} MB"
     totals = {name: int(np.sum(result.history.get(name, 0))) for name in ("newton_iterations", "linear_iterations")}
     return rows | {name.replace("_", " "): f"{n:,} in the rows of the history" for name, n in totals.items() if n}
-
-
-def _table(rows: Mapping[str, str]) -> str:
-    lines = (f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in rows.items())
-    return f"<table>{''.join(lines)}</table>"
-
-
-def _grid(head: Iterable[str], lines: Iterable[Sequence[str]]) -> str:
-    heading = "".join(f"<th>{html.escape(text)}</th>" for text in head)
-    body = "".join(f"<tr>{''.join(_cell(text) for text in line)}</tr>" for line in lines)
-    return f"<table><thead><tr>{heading}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _cell(text: str) -> str:
-    kind = ' class="number"' if re.match(r"[-−]?\d", text) else ""
-    return f"<td{kind}>{html.escape(text)}</td>"
 
 
 def _figure(path: Path, caption: str) -> str:

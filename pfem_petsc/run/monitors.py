@@ -23,55 +23,11 @@ if TYPE_CHECKING:
 _CREATED = 20.0
 # the same once nodes have been in contact: some schemes gain energy in each impact, which has a warning
 _IN_CONTACT = 1e3
-_DIVERGENCE_ROWS = (
-    6  # consecutive rows; after a start from rest, or when a wall first strikes, there is no input to compare with
-)
+# consecutive rows; after a start from rest, or when a wall first strikes, there is no input to compare with
+_DIVERGENCE_ROWS = 6
 WATCHED = ("active_contacts", *STORED, *LOST, *SUPPLIED)
 """Columns of the history that rows are checked by."""
-_AT = {name: k for k, name in enumerate(WATCHED)}
-_KINETIC, _WALLS, _LOST, _ACTIVE = map(
-    _AT.get, ("kinetic_energy", "wall_kinetic_energy", "numerical_dissipation", "active_contacts")
-)
 _BARS = ("elastic_energy", "spring_energy")
-_ELASTIC, _SPRINGS = map(_AT.get, _BARS)
-_SUPPLIED, _STORED = ([_AT[name] for name in names] for names in (SUPPLIED, STORED))
-
-
-def watched(row: Mapping[str, Any]) -> np.ndarray:
-    """Return the columns :data:`WATCHED` of one row, (1, k)."""
-    return np.array([[float(row[name]) for name in WATCHED]])
-
-
-# numbers of a check between rows; after them follow the lowest works
-_STRANGE, _MOST, _MOST_LOST, _LIMIT, _STARTED, _START_ELASTIC, _START_SPRINGS = range(7)
-_LOWEST = _START_SPRINGS + 1
-
-
-def _first_created(rows: list[list[float]], kept: list[float]) -> tuple[int, float]:
-    """Return the first of ``rows`` (m, k) of :data:`WATCHED` with which too many have more energy than was supplied,
-    or m, and the energy created [J]; update the numbers ``kept`` between rows."""
-    created = 0.0
-    for k, row in enumerate(rows):
-        moving, lost = row[_KINETIC] + row[_WALLS], row[_LOST]
-        if kept[_STARTED] == 0.0:
-            kept[_STARTED], kept[_START_ELASTIC], kept[_START_SPRINGS] = 1.0, row[_ELASTIC], row[_SPRINGS]
-            # walls with mass as well: a truss at rest has no other energy than that of what hits it
-            kept[_MOST] += moving
-            kept[_MOST_LOST] = lost
-        released = kept[_START_ELASTIC] - row[_ELASTIC] + kept[_START_SPRINGS] - row[_SPRINGS]
-        kept[_MOST] = max(kept[_MOST], released)
-        for j, supplied in enumerate(_SUPPLIED, start=_LOWEST):
-            # rises only: what a force has taken away, as drag does, it need not give back
-            kept[j] = min(kept[j], row[supplied])
-            kept[_MOST] = max(kept[_MOST], row[supplied] - kept[j])
-        kept[_MOST_LOST] = max(kept[_MOST_LOST], lost)
-        created = min(kept[_MOST_LOST] - lost, moving - released)
-        if row[_ACTIVE] > 0:
-            kept[_LIMIT] = _IN_CONTACT
-        kept[_STRANGE] = kept[_STRANGE] + 1 if created > kept[_LIMIT] * kept[_MOST] else 0
-        if kept[_STRANGE] >= _DIVERGENCE_ROWS:
-            return k, created
-    return len(rows), created
 
 
 class BlowUp:
@@ -83,54 +39,56 @@ class BlowUp:
     released since, and the largest rise of each work. The energy of prestressed bars moves nothing while they hold it,
     and the works of earlier stages are spent. Rows of static stages are not compared: works over their increments are
     quadratures.
+
+    Attributes
+    ----------
+    kept : for a checkpoint: the number of consecutive suspicious rows, energy input, the largest numerical dissipation
+        [J], the factor of the input up to which rows are not suspicious, energies of the first row, and lowest works
     """
 
     def __init__(self, model: Model, inertial: bool = True) -> None:
         self.model, self.inertial = model, inertial
-        self._kept = [0.0, model.rounding * model.length, 0.0, _CREATED, 0.0, 0.0, 0.0] + len(SUPPLIED) * [np.inf]
         self._created = 0.0  # by the last row [J]
-
-    def kept(self) -> dict[str, Any]:
-        """Return the state for a checkpoint: the number of consecutive suspicious rows, energy input, the largest
-        numerical dissipation [J], the factor of the input up to which rows are not suspicious, energies of the first
-        row, and lowest works."""
-        kept = self._kept
-        started = kept[_STARTED] > 0.0
-        return {
-            "strange": int(kept[_STRANGE]),
-            "most": kept[_MOST],
-            "lost": kept[_MOST_LOST],
-            "limit": kept[_LIMIT],
-            "start": dict(zip(_BARS, kept[_START_ELASTIC:_LOWEST], strict=True)) if started else {},
-            "lowest": dict(zip(SUPPLIED, kept[_LOWEST:], strict=True)) if started else {},
+        self.kept: dict[str, Any] = {
+            "strange": 0,
+            "most": model.rounding * model.length,
+            "lost": 0.0,
+            "limit": _CREATED,
+            "start": {},
+            "lowest": {},
         }
 
-    def load_state(self, kept: dict[str, Any]) -> None:
-        """Restore the state from a checkpoint."""
-        start, lowest = (kept[what] for what in ("start", "lowest"))
-        numbers = [kept[what] for what in ("strange", "most", "lost", "limit")]
-        numbers += [bool(start), *(start.get(name, 0.0) for name in _BARS)]
-        self._kept[:] = numbers + [lowest.get(name, np.inf) for name in SUPPLIED]
-
-    def first_wrong(self, rows: np.ndarray) -> int:
-        """Return the first of ``rows`` (m, k) of :data:`WATCHED` that :meth:`failure` tells of, or m."""
-        bad = np.flatnonzero(~np.isfinite(rows[:, [_KINETIC, _ELASTIC]]).all(axis=1))
-        finite = int(bad[0]) if len(bad) else len(rows)
-        if not self.inertial:
-            return finite
-        at, self._created = _first_created(rows[:finite].tolist(), self._kept)
-        return at
-
-    def check(self, row: Mapping[str, Any], state: State) -> None:
-        """Check one row.
+    def check(self, row: Mapping[str, Any], values: Mapping[str, float], state: State) -> None:
+        """Check one row; ``values``: its columns :data:`WATCHED`.
 
         Raises
         ------
         SimulationFailure
             On all ranks, see :meth:`failure`.
         """
-        if self.first_wrong(watched(row)) == 0:
+        finite = math.isfinite(values["kinetic_energy"]) and math.isfinite(values["elastic_energy"])
+        if not finite or (self.inertial and self._has_created(values)):
             raise self.failure(row, state)
+
+    def _has_created(self, row: Mapping[str, float]) -> bool:
+        """Return whether too many rows have more energy than was supplied."""
+        kept = self.kept
+        moving, lost = row["kinetic_energy"] + row["wall_kinetic_energy"], row["numerical_dissipation"]
+        if not kept["start"]:
+            kept["start"], kept["lowest"] = ({name: row[name] for name in names} for names in (_BARS, SUPPLIED))
+            # walls with mass as well: a truss at rest has no other energy than that of what hits it
+            kept["most"] += moving
+            kept["lost"] = lost
+        released = sum(start - row[name] for name, start in kept["start"].items())
+        # rises only: what a force has taken away, as drag does, it need not give back
+        kept["lowest"] = {name: min(low, row[name]) for name, low in kept["lowest"].items()}
+        kept["most"] = max(kept["most"], released, *(row[name] - low for name, low in kept["lowest"].items()))
+        kept["lost"] = max(kept["lost"], lost)
+        self._created = min(kept["lost"] - lost, moving - released)
+        if row["active_contacts"] > 0:
+            kept["limit"] = _IN_CONTACT
+        kept["strange"] = kept["strange"] + 1 if self._created > kept["limit"] * kept["most"] else 0
+        return kept["strange"] >= _DIVERGENCE_ROWS
 
     def failure(self, row: Mapping[str, Any], state: State) -> SimulationFailure:
         """Return what is wrong with a row: the energy is not finite, or the energy created exceeds the input several
@@ -138,7 +96,7 @@ class BlowUp:
         if math.isfinite(row["kinetic_energy"] + row["elastic_energy"]):
             return SimulationFailure(
                 f"{self._when(row)}: the integration has created {self._created:.3g} J, but only "
-                f"{self._kept[_MOST]:.3g} J were supplied: the motion is unstable and fastest at "
+                f"{self.kept['most']:.3g} J were supplied: the motion is unstable and fastest at "
                 f"{self._fastest(state)}; reduce time.step"
             )
         if row["step"] == 0:
@@ -194,41 +152,6 @@ CAUSES = {
     "self_contact_dissipation": "bars touch bars",
 }
 """What dissipates besides friction and impact, and how messages tell it."""
-_CAUSES = [_AT[name] for name in CAUSES]
-
-# numbers of a check between rows
-_BEGUN, _START, _SCALE, _TOUCHED, _ROWS = range(5)
-
-
-def _first_gain(
-    rows: list[list[float]], numbers: np.ndarray, limits: tuple[bool, float, float, float], kept: list[float]
-) -> tuple[int, float]:
-    """Return the first of ``rows`` (m, k) of :data:`WATCHED`, with the ``numbers`` (m,) of their steps, that is to be
-    told, or m, and the energy gained [J]; update the numbers ``kept`` between rows.
-
-    ``limits``: whether the scheme is explicit, what its own energy may gain of the elastic energy, the energy [J] of
-    what is at rest, and the number of the last step.
-    """
-    explicit, swing, rounding, last = limits
-    gain = 0.0
-    for k, row in enumerate(rows):
-        stored, dissipated, supplied = ([row[j] for j in columns] for columns in (_STORED, _CAUSES, _SUPPLIED))
-        net = sum(stored) + sum(dissipated) - sum(supplied)
-        if kept[_BEGUN] == 0.0:
-            kept[_BEGUN], kept[_START] = 1.0, net
-        kept[_SCALE] = scale = max(kept[_SCALE], rounding, abs(kept[_START]), *map(abs, supplied))
-        if row[_ACTIVE] > 0:
-            kept[_TOUCHED] = 1.0
-        touched = kept[_TOUCHED] > 0.0
-        gain = net - kept[_START]
-        if explicit and not touched:
-            # what its own energy may have gained for a while: all of it where nothing dissipates
-            gain -= swing * (row[_ELASTIC] + row[_SPRINGS]) if any(value > 0.0 for value in dissipated) else np.inf
-        kept[_ROWS] = kept[_ROWS] + 1 if gain > _SHARE * scale + rounding else 0
-        patience = 1 if touched else _AT_END if numbers[k] >= last else _GAIN_ROWS
-        if kept[_ROWS] >= patience:
-            return k, gain
-    return len(rows), gain
 
 
 class ContactWatch:
@@ -248,49 +171,49 @@ class ContactWatch:
     model : Model
     tell : takes the warning
     plan : Plan
+
+    Attributes
+    ----------
+    start : energy of the first row less what had been supplied [J]; None before it
     """
 
     def __init__(self, model: Model, tell: Callable[[str], None], plan: Plan) -> None:
         self.tell = tell
         self.told = False
-        swing = min((0.5 * plan.step * plan.frequency.upper) ** 2, 1.0)  # of the elastic energy
-        # of energies [J]: what is at rest has no other
-        self._limits = (plan.scheme.explicit, float(swing), float(model.rounding * model.length), float(plan.steps))
-        self._kept = [0.0] * 5
+        self.start: float | None = None
+        self._explicit, self._last = plan.scheme.explicit, plan.steps
+        self._swing = min((0.5 * plan.step * plan.frequency.upper) ** 2, 1.0)  # of the elastic energy
+        self._rounding = model.rounding * model.length  # [J]: what is at rest has no other energy
+        self._scale, self._touched, self._rows = self._rounding, False, 0
         contact, time = model.case.contact, model.case.time
         self.key = "time.safety" if time.step == "auto" else "time.step"
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
         self.moves = model.supports.moves
 
-    @property
-    def start(self) -> float | None:
-        """Energy of the first row less what had been supplied [J]; None before it."""
-        return float(self._kept[_START]) if self._kept[_BEGUN] else None
-
-    @start.setter
-    def start(self, energy: float | None) -> None:
-        self._kept[_BEGUN], self._kept[_START] = energy is not None, energy or 0.0
-
-    def first_gain(self, rows: np.ndarray, numbers: np.ndarray) -> int:
-        """Return the first of ``rows`` (m, k) of :data:`WATCHED`, with the ``numbers`` (m,) of their steps, that
-        :meth:`tell_gain` is to tell of, or m."""
+    def check(self, row: Mapping[str, Any], values: Mapping[str, float]) -> None:
+        """Check one row, and tell of the energy gained; ``values``: its columns :data:`WATCHED`."""
         if self.told:
-            return len(rows)
-        at, self._gain = _first_gain(rows.tolist(), numbers, self._limits, self._kept)
-        return at
+            return
+        dissipated, supplied = ([values[name] for name in names] for names in (CAUSES, SUPPLIED))
+        net = sum(values[name] for name in STORED) + sum(dissipated) - sum(supplied)
+        if self.start is None:
+            self.start = net
+        self._scale = max(self._scale, abs(self.start), *map(abs, supplied))
+        self._touched |= values["active_contacts"] > 0
+        gain = net - self.start
+        if self._explicit and not self._touched:
+            # what its own energy may have gained for a while: all of it where nothing dissipates
+            swinging = self._swing * (values["elastic_energy"] + values["spring_energy"])
+            gain -= swinging if any(value > 0.0 for value in dissipated) else np.inf
+        self._rows = self._rows + 1 if gain > _SHARE * self._scale + self._rounding else 0
+        if self._rows >= (1 if self._touched else _AT_END if row["step"] >= self._last else _GAIN_ROWS):
+            self._tell_gain(row, gain)
 
-    def check(self, row: Mapping[str, Any]) -> None:
-        """Check one row."""
-        if self.first_gain(watched(row), np.array([float(row["step"])])) == 0:
-            self.tell_gain(row)
-
-    def tell_gain(self, row: Mapping[str, Any]) -> None:
-        """Tell of the energy gained in a row."""
+    def _tell_gain(self, row: Mapping[str, Any], gain: float) -> None:
         self.told = True
-        scale = self._kept[_SCALE]
-        made = f"{self._gain:.3g} J, {100.0 * self._gain / scale:.2g} % of the energy that the run had or was given"
+        made = f"{gain:.3g} J, {100.0 * gain / self._scale:.2g} % of the energy that the run had or was given"
         at = f"step {row['step']}, t = {row['time']:.6g} s"
-        if self._kept[_TOUCHED]:
+        if self._touched:
             self.tell(
                 f"{at}: contact has produced {made}: {self.what} gains "
                 "energy in impacts; use another contact.treatment or time.integrator, or a smaller time.step "
@@ -332,6 +255,10 @@ class Doubts:
     ----------
     model : Model
     warn : receives a warning
+
+    Attributes
+    ----------
+    kept : counts so far, for a checkpoint or the next stage
     """
 
     def __init__(self, model: Model, warn: Callable[[str], None]) -> None:
@@ -349,15 +276,7 @@ class Doubts:
             kind: limit for kind, limit in self._limits.items() if model.comm.allreduce(bool(np.isfinite(limit).any()))
         }
         self._crossing = CrossingBars(model)
-        self._kept: dict[str, dict[str, Any]] = {}
-
-    def kept(self) -> dict[str, Any]:
-        """Return the counts so far, for a checkpoint or the next stage."""
-        return self._kept
-
-    def load_state(self, kept: dict[str, Any]) -> None:
-        """Go on with the counts of :meth:`kept`."""
-        self._kept = {kind: dict(counts) for kind, counts in kept.items()}
+        self.kept: dict[str, dict[str, Any]] = {}
 
     def look(self, x: np.ndarray, place: str, last: bool) -> None:
         """Examine the state at positions (local, 3) [m], ghosts included, at a place of the run. Collective.
@@ -378,7 +297,7 @@ class Doubts:
 
     def _counts(self, kind: str) -> dict[str, Any]:
         none = {"looks": 0, "seen": 0, "first": "", "most": 0, "worst": [0.0, -1, ""]}
-        return self._kept.setdefault(kind, none)
+        return self.kept.setdefault(kind, none)
 
     def _count(self, kind: str, number: int, worst: tuple[float, int], place: str, text: str) -> None:
         """Count a snapshot with a number of bars or pairs, and warn of the first one.
@@ -444,7 +363,7 @@ class Doubts:
     def summary(self) -> list[str]:
         """Return sentences for the end of the run, about what was seen again after its warning."""
         texts = []
-        for kind, counts in self._kept.items():
+        for kind, counts in self.kept.items():
             if counts["seen"] < 2:
                 continue
             often = f"in {counts['seen']:,} of {counts['looks']:,} snapshots, first at {counts['first']}"

@@ -17,15 +17,15 @@ from mpi4py import MPI
 from ..columns import Fields, Row, Snapshot
 from ..contact.monitoring import Piercing, check_positions
 from ..errors import SimulationFailure
+from ..files import FolderLock
 from ..output.checkpoint import write_checkpoint
-from ..output.lock import FolderLock
 from ..output.units import duration
 from ..output.vtkhdf import ResultWriter
 from ..restart import STATE_VERSION, RunState
 from ..signals import SignalNotes, early
 from ..stepping.bar_events import MOST_TOLD
 from ..stepping.ledger import Ledger
-from ..stepping.stepper import Step, Stepper
+from ..stepping.stepper import Stepper
 from ..version import __version__
 from .monitors import WATCHED, BlowUp, ContactWatch, Doubts
 from .recorder import Handover, Recorder
@@ -184,8 +184,8 @@ class Observer(ABC):
         return self.every - step % self.every if self.every else NEVER
 
     @abstractmethod
-    def observe(self, made: Step) -> None:
-        """Act after a step."""
+    def observe(self) -> None:
+        """Act in the present state of the stepper, after a step."""
 
     def complete(self) -> None:
         """Act after the last step of the run, unless this has been done."""
@@ -226,7 +226,8 @@ class History(Observer):
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
         self.ledger = stepper.ledger = Ledger(stepper)
         self.recorder = Recorder(stepper, stages.columns)
-        self.recorder.put(stages.wall_positions)
+        for name, value in stages.wall_positions.items():  # which this stage may not have
+            self.recorder.rest[self.recorder.layout[name]] = value
         stepper.row_every, stepper.probed = self.every, self.recorder.probed
         inertial = stepper.scheme.inertial
         self.blow_up = BlowUp(model, inertial)
@@ -241,44 +242,35 @@ class History(Observer):
         is the same unless a load case begins, with ``last``, the row of that end. Collective."""
         self.row, self.writer = last, earlier.writer
         first = self.recorder.begin_stage(source.recorder, last, handed)
-        self.blow_up.check(first, self._stepper.state)
-        if self._contact_watch is not None:
-            self._contact_watch.check(first)
+        self._check(first)
 
     def kept(self) -> dict[str, Any]:
         """Return what a restart goes on with, besides the ledger."""
-        recorder = self.recorder
+        recorder, watch = self.recorder, self._contact_watch
         return {
             "iterations": list(self._stepper.iterations),
             "start_energy": recorder.start_energy,
             "energy_scale": recorder.energy_scale,
-            "blow_up": self.blow_up.kept(),
+            "carried": None if recorder.carried is None else recorder.carried.tolist(),
+            "rest": None if recorder.rest is None else recorder.rest.tolist(),
+            "watch": None if watch is None else watch.start,
+            "blow_up": self.blow_up.kept,
             "row": {name: float(self.row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
         }
 
     def load_state(self, kept: Mapping[str, Any]) -> None:
-        """Take what :meth:`kept` gave; for a case with stages, under ``stage``, also what :meth:`stage` gave."""
+        """Take what :meth:`kept` gave."""
         recorder = self.recorder
         self._stepper.iterations = [int(n) for n in kept["iterations"]]
         recorder.start_energy, recorder.energy_scale = kept["start_energy"], kept["energy_scale"]
-        self.blow_up.load_state(kept["blow_up"])
+        self.blow_up.kept = kept["blow_up"]
         self.row = dict(kept["row"])
-        start, stage = recorder.start_energy, kept.get("stage")
-        if stage is not None:
-            before = stage["history"]
-            recorder.carried = None if before["carried"] is None else np.array(before["carried"])
-            recorder.rest[:], start = before["rest"], before["watch"]
+        if kept["carried"] is not None:
+            recorder.carried = np.array(kept["carried"])
+        if recorder.rest is not None:
+            recorder.rest[:] = kept["rest"]
         if self._contact_watch is not None:
-            self._contact_watch.start = start
-
-    def stage(self) -> dict[str, Any]:
-        """Return what a checkpoint must hold of the stages before."""
-        carried, watch = self.recorder.carried, self._contact_watch
-        return {
-            "carried": None if carried is None else carried.tolist(),
-            "rest": self.recorder.rest.tolist(),
-            "watch": None if watch is None else watch.start,
-        }
+            self._contact_watch.start = kept["watch"]
 
     def due(self, step: int) -> bool:
         """Return whether there is a row to record: of this step or, in a call, of one before."""
@@ -288,11 +280,11 @@ class History(Observer):
         """Never: compiled steps collect what rows need."""
         return NEVER
 
-    def observe(self, made: Step) -> None:
+    def observe(self) -> None:
         """Record rows: of compiled steps, and of the present state if it is due and not among them."""
         self.record()
-        if super().due(made.step) and self.row["step"] != made.step:
-            self.record()
+        if super().due(self._stepper.number):
+            self.complete()
 
     def record(self) -> None:
         """Record the rows of the last step or call, unless a rank has a fault, which is raised on all ranks."""
@@ -306,18 +298,17 @@ class History(Observer):
 
     def _take(self, rows: np.ndarray) -> None:
         """Check rows (m, width), store the last one and add them to the history."""
-        layout = self.recorder.layout
-        values = rows[:, self._watched]
-        sound = self.blow_up.first_wrong(values)
+        for vector in rows:
+            row = Row(self.recorder.layout, vector)
+            self._check(row)
+            self.row = row
+            self.writer.append_history(row if self._model.comm.rank == 0 else None)
+
+    def _check(self, row: Row) -> None:
+        values = dict(zip(WATCHED, row.vector[self._watched].tolist(), strict=True))
+        self.blow_up.check(row, values, self._stepper.state)
         if self._contact_watch is not None:
-            gained = self._contact_watch.first_gain(values[:sound], rows[:sound, layout.first("step")])
-            if gained < sound:
-                self._contact_watch.tell_gain(Row(layout, rows[gained]))
-        for vector in rows[:sound]:
-            self.row = Row(layout, vector)
-            self.writer.append_history(self.row if self._model.comm.rank == 0 else None)
-        if sound < len(rows):
-            raise self.blow_up.failure(Row(layout, rows[sound]), self._stepper.state)
+            self._contact_watch.check(row, values)
 
     def complete(self) -> None:
         """Record the row of the last step."""
@@ -377,11 +368,7 @@ class Snapshots(Observer):
         self.last = -1
         self.writer: ResultWriter | None = None
 
-    def observe(self, made: Step) -> None:
-        """Write a snapshot."""
-        self.write()
-
-    def write(self) -> None:
+    def observe(self) -> None:
         """Check the nodes against the walls, then write a snapshot of the present state."""
         state, fields = self._stepper.state, self._fields
         if not self.every and 0 < state.step < self._stepper.last_step:
@@ -401,17 +388,17 @@ class Snapshots(Observer):
 
     def kept(self) -> dict[str, Any]:
         """Return what a restart and the next stage go on with: the step of the last snapshot, and counts."""
-        return {"snapshot": self.last, "doubts": self._doubts.kept()}
+        return {"snapshot": self.last, "doubts": self._doubts.kept}
 
     def load_state(self, kept: Mapping[str, Any]) -> None:
         """Go on with what :meth:`kept` returned."""
         self.last = int(kept["snapshot"])
-        self._doubts.load_state(kept.get("doubts", {}))
+        self._doubts.kept = kept.get("doubts", {})
 
     def complete(self) -> None:
         """Write the snapshot of the last step."""
         if self.last != self._stepper.number:
-            self.write()
+            self.observe()
 
     def doubts(self) -> list[str]:
         """Return what the model could not represent, for the end of the run."""
@@ -461,11 +448,7 @@ class Checkpointing(Observer):
         """Return whether a checkpoint is due by the number of the step or by wall-clock time."""
         return super().due(step) or self._synchroniser.checkpoint_due
 
-    def observe(self, made: Step) -> None:
-        """Write a checkpoint."""
-        self.write()
-
-    def write(self) -> None:
+    def observe(self) -> None:
         """Flush the results, from which a restart continues, then write a checkpoint, unless the step has one.
 
         Raises
@@ -488,7 +471,7 @@ class Checkpointing(Observer):
             # the arrays of what the stage starts from are among those of nodes
             start = self._stages.model.start
             numbers = None if start is None else start.scalars()
-            scalars["stage"] = {"number": self._stages.number, "history": history.stage(), "start": numbers}
+            scalars["stage"] = {"number": self._stages.number, "start": numbers}
         attributes = {
             "state_version": STATE_VERSION,
             "pfem_petsc": __version__,
@@ -505,7 +488,7 @@ class Checkpointing(Observer):
     def complete(self) -> None:
         """Write the checkpoint of the last step, if the case requests checkpoints."""
         if self.at_end:
-            self.write()
+            self.observe()
 
 
 class Events(Observer):
@@ -530,7 +513,7 @@ class Events(Observer):
         """Return whether the step has events."""
         return bool(self._stepper.events)
 
-    def observe(self, made: Step) -> None:
+    def observe(self) -> None:
         """Record and report the events."""
         events, self._stepper.events = self._stepper.events, []
         for event in events:
@@ -567,14 +550,13 @@ class RuptureReport(Observer):
         """Return whether more bars are broken in the last row than have been reported; the same on all ranks."""
         return self._broken > self._told
 
-    def observe(self, made: Step) -> None:
-        """Report the bars that broke."""
-        self.complete()
-
     def complete(self) -> None:
         """Report the bars of the last row."""
-        if not self.due(0):
-            return
+        if self.due(0):
+            self.observe()
+
+    def observe(self) -> None:
+        """Report the bars that broke."""
         self._told = self._broken
         parts = self._comm.allgather(self._stepper.ruptures.take())
         breaks = sorted(part for share in parts for part in share)

@@ -424,7 +424,7 @@ class Outputs:
         """Record the first row and snapshot, unless the continued results contain them. Collective."""
         if not self._continues:
             self.history.record()
-            self.snapshots.write()
+            self.snapshots.observe()
 
     def after(self, made: Step) -> Step:
         """Serve the observers that are due after a step; return the step with its row. Collective."""
@@ -433,14 +433,14 @@ class Outputs:
         history, *others = self._observers
         recorded = history.due(step)
         if recorded:
-            history.observe(made)
+            history.observe()
         elif last or any(observer.needs_agreement and observer.due(step) for observer in others):
             synchroniser.synchronise()
         if synchroniser.due(step):
             synchroniser.synchronise()
         for observer in others:
             if observer.due(step):
-                observer.observe(made)
+                observer.observe()
         if last and self._stages.at_last:
             self.complete()
         elif last:
@@ -478,7 +478,7 @@ class Outputs:
         code, stepper = self._synchroniser.request, self._stepper
         if not code or (self._stages.at_last and stepper.state.step >= stepper.last_step):
             return
-        self.checkpointing.write()
+        self.checkpointing.observe()
         place = stepper.axis.exact(stepper.place)
         raise EarlyStop(
             f"{self._synchroniser.stop.reason(code)}; step {stepper.number} is finished, {place}, and "
@@ -509,7 +509,7 @@ class Outputs:
         code, stop = self._synchroniser.synchronise(), self._synchroniser.stop
         if code and self._stepper.state.step:
             if not self.checkpointing.at_end:
-                self.checkpointing.write()
+                self.checkpointing.observe()
             raise EarlyStop(
                 f"{stop.reason(code)}; the last step is finished, a checkpoint is written, and the modes are not "
                 f"computed: continue with --restart (results in {self._folder})"

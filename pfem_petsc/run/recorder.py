@@ -333,11 +333,6 @@ class Recorder:
         vectors[:, self._contact_times] = contact_times
         return vectors if self.carried is None else vectors + self.carried
 
-    def put(self, values: Mapping[str, np.ndarray]) -> None:
-        """Set values of columns that this stage may not have."""
-        for name, value in values.items():
-            self.rest[self.layout[name]] = value
-
     def begin_stage(self, before: Recorder, last: Row, handed: Handover) -> Row:
         """Go on after the stage that has ended; return the row of the start. Collective.
 

@@ -15,7 +15,7 @@ import model as m
 import numpy as np
 
 from pfem_petsc import Case, Simulation, Truss
-from pfem_petsc.bench.measure import cells_for
+from pfem_petsc.bench import cells_for
 
 LATTICES = {"octet": {}, "graded": {"grading": [1, 1, "1 + 5*z"]}, "disordered": {"perturbation": 0.2}}
 

@@ -9,8 +9,7 @@ from pfem_petsc import __version__
 from pfem_petsc.case.toml import built_in_cases
 from pfem_petsc.cli.cases import KINDS
 from pfem_petsc.cli.main import HOMES as HOMES
-from pfem_petsc.cli.main import main
-from pfem_petsc.cli.parser import seconds
+from pfem_petsc.cli.main import main, seconds
 from pfem_petsc.registry import choices
 
 

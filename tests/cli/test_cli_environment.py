@@ -15,8 +15,8 @@ import pfem_petsc
 from pfem_petsc import InputError
 from pfem_petsc.case.schema import Case
 from pfem_petsc.case.toml import built_in_cases
-from pfem_petsc.cli import environment
-from pfem_petsc.cli.environment import Finding, inspect_environment, report
+from pfem_petsc.cli import machine as environment
+from pfem_petsc.cli.machine import Finding, inspect_environment, report
 from pfem_petsc.cli.main import HOMES, exit_message, main, on_first_rank
 
 HERE = {

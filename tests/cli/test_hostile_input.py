@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case
-from pfem_petsc.cli.main import exit_message, main
-from pfem_petsc.cli.parser import PREFIXES, without_effect
+from pfem_petsc.cli.main import PREFIXES, exit_message, main, without_effect
 from pfem_petsc.errors import InputError, printable
 from pfem_petsc.restart import prepare_folder
 

@@ -30,7 +30,7 @@ def test_a_node_beyond_a_wall_is_an_error(scheme, comm, shared_tmp_path):
     check_positions(simulation.model, *stepper.held_by_contact(), "here")
     where[tip, 0] += 2e-3
     with pytest.raises(SimulationFailure) as failure:
-        simulation.outputs.snapshots.write()
+        simulation.outputs.snapshots.observe()
     messages = comm.allgather(str(failure.value))
     assert messages == [messages[0]] * comm.size and failure.value.exit_status == 3
     assert messages[0].startswith("step 70, t = 0.7") and "node 20 is 0.002 m beyond wall 'wall' (1 node" in messages[0]

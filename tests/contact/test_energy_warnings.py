@@ -80,7 +80,8 @@ def watched(rows, explicit=False, moves=False):
     watch = ContactWatch(model, told.append, SimpleNamespace(scheme=scheme, frequency=frequency, step=0.1, steps=10))
     still = dict.fromkeys((*STORED, *LOST, *SUPPLIED), 0.0) | {"kinetic_energy": 1.0, "active_contacts": 0}
     for step in range(11):
-        watch.check({**still, "step": step, "time": 0.1 * step, **rows(step)})
+        row = {**still, "step": step, "time": 0.1 * step, **rows(step)}
+        watch.check(row, row)
     return told
 
 

@@ -142,7 +142,7 @@ def assert_restart_is_bitwise(case, comm, folder, *stops, allowed=0.0):
         with Simulation(case, comm, output=part, quiet=True) as first:
             for made in first:
                 if made.step == at:
-                    first.outputs.checkpointing.write()
+                    first.outputs.checkpointing.observe()
                     break
         with Simulation(case, comm, output=part, quiet=True, restart=True) as rest:
             assert [made.step for made in rest][0] == at + 1

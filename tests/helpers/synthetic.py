@@ -69,6 +69,7 @@ class SyntheticResult:
         self.path = Path(path)
         self.start, self.bars = points, bars
         self.n_nodes, self.n_bars = len(points), len(bars)
+        self.bar_data = ()
         self.point_fields, self.cell_fields = ["displacement", "velocity"], ["plastic_strain", "strain", "stress"]
         self.times = np.linspace(0.0, end, snapshots)
         self.case = SyntheticCase(title=title, name="synthetic", wall=list(walls), stage=(), gravity=None)

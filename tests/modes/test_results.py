@@ -188,7 +188,7 @@ def test_check_and_info_tell_of_modes(tmp_path, finished, capsys):
     assert main(["info", str(finished), "--verify"]) == 0
     told = capsys.readouterr().out
     frequency = open_result(finished).modes.frequency
-    assert "modes of vibration, frequency [Hz]:" in told and f"{frequency[7]:.6g}" in told
+    assert "modes of vibration:" in told and "frequency [Hz]" in told and f"{frequency[7]:.6g}" in told
 
 
 @pytest.mark.parametrize("key", ["velocity", "angular_velocity"])

@@ -176,7 +176,7 @@ def test_a_result_that_is_a_mesh_has_its_areas_and_groups(tmp_path, result, caps
 def test_printed_results_show_what_matters(result):
     lines = str(result).splitlines()
     rows = {line[2:].split("  ")[0]: line for line in lines[1:]}
-    assert lines[0] == "A tower <of> legs" and len(lines) <= 12
+    assert lines[0] == "A tower <of> legs" and len(lines) <= 16
     assert rows["file"].endswith(str(result.path)) and "5 nodes, 8 bars" in rows["mesh"]
     assert "step 10, t = 1.000 ms, which is the end of the run" in rows["end"]
     peak = np.linalg.norm(result.history["support_force"], axis=1).max()

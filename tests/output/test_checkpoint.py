@@ -69,7 +69,6 @@ def test_a_file_of_all_ranks_equals_that_of_one(shared_tmp_path):
             assert sorted(a["arrays"]) == sorted(b["arrays"])
             for name in a["arrays"]:
                 assert a["arrays"][name][()].tobytes() == b["arrays"][name][()].tobytes()
-                assert a["arrays"][name].attrs["checksum"] == b["arrays"][name].attrs["checksum"]
         assert read(shared_tmp_path / "alone.h5", MPI.COMM_SELF)[1].scalars == SCALARS
 
 
@@ -100,9 +99,9 @@ def test_missing_other_mesh_other_array_other_version(shared_tmp_path):
         read(path, names=["velocities"])
     COMM.Barrier()
     if COMM.rank == 0:
-        path.write_bytes(path.read_bytes().replace(b"pfem_petsc checkpoint 1\n", b"pfem_petsc checkpoint 2\n"))
+        path.write_bytes(path.read_bytes().replace(b"pfem_petsc checkpoint 2\n", b"pfem_petsc checkpoint 3\n"))
     COMM.Barrier()
-    with pytest.raises(InputError, match="version 2 of the checkpoint format, this program reads 1"):
+    with pytest.raises(InputError, match="version 3 of the checkpoint format, this program reads 2"):
         read(path)
 
 
@@ -156,13 +155,13 @@ def test_other_files_are_refused(tmp_path):
     path = tmp_path / "checkpoint.h5"
     with h5py.File(path, "w") as file:
         file["arrays/positions"] = np.zeros((N, 3))
-    for content in (path.read_bytes(), b"", b"text\n", b"pfem_petsc checkpoint 1\n", b"pfem_petsc checkpoint 1\n{}\n"):
+    for content in (path.read_bytes(), b"", b"text\n", b"pfem_petsc checkpoint 2\n", b"pfem_petsc checkpoint 2\n{}\n"):
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"checkpoint\.h5: (not a checkpoint|damaged)"):
             read(path, MPI.COMM_SELF)
 
 
-def test_many_arrays_fit_the_seal(tmp_path):
+def test_many_arrays(tmp_path):
     order = NaturalOrder(MPI.COMM_SELF, np.arange(5), 5)
     arrays = {f"array{i}": (order, np.full(5, i, dtype=np.int64)) for i in range(200)}
     write_checkpoint(tmp_path / "c.h5", MPI.COMM_SELF, arrays, {}, {})

@@ -9,14 +9,14 @@ import time
 
 import pytest
 
+from pfem_petsc import files as module
 from pfem_petsc.errors import InputError, SimulationFailure
-from pfem_petsc.output import lock as module
-from pfem_petsc.output.lock import FolderLock
+from pfem_petsc.files import FolderLock
 
 TAKE = """
 import os, sys
 from pathlib import Path
-from pfem_petsc.output.lock import FolderLock
+from pfem_petsc.files import FolderLock
 lock = FolderLock(Path(sys.argv[1]))
 lock.take()
 print("taken", flush=True)
@@ -111,7 +111,7 @@ RACE = """
 import os, random, sys, time
 from pathlib import Path
 from pfem_petsc.errors import InputError
-from pfem_petsc.output.lock import FolderLock
+from pfem_petsc.files import FolderLock
 folder, log = Path(sys.argv[1]), sys.argv[2]
 chance = random.Random(int(sys.argv[3]))
 for _ in range(60):

@@ -149,12 +149,12 @@ class Terminal(io.StringIO):
 
 
 def test_bar_on_a_terminal_and_lines_under_a_launcher(monkeypatch):
-    for name in ("OMPI_COMM_WORLD_SIZE", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"):
+    for name in ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "100")
     assert _drawn_by_bar()
-    monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "2")
+    monkeypatch.setenv("OMPI_COMM_WORLD_RANK", "2")
     assert not _drawn_by_bar()
 
 

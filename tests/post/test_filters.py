@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.filters import (
+from pfem_petsc.post.curves import (
     WINDOWS,
     amplitude_spectrum,
     butterworth,

@@ -13,8 +13,9 @@ from PIL import Image
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
+from pfem_petsc.output.result import balance_error
 from pfem_petsc.post.chart import Chart, Curve, Panel
-from pfem_petsc.post.plot import balance_error, plot
+from pfem_petsc.post.plot import plot
 
 
 @pytest.fixture

@@ -14,9 +14,8 @@ from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.errors import InputError
 from pfem_petsc.post import chart
 from pfem_petsc.post.chart import DASHES, REFERENCE, distinct
-from pfem_petsc.post.curves import draw_spectra
-from pfem_petsc.post.filters import make_filter, window_mean
-from pfem_petsc.post.plot import plot
+from pfem_petsc.post.curves import make_filter, window_mean
+from pfem_petsc.post.plot import draw_spectra, plot
 
 
 @pytest.fixture

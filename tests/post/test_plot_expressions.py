@@ -15,10 +15,9 @@ from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.table import select
 from pfem_petsc.post.chart import STYLE
-from pfem_petsc.post.curves import draw_curves, draw_spectra
-from pfem_petsc.post.filters import make_filter, window_mean
+from pfem_petsc.post.curves import make_filter, window_mean
 from pfem_petsc.post.page import ColourScale, Heading, Page
-from pfem_petsc.post.plot import plot
+from pfem_petsc.post.plot import draw_curves, draw_spectra, plot
 
 
 @pytest.fixture

@@ -15,8 +15,7 @@ from PIL import Image
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.units import common_prefix
-from pfem_petsc.post.curves import closed_form
-from pfem_petsc.post.filters import cfc, window_mean
+from pfem_petsc.post.curves import cfc, closed_form, window_mean
 from pfem_petsc.post.plot import plot
 
 

@@ -29,7 +29,7 @@ def test_results_side_by_side(tmp_path, flying):
     file = draw(tmp_path, [flying, other], frames=[0], size=(640, 300), nodes=False)[0]
     picture = drawing(file)
     middle = picture.shape[1] // 2
-    strip = Page.strip_of((640, 300))
+    strip = round(34 * 300 / 720)  # with the captions
     boxes = [box(half) for half in (picture[strip:, :middle], picture[strip:, middle:])]
     heights = [bottom - top for top, bottom, _, _ in boxes]
     assert heights[1] == pytest.approx(0.5 * heights[0], abs=3)

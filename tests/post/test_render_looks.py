@@ -12,7 +12,7 @@ from helpers.synthetic import SyntheticResult, lattice, ring
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.motion import chosen_frames, drawn_radii, radii_of
+from pfem_petsc.post.motion import chosen_frames, drawn_radii
 from pfem_petsc.post.options import frames_of
 from pfem_petsc.post.page import GHOST, MARKS, TRAILS
 from pfem_petsc.post.scene import Layer, Style
@@ -54,21 +54,20 @@ def bars_of_sections(tmp_path_factory):
 def test_radii_are_those_of_sections_and_fields(bars_of_sections):
     outer = 2e-4 / (2 * math.pi * 1e-3) + 0.5e-3
     expected = [math.sqrt(1e-4 / math.pi), outer, math.sqrt(4e-4 / math.pi)]
-    assert radii_of(open_result(bars_of_sections)) == pytest.approx(expected, rel=1e-12)
+    assert drawn_radii(open_result(bars_of_sections)) == pytest.approx(expected, rel=1e-12)
 
 
-def without_mesh(result, area):
-    """The result with one section of an area, whose mesh is gone."""
+def of_one_section(result, area):
+    """The result with one section of an area."""
     section = Case.load("rod_impact").section["default"].model_copy(update={"area": area})
-    result.case.source, result.case.node_set, result.case.temperature, result.case.remove = "case", {}, (), ()
-    result.case.mesh = SimpleNamespace(generator=None, file="is/not/there.h5")
-    result.case.section = {"one": section}
-    return section
+    result.case.section, result.bar_data = {"one": section}, ("section", "area")
+    given, of_bars = result.field, {"section": np.full(result.n_bars, "one"), "area": np.full(result.n_bars, area)}
+    result.field = lambda name, i: of_bars[name] if name in of_bars else given(name, i)
 
 
 def test_stout_bars_are_drawn_thinner_with_a_remark(flying):
     """Balls of such a radius at the nodes would hide all that happens."""
-    without_mesh(flying, 100.0 * math.pi)
+    of_one_section(flying, 100.0 * math.pi)
     said = []
     start = flying.positions(0)
     length = np.linalg.norm(start[flying.bars[:, 1]] - start[flying.bars[:, 0]], axis=1)
@@ -111,7 +110,7 @@ def test_lines_and_tubes_are_chosen_by_the_number_of_bars(tmp_path):
     """Up to 20,000 bars, thick ones hide most of the page."""
     for cells, thick in ((3, True), (16, False)):
         result = SyntheticResult(tmp_path / f"{cells}.vtkhdf", *lattice(cells), walls=())
-        without_mesh(result, math.pi * (0.1 / cells) ** 2)
+        of_one_section(result, math.pi * (0.1 / cells) ** 2)
         plain, wide = (
             (drawing(draw(tmp_path, result, frames=[0], radius_scale=factor)[0])[..., :3].min(axis=2) < 250).mean()
             for factor in (0.01, 1.0)

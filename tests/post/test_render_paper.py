@@ -14,9 +14,8 @@ from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.table import Table
 from pfem_petsc.output.units import POINT
-from pfem_petsc.post.actions import Actions
 from pfem_petsc.post.members import draw_members
-from pfem_petsc.post.motion import Motion
+from pfem_petsc.post.motion import Actions, Motion
 from pfem_petsc.post.page import ColourScale, Page, inset_room
 from pfem_petsc.post.render import Film, Options, instants
 from pfem_petsc.post.scene import Style, cameras

@@ -8,7 +8,7 @@ from helpers.pictures import table_columns
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.filters import amplitude_spectrum, cfc, window_mean
+from pfem_petsc.post.curves import amplitude_spectrum, cfc, window_mean
 from pfem_petsc.post.plot import plot
 
 STEP, END = 1e-3, 0.2

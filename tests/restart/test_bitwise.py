@@ -43,7 +43,7 @@ def test_motion_that_has_come_to_rest_is_not_taken_for_unstable_after_a_restart(
 
 def _watched(simulation):
     history = simulation.outputs.history
-    return history.blow_up.kept(), history.recorder.energy_scale, simulation.model.links.force.copy()
+    return history.blow_up.kept, history.recorder.energy_scale, simulation.model.links.force.copy()
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ import pytest
 from pfem_petsc import Case, open_result
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
-from pfem_petsc.restart import STATE_VERSION
 
 FILES = Path(__file__).with_name("older_versions")
 VERSIONS = {"0.2.0": 6}  # of the state in their checkpoints
@@ -81,14 +80,14 @@ def test_results_without_checksums_are_refused(tmp_path):
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_checkpoints_are_refused(version, tmp_path, capsys):
-    """With both versions of the state, the program that wrote it, and the ways out; the results stay as they are."""
+    """With both versions of the format, and the ways out; the results stay as they are."""
     folder = of_version(version, tmp_path)
     case = tmp_path / "case.toml"
     case.write_text(open_result(folder).case_text)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert main([str(case), "-o", str(folder), "--restart", "--set", "time.end=3e-5"]) == 2
     assert (
-        f"checkpoint.h5: holds version {VERSIONS[version]} of a run's state, this program reads {STATE_VERSION}: "
-        f"restart with the version of pfem_petsc that wrote it ({version}), or start without --restart"
+        "checkpoint.h5: has version 1 of the checkpoint format, this program reads 2: restart with the version of "
+        "pfem_petsc that wrote it, or start without --restart"
     ) in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before

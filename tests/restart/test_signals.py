@@ -147,7 +147,7 @@ def test_hang_up_while_petsc_starts(ignored):
     """PETSc's own handler would end the process, also under nohup."""
     code = (
         "import os, signal; from pfem_petsc.signals import early, watch_early; watch_early(); "
-        "from pfem_petsc.cli.parser import start_petsc; start_petsc([], 0); "
+        "from pfem_petsc.cli.main import start_petsc; start_petsc([], 0); "
         "os.kill(os.getpid(), signal.SIGHUP); print('signal', early()._signal)"
     )
     words = [*(["nohup"] if ignored else []), sys.executable, "-c", code]

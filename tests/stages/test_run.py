@@ -20,7 +20,7 @@ def run(data, comm, folder, stop_after=-1, **options):
     with Simulation(Case.from_dict(data, name="block"), comm, output=folder, quiet=True, **options) as simulation:
         for made in simulation:
             if made.step == stop_after:
-                simulation.outputs.checkpointing.write()
+                simulation.outputs.checkpointing.observe()
                 break
         return simulation.stepper.number
 

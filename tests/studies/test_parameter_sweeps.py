@@ -21,7 +21,7 @@ from pfem_petsc.cli.main import main
 from pfem_petsc.mechanics.compiled import count_compiled
 from pfem_petsc.output.result import peak_force
 from pfem_petsc.output.table import Table
-from pfem_petsc.post.curves import labels_of
+from pfem_petsc.post.plot import labels_of
 from pfem_petsc.solvers import matrix_free as outlive
 from pfem_petsc.studies import Task, environment, performed
 

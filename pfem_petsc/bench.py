@@ -1,4 +1,5 @@
-"""Times and memory of the steps of jobs: a block of cubic, octet or body-centred cells that flies, or hits a floor."""
+"""Times and memory of the steps of jobs, blocks of cubic, octet or body-centred cells that fly or hit a floor, and the
+memory bandwidth of this machine; tables and JSON of both."""
 
 from __future__ import annotations
 
@@ -6,22 +7,27 @@ import contextlib
 import ctypes
 import gc
 import io
+import json
 import math
+import os
+import platform
 import re
 import shutil
 import tempfile
+import timeit
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
-from time import perf_counter, process_time
+from time import perf_counter, process_time, sleep
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import numpy as np
     from mpi4py import MPI
 
-    from ..case.schema import Case
+    from .case.schema import Case
 
 
 YOUNG_MODULUS = 110e9  # [Pa] titanium
@@ -124,7 +130,7 @@ def cells_for(kind: str, bars: int) -> int:
 
 def make_case(job: Job, kind: str, cells: int, steps: int) -> Case:
     """Return the case of a job on a lattice, with ``steps`` steps and a history but no fields."""
-    from ..case.schema import Case
+    from .case.schema import Case
 
     material: dict[str, Any] = {"young_modulus": YOUNG_MODULUS, "density": DENSITY}
     if job.plastic:
@@ -215,7 +221,7 @@ class Record:
 
 def time_job(job: Job, kind: str, cells: int, comm: MPI.Comm, seconds: float, most: int = 100_000) -> Record:
     """Run a job for about ``seconds``, at most ``most`` steps. Collective."""
-    from ..simulation import Simulation
+    from .simulation import Simulation
 
     # the foot stays on the floor until the elastic wave has run to the far side and back
     lasting = int(2.0 * cells * CROSSING / job.step) if job.contact else most
@@ -284,9 +290,9 @@ def compile_loops(jobs: list[Job], kind: str, explicit: str, comm: MPI.Comm) -> 
     machine share them: each takes the next one when it is ready, and says what takes long. Collective."""
     from mpi4py import MPI
 
-    from ..mechanics.compiled import Compilation
-    from ..mechanics.materials.base import LAWS
-    from ..registry import choices
+    from .mechanics.compiled import Compilation
+    from .mechanics.materials.base import LAWS
+    from .registry import choices
 
     tiny = tiny_jobs(explicit)[0]
     work: dict[str, Callable[[], Any]] = {
@@ -299,7 +305,8 @@ def compile_loops(jobs: list[Job], kind: str, explicit: str, comm: MPI.Comm) -> 
     with tempfile.TemporaryDirectory(prefix="pfem_compile_") as own:
         taken = Path(machine.bcast(own))
         for k, (name, make) in enumerate(work.items()):
-            if _is_first(taken / str(k)):
+            with contextlib.suppress(FileExistsError):  # another rank has taken it
+                (taken / str(k)).touch(exist_ok=False)
                 place = f"{name}, {k + 1} of {len(work)}"
                 with Compilation(partial(_tell, place, begin), lambda seconds: None, PATIENCE):
                     make()
@@ -312,25 +319,16 @@ def compile_loops(jobs: list[Job], kind: str, explicit: str, comm: MPI.Comm) -> 
 
 def _tell(place: str, begin: float, loop: str, seconds: float) -> None:
     """Say which loop is being compiled for a piece of the work, and for how long all of it has lasted."""
-    from ..output.units import duration
+    from .output.units import duration
 
     print(f"compiling loops: {place}: {loop}, {duration(perf_counter() - begin)} so far", flush=True)
 
 
-def _is_first(place: Path) -> bool:
-    """Return whether no other rank has made a file, which is made then."""
-    try:
-        place.open("x").close()
-    except FileExistsError:
-        return False
-    return True
-
-
 def law_case(name: str, explicit: str) -> Case:
     """Return a case with a law, on a floor; keys that the law needs are 1 in SI units, which all laws accept."""
-    from ..case.schema import Case
-    from ..mechanics.materials.base import LAWS
-    from ..registry import lookup
+    from .case.schema import Case
+    from .mechanics.materials.base import LAWS
+    from .registry import lookup
 
     material: dict[str, Any] = {"law": name, "young_modulus": YOUNG_MODULUS, "density": DENSITY}
     for key, field in lookup(LAWS, name, "").Parameters.model_fields.items():
@@ -350,8 +348,109 @@ def law_case(name: str, explicit: str) -> Case:
 def _run(law: str, explicit: str) -> None:
     from mpi4py import MPI
 
-    from ..simulation import Simulation
+    from .simulation import Simulation
 
     told = io.StringIO()  # warnings about values that nobody means
     with tempfile.TemporaryDirectory(prefix="pfem_compile_") as folder, contextlib.redirect_stderr(told):
         Simulation(law_case(law, explicit), MPI.COMM_SELF, output=folder, quiet=True).run()
+
+
+BYTES_PER_ELEMENT = 24
+"""As STREAM counts: two reads and a write of 8 B. Cache lines read before they are overwritten are not counted."""
+
+_ELEMENTS = 8_000_000  # 64 MB per array and process, larger than the share of a core in any current cache
+
+
+def _triad(a: np.ndarray, b: np.ndarray, c: np.ndarray, scalar: float) -> None:
+    for i in range(len(a)):
+        a[i] = b[i] + scalar * c[i]
+
+
+def measure_bandwidth(comm: MPI.Comm, repeats: int = 10) -> dict[str, float]:
+    """Return the STREAM triad [B/s], best of several, of one process alone and of all ranks together, and their ratio,
+    the maximum speed-up of memory-bound work. Collective; the other ranks sleep while one is measured."""
+    import numpy as np
+
+    from .mechanics.compiled import kernel
+
+    loop = kernel(_triad)
+    a, b, c = np.zeros(_ELEMENTS), np.full(_ELEMENTS, 1.0), np.full(_ELEMENTS, 2.0)
+    size = BYTES_PER_ELEMENT * _ELEMENTS
+
+    triad = partial(loop, a, b, c, 3.0)
+    triad()  # compile, and touch every page
+    alone = size / min(timeit.repeat(triad, number=1, repeat=repeats)) if comm.rank == 0 else 0.0
+    waiting = comm.Ibarrier()
+    while not waiting.Test():
+        sleep(0.01)
+    alone = together = comm.bcast(alone)
+    if comm.size > 1:
+        # the slowest of a round, because all share the memory until it has finished
+        slowest = np.max(comm.allgather(timeit.repeat(triad, comm.Barrier, number=1, repeat=repeats)), axis=0)
+        together = comm.size * size / float(slowest.min())
+    return {"alone": alone, "together": together, "ratio": together / alone, "bytes_per_element": BYTES_PER_ELEMENT}
+
+
+def processor() -> str:
+    """Return the name of the processor."""
+    with contextlib.suppress(OSError):
+        if found := re.search(r"^model name\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            return found[1].strip()
+    return platform.processor() or platform.machine()
+
+
+_FORMAT = "{:18} {:>11} {:>9} {:>9} {:>9} {:>8} {:>6} {:>7} {:>6} {:>6}"
+_NAMES = ("job", "bars", "step ms", "best ms", "cpu ms", "bars/s", "memory", "newton", "setup", "first")
+_UNITS = ("", "", "median", "", "", "", "B/bar", "/cg", "s", "step s")
+HEADER = f"{_FORMAT.format(*_NAMES)}\n{_FORMAT.format(*_UNITS)}"
+"""Two lines over the table."""
+
+
+def line(record: Record) -> str:
+    """Return a row of the table."""
+    return _FORMAT.format(
+        record.job,
+        f"{record.bars:,}",
+        f"{1e3 * record.median:.4g}",
+        f"{1e3 * record.best:.4g}",
+        f"{1e3 * record.cpu:.4g}",
+        f"{record.rate:.3g}",
+        f"{record.memory / record.bars:.0f}",
+        f"{record.newton:.1f}/{record.linear:.0f}" if record.newton or record.linear else "-",
+        f"{record.setup:.2f}",
+        f"{record.first:.2f}",
+    )
+
+
+def machine_lines(bandwidth: dict[str, float], ranks: int) -> str:
+    """Describe the bandwidth."""
+    text = f"STREAM triad ({BYTES_PER_ELEMENT} B an element): one process {bandwidth['alone'] / 1e9:.1f} GB/s"
+    if ranks > 1:
+        text += f", {ranks} at once {bandwidth['together'] / 1e9:.1f} GB/s ({bandwidth['ratio']:.2f} x)"
+    return text + "\n"
+
+
+def memory_slopes(records: list[Record]) -> dict[str, float]:
+    """Return bytes per bar from the two largest sizes of each job with at least two sizes."""
+    slopes = {}
+    for name in dict.fromkeys(record.job for record in records):
+        *_, less, more = [None, None, *sorted((r for r in records if r.job == name), key=lambda r: r.bars)]
+        if less is not None and more.bars > less.bars:
+            slopes[name] = (more.memory - less.memory) / (more.bars - less.bars)
+    return slopes
+
+
+def document(comm: MPI.Comm, bandwidth: dict[str, float], records: list[Record], tiny: list[Record]) -> str:
+    """Return all measurements as JSON."""
+    from .output.layout import describe_run
+
+    content: dict[str, Any] = {
+        "machine": {"processor": processor(), "cores": os.cpu_count(), "system": platform.platform()},
+        "program": describe_run(comm, {}),
+        "ranks": comm.size,
+        "bandwidth": bandwidth,
+        "runs": [asdict(record) | {"bars_per_second": record.rate} for record in records],
+        "memory_slopes": memory_slopes(records),
+        "overhead": [asdict(record) for record in tiny],
+    }
+    return json.dumps(content, indent=1) + "\n"

@@ -1,1 +1,0 @@
-"""Performance measurements on this machine: bandwidth, steps per second, memory."""

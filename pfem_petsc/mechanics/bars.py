@@ -28,7 +28,6 @@ from .elements import (
     add_tangents,
     bar_lengths,
     first_inverted,
-    write_directions,
 )
 from .internal_forces import (
     BarArrays,
@@ -638,46 +637,46 @@ class Bars:
         pattern: BlockPattern,
         values: np.ndarray,
         start: np.ndarray | None = None,
+        stored: np.ndarray | None = None,
     ) -> None:
         """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to the values of a matrix; with
-        positions ``start``, the derivative of :meth:`step_forces` from there in the place of K_t."""
+        positions ``start``, the derivative of :meth:`step_forces` from there in the place of K_t; else with ``stored``
+        (2, b), the stiffness of bars that these are, see :meth:`stiffnesses`."""
         rows = MatrixRows(pattern.ptr, pattern.slots, values, self.ends)
         mass = np.zeros(len(self.ends))
         for block, m in zip(self.blocks, inertia, strict=True):
             mass[block.start : block.stop] = m * self.mass_lengths[block.start : block.stop]
-        stored = np.zeros((2, len(self.ends)))
-        if start is None:
-            if weight:
-                self.stiffnesses(x, weight, stored)
-            add_tangents(x, stored, mass, rows)
+        if start is not None:
+            coefficients = np.zeros((2, len(self.ends)))
+            self._step_coefficients(start, x, coefficients)
+            add_step_tangents(start, x, coefficients, weight, mass, rows)
         else:
-            self._step_coefficients(start, x, stored)
-            add_step_tangents(start, x, stored, weight, mass, rows)
+            if stored is None:
+                stored = np.zeros((2, len(self.ends)))
+                if weight:
+                    self.stiffnesses(x, weight, stored)
+            add_tangents(x, stored, mass, rows)
         for family in self.families:  # in a step, their force is that at its middle
             family.add_tangents(weight if start is None else 0.5 * weight, pattern, values)
 
-    def linearise(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
-        """Fill ``stored`` (5, b) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, for each bar at ``x``;
-        without springs."""
-        self.stiffnesses(x, weight, stored[3:])
-        write_directions(x, self.ends, stored)
-
     def state_stiffness(self, x: np.ndarray) -> np.ndarray:
-        """Return the stiffness of the bars (5, b) in the state at ``x``, as :meth:`linearise`.
+        """Return the stiffness of the bars (2, b) in the state at ``x``, as :meth:`stiffnesses`.
 
         If the law has a kink at the state, as on the yield surface, dN/dl is the larger one, that of unloading: small
         motions about the state do not yield further. The strain rate has no effect.
         """
-        stored, *around = np.zeros((3 if self.kept_names else 1, 5, len(self.rest)))
+        stored, *around = np.zeros((3 if self.kept_names else 1, 2, len(self.rest)))
+        square = self.lengths(x) ** 2
         with self.without_rates():
-            self.linearise(x, 1.0, stored)
-            for sign, side in zip((-1.0, 1.0), around, strict=False):
-                self.linearise((1.0 + sign * _LOADING) * x, 1.0, side)
+            self.stiffnesses(x, 1.0, stored)
+            for factor, side in zip((1.0 - _LOADING, 1.0 + _LOADING), around, strict=False):
+                self.stiffnesses(factor * x, 1.0, side)
+                side[0] *= factor**2
         if around:
-            tangent = stored[3] + stored[4]
-            larger = np.maximum(*(side[3] + side[4] for side in around))
+            tangent = stored[0] * square + stored[1]
+            larger = np.maximum(*(side[0] * square + side[1] for side in around))
             kink = larger - tangent > _KINK * np.abs(larger)
-            stored[3, kink] = (larger - stored[4])[kink]
+            stored[0, kink] = ((larger - stored[1]) / square)[kink]
         return stored
 
     def stiffnesses(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:

@@ -19,7 +19,7 @@ from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..output.units import TIME
 from ..stepping.plan import Plan, refuse_motion
 from ..stepping.stepper import Solution, Stepper
-from .pencil import Holds, Pencil, StateMatrices, buckling_bars, join, linear_forces
+from .pencil import BarStiffness, Holds, Pencil, StateMatrices, buckling_bars, join, linear_forces
 from .solvers import SOLVERS, Dense, Lanczos, Slepc
 
 if TYPE_CHECKING:
@@ -324,7 +324,7 @@ class _Search:
     def vibration(self, matrices: StateMatrices) -> Found:
         """Return the natural vibrations: theta = 1/(lambda - shift) of M x = theta (K - shift M) x."""
         model, holds = self.model, self.holds
-        bars = model.bars.state_stiffness(self.state.x)
+        bars = BarStiffness.of(model, self.state.x, model.bars.state_stiffness(self.state.x))
         low, high = matrices.bounds(bars, holds.curvature)
         top = 2.0 * high + abs(low)
         stiffness = matrices.stiffness(bars, top * matrices.inertia.mass, holds.curvature)
@@ -359,16 +359,13 @@ class _Search:
             end = 1.0 if static is None else getattr(static.parameters, "end", None) or 1.0
             found = linear_forces(self.model, matrices, 0.0, float(end), loaded=static is not None)
             material, forces = found.stiffness, np.stack([found.start, found.change])
-            geometric = material.copy()
-            geometric[4] = found.change / found.lengths
-            geometric[3] = -geometric[4]
+            geometric = material._replace(along=np.zeros_like(found.change), across=found.change / material.lengths)
         else:
             material, geometric = buckling_bars(self.model, self.state.x)
-            forces = np.stack([np.zeros_like(geometric[4]), geometric[4] * self.model.bars.mesh_lengths])
+            forces = np.stack([geometric.along, geometric.across * self.model.bars.mesh_lengths])
             doubts = self._nonlinear(matrices, forces[1])
-        largest = np.array([np.abs(geometric[4]).max(initial=0.0), np.abs(material[3]).max(initial=0.0)])
-        comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-        if largest[0] <= _NO_LOAD * largest[1]:
+        largest = material.largest(comm)
+        if geometric.largest(comm) <= _NO_LOAD * largest:
             remedy = "give the case loads, or temperatures, rest lengths or motions that change up to load factor 1"
             if not self.linear:
                 remedy = "give the case loads, and modes.linear = true or an analysis that loads the truss ([static])"
@@ -376,9 +373,8 @@ class _Search:
                 f'{self.source}: modes: kind = "buckling" multiplies axial forces by the factors, and there are none: '
                 f"{remedy}"
             )
-        geometric[3:] *= -1.0
-        a = matrices.stiffness(geometric, 0.0, springs=False)
-        pencil = Pencil(a, matrices.stiffness(material, float(largest[1])), self.state.position, holds.held)
+        a = matrices.stiffness(geometric._replace(across=-geometric.across), 0.0, springs=False)
+        pencil = Pencil(a, matrices.stiffness(material, largest), self.state.position, holds.held)
         solver = self._make(pencil)
         try:
             if solver.definite is False:

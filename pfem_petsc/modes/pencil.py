@@ -4,7 +4,7 @@ the axial forces that the changes from the start of an analysis to its end cause
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -14,7 +14,7 @@ from ..errors import SimulationFailure
 from ..mechanics.mass import Inertia
 from ..parallel.agreement import agreed
 from ..solvers.linear import set_preconditioner
-from ..solvers.matrix import HessianMatrix
+from ..solvers.matrix import HessianMatrix, add_diagonal, block_diagonal
 from ..tolerances import BEYOND, RANK
 
 if TYPE_CHECKING:
@@ -147,14 +147,8 @@ class Holds:
 
     def _turning(self) -> PETSc.Mat:
         """Return the block-diagonal matrix from the local axes of nodes to x, y, z."""
-        owned, first = self._mesh.n_owned, 3 * self._mesh.first_node
-        blocks = np.broadcast_to(np.eye(3), (owned, 3, 3)).copy()
-        blocks[self._nodes] = self._turns.transpose(0, 2, 1)
-        turn = PETSc.Mat().createAIJ(((3 * owned, None), (3 * owned, None)), bsize=3, nnz=3, comm=self._mesh.comm)
-        columns = first + (3 * np.arange(owned)[:, None, None] + np.arange(3)).repeat(3, axis=1)
-        pointers = 3 * np.arange(3 * owned + 1, dtype=PETSc.IntType)
-        turn.setValuesCSR(pointers, columns.ravel().astype(PETSc.IntType), blocks.ravel())
-        turn.assemble()
+        turn = block_diagonal(self._mesh)
+        add_diagonal(turn, self._mesh, self._nodes, self._turns.transpose(0, 2, 1), PETSc.InsertMode.INSERT_VALUES)
         return turn
 
     def taken_out(self, matrix: PETSc.Mat, diagonal: float | np.ndarray) -> PETSc.Mat:
@@ -208,32 +202,56 @@ class Pencil:
             matrix.destroy()
 
 
-def buckling_bars(model: Model, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bars (5, b) of K0 and Kg, both on the geometry of the mesh; see ``Bars.state_stiffness``.
+class BarStiffness(NamedTuple):
+    """Stiffness of bars between positions ``x`` (local, 3) [m]: along and across them (b,) [N/m], and their lengths
+    (b,) [m]."""
+
+    x: np.ndarray
+    along: np.ndarray
+    across: np.ndarray
+    lengths: np.ndarray
+
+    @classmethod
+    def of(cls, model: Model, x: np.ndarray, stored: np.ndarray) -> BarStiffness:
+        """Return that of the numbers ``stored`` (2, b) of ``Bars.stiffnesses`` at positions."""
+        lengths = model.bars.lengths(x)
+        return cls(x, stored[0] * lengths**2 + stored[1], stored[1], lengths)
+
+    @property
+    def stored(self) -> np.ndarray:
+        """These numbers (2, b)."""
+        square = self.lengths**2
+        c = np.divide(self.along - self.across, square, out=np.zeros_like(square), where=square > 0.0)
+        return np.stack([c, self.across])
+
+    def largest(self, comm: MPI.Comm) -> float:
+        """Return the largest magnitude along or across a bar [N/m]. Collective."""
+        mine = np.maximum(np.abs(self.along), np.abs(self.across)).max(initial=0.0)
+        return comm.allreduce(float(mine), op=MPI.MAX)
+
+
+def buckling_bars(model: Model, x: np.ndarray) -> tuple[BarStiffness, BarStiffness]:
+    """Return the bars of K0 and Kg, both on the geometry of the mesh.
 
     K0: dN/dl of the unstressed bars with their virgin material, along the bar. Kg: N/l0 across it, where N is the
     axial force at the local positions ``x``.
     """
     bars, points = model.bars, model.mesh.points
-    lengths = bars.lengths(x)
-    force = bars.state_stiffness(x)[4] * lengths
+    force = bars.state_stiffness(x)[1] * bars.lengths(x)
     history, heat, rest = bars.history(), bars.heat, bars.rest
     step, bars.step = bars.step, 0.0
     try:
         bars.put_history(np.zeros_like(history))
         bars.heat, bars.rest = np.zeros_like(heat), bars.mesh_lengths
-        unloaded = np.zeros((5, len(model.mesh.bars)))
-        bars.linearise(points, 1.0, unloaded)
+        stored = np.zeros((2, len(model.mesh.bars)))
+        bars.stiffnesses(points, 1.0, stored)
     finally:
         bars.put_history(history)
         bars.heat, bars.rest, bars.step = heat, rest, step
-    unloaded[3:] *= bars.mesh_lengths / rest  # dN/dl of bars that are stress-free at their rest lengths
-    geometric = unloaded.copy()
-    unloaded[3] += unloaded[4]
-    unloaded[4] = 0.0
-    geometric[4] = force / bars.mesh_lengths
-    geometric[3] = -geometric[4]
-    return unloaded, geometric
+    # dN/dl of bars that are stress-free at their rest lengths
+    unloaded = BarStiffness.of(model, points, stored * (bars.mesh_lengths / rest))
+    none = np.zeros_like(force)
+    return unloaded._replace(across=none), unloaded._replace(along=none, across=force / bars.mesh_lengths)
 
 
 class StateMatrices:
@@ -254,23 +272,27 @@ class StateMatrices:
         self._ends = model.mesh.bars.astype(np.int64)
 
     def stiffness(
-        self, bars: np.ndarray, diagonal: float | np.ndarray, added: tuple | None = None, springs: bool = True
+        self, bars: BarStiffness, diagonal: float | np.ndarray, added: tuple | None = None, springs: bool = True
     ) -> PETSc.Mat:
-        """Return the matrix of bars (5, b), with ``diagonal`` (owned,) at held components. Collective.
+        """Return the matrix of bars, with ``diagonal`` (owned,) at held components. Collective.
 
         ``springs``: whether those to the ground are part of it
         ``added``: owned nodes (m,) and blocks (m, 3, 3) [N/m] to add
         """
+        return self.holds.taken_out(self.whole(bars, added, springs), diagonal)
+
+    def whole(self, bars: BarStiffness, added: tuple | None = None, springs: bool = True) -> PETSc.Mat:
+        """Return the matrix of bars with all components. Collective."""
         matrix = HessianMatrix(self.model.mesh)
 
         def fill(values: np.ndarray) -> None:
-            matrix.add_bars(bars, values)
+            matrix.add_bars(bars.x, bars.stored, values)
             if springs and self.model.bars.springs is not None:
                 self.model.bars.springs.add_tangents(1.0, matrix.pattern, values)
             if added is not None:
                 matrix.pattern.add_blocks(*added, values)
 
-        return self.holds.taken_out(matrix.fill(fill), diagonal)
+        return matrix.fill(fill)
 
     def mass(self) -> PETSc.Mat:
         """Return the mass matrix [kg]; held components keep their lumped mass. Collective."""
@@ -281,15 +303,14 @@ class StateMatrices:
         filled = matrix.fill(lambda values: matrix.add_mass(model.bars, inertia, values))
         return self.holds.taken_out(filled, inertia.mass)
 
-    def bounds(self, bars: np.ndarray, blocks: tuple | None = None) -> tuple[float, float]:
-        """Return bounds below and above all eigenvalues of the bars' stiffness (5, b) and the mass [1/s2]. Collective.
+    def bounds(self, bars: BarStiffness, blocks: tuple | None = None) -> tuple[float, float]:
+        """Return bounds below and above all eigenvalues of the bars' stiffness and the mass [1/s2]. Collective.
 
         A bar's matrix is (a n n^T + c (I - n n^T)) times [[1, -1], [-1, 1]], which lies between 2 min(a, c, 0) and
         2 max(a, c, 0) times the identity; a consistent mass is at least a third of the lumped one.
         """
-        axial, transverse = bars[3] + bars[4], bars[4]
-        low = self._at_nodes(2.0 * np.minimum(np.minimum(axial, transverse), 0.0))
-        high = self._at_nodes(2.0 * np.maximum(np.maximum(axial, transverse), 0.0))
+        low = self._at_nodes(2.0 * np.minimum(np.minimum(bars.along, bars.across), 0.0))
+        high = self._at_nodes(2.0 * np.maximum(np.maximum(bars.along, bars.across), 0.0))
         if self.model.bars.springs is not None:
             high[self.model.bars.springs.nodes] += self.model.bars.springs.largest()
         if blocks is not None:
@@ -342,15 +363,13 @@ class LinearForces:
 
     Attributes
     ----------
-    stiffness : (5, b) of the bars at the start with its stresses, see ``Bars.linearise``
+    stiffness : of the bars at the start with its stresses
     start, change : (b,) axial forces at the start, and what is added up to the end [N]
-    lengths : (b,) at the start [m]
     """
 
-    stiffness: np.ndarray
+    stiffness: BarStiffness
     start: np.ndarray
     change: np.ndarray
-    lengths: np.ndarray
 
 
 class _Linear:
@@ -364,40 +383,31 @@ class _Linear:
             model.mesh.update_ghosts(x)
         self.x = x
 
-    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Stiffness (5, b), axial forces (b,) and internal forces (owned, 3) at the start's positions and the
-        temperatures and rest lengths of a time."""
+    def at(self, time: float) -> tuple[BarStiffness, np.ndarray, np.ndarray]:
+        """Stiffness, axial forces (b,) and internal forces (owned, 3) at the start's positions and the temperatures
+        and rest lengths of a time."""
         model, forces = self.model, np.zeros_like(self.x)
         model.change_bars(time)
         with model.bars.without_rates():
             model.bars.forces(self.x, forces, commit=False)
-        bars = model.bars.state_stiffness(self.x)
-        return bars, bars[4] * model.bars.lengths(self.x), forces[: model.mesh.n_owned]
+        bars = BarStiffness.of(model, self.x, model.bars.state_stiffness(self.x))
+        return bars, bars.across * bars.lengths, forces[: model.mesh.n_owned]
 
-    def solve(self, bars: np.ndarray, load: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    def solve(self, bars: BarStiffness, load: np.ndarray, moved: np.ndarray) -> np.ndarray:
         """Displacements (local, 3) by loads (owned, 3) and prescribed components (k,)."""
         model, holds = self.model, self.matrices.holds
         u = np.zeros_like(self.x)
         owned = u[: len(load)]
         model.supports.put(owned, moved)
-        model.mesh.update_ghosts(u)
-        rest = holds.to_own((load - self._product(bars, u))[None])[0]
-        matrix = self.matrices.stiffness(bars, max(float(np.abs(bars[3] + bars[4]).max(initial=0.0)), 1.0))
+        whole = self.matrices.whole(bars)
+        moves, resisting = whole.createVecs()
+        moves.array[:] = owned.ravel()
+        whole.mult(moves, resisting)
+        rest = holds.to_own((load - resisting.array.reshape(load.shape))[None])[0]
+        matrix = holds.taken_out(whole, max(float(np.abs(bars.along).max(initial=0.0)), 1.0))
         owned += holds.to_axes(self._free(matrix, rest)[None])[0]
         model.mesh.update_ghosts(u)
         return u
-
-    def _product(self, bars: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Forces (owned, 3) that resist displacements (local, 3)."""
-        ends, owned = self.model.mesh.bars, self.model.mesh.n_owned
-        d = u[ends[:, 1]] - u[ends[:, 0]]
-        force = bars[3] * (bars[:3].T * d).sum(axis=1) * bars[:3] + bars[4] * d.T
-        out = np.zeros_like(u)
-        np.subtract.at(out, ends[:, 0], force.T)
-        np.add.at(out, ends[:, 1], force.T)
-        for family in self.model.bars.families:
-            family.add_product(1.0, u, out)
-        return out[:owned]
 
     def _free(self, matrix: PETSc.Mat, load: np.ndarray) -> np.ndarray:
         """Solve for the components that are not held."""
@@ -458,19 +468,19 @@ def linear_forces(model: Model, matrices: StateMatrices, begin: float, end: floa
             bars.put_history(np.zeros_like(history))
         stiffness, force, internal = linear.at(begin)
         acting = loads(begin) if loaded else np.zeros_like(x)
-        tangent = stiffness[3] + stiffness[4]
+        ends, lengths = model.mesh.bars, stiffness.lengths
 
         def stretching(u: np.ndarray) -> np.ndarray:
-            return tangent * ((u[model.mesh.bars[:, 1]] - u[model.mesh.bars[:, 0]]) * stiffness[:3].T).sum(axis=1)
+            d, du = (values[ends[:, 1]] - values[ends[:, 0]] for values in (linear.x, u))
+            return stiffness.along * (du * d).sum(axis=1) / lengths
 
         u = linear.solve(stiffness, acting - internal, supports.lacking(x, begin))
-        start, lengths = force + stretching(u), bars.lengths(linear.x)
-        stiffness[4] = start / lengths
-        stiffness[3] = tangent - stiffness[4]
+        start = force + stretching(u)
+        stiffness = stiffness._replace(across=start / lengths)
         _, forced, resisting = linear.at(end)
         added = loads(end) - acting - (resisting - internal)
         u = linear.solve(stiffness, added, supports.positions(end) - supports.positions(begin))
-        return LinearForces(stiffness, start, forced - force + stretching(u), lengths)
+        return LinearForces(stiffness, start, forced - force + stretching(u))
     finally:
         bars.put_history(history)
         model.change_bars(end)

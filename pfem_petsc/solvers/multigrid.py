@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from petsc4py import PETSc
+from scipy.sparse import bsr_array, csr_array
 
 from ..mechanics.compiled import kernel
-from ..mechanics.elements import expand_columns
 from ..mesh.exchange import Router
-from .background_grid import BackgroundGrid, Summands, arrange, assemble, interpolate, neighbours, restrict, stabilise
+from .background_grid import BackgroundGrid, Summands, assemble, interpolate, restrict
 from .linear import reproducible_products
 from .matrix_free import MatrixFreeHessian, full_blocks
 
@@ -27,17 +27,13 @@ class CoarseMatrix:
 
     def __init__(self, grid: BackgroundGrid) -> None:
         self.grid = grid
-        elements, local = grid.elements, len(grid.numbers)
-        flat = elements.corners.ravel()
-        order = np.argsort(flat, kind="stable")
-        order = order[np.count_nonzero(flat < 0) :]
-        starts = np.searchsorted(flat[order], np.arange(local + 1))
-        of_corner = (order // 16).astype(np.int32)
-        self._ptr = np.zeros(local + 1, np.int64)
-        count = neighbours(elements.corners, starts, of_corner, self._ptr, np.empty(0, np.int32))
-        self._columns = np.empty(count, np.int32)
-        if count:
-            neighbours(elements.corners, starts, of_corner, self._ptr, self._columns)
+        corners = grid.elements.corners
+        starts = np.append(0, np.cumsum((corners >= 0).sum(axis=1)))
+        columns = corners[corners >= 0]
+        meets = csr_array((np.ones(len(columns)), columns, starts), shape=(len(corners), len(grid.numbers)))
+        neighbours = (meets.T @ meets).tocsr()  # in an element
+        neighbours.sort_indices()
+        self._ptr, self._columns = neighbours.indptr.astype(np.int64), neighbours.indices.astype(np.int32)
         self._agree()
 
     def _agree(self) -> None:
@@ -52,16 +48,11 @@ class CoarseMatrix:
         all_rows = np.concatenate([rows[: self._n_own], arrived[:, 0] - grid.first])
         keys = all_rows * grid.total + np.concatenate([columns[: self._n_own], arrived[:, 1]])
         unique, slots = np.unique(keys, return_inverse=True)
-        self._slots = slots.astype(np.int64)
-        self._row_of = unique // max(grid.total, 1)
-        block_columns = unique - self._row_of * grid.total
-        self._block_ptr = np.zeros(owned + 1, np.int64)
-        np.cumsum(np.bincount(self._row_of, minlength=owned), out=self._block_ptr[1:])
-        self._diagonal = np.flatnonzero(block_columns == self._row_of + grid.first)
-        widths = np.repeat(3 * np.diff(self._block_ptr), 3)
-        self._pointers = np.concatenate([[0], np.cumsum(widths)]).astype(PETSc.IntType)
-        self._scalar_columns = np.empty(int(self._pointers[-1]), PETSc.IntType)
-        expand_columns(self._block_ptr, block_columns, self._scalar_columns)
+        self._slots = slots
+        row_of = unique // max(grid.total, 1)
+        self._block_columns = unique - row_of * grid.total
+        self._block_ptr = np.append(0, np.cumsum(np.bincount(row_of, minlength=owned)))
+        self._diagonal = np.flatnonzero(self._block_columns == row_of + grid.first)
 
     def make(self, parts: Summands) -> PETSc.Mat:
         """Return the matrix of what it is summed of. Collective."""
@@ -69,15 +60,14 @@ class CoarseMatrix:
         blocks = np.zeros((len(self._columns), 3, 3))
         assemble(grid.t, grid.base, grid.elements, parts, (self._ptr, self._columns), blocks)
         arrived = self._router.send(blocks[self._n_own :].reshape(-1, 9)).reshape(-1, 3, 3)
-        values = np.zeros(len(self._scalar_columns))
-        own = self._n_own
-        arrange(blocks[:own], self._slots[:own], self._block_ptr, self._row_of, values)
-        arrange(arrived, self._slots[own:], self._block_ptr, self._row_of, values)
-        stabilise(self._block_ptr, self._diagonal, _SHIFT, values)
+        values = np.zeros((len(self._block_columns), 3, 3))
+        np.add.at(values, self._slots, np.concatenate([blocks[: self._n_own], arrived]))
+        at = self._diagonal[:, None], np.arange(3), np.arange(3)
+        values[at] = np.where(values[at] > 0.0, values[at] * (1.0 + _SHIFT), 1.0)
         size = (3 * grid.n_owned, 3 * grid.total)
-        matrix = PETSc.Mat().createAIJ(
-            (size, size), bsize=3, csr=(self._pointers, self._scalar_columns, values), comm=grid.comm
-        )
+        rows = bsr_array((values, self._block_columns, self._block_ptr), shape=size).tocsr()
+        pattern = rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType)
+        matrix = PETSc.Mat().createAIJ((size, size), bsize=3, csr=(*pattern, rows.data), comm=grid.comm)
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         return matrix
 
@@ -161,13 +151,11 @@ class GridMultigrid:
         """Do nothing: with coordinates of rows the diagonal is the preconditioner."""
 
     def make(self, problem: StepProblem, held: np.ndarray) -> None:
-        """Set up at the positions of a problem; ``held`` (local, 3) nonzero for active unknowns, ghosts not yet up to
-        date. Collective."""
-        owned = self.mesh.n_owned
+        """Set up at the positions of a problem; ``held`` (owned, 3) nonzero for active unknowns. Collective."""
         product = self.product
         product.linearise(problem)
         product.make_definite()
-        active = held[:owned] != 0.0
+        active = held != 0.0
         product.extension.kept = np.flatnonzero(~active) if active.any() else None
         self.reduced = not problem.transform.nodewise
         if self.reduced:
@@ -193,18 +181,11 @@ class GridMultigrid:
     def _free_parts(self, active: np.ndarray, framed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the owned nodes with prescribed or active components or frames (k,), ascending, and the projections
         (k, 3, 3) of their unknowns on those left free."""
-        supports = self.model.supports
-        held = active | supports.fixed if supports.any else active
-        special = held.any(axis=1)
+        held = np.maximum(self.model.supports.spans(), np.eye(3) * active[:, :, None])
+        special = held.any(axis=(1, 2))
         special[framed] = True
-        inclined = supports.inclined if supports.any else None
-        if inclined is not None:
-            special[inclined.nodes] = True
         nodes = np.flatnonzero(special)
-        kept = np.eye(3) * ~held[nodes][:, :, None]
-        if inclined is not None:
-            kept[np.searchsorted(nodes, inclined.nodes)] = inclined.free
-        return nodes, kept
+        return nodes, np.eye(3) - held[nodes]
 
     def _make_coarse(self, problem: StepProblem, nodes: np.ndarray, turned: np.ndarray) -> None:
         mesh, product = self.mesh, self.product

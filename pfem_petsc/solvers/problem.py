@@ -26,39 +26,6 @@ def add_up(nodal, u, known, weight, f, g):
 
 
 @kernel
-def squares(mass, v, external, internal):
-    """Return the sums of the squares of mass v, of external and of internal forces (owned, 3)."""
-    sums = np.zeros((3, 3))
-    for i in range(len(mass)):
-        for c in range(3):
-            sums[0, c] += (mass[i] * v[i, c]) ** 2
-            sums[1, c] += external[i, c] ** 2
-            sums[2, c] += internal[i, c] ** 2
-    return sums.sum(axis=1)
-
-
-@kernel
-def net_force(g, nodal):
-    """Return the sums (4,) of forces (owned, 3) and of ``nodal`` (owned,)."""
-    x = y = z = total = 0.0
-    for i in range(len(nodal)):
-        x += g[i, 0]
-        y += g[i, 1]
-        z += g[i, 2]
-        total += nodal[i]
-    return np.array([x, y, z, total])
-
-
-@kernel
-def translate(shift, nodal, u, g):
-    """Subtract a translation (3,) from increments, and what it changes of the residual, both (owned, 3)."""
-    for i in range(len(nodal)):
-        for c in range(3):
-            u[i, c] -= shift[c]
-            g[i, c] -= nodal[i] * shift[c]
-
-
-@kernel
 def largest_distance(one, other):
     """Return the largest distance of nodes between positions (n, 3); NaN if any is not a number."""
     largest = 0.0
@@ -70,25 +37,6 @@ def largest_distance(one, other):
             if square != square:
                 break
     return np.sqrt(largest)
-
-
-@kernel
-def motion_energy(momentum, v, forces, before, after):
-    """Return half of the sum of momentum times velocity, and of the magnitudes of the work of ``forces``, a tuple of
-    vectors (owned, 3) that are added, between two positions."""
-    first, second, third = forces
-    x = y = z = 0.0
-    for i in range(len(v)):
-        for c in range(3):
-            work = (first[i, c] + second[i, c] + third[i, c]) * (after[i, c] - before[i, c])
-            part = momentum[i, c] * v[i, c] + abs(work)
-            if c == 0:
-                x += part
-            elif c == 1:
-                y += part
-            else:
-                z += part
-    return 0.5 * (x + y + z)
 
 
 @kernel

@@ -135,20 +135,16 @@ class Stability:
 
         It is -1 where the stiffness cannot be factorised.
 
-        ``walls`` says which nodes walls push, ``time`` where the walls are; ``bars`` (5, b) is their stiffness if not
-        the tangent, see ``Bars.linearise``. Collective.
+        ``walls`` says which nodes walls push, ``time`` where the walls are; ``bars`` (2, b) is their stiffness if not
+        the tangent, see ``Bars.stiffnesses``. Collective.
         """
         nodes, blocks = self._held(walls, time)
         model, matrix, scale = self.model, self.matrix, stiffest(self.model)
 
         def add(values: np.ndarray) -> None:
             matrix.add_lumped(np.full(model.mesh.n_owned, _RIGID_MOTION * scale), values)
-            if bars is None:
-                model.bars.tangents(x, 1.0, model.inertia.coefficients(0.0, 0.0), matrix.pattern, values)
-            else:
-                matrix.add_bars(bars, values)
-                if model.bars.springs is not None:
-                    model.bars.springs.add_tangents(1.0, matrix.pattern, values)
+            none = model.inertia.coefficients(0.0, 0.0)
+            model.bars.tangents(x, 1.0, none, matrix.pattern, values, stored=bars)
             matrix.pattern.add_blocks(nodes, _RIGID * scale * blocks, values)
             matrix.constrain(scale, values)
 

@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import inlined, kernel
-from ..mechanics.records import record
+from ..mechanics.compiled import inlined, kernel, record
 from .explicit import impact_square, rebound_lift
 from .projection import Groups, RowPushes, System, project_groups
 from .rows import FreeNodes, RowSet, find_broken, pair_values

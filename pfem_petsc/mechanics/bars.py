@@ -11,13 +11,14 @@ import numpy as np
 from mpi4py import MPI
 
 from ..case.tables import FIELD_KEYS, FieldValue
-from ..columns import BAR_ENERGIES, STATUS, STORED
+from ..columns import BAR_ENERGIES, OF_BARS, STATUS, STORED
 from ..errors import InputError
 from ..mesh import load_slab
-from ..mesh.distribution import group_hint
+from ..mesh.distribution import bars_of_group, group_hint
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
-from .chunk_laws import STRESS, densities_row, evaluate, first_class, flatten, law_loops, work_rows
+from .chunk_laws import first_class, flatten, law_loops, work_rows
+from .compiled import by_reference
 from .elements import (
     MEASURES,
     ElementFamily,
@@ -53,13 +54,12 @@ from .layout import (
     spread_values,
 )
 from .materials.base import BarShapes, Law, UnsuitableBarError, internal_variables, law_of
-from .records import by_reference
-from .rupture import breakable, intact, limit_values
+from .rupture import breakable, limit_values
 from .springs import Springs, connected, connector_modulus
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..case.tables import Section
+    from ..case.tables import BarProbe, Section
     from ..mesh.distribution import DistributedMesh
     from ..mesh.slab import MeshSlab
     from .elements import BlockPattern
@@ -824,56 +824,6 @@ class Bars:
                 block.put_row(number, history[block.start : block.stop, names.index(name)])
 
 
-def state_before_rupture(bars: Bars, x: np.ndarray, bar: int) -> tuple[BarBlock, np.ndarray, float, float]:
-    """Return the block of a bar (local index), its data (rows,), and its stress [Pa] and strain without the thermal
-    strain at positions ``x``, as if it had not broken."""
-    block = next(block for block in bars.blocks if block.start <= bar < block.stop)
-    k = bar - block.start
-    law, history = block.law, block.history[:, k : k + 1].copy()
-    history[law.rupture] = 0.0
-    length = float(np.linalg.norm(np.subtract(*x[bars.ends[bar]])))
-    shift, temperature = bars.heat[:, bar] if bars.heat.shape[1] else (0.0, 0.0)
-    strain = block.measure(length / bars.rest[bar])[0] - shift
-    if law.rate:
-        stress = history[len(law.internal) + 1, 0]
-    else:
-        stress = evaluate(law, block.parameters, strain, temperature, history)[STRESS, 0]
-    return block, history[:, 0], float(stress), float(strain)
-
-
-def release(bars: Bars, x: np.ndarray, members: np.ndarray, state: float) -> np.ndarray:
-    """Remove bars (local indices) up to a share, see :mod:`~pfem_petsc.mechanics.rupture`; return by how much the
-    energies of the bars counted on this rank change, in the order of :data:`~pfem_petsc.columns.BAR_ENERGIES`."""
-    change = np.zeros(len(BAR_ENERGIES))
-    for block in bars.blocks:
-        mine = members[(members >= block.start) & (members < block.stop)]
-        history = block.history.copy()
-        mine = mine[np.abs(history[block.law.rupture, mine - block.start]) < state]
-        if not len(mine):
-            continue
-        here, count = mine - block.start, block.law.rupture  # variables of the law of intact bars come first
-        law, parameters = intact(block.law, block.parameters)
-        ends = x[bars.ends[mine]]
-        stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / bars.rest[mine]
-        strain = np.array([block.measure(value)[0] for value in stretch])
-        shift, temperature = bars.heat[:, mine] if bars.heat.shape[1] else (0.0, 0.0)
-        rows = history[:count, here], np.zeros((len(law.rows) - count, len(mine))), history[len(block.law.rows) :, here]
-        found = evaluate(law, parameters, strain - shift, temperature, np.vstack(rows))
-        densities = found[densities_row(law) :]
-        lost = (state - np.abs(history[count, here])) * densities
-        history[count + 1 : count + 1 + len(lost), here] += lost
-        # one that has begun to break counts as broken
-        history[count, here] = np.where(history[count, here] > 0.0, state, -state)
-        for number in range(count, count + 1 + len(lost)):
-            block.put_row(number, history[number])
-        volume = np.broadcast_to(block.area, block.stop - block.start)[here] * bars.rest[mine] * (mine < block.counted)
-        for name, energy in zip(law.energies, (lost @ volume).tolist(), strict=True):
-            if name in STORED:
-                change[BAR_ENERGIES.index(name)] -= energy
-                change[BAR_ENERGIES.index("rupture_dissipation")] += energy
-    return change
-
-
 def viscous_rate(case: Case, bars: Bars, mass: np.ndarray, consistent: bool) -> float:
     """Return an upper bound of the eigenvalues of C over M [1/s] of dashpots between nodes. Collective.
 
@@ -892,3 +842,66 @@ def viscous_rate(case: Case, bars: Bars, mass: np.ndarray, consistent: bool) -> 
                 np.add.at(sums, bars.ends[part, end], 2.0 * values)
     largest = float((sums[: len(mass)] / mass).max(initial=0.0))
     return (3.0 if consistent else 1.0) * bars.mesh.comm.allreduce(largest, op=MPI.MAX)
+
+
+class ProbedBars:
+    """The bars of all ``[[output.bar_probe]]``, whose strain, stress and axial force are in each row of the history.
+    Construction is collective.
+
+    A row has them by probe, by quantity of :data:`~pfem_petsc.columns.OF_BARS`, and by mesh number. Each bar is counted
+    on one rank, so that the sum of the ranks' shares is the row's values.
+
+    Attributes
+    ----------
+    ids : name of a probe to the mesh numbers of its bars on all ranks, ascending
+    width : numbers of all probes in a row
+
+    Raises
+    ------
+    InputError
+        On all ranks, for a group that the mesh does not have, a number out of range, or a probe without bars.
+    """
+
+    def __init__(self, case: Case, mesh: DistributedMesh) -> None:
+        self.ids: dict[str, np.ndarray] = {}
+        self.width = 0
+        counted = np.arange(len(mesh.bars))[mesh.counted]
+        local, places = [np.empty(0, dtype=np.int64)], [np.empty((len(OF_BARS), 0), dtype=np.int64)]
+        for number, probe in enumerate(case.output.bar_probe):
+            chosen = np.intersect1d(_chosen(case, mesh, f"output.bar_probe[{number}]", probe, counted), counted)
+            ids = np.sort(np.concatenate(mesh.comm.allgather(mesh.bar_ids[chosen].astype(np.int64))))
+            if not len(ids):
+                raise InputError(f"{case.source}: output.bar_probe[{number}].bars = {str(probe.bars)!r}: has no bars")
+            local.append(chosen)
+            order = np.searchsorted(ids, mesh.bar_ids[chosen])
+            places.append(self.width + np.arange(len(OF_BARS))[:, None] * len(ids) + order)
+            self.ids[probe.name] = ids
+            self.width += len(OF_BARS) * len(ids)
+        self._local, self._places = np.concatenate(local), np.hstack(places)
+
+    def fill(self, bars: Bars, x: np.ndarray, share: np.ndarray) -> None:
+        """Write the values of the bars that are counted on this rank to its share (width,), at positions ``x``."""
+        if len(self._local):
+            share[self._places] = bars.axial(x)[:, self._local]
+
+
+def _chosen(case: Case, mesh: DistributedMesh, key: str, probe: BarProbe, counted: np.ndarray) -> np.ndarray:
+    """Return the local bars of a probe, with those that other ranks count. Collective."""
+    if probe.bars is not None:
+        return bars_of_group(case, mesh, f"{key}.bars", str(probe.bars))
+    ids = mesh.bar_ids[counted]
+    if probe.indices is not None:
+        last = mesh.n_bars - mesh.n_connectors - 1
+        outside = [number for number in probe.indices if number > last]
+        if outside:
+            raise InputError(
+                f"{case.source}: {key}.indices: bar {outside[0]} does not exist; the mesh has bars 0 to {last}"
+            )
+        return counted[np.isin(ids, probe.indices)]
+    real = counted[ids < mesh.n_bars - mesh.n_connectors]
+    middles = mesh.points[mesh.bars[real]].mean(axis=1)
+    distance = np.linalg.norm(middles - np.array(probe.nearest), axis=1)
+    shortest = mesh.comm.allreduce(float(distance.min(initial=np.inf)), op=MPI.MIN)
+    nearest = real[distance == shortest]
+    first = mesh.comm.allreduce(int(mesh.bar_ids[nearest].min(initial=mesh.n_bars)), op=MPI.MIN)
+    return nearest[mesh.bar_ids[nearest] == first]

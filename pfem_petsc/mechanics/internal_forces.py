@@ -27,7 +27,7 @@ from .chunk_laws import (
     TEMPERATURE,
     TEMPERATURE0,
 )
-from .compiled import add_freely, inlined, kernel
+from .compiled import add_freely, inlined, kernel, record
 from .elements import (
     COLLAPSED_STRETCH,
     ENGINEERING,
@@ -41,7 +41,6 @@ from .elements import (
     measured,
 )
 from .layout import DIFFERENCES, BarLayout, aligned, group_of, run_column
-from .records import record
 
 # Functions that are called for each group take whole arrays and where to begin: a part of an array, or a record of
 # arrays as an argument, counts references, which takes as long as several bars. Indices without a sign need no

@@ -10,8 +10,7 @@ import numpy as np
 
 from ..mesh.ordering import LEAST_RUN, NODE_BLOCK
 from .chunk_laws import CHUNK
-from .compiled import inlined, kernel
-from .records import record
+from .compiled import inlined, kernel, record
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -13,10 +13,10 @@ import numpy as np
 from mpi4py import MPI
 
 from ..contact.neighbours import Points, Segments, find_pairs
-from ..mechanics.compiled import kernel
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..mesh.tools import components
+from ..solvers.matrix_free import add_blocks, full_blocks
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -41,9 +41,11 @@ class Geometry:
     @cached_property
     def _held(self) -> np.ndarray:
         """(owned, 3, 3) Sums of d d^T over the directions d of the bars of each node."""
-        total = np.zeros((self._mesh.n_owned, 3, 3))
-        _add_directions(self._mesh.points, self._mesh.bars, total)
-        return total
+        mesh, stored = self._mesh, np.zeros((2, len(self._mesh.bars)))
+        stored[0] = self._model.bars.mesh_lengths**-2.0
+        blocks = np.zeros((mesh.n_local, 6))
+        add_blocks(mesh.bars, mesh.points, stored, blocks)
+        return full_blocks(blocks[: mesh.n_owned])
 
     @cached_property
     def span(self) -> np.ndarray:
@@ -60,15 +62,16 @@ class Geometry:
     def parts(self) -> tuple[int, int, int]:
         """Return the number of connected parts, and the size and lowest node number of the smallest one.
 
-        Every node gets the lowest mesh number that it is connected to: within a rank by compiled sweeps, between ranks
-        by the exchange of ghosts, repeated until no rank changes anything.
+        Every node gets the lowest mesh number that it is connected to: within a rank at once, between ranks by the
+        exchange of ghosts, repeated until no rank changes anything.
         """
         mesh, comm, owned = self._mesh, self._comm, self._mesh.n_owned
         label = mesh.node_ids[: mesh.n_local].astype(np.float64).reshape(-1, 1)  # whole numbers, exact to 2^53
-        changed = True
+        part, changed = components(mesh.n_local, mesh.bars), True
         while changed:
             before = label[:owned].copy()
-            _spread(mesh.bars, label[:, 0])
+            np.minimum.at(label, part, label.copy())
+            label = label[part]
             mesh.update_ghosts(label)
             # a ghost may have a lower number, and this rank's own numbers may still have to propagate
             changed = comm.allreduce(not np.array_equal(before, label[:owned]), op=MPI.LOR)
@@ -189,42 +192,3 @@ def _rigid_motions(arms: np.ndarray, held: np.ndarray, span: np.ndarray) -> int:
     _, values, vectors = np.linalg.svd(stopped, full_matrices=True)
     allowed = vectors[int((values > 1e-9).sum()) :].T
     return int(np.linalg.matrix_rank(motions.reshape(-1, 6) @ allowed, tol=1e-9)) if allowed.size else 0
-
-
-@kernel
-def _add_directions(points, bars, total):
-    for k in range(len(bars)):
-        a, b = bars[k, 0], bars[k, 1]
-        x, y, z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
-        length = np.sqrt(x * x + y * y + z * z)
-        x, y, z = x / length, y / length, z / length
-        for end in (a, b):
-            if end < len(total):
-                sums = total[end]
-                sums[0, 0] += x * x
-                sums[1, 1] += y * y
-                sums[2, 2] += z * z
-                sums[0, 1] += x * y
-                sums[0, 2] += x * z
-                sums[1, 2] += y * z
-    for end in range(len(total)):
-        for i in range(3):
-            for j in range(i):
-                total[end, i, j] = total[end, j, i]
-
-
-@kernel
-def _spread(bars, label):
-    """Assign the lower label to both ends of each bar until nothing changes, in forward and backward sweeps."""
-    changed = True
-    while changed:
-        changed = False
-        for sweep in range(2):
-            for i in range(len(bars)):
-                k = i if sweep == 0 else len(bars) - 1 - i
-                a = bars[k, 0]
-                b = bars[k, 1]
-                if label[a] != label[b]:
-                    changed = True
-                    label[a] = min(label[a], label[b])
-                    label[b] = label[a]

@@ -61,8 +61,8 @@ def made(simulation):
     )
     problem.place(problem.increment(np.zeros_like(stepper.state.v)))
     multigrid = GridMultigrid(simulation.model)
-    held = np.zeros((simulation.mesh.n_local, 3))
-    held[: simulation.mesh.n_owned][simulation.mesh.node_ids[: simulation.mesh.n_owned] % 7 == 3, 1] = 1.0
+    held = np.zeros((simulation.mesh.n_owned, 3))
+    held[simulation.mesh.node_ids[: simulation.mesh.n_owned] % 7 == 3, 1] = 1.0
     inclined = simulation.model.supports.inclined
     if inclined is not None:  # walls cannot hold these nodes
         held[inclined.nodes] = 0.0

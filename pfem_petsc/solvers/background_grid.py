@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
+from scipy.sparse import csr_array
 
 from ..mechanics.compiled import inlined, kernel
 from ..mesh.exchange import GhostExchange, Router
@@ -35,36 +36,6 @@ def _first_planes(t: np.ndarray, shape: np.ndarray) -> np.ndarray:
 def _numbers(low: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Return the numbers of the boxes or corners at planes ``low`` (..., 3)."""
     return (low[..., 0] * shape[1] + low[..., 1]) * shape[2] + low[..., 2]
-
-
-@kernel
-def interpolate(t, box, base, corners, coarse, fine):
-    """Write the values (owned, 3) of nodes from those of corners."""
-    w = np.zeros(8)
-    for k in range(len(fine)):
-        corner_weights(t, k, base, box[k], w, 0)
-        x = y = z = 0.0
-        for i in range(8):
-            at = corners[box[k], i]
-            x += w[i] * coarse[at, 0]
-            y += w[i] * coarse[at, 1]
-            z += w[i] * coarse[at, 2]
-        fine[k, 0] = x
-        fine[k, 1] = y
-        fine[k, 2] = z
-
-
-@kernel
-def restrict(t, box, base, corners, fine, coarse):
-    """Add the transpose of :func:`interpolate`."""
-    w = np.zeros(8)
-    for k in range(len(fine)):
-        corner_weights(t, k, base, box[k], w, 0)
-        for i in range(8):
-            at = corners[box[k], i]
-            coarse[at, 0] += w[i] * fine[k, 0]
-            coarse[at, 1] += w[i] * fine[k, 1]
-            coarse[at, 2] += w[i] * fine[k, 2]
 
 
 # Spacing of the planes over the mean length of the bars. Lattices of 10^5 bars, iterations to 1e-6 and time: 2 is best
@@ -200,6 +171,7 @@ class BackgroundGrid:
     t : (local, 3) positions of nodes counted in planes
     base : (boxes, 3) int32, first planes of each box on this rank; corners : (boxes, 8) int32, their local numbers
     box : (owned,) int32, box of each node
+    prolongation : (owned, local corners) sparse matrix of the weights of corners
     elements : Elements
     numbers : (local corners,) int64, numbers of the corners, first the ``n_owned`` owned ones, then those of other
         ranks, ascending; first, total : first number owned, and how many there are
@@ -225,6 +197,7 @@ class BackgroundGrid:
         corner = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
         at = np.minimum(low[:, None, :] + corner, shape - 1)
         self._number(_numbers(at, shape), int(np.prod(shape)))
+        self.prolongation = self._prolong(corner)
         pairs = self.elements.boxes
         both = self.corners[pairs]
         both[pairs < 0] = -1
@@ -232,6 +205,15 @@ class BackgroundGrid:
         key = self._keys
         along = key // (shape[1] * shape[2]), key // shape[2] % shape[1], key % shape[2]
         self.positions = np.stack([planes[i][along[i]] for i in range(3)], axis=1)
+
+    def _prolong(self, corner: np.ndarray) -> csr_array:
+        """Return the sparse matrix (owned, local corners) from values of corners to those of nodes."""
+        owned = len(self.box)
+        parts = (self.t[:owned] - self.base[self.box])[:, None]
+        weights = np.where(corner, parts, 1.0 - parts).prod(axis=2)
+        starts = np.arange(0, weights.size + 1, len(corner))
+        entries = weights.ravel(), self.corners[self.box].ravel(), starts
+        return csr_array(entries, shape=(owned, len(self.numbers)))
 
     def _make_elements(
         self, mesh: DistributedMesh, boxes: np.ndarray, node_box: np.ndarray, bar_box: np.ndarray

@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import itertools
 import weakref
-from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -37,25 +36,21 @@ if TYPE_CHECKING:
     from .problem import StepProblem
 
 
+_ALIVE: dict[int, weakref.ref] = {}
+"""PETSc objects that exist, by number in the order of their creation."""
 _NUMBERS = itertools.count()
-_ALIVE: dict[int, tuple[Callable[[weakref.ref], None], weakref.ref]] = {}
 
 
-def at_exit(function: Callable[[weakref.ref], None], thing: object) -> None:
-    """Call a function with a reference to a PETSc object when Python exits, if the object still exists then.
+def outlive_at_exit(thing: object) -> None:
+    """Let a matrix, or a linear or nonlinear solver, :func:`outlive` Python if it still exists when Python exits.
 
     Unlike ``atexit.register``, it keeps nothing of an object that is gone, of which a program that makes many runs has
     many.
     """
     number = next(_NUMBERS)
     if not number:
-        atexit.register(_call_all)
-    _ALIVE[number] = function, weakref.ref(thing, lambda _: _ALIVE.pop(number, None))
-
-
-def _call_all() -> None:
-    for function, reference in reversed(list(_ALIVE.values())):
-        function(reference)
+        atexit.register(lambda: [outlive(thing) for thing in reversed(list(_ALIVE.values()))])
+    _ALIVE[number] = weakref.ref(thing, lambda _: _ALIVE.pop(number, None))
 
 
 def outlive(reference: weakref.ref) -> None:
@@ -346,7 +341,7 @@ class Extension:
         self.mat = python_matrix(Context(self), whole.mesh)
         self.mat.setBlockSize(3)
         self.mat.setUp()
-        at_exit(outlive, self.mat)
+        outlive_at_exit(self.mat)
 
     def times(self, given: np.ndarray, out: np.ndarray) -> None:
         """Compute ``out`` = H ``given``, both (owned, 3) and contiguous. Collective."""
@@ -379,20 +374,6 @@ def add_blocks(bars, x, stored, blocks):
             blocks[i, 5] += c * dz * dz + g
 
 
-@kernel
-def drop_negative(bars, x, stored):
-    """Replace negative eigenvalues of the bars' stiffness, g and c d.d + g, by zero."""
-    for k in range(len(bars)):
-        c, g = stored[0, k], stored[1, k]
-        if c >= 0.0 and g >= 0.0:
-            continue
-        dx, dy, dz = end_difference(x, bars, k)
-        square = dx * dx + dy * dy + dz * dz
-        left = max(g, 0.0)
-        stored[0, k] = (max(c * square + g, 0.0) - left) / square if square > 0.0 else 0.0
-        stored[1, k] = left
-
-
 class MatrixFreeHessian:
     """Matrix-free replacement of :class:`~pfem_petsc.solvers.matrix.HessianMatrix` for symmetric schemes.
 
@@ -411,7 +392,7 @@ class MatrixFreeHessian:
         self.mesh = mesh
         self.mat = python_matrix(Context(self), mesh)
         self.mat.setUp()
-        at_exit(outlive, self.mat)
+        outlive_at_exit(self.mat)
         self.bounded = self.mat
         self.bars = BarProducts(model.bars)
         self.x, self.stored = self.bars.x, self.bars.stored
@@ -448,7 +429,10 @@ class MatrixFreeHessian:
 
     def make_definite(self) -> None:
         """Drop negative eigenvalues of the bars' stiffness, due to compression or softening laws."""
-        drop_negative(self.mesh.bars, self.x, self.stored)
+        square, (c, g) = self.model.bars.lengths(self.x) ** 2, self.stored
+        axial = np.maximum(c * square + g, 0.0)
+        np.maximum(g, 0.0, out=g)
+        np.divide(axial - g, square, out=c, where=square > 0.0)
         self._take()
 
     @cached_property

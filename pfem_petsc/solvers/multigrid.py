@@ -10,7 +10,7 @@ from scipy.sparse import bsr_array, csr_array
 
 from ..mechanics.compiled import kernel
 from ..mesh.exchange import Router
-from .background_grid import BackgroundGrid, Summands, assemble, interpolate, restrict
+from .background_grid import BackgroundGrid, Summands, assemble
 from .linear import reproducible_products
 from .matrix_free import MatrixFreeHessian, full_blocks
 
@@ -72,41 +72,24 @@ class CoarseMatrix:
         return matrix
 
 
-@kernel
-def invert(blocks):
-    """Invert symmetric matrices (n, 6): xx, xy, xz, yy, yz, zz, in place; singular ones become zero."""
-    for k in range(len(blocks)):
-        a, b, c, d, e, f = blocks[k]
-        xx, xy, xz = d * f - e * e, c * e - b * f, b * e - c * d
-        determinant = a * xx + b * xy + c * xz
-        inverse = 1.0 / determinant if determinant > 0.0 else 0.0
-        blocks[k, 0] = xx * inverse
-        blocks[k, 1] = xy * inverse
-        blocks[k, 2] = xz * inverse
-        blocks[k, 3] = (a * f - c * c) * inverse
-        blocks[k, 4] = (b * c - a * e) * inverse
-        blocks[k, 5] = (a * d - b * b) * inverse
+def inverses(blocks: np.ndarray) -> np.ndarray:
+    """Return the inverses of symmetric matrices (n, 3, 3); zeros for singular ones."""
+    adjugate = np.stack([np.cross(blocks[:, i - 2], blocks[:, i - 1]) for i in range(3)], axis=2)
+    determinant = np.einsum("ni,ni->n", blocks[:, 0], adjugate[:, :, 0])[:, None, None]
+    return np.divide(adjugate, determinant, out=np.zeros_like(blocks), where=determinant > 0.0)
 
 
 @kernel
 def smooth(inverse, product, of_last, of_residual, r, z, x):
-    """Subtract the product from the residual r, and make a step z of the polynomial: all (n, 3)."""
+    """Subtract the product from the residual r, and make a step z of the polynomial, all (n, 3), with the ``inverse``
+    (n, 3, 3) of the blocks on the diagonal."""
     for k in range(len(r)):
-        r0 = r[k, 0] - product[k, 0]
-        r1 = r[k, 1] - product[k, 1]
-        r2 = r[k, 2] - product[k, 2]
-        r[k, 0] = r0
-        r[k, 1] = r1
-        r[k, 2] = r2
-        z0 = of_last * z[k, 0] + of_residual * (inverse[k, 0] * r0 + inverse[k, 1] * r1 + inverse[k, 2] * r2)
-        z1 = of_last * z[k, 1] + of_residual * (inverse[k, 1] * r0 + inverse[k, 3] * r1 + inverse[k, 4] * r2)
-        z2 = of_last * z[k, 2] + of_residual * (inverse[k, 2] * r0 + inverse[k, 4] * r1 + inverse[k, 5] * r2)
-        z[k, 0] = z0
-        z[k, 1] = z1
-        z[k, 2] = z2
-        x[k, 0] += z0
-        x[k, 1] += z1
-        x[k, 2] += z2
+        for i in range(3):
+            r[k, i] -= product[k, i]
+        for i in range(3):
+            along = inverse[k, i, 0] * r[k, 0] + inverse[k, i, 1] * r[k, 1] + inverse[k, i, 2] * r[k, 2]
+            z[k, i] = of_last * z[k, i] + of_residual * along
+            x[k, i] += z[k, i]
 
 
 _PREFIX = "pfem_coarse_"
@@ -135,9 +118,8 @@ class GridMultigrid:
         self.pattern = CoarseMatrix(self.grid)
         self.reduced = False
         owned = self.mesh.n_owned
-        self._inverse = np.zeros((owned, 6))
+        self._inverse = np.zeros((owned, 3, 3))
         self._r, self._z, self._x, self._e, self._product = (np.zeros((owned, 3)) for _ in range(5))
-        self._coarse = np.zeros((len(self.grid.numbers), 3))
         self._special = np.empty(0, np.int64)
         self._turned = np.empty((0, 3, 3))
         self._solver: PETSc.PC | None = None
@@ -163,17 +145,15 @@ class GridMultigrid:
             diagonal[active] = problem.scale
             self._diagonal = diagonal
             return
-        blocks = product.blocks()
+        blocks = full_blocks(product.blocks())
         frames = problem.transform.frames
         at, kept = self._free_parts(active, frames.nodes)
         basis, inverse = np.tile(np.eye(3), (2, len(at), 1, 1))
         basis[np.searchsorted(at, frames.nodes)] = frames.basis
         inverse[np.searchsorted(at, frames.nodes)] = frames.inverse
         to_x = inverse @ kept
-        full = np.swapaxes(to_x, 1, 2) @ full_blocks(blocks[at]) @ to_x + problem.scale * (np.eye(3) - kept)
-        blocks[at] = full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-        invert(blocks)
-        self._inverse = blocks
+        blocks[at] = np.swapaxes(to_x, 1, 2) @ blocks[at] @ to_x + problem.scale * (np.eye(3) - kept)
+        self._inverse = inverses(blocks)
         self._special, self._turned = at, kept @ basis
         place, turned = self.mesh.with_ghosts(at, to_x @ basis)
         self._make_coarse(problem, np.flatnonzero(place >= 0), turned)
@@ -264,20 +244,19 @@ class GridMultigrid:
 
     def _correct(self) -> None:
         """Add the coarse correction of the residual to the solution."""
-        grid, r, coarse = self.grid, self._r, self._coarse
+        grid, r = self.grid, self._r
         at = self._special
         if len(at):
             self._e[:] = r
             r = self._e
             r[at] = np.einsum("kji,kj->ki", self._turned, r[at])
-        coarse[:] = 0.0
-        restrict(grid.t, grid.box, grid.base, grid.corners, r, coarse)
+        coarse = grid.prolongation.T @ r
         grid.give(coarse)
         self._right.setArray(coarse[: grid.n_owned].ravel())
         self._solver.apply(self._right, self._left)
         coarse[: grid.n_owned] = self._left.getArray(readonly=True).reshape(-1, 3)
         grid.bring(coarse)
-        interpolate(grid.t, grid.box, grid.base, grid.corners, coarse, self._e)
+        self._e = grid.prolongation @ coarse
         self._e[at] = np.einsum("kij,kj->ki", self._turned, self._e[at])
         self._x += self._e
 

@@ -16,7 +16,7 @@ from ..tolerances import ROUNDING
 from .lagged import LaggedPreconditioner, Preconditioning
 from .linear import USUAL_REDUCTION, LinearChoice, configure, is_failed_factorisation, linear_reason, newton_reason
 from .matrix import HessianMatrix
-from .matrix_free import MatrixFreeHessian, at_exit, outlive, pass_less_often
+from .matrix_free import MatrixFreeHessian, outlive_at_exit, pass_less_often
 
 if TYPE_CHECKING:
     from ..mechanics.elements import BlockPattern
@@ -364,7 +364,7 @@ class NewtonSolver:
                 options.delValue(name)
         pass_less_often(snes.getKSP(), self.hessian)
         self._solvers[key] = snes
-        at_exit(outlive, snes)
+        outlive_at_exit(snes)
         return snes
 
     def _residual(self, snes: PETSc.SNES, u: PETSc.Vec, g: PETSc.Vec) -> None:

@@ -19,8 +19,19 @@ from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..output.units import TIME
 from ..stepping.plan import Plan, refuse_motion
 from ..stepping.stepper import Solution, Stepper
-from .pencil import BarStiffness, Holds, Pencil, StateMatrices, buckling_bars, join, linear_forces
-from .solvers import SOLVERS, Dense, Lanczos, Slepc
+from .pencil import (
+    SOLVERS,
+    BarStiffness,
+    Dense,
+    Holds,
+    Lanczos,
+    Pencil,
+    Slepc,
+    StateMatrices,
+    buckling_bars,
+    join,
+    linear_forces,
+)
 
 if TYPE_CHECKING:
     from ..case.tables import Modes

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ..mechanics.bars import Bars
     from ..mesh.distribution import DistributedMesh
     from ..stepping.model import Model
-    from .problem import StepProblem
+    from .newton import StepProblem
 
 
 _ALIVE: dict[int, weakref.ref] = {}

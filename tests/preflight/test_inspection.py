@@ -5,7 +5,7 @@ import pytest
 from helpers.runs import inspected
 from helpers.small_models import CUBE, CUBE_EDGES, TRUSSES, case_of
 
-from pfem_petsc import Case, Simulation, Truss
+from pfem_petsc import Case, Simulation, Truss, preflight
 from pfem_petsc.output.units import engineering
 
 

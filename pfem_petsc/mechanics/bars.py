@@ -46,12 +46,10 @@ from .layout import (
     BarLayout,
     aligned,
     clear,
-    gather_values,
     join_components,
     make_layout,
     new_components,
     split_components,
-    spread_values,
 )
 from .materials.base import BarShapes, Law, UnsuitableBarError, internal_variables, law_of
 from .rupture import breakable, limit_values
@@ -247,27 +245,28 @@ class BarBlock:
     index: int
     columns: np.ndarray
 
+    @property
+    def column_of(self) -> np.ndarray:
+        """Columns (stop - start,) of its bars among those of the section."""
+        return self.layout.column_of[self.start : self.stop] - self.layout.columns(self.index).start
+
     def row(self, number: int) -> np.ndarray:
         """Return a copy (stop - start,) of a row of the data kept from step to step."""
-        values = np.empty(self.stop - self.start)
-        gather_values(self.layout, self.index, self.columns[number], values)
-        return values
+        return self.columns[number, self.column_of]
 
     def put_row(self, number: int, values: Any) -> None:
         """Set a row of these data to values (stop - start,) or a number.
 
         Columns without a bar have the ``bar_data`` of the first one, as laws need not have a stress for zeros.
         """
-        values = np.ascontiguousarray(np.broadcast_to(values, self.stop - self.start), dtype=float)
-        none = values[0] if number >= len(self.law.rows) and len(values) else 0.0
-        spread_values(self.layout, self.index, values, float(none), self.columns[number])
+        values = np.broadcast_to(values, self.stop - self.start)
+        self.columns[number] = values[0] if number >= len(self.law.rows) and len(values) else 0.0
+        self.columns[number, self.column_of] = values
 
     @property
     def history(self) -> np.ndarray:
         """Copy of all these data (rows, stop - start), which cannot be changed."""
-        rows = np.empty((len(self.columns), self.stop - self.start))
-        for spread, values in zip(self.columns, rows, strict=True):
-            gather_values(self.layout, self.index, spread, values)
+        rows = self.columns[:, self.column_of]
         rows.flags.writeable = False
         return rows
 
@@ -419,8 +418,7 @@ class Bars:
         areas = empty
         if any(not isinstance(block.area, float) for block in blocks):
             areas = aligned(int(layout.starts[-1]))
-            for block in blocks:
-                self._spread(block, np.broadcast_to(block.area, block.stop - block.start), 0.0, areas)
+            areas[layout.column_of] = self.of_blocks(lambda block: block.area)
         sizes = np.cumsum([0, *(block.columns.size for block in blocks)])[:-1]
 
         def numbers_of(value: Callable[[BarBlock], Any], kind: type = np.int64) -> np.ndarray:
@@ -444,10 +442,6 @@ class Bars:
             new_workspace(max((work_rows(block.law) for block in blocks), default=1)),
         )
 
-    def _spread(self, block: BarBlock, values: np.ndarray, none: float, out: np.ndarray) -> None:
-        part = out[block.layout.columns(block.index)]
-        spread_values(block.layout, block.index, np.ascontiguousarray(values, dtype=float), none, part)
-
     @property
     def reference(self) -> Any:
         """:attr:`arrays` as compiled loops take them."""
@@ -467,9 +461,9 @@ class Bars:
         self._rest.flags.writeable = False
         layout = self.arrays.layout
         spread = aligned(int(layout.starts[-1]))
+        spread[:] = NO_BAR
+        spread[layout.column_of] = values
         self.arrays = self.arrays._replace(rest=spread)
-        for block in self.blocks:
-            self._spread(block, values[block.start : block.stop], NO_BAR, spread)
 
     def set_rest(self, part: slice, values: Any) -> None:
         """Set the rest lengths of some bars [m]."""

@@ -23,7 +23,6 @@ from ..mechanics.layout import (
     aligned,
     new_components,
     split_components,
-    spread_values,
 )
 from ..mechanics.mass import consistent_product
 from ..mesh.ordering import NODE_BLOCK
@@ -124,12 +123,8 @@ class BarProducts:
     def take(self) -> None:
         """Take account of changes of :attr:`x` and :attr:`stored`."""
         split_components(self.x, self._places)
-        if self._columns is self.stored:
-            return
-        for block in self.bars.blocks:
-            part = self._layout.columns(block.index)
-            for values, spread in zip(self.stored[:, block.start : block.stop], self._columns[:, part], strict=True):
-                spread_values(self._layout, block.index, values, 0.0, spread)
+        if self._columns is not self.stored:
+            self._columns[:, self._layout.column_of] = self.stored
 
     def times(self, nodal: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
         """Write nodal u + K u to ``out``, both (local, 3); ``nodal`` (owned,) [N/m]."""

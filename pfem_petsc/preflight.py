@@ -291,15 +291,11 @@ def _slender(case: Case, model: Model) -> Iterator[str]:
     for block, bars in zip(mesh.blocks, model.bars.blocks, strict=True):
         lengths = model.bars.mesh_lengths[block.start : block.counted]
         if len(lengths) and block.section < len(worst):  # others are springs and dashpots
-            area = bars.counted_area
-            if not isinstance(area, float):
-                # the last of the longest of those with the largest ratio
-                ratios = lengths / np.sqrt(area)
-                most = np.flatnonzero(ratios == ratios.max())
-                area = float(area[most[np.lexsort((lengths[most],))[-1]]])
-                lengths = lengths[most]
-            length = lengths.max()
-            worst[block.section] = length / np.sqrt(area), length, area
+            area = np.broadcast_to(bars.counted_area, lengths.shape)
+            ratios = lengths / np.sqrt(area)
+            most = np.flatnonzero(ratios == ratios.max())
+            longest = most[lengths[most].argmax()]
+            worst[block.section] = ratios[longest], lengths[longest], area[longest]
     for name, *rows in zip(case.section, *model.comm.allgather(worst.tolist()), strict=True):
         ratio, length, area = max(rows)
         if ratio > _SLENDER and area >= 1e-18:  # smaller areas are reported as such

@@ -11,7 +11,6 @@ from petsc4py import PETSc
 from scipy.sparse import bsr_array
 
 from .compiled import inlined, kernel
-from .materials.base import Law
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -98,11 +97,6 @@ class ElementFamily(ForceElements, Protocol):
 
     def add_tangents(self, weight: float, pattern: Any, values: np.ndarray) -> None:
         """Add ``weight`` times the stiffness to the values of a matrix with a ``BlockPattern``."""
-
-
-def virgin(law: Law) -> tuple[float, ...]:
-    """Return the internal variables of a law at the start: zeros."""
-    return (0.0,) * len(law.internal)
 
 
 class BlockPattern:

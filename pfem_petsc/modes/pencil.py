@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from ..integrators.base import State
     from ..mechanics.supports import Directions
+    from ..mesh.distribution import DistributedMesh
     from ..stepping.model import Model
 
 _LINKED = (
@@ -300,7 +301,7 @@ class StateMatrices:
         """Return the mass matrix [kg]; held components keep their lumped mass. Collective."""
         model, inertia = self.model, self.inertia
         if not inertia.consistent:
-            return _diagonal(model.comm, np.repeat(inertia.mass, 3))
+            return _diagonal(model.mesh, np.repeat(inertia.mass, 3))
         matrix = HessianMatrix(model.mesh)
         filled = matrix.fill(lambda values: matrix.add_mass(model.bars, inertia, values))
         return self.holds.taken_out(filled, inertia.mass)
@@ -342,12 +343,10 @@ def join(first: PETSc.Mat, factor: float, second: PETSc.Mat) -> PETSc.Mat:
     return total
 
 
-def _diagonal(comm: MPI.Comm, values: np.ndarray) -> PETSc.Mat:
-    matrix = PETSc.Mat().createAIJ(((len(values), None), (len(values), None)), bsize=3, nnz=1, comm=comm)
-    first, last = matrix.getOwnershipRange()
-    rows = np.arange(first, last + 1, dtype=PETSc.IntType)
-    matrix.setValuesCSR(np.arange(len(values) + 1, dtype=PETSc.IntType), rows[:-1], values)
-    matrix.assemble()
+def _diagonal(mesh: DistributedMesh, values: np.ndarray) -> PETSc.Mat:
+    size, numbers = (len(values), 3 * mesh.n_nodes), np.arange(len(values) + 1, dtype=PETSc.IntType)
+    rows = numbers, numbers[:-1] + PETSc.IntType(3 * mesh.first_node), values
+    matrix = PETSc.Mat().createAIJ((size, size), bsize=3, csr=rows, comm=mesh.comm)
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     return matrix
 

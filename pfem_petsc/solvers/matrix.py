@@ -128,7 +128,14 @@ class HessianMatrix:
     @cached_property
     def local_columns(self) -> np.ndarray:
         """Local node index (int32) of each block's column, computed when supports or oblique walls first need it."""
-        return local_columns(self.mesh, self.pattern.columns)
+        mesh, columns = self.mesh, self.pattern.columns
+        local = (columns - mesh.first_node).astype(np.int64)
+        outside = (local < 0) | (local >= mesh.n_owned)
+        order = np.argsort(mesh.ghost_numbers, kind="stable")
+        found = np.searchsorted(mesh.ghost_numbers[order], columns[outside])
+        # blocks of nodes that are not even ghosts are those of bars that touch, which come later: zero until then
+        local[outside] = mesh.n_owned + order[np.minimum(found, len(order) - 1)] if len(order) else 0
+        return local.astype(np.int32)
 
     def fill(self, add: Callable[[np.ndarray], None]) -> PETSc.Mat:
         """Assemble the matrix; ``add(values)`` adds the Hessian of the owned rows to the zeroed values."""
@@ -307,12 +314,9 @@ def block_diagonal(mesh: DistributedMesh) -> PETSc.Mat:
     size, first = (3 * mesh.n_owned, 3 * mesh.n_nodes), 3 * mesh.first_node
     columns = first + np.repeat(np.arange(3 * mesh.n_owned).reshape(-1, 1, 3), 3, axis=1).ravel()
     pointers = 3 * np.arange(3 * mesh.n_owned + 1)
-    matrix = PETSc.Mat().create(comm=mesh.comm)
-    matrix.setSizes((size, size), bsize=3)
-    matrix.setType(PETSc.Mat.Type.AIJ)
     values = np.tile(np.eye(3), (mesh.n_owned, 1, 1)).ravel()
-    matrix.setPreallocationCSR((pointers.astype(PETSc.IntType), columns.astype(PETSc.IntType), values))
-    return matrix
+    rows = pointers.astype(PETSc.IntType), columns.astype(PETSc.IntType), values
+    return PETSc.Mat().createAIJ((size, size), bsize=3, csr=rows, comm=mesh.comm)
 
 
 def add_diagonal(matrix: PETSc.Mat, mesh: DistributedMesh, nodes: np.ndarray, blocks: np.ndarray, how: int) -> None:
@@ -321,14 +325,3 @@ def add_diagonal(matrix: PETSc.Mat, mesh: DistributedMesh, nodes: np.ndarray, bl
         rows = np.arange(at, at + 3, dtype=PETSc.IntType)
         matrix.setValues(rows, rows, block, how)
     matrix.assemble()
-
-
-def local_columns(mesh: DistributedMesh, columns: np.ndarray) -> np.ndarray:
-    """Return the local node indices (int32) of PETSc node numbers of owned nodes or ghosts."""
-    local = (columns - mesh.first_node).astype(np.int64)
-    outside = (local < 0) | (local >= mesh.n_owned)
-    order = np.argsort(mesh.ghost_numbers, kind="stable")
-    found = np.searchsorted(mesh.ghost_numbers[order], columns[outside])
-    # blocks of nodes that are not even ghosts are those of bars that touch, which come later: zero until then
-    local[outside] = mesh.n_owned + order[np.minimum(found, len(order) - 1)] if len(order) else 0
-    return local.astype(np.int32)

@@ -24,7 +24,6 @@ from ..mechanics.layout import (
     new_components,
     split_components,
 )
-from ..mechanics.mass import consistent_product
 from ..mesh.ordering import NODE_BLOCK
 
 if TYPE_CHECKING:
@@ -467,12 +466,7 @@ class MatrixFreeHessian:
         alpha, eta = problem.balance.alpha, problem.balance.eta
         self.bars.times(self._none if inertia.consistent else problem.nodal, u, out)
         if inertia.consistent:
-            coefficients = inertia.coefficients(alpha, eta)
-            for block, coefficient in zip(bars.blocks, coefficients, strict=True):
-                density = np.atleast_1d(6.0 * coefficient)
-                consistent_product(bars.ends, bars.mass_lengths, block.start, block.stop, density, u, out)
-            if inertia.points.any:
-                out[:owned] += inertia.points.nodal(alpha, eta)[:, None] * u[:owned]
+            inertia.add_consistent(alpha, eta, u, out)
         elif inertia.redistribution is not None:
             inertia.redistribution.add_times(alpha, u, out)
         for family in bars.families:

@@ -21,7 +21,7 @@ from .mechanics.loads import ForceState
 from .parallel.agreement import all_arrive, aside, on_root, outcome, passes_exception, watch
 from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
-from .preflight.checks import forecast, inspect, later_gaps, summarise, warnings_before
+from .preflight import forecast, inspect, later_gaps, summarise, warnings_before
 from .restart import RunState, find_restart, finished, finished_message
 from .run.observers import StopRequest, Synchroniser
 from .run.outputs import Outputs, ReportedCompilation

@@ -45,8 +45,6 @@ from .base import (
 from .files import found_file, profile_of
 from .section_shapes import SHAPES, SIZES, CrossSection, cross_section
 
-Indices = Annotated[tuple[NonNegativeInt, ...], listed]
-
 
 def distinct(what: str) -> AfterValidator:
     """Annotation of a list of tables whose names must differ, those of a ``what``."""
@@ -138,13 +136,21 @@ BarGroup = Annotated[
 """A group of bars: a name in the mesh, or a value of a field; its text is the name in ``bar_groups`` in both cases."""
 
 
-def distinct_numbers(what: str, indices: tuple[int, ...] | None) -> tuple[int, ...] | None:
-    """Return numbers of nodes or bars, of which there is at least one, and none is listed twice."""
-    if indices is not None and not indices:
-        raise ValueError(f"expected at least one {what} number")
-    if indices is not None and len(set(indices)) < len(indices):
-        raise ValueError(f"a {what} number is listed twice")
-    return indices
+def numbers_of(what: str) -> Any:
+    """Type of a key with numbers of nodes or bars, a ``what``, of which there is at least one, and none is listed
+    twice."""
+
+    def check(numbers: tuple[int, ...]) -> tuple[int, ...]:
+        if not numbers:
+            raise ValueError(f"expected at least one {what} number")
+        if len(set(numbers)) < len(numbers):
+            raise ValueError(f"a {what} number is listed twice")
+        return numbers
+
+    return Annotated[tuple[NonNegativeInt, ...], listed, AfterValidator(check)]
+
+
+NodeNumbers, BarNumbers = numbers_of("node"), numbers_of("bar")
 
 
 class NodeSet(StrictModel):
@@ -158,7 +164,7 @@ class NodeSet(StrictModel):
     """lower and upper corner [m]: selects the nodes inside, faces included"""
     group: str | None = None
     """a node group of the mesh"""
-    indices: Indices | None = None
+    indices: NodeNumbers | None = None
     """node numbers of the mesh, from 0"""
     field: Annotated[str, Field(min_length=1)] | None = None
     """a field of the mesh: selects the nodes where it has ``value``; of a field of bars, the ends of these bars"""
@@ -186,11 +192,6 @@ class NodeSet(StrictModel):
     def selection(self) -> FieldValue | None:
         """The value of a field that selects the nodes, if one does."""
         return None if self.field is None else FieldValue.model_construct(field=self.field, value=self.value)
-
-    @field_validator("indices")
-    @classmethod
-    def _distinct(cls, indices: tuple[int, ...] | None) -> tuple[int, ...] | None:
-        return distinct_numbers("node", indices)
 
 
 class Rupture(StrictModel):
@@ -692,6 +693,13 @@ class ContactSettings(StrictModel):
     """treatment of impact: velocity and acceleration of nodes in contact"""
 
 
+def _computable(seconds: float) -> float:
+    """Refuse times whose powers in the formulas of the schemes overflow double precision."""
+    if not 1e-50 <= seconds <= 1e50:
+        raise ValueError("overflows double precision in the formulas of the schemes; give seconds from 1e-50 to 1e50")
+    return seconds
+
+
 class TimeKeys(StrictModel):
     """The keys of [time] other than those of an integrator."""
 
@@ -699,7 +707,7 @@ class TimeKeys(StrictModel):
     """name of a time integration scheme"""
     step: Any
     """time step [s], or "auto" with an explicit scheme"""
-    end: PositiveFloat
+    end: Annotated[PositiveFloat, AfterValidator(_computable)]
     """end time [s]"""
     mass: Literal["lumped", "consistent"] = "lumped"
     """mass matrix"""
@@ -725,18 +733,6 @@ class TimeKeys(StrictModel):
         if not (step > 0 and is_finite_number(step)):
             raise ValueError('expected a finite number of seconds > 0, or "auto"')
         return _computable(float(step))
-
-    @field_validator("end")
-    @classmethod
-    def _end(cls, end: float) -> float:
-        return _computable(end)
-
-
-def _computable(seconds: float) -> float:
-    """Refuse times whose powers in the formulas of the schemes overflow double precision."""
-    if not 1e-50 <= seconds <= 1e50:
-        raise ValueError("overflows double precision in the formulas of the schemes; give seconds from 1e-50 to 1e50")
-    return seconds
 
 
 class StaticKeys(StrictModel):
@@ -786,15 +782,10 @@ class BarProbe(StrictModel):
     """name of the probe in the results"""
     bars: BarGroup | None = None
     """bar group of the mesh, or bars with a value of a field, as in a section"""
-    indices: Indices | None = None
+    indices: BarNumbers | None = None
     """bar numbers of the mesh, from 0"""
     nearest: Vector3 | None = None
     """a point [m]: selects the bar whose middle is nearest in the mesh"""
-
-    @field_validator("indices")
-    @classmethod
-    def _distinct(cls, indices: tuple[int, ...] | None) -> tuple[int, ...] | None:
-        return distinct_numbers("bar", indices)
 
 
 class Output(StrictModel):

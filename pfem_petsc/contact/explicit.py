@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..errors import SimulationFailure
-from ..mechanics.compiled import NEEDED, inlined, kernel
-from ..mechanics.records import References, record
+from ..mechanics.compiled import NEEDED, References, inlined, kernel, record
 from ..mesh.ordering import NODE_BLOCK
 from ..tolerances import FIXED_POINT, PROJECTED, RANK
 from .friction import jam

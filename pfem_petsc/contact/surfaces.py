@@ -8,8 +8,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from ..mechanics.compiled import inlined, kernel
-from ..mechanics.records import record
+from ..mechanics.compiled import inlined, kernel, record
 from .walls.base import BaseWall, RoundWall
 
 OTHER = np.inf

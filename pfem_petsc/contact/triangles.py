@@ -15,8 +15,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from ..mechanics.compiled import inlined, kernel
-from ..mechanics.records import record
+from ..mechanics.compiled import inlined, kernel, record
 from .projection import project
 from .vectors import along, dot, minus, put, times, vector
 

@@ -11,13 +11,14 @@ import numpy as np
 from mpi4py import MPI
 
 from ..case.tables import FIELD_KEYS, FieldValue
-from ..columns import BAR_ENERGIES, STATUS, STORED
+from ..columns import BAR_ENERGIES, OF_BARS, STATUS, STORED
 from ..errors import InputError
 from ..mesh import load_slab
-from ..mesh.distribution import group_hint
+from ..mesh.distribution import bars_of_group, group_hint
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
-from .chunk_laws import STRESS, densities_row, evaluate, first_class, flatten, law_loops, work_rows
+from .chunk_laws import first_class, flatten, law_loops, work_rows
+from .compiled import by_reference
 from .elements import (
     MEASURES,
     ElementFamily,
@@ -28,7 +29,6 @@ from .elements import (
     add_tangents,
     bar_lengths,
     first_inverted,
-    write_directions,
 )
 from .internal_forces import (
     BarArrays,
@@ -46,21 +46,18 @@ from .layout import (
     BarLayout,
     aligned,
     clear,
-    gather_values,
     join_components,
     make_layout,
     new_components,
     split_components,
-    spread_values,
 )
 from .materials.base import BarShapes, Law, UnsuitableBarError, internal_variables, law_of
-from .records import by_reference
-from .rupture import breakable, intact, limit_values
+from .rupture import breakable, limit_values
 from .springs import Springs, connected, connector_modulus
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..case.tables import Section
+    from ..case.tables import BarProbe, Section
     from ..mesh.distribution import DistributedMesh
     from ..mesh.slab import MeshSlab
     from .elements import BlockPattern
@@ -248,27 +245,28 @@ class BarBlock:
     index: int
     columns: np.ndarray
 
+    @property
+    def column_of(self) -> np.ndarray:
+        """Columns (stop - start,) of its bars among those of the section."""
+        return self.layout.column_of[self.start : self.stop] - self.layout.columns(self.index).start
+
     def row(self, number: int) -> np.ndarray:
         """Return a copy (stop - start,) of a row of the data kept from step to step."""
-        values = np.empty(self.stop - self.start)
-        gather_values(self.layout, self.index, self.columns[number], values)
-        return values
+        return self.columns[number, self.column_of]
 
     def put_row(self, number: int, values: Any) -> None:
         """Set a row of these data to values (stop - start,) or a number.
 
         Columns without a bar have the ``bar_data`` of the first one, as laws need not have a stress for zeros.
         """
-        values = np.ascontiguousarray(np.broadcast_to(values, self.stop - self.start), dtype=float)
-        none = values[0] if number >= len(self.law.rows) and len(values) else 0.0
-        spread_values(self.layout, self.index, values, float(none), self.columns[number])
+        values = np.broadcast_to(values, self.stop - self.start)
+        self.columns[number] = values[0] if number >= len(self.law.rows) and len(values) else 0.0
+        self.columns[number, self.column_of] = values
 
     @property
     def history(self) -> np.ndarray:
         """Copy of all these data (rows, stop - start), which cannot be changed."""
-        rows = np.empty((len(self.columns), self.stop - self.start))
-        for spread, values in zip(self.columns, rows, strict=True):
-            gather_values(self.layout, self.index, spread, values)
+        rows = self.columns[:, self.column_of]
         rows.flags.writeable = False
         return rows
 
@@ -420,8 +418,7 @@ class Bars:
         areas = empty
         if any(not isinstance(block.area, float) for block in blocks):
             areas = aligned(int(layout.starts[-1]))
-            for block in blocks:
-                self._spread(block, np.broadcast_to(block.area, block.stop - block.start), 0.0, areas)
+            areas[layout.column_of] = self.of_blocks(lambda block: block.area)
         sizes = np.cumsum([0, *(block.columns.size for block in blocks)])[:-1]
 
         def numbers_of(value: Callable[[BarBlock], Any], kind: type = np.int64) -> np.ndarray:
@@ -445,10 +442,6 @@ class Bars:
             new_workspace(max((work_rows(block.law) for block in blocks), default=1)),
         )
 
-    def _spread(self, block: BarBlock, values: np.ndarray, none: float, out: np.ndarray) -> None:
-        part = out[block.layout.columns(block.index)]
-        spread_values(block.layout, block.index, np.ascontiguousarray(values, dtype=float), none, part)
-
     @property
     def reference(self) -> Any:
         """:attr:`arrays` as compiled loops take them."""
@@ -468,9 +461,9 @@ class Bars:
         self._rest.flags.writeable = False
         layout = self.arrays.layout
         spread = aligned(int(layout.starts[-1]))
+        spread[:] = NO_BAR
+        spread[layout.column_of] = values
         self.arrays = self.arrays._replace(rest=spread)
-        for block in self.blocks:
-            self._spread(block, values[block.start : block.stop], NO_BAR, spread)
 
     def set_rest(self, part: slice, values: Any) -> None:
         """Set the rest lengths of some bars [m]."""
@@ -638,46 +631,46 @@ class Bars:
         pattern: BlockPattern,
         values: np.ndarray,
         start: np.ndarray | None = None,
+        stored: np.ndarray | None = None,
     ) -> None:
         """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to the values of a matrix; with
-        positions ``start``, the derivative of :meth:`step_forces` from there in the place of K_t."""
+        positions ``start``, the derivative of :meth:`step_forces` from there in the place of K_t; else with ``stored``
+        (2, b), the stiffness of bars that these are, see :meth:`stiffnesses`."""
         rows = MatrixRows(pattern.ptr, pattern.slots, values, self.ends)
         mass = np.zeros(len(self.ends))
         for block, m in zip(self.blocks, inertia, strict=True):
             mass[block.start : block.stop] = m * self.mass_lengths[block.start : block.stop]
-        stored = np.zeros((2, len(self.ends)))
-        if start is None:
-            if weight:
-                self.stiffnesses(x, weight, stored)
-            add_tangents(x, stored, mass, rows)
+        if start is not None:
+            coefficients = np.zeros((2, len(self.ends)))
+            self._step_coefficients(start, x, coefficients)
+            add_step_tangents(start, x, coefficients, weight, mass, rows)
         else:
-            self._step_coefficients(start, x, stored)
-            add_step_tangents(start, x, stored, weight, mass, rows)
+            if stored is None:
+                stored = np.zeros((2, len(self.ends)))
+                if weight:
+                    self.stiffnesses(x, weight, stored)
+            add_tangents(x, stored, mass, rows)
         for family in self.families:  # in a step, their force is that at its middle
             family.add_tangents(weight if start is None else 0.5 * weight, pattern, values)
 
-    def linearise(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
-        """Fill ``stored`` (5, b) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, for each bar at ``x``;
-        without springs."""
-        self.stiffnesses(x, weight, stored[3:])
-        write_directions(x, self.ends, stored)
-
     def state_stiffness(self, x: np.ndarray) -> np.ndarray:
-        """Return the stiffness of the bars (5, b) in the state at ``x``, as :meth:`linearise`.
+        """Return the stiffness of the bars (2, b) in the state at ``x``, as :meth:`stiffnesses`.
 
         If the law has a kink at the state, as on the yield surface, dN/dl is the larger one, that of unloading: small
         motions about the state do not yield further. The strain rate has no effect.
         """
-        stored, *around = np.zeros((3 if self.kept_names else 1, 5, len(self.rest)))
+        stored, *around = np.zeros((3 if self.kept_names else 1, 2, len(self.rest)))
+        square = self.lengths(x) ** 2
         with self.without_rates():
-            self.linearise(x, 1.0, stored)
-            for sign, side in zip((-1.0, 1.0), around, strict=False):
-                self.linearise((1.0 + sign * _LOADING) * x, 1.0, side)
+            self.stiffnesses(x, 1.0, stored)
+            for factor, side in zip((1.0 - _LOADING, 1.0 + _LOADING), around, strict=False):
+                self.stiffnesses(factor * x, 1.0, side)
+                side[0] *= factor**2
         if around:
-            tangent = stored[3] + stored[4]
-            larger = np.maximum(*(side[3] + side[4] for side in around))
+            tangent = stored[0] * square + stored[1]
+            larger = np.maximum(*(side[0] * square + side[1] for side in around))
             kink = larger - tangent > _KINK * np.abs(larger)
-            stored[3, kink] = (larger - stored[4])[kink]
+            stored[0, kink] = ((larger - stored[1]) / square)[kink]
         return stored
 
     def stiffnesses(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
@@ -825,56 +818,6 @@ class Bars:
                 block.put_row(number, history[block.start : block.stop, names.index(name)])
 
 
-def state_before_rupture(bars: Bars, x: np.ndarray, bar: int) -> tuple[BarBlock, np.ndarray, float, float]:
-    """Return the block of a bar (local index), its data (rows,), and its stress [Pa] and strain without the thermal
-    strain at positions ``x``, as if it had not broken."""
-    block = next(block for block in bars.blocks if block.start <= bar < block.stop)
-    k = bar - block.start
-    law, history = block.law, block.history[:, k : k + 1].copy()
-    history[law.rupture] = 0.0
-    length = float(np.linalg.norm(np.subtract(*x[bars.ends[bar]])))
-    shift, temperature = bars.heat[:, bar] if bars.heat.shape[1] else (0.0, 0.0)
-    strain = block.measure(length / bars.rest[bar])[0] - shift
-    if law.rate:
-        stress = history[len(law.internal) + 1, 0]
-    else:
-        stress = evaluate(law, block.parameters, strain, temperature, history)[STRESS, 0]
-    return block, history[:, 0], float(stress), float(strain)
-
-
-def release(bars: Bars, x: np.ndarray, members: np.ndarray, state: float) -> np.ndarray:
-    """Remove bars (local indices) up to a share, see :mod:`~pfem_petsc.mechanics.rupture`; return by how much the
-    energies of the bars counted on this rank change, in the order of :data:`~pfem_petsc.columns.BAR_ENERGIES`."""
-    change = np.zeros(len(BAR_ENERGIES))
-    for block in bars.blocks:
-        mine = members[(members >= block.start) & (members < block.stop)]
-        history = block.history.copy()
-        mine = mine[np.abs(history[block.law.rupture, mine - block.start]) < state]
-        if not len(mine):
-            continue
-        here, count = mine - block.start, block.law.rupture  # variables of the law of intact bars come first
-        law, parameters = intact(block.law, block.parameters)
-        ends = x[bars.ends[mine]]
-        stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / bars.rest[mine]
-        strain = np.array([block.measure(value)[0] for value in stretch])
-        shift, temperature = bars.heat[:, mine] if bars.heat.shape[1] else (0.0, 0.0)
-        rows = history[:count, here], np.zeros((len(law.rows) - count, len(mine))), history[len(block.law.rows) :, here]
-        found = evaluate(law, parameters, strain - shift, temperature, np.vstack(rows))
-        densities = found[densities_row(law) :]
-        lost = (state - np.abs(history[count, here])) * densities
-        history[count + 1 : count + 1 + len(lost), here] += lost
-        # one that has begun to break counts as broken
-        history[count, here] = np.where(history[count, here] > 0.0, state, -state)
-        for number in range(count, count + 1 + len(lost)):
-            block.put_row(number, history[number])
-        volume = np.broadcast_to(block.area, block.stop - block.start)[here] * bars.rest[mine] * (mine < block.counted)
-        for name, energy in zip(law.energies, (lost @ volume).tolist(), strict=True):
-            if name in STORED:
-                change[BAR_ENERGIES.index(name)] -= energy
-                change[BAR_ENERGIES.index("rupture_dissipation")] += energy
-    return change
-
-
 def viscous_rate(case: Case, bars: Bars, mass: np.ndarray, consistent: bool) -> float:
     """Return an upper bound of the eigenvalues of C over M [1/s] of dashpots between nodes. Collective.
 
@@ -893,3 +836,66 @@ def viscous_rate(case: Case, bars: Bars, mass: np.ndarray, consistent: bool) -> 
                 np.add.at(sums, bars.ends[part, end], 2.0 * values)
     largest = float((sums[: len(mass)] / mass).max(initial=0.0))
     return (3.0 if consistent else 1.0) * bars.mesh.comm.allreduce(largest, op=MPI.MAX)
+
+
+class ProbedBars:
+    """The bars of all ``[[output.bar_probe]]``, whose strain, stress and axial force are in each row of the history.
+    Construction is collective.
+
+    A row has them by probe, by quantity of :data:`~pfem_petsc.columns.OF_BARS`, and by mesh number. Each bar is counted
+    on one rank, so that the sum of the ranks' shares is the row's values.
+
+    Attributes
+    ----------
+    ids : name of a probe to the mesh numbers of its bars on all ranks, ascending
+    width : numbers of all probes in a row
+
+    Raises
+    ------
+    InputError
+        On all ranks, for a group that the mesh does not have, a number out of range, or a probe without bars.
+    """
+
+    def __init__(self, case: Case, mesh: DistributedMesh) -> None:
+        self.ids: dict[str, np.ndarray] = {}
+        self.width = 0
+        counted = np.arange(len(mesh.bars))[mesh.counted]
+        local, places = [np.empty(0, dtype=np.int64)], [np.empty((len(OF_BARS), 0), dtype=np.int64)]
+        for number, probe in enumerate(case.output.bar_probe):
+            chosen = np.intersect1d(_chosen(case, mesh, f"output.bar_probe[{number}]", probe, counted), counted)
+            ids = np.sort(np.concatenate(mesh.comm.allgather(mesh.bar_ids[chosen].astype(np.int64))))
+            if not len(ids):
+                raise InputError(f"{case.source}: output.bar_probe[{number}].bars = {str(probe.bars)!r}: has no bars")
+            local.append(chosen)
+            order = np.searchsorted(ids, mesh.bar_ids[chosen])
+            places.append(self.width + np.arange(len(OF_BARS))[:, None] * len(ids) + order)
+            self.ids[probe.name] = ids
+            self.width += len(OF_BARS) * len(ids)
+        self._local, self._places = np.concatenate(local), np.hstack(places)
+
+    def fill(self, bars: Bars, x: np.ndarray, share: np.ndarray) -> None:
+        """Write the values of the bars that are counted on this rank to its share (width,), at positions ``x``."""
+        if len(self._local):
+            share[self._places] = bars.axial(x)[:, self._local]
+
+
+def _chosen(case: Case, mesh: DistributedMesh, key: str, probe: BarProbe, counted: np.ndarray) -> np.ndarray:
+    """Return the local bars of a probe, with those that other ranks count. Collective."""
+    if probe.bars is not None:
+        return bars_of_group(case, mesh, f"{key}.bars", str(probe.bars))
+    ids = mesh.bar_ids[counted]
+    if probe.indices is not None:
+        last = mesh.n_bars - mesh.n_connectors - 1
+        outside = [number for number in probe.indices if number > last]
+        if outside:
+            raise InputError(
+                f"{case.source}: {key}.indices: bar {outside[0]} does not exist; the mesh has bars 0 to {last}"
+            )
+        return counted[np.isin(ids, probe.indices)]
+    real = counted[ids < mesh.n_bars - mesh.n_connectors]
+    middles = mesh.points[mesh.bars[real]].mean(axis=1)
+    distance = np.linalg.norm(middles - np.array(probe.nearest), axis=1)
+    shortest = mesh.comm.allreduce(float(distance.min(initial=np.inf)), op=MPI.MIN)
+    nearest = real[distance == shortest]
+    first = mesh.comm.allreduce(int(mesh.bar_ids[nearest].min(initial=mesh.n_bars)), op=MPI.MIN)
+    return nearest[mesh.bar_ids[nearest] == first]

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 from numba.extending import register_jitable
 from petsc4py import PETSc
+from scipy.sparse import bsr_array
 
 from .compiled import inlined, kernel
-from .materials.base import Law
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -99,11 +99,6 @@ class ElementFamily(ForceElements, Protocol):
         """Add ``weight`` times the stiffness to the values of a matrix with a ``BlockPattern``."""
 
 
-def virgin(law: Law) -> tuple[float, ...]:
-    """Return the internal variables of a law at the start: zeros."""
-    return (0.0,) * len(law.internal)
-
-
 class BlockPattern:
     """Block-compressed rows of the owned nodes, with one 3 x 3 block per node and per neighbour connected by a bar.
 
@@ -154,12 +149,9 @@ class BlockPattern:
 
     def scalar_rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Return row pointers and PETSc column numbers of the pattern in scalar compressed rows (PETSc integers)."""
-        blocks = np.repeat(np.diff(self.ptr), 3)
-        pointers = np.zeros(len(blocks) + 1, dtype=PETSc.IntType)
-        np.cumsum(3 * blocks, out=pointers[1:])
-        columns = np.empty(pointers[-1], dtype=PETSc.IntType)
-        expand_columns(self.ptr, self.columns, columns)
-        return pointers, columns
+        shape = 3 * (len(self.ptr) - 1), 3 * self._n
+        rows = bsr_array((np.zeros((len(self.columns), 3, 3), np.int8), self.columns, self.ptr), shape=shape).tocsr()
+        return rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType)
 
     def add_blocks(
         self, nodes: np.ndarray, blocks: np.ndarray, values: np.ndarray, keys: np.ndarray | None = None
@@ -171,18 +163,6 @@ class BlockPattern:
         for i in range(3):
             for j in range(3):
                 np.add.at(values, start + i * width + j, blocks[:, i, j])
-
-
-@kernel
-def expand_columns(ptr, columns, out):
-    """Write the columns of a matrix in scalar compressed rows; ``ptr``, ``columns``: of its blocks."""
-    for row in range(len(ptr) - 1):
-        width = 3 * (ptr[row + 1] - ptr[row])
-        for k in range(ptr[row], ptr[row + 1]):
-            at = 6 * ptr[row] + 3 * k
-            for i in range(3):
-                for j in range(3):
-                    out[at + i * width + j] = 3 * columns[k] + j
 
 
 class MatrixRows(NamedTuple):
@@ -233,14 +213,6 @@ def add_tangents(x, stored, inertia, rows):
 
 
 @kernel
-def add_bars(stored, rows):
-    """Add the stiffness ``stored`` (5, b) of bars, see ``Bars.linearise``, to the rows of a matrix."""
-    for k in range(len(rows.ends)):
-        n = stored[0, k], stored[1, k], stored[2, k]
-        _add_blocks(rows, k, stored[3, k], n, n, stored[4, k], 0.0)
-
-
-@kernel
 def add_step_tangents(x0, x, coefficients, weight, inertia, rows):
     """Add ``weight`` times the derivative of the forces of steps, not symmetric; ``coefficients``: of
     :func:`~.internal_forces.step_coefficients`."""
@@ -261,19 +233,6 @@ def add_step_forces(x0, x, ends, coefficients, f):
             force = coefficients[0, k] * (0.5 * (d0[i] + d[i]))
             f[a, i] -= force
             f[b, i] += force
-
-
-@kernel
-def write_directions(x, bars, stored):
-    """Write directions (3, b) of bars to the first rows of ``stored`` (5, b), zero without a length, and multiply the
-    next row by the squares of their lengths."""
-    for k in range(len(bars)):
-        d = end_difference(x, bars, k)
-        squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-        length = math.sqrt(squared)
-        for i in range(3):
-            stored[i, k] = d[i] / length if length > 0.0 else 0.0
-        stored[3, k] *= squared
 
 
 @kernel

@@ -27,7 +27,7 @@ from .chunk_laws import (
     TEMPERATURE,
     TEMPERATURE0,
 )
-from .compiled import add_freely, inlined, kernel
+from .compiled import add_freely, inlined, kernel, record
 from .elements import (
     COLLAPSED_STRETCH,
     ENGINEERING,
@@ -35,13 +35,10 @@ from .elements import (
     LOGARITHMIC,
     SHORTENED_STRETCH,
     engineering,
-    green,
-    logarithmic,
     mean_ratio,
     measured,
 )
 from .layout import DIFFERENCES, BarLayout, aligned, group_of, run_column
-from .records import record
 
 # Functions that are called for each group take whole arrays and where to begin: a part of an array, or a record of
 # arrays as an argument, counts references, which takes as long as several bars. Indices without a sign need no
@@ -140,15 +137,10 @@ def _measure(n, measure, work):
         for k in range(n):
             i = np.uint64(k)
             work[_STRAIN + i] = engineering(work[_STRETCH + i])[0]
-    elif measure == GREEN:
-        for k in range(n):
-            i = np.uint64(k)
-            work[_STRAIN + i], slope, _ = green(work[_STRETCH + i])
-            work[_FACTOR + i] *= slope
     else:
         for k in range(n):
             i = np.uint64(k)
-            work[_STRAIN + i], slope, _ = logarithmic(work[_STRETCH + i])
+            work[_STRAIN + i], slope, _ = measured(measure, work[_STRETCH + i])
             work[_FACTOR + i] *= slope
 
 
@@ -271,12 +263,11 @@ def _add_to_stars(g, nodes, bars, far, f, work):
 
 
 @inlined
-def _bar_of(g, column, nodes, bars):
+def _bar_of(g, column, bars, column_of):
     """Return the bar in a column of a group, counted from its first one; -1 for none."""
-    for run in range(g.run, g.end):
-        ahead = column - run_column(g, run, nodes, bars)
-        if 0 <= ahead < np.int64(bars[run + 1]) - np.int64(bars[run]):
-            return np.int64(bars[run]) + ahead
+    for k in range(np.int64(bars[g.run]), np.int64(bars[g.end])):
+        if np.int64(column_of[k]) - g.first == column:
+            return k
     return np.int64(-1)
 
 
@@ -347,7 +338,7 @@ def internal_forces(x, f, bars, laws, step, commit, energies):
                 column, inverted = _check_short(g.n, g.first, rest, broken, history, commit, work)
                 shortened = shortened or inverted
                 if column >= 0 and failed < 0:
-                    failed = _bar_of(g, column, nodes, ends)
+                    failed = _bar_of(g, column, ends, layout.column_of)
             if gone >= 0:
                 broke += _count_broken(g.n, g.first, rest, broken, history, (HISTORY + gone) * ROW, work)
             for j in range(bars.kept[s] if commit else 0):
@@ -432,23 +423,20 @@ def states(x, bars, laws, out, densities):
             _read_bars(g, measure, (layout.nodes, layout.bars, layout.far), x, bars.rest, bars.heat, work)
             _read_history(g, bars.rows[s], history, work)
             law(p, 0.0, work, g.n)
-            for run in range(g.run, g.end):
-                bar = np.int64(layout.bars[run])
-                column = run_column(g, run, layout.nodes, layout.bars)
-                for k in range(bar, np.int64(layout.bars[run + 1])):
-                    i = column + k - bar
-                    stretch, state = work[_STRETCH + np.uint64(i)], 0.0
-                    if gone >= 0:
-                        state = abs(history[g.at + gone * g.stride + i])
-                        stretch = 0.0 if state >= 1.0 and math.isnan(stretch) else stretch  # it may have no length
-                    strain, slope, _ = measured(measure, stretch)
-                    stress = work[_STRESS + np.uint64(i)]
-                    if last >= 0:  # the rate of the last step is not known any more, but its stress is
-                        stress = history[g.at + (last + 1) * g.stride + i] * (1.0 - state)
-                    out[0, k], out[1, k], out[2, k] = strain, stress, _area(bars, s, g.first + i) * stress * slope
-                    for j in range(bars.energies.shape[1] if len(densities) > 0 else 0):
-                        if bars.energies[s, j] >= 0:
-                            densities[bars.energies[s, j], k] = work[(row + j) * ROW + i]
+            for k in range(np.int64(layout.bars[g.run]), np.int64(layout.bars[g.end])):
+                i = np.int64(layout.column_of[k]) - g.first
+                stretch, state = work[_STRETCH + np.uint64(i)], 0.0
+                if gone >= 0:
+                    state = abs(history[g.at + gone * g.stride + i])
+                    stretch = 0.0 if state >= 1.0 and math.isnan(stretch) else stretch  # it may have no length
+                strain, slope, _ = measured(measure, stretch)
+                stress = work[_STRESS + np.uint64(i)]
+                if last >= 0:  # the rate of the last step is not known any more, but its stress is
+                    stress = history[g.at + (last + 1) * g.stride + i] * (1.0 - state)
+                out[0, k], out[1, k], out[2, k] = strain, stress, _area(bars, s, g.first + i) * stress * slope
+                for j in range(bars.energies.shape[1] if len(densities) > 0 else 0):
+                    if bars.energies[s, j] >= 0:
+                        densities[bars.energies[s, j], k] = work[(row + j) * ROW + i]
 
 
 class StepStart(NamedTuple):
@@ -479,43 +467,34 @@ def step_coefficients(x, ends, bars, laws, step, start, out):
             g = group_of(layout, s, group, bars.places[s])
             work[STRAIN * ROW : HISTORY * ROW] = 0.0
             _read_history(g, bars.rows[s], bars.history, work)
-            for run in range(g.run, g.end):
-                bar = np.int64(layout.bars[run])
-                column = run_column(g, run, layout.nodes, layout.bars)
-                for k in range(bar, np.int64(layout.bars[run + 1])):
-                    i = np.uint64(column + k - bar)
-                    rest = bars.rest[g.first + column + k - bar]
-                    rest0 = start.rest[k] if len(start.rest) > 0 else rest
-                    length0, length = _length(start.x, ends[k, 0], ends[k, 1]), _length(x, ends[k, 0], ends[k, 1])
-                    work[_STRAIN0 + i] = measured(measure, length0 / rest0)[0]
-                    work[_STRAIN + i] = measured(measure, length / rest)[0]
-                    if bars.heat.shape[1] > 0:
-                        work[_STRAIN0 + i] -= start.heat[0, k]
-                        work[_STRAIN + i] -= bars.heat[0, k]
-                        work[_TEMPERATURE0 + i], work[_TEMPERATURE + i] = start.heat[1, k], bars.heat[1, k]
+            for k in range(np.int64(layout.bars[g.run]), np.int64(layout.bars[g.end])):
+                i, rest = np.uint64(layout.column_of[k] - g.first), bars.rest[layout.column_of[k]]
+                rest0 = start.rest[k] if len(start.rest) > 0 else rest
+                length0, length = _length(start.x, ends[k, 0], ends[k, 1]), _length(x, ends[k, 0], ends[k, 1])
+                work[_STRAIN0 + i] = measured(measure, length0 / rest0)[0]
+                work[_STRAIN + i] = measured(measure, length / rest)[0]
+                if bars.heat.shape[1] > 0:
+                    work[_STRAIN0 + i] -= start.heat[0, k]
+                    work[_STRAIN + i] -= bars.heat[0, k]
+                    work[_TEMPERATURE0 + i], work[_TEMPERATURE + i] = start.heat[1, k], bars.heat[1, k]
             law(p, step, work, g.n)
-            for run in range(g.run, g.end):
-                bar = np.int64(layout.bars[run])
-                column = run_column(g, run, layout.nodes, layout.bars)
-                for k in range(bar, np.int64(layout.bars[run + 1])):
-                    i = np.uint64(column + k - bar)
-                    if gone >= 0:  # noqa: SIM102
-                        if abs(bars.history[g.at + gone * g.stride + column + k - bar]) >= 1.0:
-                            out[0, k], out[1, k] = 0.0, 0.0
-                            continue
-                    rest1 = bars.rest[g.first + column + k - bar]
-                    rest = 0.5 * (rest1 + start.rest[k]) if len(start.rest) > 0 else rest1
-                    length0, length = _length(start.x, ends[k, 0], ends[k, 1]), _length(x, ends[k, 0], ends[k, 1])
-                    if not length / rest > COLLAPSED_STRETCH:
-                        out[0, k], out[1, k] = math.nan, 0.0
+            for k in range(np.int64(layout.bars[g.run]), np.int64(layout.bars[g.end])):
+                i = np.int64(layout.column_of[k]) - g.first
+                if gone >= 0:  # noqa: SIM102
+                    if abs(bars.history[g.at + gone * g.stride + i]) >= 1.0:
+                        out[0, k], out[1, k] = 0.0, 0.0
                         continue
-                    slope = measured(measure, length / rest1)[1] * (rest / rest1)
-                    r, dr = mean_ratio(measure, length0 / rest, length / rest)
-                    area = _area(bars, s, g.first + column + k - bar)
-                    out[0, k] = area * work[_STRESS + i] * r / rest
-                    out[1, k] = (
-                        area * (work[_MODULUS + i] * slope * r + work[_STRESS + i] * dr) / (rest * rest) / length
-                    )
+                rest1 = bars.rest[g.first + i]
+                rest = 0.5 * (rest1 + start.rest[k]) if len(start.rest) > 0 else rest1
+                length0, length = _length(start.x, ends[k, 0], ends[k, 1]), _length(x, ends[k, 0], ends[k, 1])
+                if not length / rest > COLLAPSED_STRETCH:
+                    out[0, k], out[1, k] = math.nan, 0.0
+                    continue
+                slope = measured(measure, length / rest1)[1] * (rest / rest1)
+                r, dr = mean_ratio(measure, length0 / rest, length / rest)
+                area, stress = _area(bars, s, g.first + i), work[_STRESS + np.uint64(i)]
+                out[0, k] = area * stress * r / rest
+                out[1, k] = area * (work[_MODULUS + np.uint64(i)] * slope * r + stress * dr) / (rest * rest) / length
 
 
 @kernel
@@ -526,22 +505,19 @@ def known_rates(ends, bars, s, step, motion, known):
     layout = bars.layout
     for group in range(layout.sections[s], layout.sections[s + 1]):
         g = group_of(layout, s, group, bars.places[s])
-        for run in range(g.run, g.end):
-            bar = np.int64(layout.bars[run])
-            first = run_column(g, run, layout.nodes, layout.bars)
-            for k in range(bar, np.int64(layout.bars[run + 1])):
-                a, b, column = ends[k, 0], ends[k, 1], first + k - bar
-                rest = bars.rest[g.first + column]
-                length = _length(x, a, b)
-                strain, slope, _ = measured(bars.measures[s], length / rest)
-                along = 0.0
-                for c in range(3):
-                    along += (x[b, c] - x[a, c]) * (v[b, c] - v[a, c])
-                rate = slope * along / (length * rest) if length > 0.0 else 0.0
-                if step > 0.0:
-                    begun = measured(bars.measures[s], _length(x0, a, b) / rest)[0]
-                    shift = bars.heat[0, k] if bars.heat.shape[1] > 0 else 0.0
-                    before = bars.history[g.at + bars.last[s] * g.stride + column]
-                    # what temperatures and rest lengths change the strain by in the step, and the strain at x
-                    rate += (begun - shift - before) / step + eta * (before - (strain - shift))
-                known[k - np.int64(layout.bars[layout.runs[layout.sections[s]]])] = rate
+        for k in range(np.int64(layout.bars[g.run]), np.int64(layout.bars[g.end])):
+            a, b, column = ends[k, 0], ends[k, 1], np.int64(layout.column_of[k]) - g.first
+            rest = bars.rest[g.first + column]
+            length = _length(x, a, b)
+            strain, slope, _ = measured(bars.measures[s], length / rest)
+            along = 0.0
+            for c in range(3):
+                along += (x[b, c] - x[a, c]) * (v[b, c] - v[a, c])
+            rate = slope * along / (length * rest) if length > 0.0 else 0.0
+            if step > 0.0:
+                begun = measured(bars.measures[s], _length(x0, a, b) / rest)[0]
+                shift = bars.heat[0, k] if bars.heat.shape[1] > 0 else 0.0
+                before = bars.history[g.at + bars.last[s] * g.stride + column]
+                # what temperatures and rest lengths change the strain by in the step, and the strain at x
+                rate += (begun - shift - before) / step + eta * (before - (strain - shift))
+            known[k - np.int64(layout.bars[layout.runs[layout.sections[s]]])] = rate

@@ -10,8 +10,7 @@ import numpy as np
 
 from ..mesh.ordering import LEAST_RUN, NODE_BLOCK
 from .chunk_laws import CHUNK
-from .compiled import inlined, kernel
-from .records import record
+from .compiled import inlined, kernel, record
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,20 +36,6 @@ def new_components(nodes: int, place: int = PLACES) -> np.ndarray:
     """Return zeros (3, stride) for vectors of nodes by components, and for columns without a bar beyond them."""
     stride = -(-(nodes + 2 * LANES) // PAGE) * PAGE + 5 * LANES  # each row begins at another place of a page
     return aligned(3 * stride, place).reshape(3, stride)
-
-
-@inlined
-def copy(values, out):
-    """Write the first numbers of ``values`` to all of ``out``."""
-    for i in range(len(out)):
-        out[i] = values[i]
-
-
-@inlined
-def fill(out, value):
-    """Write a value to all of ``out``."""
-    for i in range(len(out)):
-        out[i] = value
 
 
 @kernel
@@ -107,6 +92,7 @@ class BarLayout(NamedTuple):
     nodes : (runs,) uint32, lower end of the first bar of each run
     bars : (runs + 1,) uint32, first bar of each run, and the end
     far : (b,) uint32, upper end of each bar, or (0,) without stars
+    column_of : (b,) uint32, column of each bar
     """
 
     sections: np.ndarray
@@ -119,6 +105,7 @@ class BarLayout(NamedTuple):
     nodes: np.ndarray
     bars: np.ndarray
     far: np.ndarray
+    column_of: np.ndarray
 
     def columns(self, section: int) -> slice:
         """Return the columns of a section."""
@@ -139,7 +126,7 @@ def make_layout(bars: np.ndarray, blocks: Sequence[tuple[int, int, int]]) -> Bar
     stars = joined([part.stars for part in found], np.bool_)
     far = np.empty(len(bars) if stars.any() else 0, dtype=np.uint32)
     np.maximum(bars[: len(far), 0], bars[: len(far), 1], out=far, casting="unsafe")
-    return BarLayout(
+    made = BarLayout(
         sections.astype(np.int64),
         np.array([part.counted + first for part, first in zip(found, sections, strict=False)], dtype=np.int64),
         stars,
@@ -150,11 +137,17 @@ def make_layout(bars: np.ndarray, blocks: Sequence[tuple[int, int, int]]) -> Bar
         joined([part.nodes for part in found], np.uint32),
         joined([part.bars for part in found], np.uint32, blocks[-1][2] if len(blocks) else 0),
         far,
+        _NONE,
     )
+    group, begin = np.repeat(np.arange(len(stars)), np.diff(made.runs)), made.bars.astype(np.int64)
+    ahead = np.where(stars[group], begin[:-1] - begin[made.runs[group]], made.nodes - made.heads[group])
+    lead = made.starts[group] + ahead - begin[:-1]
+    return made._replace(column_of=(np.repeat(lead, np.diff(begin)) + np.arange(begin[-1])).astype(np.uint32))
 
 
 def _make_groups(bars: np.ndarray, start: int, counted: int, stop: int) -> BarLayout:
-    """Return the layout of one section, without ``sections`` and ``far``, and with the first of ``bars`` of each run.
+    """Return the layout of one section, without ``sections``, ``far`` and ``column_of``, and with the first of ``bars``
+    of each run.
 
     Its bars are divided where CHUNK are reached, where the lower end passes to another block of nodes, and at
     ``counted``, into chunks of diagonal runs, whose ends are the nodes after those of the bar before, or of stars. A
@@ -191,7 +184,7 @@ def _make_groups(bars: np.ndarray, start: int, counted: int, stop: int) -> BarLa
     heads, fars = (np.where(stars, 0, each[first] - lead) for each in (nodes, ends))
     before = np.searchsorted(runs, np.searchsorted(first_bars, counted - start))
     columns = np.append(0, np.cumsum(sizes))
-    return BarLayout(_NONE, before, stars, heads, fars, columns, runs, nodes, first_bars + start, _NONE)
+    return BarLayout(_NONE, before, stars, heads, fars, columns, runs, nodes, first_bars + start, _NONE, _NONE)
 
 
 @kernel
@@ -253,30 +246,3 @@ def group_of(layout, section, number, place):
 def run_column(g, run, nodes, bars):
     """Return the column of the first bar of a run, counted from the first one of its group."""
     return np.int64(bars[run]) - np.int64(bars[g.run]) if g.star else np.int64(nodes[run]) - g.head
-
-
-@kernel
-def spread_values(layout, section, values, none, spread):
-    """Write values (n,) of the bars of a section to its columns ``spread``, and ``none`` to the others."""
-    bar = np.int64(layout.bars[layout.runs[layout.sections[section]]])
-    for number in range(layout.sections[section], layout.sections[section + 1]):
-        g = group_of(layout, section, number, 0)
-        end = g.at
-        for run in range(g.run, g.end):
-            first, last = np.int64(layout.bars[run]) - bar, np.int64(layout.bars[run + 1]) - bar
-            at = g.at + run_column(g, run, layout.nodes, layout.bars)
-            fill(spread[end:at], none)
-            end = at + last - first
-            copy(values[first:last], spread[at:end])
-        fill(spread[end : g.at + g.n], none)
-
-
-@kernel
-def gather_values(layout, section, spread, values):
-    """Write what the columns ``spread`` of a section have to the ``values`` (n,) of its bars."""
-    bar = np.int64(layout.bars[layout.runs[layout.sections[section]]])
-    for number in range(layout.sections[section], layout.sections[section + 1]):
-        g = group_of(layout, section, number, 0)
-        for run in range(g.run, g.end):
-            first, last = np.int64(layout.bars[run]) - bar, np.int64(layout.bars[run + 1]) - bar
-            copy(spread[g.at + run_column(g, run, layout.nodes, layout.bars) :], values[first:last])

@@ -14,9 +14,8 @@ from ..case.tables import LoadFile
 from ..errors import InputError, raised
 from ..parallel.agreement import on_root, outcome
 from ..registry import nearest
-from .compiled import kernel
+from .compiled import kernel, record
 from .motion import Group, Table, TimeTables, grouped
-from .records import record
 
 if TYPE_CHECKING:
     from ..case.schema import Case

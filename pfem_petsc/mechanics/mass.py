@@ -7,7 +7,6 @@ their nodes, on the diagonal of both matrices, and so are dashpots to the ground
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +17,7 @@ from .motion import Table
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from .bars import BarBlock, Bars
+    from .bars import Bars
 
 __all__ = ["Inertia", "PointInertia", "add_at_ends", "consistent_product", "scale_rows"]
 
@@ -146,40 +145,38 @@ class Inertia:
 
     def mass_times(self, a: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Compute ``out`` = M a for owned nodes, both (owned, 3). Collective with consistent mass."""
-        self._times(a, out, self.mass, lambda block: block.density)
-        if self.consistent and self.points.any:
-            out += self.points.mass[:, None] * a
-        return out
+        return self._times(a, out, 1.0, 0.0)
 
     def damping_times(self, v: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Compute ``out`` = C v for owned nodes, both (owned, 3). Collective with consistent mass."""
         if not self.damped:
             out[:] = 0.0
             return out
-        self._times(v, out, self.damping, lambda block: self.factor * block.damping)
-        if self.consistent and self.points.any:
-            out += self.points.damping[:, None] * v
-        return out
+        return self._times(v, out, 0.0, 1.0)
 
-    def _times(
-        self, u: np.ndarray, out: np.ndarray, lumped: np.ndarray, density: Callable[[BarBlock], float]
-    ) -> np.ndarray:
+    def _times(self, u: np.ndarray, out: np.ndarray, alpha: float, eta: float) -> np.ndarray:
+        """Compute ``out`` = (alpha M + eta C) u."""
         if not self.consistent:
-            scale_rows(lumped, u, out)
-            if self.redistribution is not None and lumped is self.mass:
-                self.redistribution.add_times(1.0, u, out)
+            scale_rows(alpha * self.mass + eta * self.damping, u, out)
+            if self.redistribution is not None:
+                self.redistribution.add_times(alpha, u, out)
             return out
         owned = self.mesh.n_owned
         self._u[:owned] = u
         self.mesh.update_ghosts(self._u)
         self._out[:] = 0.0
-        for block in self.bars.blocks:
-            coefficient = np.atleast_1d(density(block) * block.area)
-            consistent_product(
-                self.bars.ends, self.bars.mass_lengths, block.start, block.stop, coefficient, self._u, self._out
-            )
+        self.add_consistent(alpha, eta, self._u, self._out)
         out[:] = self._out[:owned]
         return out
+
+    def add_consistent(self, alpha: float, eta: float, u: np.ndarray, out: np.ndarray) -> None:
+        """Add (alpha M + eta C) u of consistent matrices to the owned rows of ``out``; both (local, 3)."""
+        bars, owned = self.bars, self.mesh.n_owned
+        for block, coefficient in zip(bars.blocks, self.coefficients(alpha, eta), strict=True):
+            density = np.atleast_1d(6.0 * coefficient)
+            consistent_product(bars.ends, bars.mass_lengths, block.start, block.stop, density, u, out)
+        if self.points.any:
+            out[:owned] += self.points.nodal(alpha, eta)[:, None] * u[:owned]
 
     def coefficients(self, alpha: float, eta: float) -> list[float | np.ndarray]:
         """Return (alpha rho + eta c_m) A / 6 [kg/(m s2)] per block, the consistent part of a Hessian; or zeros.

@@ -84,12 +84,15 @@ def motion_of(entry: Support | WallKeys) -> Motion | None:
     entry : with ``motion`` and ``velocity``, and optionally ``interpolation`` and ``acceleration``
     """
     if getattr(entry, "acceleration", None) is not None:
-        return _accelerated(np.array(entry.acceleration, dtype=np.float64))
+        rows = np.array(entry.acceleration, dtype=np.float64)
+        return Motion(rows[:, 0], _integral(rows[:, 0], _integral(rows[:, 0], _over_time(rows))))
     if entry.motion is not None:
         rows = np.array(entry.motion, dtype=np.float64)
         return _through(rows[:, 0], rows[:, 1:], getattr(entry, "interpolation", "smooth"))
     if entry.velocity is not None and has_rows(entry.velocity):
-        return _moving(np.array(entry.velocity, dtype=np.float64))
+        rows = np.array(entry.velocity, dtype=np.float64)
+        jumps = bool(rows[[0, -1], 1:].any())  # velocities are zero outside
+        return Motion(rows[:, 0], _integral(rows[:, 0], _over_time(rows)), jumps)
     if entry.velocity is not None and any(entry.velocity):
         return _uniform(entry.velocity)
     return None
@@ -168,27 +171,20 @@ def _rests(width: np.ndarray, rate: np.ndarray) -> np.ndarray:
     return rests
 
 
-def _moving(rows: np.ndarray) -> Motion:
-    """Return the motion with velocities by rows [t, vx, vy, vz], which are zero outside and may jump at both ends."""
-    times, values = rows[:, 0], rows[:, 1:]
-    width = np.diff(times)[:, None]
-    coefficients = np.zeros((len(times), 4, 3))
-    coefficients[:-1, 1] = values[:-1]
-    coefficients[:-1, 2] = np.diff(values, axis=0) / (2.0 * width)
-    coefficients[1:, 0] = np.cumsum(0.5 * width * (values[:-1] + values[1:]), axis=0)
-    return Motion(times, coefficients, jumps=bool(values[[0, -1]].any()))
+def _over_time(rows: np.ndarray) -> np.ndarray:
+    """Return the coefficients of vectors by rows [t, x, y, z], linear in between and zero after the last one."""
+    coefficients = pieces(rows[:, 0], rows[:, 1:], False)
+    coefficients[-1] = 0.0
+    return coefficients
 
 
-def _accelerated(rows: np.ndarray) -> Motion:
-    times, values = rows[:, 0], rows[:, 1:]
-    width = np.diff(times)[:, None]
-    coefficients = np.zeros((len(times), 4, 3))
-    coefficients[:-1, 2] = 0.5 * values[:-1]
-    coefficients[:-1, 3] = np.diff(values, axis=0) / (6.0 * width)
-    coefficients[1:, 1] = np.cumsum(0.5 * width * (values[:-1] + values[1:]), axis=0)
-    moved = width * coefficients[:-1, 1] + width**2 * (coefficients[:-1, 2] + width * coefficients[:-1, 3])
-    coefficients[1:, 0] = np.cumsum(moved, axis=0)
-    return Motion(times, coefficients)
+def _integral(times: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Return the coefficients of the integral of cubics from the first time on, which have no term of s^3."""
+    whole, width = np.zeros_like(rates), np.diff(times)[:, None]
+    whole[:, 1:] = rates[:, :3] / np.arange(1.0, 4.0)[:, None]
+    _, c1, c2, c3 = np.moveaxis(whole[:-1], 1, 0)
+    whole[1:, 0] = np.cumsum(width * (c1 + width * (c2 + width * c3)), axis=0)
+    return whole
 
 
 @kernel

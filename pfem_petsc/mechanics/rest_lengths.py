@@ -11,7 +11,7 @@ import numpy as np
 from ..case.base import has_rows
 from ..errors import InputError
 from ..mesh.distribution import bars_of_group
-from .elements import COLLAPSED_STRETCH, MEASURES, virgin
+from .elements import COLLAPSED_STRETCH, MEASURES
 from .materials.base import law_of
 from .motion import Table
 from .rupture import intact
@@ -246,7 +246,7 @@ def stretch_of(law: Law, measure: Callable, parameters: tuple[float, ...], targe
     if target == 0.0:
         return 1.0
     law, parameters = intact(law, parameters)
-    response, start = law.response, virgin(law)
+    response, start = law.response, (0.0,) * len(law.internal)
     stretch = kept = 1.0
     best = miss = math.inf
     for _ in range(_ITERATIONS):

@@ -377,7 +377,7 @@ class Supports:
         """Set the prescribed components of vectors (owned, 3) to zero."""
         if not self.any:
             return
-        vectors[self.fixed] = 0.0
+        vectors[self.at] = 0.0
         if self.inclined is not None:
             self.inclined.clear(vectors)
 

@@ -17,10 +17,22 @@ from petsc4py import PETSc
 from ..errors import InputError, SimulationFailure
 from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..output.units import TIME
+from ..solvers.linear import basis_by_peaks, first_largest, without
 from ..stepping.plan import Plan, refuse_motion
 from ..stepping.stepper import Solution, Stepper
-from .pencil import Holds, Pencil, StateMatrices, buckling_bars, join, linear_forces
-from .solvers import SOLVERS, Dense, Lanczos, Slepc
+from .pencil import (
+    SOLVERS,
+    BarStiffness,
+    Dense,
+    Holds,
+    Lanczos,
+    Pencil,
+    Slepc,
+    StateMatrices,
+    buckling_bars,
+    join,
+    linear_forces,
+)
 
 if TYPE_CHECKING:
     from ..case.tables import Modes
@@ -62,7 +74,6 @@ class InitialState(Stepper):
 
 
 _EQUAL = 1e-9  # relative difference below which eigenvalues count as equal
-_TIE = 1e-6  # relative difference below which components count as equal
 _SEEN = 1e-3  # smallest projection of a unit rigid motion on a space that is used
 
 
@@ -79,7 +90,7 @@ class Basis:
 
     def __init__(self, comm: MPI.Comm, numbers: np.ndarray, points: np.ndarray, mass: np.ndarray) -> None:
         self._comm, self._mass = comm, mass
-        self._places = (3 * numbers[:, None] + np.arange(3)).ravel()
+        self._numbers = numbers
         sums = comm.allreduce(np.append(mass @ points, mass.sum()))
         arms = points - sums[:3] / sums[3]
         translations = np.broadcast_to(np.eye(3)[:, None], (3, len(numbers), 3))
@@ -114,40 +125,19 @@ class Basis:
         largest = np.sqrt(mine[-1].max())
         rows: list[np.ndarray] = []
         for motion, length in zip(mine[:-1], lengths, strict=True):
-            rest = _without(motion, rows)
+            rest = without(motion, rows)
             if len(rows) < len(space) and np.linalg.norm(rest) > _SEEN * np.sqrt(length) * largest:
                 rows.append(rest / np.linalg.norm(rest))
-        while len(rows) < len(space):
-            rest = _without(self._peak(space, rows), rows)
-            rows.append(rest / np.linalg.norm(rest))
-        return np.array(rows)
-
-    def _peak(self, space: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
-        """Return coefficients (k,) of the vector orthogonal to ``rows`` with the largest component. Collective."""
-        left = np.eye(len(space)) - sum((np.outer(row, row) for row in rows), np.zeros((len(space),) * 2))
-        components = left @ space.reshape(len(space), len(self._places))
-        at = self._first_largest(np.sqrt((components**2).sum(axis=0)))
-        return self._comm.allreduce(components[:, at].copy() if at >= 0 else np.zeros(len(space)))
+        return np.array(basis_by_peaks(self._comm, self._numbers, space, rows))
 
     def _signs(self, shapes: np.ndarray) -> np.ndarray:
         signs = np.zeros(len(shapes))
         for k in range(len(shapes)):
             shape = shapes[k].ravel()
-            at = self._first_largest(np.abs(shape))
+            at = first_largest(self._comm, self._numbers, np.abs(shape))
             signs[k] = np.sign(shape[at]) if at >= 0 else 0.0
         self._comm.Allreduce(MPI.IN_PLACE, signs)
         return np.where(signs < 0.0, -1.0, 1.0)
-
-    def _first_largest(self, sizes: np.ndarray) -> int:
-        """Return the local index of the largest value of all ranks, the first in mesh numbering; -1 elsewhere."""
-        largest = self._comm.allreduce(float(sizes.max(initial=0.0)), op=MPI.MAX)
-        near = np.flatnonzero(sizes >= (1.0 - _TIE) * largest)
-        none = np.iinfo(np.int64).max
-        first = int(self._places[near].min()) if len(near) else none
-        winner = self._comm.allreduce(first, op=MPI.MIN)
-        if first != winner or not len(near):
-            return -1
-        return int(near[np.argmin(self._places[near])])
 
 
 def same(one: float, other: float, zero: float) -> bool:
@@ -155,13 +145,6 @@ def same(one: float, other: float, zero: float) -> bool:
     if not np.isfinite(one) or not np.isfinite(other):
         return one == other
     return abs(other - one) <= max(zero, _EQUAL * max(abs(one), abs(other)))
-
-
-def _without(vector: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
-    for _ in range(2):
-        for row in rows:
-            vector = vector - (row @ vector) * row
-    return vector
 
 
 DENSE_UP_TO = 600
@@ -324,7 +307,7 @@ class _Search:
     def vibration(self, matrices: StateMatrices) -> Found:
         """Return the natural vibrations: theta = 1/(lambda - shift) of M x = theta (K - shift M) x."""
         model, holds = self.model, self.holds
-        bars = model.bars.state_stiffness(self.state.x)
+        bars = BarStiffness.of(model, self.state.x, model.bars.state_stiffness(self.state.x))
         low, high = matrices.bounds(bars, holds.curvature)
         top = 2.0 * high + abs(low)
         stiffness = matrices.stiffness(bars, top * matrices.inertia.mass, holds.curvature)
@@ -359,16 +342,13 @@ class _Search:
             end = 1.0 if static is None else getattr(static.parameters, "end", None) or 1.0
             found = linear_forces(self.model, matrices, 0.0, float(end), loaded=static is not None)
             material, forces = found.stiffness, np.stack([found.start, found.change])
-            geometric = material.copy()
-            geometric[4] = found.change / found.lengths
-            geometric[3] = -geometric[4]
+            geometric = material._replace(along=np.zeros_like(found.change), across=found.change / material.lengths)
         else:
             material, geometric = buckling_bars(self.model, self.state.x)
-            forces = np.stack([np.zeros_like(geometric[4]), geometric[4] * self.model.bars.mesh_lengths])
+            forces = np.stack([geometric.along, geometric.across * self.model.bars.mesh_lengths])
             doubts = self._nonlinear(matrices, forces[1])
-        largest = np.array([np.abs(geometric[4]).max(initial=0.0), np.abs(material[3]).max(initial=0.0)])
-        comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-        if largest[0] <= _NO_LOAD * largest[1]:
+        largest = material.largest(comm)
+        if geometric.largest(comm) <= _NO_LOAD * largest:
             remedy = "give the case loads, or temperatures, rest lengths or motions that change up to load factor 1"
             if not self.linear:
                 remedy = "give the case loads, and modes.linear = true or an analysis that loads the truss ([static])"
@@ -376,9 +356,8 @@ class _Search:
                 f'{self.source}: modes: kind = "buckling" multiplies axial forces by the factors, and there are none: '
                 f"{remedy}"
             )
-        geometric[3:] *= -1.0
-        a = matrices.stiffness(geometric, 0.0, springs=False)
-        pencil = Pencil(a, matrices.stiffness(material, float(largest[1])), self.state.position, holds.held)
+        a = matrices.stiffness(geometric._replace(across=-geometric.across), 0.0, springs=False)
+        pencil = Pencil(a, matrices.stiffness(material, largest), self.state.position, holds.held)
         solver = self._make(pencil)
         try:
             if solver.definite is False:

@@ -1,10 +1,10 @@
-"""The matrices of the eigenvalue problems, with the components that supports and contact hold; and by one linear solve
-the axial forces that the changes from the start of an analysis to its end cause."""
+"""The matrices of the eigenvalue problems, with the components that supports and contact hold; by one linear solve the
+axial forces that the changes from the start of an analysis to its end cause; and solvers of A x = theta B x."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -12,14 +12,17 @@ from petsc4py import PETSc
 
 from ..errors import SimulationFailure
 from ..mechanics.mass import Inertia
-from ..parallel.agreement import agreed
-from ..solvers.linear import set_preconditioner
-from ..solvers.matrix import HessianMatrix
-from ..tolerances import BEYOND, RANK
+from ..parallel.agreement import agreed, on_root
+from ..solvers.linear import has_mumps, set_preconditioner
+from ..solvers.matrix import HessianMatrix, add_diagonal, block_diagonal
+from ..tolerances import BEYOND, RANK, SINGULAR_PIVOT
 
 if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
+
     from ..integrators.base import State
     from ..mechanics.supports import Directions
+    from ..mesh.distribution import DistributedMesh
     from ..stepping.model import Model
 
 _LINKED = (
@@ -147,14 +150,8 @@ class Holds:
 
     def _turning(self) -> PETSc.Mat:
         """Return the block-diagonal matrix from the local axes of nodes to x, y, z."""
-        owned, first = self._mesh.n_owned, 3 * self._mesh.first_node
-        blocks = np.broadcast_to(np.eye(3), (owned, 3, 3)).copy()
-        blocks[self._nodes] = self._turns.transpose(0, 2, 1)
-        turn = PETSc.Mat().createAIJ(((3 * owned, None), (3 * owned, None)), bsize=3, nnz=3, comm=self._mesh.comm)
-        columns = first + (3 * np.arange(owned)[:, None, None] + np.arange(3)).repeat(3, axis=1)
-        pointers = 3 * np.arange(3 * owned + 1, dtype=PETSc.IntType)
-        turn.setValuesCSR(pointers, columns.ravel().astype(PETSc.IntType), blocks.ravel())
-        turn.assemble()
+        turn = block_diagonal(self._mesh)
+        add_diagonal(turn, self._mesh, self._nodes, self._turns.transpose(0, 2, 1), PETSc.InsertMode.INSERT_VALUES)
         return turn
 
     def taken_out(self, matrix: PETSc.Mat, diagonal: float | np.ndarray) -> PETSc.Mat:
@@ -208,32 +205,56 @@ class Pencil:
             matrix.destroy()
 
 
-def buckling_bars(model: Model, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bars (5, b) of K0 and Kg, both on the geometry of the mesh; see ``Bars.state_stiffness``.
+class BarStiffness(NamedTuple):
+    """Stiffness of bars between positions ``x`` (local, 3) [m]: along and across them (b,) [N/m], and their lengths
+    (b,) [m]."""
+
+    x: np.ndarray
+    along: np.ndarray
+    across: np.ndarray
+    lengths: np.ndarray
+
+    @classmethod
+    def of(cls, model: Model, x: np.ndarray, stored: np.ndarray) -> BarStiffness:
+        """Return that of the numbers ``stored`` (2, b) of ``Bars.stiffnesses`` at positions."""
+        lengths = model.bars.lengths(x)
+        return cls(x, stored[0] * lengths**2 + stored[1], stored[1], lengths)
+
+    @property
+    def stored(self) -> np.ndarray:
+        """These numbers (2, b)."""
+        square = self.lengths**2
+        c = np.divide(self.along - self.across, square, out=np.zeros_like(square), where=square > 0.0)
+        return np.stack([c, self.across])
+
+    def largest(self, comm: MPI.Comm) -> float:
+        """Return the largest magnitude along or across a bar [N/m]. Collective."""
+        mine = np.maximum(np.abs(self.along), np.abs(self.across)).max(initial=0.0)
+        return comm.allreduce(float(mine), op=MPI.MAX)
+
+
+def buckling_bars(model: Model, x: np.ndarray) -> tuple[BarStiffness, BarStiffness]:
+    """Return the bars of K0 and Kg, both on the geometry of the mesh.
 
     K0: dN/dl of the unstressed bars with their virgin material, along the bar. Kg: N/l0 across it, where N is the
     axial force at the local positions ``x``.
     """
     bars, points = model.bars, model.mesh.points
-    lengths = bars.lengths(x)
-    force = bars.state_stiffness(x)[4] * lengths
+    force = bars.state_stiffness(x)[1] * bars.lengths(x)
     history, heat, rest = bars.history(), bars.heat, bars.rest
     step, bars.step = bars.step, 0.0
     try:
         bars.put_history(np.zeros_like(history))
         bars.heat, bars.rest = np.zeros_like(heat), bars.mesh_lengths
-        unloaded = np.zeros((5, len(model.mesh.bars)))
-        bars.linearise(points, 1.0, unloaded)
+        stored = np.zeros((2, len(model.mesh.bars)))
+        bars.stiffnesses(points, 1.0, stored)
     finally:
         bars.put_history(history)
         bars.heat, bars.rest, bars.step = heat, rest, step
-    unloaded[3:] *= bars.mesh_lengths / rest  # dN/dl of bars that are stress-free at their rest lengths
-    geometric = unloaded.copy()
-    unloaded[3] += unloaded[4]
-    unloaded[4] = 0.0
-    geometric[4] = force / bars.mesh_lengths
-    geometric[3] = -geometric[4]
-    return unloaded, geometric
+    # dN/dl of bars that are stress-free at their rest lengths
+    unloaded = BarStiffness.of(model, points, stored * (bars.mesh_lengths / rest))
+    none = np.zeros_like(force)
+    return unloaded._replace(across=none), unloaded._replace(along=none, across=force / bars.mesh_lengths)
 
 
 class StateMatrices:
@@ -254,42 +275,45 @@ class StateMatrices:
         self._ends = model.mesh.bars.astype(np.int64)
 
     def stiffness(
-        self, bars: np.ndarray, diagonal: float | np.ndarray, added: tuple | None = None, springs: bool = True
+        self, bars: BarStiffness, diagonal: float | np.ndarray, added: tuple | None = None, springs: bool = True
     ) -> PETSc.Mat:
-        """Return the matrix of bars (5, b), with ``diagonal`` (owned,) at held components. Collective.
+        """Return the matrix of bars, with ``diagonal`` (owned,) at held components. Collective.
 
         ``springs``: whether those to the ground are part of it
         ``added``: owned nodes (m,) and blocks (m, 3, 3) [N/m] to add
         """
+        return self.holds.taken_out(self.whole(bars, added, springs), diagonal)
+
+    def whole(self, bars: BarStiffness, added: tuple | None = None, springs: bool = True) -> PETSc.Mat:
+        """Return the matrix of bars with all components. Collective."""
         matrix = HessianMatrix(self.model.mesh)
 
         def fill(values: np.ndarray) -> None:
-            matrix.add_bars(bars, values)
+            matrix.add_bars(bars.x, bars.stored, values)
             if springs and self.model.bars.springs is not None:
                 self.model.bars.springs.add_tangents(1.0, matrix.pattern, values)
             if added is not None:
                 matrix.pattern.add_blocks(*added, values)
 
-        return self.holds.taken_out(matrix.fill(fill), diagonal)
+        return matrix.fill(fill)
 
     def mass(self) -> PETSc.Mat:
         """Return the mass matrix [kg]; held components keep their lumped mass. Collective."""
         model, inertia = self.model, self.inertia
         if not inertia.consistent:
-            return _diagonal(model.comm, np.repeat(inertia.mass, 3))
+            return _diagonal(model.mesh, np.repeat(inertia.mass, 3))
         matrix = HessianMatrix(model.mesh)
         filled = matrix.fill(lambda values: matrix.add_mass(model.bars, inertia, values))
         return self.holds.taken_out(filled, inertia.mass)
 
-    def bounds(self, bars: np.ndarray, blocks: tuple | None = None) -> tuple[float, float]:
-        """Return bounds below and above all eigenvalues of the bars' stiffness (5, b) and the mass [1/s2]. Collective.
+    def bounds(self, bars: BarStiffness, blocks: tuple | None = None) -> tuple[float, float]:
+        """Return bounds below and above all eigenvalues of the bars' stiffness and the mass [1/s2]. Collective.
 
         A bar's matrix is (a n n^T + c (I - n n^T)) times [[1, -1], [-1, 1]], which lies between 2 min(a, c, 0) and
         2 max(a, c, 0) times the identity; a consistent mass is at least a third of the lumped one.
         """
-        axial, transverse = bars[3] + bars[4], bars[4]
-        low = self._at_nodes(2.0 * np.minimum(np.minimum(axial, transverse), 0.0))
-        high = self._at_nodes(2.0 * np.maximum(np.maximum(axial, transverse), 0.0))
+        low = self._at_nodes(2.0 * np.minimum(np.minimum(bars.along, bars.across), 0.0))
+        high = self._at_nodes(2.0 * np.maximum(np.maximum(bars.along, bars.across), 0.0))
         if self.model.bars.springs is not None:
             high[self.model.bars.springs.nodes] += self.model.bars.springs.largest()
         if blocks is not None:
@@ -319,12 +343,10 @@ def join(first: PETSc.Mat, factor: float, second: PETSc.Mat) -> PETSc.Mat:
     return total
 
 
-def _diagonal(comm: MPI.Comm, values: np.ndarray) -> PETSc.Mat:
-    matrix = PETSc.Mat().createAIJ(((len(values), None), (len(values), None)), bsize=3, nnz=1, comm=comm)
-    first, last = matrix.getOwnershipRange()
-    rows = np.arange(first, last + 1, dtype=PETSc.IntType)
-    matrix.setValuesCSR(np.arange(len(values) + 1, dtype=PETSc.IntType), rows[:-1], values)
-    matrix.assemble()
+def _diagonal(mesh: DistributedMesh, values: np.ndarray) -> PETSc.Mat:
+    size, numbers = (len(values), 3 * mesh.n_nodes), np.arange(len(values) + 1, dtype=PETSc.IntType)
+    rows = numbers, numbers[:-1] + PETSc.IntType(3 * mesh.first_node), values
+    matrix = PETSc.Mat().createAIJ((size, size), bsize=3, csr=rows, comm=mesh.comm)
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     return matrix
 
@@ -342,15 +364,13 @@ class LinearForces:
 
     Attributes
     ----------
-    stiffness : (5, b) of the bars at the start with its stresses, see ``Bars.linearise``
+    stiffness : of the bars at the start with its stresses
     start, change : (b,) axial forces at the start, and what is added up to the end [N]
-    lengths : (b,) at the start [m]
     """
 
-    stiffness: np.ndarray
+    stiffness: BarStiffness
     start: np.ndarray
     change: np.ndarray
-    lengths: np.ndarray
 
 
 class _Linear:
@@ -364,40 +384,31 @@ class _Linear:
             model.mesh.update_ghosts(x)
         self.x = x
 
-    def at(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Stiffness (5, b), axial forces (b,) and internal forces (owned, 3) at the start's positions and the
-        temperatures and rest lengths of a time."""
+    def at(self, time: float) -> tuple[BarStiffness, np.ndarray, np.ndarray]:
+        """Stiffness, axial forces (b,) and internal forces (owned, 3) at the start's positions and the temperatures
+        and rest lengths of a time."""
         model, forces = self.model, np.zeros_like(self.x)
         model.change_bars(time)
         with model.bars.without_rates():
             model.bars.forces(self.x, forces, commit=False)
-        bars = model.bars.state_stiffness(self.x)
-        return bars, bars[4] * model.bars.lengths(self.x), forces[: model.mesh.n_owned]
+        bars = BarStiffness.of(model, self.x, model.bars.state_stiffness(self.x))
+        return bars, bars.across * bars.lengths, forces[: model.mesh.n_owned]
 
-    def solve(self, bars: np.ndarray, load: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    def solve(self, bars: BarStiffness, load: np.ndarray, moved: np.ndarray) -> np.ndarray:
         """Displacements (local, 3) by loads (owned, 3) and prescribed components (k,)."""
         model, holds = self.model, self.matrices.holds
         u = np.zeros_like(self.x)
         owned = u[: len(load)]
         model.supports.put(owned, moved)
-        model.mesh.update_ghosts(u)
-        rest = holds.to_own((load - self._product(bars, u))[None])[0]
-        matrix = self.matrices.stiffness(bars, max(float(np.abs(bars[3] + bars[4]).max(initial=0.0)), 1.0))
+        whole = self.matrices.whole(bars)
+        moves, resisting = whole.createVecs()
+        moves.array[:] = owned.ravel()
+        whole.mult(moves, resisting)
+        rest = holds.to_own((load - resisting.array.reshape(load.shape))[None])[0]
+        matrix = holds.taken_out(whole, max(float(np.abs(bars.along).max(initial=0.0)), 1.0))
         owned += holds.to_axes(self._free(matrix, rest)[None])[0]
         model.mesh.update_ghosts(u)
         return u
-
-    def _product(self, bars: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Forces (owned, 3) that resist displacements (local, 3)."""
-        ends, owned = self.model.mesh.bars, self.model.mesh.n_owned
-        d = u[ends[:, 1]] - u[ends[:, 0]]
-        force = bars[3] * (bars[:3].T * d).sum(axis=1) * bars[:3] + bars[4] * d.T
-        out = np.zeros_like(u)
-        np.subtract.at(out, ends[:, 0], force.T)
-        np.add.at(out, ends[:, 1], force.T)
-        for family in self.model.bars.families:
-            family.add_product(1.0, u, out)
-        return out[:owned]
 
     def _free(self, matrix: PETSc.Mat, load: np.ndarray) -> np.ndarray:
         """Solve for the components that are not held."""
@@ -458,19 +469,251 @@ def linear_forces(model: Model, matrices: StateMatrices, begin: float, end: floa
             bars.put_history(np.zeros_like(history))
         stiffness, force, internal = linear.at(begin)
         acting = loads(begin) if loaded else np.zeros_like(x)
-        tangent = stiffness[3] + stiffness[4]
+        ends, lengths = model.mesh.bars, stiffness.lengths
 
         def stretching(u: np.ndarray) -> np.ndarray:
-            return tangent * ((u[model.mesh.bars[:, 1]] - u[model.mesh.bars[:, 0]]) * stiffness[:3].T).sum(axis=1)
+            d, du = (values[ends[:, 1]] - values[ends[:, 0]] for values in (linear.x, u))
+            return stiffness.along * (du * d).sum(axis=1) / lengths
 
         u = linear.solve(stiffness, acting - internal, supports.lacking(x, begin))
-        start, lengths = force + stretching(u), bars.lengths(linear.x)
-        stiffness[4] = start / lengths
-        stiffness[3] = tangent - stiffness[4]
+        start = force + stretching(u)
+        stiffness = stiffness._replace(across=start / lengths)
         _, forced, resisting = linear.at(end)
         added = loads(end) - acting - (resisting - internal)
         u = linear.solve(stiffness, added, supports.positions(end) - supports.positions(begin))
-        return LinearForces(stiffness, start, forced - force + stretching(u), lengths)
+        return LinearForces(stiffness, start, forced - force + stretching(u))
     finally:
         bars.put_history(history)
         model.change_bars(end)
+
+
+_TOLERANCE = 1e-11  # relative, of theta; its square is the error of the eigenvalue
+
+
+class OnOneRank:
+    """Solves A x = theta B x with B positive definite for the largest theta, on rank 0, without the held components.
+
+    All solvers are constructed from a :class:`Pencil`, collectively, and have ``name``; ``finds_all``, whether repeated
+    eigenvalues are found with their multiplicity; ``definite``, whether B is positive definite, None if that is
+    unknown; ``largest(count, start, known)``, which returns vectors (k, owned components) of at least the ``count``
+    largest theta in the complement of the vectors ``known``; and ``destroy()``.
+    """
+
+    def __init__(self, pencil: Pencil) -> None:
+        self._comm, self._owned = pencil.a.comm.tompi4py(), pencil.held.size
+        self._free = np.flatnonzero(~pencil.held.ravel())
+        parts = self._comm.allgather(self._free + pencil.a.getOwnershipRange()[0])
+        before = sum(map(len, parts[: self._comm.rank]))
+        self._mine = slice(before, before + len(self._free))
+        rows = np.concatenate(parts) if self._comm.rank == 0 else self._free[:0]
+        self.definite: bool | None = on_root(
+            self._comm, self._prepare, self._whole(pencil.a, rows), self._whole(pencil.b, rows)
+        )
+
+    def _whole(self, matrix: PETSc.Mat, rows: np.ndarray) -> csc_matrix:
+        """Return the given rows and columns of a matrix. Collective."""
+        from scipy.sparse import csr_matrix
+
+        chosen = PETSc.IS().createGeneral(rows.astype(PETSc.IntType), comm=matrix.comm)
+        part = matrix.createSubMatrix(chosen, chosen)
+        pointers, columns, values = part.getValuesCSR()
+        whole = csr_matrix((values, columns, pointers), shape=(len(rows), len(rows))).tocsc()
+        part.destroy()
+        chosen.destroy()
+        return whole
+
+    def largest(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """See :class:`OnOneRank`. Collective."""
+        parts = self._comm.gather(np.concatenate([start[None], known])[:, self._free])
+        given = np.concatenate(parts, axis=1) if parts is not None else start[None]
+        vectors = on_root(self._comm, self._find, count, given[0], given[1:])
+        mine = np.zeros((len(vectors), self._owned))
+        mine[:, self._free] = vectors[:, self._mine]
+        return mine
+
+    def destroy(self) -> None:
+        """Free nothing: matrices and factors are Python's."""
+
+
+class Dense(OnOneRank):
+    """All eigenvalues by LAPACK: for small models."""
+
+    name = "dense matrices (LAPACK)"
+    finds_all = True
+
+    def _prepare(self, a: csc_matrix, b: csc_matrix) -> bool:
+        from scipy.linalg import eigh
+
+        right = b.toarray()
+        try:
+            pivots = np.diag(np.linalg.cholesky(right)) ** 2
+        except np.linalg.LinAlgError:
+            return False
+        if pivots.min() <= SINGULAR_PIVOT * right.diagonal().max():
+            return False
+        self._vectors = eigh(a.toarray(), right)[1].T[::-1]
+        return True
+
+    def _find(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray:
+        return self._vectors[len(known) : len(known) + count]
+
+
+class Lanczos(OnOneRank):
+    """Some eigenvalues by SciPy (ARPACK) with a factorisation."""
+
+    name = "Lanczos iterations with a factorisation on one rank (SciPy)"
+    finds_all = False
+
+    def _prepare(self, a: csc_matrix, b: csc_matrix) -> bool | None:
+        from scipy.sparse.linalg import splu
+
+        self._a, self._b = a, b
+        options = {"SymmetricMode": True}
+        try:
+            self._factor = splu(b, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        except RuntimeError:
+            return False
+        if not np.array_equal(self._factor.perm_r, self._factor.perm_c):
+            return None
+        # L D L^T without row exchanges: by Sylvester's law the signs of D are those of the eigenvalues
+        return bool((self._factor.U.diagonal() > SINGULAR_PIVOT * b.diagonal().max()).all())
+
+    def _find(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray:
+        from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
+
+        n = len(start)
+        products = self._b @ known.T
+        gram = known @ products
+
+        def complement(x: np.ndarray) -> np.ndarray:
+            """Remove the component in the span of the known vectors, which are B-orthogonal to all others."""
+            return x - known.T @ np.linalg.solve(gram, products.T @ x)
+
+        def applied(x: np.ndarray) -> np.ndarray:
+            y = self._a @ complement(x)
+            return y - products @ np.linalg.solve(gram, known @ y)
+
+        def operator(function: Any) -> LinearOperator:
+            return LinearOperator((n, n), matvec=function, dtype=float)
+
+        options = {
+            "M": self._b,
+            "which": "LA",
+            "v0": complement(start),
+            "tol": _TOLERANCE,
+            "ncv": min(n, 2 * count + 20),
+        }
+        try:
+            _, vectors = eigsh(operator(applied), min(count, n - 1), Minv=operator(self._factor.solve), **options)
+        except ArpackNoConvergence as failure:
+            raise SimulationFailure(f"modes: the Lanczos iterations of SciPy did not converge: {failure}") from failure
+        return np.ascontiguousarray(complement(vectors).T)
+
+
+FACTORISED_UP_TO = 400_000
+"""Maximum number of components for which SLEPc uses a factorisation of B."""
+_OPTIONS = "pfem_modes_"
+_LINEAR = 1e-12  # tolerance of solves with multigrid, which the iterations treat as exact
+
+
+class Slepc:
+    """Krylov-Schur iterations by SLEPc on all ranks: with a factorisation by MUMPS, for large models with multigrid.
+
+    Options: prefix ``pfem_modes_``, of the eigensolver (``eps_...``) and of its linear solver (``st_ksp_...``).
+    """
+
+    finds_all = False
+
+    def __init__(self, pencil: Pencil) -> None:
+        from slepc4py import SLEPc
+
+        self.pencil = pencil
+        self._eps = eps = SLEPc.EPS().create(pencil.b.comm)
+        eps.setOptionsPrefix(_OPTIONS)
+        eps.setOperators(pencil.a, pencil.b)
+        eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
+        eps.setType(SLEPc.EPS.Type.KRYLOVSCHUR)
+        eps.setWhichEigenpairs(SLEPc.EPS.Which.LARGEST_REAL)
+        eps.setTolerances(_TOLERANCE, 500)
+        ksp, mumps = eps.getST().getKSP(), has_mumps()
+        pc = ksp.getPC()
+        self.name = "Krylov-Schur iterations (SLEPc), "
+        if (mumps or pencil.b.comm.size == 1) and pencil.b.getSize()[0] <= FACTORISED_UP_TO:
+            self.name += "factorisation by MUMPS" if mumps else "factorisation"
+            ksp.setType("preonly")
+            pc.setType("cholesky")
+            if mumps:
+                pc.setFactorSolverType("mumps")
+        else:
+            self.name += "conjugate gradients with multigrid"
+            ksp.setType("cg")
+            ksp.setTolerances(rtol=_LINEAR, max_it=2000)
+            pc.setType("gamg")
+            pc.setOperators(pencil.b)
+            points = pencil.points
+            total = pencil.b.comm.tompi4py().allreduce(np.append(points.sum(axis=0), float(len(points))))
+            pc.setCoordinates(points - total[:3] / total[3])
+        eps.setFromOptions()
+        self.definite = self._definite(ksp)
+
+    def _definite(self, ksp: PETSc.KSP) -> bool | None:
+        """Return whether B is positive definite, by the signs of its factors (Sylvester's law)."""
+        pc = ksp.getPC()
+        if pc.getType() != "cholesky":
+            return None
+        ksp.setOperators(self.pencil.b)
+        mumps = pc.getFactorSolverType() == "mumps"
+        if mumps:
+            pc.setFactorSetUpSolverType()
+            factor = pc.getFactorMatrix()
+            factor.setMumpsIcntl(24, 1)  # count zero pivots
+            factor.setMumpsIcntl(13, 1)  # and signs of pivots of the last front, which several ranks may share
+        ksp.setUp()
+        factor = pc.getFactorMatrix()
+        if mumps and factor.getMumpsInfog(1) < 0:
+            return False
+        negative, zero, _ = factor.getInertia()
+        return negative == 0 and zero == 0
+
+    def largest(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """See :class:`OnOneRank`. Collective."""
+        eps, b = self._eps, self.pencil.b
+        size = b.getSize()[0]
+        spaces = [b.createVecRight() for _ in range(len(known) + 1)]
+        for vector, values in zip(spaces, (*known, start), strict=True):
+            vector.setArray(values)
+        eps.setDeflationSpace(spaces[:-1])
+        eps.setInitialSpace(spaces[-1:])
+        eps.setDimensions(min(count, size), min(size, 2 * count + 20))
+        try:
+            eps.solve()
+        except PETSc.Error as failure:
+            reason = str(failure).strip().splitlines()[-1]
+            raise SimulationFailure(
+                f"modes: {self.name}: PETSc or SLEPc failed ({reason}); use another modes.solver, or other options "
+                f"-{_OPTIONS}..."
+            ) from failure
+        finally:
+            for vector in spaces:
+                vector.destroy()
+        found = eps.getConverged()
+        if found < min(count, size - len(known)):
+            raise SimulationFailure(
+                f"modes: {found} of {count} eigenvalues converged after {eps.getIterationNumber()} restarts of SLEPc's "
+                f"iterations ({self.name}); ask for fewer modes, or give other options -{_OPTIONS}eps_..."
+            )
+        vectors = np.empty((found, len(start)))
+        x = b.createVecRight()
+        for k in range(found):
+            eps.getEigenvector(k, x)
+            vectors[k] = x.getArray(readonly=True)
+        x.destroy()
+        return vectors
+
+    def destroy(self) -> None:
+        """Free the SLEPc objects."""
+        self._eps.destroy()
+
+
+SOLVERS = {"dense": Dense, "scipy": Lanczos, "slepc": Slepc}
+"""By the name in ``modes.solver``."""

@@ -24,7 +24,7 @@ from ..output.result import RESULT_NAME
 from ..output.units import MODE, TIME, duration
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import agreed_call, on_root
-from ..preflight.checks import summarise, warnings_before
+from ..preflight import summarise, warnings_before
 from ..restart import Restart, RunState, changed_keys, prepare_folder
 from ..signals import early
 from ..stepping.model import Model

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from ..columns import Fields, declared
 from ..contact.contact import check_start
 from ..errors import InputError, SimulationFailure
-from ..preflight.checks import warnings_before
+from ..preflight import warnings_before
 from ..stepping.model import Model, StageStart
 from ..stepping.plan import Plan, make_plan
 from ..stepping.plan import make_stepper as time_stepper

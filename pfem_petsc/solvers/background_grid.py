@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
+from scipy.sparse import csr_array
 
 from ..mechanics.compiled import inlined, kernel
 from ..mesh.exchange import GhostExchange, Router
@@ -27,63 +28,14 @@ def corner_weights(t, node, base, box, weights, first):
         weights[first + i] = w
 
 
-@inlined
-def _box(low, shape):
-    """Return the number of the box that starts at the planes ``low`` (3,)."""
-    return (low[0] * shape[1] + low[1]) * shape[2] + low[2]
+def _first_planes(t: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Return the planes (n, 3) at which the boxes of positions (n, 3) counted in planes start."""
+    return np.maximum(np.minimum(t.astype(np.int64), shape - 2), 0)
 
 
-@kernel
-def node_boxes(t, shape, out):
-    """Write the box of each node."""
-    low = np.zeros(3, np.int64)
-    for k in range(len(t)):
-        for i in range(3):
-            low[i] = max(min(int(t[k, i]), shape[i] - 2), 0)
-        out[k] = _box(low, shape)
-
-
-@kernel
-def bar_boxes(t, shape, bars, start, stop, out):
-    """Write the box with all corners that have a weight at either end of each bar, -1 if there is none."""
-    low = np.zeros(3, np.int64)
-    for k in range(start, stop):
-        fits = True
-        for i in range(3):
-            p, q = t[bars[k, 0], i], t[bars[k, 1], i]
-            low[i] = max(min(int(min(p, q)), shape[i] - 2), 0)
-            fits &= max(p, q) <= low[i] + 1.0
-        out[k] = _box(low, shape) if fits else -1
-
-
-@kernel
-def interpolate(t, box, base, corners, coarse, fine):
-    """Write the values (owned, 3) of nodes from those of corners."""
-    w = np.zeros(8)
-    for k in range(len(fine)):
-        corner_weights(t, k, base, box[k], w, 0)
-        x = y = z = 0.0
-        for i in range(8):
-            at = corners[box[k], i]
-            x += w[i] * coarse[at, 0]
-            y += w[i] * coarse[at, 1]
-            z += w[i] * coarse[at, 2]
-        fine[k, 0] = x
-        fine[k, 1] = y
-        fine[k, 2] = z
-
-
-@kernel
-def restrict(t, box, base, corners, fine, coarse):
-    """Add the transpose of :func:`interpolate`."""
-    w = np.zeros(8)
-    for k in range(len(fine)):
-        corner_weights(t, k, base, box[k], w, 0)
-        for i in range(8):
-            at = corners[box[k], i]
-            coarse[at, 0] += w[i] * fine[k, 0]
-            coarse[at, 1] += w[i] * fine[k, 1]
-            coarse[at, 2] += w[i] * fine[k, 2]
+def _numbers(low: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Return the numbers of the boxes or corners at planes ``low`` (..., 3)."""
+    return (low[..., 0] * shape[1] + low[..., 1]) * shape[2] + low[..., 2]
 
 
 # Spacing of the planes over the mean length of the bars. Lattices of 10^5 bars, iterations to 1e-6 and time: 2 is best
@@ -219,6 +171,7 @@ class BackgroundGrid:
     t : (local, 3) positions of nodes counted in planes
     base : (boxes, 3) int32, first planes of each box on this rank; corners : (boxes, 8) int32, their local numbers
     box : (owned,) int32, box of each node
+    prolongation : (owned, local corners) sparse matrix of the weights of corners
     elements : Elements
     numbers : (local corners,) int64, numbers of the corners, first the ``n_owned`` owned ones, then those of other
         ranks, ascending; first, total : first number owned, and how many there are
@@ -230,19 +183,21 @@ class BackgroundGrid:
         planes = grid_planes(mesh)
         self.t = grid_coordinates(mesh.points, planes)
         shape = np.array([len(each) for each in planes], dtype=np.int64)
-        node_box = np.empty(mesh.n_local, np.int64)
-        node_boxes(self.t, shape, node_box)
+        node_box = _numbers(_first_planes(self.t, shape), shape)
         bar_box = np.full(len(mesh.bars), -2, np.int64)  # not counted here
         for block in mesh.blocks:
-            bar_boxes(self.t, shape, mesh.bars, block.start, block.counted, bar_box)
+            ends = self.t[mesh.bars[block.start : block.counted]]
+            low = _first_planes(ends.min(axis=1), shape)
+            fits = (ends.max(axis=1) <= low + 1.0).all(axis=1)
+            bar_box[block.start : block.counted] = np.where(fits, _numbers(low, shape), -1)  # -1: in no box
         boxes = np.unique(np.concatenate([np.unique(node_box), np.unique(bar_box[bar_box >= 0])]))
         self._make_elements(mesh, boxes, node_box, bar_box)
         low = np.stack([boxes // (shape[1] * shape[2]), boxes // shape[2] % shape[1], boxes % shape[2]], axis=1)
         self.base = low.astype(np.int32)
         corner = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
         at = np.minimum(low[:, None, :] + corner, shape - 1)
-        keys = (at[:, :, 0] * shape[1] + at[:, :, 1]) * shape[2] + at[:, :, 2]
-        self._number(keys, int(np.prod(shape)))
+        self._number(_numbers(at, shape), int(np.prod(shape)))
+        self.prolongation = self._prolong(corner)
         pairs = self.elements.boxes
         both = self.corners[pairs]
         both[pairs < 0] = -1
@@ -250,6 +205,15 @@ class BackgroundGrid:
         key = self._keys
         along = key // (shape[1] * shape[2]), key // shape[2] % shape[1], key % shape[2]
         self.positions = np.stack([planes[i][along[i]] for i in range(3)], axis=1)
+
+    def _prolong(self, corner: np.ndarray) -> csr_array:
+        """Return the sparse matrix (owned, local corners) from values of corners to those of nodes."""
+        owned = len(self.box)
+        parts = (self.t[:owned] - self.base[self.box])[:, None]
+        weights = np.where(corner, parts, 1.0 - parts).prod(axis=2)
+        starts = np.arange(0, weights.size + 1, len(corner))
+        entries = weights.ravel(), self.corners[self.box].ravel(), starts
+        return csr_array(entries, shape=(owned, len(self.numbers)))
 
     def _make_elements(
         self, mesh: DistributedMesh, boxes: np.ndarray, node_box: np.ndarray, bar_box: np.ndarray
@@ -327,26 +291,6 @@ def _sorted(numbers: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     number starts."""
     order = np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :].astype(np.int32)
     return order, np.searchsorted(numbers[order], np.arange(count + 1))
-
-
-@kernel
-def neighbours(corners, starts, elements, ptr, columns):
-    """Write the neighbours of each corner in its elements, ascending; return their number."""
-    seen = np.full(len(starts) - 1, -1, np.int32)
-    count = 0
-    for row in range(len(starts) - 1):
-        first = count
-        for at in range(starts[row], starts[row + 1]):
-            for column in corners[elements[at]]:
-                if column >= 0 and seen[column] != row:
-                    seen[column] = row
-                    if len(columns) > 0:
-                        columns[count] = column
-                    count += 1
-        ptr[row + 1] = count
-        if len(columns) > 0:
-            columns[first:count].sort()
-    return count
 
 
 @inlined
@@ -475,26 +419,3 @@ def _is_inside(t, node, base, box):
         if part < 0.0 or part > 1.0:
             return False
     return True
-
-
-@kernel
-def arrange(blocks, slots, ptr, row_of, values):
-    """Write blocks (n, 3, 3) to the values in scalar compressed rows, each at its slot."""
-    for k in range(len(slots)):
-        slot = slots[k]
-        row = row_of[slot]
-        width = 3 * (ptr[row + 1] - ptr[row])
-        at = 6 * ptr[row] + 3 * slot
-        for i in range(3):
-            for j in range(3):
-                values[at + i * width + j] += blocks[k, i, j]
-
-
-@kernel
-def stabilise(ptr, diagonal, shift, values):
-    """Add ``shift`` of the diagonal to it; 1 where it is zero."""
-    for row in range(len(diagonal)):
-        width = 3 * (ptr[row + 1] - ptr[row])
-        for i in range(3):
-            at = 6 * ptr[row] + 3 * diagonal[row] + i * (width + 1)
-            values[at] = values[at] * (1.0 + shift) if values[at] > 0.0 else 1.0

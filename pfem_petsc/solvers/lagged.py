@@ -17,7 +17,7 @@ from .multigrid import GridMultigrid
 if TYPE_CHECKING:
     from ..contact.transform import RowCoordinates
     from ..stepping.model import Model
-    from .problem import StepProblem
+    from .newton import StepProblem
 
 
 # Nodes a rank. Aggregates of fewer unknowns than rigid body modes make PETSc 3.18 fail on several ranks, and let solves
@@ -60,15 +60,13 @@ class AssembledPreconditioner:
         self.matrix.couple(rows)
 
     def make(self, problem: StepProblem, held: np.ndarray) -> None:
-        """Set up at the positions of a problem; ``held`` (local, 3): nonzero for active unknowns, ghosts not yet up to
-        date. Collective."""
-        self.mesh.update_ghosts(held)
+        """Set up at the positions of a problem; ``held`` (owned, 3): nonzero for active unknowns. Collective."""
         stored = None
         if self.product is not None:
             self.product.linearise(problem)
             self.product.make_definite()
-            stored = self._vectors()
-            self.product.extension.kept = np.flatnonzero(held[: self.mesh.n_owned] == 0.0)
+            stored = self.product.stored
+            self.product.extension.kept = np.flatnonzero(held == 0.0)
         final = self.matrix.fill_held(problem, held, stored)
         self._set_up(final, problem)
         if self._inner.getType() == "gamg" and self.fill() > _DENSE:
@@ -79,14 +77,6 @@ class AssembledPreconditioner:
                 options["mat_coarsen_type"] = "hem"
                 self._set_up(final, problem)
                 options.delValue("mat_coarsen_type")
-
-    def _vectors(self) -> np.ndarray:
-        """Return vectors and stiffnesses (5, b) of the bars for :meth:`HessianMatrix.add_bars`."""
-        ends, x = self.mesh.bars, self.product.x
-        stored = np.empty((5, len(ends)))
-        np.subtract(x[ends[:, 1]].T, x[ends[:, 0]].T, out=stored[:3])
-        stored[3:] = self.product.stored
-        return stored
 
     def fill(self) -> float:
         """Return the entries of multigrid's coarse matrices relative to the finest. Collective."""
@@ -224,14 +214,13 @@ class LaggedPreconditioner:
             if not due and self._problem is None:
                 self._make_again(problem, step)
         if due:
-            held = np.zeros((self.mesh.n_local, 3))
+            owned = self.mesh.n_owned
+            held = np.full((owned, 3), float(kept is not None))
             if kept is not None:
-                held[: self.mesh.n_owned] = 1.0
-                held[: self.mesh.n_owned].reshape(-1)[kept] = 0.0
+                held.reshape(-1)[kept] = 0.0
             self.inner.make(problem, held)
             first, beyond, step = 0.0, 0.0, self.bars.step
-            owned = self.mesh.n_owned
-            self.place = np.hstack([problem.x[:owned], held[:owned]]) if usable else np.zeros((owned, 0))
+            self.place = np.hstack([problem.x[:owned], held]) if usable else np.zeros((owned, 0))
             if self.remembers and usable:
                 self.history = self.bars.history()
         self.carried &= not due
@@ -242,15 +231,14 @@ class LaggedPreconditioner:
         """Recreate the preconditioner after a restart, from the Hessian at its last set-up with a ``step`` of the bars,
         which differs from step to step by rounding."""
         here, owned = problem.x.copy(), self.mesh.n_owned
-        held = np.zeros((self.mesh.n_local, 3))
-        problem.x[:owned], held[:owned] = self.place[:, :3], self.place[:, 3:]
+        problem.x[:owned] = self.place[:, :3]
         self.mesh.update_ghosts(problem.x)
         if self.remembers:
             history = self.bars.history()
             self.bars.put_history(self.history)
         balance = problem.balance
         with self.bars.at_step(step, balance.eta / balance.weight if balance.weight else 0.0):
-            self.inner.make(problem, held)
+            self.inner.make(problem, self.place[:, 3:])
         problem.x[:] = here
         if self.remembers:
             self.bars.put_history(history)

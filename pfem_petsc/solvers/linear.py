@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -345,3 +345,43 @@ def reproducible_products(comm: MPI.Comm) -> Iterator[None]:
     yield
     if ours:
         options.delValue("matptap_via")
+
+
+_TIE = 1e-6  # relative difference below which components count as equal
+
+
+def first_largest(comm: MPI.Comm, numbers: np.ndarray, sizes: np.ndarray) -> int:
+    """Return the local index of the largest of sizes (3 owned,) of components on all ranks, the first one by the mesh
+    ``numbers`` (owned,) of nodes; -1 on the other ranks. Collective."""
+    largest = comm.allreduce(float(sizes.max(initial=0.0)), op=MPI.MAX)
+    near = np.flatnonzero(sizes >= (1.0 - _TIE) * largest)
+    places = 3 * numbers[near // 3] + near % 3
+    first = int(places.min(initial=np.iinfo(np.int64).max))
+    found = comm.allreduce(first, op=MPI.MIN) == first and len(near) > 0
+    return int(near[places.argmin()]) if found else -1
+
+
+def basis_by_peaks(
+    comm: MPI.Comm, numbers: np.ndarray, space: np.ndarray, rows: Sequence[np.ndarray] = ()
+) -> list[np.ndarray]:
+    """Return orthonormal coefficients (k,) of k combinations of vectors (k, owned, 3) that do not depend on which
+    vectors span the space: first ``rows``, and then projections of single components. Collective.
+
+    They are those of the component that has the largest within what is left, of these the first in the mesh.
+    """
+    rows, flat = list(rows), space.reshape(len(space), 3 * len(numbers))
+    while len(rows) < len(space):
+        left = flat - sum((np.outer(row, row @ flat) for row in rows), np.zeros_like(flat))
+        at = first_largest(comm, numbers, np.sqrt((left**2).sum(axis=0)))
+        peak = comm.allreduce(left[:, at].copy() if at >= 0 else np.zeros(len(space)))
+        rest = without(peak, rows)
+        rows.append(rest / np.linalg.norm(rest))
+    return rows
+
+
+def without(vector: np.ndarray, rows: Sequence[np.ndarray]) -> np.ndarray:
+    """Return what is left of a vector without its components along orthonormal rows."""
+    for _ in range(2):
+        for row in rows:
+            vector = vector - (row @ vector) * row
+    return vector

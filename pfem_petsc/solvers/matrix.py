@@ -11,15 +11,15 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mechanics.compiled import kernel
-from ..mechanics.elements import BlockPattern, MatrixRows, add_bars
+from ..mechanics.elements import BlockPattern, MatrixRows, add_tangents
 
 if TYPE_CHECKING:
     from ..contact.transform import RowCoordinates, Transform
     from ..mechanics.bars import Bars
     from ..mechanics.mass import Inertia
-    from ..mechanics.supports import Directions, Supports
+    from ..mechanics.supports import Supports
     from ..mesh.distribution import DistributedMesh
-    from .problem import StepProblem
+    from .newton import StepProblem
 
 
 @kernel
@@ -65,32 +65,6 @@ def _add_lumped(ptr, diagonal, inertia, values):
             values[at + i * (width + 1)] += inertia[row]
 
 
-@kernel
-def _constrain_rows(ptr, diagonal, fixed, scale, values):
-    for row in range(len(diagonal)):
-        width = 3 * (ptr[row + 1] - ptr[row])
-        start = 9 * ptr[row]
-        for i in range(3):
-            if fixed[row, i]:
-                for j in range(width):
-                    values[start + i * width + j] = 0.0
-                values[6 * ptr[row] + 3 * diagonal[row] + i * (width + 1)] = scale
-
-
-@kernel
-def _constrain_columns(ptr, local_columns, diagonal, fixed, values):
-    for row in range(len(diagonal)):
-        width = 3 * (ptr[row + 1] - ptr[row])
-        for k in range(ptr[row], ptr[row + 1]):
-            column = local_columns[k]
-            at = 6 * ptr[row] + 3 * k
-            for j in range(3):
-                if fixed[column, j]:
-                    for i in range(3):
-                        if k != diagonal[row] or i != j:
-                            values[at + i * width + j] = 0.0
-
-
 class HessianMatrix:
     """Assembled Hessian of the owned rows; one interface to the two ways of setting values in a fixed PETSc pattern.
 
@@ -119,15 +93,9 @@ class HessianMatrix:
         self._rows: RowCoordinates | None = None
         self._made: list[PETSc.Mat] = []  # of these: B^-1, B^-T mat B^-1, then M and the product of both, if rows rub
         self._symmetric = symmetric
-        self.any_fixed = supports is not None and supports.any
-        self._inclined: Directions | None = None
-        if self.any_fixed:
-            self._fixed = np.zeros((mesh.n_local, 3))
-            self._fixed[: mesh.n_owned] = supports.fixed
-            mesh.update_ghosts(self._fixed)
-            self._inclined = supports.inclined
-        if self._inclined is not None:
-            self._place, self._free = mesh.with_ghosts(self._inclined.nodes, self._inclined.free)
+        self._held = None if supports is None or not supports.any else supports.spans()  # projections of owned nodes
+        if self._held is not None:
+            self._projection = self._project(self._held)
 
     def _allocate(self) -> None:
         """Give the matrix the pattern of bars, and of the nodes of bars that touch."""
@@ -160,7 +128,14 @@ class HessianMatrix:
     @cached_property
     def local_columns(self) -> np.ndarray:
         """Local node index (int32) of each block's column, computed when supports or oblique walls first need it."""
-        return local_columns(self.mesh, self.pattern.columns)
+        mesh, columns = self.mesh, self.pattern.columns
+        local = (columns - mesh.first_node).astype(np.int64)
+        outside = (local < 0) | (local >= mesh.n_owned)
+        order = np.argsort(mesh.ghost_numbers, kind="stable")
+        found = np.searchsorted(mesh.ghost_numbers[order], columns[outside])
+        # blocks of nodes that are not even ghosts are those of bars that touch, which come later: zero until then
+        local[outside] = mesh.n_owned + order[np.minimum(found, len(order) - 1)] if len(order) else 0
+        return local.astype(np.int32)
 
     def fill(self, add: Callable[[np.ndarray], None]) -> PETSc.Mat:
         """Assemble the matrix; ``add(values)`` adds the Hessian of the owned rows to the zeroed values."""
@@ -210,14 +185,14 @@ class HessianMatrix:
             self._change_coordinates(problem.transform)
 
     def put(self, problem: StepProblem, bars: np.ndarray) -> None:
-        """Assemble at the predictor of a problem, with the stiffness (5, b) of ``Bars.linearise``. Collective."""
+        """Assemble at the predictor of a problem, with the stiffness (2, b) of ``Bars.state_stiffness``. Collective."""
         problem.place(np.zeros_like(problem.u))
         self.fill(lambda values: self.add(problem, values, bars))
 
     def add(self, problem: StepProblem, values: np.ndarray, stored: np.ndarray | None = None) -> None:
         """Add dg/dw of a problem at its positions, ghosts included, without the coordinates of rows. Collective.
 
-        With ``stored`` (5, b) the stiffness of the bars is computed from these data, see ``Bars.linearise``.
+        ``stored`` (2, b) : stiffness of the bars instead of the tangent one, see ``Bars.stiffnesses``
         """
         inertia, bars, balance = problem.model.inertia, problem.model.bars, problem.balance
         if not inertia.consistent:
@@ -229,14 +204,8 @@ class HessianMatrix:
             self.add_lumped(inertia.points.nodal(balance.alpha, balance.eta), values)
         coefficients = inertia.coefficients(balance.alpha, balance.eta)
         if balance.weight or inertia.consistent:
-            apart = stored is not None and not balance.discrete_gradient
             start = problem.state.x if balance.discrete_gradient else None
-            weight = 0.0 if apart else balance.weight
-            bars.tangents(problem.x, weight, coefficients, self.pattern, values, start)
-            if apart:
-                self.add_bars(stored, values)
-                for family in bars.families:
-                    family.add_tangents(balance.weight, self.pattern, values)
+            bars.tangents(problem.x, balance.weight, coefficients, self.pattern, values, start, stored)
         self._turn(problem.transform, values)
         self.constrain(problem.scale, values)
         if problem is self._problem and self._touching is not None:
@@ -263,8 +232,8 @@ class HessianMatrix:
         """Compute ``bounded`` from B^-T mat B^-1: add the turning of slips, and multiply by M. Collective."""
         nodes = transform.sliding.nodes
         turning, left = transform.slip_blocks(), transform.left()
-        if self.any_fixed:  # whose rows and columns remain those of the identity
-            held = self._fixed[nodes] > 0.0
+        if self._held is not None:  # whose rows and columns remain those of the identity
+            held = np.einsum("kii->ki", self._held[nodes]) > 0.0
             turning[held[:, :, None] | held[:, None, :]] = 0.0
             left = np.where(held[:, :, None], np.eye(3), left)
         add_diagonal(product, self.mesh, nodes, turning, PETSc.InsertMode.ADD_VALUES)
@@ -274,19 +243,21 @@ class HessianMatrix:
         maps.matMult(product, self.bounded)
 
     def fill_held(self, problem: StepProblem, held: np.ndarray, stored: np.ndarray | None) -> PETSc.Mat:
-        """Assemble as :meth:`add`, in the coordinates of the problem; rows and columns of components (local nodes, 3)
-        with nonzero ``held`` are replaced by the scale of the problem on the diagonal. Collective."""
+        """Assemble as :meth:`add`, in the coordinates of the problem; rows and columns of components (owned, 3) with
+        nonzero ``held`` are replaced by the scale of the problem on the diagonal. Collective."""
+        active = np.eye(3) * (held != 0.0)[:, :, None]
+        projection = self._project(active) if problem.transform.rows is None else None
 
         def add(values: np.ndarray) -> None:
             self.add(problem, values, stored)
-            if held.any() and problem.transform.rows is None:
-                self.hold(held, problem.scale, values)
+            if projection is not None:
+                self._hold(projection, problem.scale, values)
 
         self.fill(add)
         if problem.transform.rows is None:
             return self.mat
         self._change_coordinates(problem.transform)
-        rows = np.flatnonzero(held[: self.mesh.n_owned]) + 3 * self.mesh.first_node
+        rows = np.flatnonzero(held) + 3 * self.mesh.first_node
         self.bounded.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
         self.bounded.zeroRowsColumns(rows.astype(PETSc.IntType), problem.scale)
         return self.bounded
@@ -301,23 +272,30 @@ class HessianMatrix:
         if inertia.points.any:
             self.add_lumped(inertia.points.mass, values)
 
-    def add_bars(self, stored: np.ndarray, values: np.ndarray) -> None:
-        """Add the bars' stiffness from the data of :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`, (5, b)."""
-        add_bars(stored, MatrixRows(self.pattern.ptr, self.pattern.slots, values, self.mesh.bars))
+    def add_bars(self, x: np.ndarray, stored: np.ndarray, values: np.ndarray) -> None:
+        """Add the stiffness (2, b) of bars between positions (local, 3), see ``Bars.stiffnesses``."""
+        rows = MatrixRows(self.pattern.ptr, self.pattern.slots, values, self.mesh.bars)
+        add_tangents(x, stored, np.zeros(stored.shape[1]), rows)
 
     def constrain(self, scale: float, values: np.ndarray) -> None:
         """Replace rows and columns of prescribed components by ``scale`` on the diagonal."""
-        if self.any_fixed:
-            self.hold(self._fixed, scale, values)
-        if self._inclined is not None:
-            turn_blocks(self.pattern.ptr, self.local_columns, self._place, self._free, self._free, values)
-            self.pattern.add_blocks(self._inclined.nodes, scale * (np.eye(3) - self._inclined.free), values)
+        if self._held is not None:
+            self._hold(self._projection, scale, values)
 
-    def hold(self, held: np.ndarray, scale: float, values: np.ndarray) -> None:
-        """Replace rows and columns of components (local nodes, 3) by ``scale`` on the diagonal."""
-        p = self.pattern
-        _constrain_rows(p.ptr, p.diagonal, held, scale, values)
-        _constrain_columns(p.ptr, self.local_columns, p.diagonal, held, values)
+    def _project(self, held: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the owned nodes (k,) with directions that are held, projections (owned, 3, 3), those (k, 3, 3) on the
+        others, and both as :func:`turn_blocks` takes them. Collective."""
+        nodes = np.flatnonzero(held.any(axis=(1, 2)))
+        free = np.eye(3) - held[nodes]
+        return nodes, free, *self.mesh.with_ghosts(nodes, free)
+
+    def _hold(self, projection: tuple[np.ndarray, ...], scale: float, values: np.ndarray) -> None:
+        """Replace rows and columns along the directions of :meth:`_project` by ``scale`` on the diagonal."""
+        nodes, free, place, every = projection
+        if not len(every):
+            return
+        turn_blocks(self.pattern.ptr, self.local_columns, place, every, every, values)
+        self.pattern.add_blocks(nodes, scale * (np.eye(3) - free), values)
 
     def _free_made(self) -> None:
         for matrix in reversed(self._made):
@@ -336,28 +314,14 @@ def block_diagonal(mesh: DistributedMesh) -> PETSc.Mat:
     size, first = (3 * mesh.n_owned, 3 * mesh.n_nodes), 3 * mesh.first_node
     columns = first + np.repeat(np.arange(3 * mesh.n_owned).reshape(-1, 1, 3), 3, axis=1).ravel()
     pointers = 3 * np.arange(3 * mesh.n_owned + 1)
-    matrix = PETSc.Mat().create(comm=mesh.comm)
-    matrix.setSizes((size, size), bsize=3)
-    matrix.setType(PETSc.Mat.Type.AIJ)
     values = np.tile(np.eye(3), (mesh.n_owned, 1, 1)).ravel()
-    matrix.setPreallocationCSR((pointers.astype(PETSc.IntType), columns.astype(PETSc.IntType), values))
-    return matrix
+    rows = pointers.astype(PETSc.IntType), columns.astype(PETSc.IntType), values
+    return PETSc.Mat().createAIJ((size, size), bsize=3, csr=rows, comm=mesh.comm)
 
 
 def add_diagonal(matrix: PETSc.Mat, mesh: DistributedMesh, nodes: np.ndarray, blocks: np.ndarray, how: int) -> None:
     """Set or add the diagonal blocks (m, 3, 3) of owned nodes (m,) in a matrix with entries for them. Collective."""
-    for at, block in zip(3 * (mesh.first_node + nodes), blocks, strict=True):
+    for at, block in zip(3 * (mesh.first_node + nodes), np.ascontiguousarray(blocks), strict=True):
         rows = np.arange(at, at + 3, dtype=PETSc.IntType)
         matrix.setValues(rows, rows, block, how)
     matrix.assemble()
-
-
-def local_columns(mesh: DistributedMesh, columns: np.ndarray) -> np.ndarray:
-    """Return the local node indices (int32) of PETSc node numbers of owned nodes or ghosts."""
-    local = (columns - mesh.first_node).astype(np.int64)
-    outside = (local < 0) | (local >= mesh.n_owned)
-    order = np.argsort(mesh.ghost_numbers, kind="stable")
-    found = np.searchsorted(mesh.ghost_numbers[order], columns[outside])
-    # blocks of nodes that are not even ghosts are those of bars that touch, which come later: zero until then
-    local[outside] = mesh.n_owned + order[np.minimum(found, len(order) - 1)] if len(order) else 0
-    return local.astype(np.int32)

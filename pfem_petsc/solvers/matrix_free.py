@@ -5,46 +5,50 @@ from __future__ import annotations
 import atexit
 import itertools
 import weakref
-from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..mechanics.chunk_laws import CHUNK
+from ..mechanics.chunk_laws import CHUNK, ROW
 from ..mechanics.compiled import inlined, kernel
 from ..mechanics.elements import end_difference
-from ..mechanics.mass import consistent_product
-from ..mechanics.products import BarProducts
+from ..mechanics.layout import (
+    DIFFERENCES,
+    FORCES,
+    BarLayout,
+    Group,
+    aligned,
+    new_components,
+    split_components,
+)
+from ..mesh.ordering import NODE_BLOCK
 
 if TYPE_CHECKING:
     from ..contact.transform import RowCoordinates
+    from ..mechanics.bars import Bars
     from ..mesh.distribution import DistributedMesh
     from ..stepping.model import Model
-    from .problem import StepProblem
+    from .newton import StepProblem
 
 
+_ALIVE: dict[int, weakref.ref] = {}
+"""PETSc objects that exist, by number in the order of their creation."""
 _NUMBERS = itertools.count()
-_ALIVE: dict[int, tuple[Callable[[weakref.ref], None], weakref.ref]] = {}
 
 
-def at_exit(function: Callable[[weakref.ref], None], thing: object) -> None:
-    """Call a function with a reference to a PETSc object when Python exits, if the object still exists then.
+def outlive_at_exit(thing: object) -> None:
+    """Let a matrix, or a linear or nonlinear solver, :func:`outlive` Python if it still exists when Python exits.
 
     Unlike ``atexit.register``, it keeps nothing of an object that is gone, of which a program that makes many runs has
     many.
     """
     number = next(_NUMBERS)
     if not number:
-        atexit.register(_call_all)
-    _ALIVE[number] = function, weakref.ref(thing, lambda _: _ALIVE.pop(number, None))
-
-
-def _call_all() -> None:
-    for function, reference in reversed(list(_ALIVE.values())):
-        function(reference)
+        atexit.register(lambda: [outlive(thing) for thing in reversed(list(_ALIVE.values()))])
+    _ALIVE[number] = weakref.ref(thing, lambda _: _ALIVE.pop(number, None))
 
 
 def outlive(reference: weakref.ref) -> None:
@@ -78,6 +82,192 @@ def python_matrix(context: object, mesh: DistributedMesh, local: int | None = No
     matrix = PETSc.Mat().createPython((size, size), context, comm=mesh.comm)
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     return matrix
+
+
+_X, _Y, _Z = (np.uint64(row * ROW) for row in range(3))
+
+
+class BarProducts:
+    """Products with the stiffness of all bars of a rank, and its diagonal.
+
+    Attributes
+    ----------
+    x : (local, 3) positions [m]
+    stored : (2, b) c [N/m3] and g [N/m] of each bar
+    """
+
+    def __init__(self, bars: Bars) -> None:
+        self.bars = bars
+        nodes, self._layout = bars.mesh.n_local, bars.arrays.layout
+        self.x = np.zeros((nodes, 3))
+        self.stored = np.zeros((2, len(bars.ends)))
+        self._columns = self.stored
+        columns = int(self._layout.starts[-1])
+        if columns > len(bars.ends):
+            self._columns = aligned(2 * columns).reshape(2, columns)
+        self._places, self._vectors = new_components(nodes), new_components(nodes)
+        self._sums = new_components(nodes, FORCES)
+        self._work = aligned(3 * ROW, DIFFERENCES)
+        self._needed, self._complete = _order(self._layout, nodes)
+
+    @classmethod
+    def tangent(cls, bars: Bars, x: np.ndarray) -> BarProducts:
+        """Return products with the tangent stiffness at positions ``x`` (local, 3), without springs."""
+        made = cls(bars)
+        made.x[:] = x
+        bars.stiffnesses(x, 1.0, made.stored)
+        made.take()
+        return made
+
+    def take(self) -> None:
+        """Take account of changes of :attr:`x` and :attr:`stored`."""
+        split_components(self.x, self._places)
+        if self._columns is not self.stored:
+            self._columns[:, self._layout.column_of] = self.stored
+
+    def times(self, nodal: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
+        """Write nodal u + K u to ``out``, both (local, 3); ``nodal`` (owned,) [N/m]."""
+        task = ProductTask(nodal, u.reshape(-1), out.reshape(-1), self._needed, self._complete)
+        multiply(self._layout, self._places, self._vectors, self._columns, self._sums, self._work, task)
+
+
+def _order(layout: BarLayout, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each group how many leading nodes must be begun before it, and how many no later one adds to."""
+    lowest, highest = layout.heads // NODE_BLOCK * NODE_BLOCK, layout.fars + np.diff(layout.starts)
+    for group in np.flatnonzero(layout.stars):
+        first, last = layout.runs[group : group + 2]
+        lowest[group] = layout.nodes[first:last].min()
+        highest[group] = layout.far[layout.bars[first] : layout.bars[last]].max() + 1
+    complete = np.append(np.minimum.accumulate(lowest[::-1])[::-1], nodes)[1:]
+    return np.minimum(np.maximum(np.maximum.accumulate(highest), complete), nodes), complete
+
+
+class ProductTask(NamedTuple):
+    """What a product reads and writes: ``nodal`` (owned,), vectors ``u`` and ``out`` (3 local,), and for each group how
+    many leading nodes are ``needed``, and which are ``complete`` after it."""
+
+    nodal: np.ndarray
+    u: np.ndarray
+    out: np.ndarray
+    needed: np.ndarray
+    complete: np.ndarray
+
+
+@inlined
+def _begin(first, end, u, vectors, sums):
+    """Write the vectors of nodes to components, and clear their sums."""
+    for k in range(first, end):
+        i, at = np.uint64(k), np.uint64(3 * k)
+        vectors[0, i], vectors[1, i], vectors[2, i] = u[at], u[np.uint64(3 * k + 1)], u[np.uint64(3 * k + 2)]
+        sums[0, i] = 0.0
+        sums[1, i] = 0.0
+        sums[2, i] = 0.0
+
+
+@inlined
+def _end(first, end, nodal, u, sums, out):
+    """Write the products of nodes; those of ghosts are not complete, and zero."""
+    for k in range(first, min(end, len(nodal))):
+        i, at, after, last = np.uint64(k), np.uint64(3 * k), np.uint64(3 * k + 1), np.uint64(3 * k + 2)
+        out[at] = nodal[i] * u[at] + sums[0, i]
+        out[after] = nodal[i] * u[after] + sums[1, i]
+        out[last] = nodal[i] * u[last] + sums[2, i]
+    for k in range(3 * max(first, len(nodal)), 3 * end):
+        out[k] = 0.0
+
+
+@inlined
+def _add_products_of_runs(g, x, u, stored, sums, work):
+    """Add the products of a group of runs to the upper ends, and subtract them from the lower ones in a workspace for
+    the nodes of a block, at the place of the group in it."""
+    for k in range(g.n):
+        a, b, i, at = np.uint64(g.head + k), np.uint64(g.far + k), np.uint64(g.first + k), np.uint64(g.at + k)
+        dx, dy, dz = x[0, b] - x[0, a], x[1, b] - x[1, a], x[2, b] - x[2, a]
+        ux, uy, uz = u[0, b] - u[0, a], u[1, b] - u[1, a], u[2, b] - u[2, a]
+        c, across = stored[0, i] * (dx * ux + dy * uy + dz * uz), stored[1, i]
+        px, py, pz = c * dx + across * ux, c * dy + across * uy, c * dz + across * uz
+        work[_X + at] -= px
+        work[_Y + at] -= py
+        work[_Z + at] -= pz
+        sums[0, b] += px
+        sums[1, b] += py
+        sums[2, b] += pz
+
+
+@inlined
+def _flush(origin, count, sums, work):
+    """Add what is due to the first nodes of a block, and clear it."""
+    for k in range(count):
+        i, at = np.uint64(origin + k), np.uint64(k)
+        sums[0, i] += work[_X + at]
+        sums[1, i] += work[_Y + at]
+        sums[2, i] += work[_Z + at]
+        work[_X + at] = 0.0
+        work[_Y + at] = 0.0
+        work[_Z + at] = 0.0
+
+
+@inlined
+def _add_products_of_stars(g, runs, x, u, stored, sums):
+    """Add the products of a group of stars; ``runs``: nodes, bars and far ends of the layout."""
+    nodes, bars, far = runs
+    ahead = g.first - np.int64(bars[g.run])
+    for run in range(g.run, g.end):
+        a = np.uint64(nodes[run])
+        ax, ay, az = x[0, a], x[1, a], x[2, a]
+        px, py, pz = u[0, a], u[1, a], u[2, a]
+        sx = sy = sz = 0.0
+        for k in range(np.int64(bars[run]), np.int64(bars[run + 1])):
+            b, i = np.uint64(far[k]), np.uint64(ahead + k)
+            dx, dy, dz = x[0, b] - ax, x[1, b] - ay, x[2, b] - az
+            ux, uy, uz = u[0, b] - px, u[1, b] - py, u[2, b] - pz
+            c, across = stored[0, i] * (dx * ux + dy * uy + dz * uz), stored[1, i]
+            fx, fy, fz = c * dx + across * ux, c * dy + across * uy, c * dz + across * uz
+            sx += fx
+            sy += fy
+            sz += fz
+            sums[0, b] += fx
+            sums[1, b] += fy
+            sums[2, b] += fz
+        sums[0, a] -= sx
+        sums[1, a] -= sy
+        sums[2, a] -= sz
+
+
+@kernel
+def multiply(layout, x, vectors, stored, sums, work, task):
+    """Write nodal u + K u; positions, vectors and sums by components, ``stored`` (2, columns) of a
+    :class:`~pfem_petsc.mechanics.layout.BarLayout`, ``work`` (3 ROW,) zeros.
+
+    Vectors are split shortly before they are needed, and products written as soon as they are complete.
+    """
+    nodal, u, out, runs = task.nodal, task.u, task.out, (layout.nodes, layout.bars, layout.far)
+    begun, ended, origin, wide = np.int64(0), np.int64(0), np.int64(-1), np.int64(0)
+    for group in range(len(layout.heads)):
+        first, head, star = layout.starts[group], layout.heads[group], layout.stars[group]
+        n = layout.starts[group + 1] - first
+        block = np.int64(-1) if star else head // NODE_BLOCK * NODE_BLOCK
+        g = Group(first, n, head, layout.fars[group], layout.runs[group], layout.runs[group + 1], star, head - block, n)
+        if block != origin and origin >= 0:
+            _flush(origin, wide, sums, work)
+            wide = np.int64(0)
+        if (block != origin or star) and group > 0 and task.complete[group - 1] > ended:
+            _end(ended, task.complete[group - 1], nodal, u, sums, out)
+            ended = task.complete[group - 1]
+        origin = block
+        if task.needed[group] > begun:
+            _begin(begun, task.needed[group], u, vectors, sums)
+            begun = task.needed[group]
+        if star:
+            _add_products_of_stars(g, runs, x, vectors, stored, sums)
+        else:
+            wide = max(wide, g.at + n)
+            _add_products_of_runs(g, x, vectors, stored, sums, work)
+    if origin >= 0:
+        _flush(origin, wide, sums, work)
+    nodes = len(u) // 3
+    _begin(begun, nodes, u, vectors, sums)
+    _end(ended, nodes, nodal, u, sums, out)
 
 
 class Restriction:
@@ -145,7 +335,7 @@ class Extension:
         self.mat = python_matrix(Context(self), whole.mesh)
         self.mat.setBlockSize(3)
         self.mat.setUp()
-        at_exit(outlive, self.mat)
+        outlive_at_exit(self.mat)
 
     def times(self, given: np.ndarray, out: np.ndarray) -> None:
         """Compute ``out`` = H ``given``, both (owned, 3) and contiguous. Collective."""
@@ -178,20 +368,6 @@ def add_blocks(bars, x, stored, blocks):
             blocks[i, 5] += c * dz * dz + g
 
 
-@kernel
-def drop_negative(bars, x, stored):
-    """Replace negative eigenvalues of the bars' stiffness, g and c d.d + g, by zero."""
-    for k in range(len(bars)):
-        c, g = stored[0, k], stored[1, k]
-        if c >= 0.0 and g >= 0.0:
-            continue
-        dx, dy, dz = end_difference(x, bars, k)
-        square = dx * dx + dy * dy + dz * dz
-        left = max(g, 0.0)
-        stored[0, k] = (max(c * square + g, 0.0) - left) / square if square > 0.0 else 0.0
-        stored[1, k] = left
-
-
 class MatrixFreeHessian:
     """Matrix-free replacement of :class:`~pfem_petsc.solvers.matrix.HessianMatrix` for symmetric schemes.
 
@@ -200,7 +376,7 @@ class MatrixFreeHessian:
     mat : PETSc matrix of type python
     bounded : the matrix of steps with bounds, equal to ``mat``
     problem : of the last :meth:`linearise`
-    bars : :class:`~pfem_petsc.mechanics.products.BarProducts`
+    bars : BarProducts
     x, stored : positions there [m], and data of each bar, of these
     """
 
@@ -210,7 +386,7 @@ class MatrixFreeHessian:
         self.mesh = mesh
         self.mat = python_matrix(Context(self), mesh)
         self.mat.setUp()
-        at_exit(outlive, self.mat)
+        outlive_at_exit(self.mat)
         self.bounded = self.mat
         self.bars = BarProducts(model.bars)
         self.x, self.stored = self.bars.x, self.bars.stored
@@ -240,14 +416,17 @@ class MatrixFreeHessian:
         self._diagonal = None
 
     def put(self, problem: StepProblem, bars: np.ndarray) -> None:
-        """Linearise at the predictor of a problem, with the stiffness (5, b) of ``Bars.linearise``. Collective."""
+        """Linearise at the predictor, with the stiffness (2, b) of bars by ``Bars.state_stiffness``. Collective."""
         self.update(problem, np.zeros_like(problem.u))
-        self.stored[0], self.stored[1] = bars[3] / self.model.bars.lengths(self.x) ** 2, bars[4]
+        self.stored[:] = bars
         self._take()
 
     def make_definite(self) -> None:
         """Drop negative eigenvalues of the bars' stiffness, due to compression or softening laws."""
-        drop_negative(self.mesh.bars, self.x, self.stored)
+        square, (c, g) = self.model.bars.lengths(self.x) ** 2, self.stored
+        axial = np.maximum(c * square + g, 0.0)
+        np.maximum(g, 0.0, out=g)
+        np.divide(axial - g, square, out=c, where=square > 0.0)
         self._take()
 
     @cached_property
@@ -287,12 +466,7 @@ class MatrixFreeHessian:
         alpha, eta = problem.balance.alpha, problem.balance.eta
         self.bars.times(self._none if inertia.consistent else problem.nodal, u, out)
         if inertia.consistent:
-            coefficients = inertia.coefficients(alpha, eta)
-            for block, coefficient in zip(bars.blocks, coefficients, strict=True):
-                density = np.atleast_1d(6.0 * coefficient)
-                consistent_product(bars.ends, bars.mass_lengths, block.start, block.stop, density, u, out)
-            if inertia.points.any:
-                out[:owned] += inertia.points.nodal(alpha, eta)[:, None] * u[:owned]
+            inertia.add_consistent(alpha, eta, u, out)
         elif inertia.redistribution is not None:
             inertia.redistribution.add_times(alpha, u, out)
         for family in bars.families:
@@ -311,11 +485,9 @@ class MatrixFreeHessian:
         if self._diagonal is not None:
             return self._diagonal
         problem, supports = self.problem, self.model.supports
-        if problem.transform.identity and supports.inclined is None:
-            diagonal = self._plain_diagonal()
-        else:
-            blocks = self.blocks()
-            diagonal = blocks[:, [0, 3, 5]]
+        blocks = self.blocks()
+        diagonal = blocks[:, [0, 3, 5]]
+        if not problem.transform.identity:
             problem.transform.diagonal(self._left, lambda nodes: full_blocks(blocks[nodes]), diagonal)
         diagonal[supports.fixed] = problem.scale
         if supports.inclined is not None:
@@ -323,14 +495,6 @@ class MatrixFreeHessian:
             full = free @ full_blocks(blocks[at]) @ free + problem.scale * (np.eye(3) - free)
             diagonal[at] = np.einsum("mii->mi", full)
         self._diagonal = diagonal
-        return diagonal
-
-    def _plain_diagonal(self) -> np.ndarray:
-        """Return the diagonal (owned, 3), without supports and transform."""
-        diagonal = self.bars.diagonal()[: self.mesh.n_owned]
-        for nodes, extra in self._additions():
-            diagonal[nodes] += np.einsum("kii->ki", extra)
-        diagonal += self._nodal()[:, None]
         return diagonal
 
     def blocks(self) -> np.ndarray:

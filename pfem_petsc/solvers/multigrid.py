@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from petsc4py import PETSc
+from scipy.sparse import bsr_array, csr_array
 
 from ..mechanics.compiled import kernel
-from ..mechanics.elements import expand_columns
 from ..mesh.exchange import Router
-from .background_grid import BackgroundGrid, Summands, arrange, assemble, interpolate, neighbours, restrict, stabilise
+from .background_grid import BackgroundGrid, Summands, assemble
 from .linear import reproducible_products
 from .matrix_free import MatrixFreeHessian, full_blocks
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
-    from .problem import StepProblem
+    from .newton import StepProblem
 
 
 _SHIFT = 1e-8  # of the diagonal: corners that few nodes depend on may have functions that depend on each other
@@ -27,17 +27,13 @@ class CoarseMatrix:
 
     def __init__(self, grid: BackgroundGrid) -> None:
         self.grid = grid
-        elements, local = grid.elements, len(grid.numbers)
-        flat = elements.corners.ravel()
-        order = np.argsort(flat, kind="stable")
-        order = order[np.count_nonzero(flat < 0) :]
-        starts = np.searchsorted(flat[order], np.arange(local + 1))
-        of_corner = (order // 16).astype(np.int32)
-        self._ptr = np.zeros(local + 1, np.int64)
-        count = neighbours(elements.corners, starts, of_corner, self._ptr, np.empty(0, np.int32))
-        self._columns = np.empty(count, np.int32)
-        if count:
-            neighbours(elements.corners, starts, of_corner, self._ptr, self._columns)
+        corners = grid.elements.corners
+        starts = np.append(0, np.cumsum((corners >= 0).sum(axis=1)))
+        columns = corners[corners >= 0]
+        meets = csr_array((np.ones(len(columns)), columns, starts), shape=(len(corners), len(grid.numbers)))
+        neighbours = (meets.T @ meets).tocsr()  # in an element
+        neighbours.sort_indices()
+        self._ptr, self._columns = neighbours.indptr.astype(np.int64), neighbours.indices.astype(np.int32)
         self._agree()
 
     def _agree(self) -> None:
@@ -52,16 +48,11 @@ class CoarseMatrix:
         all_rows = np.concatenate([rows[: self._n_own], arrived[:, 0] - grid.first])
         keys = all_rows * grid.total + np.concatenate([columns[: self._n_own], arrived[:, 1]])
         unique, slots = np.unique(keys, return_inverse=True)
-        self._slots = slots.astype(np.int64)
-        self._row_of = unique // max(grid.total, 1)
-        block_columns = unique - self._row_of * grid.total
-        self._block_ptr = np.zeros(owned + 1, np.int64)
-        np.cumsum(np.bincount(self._row_of, minlength=owned), out=self._block_ptr[1:])
-        self._diagonal = np.flatnonzero(block_columns == self._row_of + grid.first)
-        widths = np.repeat(3 * np.diff(self._block_ptr), 3)
-        self._pointers = np.concatenate([[0], np.cumsum(widths)]).astype(PETSc.IntType)
-        self._scalar_columns = np.empty(int(self._pointers[-1]), PETSc.IntType)
-        expand_columns(self._block_ptr, block_columns, self._scalar_columns)
+        self._slots = slots
+        row_of = unique // max(grid.total, 1)
+        self._block_columns = unique - row_of * grid.total
+        self._block_ptr = np.append(0, np.cumsum(np.bincount(row_of, minlength=owned)))
+        self._diagonal = np.flatnonzero(self._block_columns == row_of + grid.first)
 
     def make(self, parts: Summands) -> PETSc.Mat:
         """Return the matrix of what it is summed of. Collective."""
@@ -69,54 +60,36 @@ class CoarseMatrix:
         blocks = np.zeros((len(self._columns), 3, 3))
         assemble(grid.t, grid.base, grid.elements, parts, (self._ptr, self._columns), blocks)
         arrived = self._router.send(blocks[self._n_own :].reshape(-1, 9)).reshape(-1, 3, 3)
-        values = np.zeros(len(self._scalar_columns))
-        own = self._n_own
-        arrange(blocks[:own], self._slots[:own], self._block_ptr, self._row_of, values)
-        arrange(arrived, self._slots[own:], self._block_ptr, self._row_of, values)
-        stabilise(self._block_ptr, self._diagonal, _SHIFT, values)
+        values = np.zeros((len(self._block_columns), 3, 3))
+        np.add.at(values, self._slots, np.concatenate([blocks[: self._n_own], arrived]))
+        at = self._diagonal[:, None], np.arange(3), np.arange(3)
+        values[at] = np.where(values[at] > 0.0, values[at] * (1.0 + _SHIFT), 1.0)
         size = (3 * grid.n_owned, 3 * grid.total)
-        matrix = PETSc.Mat().createAIJ(
-            (size, size), bsize=3, csr=(self._pointers, self._scalar_columns, values), comm=grid.comm
-        )
+        rows = bsr_array((values, self._block_columns, self._block_ptr), shape=size).tocsr()
+        pattern = rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType)
+        matrix = PETSc.Mat().createAIJ((size, size), bsize=3, csr=(*pattern, rows.data), comm=grid.comm)
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         return matrix
 
 
-@kernel
-def invert(blocks):
-    """Invert symmetric matrices (n, 6): xx, xy, xz, yy, yz, zz, in place; singular ones become zero."""
-    for k in range(len(blocks)):
-        a, b, c, d, e, f = blocks[k]
-        xx, xy, xz = d * f - e * e, c * e - b * f, b * e - c * d
-        determinant = a * xx + b * xy + c * xz
-        inverse = 1.0 / determinant if determinant > 0.0 else 0.0
-        blocks[k, 0] = xx * inverse
-        blocks[k, 1] = xy * inverse
-        blocks[k, 2] = xz * inverse
-        blocks[k, 3] = (a * f - c * c) * inverse
-        blocks[k, 4] = (b * c - a * e) * inverse
-        blocks[k, 5] = (a * d - b * b) * inverse
+def inverses(blocks: np.ndarray) -> np.ndarray:
+    """Return the inverses of symmetric matrices (n, 3, 3); zeros for singular ones."""
+    adjugate = np.stack([np.cross(blocks[:, i - 2], blocks[:, i - 1]) for i in range(3)], axis=2)
+    determinant = np.einsum("ni,ni->n", blocks[:, 0], adjugate[:, :, 0])[:, None, None]
+    return np.divide(adjugate, determinant, out=np.zeros_like(blocks), where=determinant > 0.0)
 
 
 @kernel
 def smooth(inverse, product, of_last, of_residual, r, z, x):
-    """Subtract the product from the residual r, and make a step z of the polynomial: all (n, 3)."""
+    """Subtract the product from the residual r, and make a step z of the polynomial, all (n, 3), with the ``inverse``
+    (n, 3, 3) of the blocks on the diagonal."""
     for k in range(len(r)):
-        r0 = r[k, 0] - product[k, 0]
-        r1 = r[k, 1] - product[k, 1]
-        r2 = r[k, 2] - product[k, 2]
-        r[k, 0] = r0
-        r[k, 1] = r1
-        r[k, 2] = r2
-        z0 = of_last * z[k, 0] + of_residual * (inverse[k, 0] * r0 + inverse[k, 1] * r1 + inverse[k, 2] * r2)
-        z1 = of_last * z[k, 1] + of_residual * (inverse[k, 1] * r0 + inverse[k, 3] * r1 + inverse[k, 4] * r2)
-        z2 = of_last * z[k, 2] + of_residual * (inverse[k, 2] * r0 + inverse[k, 4] * r1 + inverse[k, 5] * r2)
-        z[k, 0] = z0
-        z[k, 1] = z1
-        z[k, 2] = z2
-        x[k, 0] += z0
-        x[k, 1] += z1
-        x[k, 2] += z2
+        for i in range(3):
+            r[k, i] -= product[k, i]
+        for i in range(3):
+            along = inverse[k, i, 0] * r[k, 0] + inverse[k, i, 1] * r[k, 1] + inverse[k, i, 2] * r[k, 2]
+            z[k, i] = of_last * z[k, i] + of_residual * along
+            x[k, i] += z[k, i]
 
 
 _PREFIX = "pfem_coarse_"
@@ -145,9 +118,8 @@ class GridMultigrid:
         self.pattern = CoarseMatrix(self.grid)
         self.reduced = False
         owned = self.mesh.n_owned
-        self._inverse = np.zeros((owned, 6))
+        self._inverse = np.zeros((owned, 3, 3))
         self._r, self._z, self._x, self._e, self._product = (np.zeros((owned, 3)) for _ in range(5))
-        self._coarse = np.zeros((len(self.grid.numbers), 3))
         self._special = np.empty(0, np.int64)
         self._turned = np.empty((0, 3, 3))
         self._solver: PETSc.PC | None = None
@@ -161,13 +133,11 @@ class GridMultigrid:
         """Do nothing: with coordinates of rows the diagonal is the preconditioner."""
 
     def make(self, problem: StepProblem, held: np.ndarray) -> None:
-        """Set up at the positions of a problem; ``held`` (local, 3) nonzero for active unknowns, ghosts not yet up to
-        date. Collective."""
-        owned = self.mesh.n_owned
+        """Set up at the positions of a problem; ``held`` (owned, 3) nonzero for active unknowns. Collective."""
         product = self.product
         product.linearise(problem)
         product.make_definite()
-        active = held[:owned] != 0.0
+        active = held != 0.0
         product.extension.kept = np.flatnonzero(~active) if active.any() else None
         self.reduced = not problem.transform.nodewise
         if self.reduced:
@@ -175,17 +145,15 @@ class GridMultigrid:
             diagonal[active] = problem.scale
             self._diagonal = diagonal
             return
-        blocks = product.blocks()
+        blocks = full_blocks(product.blocks())
         frames = problem.transform.frames
         at, kept = self._free_parts(active, frames.nodes)
         basis, inverse = np.tile(np.eye(3), (2, len(at), 1, 1))
         basis[np.searchsorted(at, frames.nodes)] = frames.basis
         inverse[np.searchsorted(at, frames.nodes)] = frames.inverse
         to_x = inverse @ kept
-        full = np.swapaxes(to_x, 1, 2) @ full_blocks(blocks[at]) @ to_x + problem.scale * (np.eye(3) - kept)
-        blocks[at] = full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-        invert(blocks)
-        self._inverse = blocks
+        blocks[at] = np.swapaxes(to_x, 1, 2) @ blocks[at] @ to_x + problem.scale * (np.eye(3) - kept)
+        self._inverse = inverses(blocks)
         self._special, self._turned = at, kept @ basis
         place, turned = self.mesh.with_ghosts(at, to_x @ basis)
         self._make_coarse(problem, np.flatnonzero(place >= 0), turned)
@@ -193,18 +161,11 @@ class GridMultigrid:
     def _free_parts(self, active: np.ndarray, framed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the owned nodes with prescribed or active components or frames (k,), ascending, and the projections
         (k, 3, 3) of their unknowns on those left free."""
-        supports = self.model.supports
-        held = active | supports.fixed if supports.any else active
-        special = held.any(axis=1)
+        held = np.maximum(self.model.supports.spans(), np.eye(3) * active[:, :, None])
+        special = held.any(axis=(1, 2))
         special[framed] = True
-        inclined = supports.inclined if supports.any else None
-        if inclined is not None:
-            special[inclined.nodes] = True
         nodes = np.flatnonzero(special)
-        kept = np.eye(3) * ~held[nodes][:, :, None]
-        if inclined is not None:
-            kept[np.searchsorted(nodes, inclined.nodes)] = inclined.free
-        return nodes, kept
+        return nodes, np.eye(3) - held[nodes]
 
     def _make_coarse(self, problem: StepProblem, nodes: np.ndarray, turned: np.ndarray) -> None:
         mesh, product = self.mesh, self.product
@@ -283,20 +244,19 @@ class GridMultigrid:
 
     def _correct(self) -> None:
         """Add the coarse correction of the residual to the solution."""
-        grid, r, coarse = self.grid, self._r, self._coarse
+        grid, r = self.grid, self._r
         at = self._special
         if len(at):
             self._e[:] = r
             r = self._e
             r[at] = np.einsum("kji,kj->ki", self._turned, r[at])
-        coarse[:] = 0.0
-        restrict(grid.t, grid.box, grid.base, grid.corners, r, coarse)
+        coarse = grid.prolongation.T @ r
         grid.give(coarse)
         self._right.setArray(coarse[: grid.n_owned].ravel())
         self._solver.apply(self._right, self._left)
         coarse[: grid.n_owned] = self._left.getArray(readonly=True).reshape(-1, 3)
         grid.bring(coarse)
-        interpolate(grid.t, grid.box, grid.base, grid.corners, coarse, self._e)
+        self._e = grid.prolongation @ coarse
         self._e[at] = np.einsum("kij,kj->ki", self._turned, self._e[at])
         self._x += self._e
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..integrators.base import Balance
     from ..solvers.linear import LinearChoice
     from ..stepping.model import Model
-    from .keys import ForceDensityKeys
+    from .methods.force_density import Parameters as ForceDensityKeys
 
 _DIRECT_UP_TO = 200_000
 """Nodes up to which a factorisation is used; beyond, conjugate gradients with multigrid, if no density is negative."""
@@ -194,7 +194,8 @@ class Form:
         self.model, self.external, self.x = model, external, x
         mesh = model.mesh
         numbers = np.concatenate([mesh.first_node + np.arange(mesh.n_owned), mesh.ghost_numbers])
-        self._ends = numbers[mesh.bars]
+        self._numbers = numbers
+        self._near, self._far = np.concatenate([mesh.bars, mesh.bars[:, ::-1]]).T  # from either end of each bar
 
     def find(self, given: Prescribed, tolerance: float, most: int) -> int:
         """Find the form, and return the number of solves. Collective.
@@ -251,8 +252,7 @@ class Form:
         other ends."""
         mesh = self.model.mesh
         out = np.zeros((mesh.n_local, 3))
-        for near, far in (mesh.bars.T, mesh.bars.T[::-1]):
-            np.add.at(out, near, density[:, None] * values[far])
+        np.add.at(out, self._near, np.tile(density, 2)[:, None] * values[self._far])
         return out[: mesh.n_owned]
 
     def _solved(self, solver: PETSc.KSP, right: np.ndarray) -> np.ndarray:
@@ -274,18 +274,13 @@ class Form:
         """Return the solver of a component that is prescribed at some nodes, 1 in ``held`` (local,). Collective."""
         mesh, comm = self.model.mesh, self.model.comm
         owned, first, free = mesh.n_owned, mesh.first_node, held == 0.0
-        rows, columns = [np.arange(owned)], [first + np.arange(owned)]
-        diagonal, values = held[:owned].copy(), []
-        for one, other in ((0, 1), (1, 0)):
-            near, far = mesh.bars[:, one], mesh.bars[:, other]
-            own = (near < owned) & free[near]
-            np.add.at(diagonal, near[own], density[own])
-            both = own & free[far]
-            rows.append(near[both])
-            columns.append(self._ends[both, other])
-            values.append(-density[both])
-        places = np.concatenate(rows), np.concatenate(columns)
-        local = coo_array((np.concatenate([diagonal, *values]), places), shape=(owned, mesh.n_nodes)).tocsr()
+        near, far, q = self._near, self._far, np.tile(density, 2)
+        own = (near < owned) & free[near]
+        both = own & free[far]
+        diagonal = held[:owned] + np.bincount(near[own], weights=q[own], minlength=owned)
+        rows = np.append(np.arange(owned), near[both])
+        columns = np.append(first + np.arange(owned), self._numbers[far[both]])
+        local = coo_array((np.append(diagonal, -q[both]), (rows, columns)), shape=(owned, mesh.n_nodes)).tocsr()
         matrix = PETSc.Mat().createAIJ(
             ((owned, mesh.n_nodes), (owned, mesh.n_nodes)),
             csr=(local.indptr.astype(PETSc.IntType), local.indices.astype(PETSc.IntType), local.data),

@@ -14,9 +14,8 @@ from ..errors import NotConverged, SimulationFailure
 from ..solvers.lagged import Preconditioning
 from ..solvers.linear import LinearChoice, configure, is_failed_factorisation, linear_reason
 from ..solvers.matrix import HessianMatrix
-from ..solvers.matrix_free import at_exit, outlive
-from ..solvers.newton import STAGNATION, Tolerance
-from ..solvers.problem import StepProblem
+from ..solvers.matrix_free import outlive_at_exit
+from ..solvers.newton import STAGNATION, StepProblem, Tolerance
 from .stability import Stability
 
 if TYPE_CHECKING:
@@ -88,7 +87,7 @@ class BorderedSystem:
             ksp.setTolerances(rtol=_RTOL, max_it=2000)
         ksp.setOperators(self.hessian.mat, self.hessian.mat)
         ksp.setFromOptions()
-        at_exit(outlive, ksp)
+        outlive_at_exit(ksp)
         return ksp
 
     def begin(self, state: State) -> None:

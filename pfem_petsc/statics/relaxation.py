@@ -15,6 +15,7 @@ from ..integrators.base import Balance
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.compiled import kernel
 from ..parallel.agreement import agreed
+from ..solvers.matrix_free import add_blocks
 from ..solvers.newton import Tolerance, largest_at_node
 from ..stepping.stepper import Solution
 from ..tolerances import TIME
@@ -25,26 +26,12 @@ if TYPE_CHECKING:
     from ..integrators.base import State
     from ..solvers.linear import LinearChoice
     from ..stepping.model import Model
-    from .keys import RelaxationKeys
+    from .methods.relaxation import Parameters as RelaxationKeys
 
 
 RESIDUAL, KINETIC, SUPPORTS, WALLS, BARS, FAILED, WIDTH = range(7)
 """Sums over all nodes: squares of the residual [N2], twice the kinetic energy, squares of the forces of supports, of
 walls, of bars [N2], ranks that failed."""
-
-
-@kernel
-def free_residual(external, f, fixed, r):
-    """External less internal force into ``r`` (owned, 3) [N], zero on prescribed components; gives the sum of squares
-    there, which supports take [N2]."""
-    taken = 0.0
-    for i in range(len(r)):
-        for c in range(3):
-            r[i, c] = external[i, c] - f[i, c]
-            if fixed[i, c]:
-                taken += r[i, c] * r[i, c]
-                r[i, c] = 0.0
-    return taken
 
 
 @kernel
@@ -71,41 +58,6 @@ def push(r, mass, factor, reach, v):
             shorter = reach[i] / square**0.5
             for c in range(3):
                 v[i, c] *= shorter
-
-
-@kernel
-def node_stiffness(x, bars, stored, axial, counted, blocks, bound):
-    """Upper bound of the eigenvalues of each node's diagonal block of the stiffness into ``bound`` (owned,) [N/m].
-
-    The largest row sum bounds them, and so does the Frobenius norm, which does not depend on the axes. A bar counts
-    with the larger of its present axial stiffness and ``axial`` (b,), that of its law at most, and with its geometric
-    stiffness N/l where it is under tension. ``stored`` (5, b) is that of ``Bars.linearise``, ``blocks`` (local, 6) is
-    workspace. Gives the sum of N.N over the bars ``counted`` here [N2].
-    """
-    blocks[:] = 0.0
-    forces = 0.0
-    for k in range(len(bars)):
-        a, b = bars[k, 0], bars[k, 1]
-        n0, n1, n2 = stored[0, k], stored[1, k], stored[2, k]
-        geometric = max(stored[4, k], 0.0)
-        along = max(stored[3, k] + stored[4, k], axial[k]) - geometric
-        along = max(along, 0.0)
-        for i in (a, b):
-            blocks[i, 0] += along * n0 * n0 + geometric
-            blocks[i, 1] += along * n1 * n1 + geometric
-            blocks[i, 2] += along * n2 * n2 + geometric
-            blocks[i, 3] += along * n0 * n1
-            blocks[i, 4] += along * n1 * n2
-            blocks[i, 5] += along * n2 * n0
-        if counted[k]:
-            square = (x[b, 0] - x[a, 0]) ** 2 + (x[b, 1] - x[a, 1]) ** 2 + (x[b, 2] - x[a, 2]) ** 2
-            forces += stored[4, k] * stored[4, k] * square
-    for i in range(len(bound)):
-        xy, yz, zx = abs(blocks[i, 3]), abs(blocks[i, 4]), abs(blocks[i, 5])
-        rows = max(blocks[i, 0] + xy + zx, blocks[i, 1] + xy + yz, blocks[i, 2] + yz + zx)
-        squares = blocks[i, 0] ** 2 + blocks[i, 1] ** 2 + blocks[i, 2] ** 2 + 2.0 * (xy * xy + yz * yz + zx * zx)
-        bound[i] = min(rows, squares**0.5)
-    return forces
 
 
 _SAFETY = 1.1  # s of the mass: bars turn and tighten between two estimates
@@ -149,11 +101,8 @@ class PseudoMotion:
         self.sums = np.zeros(WIDTH)
         self._before = np.zeros((owned, 3))  # residual of the pseudo-step before
         self._kinetic = -1.0  # its sum of the kinetic energy, negative at rest
-        self._stored = np.zeros((5, len(mesh.bars)))
+        self._stored, self._blocks = np.zeros((2, len(mesh.bars))), np.zeros((local, 6))
         self._axial = model.bars.stiffness
-        self._counted = np.zeros(len(mesh.bars), dtype=bool)
-        self._counted[mesh.counted] = True
-        self._blocks = np.zeros((local, 6))
         reach = np.full(local, np.inf)
         np.minimum.at(reach, mesh.bars.ravel(), np.repeat(_REACH * model.bars.rest, 2))
         self._reach = reach[:owned].copy()
@@ -261,10 +210,9 @@ class PseudoMotion:
         if self.steps % _ESTIMATE_EVERY == 0:
             self._estimate()
         sums[BARS] = self._bar_forces
-        sums[SUPPORTS] = free_residual(self.external, self.f, model.supports.fixed, self.residual)
-        if model.supports.inclined is not None:
-            sums[SUPPORTS] += (model.supports.inclined.get(self.residual) ** 2).sum()
-            model.supports.inclined.clear(self.residual)
+        np.subtract(self.external, self.f[: len(self.external)], out=self.residual)
+        sums[SUPPORTS] = (model.supports.get(self.residual) ** 2).sum()
+        model.supports.clear(self.residual)
         if model.contact.any:
             u = self.residual / self.mass[:, None]
             self._project(u)
@@ -279,14 +227,28 @@ class PseudoMotion:
             self._fail()
 
     def _estimate(self) -> None:
-        """Compute masses at the current positions."""
-        model = self.model
-        bars = model.bars
-        bars.linearise(self.x, 1.0, self._stored)
-        self._bar_forces = node_stiffness(
-            self.x, bars.ends, self._stored, self._axial, self._counted, self._blocks, self.mass
-        )
-        self.mass *= 0.5 * _SAFETY
+        """Compute masses at the current positions, from an upper bound of the eigenvalues of each node's diagonal block
+        of the stiffness.
+
+        The largest row sum bounds them, and so does the Frobenius norm, which does not depend on the axes. A bar counts
+        with the larger of its present axial stiffness and that of its law at most, and with its geometric stiffness N/l
+        where it is under tension.
+        """
+        mesh, bars, stored, blocks = self.model.mesh, self.model.bars, self._stored, self._blocks
+        bars.stiffnesses(self.x, 1.0, stored)
+        lengths = bars.lengths(self.x)
+        square = lengths**2
+        self._bar_forces = ((stored[1] * lengths)[mesh.counted] ** 2).sum()
+        axial = np.maximum(stored[0] * square + stored[1], self._axial)
+        np.maximum(stored[1], 0.0, out=stored[1])
+        stored[0] = 0.0
+        np.divide(np.maximum(axial - stored[1], 0.0), square, out=stored[0], where=square > 0.0)
+        blocks[:] = 0.0
+        add_blocks(mesh.bars, self.x, stored, blocks)
+        xx, xy, xz, yy, yz, zz = np.abs(blocks[: mesh.n_owned].T)
+        rows = np.maximum(np.maximum(xx + xy + xz, yy + xy + yz), zz + yz + xz)
+        squares = xx**2 + yy**2 + zz**2 + 2.0 * (xy**2 + yz**2 + xz**2)
+        self.mass = 0.5 * _SAFETY * np.minimum(rows, np.sqrt(squares))
         # a node without bars has no stiffness of its own
         self.mass[self.mass == 0.0] = 1.0
 

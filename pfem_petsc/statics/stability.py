@@ -9,7 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..errors import NotConverged
-from ..solvers.linear import has_mumps
+from ..solvers.linear import basis_by_peaks, has_mumps
 from ..solvers.matrix import HessianMatrix
 from .equilibrium import problem_at_rest
 
@@ -33,7 +33,6 @@ _ITERATIONS = 500  # of conjugate gradients that look for a negative curvature, 
 _RTOL = 1e-6  # a mode of negative curvature cannot remain hidden while the residual of a random load falls this far
 _NOISE = 1e-12  # of the largest nodal stiffness: curvatures down to minus this are rounding
 _SWEEPS = 6  # of inverse iteration; where its result matters, the eigenvalue is far nearer to zero than the next
-_ALIKE = 1e-6
 _PREFIX = "pfem_inertia_"
 
 
@@ -115,40 +114,24 @@ class Stability:
 
     def combined(self, vectors: np.ndarray) -> list[np.ndarray]:
         """Combinations of modes (n, owned, 3) that do not depend on which modes they are made of, see :meth:`modes`."""
-        ids = 3 * self.mesh.node_ids[: self.mesh.n_owned, None] + np.arange(3)
-        found = []
-        for _ in range(len(vectors)):
-            size = np.einsum("knc,knc->nc", vectors, vectors)
-            largest = self.comm.allreduce(float(size.max(initial=0.0)), op=MPI.MAX)
-            candidates = np.where(size >= (1.0 - _ALIKE) * largest, ids, np.iinfo(np.int64).max)
-            first = self.comm.allreduce(int(candidates.min(initial=np.iinfo(np.int64).max)), op=MPI.MIN)
-            row = self.comm.allreduce(vectors[:, ids == first].sum(axis=1))
-            unit = row / np.linalg.norm(row)
-            found.append(np.einsum("k,knc->nc", unit, vectors))
-            # what is orthogonal to it
-            basis = np.linalg.svd(unit[None, :])[2][1:]
-            vectors = np.einsum("jk,knc->jnc", basis, vectors)
-        return found
+        rows = basis_by_peaks(self.comm, self.mesh.node_ids[: self.mesh.n_owned], vectors)
+        return [np.einsum("k,knc->nc", row, vectors) for row in rows]
 
     def falling(self, x: np.ndarray, walls: WallForces, time: float, bars: np.ndarray | None = None) -> int:
         """Number of directions in which the potential falls at positions (local, 3), without those that walls prevent.
 
         It is -1 where the stiffness cannot be factorised.
 
-        ``walls`` says which nodes walls push, ``time`` where the walls are; ``bars`` (5, b) is their stiffness if not
-        the tangent, see ``Bars.linearise``. Collective.
+        ``walls`` says which nodes walls push, ``time`` where the walls are; ``bars`` (2, b) is their stiffness if not
+        the tangent, see ``Bars.stiffnesses``. Collective.
         """
         nodes, blocks = self._held(walls, time)
         model, matrix, scale = self.model, self.matrix, stiffest(self.model)
 
         def add(values: np.ndarray) -> None:
             matrix.add_lumped(np.full(model.mesh.n_owned, _RIGID_MOTION * scale), values)
-            if bars is None:
-                model.bars.tangents(x, 1.0, model.inertia.coefficients(0.0, 0.0), matrix.pattern, values)
-            else:
-                matrix.add_bars(bars, values)
-                if model.bars.springs is not None:
-                    model.bars.springs.add_tangents(1.0, matrix.pattern, values)
+            none = model.inertia.coefficients(0.0, 0.0)
+            model.bars.tangents(x, 1.0, none, matrix.pattern, values, stored=bars)
             matrix.pattern.add_blocks(nodes, _RIGID * scale * blocks, values)
             matrix.constrain(scale, values)
 

@@ -41,7 +41,7 @@ from .stability import (
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
-    from .keys import Increments
+    from .methods import Increments
 
 
 _FEW = 5  # maximum number of Newton iterations after which the next increment is larger

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..contact.surfaces import OTHER, Surfaces, tangent
-from ..mechanics.compiled import addressed, inlined
-from ..mechanics.records import record
+from ..mechanics.compiled import addressed, inlined, record
 from ..tolerances import BEYOND
 from .contact_phase import PUSHED, find_beyond, note_contacts
 from .impact import join_nodes

@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..columns import BAR_ENERGIES, HEAD, PROBED
-from ..mechanics.compiled import addressed, inlined, kernel
+from ..mechanics.compiled import addressed, inlined, kernel, record
 from ..mechanics.elements import first_inverted
 from ..mechanics.internal_forces import BarArrays, internal_forces
 from ..mechanics.layout import clear, join_components, split_components
 from ..mechanics.loads import LoadSchedule, set_forces
-from ..mechanics.records import record
 from ..mesh.exchange import Messages
 from .called_walls import CalledWalls
 from .contact_phase import PUSHED, ContactNodes, WallArrays

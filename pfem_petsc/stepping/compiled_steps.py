@@ -18,8 +18,7 @@ from ..contact.surfaces import OTHER
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.chunk_laws import first_class
-from ..mechanics.compiled import COMPILED
-from ..mechanics.records import References, by_reference
+from ..mechanics.compiled import COMPILED, References, by_reference
 from ..mesh.exchange import SIGNATURES, CFunction, mpi_functions
 from ..mesh.ordering import NODE_BLOCK
 from ..parallel.heap import return_freed_memory

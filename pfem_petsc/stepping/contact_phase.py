@@ -12,8 +12,7 @@ from ..columns import HEAD
 from ..contact.explicit import Arrivals, PressedWalls, WallSums, find_penetrating, press_nodes
 from ..contact.node_walls import compare_contacts
 from ..contact.surfaces import Surfaces, wall_gaps
-from ..mechanics.compiled import addressed, inlined
-from ..mechanics.records import record
+from ..mechanics.compiled import addressed, inlined, record
 from ..mesh.ordering import NODE_BLOCK
 from .impact import Approach, Touched, join_nodes, stop_nodes, unpressed
 from .phases import clear_rows, displace, put_rates, rates_of

@@ -9,8 +9,7 @@ from mpi4py import MPI
 
 from ..contact.fixed_rows import close_rows
 from ..contact.surfaces import wall_gaps
-from ..mechanics.compiled import kernel
-from ..mechanics.records import record
+from ..mechanics.compiled import kernel, record
 from ..tolerances import ON_BOUND
 
 if TYPE_CHECKING:

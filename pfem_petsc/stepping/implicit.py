@@ -22,8 +22,7 @@ from ..solvers.lagged import LaggedPreconditioner
 from ..solvers.linear import LinearChoice, MassSolver, unsymmetric
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
-from ..solvers.newton import Forcing, NewtonSolver, Tolerance, zero_tolerance
-from ..solvers.problem import StepProblem, extend, extrapolate, motion_energy, net_force, squares, translate
+from ..solvers.newton import Forcing, NewtonSolver, StepProblem, Tolerance, extend, extrapolate, zero_tolerance
 from ..tolerances import ON_BOUND
 from .guard import StepGuard
 from .stepper import AttributeOf, Solution, Stepper
@@ -58,7 +57,7 @@ class Resolution:
         forces, left = self.numbers
         lacking = residual if residual > tolerance else 0.0
         if lacking > _DOUBTFUL * max(scale, forces):  # the forces of bars may balance each other
-            bars = model.bars.state_stiffness(x)[4] * model.bars.lengths(x)
+            bars = model.bars.state_stiffness(x)[1] * model.bars.lengths(x)
             scale = max(scale, float(np.sqrt(model.comm.allreduce(float((bars[model.mesh.counted] ** 2).sum())))))
         self.numbers = [max(forces, scale), max(left, lacking)]
 
@@ -270,8 +269,8 @@ class ImplicitStepper(Stepper):
         h = balance.time - state.time
         after = self.with_ghosts(balance.predictor + solution.u)
         momentum = model.inertia.mass_times(state.v, np.empty_like(state.v))
-        forces = state.external, state.contact, state.support
-        energy = motion_energy(momentum, state.v, forces, state.position, after)
+        works = (state.external + state.contact + state.support) * (after[: len(state.v)] - state.position)
+        energy = 0.5 * float((momentum * state.v).sum() + np.abs(works).sum())
         return self.guard.check(state.x, after, state.position + self.scheme.expected_move(state, h), energy)
 
     def _with_walls(self, balance: Balance) -> Solution:
@@ -384,8 +383,9 @@ class ImplicitStepper(Stepper):
     def _force_scale(self) -> float:
         """Return the largest 2-norm [N] of momentum per part of a step, loads and internal forces. Collective."""
         state, model = self.state, self.model
-        sums = squares(model.inertia.mass, state.v, state.external, state.f[: model.mesh.n_owned])
-        sums[0] /= self.part**2
+        momenta = np.einsum("i,ic,ic", model.inertia.mass**2, state.v, state.v) / self.part**2
+        forces = state.external, state.f[: model.mesh.n_owned]
+        sums = np.array([momenta, *((force**2).sum() for force in forces)])
         model.comm.Allreduce(MPI.IN_PLACE, sums)
         return float(np.sqrt(sums.max()))
 
@@ -419,9 +419,10 @@ class ImplicitStepper(Stepper):
 
         An iterative solution leaves a residual within the tolerance, whose sum would be a drift of linear momentum.
         """
-        net = net_force(g, problem.nodal)
-        self.model.comm.Allreduce(MPI.IN_PLACE, net)
-        translate(net[:3] / net[3], problem.nodal, u, g)
+        net = self.model.comm.allreduce(np.append(g.sum(axis=0), problem.nodal.sum()))
+        shift = net[:3] / net[3]
+        u -= shift
+        g -= problem.nodal[:, None] * shift
 
     def _free_guess(self, balance: Balance) -> np.ndarray:
         """Return increments for the accelerations that those of the last steps let expect."""

@@ -14,10 +14,9 @@ from ..contact.contact import Contact, adjust_start
 from ..contact.self_contact import SelfContact
 from ..contact.wall_motion import Poses
 from ..errors import InputError
-from ..mechanics.bars import Bars, check_areas, mesh_of_cases, section_of_bars
+from ..mechanics.bars import Bars, ProbedBars, check_areas, mesh_of_cases, section_of_bars
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia, PointInertia, add_at_ends
-from ..mechanics.probed_bars import ProbedBars
 from ..mechanics.rest_lengths import RestLengths, Temperatures, unstressed_lengths
 from ..mechanics.springs import add_connectors, connected, make_springs, with_connectors
 from ..mechanics.supports import Supports

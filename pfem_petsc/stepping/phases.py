@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import add_freely, addressed, inlined, kernel
-from ..mechanics.records import record
+from ..mechanics.compiled import add_freely, addressed, inlined, kernel, record
 
 WORKS = ("external", "contact", "damping", "inertial", "internal")
 """Works of the energy balance [J], in this order; the first includes supports."""

@@ -16,10 +16,10 @@ from ..errors import InputError
 from ..integrators.base import Scheme
 from ..mechanics.bars import viscous_rate
 from ..mechanics.materials.base import law_name, law_of
-from ..mechanics.products import BarProducts
 from ..output.units import TIME as AXIS
 from ..output.units import Axis, engineering
 from ..registry import choices, lookup
+from ..solvers.matrix_free import BarProducts
 from ..tolerances import TIME
 from .explicit import ExplicitStepper, RedistributedStepper
 

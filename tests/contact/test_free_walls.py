@@ -6,7 +6,7 @@ from helpers.lattices import lattice_case, planes, simulation
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError, SimulationFailure
-from pfem_petsc.preflight.checks import warnings_before
+from pfem_petsc.preflight import warnings_before
 
 SCHEMES = [("central_differences", {}), ("chung_lee", {}), ("newmark", {}), ("houbolt", {})]
 SPEED = np.array([1.0, -0.5, -4.0])

@@ -5,7 +5,7 @@ import pytest
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.contact.monitoring import distances
-from pfem_petsc.preflight.checks import warnings_before
+from pfem_petsc.preflight import warnings_before
 
 SHAPES = {
     "sphere": {"type": "sphere", "point": [1.0, 0.0, 0.6], "radius": 0.4},

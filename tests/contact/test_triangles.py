@@ -7,7 +7,7 @@ from helpers.triangles import ball, box, groove, torus
 
 from pfem_petsc.contact.projection import project
 from pfem_petsc.contact.triangles import Triangles, signed_distances, stopping_faces
-from pfem_petsc.mechanics.records import by_reference
+from pfem_petsc.mechanics.compiled import by_reference
 
 BODIES = {"box": box((-1.0, -0.6, -0.3), (1.0, 0.6, 0.3)), "ball": ball(2), "torus": torus()}
 

@@ -5,7 +5,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case
-from pfem_petsc.mechanics.products import BarProducts
+from pfem_petsc.solvers.matrix_free import BarProducts
 from pfem_petsc.stepping.model import Model
 
 STIFFNESS = 30.0  # N/m, of the second difference of positions

@@ -8,12 +8,9 @@ from hypothesis import strategies as st
 
 from pfem_petsc.mechanics.chunk_laws import CHUNK
 from pfem_petsc.mechanics.layout import (
-    NO_BAR,
-    gather_values,
     group_of,
     make_layout,
     run_column,
-    spread_values,
 )
 from pfem_petsc.mesh.ordering import LEAST_RUN, NODE_BLOCK, bar_order
 
@@ -53,15 +50,7 @@ def check_layout(bars, block):
                 np.testing.assert_array_equal(high[here], layout.fars[group] + inside)
     columns = layout.columns(section)
     np.testing.assert_array_equal(places[columns][places[columns] >= 0], np.arange(start, stop))
-    values, spread, back = (
-        np.arange(start, stop, dtype=float),
-        np.zeros(columns.stop - columns.start),
-        np.zeros(stop - start),
-    )
-    spread_values(layout, section, values, NO_BAR, spread)
-    np.testing.assert_array_equal(spread, places[columns])
-    gather_values(layout, section, spread, back)
-    np.testing.assert_array_equal(back, values)
+    np.testing.assert_array_equal(places[layout.column_of[start:stop]], np.arange(start, stop))
 
 
 def lattice(n):

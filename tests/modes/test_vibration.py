@@ -10,7 +10,7 @@ from helpers.small_models import ARCH_AREA, ARCH_YOUNG, arch_of, press
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import SimulationFailure
-from pfem_petsc.modes import solvers
+from pfem_petsc.modes import pencil
 from pfem_petsc.output.result import open_result
 
 LENGTH, AREA, YOUNG, DENSITY = 2.54, 1.979325e-6, 2.06842719e11, 7801.433  # VM53
@@ -151,7 +151,7 @@ def test_multigrid_in_place_of_a_factorisation(held, shared_tmp_path, comm, monk
     if held:
         data |= {"node_set": {"feet": {"group": "bottom"}}, "support": [{"node_set": "feet", "fix": "xyz"}]}
     expected = modes_of(Case.from_dict(data), shared_tmp_path / "dense", comm)
-    monkeypatch.setattr(solvers, "DIRECT_UP_TO", 0)
+    monkeypatch.setattr(pencil, "FACTORISED_UP_TO", 0)
     data["modes"]["solver"] = "slepc"
     found = modes_of(Case.from_dict(data), shared_tmp_path / "multigrid", comm)
     assert found[0] == pytest.approx(expected[0], rel=1e-8)

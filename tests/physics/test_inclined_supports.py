@@ -11,7 +11,7 @@ from helpers.stopped import assert_restart_is_bitwise
 from scipy.spatial.transform import Rotation
 
 from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.preflight.geometry import Geometry
+from pfem_petsc.preflight import Geometry
 
 TURN = Rotation.from_rotvec([0.4, -0.9, 0.7]).as_matrix()
 POINTS = np.array(

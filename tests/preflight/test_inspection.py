@@ -5,9 +5,8 @@ import pytest
 from helpers.runs import inspected
 from helpers.small_models import CUBE, CUBE_EDGES, TRUSSES, case_of
 
-from pfem_petsc import Case, Simulation, Truss
+from pfem_petsc import Case, Simulation, Truss, preflight
 from pfem_petsc.output.units import engineering
-from pfem_petsc.preflight import checks
 
 
 def test_two_free_bodies_have_no_mechanisms(comm, shared_tmp_path):
@@ -118,14 +117,14 @@ def test_gaps_of_a_static_analysis_close_per_load_factor(comm):
 def test_memory_that_the_machine_lacks(comm, monkeypatch):
     simulation = Simulation(Case.load("rod_impact"), comm, check_only=True)
     assert simulation.inspect()[1] == []
-    monkeypatch.setattr(checks, "memory_of_machine", lambda: 1e8)
+    monkeypatch.setattr(preflight, "memory_of_machine", lambda: 1e8)
     (text,) = simulation.inspect()[1]
     assert "and it has 100 MB" in text
 
 
 def test_a_run_needs_at_least_the_memory_that_is_used_before_it(comm, monkeypatch):
     simulation = Simulation(Case.load("rod_impact"), comm, check_only=True)
-    monkeypatch.setattr(checks, "_used", lambda: 5e9)
+    monkeypatch.setattr(preflight, "_used", lambda: 5e9)
     used = engineering(5e9 * comm.size, "B", 3)
     assert simulation.summary()["memory"] == f"{used} used so far, on all ranks"
     assert simulation.inspect()[0]["memory needed"] == f"about {used} by the end of the run, on all ranks"

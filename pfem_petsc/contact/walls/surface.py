@@ -12,7 +12,7 @@ from ...case.base import FileName, PositiveFloat, Vector3
 from ...case.files import digest_of, found_file
 from ...errors import InputError
 from ...formats import read_triangles
-from ...mechanics.records import by_reference
+from ...mechanics.compiled import by_reference
 from ...mesh.tools import coincident
 from ..triangles import Triangles, signed_distances, stopping_faces
 from .base import BaseWall, Surface, WallKeys

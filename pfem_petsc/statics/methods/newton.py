@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ...case.base import NonNegativeFloat, PositiveFloat
-from ..keys import Increments
+from . import Increments
 
 if TYPE_CHECKING:
     from ...solvers.linear import LinearChoice

@@ -1,1 +1,0 @@
-"""Checks before a run: connectivity and bracing of the truss, plausible values, memory, time and disk space."""

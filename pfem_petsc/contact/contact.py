@@ -1,7 +1,8 @@
-"""Walls and the nodes that they stop: search, candidates of implicit steps, nodes that start beyond walls."""
+"""Walls and the nodes that they stop: search, candidates of implicit steps, nodes that start or come beyond walls."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -14,17 +15,23 @@ from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, ON_BOUND
 from .explicit import ExplicitContact
 from .frames import MIN_VOLUME, NodalFrames, Planes, RowPlanes, build_frames
-from .node_walls import WallForces
+from .friction import planes_at_rest
+from .node_walls import WallForces, held_by_supports
+from .projection import NodesAtPlanes, pressed
 from .surfaces import OTHER
 from .tied import FreshTies
 from .wall_motion import Poses
 
 if TYPE_CHECKING:
     from ..case.schema import Case
+    from ..mechanics.mass import Inertia
     from ..mesh.distribution import DistributedMesh
+    from ..stepping.model import Model
+    from .constraint_set import ConstraintSet
 
 
 _NO_ROWS = RowPlanes.none(0)
+_ROUNDS = 60  # of the initial equilibrium, each at least halves the error
 
 
 class Contact(ExplicitContact):
@@ -208,7 +215,7 @@ def _within_reach(
     for place, there, distance in ((x, poses, reach[:, None]), starts):
         within |= contact.distances(applicable, place, there)[1] < distance
     for k in contact.surfaces_of_triangles:  # whose other faces are found when nodes touch them
-        slots = slice(contact.first[k], contact.first[k] + contact.walls[k].faces)
+        slots = contact.slots(k)
         within[:, slots] = within[:, slots].any(axis=1, keepdims=True)
     return within & applicable
 
@@ -275,3 +282,193 @@ def check_start(contact: Contact, x: np.ndarray, length: float, adjusts: bool = 
             f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "
             f"{side}, name the nodes that it applies to with 'node_set', or {remedy}"
         )
+
+
+def check_positions(model: Model, x: np.ndarray, time: float, where: str) -> None:
+    """Check that no node lies beyond a wall, with one pass over the nodes and one reduction. Collective.
+
+    Parameters
+    ----------
+    model : Model
+    x : (owned, 3) positions [m] at a time [s] at which contact holds
+    where : the step, for the message
+
+    Raises
+    ------
+    SimulationFailure
+        On all ranks, with the wall, its deepest node and depth, the number of nodes, the step, and the remedy.
+    """
+    contact, comm = model.contact, model.comm
+    if not contact.any:
+        return
+    found = contact.deepest(x, time, BEYOND * max(model.size, model.reach))
+    if found is None:
+        return
+    depth, node, wall, count = found
+    own = np.flatnonzero(model.mesh.node_ids[: len(x)] == node)
+    carried = comm.allreduce(len(own) > 0 and _prescribed(contact, own[0], wall, x, time))
+    if carried:
+        raise SimulationFailure(_told(where, node, depth, contact.names[wall], count))
+    case = model.case
+    treatment = case.contact.treatment
+    others = f'contact.treatment = "scheme" instead of "{treatment}"'
+    others = others if treatment != "scheme" else "another contact.treatment or time.integrator"
+    raise SimulationFailure(
+        f"{where}: node {node} is {depth:.3g} m beyond wall {contact.names[wall]!r} "
+        f"({count} node{'s' if count > 1 else ''} in all), which contact did not prevent: results since it "
+        f"passed the wall are wrong; reduce time.step, or use {others}"
+    )
+
+
+def _told(where: str, node: int, depth: float, wall: str, count: int) -> str:
+    """Return the message about nodes that supports move beyond a wall."""
+    return (
+        f"{where}: node {node} is {depth:.3g} m beyond wall {wall!r} "
+        f"({count} node{'s' if count > 1 else ''} in all), moved there by its supports; let the wall move with "
+        "the supports, name the nodes that it stops with 'node_set', or do not tie them"
+    )
+
+
+class CarriedNodes:
+    """Nodes of this rank whose motion along the normal of a rectangle is prescribed, so that contact cannot stop them.
+
+    Only the step in which a node crosses shows that it did not come from beside or behind, so every step is checked.
+
+    Attributes
+    ----------
+    of : index of each rectangle that applies to such nodes, to these nodes (k,)
+    """
+
+    def __init__(self, contact: Contact) -> None:
+        self._contact = contact
+        self._before: dict[int, np.ndarray] = {}
+        self.of: dict[int, np.ndarray] = {}
+        for k, wall in enumerate(contact.walls):
+            if wall.partial:
+                held = held_by_supports(contact.fixed, wall.normal) | (
+                    contact.fixed.any(axis=1) & contact.motion.turning[k]
+                )
+                nodes = np.flatnonzero(contact.members[:, contact.first[k]] & held)
+                self.of |= {k: nodes} if len(nodes) else {}
+
+    def start(self, x: np.ndarray, time: float) -> None:
+        """Keep where they are at the start of a step, from all positions (owned, 3) [m] at a time [s]."""
+        if self.of:
+            self._before = self._places(x, time)
+
+    def _places(self, x: np.ndarray, time: float) -> dict[int, np.ndarray]:
+        """Return their positions (k, 3) [m] relative to the rectangles, from all positions (owned, 3)."""
+        poses = self._contact.motion.poses(time)
+        return {k: poses.rest(k, x[nodes]) for k, nodes in self.of.items()}
+
+    def crossing(self, x: np.ndarray, time: float, where: str) -> str | None:
+        """Return the message about nodes that have crossed a rectangle since :meth:`start`, None if there are none."""
+        contact, tolerance = self._contact, BEYOND * self._contact.size
+        after = self._places(x, time)
+        for k, nodes in self.of.items():
+            wall = contact.walls[k]
+            depth = wall.offset - after[k] @ wall.normal
+            crossed = (depth > tolerance) & wall.stops(self._before[k], after[k], np.full(len(nodes), tolerance))
+            if crossed.any():
+                at = int(np.argmax(np.where(crossed, depth, 0.0)))
+                node = int(contact.mesh.node_ids[nodes[at]])
+                return _told(where, node, float(depth[at]), contact.names[k], int(crossed.sum()))
+        return None
+
+
+def _prescribed(contact: Contact, node: int, wall: int, x: np.ndarray, time: float) -> bool:
+    """Return whether supports prescribe an owned node along a wall's normal, or some components of a tied node.
+
+    ``x`` (owned, 3) : positions [m]
+    """
+    if contact.ties.any and contact.ties.held[node] and contact.fixed[node].any():
+        return True
+    normals, _ = contact.planes(np.ones((1, len(contact.wall_of)), dtype=bool), x[[node]], contact.motion.poses(time))
+    return bool(held_by_supports(contact.fixed[node], normals[0, contact.first[wall]]))
+
+
+def start_at_rest(
+    links: ConstraintSet,
+    inertia: Inertia,
+    state: State,
+    accelerate: Callable[[np.ndarray], np.ndarray],
+    load: np.ndarray,
+    still: float,
+) -> WallForces | None:
+    """Set acceleration and contact forces of nodes that rest on walls or on each other in the state; return the forces
+    per wall. Collective.
+
+    A node that touches a wall and does not move along its normal is not accelerated into it: with the walls' forces r
+    and accelerations a_w,
+
+        M a = f + r,   0 <= n . (a - a_w)  complementary to  the normal force in r,
+
+    and likewise with n . (a_2 - a_1) of closed pairs. r includes friction: opposite to the velocity of a node that
+    slides, else the force that prevents sliding, up to the limit of the wall. Without r a truss at rest on a floor
+    would start with a velocity error of h g, which decays slowly with some schemes.
+
+    The forces follow from projections with the lumped mass, in one iteration if the mass is lumped. The eigenvalues of
+    a consistent mass are between one third and one times the lumped one, so projections with half the lumped mass
+    halve the error in every iteration.
+
+    Parameters
+    ----------
+    links : ConstraintSet, with the walls of the case
+    inertia : Inertia
+    state : with ``state.a`` without walls
+    accelerate : returns the acceleration (owned, 3) with M a = load. Collective
+    load : (owned, 3) without walls [N]
+    still : velocity that counts as none [m/s]
+
+    Returns
+    -------
+    WallForces or None
+        None if no node of any rank rests on a wall or on another node, or if no contact force is needed.
+    """
+    contact, comm, mass = links.contact, links.contact.mesh.comm, inertia.mass
+    x, v = state.position, state.v
+    poses = contact.motion.poses(state.time)
+    slack = ON_BOUND * contact.size
+    nodes = np.flatnonzero(contact.near(x, poses, np.array([slack])))
+    applicable = contact.members[nodes]
+    normals, gaps = contact.distances(applicable, x[nodes], poses)
+    rates = contact.rates(x[nodes], state.time, ahead=True)
+    away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - rates)
+    resting = applicable & (np.abs(gaps) <= slack) & (np.abs(away) <= still)
+    # the plane of a partial wall extends beyond the wall, and walls with mass are not fixed
+    partial = [k for k, wall in enumerate(contact.walls) if wall.partial]
+    resting[:, np.isin(contact.wall_of, [*partial, *contact.motion.bodies.at])] = False
+    kept = resting.any(axis=1)
+    nodes, resting = nodes[kept], resting[kept]
+    share = 0.5 if inertia.consistent else 1.0
+    weight = share * mass[nodes]
+    closed = links.resting(x, v, slack, still)
+    held = np.zeros(contact.members.shape, dtype=bool)
+    held[nodes] = resting
+
+    hold = np.zeros((len(nodes), 3))  # free components of the walls' forces
+    between = np.zeros_like(load)  # likewise for the links
+    for _ in range(_ROUNDS if inertia.consistent else 1):
+        apart = state.a - between / (share * mass[:, None])
+        apart[nodes] -= hold / weight[:, None]
+        earlier = between
+        # links first, as in a step: they account for the walls
+        between = links.rest(apart, share * mass, closed, held, still)
+        free = apart[nodes] + between[nodes] / weight[:, None]
+        planes = planes_at_rest(contact, resting, (x[nodes], v[nodes], free), still)
+        found = pressed(NodesAtPlanes(free, contact.fixed[nodes], weight, planes), 0.0)
+        before, hold = hold, weight[:, None] * (found.x - free)
+        sizes = [np.abs(part).max(initial=0.0) for part in (hold - before, between - earlier, hold, between)]
+        last_hold, last_between, *largest = np.max(comm.allgather(sizes), axis=0)
+        if max(last_hold, last_between) <= 1e-13 * max(largest):
+            break
+        total = load + between
+        total[nodes] += hold
+        state.a = accelerate(total)
+    if max(largest) == 0.0:
+        return None
+    force = found.normal[:, :, None] * planes.normals + found.drag
+    state.contact = np.zeros_like(load)
+    state.contact[nodes] = force.sum(axis=1)
+    links.add_forces(state.contact)
+    return contact.sums(nodes, force, (x[nodes], x[nodes]), found.normal > 0.0)

@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import inlined, kernel
 from ..tolerances import FREE_PART
+from .rotations import along, cross, dot, minus, put, times, vector
 
 _SINGULAR = 1e-6  # determinant of I - C below which a wedge is jammed
 
@@ -88,6 +89,7 @@ class Sliding:
 MIN_VOLUME = 0.04  # of the rows of B: cond(B) <= 2.6/0.04 = 65; two planes can share a node from 2.3 degrees
 _PARALLEL = 1e-14  # 1 - |cos| of free parts of normals that share a row; the bound is exact only at the given position
 _ALONG = 1e-15  # components of a unit normal off an axis that count as zero
+_AXES = np.eye(3)
 
 
 class NodalFrames:
@@ -209,61 +211,37 @@ def build_frames(nodes: np.ndarray, planes: Planes, tolerance: float = 0.0, leas
     return frames
 
 
-@kernel
-def _rest(vector, spanned, n, out):
-    """Write the part of a unit vector orthogonal to n orthonormal vectors to ``out``; return its length."""
-    for c in range(3):
-        out[c] = vector[c]
+@inlined
+def _rest(part, spanned, n):
+    """Return the part of a unit vector orthogonal to n orthonormal vectors, and its length."""
     for _ in range(2):  # twice is enough for orthogonality to rounding
         for p in range(n):
-            s = 0.0
-            for c in range(3):
-                s += spanned[p, c] * out[c]
-            for c in range(3):
-                out[c] -= s * spanned[p, c]
-    return math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+            part = along(part, -dot(part, vector(spanned, p)), vector(spanned, p))
+    return part, math.sqrt(dot(part, part))
 
 
-@kernel
+@inlined
 def _complete(basis, taken, spanned, n):
     """Fill the rows of a basis (3, 3) that are not ``taken``; the first n of ``spanned`` (3, 3) are orthonormal vectors
     of the span of the others."""
-    part, unit, best_part = np.zeros(3), np.zeros(3), np.zeros(3)
     for slot in range(3):
         if taken[slot]:
             continue
         # prefer the axis of the slot, to avoid needless rotations
         best = -1.0
         for shift in range(3):
-            axis = (slot + shift) % 3
-            for c in range(3):
-                unit[c] = 1.0 if c == axis else 0.0
-            length = _rest(unit, spanned, n, part)
+            part, length = _rest(vector(_AXES, (slot + shift) % 3), spanned, n)
             if length > best + 1e-9:
                 best = length
-                for c in range(3):
-                    best_part[c] = part[c] / length
-        for c in range(3):
-            basis[slot, c] = best_part[c]
-            spanned[n, c] = best_part[c]
+                put(basis, slot, times(1.0 / length, part))
+        put(spanned, n, vector(basis, slot))
         n += 1
 
 
-@kernel
-def _invert(b, inverse):
-    """Write the inverse of a basis (3, 3); return whether it is the identity."""
-    for r in range(3):
-        p, q = (r + 1) % 3, (r + 2) % 3
-        for c in range(3):
-            s, t = (c + 1) % 3, (c + 2) % 3
-            inverse[c, r] = b[p, s] * b[q, t] - b[p, t] * b[q, s]
-    determinant = b[0, 0] * inverse[0, 0] + b[0, 1] * inverse[1, 0] + b[0, 2] * inverse[2, 0]
-    plain = True
-    for r in range(3):
-        for c in range(3):
-            inverse[r, c] /= determinant
-            plain = plain and b[r, c] == (1.0 if r == c else 0.0)
-    return plain
+@inlined
+def _free(n, fixed):
+    """Return a vector without its ``fixed`` components."""
+    return 0.0 if fixed[0] else n[0], 0.0 if fixed[1] else n[1], 0.0 if fixed[2] else n[2]
 
 
 @kernel
@@ -273,21 +251,15 @@ def _build(planes, tolerance, least, output):
     fixed, normals, offsets, rank, places = planes
     basis, inverse, lower, upper, rows, ratios, shares, bounds = output
     m, w = offsets.shape
-    taken = np.zeros(3, dtype=np.bool_)
-    spanned = np.zeros((3, 3))
-    part = np.zeros(3)
-    done = np.zeros(w, dtype=np.bool_)
-    oblique = False
-    contradiction = -1
+    taken, done, spanned = np.zeros(3, dtype=np.bool_), np.zeros(w, dtype=np.bool_), np.zeros((3, 3))
+    oblique, contradiction = False, -1
     for i in range(m):
-        n = 0
-        volume = 1.0
+        n, volume, own = 0, 1.0, basis[i]
         for c in range(3):
             taken[c] = fixed[i, c]
             if taken[c]:
-                basis[i, c, c] = 1.0
-                spanned[n, 0] = spanned[n, 1] = spanned[n, 2] = 0.0
-                spanned[n, c] = 1.0
+                put(own, c, vector(_AXES, c))
+                put(spanned, n, vector(_AXES, c))
                 n += 1
         for k in range(w):
             done[k] = offsets[i, k] == -math.inf
@@ -299,70 +271,49 @@ def _build(planes, tolerance, least, output):
             if wall < 0:
                 break
             done[wall] = True
-            normal = normals[i, wall]
-            slot, ratio, shared = -1, 1.0, False
+            normal, slot, ratio, shared = vector(normals[i], wall), -1, 1.0, False
+            free = _free(normal, fixed[i])
             for row in range(3):
                 if taken[row] and not fixed[i, row]:
-                    along, square, free = 0.0, 0.0, 0.0
-                    for c in range(3):
-                        if not fixed[i, c]:
-                            along += basis[i, row, c] * normal[c]
-                            square += basis[i, row, c] ** 2
-                            free += normal[c] ** 2
-                    if free > FREE_PART and abs(along) > (1.0 - _PARALLEL) * math.sqrt(square * free):
-                        slot, ratio, shared = row, along / square, True
+                    other = _free(vector(own, row), fixed[i])
+                    lengths, common = dot(other, other) * dot(free, free), dot(other, free)
+                    if dot(free, free) > FREE_PART and abs(common) > (1.0 - _PARALLEL) * math.sqrt(lengths):
+                        slot, ratio, shared = row, common / dot(other, other), True
             if not shared:
-                if n == 3:
-                    continue
-                length = _rest(normal, spanned, n, part)
-                if length * volume < least:
+                part, length = _rest(normal, spanned, n)
+                if n == 3 or length * volume < least:
                     continue
                 volume *= length
-                axis = 0
                 for c in range(3):
-                    if abs(normal[c]) > abs(normal[axis]):
-                        axis = c
+                    if not taken[c] and (slot < 0 or abs(normal[c]) > abs(normal[slot])):
+                        slot = c
                 # the length along the axis is not enough: it is 1 to rounding for normals up to 1e-8 off the axis
-                only = max(abs(normal[(axis + 1) % 3]), abs(normal[(axis + 2) % 3])) <= _ALONG
-                if only and not taken[axis]:
-                    slot = axis
-                    ratio = 1.0 if normal[axis] > 0.0 else -1.0
-                    basis[i, slot, axis] = 1.0
+                if max(abs(normal[(slot + 1) % 3]), abs(normal[(slot + 2) % 3])) <= _ALONG:
+                    put(own, slot, vector(_AXES, slot))
+                    ratio = 1.0 if normal[slot] > 0.0 else -1.0
                 else:
-                    for c in range(3):
-                        if not taken[c] and (slot < 0 or abs(normal[c]) > abs(normal[slot])):
-                            slot = c
-                    for c in range(3):
-                        basis[i, slot, c] = normal[c]
-                for c in range(3):
-                    spanned[n, c] = part[c] / length
+                    put(own, slot, normal)
+                put(spanned, n, times(1.0 / length, part))
                 n += 1
                 taken[slot] = True
-            rows[i, wall] = slot
-            ratios[i, wall] = ratio
-            bound = offsets[i, wall] / ratio
-            if shared:
-                here, gap, same = 0.0, -offsets[i, wall], True
-                for c in range(3):
-                    here += basis[i, slot, c] * places[i, c]
-                    gap += normal[c] * places[i, c]
-                    same = same and normal[c] == ratio * basis[i, slot, c]
-                if not same:
-                    bound = here - gap / ratio
-                    shares[i, wall] = True
-            bounds[i, wall] = bound
+            rows[i, wall], ratios[i, wall], bounds[i, wall] = slot, ratio, offsets[i, wall] / ratio
+            turn, place = along(normal, -ratio, vector(own, slot)), vector(places, i)
+            if shared and not turn[0] == turn[1] == turn[2] == 0.0:
+                bounds[i, wall] = dot(vector(own, slot), place) - (dot(normal, place) - offsets[i, wall]) / ratio
+                shares[i, wall] = True
             if ratio > 0.0:
-                lower[i, slot] = max(lower[i, slot], bound)
+                lower[i, slot] = max(lower[i, slot], bounds[i, wall])
             else:
-                upper[i, slot] = min(upper[i, slot], bound)
-        _complete(basis[i], taken, spanned, n)
-        plain = _invert(basis[i], inverse[i])
+                upper[i, slot] = min(upper[i, slot], bounds[i, wall])
+        _complete(own, taken, spanned, n)
+        determinant = dot(vector(own, 0), cross(vector(own, 1), vector(own, 2)))
         for r in range(3):
+            column = cross(vector(own, (r + 1) % 3), vector(own, (r + 2) % 3))
+            put(inverse[i].T, r, times(1.0 / determinant, column))
+            turn = minus(vector(own, r), vector(_AXES, r))
+            oblique = oblique or not turn[0] == turn[1] == turn[2] == 0.0
             if lower[i, r] > upper[i, r]:
                 if lower[i, r] > upper[i, r] + tolerance and contradiction < 0:
                     contradiction = i
-                middle = 0.5 * (lower[i, r] + upper[i, r])
-                lower[i, r] = middle
-                upper[i, r] = middle
-        oblique = oblique or not plain
+                lower[i, r] = upper[i, r] = 0.5 * (lower[i, r] + upper[i, r])
     return oblique, contradiction

@@ -18,7 +18,7 @@ from .projection import NodesAtPlanes, Planes, Pressed, pressed
 if TYPE_CHECKING:
     from ..mechanics.mass import Inertia
     from .node_walls import NodeWalls
-    from .relative import RelativeCoordinates
+    from .transform import RelativeCoordinates
 
 
 FAST = 1e16
@@ -92,7 +92,8 @@ _SOFTER, _LEAST = 0.1, 1e-4
 class StepFriction:
     """Friction in one implicit step, at the slots of walls and, behind them, of tables of rows.
 
-    Positions are those of nodes, at carriers of rows relative ones: see :mod:`~pfem_petsc.contact.relative`.
+    Positions are those of nodes, at carriers of rows relative ones, see
+    :class:`~pfem_petsc.contact.transform.RelativeCoordinates`.
 
     Parameters
     ----------

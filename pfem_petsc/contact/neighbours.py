@@ -9,14 +9,20 @@ rank that has most segments there. Points are segments whose ends coincide.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
+from ..columns import STATUS
 from ..mechanics.compiled import inlined, kernel
 from ..mesh.exchange import Router
-from .vectors import along, cross, dot, minus, vector
+from ..mesh.slab import slab_of
+from ..parallel.heap import returning_freed_memory
+from .rotations import along, cross, dot, minus, vector
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
 
 # Limits for each segment: pieces, and comparisons.
 _PIECES, _COMPARISONS = 8.0, 2000.0
@@ -624,3 +630,125 @@ def _compare_rows(pieces, points, held, grid, folded, most):
                         rows[found, 0], rows[found, 1], at[found, 0], at[found, 1] = one, two, s, t
                         found += 1
     return rows[:found], at[:found], gap, comparisons
+
+
+STOUT = 0.25
+"""Radius of a bar over its length beyond which it has no axis that others could cross."""
+
+# Bars this much closer to each other in the mesh, relative to their radii, touch there: it may be rounding.
+_NEAR = 0.01
+
+# Distance between bars up to which the search knows it, over their mean length. No search is needed before it has
+# changed.
+_SKIN = 0.1
+
+# Coordinate beyond which a node is not searched [m].
+_STRAY = 1e100
+
+
+class Crossing(NamedTuple):
+    """Pairs of bars that pass through each other, number of bars among them, and the lowest pair of numbers."""
+
+    pairs: int
+    bars: int
+    lowest: tuple[int, int]
+
+
+class CrossingBars:
+    """Finds bars that pass through each other and did not in the mesh. Collective, with results for any ranks alike.
+
+    Bars with an end in contact pairs or constraints may meet, by which others of this kind come close: such pairs are
+    left out, and so are springs, dashpots, broken bars, and bars that are less than twice as long as thick.
+
+    Attributes
+    ----------
+    applicable : whether there are bars to be searched
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        mesh = model.mesh
+        self._n_bars = mesh.n_bars - mesh.n_connectors
+        radius = model.bars.radii()[mesh.counted]
+        slender = radius < STOUT * model.bars.mesh_lengths[mesh.counted]
+        slender &= mesh.bar_ids[mesh.counted] < self._n_bars
+        self._bars = mesh.counted
+        if not (isinstance(self._bars, slice) and slender.all()):
+            self._bars = np.arange(len(mesh.bars), dtype=np.int32)[self._bars][slender]
+        self.applicable = model.comm.allreduce(int(np.count_nonzero(slender))) > 1 and model.self_contact is None
+        self._thick = 2.0 * model.comm.allreduce(float(radius[slender].max(initial=0.0)), op=MPI.MAX)
+        self._kind = self._linked_bars()
+        self._last: _Search | None = None
+
+    def _linked_bars(self) -> np.ndarray:
+        """Return (bars,) uint8: 1 for those with an end in contact pairs or constraints, else 0; (0,) without any.
+        Collective."""
+        case, mesh = self._model.case, self._model.mesh
+        tables = (*case.contact_pair, *case.constraint)
+        if not tables:
+            return np.empty(0, np.uint8)
+        linked = np.zeros((mesh.n_local, 1))
+        for table in tables:
+            for value in table.model_dump().values():
+                for name in value if isinstance(value, list | tuple) else [value]:
+                    if isinstance(name, str) and name in self._model.nodes:
+                        linked[self._model.nodes[name]] = 1.0
+        mesh.update_ghosts(linked)
+        return (linked[mesh.bars[self._bars], 0] > 0.0).any(axis=1).astype(np.uint8)
+
+    def find(self, x: np.ndarray) -> Crossing | None:
+        """Return the bars at positions (local, 3) [m] that pass through each other; None if the search would take too
+        long, because too many bars are in one place."""
+        if self._last is None:  # in the mesh, no bar does
+            self._last = _Search(Crossing(0, 0, (-1, -1)), 0.0, self._model.mesh.points, self._intact())
+        comm, last, owned = self._model.comm, self._last, self._model.mesh.n_owned
+        motion = last.x[:owned], x[:owned]
+        change = largest_change(comm, motion, self._model.mesh.n_nodes, self._thick + last.gap)
+        if comm.allreduce(bool((self._intact() != last.intact).any()), op=MPI.LOR):
+            change = np.inf
+        if change > 0.0 and change >= 0.998 * self._last.gap:
+            with returning_freed_memory():
+                found, gap = self._search(x)
+            self._last = _Search(found, gap, x.copy(), self._intact())
+        return self._last.found
+
+    def _intact(self) -> np.ndarray:
+        """Return (bars,) bool: those that are not broken; (0,) if none can break."""
+        if not self._model.bars.can_break:
+            return np.empty(0, dtype=bool)
+        return self._model.bars.status()[self._bars] != STATUS.index("broken")
+
+    def _count(self, pairs: np.ndarray) -> Crossing:
+        """Return the number of pairs and bars from the pairs (m, 2) that this rank has found. Collective."""
+        comm, n = self._model.comm, self._n_bars
+        both = np.unique(pairs)
+        bars = np.unique(Router(comm, slab_of(both, n, comm.size)).send(both))
+        lowest = int((pairs[:, 0] * n + pairs[:, 1]).min(initial=np.iinfo(np.int64).max))
+        lowest = comm.allreduce(lowest, op=MPI.MIN)
+        return Crossing(comm.allreduce(len(pairs)), comm.allreduce(len(bars)), (lowest // n, lowest % n))
+
+    def _search(self, x: np.ndarray) -> tuple[Crossing | None, float]:
+        """Return the pairs at positions (local, 3) [m], and by how much the distance of any two bars differs at least
+        from the sum of their radii [m]."""
+        comm, mesh, bars = self._model.comm, self._model.mesh, self._model.bars
+        ids, ends, radius, kind = mesh.bar_ids[self._bars], mesh.bars[self._bars], bars.radii()[self._bars], self._kind
+        # stray nodes may be anywhere, and squares of distances must be finite; a NaN has its own message elsewhere
+        near = (np.abs(x) < _STRAY).all(axis=1)
+        if bars.can_break or not near.all():
+            kept = near[ends].all(axis=1)
+            if bars.can_break:
+                kept &= self._intact()
+            ids, ends, radius, kind = ids[kept], ends[kept], radius[kept], kind[kept] if len(kind) else kind
+        segments = Segments(ids, ends, radius, kind)
+        found = find_pairs(comm, Points(x, mesh.node_ids, mesh.points), segments, _SKIN, 1.0 + _NEAR)
+        return (None, 0.0) if found is None else (self._count(found.ids), found.gap)
+
+
+class _Search(NamedTuple):
+    """The last search: its result, the smallest distance at which that would change [m], positions (local, 3), and
+    which bars were intact."""
+
+    found: Crossing | None
+    gap: float
+    x: np.ndarray
+    intact: np.ndarray

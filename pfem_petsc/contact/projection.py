@@ -11,7 +11,7 @@ import numpy as np
 
 from ..mechanics.compiled import NEEDED, inlined, kernel
 from ..tolerances import FREE_PART, SINGULAR_ROW
-from .sweeps import Pushes, RubbingRows, settle_friction
+from .sweeps import NO_DRAG, Pushes, RubbingRows, compliance, displace, settle_friction
 
 
 @kernel
@@ -214,16 +214,6 @@ def _add_planes(at, i, n, planes, room):
     return n
 
 
-@inlined
-def _push(a, force, rows, moves):
-    """Displace the nodes of a row by a force."""
-    for k in range(rows.ends.shape[1]):
-        i = rows.ends[a, k]
-        if i >= 0:
-            for c in range(3):
-                moves[i, c] += force * rows.gradients[a, k, c] * rows.soft[i, c]
-
-
 @kernel
 def _solve_several(n, rows, tolerances, pushes):
     """Find the normal forces of rows, and the displacements by these; return whether there are such forces."""
@@ -243,7 +233,7 @@ def _solve_several(n, rows, tolerances, pushes):
     if not found and tolerances[0] < tolerances[1]:
         found = find_multipliers(gram, values, tolerances[1], normal)
     for a in range(n if found else 0):
-        _push(a, normal[a], rows, pushes.moves)
+        displace(a, normal[a], NO_DRAG, rows, pushes.moves)
     return found
 
 
@@ -262,13 +252,8 @@ def _solve_rows(n, rows, tolerances, size, pushes):
     if not broken:
         return 0
     if n == 1:
-        gives = 0.0
-        for k in range(rows.ends.shape[1]):
-            i = rows.ends[0, k]
-            for c in range(3 if i >= 0 else 0):
-                gives += rows.gradients[0, k, c] * rows.gradients[0, k, c] * rows.soft[i, c]
-        normal[0] = -rows.values[0] / gives
-        _push(0, normal[0], rows, moves)
+        normal[0] = -rows.values[0] / compliance(0, rows)
+        displace(0, normal[0], NO_DRAG, rows, moves)
     if (n == 1 and not normal[0] < math.inf) or (n > 1 and not _solve_several(n, rows, tolerances, pushes)):
         return INFEASIBLE
     return 0 if settle_friction(n, rows, size, pushes) else JAMMED

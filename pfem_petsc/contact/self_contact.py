@@ -58,8 +58,8 @@ from .neighbours import (
     make_regions,
     segment_distance,
 )
+from .rotations import add_to, along, dot, minus, put, times, vector
 from .rows import owner_starts, to_owners
-from .vectors import add_to, along, dot, minus, put, times, vector
 
 if TYPE_CHECKING:
     from ..integrators.base import Balance, Scheme

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..contact.initial_equilibrium import start_at_rest
-from ..contact.massless import MasslessNodes
-from ..contact.monitoring import CarriedNodes
+from ..contact.contact import CarriedNodes, start_at_rest
 from ..contact.node_walls import WallForces
+from ..contact.treatments.mass_redistribution import MasslessNodes
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy, release

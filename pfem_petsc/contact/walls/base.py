@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -19,6 +20,16 @@ WALLS = "pfem_petsc.contact.walls"
 
 _ALIKE = 1e-6
 """Relative difference up to which numbers of a file count as equal."""
+
+_DEEP = 0.125
+"""Depth of bars in a body, as a fraction of its width, beyond which they are reported."""
+_SAMPLES = 9
+"""Places along a bar at which the least distance is looked for first."""
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+_ROUNDS = 30
+"""Of the search by golden sections, each of which leaves 0.62 of the interval."""
+_AT_END = 1e-7
+"""Part of the length next to an end of a bar, where walls stop the node."""
 
 Row2 = Annotated[tuple[Finite, Finite], listed]
 Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
@@ -161,6 +172,7 @@ class BaseWall(ABC):
     ----------
     flat : whether the tangent plane is the same everywhere; then ``normal`` (3,) and ``offset`` [m] are that plane
     partial : whether nodes can pass beside it, so that their previous positions matter (:meth:`stops`)
+    closed : whether bars can be deep in it, rather than cross it
     faces : how many planes a node can touch at once; more than one for a surface of triangles
     width : smallest extent [m] of a wall that bars can cross between their nodes, infinite for others
     centre : (3,) [m], the point whose position is recorded if the wall moves
@@ -168,6 +180,7 @@ class BaseWall(ABC):
 
     flat = False
     partial = False
+    closed = True
     faces = 1
     width = np.inf
     centre: np.ndarray
@@ -189,6 +202,44 @@ class BaseWall(ABC):
     def stops(self, before: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
         """Return (m,) bool: nodes that the wall stops between ``before`` (m, 3) and ``x`` (m, 3); for partial walls."""
         return np.ones(len(x), dtype=bool)
+
+    def crossed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Return (m,) bool: bars from ``starts`` to ``ends`` (m, 3) that intersect a wall of finite width."""
+        return deepest(self.gaps, np.stack([starts, ends], axis=1))[1] < -_DEEP * self.width
+
+
+def deepest(gaps_of: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where between their ends (m, 2, 3) bars are deepest beyond a wall, from 0 to 1, and the distances there
+    (m,) [m]; infinite where that is at an end, which walls stop as a node, and where none is beyond it.
+
+    ``gaps_of``: see :meth:`BaseWall.gaps`
+    """
+
+    def gap(t: np.ndarray) -> np.ndarray:
+        return gaps_of((1.0 - t)[:, None] * ends[:, 0] + t[:, None] * ends[:, 1])
+
+    where, least = np.zeros(len(ends)), np.full(len(ends), np.inf)
+    # the distance changes along a bar by no more than the way
+    near = np.flatnonzero(gap(where + 0.5) <= 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))
+    if not len(near):
+        return where, least
+    ends, places = ends[near], np.linspace(0.0, 1.0, _SAMPLES)
+    best = np.stack([gap(np.full(len(ends), t)) for t in places]).argmin(axis=0)
+    low, high = places[np.maximum(best - 1, 0)], places[np.minimum(best + 1, _SAMPLES - 1)]
+    one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    first, second = gap(one), gap(two)
+    for _ in range(_ROUNDS):
+        left = first < second
+        low, high = np.where(left, low, one), np.where(left, two, high)
+        one, two = (
+            np.where(left, high - _GOLDEN * (high - low), two),
+            np.where(left, one, low + _GOLDEN * (high - low)),
+        )
+        fresh = gap(np.where(left, one, two))
+        first, second = np.where(left, fresh, second), np.where(left, first, fresh)
+    t = 0.5 * (low + high)
+    where[near], least[near] = t, np.where((t > _AT_END) & (t < 1.0 - _AT_END), gap(t), np.inf)
+    return where, least
 
 
 class RoundWall(BaseWall):

@@ -11,6 +11,8 @@ from ...case.base import PositiveFloat, Vector3, listed
 from .base import Surface, WallKeys, direction, slab
 from .plane import Wall as Plane
 
+_SLACK = 1e-6  # distance of both ends from the plane, over their length, beyond which bars cross it
+
 
 class Parameters(WallKeys):
     """Keys of a rectangular wall."""
@@ -38,6 +40,7 @@ class Wall(Plane):
     """A part of the plane n . x = d."""
 
     partial = True
+    closed = False
 
     def __init__(self, parameters: Parameters) -> None:
         super().__init__(parameters)
@@ -54,9 +57,19 @@ class Wall(Plane):
         # the point where the path crosses the plane; the foot of x if it does not
         crossing = end < 0.0
         part = np.where(crossing, np.clip(start, 0.0, None) / np.maximum(start - end, 1e-300), 1.0)
-        point = before + np.minimum(part, 1.0)[:, None] * (x - before) - self.centre
-        inside = (np.abs(point @ self.first) <= self.half[0]) & (np.abs(point @ self.second) <= self.half[1])
-        return inside & (start >= -tolerance)
+        return self._has(before + np.minimum(part, 1.0)[:, None] * (x - before)) & (start >= -tolerance)
+
+    def _has(self, x: np.ndarray) -> np.ndarray:
+        """Return (m,) bool: points (m, 3) of the plane that are in the rectangle."""
+        point = x - self.centre
+        return (np.abs(point @ self.first) <= self.half[0]) & (np.abs(point @ self.second) <= self.half[1])
+
+    def crossed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        first, second = starts @ self.normal - self.offset, ends @ self.normal - self.offset
+        across = np.minimum(np.abs(first), np.abs(second)) > _SLACK * np.linalg.norm(ends - starts, axis=1)
+        across &= (first < 0.0) != (second < 0.0)
+        part = np.where(across, first / np.where(across, first - second, 1.0), 0.0)
+        return across & self._has(starts + part[:, None] * (ends - starts))
 
 
 def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:

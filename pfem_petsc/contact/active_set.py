@@ -86,11 +86,9 @@ def broken_walls(
     applicable = contact.applicable(beyond, x[beyond], poses)
     normals, gaps = contact.distances(applicable, x[beyond], poses, beyond)
     broken = gaps < -tolerance
-    place = np.searchsorted(candidates.nodes, beyond)
-    known = place < len(candidates.nodes)
-    known[known] = candidates.nodes[place[known]] == beyond[known]
+    _, known, place = np.intersect1d(beyond, candidates.nodes, assume_unique=True, return_indices=True)
     # walls with their own bound are satisfied to rounding of the coordinates; supports override walls
-    place, walls = place[known], broken.shape[1]
+    walls = broken.shape[1]
     broken[known] &= (frames.rows[place, :walls] < 0) | frames.shared[place, :walls]
     broken &= ~contact.ties.held[beyond][:, None]
     broken &= ~held_by_supports(contact.fixed[beyond][:, None, :], normals)
@@ -236,22 +234,24 @@ class ActiveSet:
         SimulationFailure
             On all ranks, if the walls and supports of a node are infeasible together.
         """
-        contact, time, y = self.contact, self.balance.time, x
-        rows = RowPlanes.none(self.friction.slots - len(contact.wall_of))
+        contact, slots = self.contact, self.friction.slots
         relative = None if coupled is None else coupled.relative
         if relative is not None:
             stopped = np.zeros(len(x), dtype=bool)
             stopped[candidates.nodes] = candidates.applicable.any(axis=1)
             relative.choose(stopped, x)
             self.friction.relate(relative)
-            rows, y, candidates = relative.planes(x), relative.positions(x), candidates.beside(relative.nodes)
-        frames, tied = NodalFrames(candidates.nodes, self.friction.slots), contact.ties.nobody
+            candidates = candidates.beside(relative.nodes)
+        frames, tied = NodalFrames(candidates.nodes, slots), contact.ties.nobody
         if candidates.anywhere:
+            rows = RowPlanes.none(x[candidates.nodes], slots - len(contact.wall_of))
+            if relative is not None:
+                rows = relative.planes(x, candidates.nodes)
             least = MIN_VOLUME if self._iterations < _PATIENCE else _SMALL_VOLUME
             untied = candidates.without(contact.ties.held)
-            frames = contact.frames(untied, x, time, least, self.balance.acting, rows)
-            tied = contact.ties.pin(frames, x, time)
-            self.friction.apply(frames, y)
+            frames = contact.frames(untied, x, self.balance, rows, least)
+            tied = contact.ties.pin(frames, x, self.balance.time)
+            self.friction.apply(frames)
         met = frames if candidates.anywhere else None
         if coupled is not None:
             coupled.place(met, self.balance, self.state, x)

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from .constraint_set import ConstraintSet
 
 
-_NO_ROWS = RowPlanes.none(0)
 _ROUNDS = 60  # of the initial equilibrium, each at least halves the error
 
 
@@ -63,30 +62,25 @@ class Contact(ExplicitContact):
         return self.ties.take(walls.nodes, walls.touching, walls.places, time)
 
     def frames(
-        self,
-        candidates: Candidates,
-        x: np.ndarray,
-        time: float,
-        least: float = MIN_VOLUME,
-        part: float = 1.0,
-        rows: RowPlanes = _NO_ROWS,
+        self, candidates: Candidates, x: np.ndarray, balance: Balance, rows: RowPlanes, least: float = MIN_VOLUME
     ) -> NodalFrames:
         """Build coordinates and bounds of candidates from their planes at positions (owned, 3). Collective.
 
-        ``least``: see :func:`~pfem_petsc.contact.frames.build_frames`; ``part``: see :meth:`acting`; ``rows``: further
-        planes of some of the candidates.
+        ``rows``: further planes of the candidates; ``least``: see :func:`~pfem_petsc.contact.frames.build_frames`.
         """
-        nodes, rank = candidates.nodes, candidates.priority
-        at, poses = x[nodes], self.motion.poses(time)
-        self.find_faces(nodes, at, poses, ON_BOUND * self.size)
-        acting = self.acting(nodes, at, poses, part)
+        nodes, poses, tolerance = candidates.nodes, self.motion.poses(balance.time), ON_BOUND * self.size
+        at = x[nodes]
+        self.find_faces(nodes, at, poses, tolerance)
+        acting = self.acting(nodes, at, poses, balance.acting)
         normals, offsets = self.planes(candidates.applicable, at, poses, acting, nodes)
-        if rank is None:
-            rank = np.einsum("iwk,ik->iw", normals, at) - offsets
-        tolerance, walls = ON_BOUND * self.size, offsets.shape[1]
-        if rows.offsets.shape[1]:
-            normals, offsets, rank, at = rows.beside(nodes, (normals, offsets, rank, at))
-        frames = build_frames(nodes, Planes(self.fixed[nodes], normals, offsets, rank, at), tolerance, least)
+        walls = offsets.shape[1]
+        normals = np.concatenate([normals, rows.normals], axis=1)
+        offsets = np.concatenate([offsets, rows.offsets], axis=1)
+        rank = np.einsum("iwk,ik->iw", normals, rows.places) - offsets
+        if candidates.priority is not None:
+            rank[:, :walls] = candidates.priority
+        planes = Planes(self.fixed[nodes], normals, offsets, rank, rows.places)
+        frames = build_frames(nodes, planes, tolerance, least)
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction

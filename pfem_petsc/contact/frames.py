@@ -5,7 +5,7 @@ of slipping nodes.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -157,37 +157,22 @@ class Planes(NamedTuple):
 
 
 class RowPlanes(NamedTuple):
-    """Rows as planes n . y >= d of owned nodes (m,), ascending, with one slot for each table (t,).
+    """Rows as planes n . y >= d of nodes (m,), with one slot for each table (t,).
 
     Attributes
     ----------
-    nodes : (m,) owned local indices; places : (m, 3) y at these [m]
+    places : (m, 3) y [m], the positions of nodes without rows
     normals, offsets : (m, t, 3), (m, t) [m]; offsets -inf where a table has no row
     """
 
-    nodes: np.ndarray
     places: np.ndarray
     normals: np.ndarray
     offsets: np.ndarray
 
     @classmethod
-    def none(cls, tables: int) -> RowPlanes:
+    def none(cls, places: np.ndarray, tables: int) -> Self:
         """Return the planes of no rows."""
-        vectors = np.empty((0, 3))
-        return cls(np.empty(0, dtype=np.int64), vectors, np.empty((0, tables, 3)), np.empty((0, tables)))
-
-    def beside(self, nodes: np.ndarray, walls: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-        """Append the slots of tables to ``walls``, the normals, offsets and ranks (k, w) and places (k, 3) of nodes
-        (k,), ascending, which include those of the rows."""
-        normals, offsets, rank, places = walls
-        at, tables = np.searchsorted(nodes, self.nodes), self.offsets.shape[1]
-        own = np.zeros((len(nodes), tables, 3)), np.full((len(nodes), tables), -np.inf), np.zeros((len(nodes), tables))
-        own[0][at], own[1][at] = self.normals, self.offsets
-        own[2][at] = np.einsum("mti,mi->mt", self.normals, self.places) - self.offsets
-        places = places.copy()
-        places[at] = self.places
-        every = (np.concatenate(pair, axis=1) for pair in zip((normals, offsets, rank), own, strict=True))
-        return *every, places
+        return cls(places, np.zeros((len(places), tables, 3)), np.full((len(places), tables), -np.inf))
 
 
 _FILLED = "basis", "inverse", "lower", "upper", "rows", "ratios", "shared", "bounds"

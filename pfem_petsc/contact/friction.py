@@ -174,20 +174,18 @@ class StepFriction:
         ways[:, : len(self.contact.wall_of)] = self.contact.ways(self.state.position[nodes], *self._poses)
         return ways
 
-    def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
-        """Fix the sticking nodes of the frames and apply friction to the slipping ones, at a guess (owned, 3)."""
+    def apply(self, frames: NodalFrames) -> None:
+        """Fix the sticking nodes of the frames and apply friction to the slipping ones, at the places of the frames."""
         if not self._rubs:
             return
         nodes = frames.nodes
         has_friction = self._has_friction(frames)
-        fresh = has_friction & ~self._guessed[nodes]
-        if fresh.any():
-            at = np.flatnonzero(fresh)
-            reaction = self._reaction[nodes[at]]
-            none = np.zeros(len(at), dtype=bool)
-            own = self._local(frames, at, x[nodes[at]], reaction, none)
+        at = np.flatnonzero(has_friction & ~self._guessed[nodes])
+        if len(at):
+            x, slipping = frames.places[at], np.zeros(len(at), dtype=bool)
+            own = self._local(frames, at, x, self._reaction[nodes[at]], slipping)
             self._forces[nodes[at]] = own.drag.sum(axis=1)
-            self._decide(frames, at, x[nodes[at]], none, own)
+            self._decide(frames, at, x, slipping, own)
             self._guessed[nodes[at]] = True
         self._hold(frames, np.flatnonzero(has_friction & (self._sticks[nodes] >= 0)))
         moving = has_friction & (self._sticks[nodes] < 0) & (self._directions[nodes] != 0.0).any(axis=(1, 2))

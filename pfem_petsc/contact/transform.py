@@ -181,19 +181,18 @@ class RelativeCoordinates:
         total[self.nodes] = np.where(soft > 0.0, 1.0 / np.maximum(soft, 1e-300), k[self.nodes])
         return total
 
-    def planes(self, x: np.ndarray) -> RowPlanes:
-        """Return the rows with carriers at positions (owned, 3) as planes of owned nodes. Collective."""
-        rows, every = self.rows, self.rows.gather(x)
-        y = rows.slips(every)
-        at, place, tables = self._placed, self._place, len(self.friction)
-        normals = np.zeros((len(self.nodes), tables, 3))
-        offsets = np.full((len(self.nodes), tables), -np.inf)
+    def planes(self, x: np.ndarray, nodes: np.ndarray) -> RowPlanes:
+        """Return the rows with carriers at positions (owned, 3) as planes of owned nodes (k,), ascending, which include
+        the carriers. Collective."""
+        rows, every, at, tables = self.rows, self.rows.gather(x), self._placed, len(self.friction)
+        planes = RowPlanes.none(self.positions(x)[nodes], tables)
         if len(at):
+            place, table = np.searchsorted(nodes, self.nodes)[self._place], rows.source[at]
             end = np.abs(rows.weights[at]).argmax(axis=1)
             n = rows.fixed_jacobian[at, end] / rows.weights[at, end][:, None]
-            normals[place, rows.source[at]] = n
-            offsets[place, rows.source[at]] = np.einsum("ri,ri->r", n, y[at]) - rows.values(every)[at]
-        return RowPlanes(self.nodes, y[self.at], normals, offsets)
+            planes.normals[place, table] = n
+            planes.offsets[place, table] = np.einsum("ri,ri->r", n, rows.slips(every)[at]) - rows.values(every)[at]
+        return planes
 
     def of_rows(self, normal: np.ndarray, drag: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return normal forces (r,) and drags (r, 3) of the rows here from those of nodes ``frames`` (m,) in the slots
@@ -520,16 +519,12 @@ class Transform:
 
     def forward(self, w: np.ndarray) -> None:
         """Transform w (owned, 3) to u, in place. Collective."""
-        if self.identity:
-            return
         if self.rows is not None:
             self.rows.forward(w)
         w[self._nodes] = np.einsum("nij,nj->ni", self._back, w[self._nodes])
 
     def inverse(self, u: np.ndarray) -> None:
         """Transform u (owned, 3) to w, in place. Collective."""
-        if self.identity:
-            return
         if self.rows is not None:
             self.rows.inverse(u)
         u[self._nodes] = np.einsum("nij,nj->ni", self._basis, u[self._nodes])
@@ -546,8 +541,6 @@ class Transform:
 
     def residual(self, predictor: np.ndarray, u: np.ndarray, g: np.ndarray) -> None:
         """Transform the residual force (owned, 3) at predictor + u to the residual of w, in place. Collective."""
-        if self.identity:
-            return
         self.adjoint(g)
         if self.slides:
             slipping = self.sliding.nodes
@@ -562,8 +555,6 @@ class Transform:
 
         ``left`` : value of :meth:`left` where H was evaluated.
         """
-        if self.identity:
-            return
         self.adjoint(out)
         if self.slides:
             sliding, y = self.sliding, self.positions(u[: self.mesh.n_owned])[self.sliding.nodes]

@@ -144,10 +144,7 @@ def _movable(contact: Contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
     """Return owned nodes (m,) that can move off their walls (m,), the unit vectors (m, 3), and ``across`` (m,)."""
     nodes = np.flatnonzero(contact.members.any(axis=1))
     walls = contact.members[nodes].argmax(axis=1)
-    normals = contact.normals[walls]
-    free = np.where(contact.fixed[nodes], 0.0, normals)
-    # a fully free normal is not rescaled, which would change its last digits
-    free = np.where(contact.fixed[nodes].any(axis=1)[:, None], free, normals)
+    free = np.where(contact.fixed[nodes], 0.0, contact.normals[walls])
     across = np.sqrt((free * free).sum(axis=1))
     can = across**2 > FREE_PART
     return nodes[can], walls[can], free[can] / across[can, None], across[can]

@@ -210,7 +210,7 @@ class BaseWall(ABC):
 
 def deepest(gaps_of: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where between their ends (m, 2, 3) bars are deepest beyond a wall, from 0 to 1, and the distances there
-    (m,) [m]; infinite where that is at an end, which walls stop as a node, and where none is beyond it.
+    (m,) [m]; infinite where that is at an end, which walls stop as a node, and of bars that are far from it.
 
     ``gaps_of``: see :meth:`BaseWall.gaps`
     """

@@ -127,125 +127,32 @@ def find_pairs(comm: MPI.Comm, points: Points, own: Segments, skin: float = 0.0,
     return Pairs(np.empty((0, 2), np.int64), np.empty((0, 2, 2), np.int64), np.empty((0, 2)), np.inf)
 
 
-class Regions(NamedTuple):
-    """Cells of space, by which nodes near each other are compared: of each owned node ``of`` (n,); their numbers along
-    the axes ``count`` (3,), and their width [m]."""
-
-    of: np.ndarray
-    count: np.ndarray
-    width: float
-
-
-_REGIONS = 24  # along an axis, at most
-
-
-def make_regions(comm: MPI.Comm, x: np.ndarray, width: float) -> Regions:
-    """Return cells of at least a width [m] around owned nodes at ``x`` (n, 3). Collective."""
-    ends = np.stack([x.max(axis=0, initial=-np.inf), -x.min(axis=0, initial=np.inf)])
-    comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
-    width = max(width, float((ends[0] + ends[1]).max()) / _REGIONS)
-    count = ((ends[0] + ends[1]) / width).astype(np.int64) + 1
-    at = np.minimum(((x + ends[1]) / width).astype(np.int64), count - 1)
-    return Regions((at[:, 0] * count[1] + at[:, 1]) * count[2] + at[:, 2], count, width)
-
-
-def largest_change(
-    comm: MPI.Comm,
-    motion: tuple[np.ndarray, np.ndarray],
-    n_nodes: int,
-    reach: float,
-    near: tuple[Regions, float] | None = None,
-) -> float:
+def largest_change(comm: MPI.Comm, motion: tuple[np.ndarray, np.ndarray], n_nodes: int, reach: float) -> float:
     """Return by how much distances up to ``reach`` between any bars may have changed [m]; infinite for positions that
     are not finite. Collective.
 
     An affine map, the fit of all displacements, takes nodes to within r of where they are. With its singular values s,
-    a distance d has become one between s_min d - 2 r and s_max d + 2 r: a body that spins has not changed. Instead of
-    2 r, bars whose ends are in neighbouring regions have what these differ in at most from the map, as long as others
-    are too far from each other to come near.
+    a distance d has become one between s_min d - 2 r and s_max d + 2 r: a body that spins has not changed.
 
     Parameters
     ----------
     motion : positions (owned, 3) before and now [m]
     n_nodes : of all ranks
-    near : regions of the positions before, and the length of the longest bar [m]
     """
-    start, now = (np.asarray(x) for x in motion)
-    means = comm.allreduce(_moments(start, now, np.zeros((2, 3)))[0]).reshape(2, 3) / n_nodes
-    moments = comm.allreduce(_moments(start, now, means)[1:])
+    at, moved = motion[0], motion[1] - motion[0]
+    middle, way = comm.allreduce(np.stack([at.sum(axis=0), moved.sum(axis=0)])) / n_nodes
+    at, moved = at - middle, moved - way
+    moments = comm.allreduce(np.hstack([at.T @ at, at.T @ moved]))
     if not np.isfinite(moments).all():
         return np.inf
     gradient = np.linalg.pinv(moments[:, :3], rcond=1e-9, hermitian=True) @ moments[:, 3:]
-    regions, longest = near or (None, 0.0)
-    most = np.full((int(np.prod(regions.count)) if near else 0, 6), -np.inf)
-    ends = np.full(6, -np.inf)
-    _ranges(start, now, means, gradient, regions.of if near else np.empty(0, np.int64), most, ends)
+    rest = moved - at @ gradient
+    ends = np.stack([rest.max(axis=0, initial=-np.inf), -rest.min(axis=0, initial=np.inf)])
     comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
-    square = _farthest(start, now, means, gradient, 0.5 * (ends[:3] - ends[3:]))
-    rest = 2.0 * np.sqrt(comm.allreduce(square, op=MPI.MAX))
+    rest -= 0.5 * (ends[0] - ends[1])
+    square = comm.allreduce(float(np.einsum("ij,ij->i", rest, rest).max(initial=0.0)), op=MPI.MAX)
     stretch = float(np.abs(np.linalg.svd(np.eye(3) + gradient, compute_uv=False) - 1.0).max())
-    if near:
-        comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
-        beyond = regions.width - 2.0 * longest
-        if rest + stretch * beyond <= beyond - reach:
-            rest = min(rest, _largest_range(most.reshape(*regions.count, 6)))
-    return rest + stretch * reach
-
-
-def _largest_range(most: np.ndarray) -> float:
-    """Return the largest length of the differences of displacements in neighbouring regions, whose largest ones are
-    ``most`` (nx, ny, nz, 6), in positive and in negative directions."""
-    for axis in range(3):
-        padded = np.pad(most, [(1, 1) if k == axis else (0, 0) for k in range(4)], constant_values=-np.inf)
-        n = most.shape[axis]
-        most = np.maximum.reduce([padded.take(range(k, k + n), axis=axis) for k in range(3)])
-    ways = np.maximum(most[..., :3] + most[..., 3:], 0.0)
-    return float(np.sqrt(np.einsum("...i,...i", ways, ways).max(initial=0.0)))
-
-
-@kernel
-def _moments(start, now, means):
-    """Return the sums (4, 6) of the products of 1 and the positions of nodes with their positions and displacements,
-    less ``means`` (2, 3) of these."""
-    moments = np.zeros((4, 6))
-    for i in range(len(start)):
-        at = minus(vector(start, i), means[0])
-        moved = minus(minus(vector(now, i), vector(start, i)), means[1])
-        rows, columns = (1.0, at[0], at[1], at[2]), (at[0], at[1], at[2], moved[0], moved[1], moved[2])
-        for c in range(4):
-            for d in range(6):
-                moments[c, d] += rows[c] * columns[d]
-    return moments
-
-
-@inlined
-def _rest_of(start, now, means, gradient, i):
-    """Return the displacement of a node beyond an affine map."""
-    at, moved = minus(vector(start, i), means[0]), minus(minus(vector(now, i), vector(start, i)), means[1])
-    return minus(moved, (dot(at, gradient[:, 0]), dot(at, gradient[:, 1]), dot(at, gradient[:, 2])))
-
-
-@kernel
-def _ranges(start, now, means, gradient, regions, most, ends):
-    """Write the largest displacements beyond an affine map, in positive and negative directions, of all nodes, ``ends``
-    (6,), and of the regions, ``most`` (k, 6)."""
-    for i in range(len(start)):
-        rest = _rest_of(start, now, means, gradient, i)
-        for c in range(3):
-            ends[c], ends[3 + c] = max(ends[c], rest[c]), max(ends[3 + c], -rest[c])
-            if len(regions) > 0:
-                k = regions[i]
-                most[k, c], most[k, 3 + c] = max(most[k, c], rest[c]), max(most[k, 3 + c], -rest[c])
-
-
-@kernel
-def _farthest(start, now, means, gradient, centre):
-    """Return the square of the largest distance of displacements beyond an affine map from a ``centre`` (3,)."""
-    farthest = 0.0
-    for i in range(len(start)):
-        rest = minus(_rest_of(start, now, means, gradient, i), centre)
-        farthest = max(farthest, dot(rest, rest))
-    return farthest
+    return 2.0 * np.sqrt(square) + stretch * reach
 
 
 def _measure(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -248,7 +248,8 @@ class ActiveSet:
             if relative is not None:
                 rows = relative.planes(x, candidates.nodes)
             least = MIN_VOLUME if self._iterations < _PATIENCE else _SMALL_VOLUME
-            untied = candidates.without(contact.ties.held)
+            tied_ones = contact.ties.held[candidates.nodes]
+            untied = replace(candidates, applicable=candidates.applicable & ~tied_ones[:, None])
             frames = contact.frames(untied, x, self.balance, rows, least)
             tied = contact.ties.pin(frames, x, self.balance.time)
             self.friction.apply(frames)

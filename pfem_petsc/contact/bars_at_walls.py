@@ -104,8 +104,7 @@ class BarsAtWalls:
             if np.abs(there - before).max(initial=0.0) * sqrt(3.0) < 0.5 * self._skin:
                 return bars
         a, b = there[self._mesh.bars[self._bars]].swapaxes(0, 1)
-        half = 0.5 * np.linalg.norm(b - a, axis=1)
-        near = self._contact.walls[k].gaps(0.5 * (a + b)) < half + self._skin
+        near = self._contact.walls[k].gaps(0.5 * (a + b)) < 0.5 * np.linalg.norm(b - a, axis=1) + self._skin
         bars = np.flatnonzero(near & self._applies[:, self.walls.index(k)])
         self._near[k] = bars, there.copy()
         return bars
@@ -140,8 +139,7 @@ class BarsAtWalls:
             size = np.linalg.norm(along, axis=1)
             most = 0.5 * size / (mobility * h * h) if h > 0.0 else size * 0.0
             drag = np.minimum(contact.friction[contact.first[k]] * normal, most)
-            tangent = along / np.maximum(size, 1e-300)[:, None]
-            force = normal[:, None] * normals - drag[:, None] * tangent
+            force = normal[:, None] * normals - (drag / np.maximum(size, 1e-300))[:, None] * along
             mine = self._counted[bars]
             self.energy += 0.5 * float((stiffness * gaps * gaps)[mine].sum())
             half = 0.5 * h * h * mobility  # to the end of the step, by which forces change the way
@@ -177,16 +175,14 @@ class BarsAtWalls:
     def _normals(self, k: int, ends: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Return the derivatives (m, 3) of the least distances by the positions of the places ``t`` (m,)."""
         along = ends[:, 1] - ends[:, 0]
-        points = ends[:, 0] + t[:, None] * along
-        planes_of = self._contact.walls[k].planes
-        behind, ahead = (planes_of(points + side * _BESIDE * along)[0] for side in (-1.0, 1.0))
+        points, wall = ends[:, 0] + t[:, None] * along, self._contact.walls[k]
+        behind, ahead = (wall.planes(points + side * _BESIDE * along)[0] for side in (-1.0, 1.0))
         falls, rises = (np.einsum("mi,mi->m", normal, along) for normal in (behind, ahead))
-        share = np.where(
-            rises - falls > 0.0, np.clip(rises / np.where(rises > falls, rises - falls, 1.0), 0.0, 1.0), 0.5
-        )
+        turn = np.where(rises > falls, rises - falls, 1.0)
+        share = np.where(rises > falls, np.clip(rises / turn, 0.0, 1.0), 0.5)
         mean = share[:, None] * behind + (1.0 - share)[:, None] * ahead
-        square = np.einsum("mi,mi->m", along, along)
-        return mean - (np.einsum("mi,mi->m", mean, along) / square)[:, None] * along
+        part = np.einsum("mi,mi->m", mean, along) / np.einsum("mi,mi->m", along, along)
+        return mean - part[:, None] * along
 
 
 class Piercing:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -97,15 +97,12 @@ class Contact(ExplicitContact):
         residual : (m, 3) residual of the frames' nodes in their coordinates [N]
         active : (m, 3) int8: -1 on the lower bound, +1 on the upper, 0 on none
         """
-        strengths = np.zeros(frames.rows.shape)
-        every = np.arange(len(frames.nodes))
+        strengths, every = np.zeros(frames.rows.shape), np.arange(len(frames.nodes))
         left = np.where(active != 0, residual, 0.0)
         for k in range(frames.rows.shape[1]):
-            row = frames.rows[:, k]
-            ratio = frames.ratios[:, k]
+            safe, ratio = np.maximum(frames.rows[:, k], 0), frames.ratios[:, k]
             sign = np.sign(ratio)
-            safe = np.maximum(row, 0)
-            touching = (row >= 0) & (active[every, safe] == -sign)
+            touching = (frames.rows[:, k] >= 0) & (active[every, safe] == -sign)
             # of almost parallel walls that share a row, take the nearest
             bound = np.where(sign > 0.0, frames.lower[every, safe], frames.upper[every, safe])
             touching &= sign * (bound - frames.bounds[:, k]) <= ON_BOUND * self.size
@@ -151,33 +148,22 @@ class Candidates:
         strengths : (m, slots) normal forces on the present candidates [N]
         largest_rank : offset that orders walls that press before all open ones [m]
         """
-        nodes = np.union1d(self.nodes, joined)
-        applicable = np.zeros((len(nodes), len(contact.wall_of)), dtype=bool)
-        applicable[np.searchsorted(nodes, joined)] = broken
-        place = np.searchsorted(nodes, self.nodes)
-        applicable[place] |= self.applicable
+        wider = self.beside(joined)
+        nodes, applicable = wider.nodes, wider.applicable
+        applicable[np.searchsorted(nodes, joined)] |= broken
         _, priority = contact.distances(applicable, x[nodes], poses, nodes)
-        normal_forces = strengths > 0.0
-        largest = max(float(strengths.max(initial=0.0)), 1e-300)
-        held = priority[place]
-        held[normal_forces] = -largest_rank * (1.0 + strengths[normal_forces] / largest)
-        priority[place] = held
+        pressed, slot = np.nonzero(strengths > 0.0)
+        shares = strengths[pressed, slot] / strengths.max(initial=1e-300)
+        priority[np.searchsorted(nodes, self.nodes[pressed]), slot] = -largest_rank * (1.0 + shares)
         return Candidates(nodes, applicable, priority)
 
     def beside(self, nodes: np.ndarray) -> Candidates:
         """Return the candidates and further nodes (k,) that no wall stops, for rows; there are some anywhere."""
         every = np.union1d(self.nodes, nodes)
         at, shape = np.searchsorted(every, self.nodes), (len(every), self.applicable.shape[1])
-        applicable, priority = np.zeros(shape, dtype=bool), None
-        applicable[at] = self.applicable
-        if self.priority is not None:
-            priority = np.zeros(shape)
-            priority[at] = self.priority
-        return Candidates(every, applicable, priority)
-
-    def without(self, held: np.ndarray) -> Candidates:
-        """Return the candidates with no applicable walls at tied nodes, ``held`` (owned,) bool."""
-        return replace(self, applicable=self.applicable & ~held[self.nodes][:, None])
+        applicable, priority = np.zeros(shape, dtype=bool), np.zeros(shape)
+        applicable[at], priority[at] = self.applicable, 0.0 if self.priority is None else self.priority
+        return Candidates(every, applicable, None if self.priority is None else priority)
 
 
 def expected_candidates(contact: Contact, state: State, balance: Balance, held: np.ndarray, poses: Poses) -> Candidates:
@@ -196,22 +182,16 @@ def expected_candidates(contact: Contact, state: State, balance: Balance, held: 
     if contact.mesh.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
         return nobody
     nodes = np.flatnonzero(near)
-    return Candidates(nodes, _within_reach(contact, state, nodes, (state.position + move)[nodes], poses, reach[nodes]))
-
-
-def _within_reach(
-    contact: Contact, state: State, nodes: np.ndarray, x: np.ndarray, poses: Poses, reach: np.ndarray
-) -> np.ndarray:
-    """Return (m, slots) bool: walls that nodes (m,) moving to (m, 3) touch or come within reach (m,) [m] of."""
+    x = state.position[nodes] + move[nodes]
     applicable = contact.applicable(nodes, x, poses)
-    within = np.zeros_like(applicable)
+    within = np.zeros_like(applicable)  # walls that they touch or come within reach of
     starts = state.position[nodes], contact.motion.poses(state.time), BEYOND * contact.size
-    for place, there, distance in ((x, poses, reach[:, None]), starts):
+    for place, there, distance in ((x, poses, reach[nodes, None]), starts):
         within |= contact.distances(applicable, place, there)[1] < distance
     for k in contact.surfaces_of_triangles:  # whose other faces are found when nodes touch them
         slots = contact.slots(k)
         within[:, slots] = within[:, slots].any(axis=1, keepdims=True)
-    return within & applicable
+    return Candidates(nodes, within & applicable)
 
 
 def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> int:
@@ -300,11 +280,9 @@ def check_positions(model: Model, x: np.ndarray, time: float, where: str) -> Non
         return
     depth, node, wall, count = found
     own = np.flatnonzero(model.mesh.node_ids[: len(x)] == node)
-    carried = comm.allreduce(len(own) > 0 and _prescribed(contact, own[0], wall, x, time))
-    if carried:
+    if comm.allreduce(len(own) > 0 and _prescribed(contact, own[0], wall, x, time)):
         raise SimulationFailure(_told(where, node, depth, contact.names[wall], count))
-    case = model.case
-    treatment = case.contact.treatment
+    treatment = model.case.contact.treatment
     others = f'contact.treatment = "scheme" instead of "{treatment}"'
     others = others if treatment != "scheme" else "another contact.treatment or time.integrator"
     raise SimulationFailure(

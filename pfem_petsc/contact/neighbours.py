@@ -585,7 +585,9 @@ class CrossingBars:
         self.applicable = model.comm.allreduce(int(np.count_nonzero(slender))) > 1 and model.self_contact is None
         self._thick = 2.0 * model.comm.allreduce(float(radius[slender].max(initial=0.0)), op=MPI.MAX)
         self._kind = self._linked_bars()
-        self._last: _Search | None = None
+        # the last search: its result, the smallest distance at which that would change [m], positions, and bars
+        self._found: Crossing | None = Crossing(0, 0, (-1, -1))  # in the mesh, no bar does
+        self._gap, self._before, self._were = 0.0, mesh.points, None
 
     def _linked_bars(self) -> np.ndarray:
         """Return (bars,) uint8: 1 for those with an end in contact pairs or constraints, else 0; (0,) without any.
@@ -606,18 +608,17 @@ class CrossingBars:
     def find(self, x: np.ndarray) -> Crossing | None:
         """Return the bars at positions (local, 3) [m] that pass through each other; None if the search would take too
         long, because too many bars are in one place."""
-        if self._last is None:  # in the mesh, no bar does
-            self._last = _Search(Crossing(0, 0, (-1, -1)), 0.0, self._model.mesh.points, self._intact())
-        comm, last, owned = self._model.comm, self._last, self._model.mesh.n_owned
-        motion = last.x[:owned], x[:owned]
-        change = largest_change(comm, motion, self._model.mesh.n_nodes, self._thick + last.gap)
-        if comm.allreduce(bool((self._intact() != last.intact).any()), op=MPI.LOR):
+        comm, mesh, intact = self._model.comm, self._model.mesh, self._intact()
+        self._were = intact if self._were is None else self._were
+        motion = self._before[: mesh.n_owned], x[: mesh.n_owned]
+        change = largest_change(comm, motion, mesh.n_nodes, self._thick + self._gap)
+        if comm.allreduce(bool((intact != self._were).any()), op=MPI.LOR):
             change = np.inf
-        if change > 0.0 and change >= 0.998 * self._last.gap:
+        if change > 0.0 and change >= 0.998 * self._gap:
             with returning_freed_memory():
-                found, gap = self._search(x)
-            self._last = _Search(found, gap, x.copy(), self._intact())
-        return self._last.found
+                self._found, self._gap = self._search(x)
+            self._before, self._were = x.copy(), intact
+        return self._found
 
     def _intact(self) -> np.ndarray:
         """Return (bars,) bool: those that are not broken; (0,) if none can break."""
@@ -642,20 +643,8 @@ class CrossingBars:
         # stray nodes may be anywhere, and squares of distances must be finite; a NaN has its own message elsewhere
         near = (np.abs(x) < _STRAY).all(axis=1)
         if bars.can_break or not near.all():
-            kept = near[ends].all(axis=1)
-            if bars.can_break:
-                kept &= self._intact()
+            kept = near[ends].all(axis=1) & (self._intact() if bars.can_break else True)
             ids, ends, radius, kind = ids[kept], ends[kept], radius[kept], kind[kept] if len(kind) else kind
         segments = Segments(ids, ends, radius, kind)
         found = find_pairs(comm, Points(x, mesh.node_ids, mesh.points), segments, _SKIN, 1.0 + _NEAR)
         return (None, 0.0) if found is None else (self._count(found.ids), found.gap)
-
-
-class _Search(NamedTuple):
-    """The last search: its result, the smallest distance at which that would change [m], positions (local, 3), and
-    which bars were intact."""
-
-    found: Crossing | None
-    gap: float
-    x: np.ndarray
-    intact: np.ndarray

@@ -210,7 +210,7 @@ class NodeWalls:
     moving : (walls,) bool
     wall_of, first : (slots,) and (walls,): the wall of each slot, and the first slot of each wall
     members : (owned, slots) bool, nodes that a wall can stop
-    flat : (slots,) bool, planes that never turn; normals : (slots, 3) of these, zero for the others
+    flat : (slots,) bool, planes that never turn
     surfaces : Surfaces of the walls at rest
     centres : (walls, 3) points at rest whose positions are recorded, of walls with inertia the centres of mass [m]
     log : ContactLog
@@ -256,13 +256,9 @@ class NodeWalls:
         self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)[self.wall_of]
         self.rebounds = False
         self.has_friction = bool(self.static_friction.any())
-        flat = np.array([wall.flat for wall in self.walls], dtype=bool) & ~self.motion.turning
-        self.flat = flat[self.wall_of]
+        self.flat = (np.array([wall.flat for wall in self.walls], dtype=bool) & ~self.motion.turning)[self.wall_of]
         self.surfaces = Surfaces.of([self.walls[k] for k in self.wall_of], self.motion.turning[self.wall_of])
         self.partial = any(wall.partial for wall in self.walls)
-        self.normals = np.zeros((len(self.wall_of), 3))
-        for s in np.flatnonzero(self.flat):
-            self.normals[s] = self.walls[self.wall_of[s]].normal
         self._faces = {k: TouchedFaces(wall, mesh.n_owned) for k, wall in enumerate(self.walls) if wall.faces > 1}
         ends = np.stack([-mesh.points.min(axis=0, initial=np.inf), mesh.points.max(axis=0, initial=-np.inf)])
         mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
@@ -284,8 +280,7 @@ class NodeWalls:
 
     def positions(self, time: float) -> np.ndarray:
         """Return the positions of the walls' centres, of mass for walls with inertia (walls, 3) [m]."""
-        poses = self.motion.poses(time)
-        return poses.carried(np.arange(len(self.walls)), self.centres)
+        return self.motion.poses(time).carried(np.arange(len(self.walls)), self.centres)
 
     def velocities(self, time: float) -> np.ndarray:
         """Return the velocities of the walls' centres (walls, 3) [m/s]."""
@@ -307,11 +302,9 @@ class NodeWalls:
         """
         members = self.members if nodes is None else self.members[nodes]
         poses = self.motion.poses(time)
-        gaps = np.full((len(x), len(self.walls)), np.inf)
+        gaps = np.empty((len(x), len(self.walls)))
         for k, s in enumerate(self.first):
-            gaps[:, k] = self.gap(k, x, poses)
-            if not self.all_nodes[s]:
-                gaps[~members[:, s], k] = np.inf
+            gaps[:, k] = np.where(members[:, s], self.gap(k, x, poses), np.inf)
         return gaps
 
     def gap(self, k: int, x: np.ndarray, poses: Poses) -> np.ndarray:

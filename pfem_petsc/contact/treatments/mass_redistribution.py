@@ -76,8 +76,7 @@ def redistribute(model: Model) -> Redistribution:
         neighbours.
     """
     contact, mesh, inertia = model.contact, model.mesh, model.inertia
-    source = model.case.source
-    key = f'{source}: contact.treatment = "mass_redistribution"'
+    key = f'{model.case.source}: contact.treatment = "mass_redistribution"'
     for k, wall in enumerate(contact.walls):
         if not wall.flat or wall.partial or contact.motion.turning[k] or contact.all_nodes[k]:
             raise InputError(
@@ -144,7 +143,7 @@ def _movable(contact: Contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
     """Return owned nodes (m,) that can move off their walls (m,), the unit vectors (m, 3), and ``across`` (m,)."""
     nodes = np.flatnonzero(contact.members.any(axis=1))
     walls = contact.members[nodes].argmax(axis=1)
-    free = np.where(contact.fixed[nodes], 0.0, contact.normals[walls])
+    free = np.where(contact.fixed[nodes], 0.0, contact.surfaces.normals[walls])
     across = np.sqrt((free * free).sum(axis=1))
     can = across**2 > FREE_PART
     return nodes[can], walls[can], free[can] / across[can, None], across[can]
@@ -216,7 +215,7 @@ class MasslessNodes:
         strength = np.where(touching, np.maximum(strength, 0.0), 0.0) / moved.across
         force, touched = np.zeros_like(load), np.zeros((len(nodes), len(contact.wall_of)), dtype=bool)
         touched[np.arange(len(nodes)), moved.walls] = strength > 0.0
-        each = touched[:, :, None] * (strength[:, None] * contact.normals[moved.walls])[:, None, :]
+        each = touched[:, :, None] * (strength[:, None] * contact.surfaces.normals[moved.walls])[:, None, :]
         force[nodes] = each.sum(axis=1)
         return force, contact.sums(nodes, each, (x[nodes], x[nodes]), touched)
 

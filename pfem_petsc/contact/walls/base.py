@@ -10,7 +10,17 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from ...case.base import Finite, Inertia, PositiveFloat, StrictModel, SurfaceKeys, Vector3, WallParameters, listed
+from ...case.base import (
+    Finite,
+    Inertia,
+    PositiveFloat,
+    StrictModel,
+    SurfaceKeys,
+    Table2,
+    Table4,
+    Vector3,
+    WallParameters,
+)
 from ...errors import InputError, raised
 from ...registry import added_file, lookup
 from ..plugins import checked
@@ -30,19 +40,6 @@ _ROUNDS = 30
 """Of the search by golden sections, each of which leaves 0.62 of the interval."""
 _AT_END = 1e-7
 """Part of the length next to an end of a bar, where walls stop the node."""
-
-Row2 = Annotated[tuple[Finite, Finite], listed]
-Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
-
-
-def increasing(rows: tuple | None) -> tuple | None:
-    """Check that the times of rows [t, ...] increase; return them."""
-    if rows is not None and not rows:
-        raise ValueError("expected at least one row")
-    for k in range(1, len(rows or ())):
-        if rows[k][0] <= rows[k - 1][0]:
-            raise ValueError(f"times must increase, but row {k} has t = {rows[k][0]!r} after {rows[k - 1][0]!r}")
-    return rows
 
 
 class Hinge(StrictModel):
@@ -66,15 +63,10 @@ class Rotation(Hinge):
 
     angular_velocity: Finite | None = None
     """constant angular velocity [rad/s], by the right-hand rule"""
-    angles: Annotated[tuple[Row2, ...], listed] | None = None
+    angles: Table2 | None = None
     """rows [t, angle]: rotation from rest [s, rad], at rest before the first and after the last"""
     interpolation: Literal["smooth", "linear"] = "smooth"
     """interpolation of ``angles`` between its rows: a cubic spline, or straight lines with velocity jumps at rows"""
-
-    @field_validator("angles")
-    @classmethod
-    def _times_increase(cls, rows: tuple | None) -> tuple | None:
-        return increasing(rows)
 
 
 class WallKeys(SurfaceKeys, WallParameters):
@@ -98,7 +90,7 @@ class WallKeys(SurfaceKeys, WallParameters):
     """axis about which alone a wall with inertia turns"""
     gravity: bool = False
     """true: gravity acts on a wall with mass, as on the truss"""
-    motion: Annotated[tuple[Row4, ...], listed] | None = None
+    motion: Table4 | None = None
     """rows [t, dx, dy, dz]: displacement of the wall [s, m], at rest before the first and after the last"""
     motion_file: Annotated[str, Field(min_length=1)] | None = None
     """the rows of ``motion`` from the columns of a CSV or NPZ file: its name, or a table"""
@@ -110,52 +102,58 @@ class WallKeys(SurfaceKeys, WallParameters):
     tied: bool = False
     """true: a node that touches the wall is fixed to it from then on, in all directions"""
 
-    @field_validator("motion")
-    @classmethod
-    def _times_increase(cls, rows: tuple | None) -> tuple | None:
-        return increasing(rows)
-
     @model_validator(mode="after")
     def _moves_one_way(self) -> WallKeys:
-        if self.velocity is not None and self.motion is not None:
-            raise ValueError("expected at most one of the keys velocity, motion")
-        if self.interpolation == "linear" and self.motion is None:
-            raise ValueError('interpolation = "linear" requires motion')
-        if self.gravity and self.mass is None:
-            raise ValueError("gravity = true needs the wall's mass [kg]")
-        if self.mass is not None and self.motion is not None:
-            raise ValueError("expected at most one of the keys mass, motion")
-        self._turns_one_way()
+        turning = [key for key in ("centre_of_mass", "angular_velocity", "hinge") if getattr(self, key) is not None]
+        for wrong, text in (
+            (
+                self.velocity is not None and self.motion is not None,
+                "expected at most one of the keys velocity, motion",
+            ),
+            (self.interpolation == "linear" and self.motion is None, 'interpolation = "linear" requires motion'),
+            (self.gravity and self.mass is None, "gravity = true needs the wall's mass [kg]"),
+            (self.mass is not None and self.motion is not None, "expected at most one of the keys mass, motion"),
+            (
+                turning and self.inertia is None,
+                f"{''.join(turning[:1])} is that of a wall with inertia [kg m2], which this wall has not",
+            ),
+            (self.inertia is not None and self.mass is None, "inertia needs the wall's mass [kg]"),
+            (
+                self.inertia is not None and self.rotation is not None,
+                "expected at most one of the keys inertia, rotation",
+            ),
+        ):
+            if wrong:
+                raise ValueError(text)
+        if self.inertia is not None:
+            self._check_inertia()
         if self.tied and (self.friction or self.static_friction or self.restitution):
             raise ValueError("a tied wall cannot have friction or restitution: nodes neither slip nor leave")
         return self
 
-    def _turns_one_way(self) -> None:
-        if self.inertia is None:
-            for key in ("centre_of_mass", "angular_velocity", "hinge"):
-                if getattr(self, key) is not None:
-                    raise ValueError(f"{key} is that of a wall with inertia [kg m2], which this wall has not")
-            return
-        if self.mass is None:
-            raise ValueError("inertia needs the wall's mass [kg]")
-        if self.rotation is not None:
-            raise ValueError("expected at most one of the keys inertia, rotation")
+    def _check_inertia(self) -> None:
         tensor = self.tensor
         moments = np.linalg.eigvalsh(tensor)
-        if np.abs(tensor - tensor.T).max() > _ALIKE * np.abs(tensor).max():
-            raise ValueError(f"inertia is not symmetric: {tensor.tolist()}")
-        if moments[0] <= 0.0 or moments[2] > (1.0 + _ALIKE) * (moments[0] + moments[1]):
-            raise ValueError(
+        hinge = self.hinge and self.hinge.axis
+        spin, axis = (np.array(each or (0.0, 0.0, 0.0)) for each in (self.angular_velocity, hinge))
+        for wrong, text in (
+            (
+                np.abs(tensor - tensor.T).max() > _ALIKE * np.abs(tensor).max(),
+                f"inertia is not symmetric: {tensor.tolist()}",
+            ),
+            (
+                moments[0] <= 0.0 or moments[2] > (1.0 + _ALIKE) * (moments[0] + moments[1]),
                 f"inertia has the principal moments {', '.join(f'{moment:.4g}' for moment in moments)} kg m2, which no "
-                "body has: they must be positive, and none larger than the sum of the others"
-            )
-        if self.hinge is None:
-            return
-        if self.velocity is not None:
-            raise ValueError("expected at most one of the keys hinge, velocity")
-        spin, axis = (np.array(each or (0.0, 0.0, 0.0)) for each in (self.angular_velocity, self.hinge.axis))
-        if np.linalg.norm(np.cross(spin, axis)) > _ALIKE * np.linalg.norm(spin) * np.linalg.norm(axis):
-            raise ValueError("angular_velocity must be along the axis of the hinge")
+                "body has: they must be positive, and none larger than the sum of the others",
+            ),
+            (self.hinge is not None and self.velocity is not None, "expected at most one of the keys hinge, velocity"),
+            (
+                np.linalg.norm(np.cross(spin, axis)) > _ALIKE * np.linalg.norm(spin) * np.linalg.norm(axis),
+                "angular_velocity must be along the axis of the hinge",
+            ),
+        ):
+            if wrong:
+                raise ValueError(text)
 
     @property
     def tensor(self) -> np.ndarray:

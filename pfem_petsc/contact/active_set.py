@@ -127,8 +127,7 @@ def is_off_surface(
     at = frames.nodes
     if contact.find_faces(at, x[at], poses, tolerance):
         return True
-    acting = contact.acting(at, x[at], poses, part)
-    normals, _ = contact.planes(strengths > 0.0, x[at], poses, acting, at)
+    normals, _ = contact.planes(strengths > 0.0, x[at], poses, contact.acting(at, x[at], poses, part), at)
     for k in np.flatnonzero(~contact.flat):
         wall, pressed = contact.wall_of[k], strengths[:, k] > 0.0
         passed = ~pressed & (frames.rows[:, k] >= 0)
@@ -398,8 +397,7 @@ class ActiveSet:
         frames, walls, relative = outcome.trial.frames, len(self.contact.wall_of), outcome.trial.transform.relative
         at, dissipated = frames.nodes, np.zeros(self.friction.slots)
         if outcome.trial.candidates.anywhere:
-            y = outcome.trial.transform.positions(x)[at]
-            dissipated = self.friction.dissipated(at, y)
+            dissipated = self.friction.dissipated(at, outcome.trial.transform.positions(x)[at])
         if self._all_rows is not None:
             constraints = self._all_rows.constraints
             if outcome.rows is None:

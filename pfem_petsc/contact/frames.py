@@ -71,8 +71,7 @@ class Sliding:
             factor = friction[:, k] / ratios[:, k]
             coupling[every, :, np.maximum(rows[:, k], 0)] += factor[:, None] * turned[:, k]
         system = np.eye(3) - coupling
-        jammed = np.abs(np.linalg.det(system)) < _SINGULAR
-        system[jammed] = np.eye(3)
+        system[np.abs(np.linalg.det(system)) < _SINGULAR] = np.eye(3)
         self.maps = np.linalg.inv(system)
         g = np.einsum("mij,mj->mi", self.maps, g - np.einsum("mji,mj->mi", self.inverse, known))
         # the change of friction as the direction of slip turns

@@ -97,8 +97,7 @@ class FreeWalls:
         self.turns = np.tile(np.eye(3), (len(self.turners), 1, 1))
         speeds = np.array([wall.velocity or (0.0, 0.0, 0.0) for wall in mine], dtype=float).reshape(-1, 3)
         spins = np.array([mine[i].angular_velocity or (0.0, 0.0, 0.0) for i in self.turners], dtype=float)
-        momenta = np.einsum("tij,tj->ti", tensors, spins.reshape(-1, 3))
-        v = np.vstack([speeds, momenta / self._scale])
+        v = np.vstack([speeds, np.einsum("tij,tj->ti", tensors, spins.reshape(-1, 3)) / self._scale])
         self.state = State(np.zeros_like(v), v, *(np.zeros_like(v) for _ in range(5)))
         self._balance: Balance | None = None
         self._u = np.zeros_like(v)

@@ -165,8 +165,7 @@ class StepFriction:
 
     def dissipated(self, nodes: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Return the energy that friction dissipates in each slot, on nodes (m,) of the frames at (m, 3) [J]."""
-        slip = (x - self._start[nodes])[:, None, :] - self._ways(nodes)
-        return -(self.drag * slip).sum(axis=(0, 2))
+        return -(self.drag * ((x - self._start[nodes])[:, None, :] - self._ways(nodes))).sum(axis=(0, 2))
 
     def _ways(self, nodes: np.ndarray) -> np.ndarray:
         """Return how far walls carry nodes (k,) that stick to them in the step, (k, slots, 3) [m]."""

@@ -9,6 +9,7 @@ rank that has most segments there. Points are segments whose ends coincide.
 
 from __future__ import annotations
 
+from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from ..mechanics.compiled import inlined, kernel
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..parallel.heap import returning_freed_memory
-from .rotations import along, cross, dot, minus, vector
+from .rotations import along, cross, dot, minus, put, vector
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -168,12 +169,15 @@ def _measure(
 def _hold(comm: MPI.Comm, grid: _Grid, points: Points, own: Segments) -> tuple[Points, Segments]:
     """Give blocks to ranks, and send segments to those of their cells and of the neighbouring ones; return those that
     this rank has then. Collective."""
-    votes = np.zeros(_BLOCKS, np.int64)
-    _count_blocks(points.at, own, grid, votes)
-    votes = votes * comm.size + (np.arange(_BLOCKS) + comm.rank) % comm.size  # of equal ones, by turns
+    rows, _, cells = _list_pieces(points.at, own, grid)
+    votes = (
+        np.bincount(_block(cells), minlength=_BLOCKS) * comm.size + (np.arange(_BLOCKS) + comm.rank) % comm.size
+    )  # of equal ones, by turns
     comm.Allreduce(MPI.IN_PLACE, votes, op=MPI.MAX)
     grid.owners[:] = (votes - np.arange(_BLOCKS)) % comm.size
-    router = Router(comm, *_list_ranks(points.at, own, grid, comm.size))
+    ranks = [grid.owners[_block(np.maximum(cells + shift, 0))] for shift in product((-1, 1), repeat=3)]
+    rank, row = np.divmod(np.unique(np.stack(ranks) * len(own.ids) + rows), max(len(own.ids), 1))
+    router = Router(comm, rank, row)
     ends = router.send(points.at[own.points])
     before = router.send(points.before[own.points]) if len(points.before) else points.before
     names = router.send(points.names[own.points])
@@ -209,7 +213,14 @@ def _compare(grid: _Grid, points: Points, held: Segments, most: float) -> tuple[
     marks = points.names
     if int(marks.max(initial=0)) > np.iinfo(np.int32).max:
         marks = np.unique(marks, return_inverse=True)[1]
-    pieces = _sort_pieces(points.at, held, grid, folded, marks.astype(np.int32))
+    rows, parts, cells = _list_pieces(points.at, held, grid)
+    x, y, z = (cells % folded).T
+    places = (x * folded[1] + y) * folded[2] + z
+    order = np.argsort(places, kind="stable")
+    starts = np.append(0, np.cumsum(np.bincount(places, minlength=folded.prod())))
+    rows, parts, here = rows[order], parts[order], (grid.owners[_block(cells)] == grid.rank)[order]
+    sorted_ones = rows, parts, *_box_pieces(points.at, held, grid, rows, parts, marks.astype(np.int32)), here
+    pieces = _Pieces(starts.astype(np.int32), *sorted_ones)
     rows, at, gap, comparisons = _compare_rows(pieces, points, held, grid, folded, most)
     ids = held.ids[rows].astype(np.int64)
     return Pairs(ids, points.names[held.points[rows]].astype(np.int64), at, gap), comparisons
@@ -257,42 +268,28 @@ def _cell(first, way, part, pieces, grid):
     return i, j, int(min(max(z * grid.inverse[2], 0.0), grid.count[2] - 1.0))
 
 
-@inlined
-def _block(i, j, k):
-    """Return the number of a block of cells."""
-    key = np.uint64(((i << 42) | (j << 21) | k) + 1)
-    return np.int64((key * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(33)) % _BLOCKS
-
-
 @kernel
-def _count_blocks(at, segments, grid, votes):
-    """Count the pieces in each block."""
+def _list_pieces(at, segments, grid):
+    """Return the rows of the segments of all pieces (m,) int32, their numbers among those of the segment (m,) int32, and
+    the cells (m, 3) of their middles."""
+    count = 0
+    for n in range(len(segments.ids)):
+        count += _pieces(at, segments, n, grid.longest, grid.skin)[3]
+    rows, parts, cells, m = np.empty(count, np.int32), np.empty(count, np.int32), np.empty((count, 3), np.int64), 0
     for n in range(len(segments.ids)):
         first, way, _, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
         for part in range(pieces):
-            i, j, k = _cell(first, way, part, pieces, grid)
-            votes[_block(i // _BLOCK, j // _BLOCK, k // _BLOCK)] += 1
+            rows[m], parts[m] = n, part
+            put(cells, m, _cell(first, way, part, pieces, grid))
+            m += 1
+    return rows, parts, cells
 
 
-@kernel
-def _list_ranks(at, segments, grid, size):
-    """Return the ranks to which each segment goes, and its row, for each."""
-    seen, count = np.full(size, -1, np.int64), 0
-    ranks, rows = np.empty(_ROOM, np.int64), np.empty(_ROOM, np.int64)
-    for n in range(len(segments.ids)):
-        first, way, _, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
-        if count + size > len(rows):
-            ranks, rows = _longer(ranks, size), _longer(rows, size)
-        for part in range(pieces):
-            x, y, z = _cell(first, way, part, pieces, grid)
-            for i in range(max(x - 1, 0) // _BLOCK, (x + 1) // _BLOCK + 1):
-                for j in range(max(y - 1, 0) // _BLOCK, (y + 1) // _BLOCK + 1):
-                    for k in range(max(z - 1, 0) // _BLOCK, (z + 1) // _BLOCK + 1):
-                        owner = grid.owners[_block(i, j, k)]
-                        if seen[owner] < n:
-                            seen[owner], ranks[count], rows[count] = n, owner, n
-                            count += 1
-    return ranks[:count], rows[:count]
+def _block(cells: np.ndarray) -> np.ndarray:
+    """Return the numbers of the blocks of cells (..., 3)."""
+    i, j, k = np.moveaxis(cells // _BLOCK, -1, 0).astype(np.uint64)
+    key = ((i << np.uint64(42)) | (j << np.uint64(21)) | k) + np.uint64(1)
+    return ((key * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(33)).astype(np.int64) % _BLOCKS
 
 
 @inlined
@@ -303,49 +300,23 @@ def _longer(array, more):
     return copy
 
 
-@inlined
-def _fold(i, count):
-    """Return the place of a cell along an axis with some places; divisions are slow."""
-    return i if i < count else i % count
-
-
 @kernel
-def _sort_pieces(at, segments, grid, folded, marks):
-    """Return the pieces of segments, sorted by cells; ``folded`` (3,): places of cells along the axes; ``marks`` (p,)
-    int32 of points, equal where their names are."""
-    starts, most = np.zeros(folded[0] * folded[1] * folded[2] + 2, np.int32), 0
-    for n in range(len(segments.ids)):
-        most += _pieces(at, segments, n, grid.longest, grid.skin)[3]
-    cells, here, unit, m = np.empty(most, np.int32), np.empty(most, np.bool_), grid.unit, 0
-    for n in range(len(segments.ids)):
-        first, way, _, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
-        for part in range(pieces):
-            i, j, k = _cell(first, way, part, pieces, grid)
-            cells[m] = (_fold(i, folded[0]) * folded[1] + _fold(j, folded[1])) * folded[2] + _fold(k, folded[2])
-            starts[cells[m] + 2] += 1
-            m += 1
-    for cell in range(len(starts) - 1):
-        starts[cell + 1] += starts[cell]
-    rows, parts, m = np.empty(most, np.int32), np.empty(most, np.int32), 0
+def _box_pieces(at, segments, grid, rows, parts, marks):
+    """Return the boxes (m, 6), ways (m, 4) and ends (m, 2) of :class:`_Pieces`; ``marks`` (p,) int32 of points, equal
+    where their names are."""
+    most, unit = len(rows), grid.unit
     boxes, ways, ends = np.empty((most, 6), np.float32), np.empty((most, 4), np.float32), np.empty((most, 2), np.int32)
-    for n in range(len(segments.ids)):
-        first, way, margin, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
-        for part in range(pieces):
-            place = starts[cells[m] + 1]
-            starts[cells[m] + 1] += 1
-            m += 1
-            i, j, k = _cell(first, way, part, pieces, grid)
-            here[place] = grid.owners[_block(i // _BLOCK, j // _BLOCK, k // _BLOCK)] == grid.rank
-            rows[place], parts[place] = n, part
-            ends[place, 0], ends[place, 1] = marks[segments.points[n, 0]], marks[segments.points[n, 1]]
-            middle, slack = minus(along(first, (part + 0.5) / pieces, way), grid.low), 0.0
-            for c in range(3):  # in single precision, boxes are rounded outwards
-                slack = max(slack, 2e-7 * ((abs(middle[c]) + abs(way[c])) / unit + 1.0))
-            ways[place, 3] = margin / unit + slack
-            for c in range(3):
-                boxes[place, c], ways[place, c] = middle[c] / unit, way[c] / pieces / unit
-                boxes[place, 3 + c] = _HALF * abs(ways[place, c]) + ways[place, 3]
-    return _Pieces(starts[:-1], rows, parts, boxes, ways, ends, here)
+    for m in range(most):
+        first, way, margin, pieces = _pieces(at, segments, rows[m], grid.longest, grid.skin)
+        ends[m, 0], ends[m, 1] = marks[segments.points[rows[m], 0]], marks[segments.points[rows[m], 1]]
+        middle, slack = minus(along(first, (parts[m] + 0.5) / pieces, way), grid.low), 0.0
+        for c in range(3):  # in single precision, boxes are rounded outwards
+            slack = max(slack, 2e-7 * ((abs(middle[c]) + abs(way[c])) / unit + 1.0))
+        ways[m, 3] = margin / unit + slack
+        for c in range(3):
+            boxes[m, c], ways[m, c] = middle[c] / unit, way[c] / pieces / unit
+            boxes[m, 3 + c] = _HALF * abs(ways[m, c]) + ways[m, 3]
+    return boxes, ways, ends
 
 
 @inlined

@@ -1047,8 +1047,7 @@ class SelfContact:
         or no contact there, allowed; zero if these are the same. Collective."""
         same = earlier is not None and np.array_equal(self._radius, earlier._radius)
         same = same and np.array_equal(self.chosen, earlier.chosen)
-        least = 0.0 if same else float(self.sums[OVERLAP])
-        return self.comm.allreduce(least, op=MPI.MAX)
+        return self.comm.allreduce(0.0 if same else float(self.sums[OVERLAP]), op=MPI.MAX)
 
     def take_over(self, earlier: SelfContact | None, x: np.ndarray) -> None:
         """Go on from the end of an earlier stage, with contact of bars or not, at positions (owned, 3). Collective."""

@@ -357,8 +357,7 @@ class Restitution(Treatment):
             return nodes, v, a
         touching = np.zeros_like(self._touched)
         touching[self.stepper.solution.walls.nodes] = self.stepper.solution.walls.touching
-        closed = touching & ~self._touched & (model.contact.restitution > 0.0)
-        leaves = closed[nodes].any(axis=1)
+        leaves = (touching & ~self._touched & (model.contact.restitution > 0.0))[nodes].any(axis=1)
         if leaves.any():
             a[leaves] += np.einsum("mij,mj->mi", normal[leaves], self._without_contact(nodes[leaves]))
         return nodes, v, a

@@ -268,8 +268,7 @@ class RoundWall(BaseWall):
         arm, length = self._arms(x)
         far = length[:, None] > 1e-12 * self.radius
         normals = np.where(far, arm / np.maximum(length, 1e-300)[:, None], self.across)
-        offsets = self.sign * (np.einsum("ij,ij->i", normals, x - arm) + self.radius)
-        return self.sign * normals, offsets
+        return self.sign * normals, self.sign * (np.einsum("ij,ij->i", normals, x - arm) + self.radius)
 
     def gaps(self, x: np.ndarray) -> np.ndarray:
         return self.sign * (self._arms(x)[1] - self.radius)

@@ -55,8 +55,7 @@ class Wall(Plane):
         start = before @ self.normal - self.offset
         end = x @ self.normal - self.offset
         # the point where the path crosses the plane; the foot of x if it does not
-        crossing = end < 0.0
-        part = np.where(crossing, np.clip(start, 0.0, None) / np.maximum(start - end, 1e-300), 1.0)
+        part = np.where(end < 0.0, np.clip(start, 0.0, None) / np.maximum(start - end, 1e-300), 1.0)
         return self._has(before + np.minimum(part, 1.0)[:, None] * (x - before)) & (start >= -tolerance)
 
     def _has(self, x: np.ndarray) -> np.ndarray:

@@ -192,8 +192,7 @@ def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:
     total = np.zeros((len(ends), 3))
     np.add.at(total, number.ravel(), np.repeat(normals, 3, axis=0))
     # the sum of two unit vectors has the squared length 2 + 2 cos
-    sharp = (count == 1) | ((total**2).sum(axis=1) < 2.0 + 2.0 * _SHARP)
-    points, lines = wall.points, ends[sharp]
+    points, lines = wall.points, ends[(count == 1) | ((total**2).sum(axis=1) < 2.0 + 2.0 * _SHARP)]
     if not len(lines):
         points, lines = _with_sections(points, ends, number, wall.centre)
     return Surface(parameters.name, points, wall.corners, np.zeros(len(points)), lines)

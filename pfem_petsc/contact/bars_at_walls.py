@@ -62,7 +62,8 @@ def _applying(model: Model, walls: list[int], bars: np.ndarray | slice) -> np.nd
     contact, mesh = model.contact, model.mesh
     members = np.zeros((mesh.n_local, len(walls)))
     members[: mesh.n_owned] = contact.members[:, contact.first[walls]]
-    mesh.update_ghosts(members)
+    if walls:
+        mesh.update_ghosts(members)
     return (members[mesh.bars[bars]] > 0.0).all(axis=1)
 
 

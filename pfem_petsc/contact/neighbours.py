@@ -170,9 +170,8 @@ def _hold(comm: MPI.Comm, grid: _Grid, points: Points, own: Segments) -> tuple[P
     """Give blocks to ranks, and send segments to those of their cells and of the neighbouring ones; return those that
     this rank has then. Collective."""
     rows, _, cells = _list_pieces(points.at, own, grid)
-    votes = (
-        np.bincount(_block(cells), minlength=_BLOCKS) * comm.size + (np.arange(_BLOCKS) + comm.rank) % comm.size
-    )  # of equal ones, by turns
+    votes = np.bincount(_block(cells), minlength=_BLOCKS) * comm.size
+    votes += (np.arange(_BLOCKS) + comm.rank) % comm.size  # of equal ones, by turns
     comm.Allreduce(MPI.IN_PLACE, votes, op=MPI.MAX)
     grid.owners[:] = (votes - np.arange(_BLOCKS)) % comm.size
     ranks = [grid.owners[_block(np.maximum(cells + shift, 0))] for shift in product((-1, 1), repeat=3)]
@@ -219,8 +218,8 @@ def _compare(grid: _Grid, points: Points, held: Segments, most: float) -> tuple[
     order = np.argsort(places, kind="stable")
     starts = np.append(0, np.cumsum(np.bincount(places, minlength=folded.prod())))
     rows, parts, here = rows[order], parts[order], (grid.owners[_block(cells)] == grid.rank)[order]
-    sorted_ones = rows, parts, *_box_pieces(points.at, held, grid, rows, parts, marks.astype(np.int32)), here
-    pieces = _Pieces(starts.astype(np.int32), *sorted_ones)
+    boxes = _box_pieces(points.at, held, grid, rows, parts, marks.astype(np.int32))
+    pieces = _Pieces(starts.astype(np.int32), rows, parts, *boxes, here)
     rows, at, gap, comparisons = _compare_rows(pieces, points, held, grid, folded, most)
     ids = held.ids[rows].astype(np.int64)
     return Pairs(ids, points.names[held.points[rows]].astype(np.int64), at, gap), comparisons
@@ -270,8 +269,8 @@ def _cell(first, way, part, pieces, grid):
 
 @kernel
 def _list_pieces(at, segments, grid):
-    """Return the rows of the segments of all pieces (m,) int32, their numbers among those of the segment (m,) int32, and
-    the cells (m, 3) of their middles."""
+    """Return the rows of the segments of all pieces (m,) int32, their numbers among those of the segment (m,) int32,
+    and the cells (m, 3) of their middles."""
     count = 0
     for n in range(len(segments.ids)):
         count += _pieces(at, segments, n, grid.longest, grid.skin)[3]

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..mechanics.compiled import inlined, kernel
 from ..tolerances import FREE_PART
-from .rotations import along, cross, dot, minus, put, times, vector
+from .rotations import along, cross, dot, free_components, minus, put, times, vector
 
 _SINGULAR = 1e-6  # determinant of I - C below which a wedge is jammed
 
@@ -222,12 +222,6 @@ def _complete(basis, taken, spanned, n):
         n += 1
 
 
-@inlined
-def _free(n, fixed):
-    """Return a vector without its ``fixed`` components."""
-    return 0.0 if fixed[0] else n[0], 0.0 if fixed[1] else n[1], 0.0 if fixed[2] else n[2]
-
-
 @kernel
 def _build(planes, tolerance, least, output):
     """Fill the arrays of :class:`NodalFrames` that ``_FILLED`` names; return whether any basis is not the identity, and
@@ -256,10 +250,10 @@ def _build(planes, tolerance, least, output):
                 break
             done[wall] = True
             normal, slot, ratio, shared = vector(normals[i], wall), -1, 1.0, False
-            free = _free(normal, fixed[i])
+            free = free_components(normal, fixed[i])
             for row in range(3):
                 if taken[row] and not fixed[i, row]:
-                    other = _free(vector(own, row), fixed[i])
+                    other = free_components(vector(own, row), fixed[i])
                     lengths, common = dot(other, other) * dot(free, free), dot(other, free)
                     if dot(free, free) > FREE_PART and abs(common) > (1.0 - _PARALLEL) * math.sqrt(lengths):
                         slot, ratio, shared = row, common / dot(other, other), True

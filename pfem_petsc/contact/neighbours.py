@@ -159,8 +159,17 @@ def largest_change(comm: MPI.Comm, motion: tuple[np.ndarray, np.ndarray], n_node
 def _measure(
     comm: MPI.Comm, at: np.ndarray, own: Segments, longest: float, skin: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return extremes (9,) and sums (3,) of all segments, see :func:`_measure_segments`. Collective."""
-    most, sums = _measure_segments(at, own, longest, skin)
+    """Return the largest coordinates, with the negative sign and without, and how far pieces with their margins reach
+    from their middles along x, y and z (9,); and the numbers of segments longer than zero, the sum of their lengths
+    with margins, and the number of pieces (3,), of all ranks. Collective."""
+    ends, margin = at[own.points], own.margin + 0.5 * skin
+    way = ends[:, 1] - ends[:, 0]
+    length = np.sqrt(np.einsum("ni,ni->n", way, way))
+    # never more than those of loops, which round otherwise: then cells would be too small
+    pieces = np.floor((1.0 - 1e-9) * length / np.maximum(longest, 4.0 * margin)) + 1.0
+    reach = 0.5 * np.abs(way) / pieces[:, None] + margin[:, None]
+    most = np.stack([-ends.min(axis=1), ends.max(axis=1), reach]).max(axis=1, initial=-np.inf).ravel()
+    sums = np.array([np.count_nonzero(length), (length + 2.0 * own.margin).sum(), pieces.sum()])
     comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
     comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
     return most, sums
@@ -233,28 +242,6 @@ def _pieces(at, segments, n, longest, skin):
     way = minus(vector(at, segments.points[n, 1]), first)
     square, most = dot(way, way), max(longest, 4.0 * margin)
     return first, way, margin, 1 if square <= most * most else int(np.sqrt(square) / most) + 1
-
-
-@kernel
-def _measure_segments(at, segments, longest, skin):
-    """Return the largest coordinates, with the negative sign and without, and how far pieces with their margins reach
-    from their middles along x, y and z (9,); and the numbers of segments longer than zero, the sum of their lengths
-    with margins, and the number of pieces (3,)."""
-    most, sums = np.full(9, -np.inf), np.zeros(3)
-    number = total = every = 0.0
-    for n in range(len(segments.ids)):
-        first, way, margin, pieces = _pieces(at, segments, n, longest, skin)
-        part, square = 0.5 / pieces, dot(way, way)
-        for c in range(3):
-            last = first[c] + way[c]
-            most[c] = max(most[c], -first[c], -last)
-            most[3 + c] = max(most[3 + c], first[c], last)
-            most[6 + c] = max(most[6 + c], part * abs(way[c]) + margin)
-        number += square > 0.0
-        total += np.sqrt(square) + 2.0 * segments.margin[n]
-        every += pieces
-    sums[0], sums[1], sums[2] = number, total, every
-    return most, sums
 
 
 @inlined

@@ -63,6 +63,12 @@ def add_to(x, i, s, a):
     put(x, i, along(vector(x, i), s, a))
 
 
+@inlined
+def free_components(a, fixed):
+    """Return a vector without its ``fixed`` components."""
+    return 0.0 if fixed[0] else a[0], 0.0 if fixed[1] else a[1], 0.0 if fixed[2] else a[2]
+
+
 @kernel
 def across(vectors):
     """Return the matrices (w, 3, 3) of products of vectors (w, 3) from the left, v x ..."""

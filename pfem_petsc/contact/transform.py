@@ -166,10 +166,9 @@ class RelativeCoordinates:
     def forces(self, g: np.ndarray) -> np.ndarray:
         """Return the forces (owned, 3) on y of forces g (owned, 3) on x [N]. Collective."""
         every, g = self.rows.gather(g), g.copy()
-        turned = every.copy()
         for nodes, inverse in self._inverse:
-            turned[nodes] = np.einsum("gab,gai->gbi", inverse, every[nodes])
-        g[self.rows.here] = turned[self.rows.mine]
+            every[nodes] = np.einsum("gab,gai->gbi", inverse, every[nodes])
+        g[self.rows.here] = every[self.rows.mine]
         return g
 
     def stiffness(self, k: np.ndarray) -> np.ndarray:
@@ -193,18 +192,6 @@ class RelativeCoordinates:
             planes.normals[place, table] = n
             planes.offsets[place, table] = np.einsum("ri,ri->r", n, rows.slips(every)[at]) - rows.values(every)[at]
         return planes
-
-    def of_rows(self, normal: np.ndarray, drag: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return normal forces (r,) and drags (r, 3) of the rows here from those of nodes ``frames`` (m,) in the slots
-        of tables (m, t), (m, t, 3) [N]. Collective."""
-        rows, tables = self.rows, len(self.friction)
-        own = np.zeros((rows.mesh.n_owned, tables, 4))
-        own[frames, :, 0], own[frames, :, 1:] = normal, drag
-        every = rows.gather(own.reshape(len(own), -1)).reshape(-1, tables, 4)
-        placed = np.flatnonzero(self.carrier >= 0)
-        found = np.zeros((len(rows.source), 4))
-        found[placed] = every[self.carrier[placed], rows.source[placed]]
-        return found[:, 0], found[:, 1:]
 
 
 class Blocks(NamedTuple):
@@ -427,10 +414,10 @@ class RowCoordinates:
     def set_forces(self, nodes: np.ndarray, normal: np.ndarray, drag: np.ndarray) -> None:
         """Set the forces of rows with relative coordinates from those of nodes (m,) in the slots of tables, (m, t) and
         (m, t, 3) [N]. Collective."""
-        constraints, relative = self.constraints, self.relative
-        force, drags = relative.of_rows(normal, drag, nodes)
-        some = relative.carrier >= 0
-        constraints.force[some], constraints.drag[some] = force[some], drags[some]
+        own, some = np.zeros((self.rows.mesh.n_owned, normal.shape[1], 4)), np.flatnonzero(self.relative.carrier >= 0)
+        own[nodes, :, 0], own[nodes, :, 1:] = normal, drag
+        found = self.rows.gather(own)[self.relative.carrier[some], self.rows.source[some]]
+        self.constraints.force[some], self.constraints.drag[some] = found[:, 0], found[:, 1:]
 
     def satisfied(self, x: np.ndarray, slack: float) -> bool:
         """Return whether positions (owned, 3) satisfy the rows that were bounds, to ``slack`` [m]. Collective.

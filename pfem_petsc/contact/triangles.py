@@ -355,16 +355,6 @@ def faces_at(triangles, start, free, fixed, tolerance, normals, offsets):
 
 
 @kernel
-def signed_distances(triangles, x, reach, distances, faces, places):
-    """Write :func:`nearest` of points (m, 3) into distances (m,), faces (m, 2), with what of them is nearest, and
-    places (m, 3)."""
-    for i in range(len(x)):
-        distances[i], faces[i, 0], faces[i, 1], places[i, 0], places[i, 1], places[i, 2] = nearest(
-            triangles, x[i, 0], x[i, 1], x[i, 2], reach
-        )
-
-
-@kernel
 def stopping_faces(triangles, ways, fixed, tolerance, normals, offsets):
     """Write :func:`faces_at` of nodes that move from ``ways[0]`` to ``ways[1]``, (2, m, 3), with the ``fixed``
     components (m, 3) bool and the tolerance (m,), into normals (m, 3, 3) and offsets (m, 3)."""

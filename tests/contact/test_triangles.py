@@ -6,10 +6,19 @@ import pytest
 from helpers.triangles import ball, box, groove, torus
 
 from pfem_petsc.contact.projection import project
-from pfem_petsc.contact.triangles import Triangles, signed_distances, stopping_faces
+from pfem_petsc.contact.triangles import Triangles, nearest, stopping_faces
+from pfem_petsc.mechanics.compiled import kernel
 from pfem_petsc.mechanics.records import by_reference
 
 BODIES = {"box": box((-1.0, -0.6, -0.3), (1.0, 0.6, 0.3)), "ball": ball(2), "torus": torus()}
+
+
+@kernel
+def signed_distances(triangles, x, reach, distances, faces, places):
+    for i in range(len(x)):
+        distances[i], faces[i, 0], faces[i, 1], places[i, 0], places[i, 1], places[i, 2] = nearest(
+            triangles, x[i, 0], x[i, 1], x[i, 2], reach
+        )
 
 
 def query(triangles, x, reach=np.inf):

@@ -158,6 +158,11 @@ class Treatment(ABC):
             change[:] = 0.0
 
 
+def across(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return the parts of vectors (m, w, 3) across normals (m, w, 3)."""
+    return vectors - np.einsum("mwi,mwi->mw", vectors, normals)[:, :, None] * normals
+
+
 STILL = 1e-13  # of the model's length: a slip that is rounding
 _NONE = 1e-9  # of a force: what of it is rounding, and of the tolerance of the solve
 
@@ -329,8 +334,7 @@ class Restitution(Treatment):
         model = self.stepper.model
         if not model.contact.has_friction:
             return np.zeros(touching.shape, dtype=bool)
-        slip = self._moved(nodes)
-        slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
+        slip = across(self._moved(nodes), normals)
         still = np.linalg.norm(slip, axis=2) <= STILL * model.size
         return touching & still & (model.contact.static_friction > 0.0)
 
@@ -355,11 +359,9 @@ class Restitution(Treatment):
         a = a - np.einsum("mij,mj->mi", normal, a)
         if not model.contact.restitution.any():
             return nodes, v, a
-        touching = np.zeros_like(self._touched)
-        touching[self.stepper.solution.walls.nodes] = self.stepper.solution.walls.touching
-        leaves = (touching & ~self._touched & (model.contact.restitution > 0.0))[nodes].any(axis=1)
-        if leaves.any():
-            a[leaves] += np.einsum("mij,mj->mi", normal[leaves], self._without_contact(nodes[leaves]))
+        closed = self.stepper.touching & ~self._touched & (model.contact.restitution > 0.0)
+        leaves = closed[nodes].any(axis=1)
+        a[leaves] += np.einsum("mij,mj->mi", normal[leaves], self._without_contact(nodes[leaves]))
         return nodes, v, a
 
     def _pairs_let_go(self) -> tuple[np.ndarray, np.ndarray]:

@@ -83,8 +83,7 @@ def broken_walls(
     """
     beyond = np.flatnonzero(contact.near(x, poses, np.array([-tolerance])))
     contact.find_faces(beyond, x[beyond], poses, tolerance)
-    applicable = contact.applicable(beyond, x[beyond], poses)
-    normals, gaps = contact.distances(applicable, x[beyond], poses, beyond)
+    normals, gaps = contact.distances(contact.applicable(beyond, x[beyond], poses), x[beyond], poses, beyond)
     broken = gaps < -tolerance
     _, known, place = np.intersect1d(beyond, candidates.nodes, assume_unique=True, return_indices=True)
     # walls with their own bound are satisfied to rounding of the coordinates; supports override walls
@@ -100,8 +99,7 @@ def is_misaligned(frames: NodalFrames, fixed: np.ndarray, strengths: np.ndarray)
     """Return whether a wall presses through the row of an almost parallel wall, so that the force is off its normal on
     components that are not ``fixed`` (m, 3)."""
     normal_forces = strengths > 0.0
-    astray = normal_forces & frames.shared
-    for node, wall in np.argwhere(astray):
+    for node, wall in np.argwhere(normal_forces & frames.shared):
         own = (frames.rows[node] == frames.rows[node, wall]) & ~frames.shared[node]
         along = frames.ratios[node, wall] * frames.basis[node, frames.rows[node, wall]]
         turn = np.abs(frames.normals[node, wall] - along)[~fixed[node]]

@@ -273,9 +273,7 @@ def check_positions(model: Model, x: np.ndarray, time: float, where: str) -> Non
         On all ranks, with the wall, its deepest node and depth, the number of nodes, the step, and the remedy.
     """
     contact, comm = model.contact, model.comm
-    if not contact.any:
-        return
-    found = contact.deepest(x, time, BEYOND * max(model.size, model.reach))
+    found = contact.deepest(x, time, BEYOND * max(model.size, model.reach)) if contact.any else None
     if found is None:
         return
     depth, node, wall, count = found

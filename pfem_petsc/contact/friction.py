@@ -279,8 +279,7 @@ class StepFriction:
         gaps = np.einsum("mwi,mi->mw", normals, free) - frames.offsets[at]
         static = np.where(slipping[:, None], self._friction, self._static)
         friction = np.stack([np.broadcast_to(self._friction, static.shape), static], axis=-1)
-        slips = (free - self._start[nodes])[:, None, :] - self._ways(nodes)
-        planes = Planes(normals, gaps, friction, slips)
+        planes = Planes(normals, gaps, friction, (free - self._start[nodes])[:, None, :] - self._ways(nodes))
         return pressed(NodesAtPlanes(free, fixed, stiffness, planes), PROJECTED * contact.size)
 
     def _may_stick(

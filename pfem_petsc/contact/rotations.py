@@ -122,8 +122,7 @@ def vectors_of(turns: np.ndarray) -> np.ndarray:
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         products[:, 0, k + 1] = products[:, k + 1, 0] = turns[:, j, i] - turns[:, i, j]
-    largest = np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=1)
-    quaternion = products[np.arange(len(turns)), largest]
+    quaternion = products[np.arange(len(turns)), np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=1)]
     quaternion *= np.where(quaternion[:, :1] < 0.0, -1.0, 1.0)
     sines = np.linalg.norm(quaternion[:, 1:], axis=1)
     angles = 2.0 * np.arctan2(sines, quaternion[:, 0])

@@ -687,18 +687,16 @@ class SelfContact:
 
     def text(self) -> str:
         """Return what can touch, for the user before a run. Collective."""
-        count = self.comm.allreduce(len(self._bars))
-        return f"{count:,} bars, up to {engineering(self._thick, 'm')} thick"
+        return f"{self.comm.allreduce(len(self._bars)):,} bars, up to {engineering(self._thick, 'm')} thick"
 
     def doubts(self) -> list[str]:
         """Return a text if bars have overlapped deeply. Collective."""
         deepest = self.comm.allreduce(self.deepest, op=MPI.MAX)
-        if not deepest > _DEEP:
-            return []
-        return [
+        text = (
             f"[self_contact]: bars have overlapped by up to {100.0 * deepest:.0f} % of a radius, as contacts must be "
             "soft for this time.step: a smaller one (time.safety) makes them stiffer"
-        ]
+        )
+        return [text] if deepest > _DEEP else []
 
     def hint(self) -> str:
         """Return what to add to the message about a solve that did not converge. Collective."""
@@ -988,8 +986,7 @@ class SelfContact:
                 self._limit = way + 0.998 * (left - move)
                 return
         if step > 0.0:
-            moved = self.comm.allreduce((x[:owned] - self._last.T).sum(axis=0)) / mesh.n_nodes
-            self._drift = moved / step
+            self._drift = self.comm.allreduce((x[:owned] - self._last.T).sum(axis=0)) / (mesh.n_nodes * step)
         self._search(x, move)
         self._reference[:] = x[:owned]
         self._limit, self.stale, self._most[:] = way + 0.998 * (self._skin - move), False, 0.0
@@ -1008,8 +1005,7 @@ class SelfContact:
         """What a checkpoint keeps, name to an order and this rank's part. Collective."""
         table = self._table()
         counts = self.comm.allgather(len(table))
-        numbers = sum(counts[: self.comm.rank]) + np.arange(len(table))
-        order = NaturalOrder(self.comm, numbers, sum(counts))
+        order = NaturalOrder(self.comm, sum(counts[: self.comm.rank]) + np.arange(len(table)), sum(counts))
         return {"self_contact.pairs": (order, table)} if sum(counts) else {}
 
     def _table(self) -> np.ndarray:

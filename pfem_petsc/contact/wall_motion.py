@@ -47,8 +47,7 @@ class Poses(NamedTuple):
         """Return how far the points of all walls at (m, 3) are from there at ``later`` poses, (m, w, 3) [m]."""
         if not len(self.turns):
             return np.broadcast_to(later.shifts - self.shifts, (len(x), *self.shifts.shape))
-        turns = later.turns @ self.turns.swapaxes(1, 2)
-        moved = np.einsum("wij,mwj->mwi", turns, x[:, None, :] - self.shifts)
+        moved = np.einsum("wij,mwj->mwi", later.turns @ self.turns.swapaxes(1, 2), x[:, None, :] - self.shifts)
         return moved + later.shifts - x[:, None, :]
 
 

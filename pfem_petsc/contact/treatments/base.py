@@ -255,8 +255,7 @@ class Restitution(Treatment):
         two, moved = links.two, state.position - self._place
         ends = two.gather(np.hstack([moved, *self._free_motion(np.arange(len(moved)), moved)]))
         closing, *towards = (-two.apart(ends[:, :, k : k + 3]) for k in range(0, ends.shape[2], 3))
-        leaves = self._rebound(links.rows.restitution, np.maximum(closing, 0.0), *towards)
-        return np.where(fresh, leaves, 0.0)
+        return np.where(fresh, self._rebound(links.rows.restitution, np.maximum(closing, 0.0), *towards), 0.0)
 
     def _free_motion(self, nodes: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the motion without contact of nodes (m,), which have ``moved`` by (m, 3) with it: in explicit steps
@@ -334,8 +333,7 @@ class Restitution(Treatment):
         model = self.stepper.model
         if not model.contact.has_friction:
             return np.zeros(touching.shape, dtype=bool)
-        slip = across(self._moved(nodes), normals)
-        still = np.linalg.norm(slip, axis=2) <= STILL * model.size
+        still = np.linalg.norm(across(self._moved(nodes), normals), axis=2) <= STILL * model.size
         return touching & still & (model.contact.static_friction > 0.0)
 
     def _moved(self, nodes: np.ndarray) -> np.ndarray:
@@ -347,8 +345,7 @@ class Restitution(Treatment):
         """Return how far walls carry their points at nodes (m,) from the start of the step to a time [s], (m, slots, 3)
         [m]."""
         contact = self.stepper.model.contact
-        poses = contact.motion.poses(self._time), contact.motion.poses(time)
-        return contact.ways(self._place[nodes], *poses)
+        return contact.ways(self._place[nodes], contact.motion.poses(self._time), contact.motion.poses(time))
 
     def on_walls(self, applicable: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return nodes in contact with walls (m,), and their new velocities and accelerations (m, 3) [m/s], [m/s2]."""
@@ -359,8 +356,7 @@ class Restitution(Treatment):
         a = a - np.einsum("mij,mj->mi", normal, a)
         if not model.contact.restitution.any():
             return nodes, v, a
-        closed = self.stepper.touching & ~self._touched & (model.contact.restitution > 0.0)
-        leaves = closed[nodes].any(axis=1)
+        leaves = (self.stepper.touching & ~self._touched & (model.contact.restitution > 0.0))[nodes].any(axis=1)
         a[leaves] += np.einsum("mij,mj->mi", normal[leaves], self._without_contact(nodes[leaves]))
         return nodes, v, a
 

@@ -96,25 +96,20 @@ def redistribute(model: Model) -> Redistribution:
         if applies:
             raise InputError(f"{key}: {text}")
     owned = mesh.n_owned
-    members = contact.members
     with agreed(mesh.comm):
-        several = np.flatnonzero(members.sum(axis=1) > 1)
+        several = np.flatnonzero(contact.members.sum(axis=1) > 1)
         if len(several):
             raise InputError(f"{key}: node {mesh.node_ids[several[0]]} belongs to several walls; give it one")
     # normal, mass and sum of weights of contact nodes, known to all ranks that see them
     info = np.zeros((mesh.n_local, 5))
     nodes, walls, free, across = _movable(contact)
-    info[nodes, :3] = free
-    info[nodes, 3] = inertia.mass[nodes]
+    info[nodes, :3], info[nodes, 3] = free, inertia.mass[nodes]
     mesh.update_ghosts(info)
-    is_contact = info[:, 3] > 0.0
-    a, b = mesh.bars.T
-    weights = []
-    for here, there in ((a, b), (b, a)):
-        way = mesh.points[there] - mesh.points[here]
-        squared = np.einsum("bi,bi->b", way, info[here, :3]) ** 2 / (way * way).sum(axis=1)
-        weights.append(np.where(is_contact[here] & ~is_contact[there], squared, 0.0))
-        np.add.at(info[:, 4], here, weights[-1])
+    here, there = np.hstack([mesh.bars.T, mesh.bars.T[::-1]])  # of each bar in both directions
+    way = mesh.points[there] - mesh.points[here]
+    weight = np.einsum("bi,bi->b", way, info[here, :3]) ** 2 / (way * way).sum(axis=1)
+    weight[~((info[here, 3] > 0.0) & (info[there, 3] <= 0.0))] = 0.0
+    np.add.at(info[:, 4], here, weight)
     mesh.update_ghosts(info)
     with agreed(mesh.comm):
         lone = nodes[info[nodes, 4] <= 1e-6]
@@ -126,11 +121,9 @@ def redistribute(model: Model) -> Redistribution:
     tensors = np.zeros((owned, 3, 3))
     normals = info[:, :3]
     tensors[nodes] -= info[nodes, 3, None, None] * normals[nodes, :, None] * normals[nodes, None, :]
-    for (here, there), weight in zip(((a, b), (b, a)), weights, strict=True):
-        give = np.flatnonzero((weight > 0.0) & (there < owned))
-        share = weight[give] / info[here[give], 4] * info[here[give], 3]
-        n = normals[here[give]]
-        np.add.at(tensors, there[give], share[:, None, None] * n[:, :, None] * n[:, None, :])
+    give = np.flatnonzero((weight > 0.0) & (there < owned))
+    share, n = weight[give] / info[here[give], 4] * info[here[give], 3], normals[here[give]]
+    np.add.at(tensors, there[give], share[:, None, None] * n[:, :, None] * n[:, None, :])
     touched = np.flatnonzero(np.abs(tensors).max(axis=(1, 2), initial=0.0) > 0.0)
     movable = ~model.supports.fixed[touched]
     matrices = inertia.mass[touched, None, None] * np.eye(3) + tensors[touched]
@@ -186,8 +179,7 @@ class MasslessNodes:
             stiffness = np.where((secant > _SOFTEST * elastic) & (secant < elastic / _SOFTEST), secant, elastic)
             swings = step * force < 0.0  # massless neighbours may push each other back and forth
             part = np.where(swings, _CALMER * part, np.minimum(_BOLDER * part, 1.0))
-            move = np.clip(part * force / stiffness, -farthest, farthest)
-            step = np.maximum(move, -np.maximum(gap, 0.0))
+            step = np.maximum(np.clip(part * force / stiffness, -farthest, farthest), -np.maximum(gap, 0.0))
             x[nodes] += step[:, None] * n
             # with a bar perpendicular to the normal, forces within rounding may leave the position undetermined
             open_way = np.minimum(np.abs(step), np.abs(force) / elastic)
@@ -225,15 +217,13 @@ class MasslessNodes:
         A bar perpendicular to the normal has geometric stiffness only, so a minimum inclination is assumed.
         """
         mesh, model = self.model.mesh, self.model
-        a, b = mesh.bars.T
-        total = np.zeros(mesh.n_local)
-        shortest = np.full(mesh.n_local, np.inf)
+        total, shortest = np.zeros(mesh.n_local), np.full(mesh.n_local, np.inf)
         normal = np.zeros((mesh.n_local, 3))
         normal[self.moved.nodes] = self.moved.normals
-        way = x[b] - x[a]
+        way = x[mesh.bars[:, 1]] - x[mesh.bars[:, 0]]
         length = np.linalg.norm(way, axis=1)
         stiffness = model.bars.of_blocks(lambda block: block.area * block.modulus) / model.bars.rest
-        for end in (a, b):
+        for end in mesh.bars.T:
             along = np.einsum("bi,bi->b", way, normal[end]) / length
             np.add.at(total, end, stiffness * np.maximum(along * along, _STEEPEST))
             np.minimum.at(shortest, end, model.bars.rest)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from ...case.base import (
     Finite,
@@ -42,6 +42,22 @@ _AT_END = 1e-7
 """Part of the length next to an end of a bar, where walls stop the node."""
 
 
+def has_length(value: tuple[float, float, float], what: str) -> tuple[float, float, float]:
+    """Check that a vector has nonzero length; return it."""
+    largest = max(map(abs, value))
+    if not largest > 0.0:
+        raise ValueError(f"has zero length; give {what}")
+    if not 1e-100 < largest < 1e100:
+        # the squares of its components would overflow or vanish
+        raise ValueError(f"has components out of range (1e-100 to 1e100); give {what} as a vector of about length 1")
+    return value
+
+
+def direction(what: str) -> AfterValidator:
+    """Annotation of a vector that gives a direction, which messages call ``what``."""
+    return AfterValidator(lambda value: has_length(value, what))
+
+
 class Hinge(StrictModel):
     """An axis fixed in space about which a wall with inertia turns freely."""
 
@@ -53,7 +69,7 @@ class Hinge(StrictModel):
     @field_validator("axis")
     @classmethod
     def _has_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        return direction(value, f"the direction of the axis of the {cls.__name__.lower()}")
+        return has_length(value, f"the direction of the axis of the {cls.__name__.lower()}")
 
 
 class Rotation(Hinge):
@@ -320,17 +336,6 @@ def _flaw(wall: BaseWall, x: np.ndarray) -> str:
 
 def _is_plane(normal: Any, offset: Any) -> bool:
     return np.shape(normal) == (3,) and abs(np.linalg.norm(normal) - 1.0) < 1e-6 and bool(np.isfinite(offset))
-
-
-def direction(value: tuple[float, float, float], what: str) -> tuple[float, float, float]:
-    """Check that a vector has nonzero length; return it."""
-    largest = max(map(abs, value))
-    if not largest > 0.0:
-        raise ValueError(f"has zero length; give {what}")
-    if not 1e-100 < largest < 1e100:
-        # the squares of its components would overflow or vanish
-        raise ValueError(f"has components out of range (1e-100 to 1e100); give {what} as a vector of about length 1")
-    return value
 
 
 @dataclass(frozen=True)

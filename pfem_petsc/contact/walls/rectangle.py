@@ -19,7 +19,7 @@ class Parameters(WallKeys):
 
     point: Vector3
     """Centre of the rectangle [m]."""
-    normal: Vector3
+    normal: Annotated[Vector3, direction("the direction that nodes come from")]
     """Points to the side that nodes come from, of any nonzero length."""
     along: Vector3
     """Direction of the first edges; its component along the normal is ignored."""
@@ -28,7 +28,6 @@ class Parameters(WallKeys):
 
     @model_validator(mode="after")
     def _spans(self) -> Parameters:
-        direction(self.normal, "the direction that nodes come from")
         if not np.linalg.norm(np.cross(self.normal, self.along)) > 1e-9 * np.linalg.norm(self.along) * np.linalg.norm(
             self.normal
         ):

@@ -144,8 +144,7 @@ class BarsAtWalls:
             mine = self._counted[bars]
             self.energy += 0.5 * float((stiffness * gaps * gaps)[mine].sum())
             half = 0.5 * h * h * mobility  # to the end of the step, by which forces change the way
-            losses = drag * (size - half * drag) - (normal - push) * (closing + half * normal)
-            lost += float(losses[mine].sum())
+            lost += float((drag * (size - half * drag) - (normal - push) * (closing + half * normal))[mine].sum())
             np.add.at(total, ends, weights[:, :, None] * force[:, None, :])
             sums[0, k], sums[1, k] = force[mine].sum(axis=0), np.cross(point, force)[mine].sum(axis=0)
         self.force, self.sums, self._before, self.last_step = total[: mesh.n_owned], sums, x.copy(), h
@@ -179,11 +178,9 @@ class BarsAtWalls:
         points, wall = ends[:, 0] + t[:, None] * along, self._contact.walls[k]
         behind, ahead = (wall.planes(points + side * _BESIDE * along)[0] for side in (-1.0, 1.0))
         falls, rises = (np.einsum("mi,mi->m", normal, along) for normal in (behind, ahead))
-        turn = np.where(rises > falls, rises - falls, 1.0)
-        share = np.where(rises > falls, np.clip(rises / turn, 0.0, 1.0), 0.5)
+        share = np.where(rises > falls, np.clip(rises / np.where(rises > falls, rises - falls, 1.0), 0.0, 1.0), 0.5)
         mean = share[:, None] * behind + (1.0 - share)[:, None] * ahead
-        part = np.einsum("mi,mi->m", mean, along) / np.einsum("mi,mi->m", along, along)
-        return mean - part[:, None] * along
+        return mean - (np.einsum("mi,mi->m", mean, along) / np.einsum("mi,mi->m", along, along))[:, None] * along
 
 
 class Piercing:

@@ -79,8 +79,7 @@ class Contact(ExplicitContact):
         rank = np.einsum("iwk,ik->iw", normals, rows.places) - offsets
         if candidates.priority is not None:
             rank[:, :walls] = candidates.priority
-        planes = Planes(self.fixed[nodes], normals, offsets, rank, rows.places)
-        frames = build_frames(nodes, planes, tolerance, least)
+        frames = build_frames(nodes, Planes(self.fixed[nodes], normals, offsets, rank, rows.places), tolerance, least)
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction
@@ -402,8 +401,7 @@ def start_at_rest(
     nodes = np.flatnonzero(contact.near(x, poses, np.array([slack])))
     applicable = contact.members[nodes]
     normals, gaps = contact.distances(applicable, x[nodes], poses)
-    rates = contact.rates(x[nodes], state.time, ahead=True)
-    away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - rates)
+    away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - contact.rates(x[nodes], state.time, ahead=True))
     resting = applicable & (np.abs(gaps) <= slack) & (np.abs(away) <= still)
     # the plane of a partial wall extends beyond the wall, and walls with mass are not fixed
     partial = [k for k, wall in enumerate(contact.walls) if wall.partial]

@@ -304,8 +304,7 @@ class StepFriction:
         slip = self._slip(nodes, moved, frames.normals[at])
         size = np.linalg.norm(drag, axis=2)
         # a normal force within rounding neither sticks nor causes friction
-        least = 1e-9 * normal_forces.max(axis=1, initial=0.0)
-        rubbing = (normal_forces > least[:, None]) & (self._static > 0.0)
+        rubbing = (normal_forces > (1e-9 * normal_forces.max(axis=1, initial=0.0))[:, None]) & (self._static > 0.0)
         needed = np.linalg.norm(drag - self._stiffness[nodes, None, None] * slip, axis=2)
         limit = np.where(slipping[:, None], self._friction, self._static) * normal_forces
         slips = rubbing & (needed > (1.0 + 1e-13) * limit)

@@ -324,23 +324,21 @@ class NodeWalls:
             start, earlier, slack = self._starts(nodes, x, poses)
         for k, s in enumerate(self.first):
             if k in self._faces:
-                ways = earlier.rest(k, start), poses.rest(k, x)
-                near |= self._faces[k].near(*ways, reach, slack) & members[:, s]
+                close = self._faces[k].near(earlier.rest(k, start), poses.rest(k, x), reach, slack)
             else:
-                near |= (self.gap(k, x, poses) < reach) & members[:, s]
+                close = self.gap(k, x, poses) < reach
+            near |= close & members[:, s]
         return near
 
     def applicable(self, nodes: np.ndarray, x: np.ndarray, poses: Poses) -> np.ndarray:
         """Return (m, slots) bool: walls that can stop nodes that move to positions (m, 3)."""
         applicable = self.members[nodes]
         if self.partial and self.state is not None:
-            state = self.state
-            before = state.position[nodes]
-            earlier = self.motion.poses(state.time)
+            before, earlier, _ = self._starts(nodes, x, poses)
             for k, wall in enumerate(self.walls):
                 if wall.partial:
                     # a node in contact may lie beyond the wall, because the balance need not hold at its position
-                    held = state.contact[nodes] @ earlier.turned(k, wall.normal) > 0.0
+                    held = self.state.contact[nodes] @ earlier.turned(k, wall.normal) > 0.0
                     slack = np.where(held, 0.1 * wall.half.min(), BEYOND * self.size)
                     applicable[:, self.first[k]] &= wall.stops(earlier.rest(k, before), poses.rest(k, x), slack)
         return applicable

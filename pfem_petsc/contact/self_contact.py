@@ -584,7 +584,13 @@ class SelfContact:
         self._friction, self._damping = float(table.friction), damping_of(float(table.restitution))
         self._starts = owner_starts(mesh)
         self._numbers = np.concatenate([mesh.first_node + np.arange(mesh.n_owned), mesh.ghost_numbers])
-        self._make_directory()
+        # ends, radius and stiffness of all bars on the ranks of their slabs
+        ids = mesh.bar_ids[self._bars].astype(np.int64)
+        router = Router(comm, slab_of(ids, mesh.n_bars, comm.size))
+        self._first_bar, end = slab_range(mesh.n_bars, comm.rank, comm.size)
+        self._directory, at = np.zeros((end - self._first_bar, 4)), router.send(ids) - self._first_bar
+        ends, stiffness = self._numbers[mesh.bars[self._bars]], model.bars.stiffness[self._bars]
+        self._directory[at] = router.send(np.column_stack([ends, self._radius[self._bars], stiffness]))
         self._h, self.room, self.implicit, self._steps = 0.0, 0.0, False, "time.step"
         self.between: tuple[int, ...] = ()
         self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
@@ -596,18 +602,6 @@ class SelfContact:
         self._empty()
         made = BarsAtWalls(model, chosen)
         self.at_walls = made if made.walls else None
-
-    def _make_directory(self) -> None:
-        """Send the ends, radius and stiffness of all bars to the ranks of their slabs."""
-        mesh, comm = self._mesh, self.comm
-        ids = mesh.bar_ids[self._bars].astype(np.int64)
-        router = Router(comm, slab_of(ids, mesh.n_bars, comm.size))
-        begin, end = slab_range(mesh.n_bars, comm.rank, comm.size)
-        at = router.send(ids) - begin
-        self._first_bar, self._directory = begin, np.zeros((end - begin, 4))
-        stiffness = self._model.bars.stiffness[self._bars]
-        ends = self._numbers[mesh.bars[self._bars]]
-        self._directory[at] = router.send(np.column_stack([ends, self._radius[self._bars], stiffness]))
 
     def begin(self, scheme: Scheme, h: float, frequency: float, critical: float) -> None:
         """Take the step [s], the highest frequency of the bars [rad/s] and the critical step [s].
@@ -961,8 +955,7 @@ class SelfContact:
             return 1.0
         x = self._gather(lambda rows: start[rows], 3)
         part, limiting = free_part(self._pairs, x, found[0].x[:, :3] - x)
-        parts = self.comm.allgather((part, tuple(self.ids[limiting - 1].tolist()) if limiting else ()))
-        part, between = min(parts)
+        part, between = min(self.comm.allgather((part, tuple(self.ids[limiting - 1].tolist()) if limiting else ())))
         self.between = between or self.between
         return part
 

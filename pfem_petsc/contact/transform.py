@@ -99,21 +99,17 @@ class RelativeCoordinates:
         coefficients[rows.source] = rows.friction
         comm.Allreduce(MPI.IN_PLACE, coefficients, op=MPI.MAX)
         self.friction, self.static = coefficients.T.copy()
-        self._may = self._supported()
+        # nodes of rows whose supports let them carry the relative coordinate
+        part = (rows.weights != 0.0) & rows.fixed[:, None]
+        free = (rows.free > 0.0)[rows.ends]
+        needed = (free & part[:, :, None]).any(axis=1, keepdims=True)
+        self._may = part & (free | ~needed).all(axis=2) & groups[rows.group_of_row][:, None]
         # the first row over the same nodes, with whose carrier the first ones of other tables have a slot as well
         nodes = np.column_stack([rows.ends, rows.weights])
         _, first, same = np.unique(nodes, axis=0, return_index=True, return_inverse=True)
         self._first, self._slot = first[same.ravel()], np.zeros(len(rows.source), dtype=bool)
         self._slot[np.unique(np.column_stack([self._first, rows.source]), axis=0, return_index=True)[1]] = True
         self._take(np.full(len(rows.source), -1))
-
-    def _supported(self) -> np.ndarray:
-        """Return (r, k) bool: nodes of rows whose supports let them carry the relative coordinate."""
-        rows = self.rows
-        part = (rows.weights != 0.0) & rows.fixed[:, None]
-        free = (rows.free > 0.0)[rows.ends]
-        needed = (free & part[:, :, None]).any(axis=1, keepdims=True)
-        return part & (free | ~needed).all(axis=2) & self.groups[rows.group_of_row][:, None]
 
     def choose(self, stopped: np.ndarray, x: np.ndarray) -> None:
         """Choose the carriers for a solve, by elimination. Collective.
@@ -261,8 +257,7 @@ class RowCoordinates:
         data = rows.gather(data)
         self._part = balance.acting
         self._start = rows.gather(state.position) if self._part < 1.0 else self._start
-        jacobian = rows.gradients(self._acting(rows.gather(x)))
-        self._place(jacobian, data[:, :9].reshape(-1, 3, 3), data[:, 9:] == 0.0)
+        self._place(rows.gradients(self._acting(rows.gather(x))), data[:, :9].reshape(-1, 3, 3), data[:, 9:] == 0.0)
 
     def _acting(self, x: np.ndarray) -> np.ndarray:
         """Places (n, 3) where the forces of the balance act, for nodes that move to (n, 3)."""
@@ -405,8 +400,7 @@ class RowCoordinates:
         """
         node, component, row = self._here
         force, own = g[node, component] / self._scale[row], np.zeros(w.shape)
-        pressed = (w[node, component] <= lower[node, component]) & (force > noise)
-        own[node, component] = np.where(pressed, force, 0.0)
+        own[node, component] = np.where((w[node, component] <= lower[node, component]) & (force > noise), force, 0.0)
         self.constraints.release()
         self.constraints.jacobian = self.jacobian
         self.constraints.force[self._placed] = self._all(own)[self._pivot[self._placed]]
@@ -455,8 +449,7 @@ class RowCoordinates:
 
     def broken(self, x: np.ndarray, slack: float) -> bool:
         """Return whether positions (owned, 3) violate any row by more than ``slack`` [m]. Collective."""
-        usable = self.rows.usable(self.jacobian)
-        return self._any((self.rows.values(self.rows.gather(x))[usable] < -slack).any())
+        return self._any((self.rows.values(self.rows.gather(x))[self.rows.usable(self.jacobian)] < -slack).any())
 
 
 class Transform:

@@ -27,7 +27,6 @@ from .base import Treatment as Base
 
 if TYPE_CHECKING:
     from ...stepping.model import Model
-    from ..contact import Contact
 
 
 _ITERATIONS = 200
@@ -102,7 +101,12 @@ def redistribute(model: Model) -> Redistribution:
             raise InputError(f"{key}: node {mesh.node_ids[several[0]]} belongs to several walls; give it one")
     # normal, mass and sum of weights of contact nodes, known to all ranks that see them
     info = np.zeros((mesh.n_local, 5))
-    nodes, walls, free, across = _movable(contact)
+    nodes = np.flatnonzero(contact.members.any(axis=1))
+    walls = contact.members[nodes].argmax(axis=1)
+    free = np.where(contact.fixed[nodes], 0.0, contact.surfaces.normals[walls])
+    across = np.sqrt((free * free).sum(axis=1))
+    can = across**2 > FREE_PART  # move off their walls
+    nodes, walls, free, across = nodes[can], walls[can], free[can] / across[can, None], across[can]
     info[nodes, :3], info[nodes, 3] = free, inertia.mass[nodes]
     mesh.update_ghosts(info)
     here, there = np.hstack([mesh.bars.T, mesh.bars.T[::-1]])  # of each bar in both directions
@@ -130,16 +134,6 @@ def redistribute(model: Model) -> Redistribution:
     matrices *= movable[:, :, None] & movable[:, None, :]
     inverses = np.linalg.pinv(matrices, rcond=1e-10, hermitian=True)
     return Redistribution(nodes, walls, free, across, touched, tensors[touched], inverses)
-
-
-def _movable(contact: Contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return owned nodes (m,) that can move off their walls (m,), the unit vectors (m, 3), and ``across`` (m,)."""
-    nodes = np.flatnonzero(contact.members.any(axis=1))
-    walls = contact.members[nodes].argmax(axis=1)
-    free = np.where(contact.fixed[nodes], 0.0, contact.surfaces.normals[walls])
-    across = np.sqrt((free * free).sum(axis=1))
-    can = across**2 > FREE_PART
-    return nodes[can], walls[can], free[can] / across[can, None], across[can]
 
 
 class MasslessNodes:
@@ -271,5 +265,4 @@ class Treatment(Base):
         stepper.scheme.restart(state, nodes, stepper.part)
         # along the normals alone, where there is no momentum that jumps
         for name, kept in memory.items():
-            change = np.einsum("mi,mi->m", state.memory[name][nodes] - kept, n)
-            state.memory[name][nodes] = kept + change[:, None] * n
+            state.memory[name][nodes] = kept + np.einsum("mi,mi->m", state.memory[name][nodes] - kept, n)[:, None] * n

@@ -59,8 +59,7 @@ class Treatment(Restitution):
         if not contact.has_friction or stepper.scheme.solves_next_position or len(nodes) == 0:
             return v, a, 0.0
         touching = stepper.touching[nodes]
-        poses = contact.motion.poses(state.time)
-        normals, _ = contact.planes(touching, state.position[nodes], poses, nodes=nodes)
+        normals, _ = contact.planes(touching, state.position[nodes], contact.motion.poses(state.time), nodes=nodes)
         slip = across(self._moved(nodes), normals)
         if not stepper.scheme.solves_end:  # friction acts along the slip to the position solved for, if any
             solved = across(self._moved_to_solution(nodes), normals)

@@ -318,7 +318,9 @@ def _flaw(wall: BaseWall, x: np.ndarray) -> str:
     """Return how a wall differs from what :class:`BaseWall` says, empty if it does not."""
     if np.shape(wall.centre) != (3,):
         return f"its centre is {wall.centre!r:.80}; it must be an array (3,)"
-    if wall.flat and not _is_plane(wall.normal, wall.offset):
+    if wall.flat and not (
+        np.shape(wall.normal) == (3,) and abs(np.linalg.norm(wall.normal) - 1.0) < 1e-6 and np.isfinite(wall.offset)
+    ):
         return f"its normal is {wall.normal!r:.80} and its offset {wall.offset!r:.80}; give a unit vector and a number"
     must = "it must return unit normals (m, 3) and offsets (m,) for positions (m, 3)"
     planes = wall.planes(x)
@@ -332,10 +334,6 @@ def _flaw(wall: BaseWall, x: np.ndarray) -> str:
         found = f"the normal {normals[at].tolist()} and the offset {offsets[at]} at {x[at].tolist()}"
         return f"planes returned {found}; {must}"
     return ""
-
-
-def _is_plane(normal: Any, offset: Any) -> bool:
-    return np.shape(normal) == (3,) and abs(np.linalg.norm(normal) - 1.0) < 1e-6 and bool(np.isfinite(offset))
 
 
 @dataclass(frozen=True)

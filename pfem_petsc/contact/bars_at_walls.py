@@ -14,7 +14,6 @@ from math import acosh, asin, exp, pi, sqrt, tan
 from typing import TYPE_CHECKING
 
 import numpy as np
-from mpi4py import MPI
 
 from .wall_motion import Poses
 from .walls.base import deepest
@@ -214,11 +213,9 @@ class Piercing:
             return []
         self.looks += 1
         poses = self._model.contact.motion.poses(time)
-        found = np.array([self._across(i, k, x, poses) for i, k in enumerate(self.walls)])
-        counts, lowest = found[:, 0].copy(), found[:, 1].copy()
-        comm = self._model.comm
-        comm.Allreduce(MPI.IN_PLACE, counts, op=MPI.SUM)
-        comm.Allreduce(MPI.IN_PLACE, lowest, op=MPI.MIN)
+        here = [self._across(i, k, x, poses) for i, k in enumerate(self.walls)]
+        found = np.array(self._model.comm.allgather(here))
+        counts, lowest = found[:, :, 0].sum(axis=0), found[:, :, 1].min(axis=0)
         told = []
         for count, bar, k in zip(counts.tolist(), lowest.tolist(), self.walls, strict=True):
             self.seen[k] += count > 0

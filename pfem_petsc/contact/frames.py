@@ -75,13 +75,10 @@ class Sliding:
         self.maps = np.linalg.inv(system)
         g = np.einsum("mij,mj->mi", self.maps, g - np.einsum("mji,mj->mi", self.inverse, known))
         # the change of friction as the direction of slip turns
-        self.stiffness[:] = 0.0
-        for k in range(rows.shape[1]):
-            normal_forces = np.maximum(g[every, np.maximum(rows[:, k], 0)] / ratios[:, k], 0.0)
-            factor = friction[:, k] * normal_forces * weight / size[:, k]
-            n, d = normals[:, k], directions[:, k]
-            across = np.eye(3) - n[:, :, None] * n[:, None, :] - d[:, :, None] * d[:, None, :]
-            self.stiffness += factor[:, None, None] * across
+        normal_forces = np.maximum(np.take_along_axis(g, np.maximum(rows, 0).astype(np.int64), axis=1) / ratios, 0.0)
+        factor = friction * normal_forces * weight[:, None] / size
+        outer = np.einsum("mwi,mwj->mwij", normals, normals) + np.einsum("mwi,mwj->mwij", directions, directions)
+        self.stiffness[:] = np.einsum("mw,mwij->mij", factor, np.eye(3) - outer)
         return g
 
 

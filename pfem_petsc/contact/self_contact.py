@@ -619,9 +619,8 @@ class SelfContact:
             raise InputError(
                 f'{source}: [self_contact] needs time.mass = "lumped", and no contact.treatment = "mass_redistribution"'
             )
-        room = 1.0
-        if np.isfinite(critical):  # less a tenth, as weights change
-            room = 0.9 * (frequency * h) ** 2 * ((critical / h) ** 2 - 1.0)
+        # less a tenth, as weights change
+        room = 0.9 * (frequency * h) ** 2 * ((critical / h) ** 2 - 1.0) if np.isfinite(critical) else 1.0
         if room < _ROOM:
             raise InputError(
                 f"{source}: time.step = {h:g} s leaves no room for the stiffness of [self_contact] below the critical "

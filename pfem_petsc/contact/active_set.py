@@ -210,10 +210,8 @@ class ActiveSet:
         rows: RowCoordinates | None = None,
         remedy: str = "reduce time.step",
     ) -> None:
-        self.contact, self._remedy = model.contact, remedy
-        self.model = model
-        self.state = state
-        self.balance = balance
+        self.model, self.contact, self._remedy = model, model.contact, remedy
+        self.state, self.balance = state, balance
         self._iterations = self._row_iterations = 0
         self._poses = self.contact.motion.poses(balance.time)
         relative = None if rows is None else rows.relative

@@ -229,10 +229,8 @@ class NodeWalls:
         parameters: Sequence[WallKeys] | None = None,
     ) -> None:
         walls = list(case.wall) if parameters is None else parameters
-        self.source = case.source
-        self.mesh = mesh
-        self.fixed = fixed
-        self.state = None
+        self.source, self.state = case.source, None
+        self.mesh, self.fixed = mesh, fixed
         self.names = [wall.name for wall in walls]
         self.any = bool(walls)
         with agreed(mesh.comm):
@@ -246,10 +244,9 @@ class NodeWalls:
         self.wall_of, self.first = np.repeat(np.arange(len(walls)), faces), np.cumsum(faces) - faces
         self.all_nodes = np.array([wall.node_set is None for wall in walls], dtype=bool)[self.wall_of]
         self.members = np.ones((mesh.n_owned, len(self.wall_of)), dtype=bool)
-        for s, k in enumerate(self.wall_of):
-            if walls[k].node_set is not None:
-                self.members[:, s] = False
-                self.members[nodes[walls[k].node_set], s] = True
+        for s in np.flatnonzero(~self.all_nodes):
+            self.members[:, s] = False
+            self.members[nodes[walls[self.wall_of[s]].node_set], s] = True
         self.log = ContactLog(mesh.n_owned, len(walls), self.wall_of)
         friction = np.array([wall.friction_coefficients for wall in walls], dtype=np.float64).reshape(-1, 2)
         self.friction, self.static_friction = np.ascontiguousarray(friction[self.wall_of].T)

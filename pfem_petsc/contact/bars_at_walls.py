@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import acosh, asin, exp, pi, sqrt, tan
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from .wall_motion import Poses
 from .walls.base import deepest
 
 if TYPE_CHECKING:
-    from ..stepping.model import Model
     from .walls.base import BaseWall
 
 _SHARE = 0.2  # of the lighter node's mass over the square of the step, and of what this leaves, that is the stiffness
@@ -56,7 +55,7 @@ def small_walls(walls: Sequence[BaseWall]) -> list[int]:
     return [k for k, wall in enumerate(walls) if np.isfinite(wall.width)]
 
 
-def _applying(model: Model, walls: list[int], bars: np.ndarray | slice) -> np.ndarray:
+def _applying(model: Any, walls: list[int], bars: np.ndarray | slice) -> np.ndarray:
     """Return (m, walls) bool: walls that stop both nodes of bars (m,). Collective."""
     contact, mesh = model.contact, model.mesh
     members = np.zeros((mesh.n_local, len(walls)))
@@ -78,7 +77,7 @@ class BarsAtWalls:
     sums : (2, walls, 3) forces of walls on this rank's counted bars [N], and their moments about the origin [N m]
     """
 
-    def __init__(self, model: Model, chosen: np.ndarray) -> None:
+    def __init__(self, model: Any, chosen: np.ndarray) -> None:
         contact, mesh = model.contact, model.mesh
         self._model, self._contact, self._mesh = model, contact, mesh
         self.walls = [k for k in small_walls(contact.walls) if contact.walls[k].closed]
@@ -193,7 +192,7 @@ class Piercing:
     looks : number of snapshots checked
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Any) -> None:
         self._model = model
         self.walls = small_walls(model.contact.walls)
         self.first: dict[int, str] = {}

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -15,22 +14,14 @@ from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, ON_BOUND
 from .explicit import ExplicitContact
 from .frames import MIN_VOLUME, NodalFrames, Planes, RowPlanes, build_frames
-from .friction import planes_at_rest
 from .node_walls import WallForces, held_by_supports
-from .projection import NodesAtPlanes, pressed
 from .surfaces import OTHER
 from .tied import FreshTies
 from .wall_motion import Poses
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..mechanics.mass import Inertia
     from ..mesh.distribution import DistributedMesh
-    from ..stepping.model import Model
-    from .constraint_set import ConstraintSet
-
-
-_ROUNDS = 60  # of the initial equilibrium, each at least halves the error
 
 
 class Contact(ExplicitContact):
@@ -257,7 +248,7 @@ def check_start(contact: Contact, x: np.ndarray, length: float, adjusts: bool = 
         )
 
 
-def check_positions(model: Model, x: np.ndarray, time: float, where: str) -> None:
+def check_positions(model: Any, x: np.ndarray, time: float, where: str) -> None:
     """Check that no node lies beyond a wall, with one pass over the nodes and one reduction. Collective.
 
     Parameters
@@ -354,89 +345,3 @@ def _prescribed(contact: Contact, node: int, wall: int, x: np.ndarray, time: flo
         return True
     normals, _ = contact.planes(np.ones((1, len(contact.wall_of)), dtype=bool), x[[node]], contact.motion.poses(time))
     return bool(held_by_supports(contact.fixed[node], normals[0, contact.first[wall]]))
-
-
-def start_at_rest(
-    links: ConstraintSet,
-    inertia: Inertia,
-    state: State,
-    accelerate: Callable[[np.ndarray], np.ndarray],
-    load: np.ndarray,
-    still: float,
-) -> WallForces | None:
-    """Set acceleration and contact forces of nodes that rest on walls or on each other in the state; return the forces
-    per wall. Collective.
-
-    A node that touches a wall and does not move along its normal is not accelerated into it: with the walls' forces r
-    and accelerations a_w,
-
-        M a = f + r,   0 <= n . (a - a_w)  complementary to  the normal force in r,
-
-    and likewise with n . (a_2 - a_1) of closed pairs. r includes friction: opposite to the velocity of a node that
-    slides, else the force that prevents sliding, up to the limit of the wall. Without r a truss at rest on a floor
-    would start with a velocity error of h g, which decays slowly with some schemes.
-
-    The forces follow from projections with the lumped mass, in one iteration if the mass is lumped. The eigenvalues of
-    a consistent mass are between one third and one times the lumped one, so projections with half the lumped mass
-    halve the error in every iteration.
-
-    Parameters
-    ----------
-    links : ConstraintSet, with the walls of the case
-    inertia : Inertia
-    state : with ``state.a`` without walls
-    accelerate : returns the acceleration (owned, 3) with M a = load. Collective
-    load : (owned, 3) without walls [N]
-    still : velocity that counts as none [m/s]
-
-    Returns
-    -------
-    WallForces or None
-        None if no node of any rank rests on a wall or on another node, or if no contact force is needed.
-    """
-    contact, comm, mass = links.contact, links.contact.mesh.comm, inertia.mass
-    x, v = state.position, state.v
-    poses = contact.motion.poses(state.time)
-    slack = ON_BOUND * contact.size
-    nodes = np.flatnonzero(contact.near(x, poses, np.array([slack])))
-    applicable = contact.members[nodes]
-    normals, gaps = contact.distances(applicable, x[nodes], poses)
-    away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - contact.rates(x[nodes], state.time, ahead=True))
-    resting = applicable & (np.abs(gaps) <= slack) & (np.abs(away) <= still)
-    # the plane of a partial wall extends beyond the wall, and walls with mass are not fixed
-    partial = [k for k, wall in enumerate(contact.walls) if wall.partial]
-    resting[:, np.isin(contact.wall_of, [*partial, *contact.motion.bodies.at])] = False
-    kept = resting.any(axis=1)
-    nodes, resting = nodes[kept], resting[kept]
-    share = 0.5 if inertia.consistent else 1.0
-    weight = share * mass[nodes]
-    closed = links.resting(x, v, slack, still)
-    held = np.zeros(contact.members.shape, dtype=bool)
-    held[nodes] = resting
-
-    hold = np.zeros((len(nodes), 3))  # free components of the walls' forces
-    between = np.zeros_like(load)  # likewise for the links
-    for _ in range(_ROUNDS if inertia.consistent else 1):
-        apart = state.a - between / (share * mass[:, None])
-        apart[nodes] -= hold / weight[:, None]
-        earlier = between
-        # links first, as in a step: they account for the walls
-        between = links.rest(apart, share * mass, closed, held, still)
-        free = apart[nodes] + between[nodes] / weight[:, None]
-        planes = planes_at_rest(contact, resting, (x[nodes], v[nodes], free), still)
-        found = pressed(NodesAtPlanes(free, contact.fixed[nodes], weight, planes), 0.0)
-        before, hold = hold, weight[:, None] * (found.x - free)
-        sizes = [np.abs(part).max(initial=0.0) for part in (hold - before, between - earlier, hold, between)]
-        last_hold, last_between, *largest = np.max(comm.allgather(sizes), axis=0)
-        if max(last_hold, last_between) <= 1e-13 * max(largest):
-            break
-        total = load + between
-        total[nodes] += hold
-        state.a = accelerate(total)
-    if max(largest) == 0.0:
-        return None
-    force = found.normal[:, :, None] * planes.normals + found.drag
-    state.contact = np.zeros_like(load)
-    state.contact[nodes] = force.sum(axis=1)
-    links.add_forces(state.contact)
-    return contact.sums(nodes, force, (x[nodes], x[nodes]), found.normal > 0.0)

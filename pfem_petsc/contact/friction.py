@@ -11,14 +11,13 @@ from mpi4py import MPI
 
 from ..integrators.base import Balance, State
 from ..tolerances import FREE_PART, ON_BOUND, PROJECTED
-from .frames import NodalFrames, Sliding, SlipForces
+from .frames import NodalFrames, RelativeCoordinates, Sliding, SlipForces
 from .node_walls import free_squares
 from .projection import NodesAtPlanes, Planes, Pressed, pressed
 
 if TYPE_CHECKING:
     from ..mechanics.mass import Inertia
     from .node_walls import NodeWalls
-    from .transform import RelativeCoordinates
 
 
 FAST = 1e16
@@ -93,7 +92,7 @@ class StepFriction:
     """Friction in one implicit step, at the slots of walls and, behind them, of tables of rows.
 
     Positions are those of nodes, at carriers of rows relative ones, see
-    :class:`~pfem_petsc.contact.transform.RelativeCoordinates`.
+    :class:`~pfem_petsc.contact.frames.RelativeCoordinates`.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ rank that has most segments there. Points are segments whose ends coincide.
 from __future__ import annotations
 
 from itertools import product
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -21,9 +21,6 @@ from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..parallel.heap import returning_freed_memory
 from .rotations import along, cross, dot, minus, put, vector
-
-if TYPE_CHECKING:
-    from ..stepping.model import Model
 
 # Limits for each segment: pieces, and comparisons.
 _PIECES, _COMPARISONS = 8.0, 2000.0
@@ -529,7 +526,7 @@ class CrossingBars:
     applicable : whether there are bars to be searched
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Any) -> None:
         self._model = model
         mesh = model.mesh
         self._n_bars = mesh.n_bars - mesh.n_connectors

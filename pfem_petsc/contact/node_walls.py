@@ -256,7 +256,8 @@ class NodeWalls:
         self.flat = (np.array([wall.flat for wall in self.walls], dtype=bool) & ~self.motion.turning)[self.wall_of]
         self.surfaces = Surfaces.of([self.walls[k] for k in self.wall_of], self.motion.turning[self.wall_of])
         self.partial = any(wall.partial for wall in self.walls)
-        self._faces = {k: TouchedFaces(wall, mesh.n_owned) for k, wall in enumerate(self.walls) if wall.faces > 1}
+        surfaces = ((k, wall) for k, wall in enumerate(self.walls) if wall.faces > 1)
+        self._faces = {k: TouchedFaces(wall.compiled, wall.planes, mesh.n_owned) for k, wall in surfaces}
         ends = np.stack([-mesh.points.min(axis=0, initial=np.inf), mesh.points.max(axis=0, initial=-np.inf)])
         mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
         coordinates = float(np.abs(ends).max()), float(np.abs(self.centres).max(initial=0.0))

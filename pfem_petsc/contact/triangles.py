@@ -11,7 +11,8 @@ what is beside the surface is in front of it.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple, Self
+from collections.abc import Callable
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -19,9 +20,6 @@ from ..mechanics.compiled import inlined, kernel
 from ..mechanics.records import record
 from .projection import project
 from .rotations import along, dot, minus, put, times, vector
-
-if TYPE_CHECKING:
-    from .walls.surface import Wall
 
 ROUNDING = 1e-13
 """Distances below this fraction of the largest coordinate count as zero where planes meet."""
@@ -483,12 +481,15 @@ class TouchedFaces:
 
     Parameters
     ----------
-    wall : a surface of triangles
+    triangles : Triangles, for loops
+    planes_of : returns the planes nearest to positions, see :class:`~pfem_petsc.contact.walls.base.BaseWall`
     n_owned : number of nodes
     """
 
-    def __init__(self, wall: Wall, n_owned: int) -> None:
-        self._wall, self._triangles = wall, wall.compiled
+    def __init__(
+        self, triangles: Any, planes_of: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], n_owned: int
+    ) -> None:
+        self._triangles, self._planes_of = triangles, planes_of
         self._table = np.zeros(n_owned, dtype=np.int8), np.zeros((n_owned, 3, 3)), np.full((n_owned, 3), -np.inf)
 
     def forget(self) -> None:
@@ -531,6 +532,6 @@ class TouchedFaces:
             normals, offsets, at = normals[nodes], offsets[nodes], np.flatnonzero(known[nodes] == 0)
         if len(at):
             slots = slice(1 if nodes is None else 3)
-            own, level = self._wall.planes(x[at])
+            own, level = self._planes_of(x[at])
             normals[at, slots], offsets[at, slots] = own[:, None], level[:, None]
         return normals, np.einsum("mki,mi->mk", normals, x) - offsets

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..contact.contact import CarriedNodes, start_at_rest
+from ..contact.active_set import start_at_rest
+from ..contact.contact import CarriedNodes
 from ..contact.node_walls import WallForces
-from ..contact.treatments.mass_redistribution import MasslessNodes
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy, release
@@ -269,7 +269,8 @@ class Stepper(ABC):
         )
         self.before = mesh.points.copy()
         model.contact.state = self.state
-        self.massless = MasslessNodes(model) if model.inertia.redistribution is not None else None
+        moved = model.inertia.redistribution
+        self.massless = None if moved is None else moved.massless(model)
         self.step_changed = False
         self.support_changes = 0
         self.prescribed = PrescribedMotion(self)

@@ -64,6 +64,10 @@ class Redistribution:
         """Add the product of the tensors with vectors ``u`` (owned, 3), times a factor."""
         out[self.touched] += factor * np.einsum("kij,kj->ki", self.tensors, u[self.touched])
 
+    def massless(self, model: Model) -> MasslessNodes:
+        """Return the nodes without mass of a model."""
+        return MasslessNodes(model)
+
 
 def redistribute(model: Model) -> Redistribution:
     """Compute the redistributed masses. Collective.
